@@ -198,9 +198,9 @@ class Rig(Batched):
     """Ordered, named cameras of different sizes, lenses and spectral responses.
 
     `depth` is (near, far) in metres along the optical axis of whichever camera is alpha; far may be inf.
-    Every number may have leading batch axes, the same for all: a batch of rigs. Kornia's pinholes are
-    converted. `links` relate cameras that are not calibrated, by (alpha, beta). A rig never changes: methods
-    return new ones.
+    Every number may have leading batch axes, the same for all: a batch of rigs. A depth range without them is
+    that of each rig. Kornia's pinholes are converted. `links` relate cameras that are not calibrated, by
+    (alpha, beta). A rig never changes: methods return new ones.
     """
 
     cameras: Mapping[str, Any]  # View once made; kornia pinholes serve as well
@@ -220,6 +220,8 @@ class Rig(Batched):
             if not isinstance(self.depth, Sequence | Tensor) or len(self.depth) != 2:
                 raise TypeError(f"depth is {self.depth!r}: wanted (near, far), in metres")
             object.__setattr__(self, "depth", depth_range(*self.depth))
+            shape = self.batch_shape
+            object.__setattr__(self, "depth", tuple(bound.expand(shape) for bound in self.depth))
         if checking():
             self._check_links()
 
@@ -484,6 +486,7 @@ def focal_positions(K: Tensor) -> Tensor:
 
 
 def _perturbed_camera(name: str, camera: View, changes: Mapping[str, Tensor]) -> View:
+    """The camera with its part of the changes, by the names of `Rig.parameters`, added."""
     mine = {k.removeprefix(f"{name}."): v for k, v in changes.items() if k.startswith(f"{name}.")}
     if not mine or not isinstance(camera, LensView):
         return camera

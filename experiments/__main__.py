@@ -5,16 +5,20 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from pat.cli.main import main
-from pat.cli.options import MaybeOut, MaybePath, Memory, Out, Weights, say, working, writable
+from pat.cli.options import MaybeOut, MaybePath, Memory, Out, Weights, progress, say, working, writable
+from pat.data.windows import scene_folders
+from pat.sensors import seed_for
+from pat.support.schema import read_yaml
 
 from .alignment import evaluate_alignment
 from .evaluation import commands
 from .fast_slow.recorded import run_recorded
+from .sensors import read_chains, record_rendered
 from .showcase import showcase
 from .system import NAMES, load_system, run_system
 
@@ -115,6 +119,28 @@ class Systems:
     commands: ClassVar[Mapping[str, Any]] = {"list": SystemsList, "run": SystemsRun}
 
 
+@dataclass
+class Record:
+    """Record rendered scenes as their cameras would: of each scene images and a rig, for `pat fuse`."""
+
+    folder: Annotated[Positional[Path], arg(metavar="FOLDER", help="Folder written by `pat render`.")]
+    out: Out = Path("out/recorded")
+    """Folder for a folder of each scene."""
+    sensors: MaybePath = None
+    """File (YAML) with a list of steps for each camera, instead of those that follow from their responses."""
+    seed: int = 0
+    """Of the noise."""
+
+    def run(self) -> None:
+        """Write images and rigs. Raises ValueError for a folder without scenes, and for unknown steps."""
+        chains = None if self.sensors is None else read_chains(read_yaml(self.sensors), str(self.sensors))
+        scenes = scene_folders(self.folder)
+        writable(self.out, folder=True)
+        for scene in progress("recording")(scenes, len(scenes)):
+            record_rendered(scene, self.out / scene.name, chains, seed=seed_for(self.seed, scene.name))
+        say(f"written: {self.out} (images and rig.yaml of each of {len(scenes)} scenes)")
+
+
 class Experiments:
     """Run the paper's arrays, fuse real images, and measure the tables of the documentation."""
 
@@ -128,7 +154,7 @@ class Experiments:
         "certainty": commands.Certainty,
         "sweeps": commands.Sweeps,
         "fields": commands.Fields,
-        "patches": commands.Patches,
+        "record": Record,
     }
 
 

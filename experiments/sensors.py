@@ -23,6 +23,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -32,8 +33,10 @@ from torch import Generator, Tensor
 from arraygeom.pixels import pixel_grid
 from arraygeom.rig import Rig
 from arraygeom.sampling import sample
-from arraygeom.sensor import Band, Curve
+from arraygeom.sensor import Band, Curve, Sensor
+from pat.data.windows import read_view, scene_rig
 from pat.media.colour import REC601, linear_from_srgb, srgb_from_linear
+from pat.media.images import write_image
 from pat.sensors import BoxBlur, Clip, GaussianBlur, Jitter, Noise, Quantise, Resample, Step, generator_for
 from pat.support.schema import from_document, near
 
@@ -234,6 +237,35 @@ def record_array(
     return RecordedArray(recorded, rig)
 
 
+def record_rendered(
+    folder: Path, out: Path, chains: Mapping[str, Sequence[Step]] | None = None, *, seed: int = 0
+) -> None:
+    """Write the images (16-bit PNG) that a rig's cameras record of a rendered scene, and their rig.yaml.
+
+    `chains` are `default_chains` of the rig unless given. Raises ValueError for a scene that cannot be read.
+    """
+    rig = scene_rig(folder)
+    images = {name: read_view(folder, name).rgb[None] for name in rig.names}
+    recorded = record_array(images, rig, default_chains(rig) if chains is None else chains, seed=seed)
+    for name, image in recorded.images.items():
+        write_image(out / f"{name}.png", image[0], bits=16)
+    recorded.rig.save(out / "rig.yaml")
+
+
+def default_chains(rig: Rig) -> dict[str, tuple[Step, ...]]:
+    """Each camera's spectral response, a little noise, sRGB encoding, 8 bits."""
+    return {
+        name: (_spectral(c.sensor), Noise(8000, 3), Clip(), EncodeSRGB(), Quantise(8))
+        for name, c in rig.cameras.items()
+    }
+
+
+def _spectral(sensor: Sensor) -> Spectral:
+    if isinstance(sensor.response, Band | Curve):
+        return Spectral(sensor.response)
+    return Spectral("luminance" if sensor.response in ("mono", "luminance") else "rgb")
+
+
 _CLASSES: tuple[type[Step], ...] = (
     *(DecodeSRGB, EncodeSRGB, Spectral, Exposure, BoxBlur, GaussianBlur, MotionBlur),
     *(Resample, Mosaic, Noise, Clip, Quantise, Jitter),
@@ -263,6 +295,7 @@ def read_chains(value: Any, where: str = "sensors") -> dict[str, tuple[Step, ...
 
 
 def _step(entry: Any, where: str) -> Step:
+    """One step of a chain. Raises ValueError naming the entry."""
     name, options = (
         next(iter(entry.items())) if isinstance(entry, Mapping) and len(entry) == 1 else (entry, {})
     )

@@ -2,6 +2,7 @@
 
 import gc
 import os
+import re
 from collections.abc import Generator
 from importlib.util import find_spec
 from pathlib import Path
@@ -52,3 +53,21 @@ def shared_data() -> Path:
     if not SHARED.is_dir():
         pytest.skip(f"real images not at {SHARED}")
     return SHARED
+
+
+@pytest.fixture
+def refusal(capsys):
+    """What `pat`, or another group of commands, says as it refuses its arguments: the last line, and one."""
+
+    def said(*arguments: object, **group: object) -> str:
+        from pat.cli.main import main
+
+        with pytest.raises(SystemExit) as stop:
+            main([str(argument) for argument in arguments], **group)
+        assert stop.value.code == 2
+        lines = capsys.readouterr().err.splitlines()
+        errors = [i for i, line in enumerate(lines, 1) if re.match("pat: (?!warning)", line)]
+        assert errors == [len(lines)]
+        return lines[-1]
+
+    return said

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -11,7 +12,7 @@ from torch import Tensor
 from ..chunks import Box, chunked
 from ..pixels import HW, pixel_coordinates, pixel_grid
 from ..rig import Pair
-from ..segments import Positions, Segments
+from ..segments import Positions, Segments, clip_to_image
 from .protocol import ReceptiveField, SamplingLocations, device_of, lazily
 
 At = Callable[[Tensor], SamplingLocations]
@@ -65,6 +66,8 @@ class FieldOnGrid:
         h, w = pair.alpha.hw
         sparse = (..., slice(0, h, 4), slice(0, w, 4))
         longest = torch.where(pixels.valid[sparse], pixels.length[sparse].detach().float(), 0.0).max()
+        if longest > math.hypot(*pair.beta.hw) + 1:  # of one's own, and what is off the image does not count
+            return cls.of(_clipped(field), pair, hw=hw, blocks=blocks)
         on_grid = cls(evaluate, int(torch.ceil(longest)) + 1, pixels)
         return replace(on_grid, blocks=on_grid.of_blocks(BLOCK)) if blocks and not on_grid.large else on_grid
 
@@ -173,6 +176,18 @@ def _on_grid(evaluate: At, hw: HW, side: int = 1, device: torch.device | None = 
 
     x, y = pixel_coordinates(hw, dtype=torch.float64, device=device)
     return Segments(*chunked(segments, x[None], y[None], rows=max(_CHUNK // max(w, 1), 1), axis=1))
+
+
+def _clipped(field: ReceptiveField) -> ReceptiveField:
+    """A field of segments, of each the part on beta's image."""
+
+    def on_image(pair: Pair, x: Tensor) -> Segments:
+        segments = field(pair, x)
+        assert isinstance(segments, Segments)
+        part = clip_to_image(segments.start.double(), segments.end.double(), pair.beta.hw)
+        return replace(part, valid=part.valid & segments.valid)
+
+    return on_image
 
 
 def _finite(locations: SamplingLocations) -> Positions:

@@ -7,25 +7,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar
 
-import torch
-from tyro.conf import Positional, arg
+from tyro.conf import arg
 
 from arraygeom.atomic import write_text
 from experiments.names import refuse_unknown
-from experiments.patches import ScenePatches, draw_patches
-from experiments.sensors import read_chains
 from pat.cli import research
-from pat.cli.options import MaybePath, Out, Weights, optional, progress, say, writable
+from pat.cli.options import MaybePath, Out, Weights, progress, say, writable
 from pat.data.pairs import StereoPair, middlebury_pairs
 from pat.evaluation import protocols, stereo
 from pat.evaluation.ablation import sample_photographs
 from pat.evaluation.tables import write_csv
 from pat.matching.certainty import fitted_network
-from pat.media.figures import save_figure, save_panels
+from pat.media.figures import save_panels
 from pat.networks.protocol import Comparing
 from pat.networks.weights import Network, load_weights
-from pat.sensors import generator_for
-from pat.support.schema import read_yaml
 from pat.support.tensor_files import write_tensors
 from pat.synthesis.photos import PhotoBank
 
@@ -283,30 +278,3 @@ class Fields(OnScenes):
         write_text(self.out / "ablation.md", fields.fields_markdown(rows))
         write_csv(self.out / "ablation.csv", fields.FieldRow._fields, rows)
         self.say_written()
-
-
-@dataclass
-class Patches:
-    """Draw the paper's patches of rendered scenes: recorded images, some segments, true colours and depth."""
-
-    folder: Annotated[Positional[Path], arg(metavar="FOLDER", help="Folder written by `pat render`.")]
-    out: Out = Path("out/patches.png")
-    """Image to write."""
-    samples: int = 6
-    """Number of patches."""
-    alpha: Annotated[str | None, optional("NAME")] = None
-    """The camera at whose view is fused; by default the first."""
-    sensors: MaybePath = None
-    """File (YAML) with a list of steps for each camera, instead of those that follow from their responses."""
-    seed: int = 0
-    """Of the choice of patches, and of noise."""
-
-    def run(self) -> None:
-        """Draw patches chosen by the seed. Raises ValueError for less than one."""
-        if self.samples < 1:
-            raise ValueError(f"--samples: {self.samples}: give a whole number from 1 up")
-        chains = None if self.sensors is None else read_chains(read_yaml(self.sensors), str(self.sensors))
-        data = ScenePatches(self.folder, alpha=self.alpha, chains=chains, seed=self.seed)
-        chosen = torch.randperm(len(data), generator=generator_for(self.seed, "show"))[: self.samples]
-        save_figure(draw_patches([data[i] for i in chosen.tolist()]), self.out)
-        say(f"written: {self.out} ({len(data)} patches of {len(data.folders)} scenes in {self.folder})")

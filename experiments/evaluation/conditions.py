@@ -299,6 +299,7 @@ def _by_region(rows: Sequence[ConditionRow]) -> str:
 
 
 def _depth(rows: Sequence[ConditionRow]) -> str:
+    """A table of errors of disparity under ideal conditions."""
     lines = []
     with_disparity = [r for r in rows if r.condition in ("ideal", "x1") and r.within_one is not None]
     for condition, method in distinct((r.condition, r.method) for r in with_disparity):

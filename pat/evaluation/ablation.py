@@ -354,6 +354,7 @@ def markdown(rows: Sequence[AblationRow]) -> str:
 
 
 def _cells(rows: Sequence[AblationRow], every: Sequence[AblationRow]) -> list[str]:
+    """One family's line of the table: its own rows, and all rows for the reference."""
     served = [row for row in rows if not math.isnan(row.psnr)]
     if not served:
         return [""] * (len(RATIOS) + 6) + [rows[0].note]

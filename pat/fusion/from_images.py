@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from jaxtyping import Float
 from torch import Tensor
@@ -34,7 +35,7 @@ from ..networks.weights import Network, load_weights, weights_for
 from .fuse import ImageSources, fuse
 from .results import Frame
 from .steps import without_lenses
-from .views import is_in_colour, read_view
+from .views import is_in_colour, range_of, read_view
 
 LOG = logging.getLogger(__name__)
 
@@ -90,8 +91,10 @@ def array_from_images(
     length of no camera.
     """
     sources, focal = _by_camera(sources), focal or {}
-    images = {name: image for name, image in sources.items() if isinstance(image, Tensor)}
-    files = {name: Path(path) for name, path in sources.items() if not isinstance(path, Tensor)}
+    files = {name: Path(path) for name, path in sources.items() if isinstance(path, str | Path)}
+    images: dict[str, Any] = {name: image for name, image in sources.items() if name not in files}
+    for name, image in images.items():
+        range_of(name, image)
     for name, length in focal.items():
         if name not in sources or not 0 < length < math.inf:
             raise ValueError(
@@ -297,22 +300,11 @@ def _calibrated(
     links: dict[tuple[str, str], Link] = {}
     for i, name in enumerate(betas):
         log_step(LOG, LINES + (1 - LINES) * i / len(betas), "calibrating %s and %s", alpha, name)
-        link = uncalibrated.rig.links[alpha, name]
-        views = {n: uncalibrated.rig[n] for n in (alpha, name)}
-        pair = self_calibrated(views, link, uncalibrated.matches[alpha, name], focal=focal)
+        pair = _calibrated_pair(uncalibrated, alpha, name, focal, note)
         if pair is None or not pair.exact:
-            links[alpha, name] = link
-            lines = uncalibrated.as_text().splitlines()
-            note(next(line for line in lines if line.startswith(f"{alpha} > {name}")))
+            links[alpha, name] = uncalibrated.rig.links[alpha, name]
         if pair is None:
-            note(
-                f"no depth by {name}: "
-                f"its points show no parallax, beside {alpha} it is too near, or its scene too far or flat"
-            )
             continue
-        exact = f"{pair.points} points, {pair.distance:.2f} px from their lines; refining"
-        rough = f"lines by F; depths are rough, by poses whose lines are {pair.distance:.2f} px off"
-        note(f"{alpha} > {name}: {exact if pair.exact else rough}")
         pairs[name] = pair
         if pair.exact or len(betas) > 1:
             pairs[name], depths[name] = _refined(pair, images, network, links)
@@ -337,6 +329,28 @@ def _calibrated(
         if name not in pairs:
             rig = rig.with_camera(name, uncalibrated.rig[name])
     return rig.replace(cameras={name: rig[name] for name in (alpha, *betas)}, links=links)
+
+
+def _calibrated_pair(
+    uncalibrated: UncalibratedRig, alpha: str, name: str, focal: Mapping[str, float], note: Say
+) -> RefinedPair | None:
+    """Alpha and one beta with poses by their points; None without parallax. What was found is said."""
+    views = {n: uncalibrated.rig[n] for n in (alpha, name)}
+    link, matches = uncalibrated.rig.links[alpha, name], uncalibrated.matches[alpha, name]
+    pair = self_calibrated(views, link, matches, focal=focal)
+    if pair is None or not pair.exact:
+        lines = uncalibrated.as_text().splitlines()
+        note(next(line for line in lines if line.startswith(f"{alpha} > {name}")))
+    if pair is None:
+        note(
+            f"no depth by {name}: "
+            f"its points show no parallax, beside {alpha} it is too near, or its scene too far or flat"
+        )
+        return None
+    exact = f"{pair.points} points, {pair.distance:.2f} px from their lines; refining"
+    rough = f"lines by F; depths are rough, by poses whose lines are {pair.distance:.2f} px off"
+    note(f"{alpha} > {name}: {exact if pair.exact else rough}")
+    return pair
 
 
 def _refined(

@@ -152,7 +152,7 @@ def fuse(
 
     Raises:
         ValueError: a camera that the rig lacks, an image of another size, a rig whose views do not overlap,
-            bands that the network does not make, `differentiable` with `max_memory` or `store`.
+            bands that the network does not make, `differentiable` with `max_memory`, `store` or `noise`.
         NotImplementedError: within a transformation of `torch.func`.
 
     Warns:
@@ -161,11 +161,14 @@ def fuse(
     """
     settings = _given(FuseSettings, settings).changed(changes)
     noise, luminance, response = settings.noise, settings.luminance, settings.response
-    noise = "auto" if noise is None and rig is None and luminance == "alpha" else noise
+    automatic = noise is None and rig is None and luminance == "alpha" and not differentiable
+    noise = "auto" if automatic else noise
     network, rig, images, alpha, grey_world = _with_rig(network, rig, images, alpha, explain)
     align = not differentiable if settings.align is None else settings.align
     if differentiable and not (settings.max_memory is None and store is None):
         raise ValueError("differentiable=True fuses the whole frame at once: leave out max_memory and store")
+    if differentiable and noise:
+        raise ValueError("differentiable=True has no gradients through denoising: leave out noise")
     if transformations():
         raise NotImplementedError(
             "fuse has no gradients by torch.func: ask for them by differentiable=True and torch.autograd"
@@ -282,7 +285,7 @@ def _given(kind: type[T], value: T) -> T:
 def _matched(matcher: Matcher, inputs: Inputs) -> Matches:
     """What a matcher finds. Raises TypeError or ValueError for what are no matches of these inputs."""
     matches = _given(Matches, matcher(inputs))
-    matches.check(inputs.hw, len(inputs.betas))
+    matches.check(inputs)
     return matches
 
 

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from arraygeom import Curved, Epipolar, Moved, Pair, ReceptiveField, Rig, Sensor, ThroughLenses, Widened
 from arraygeom.batching import tensors_of
+from arraygeom.pixels import HW
 from arraygeom.warned import warn
 
 from ..media.colour import luminance_of as grey
@@ -105,7 +106,7 @@ def innermost(field: ReceptiveField | None) -> ReceptiveField | None:
 
 
 LARGEST_VALUE = 32.0
-"""Of an image in 0..1: developed short exposures exceed 1, and those of 8 bits have values to 255."""
+"""Of an image in 0..1: highlights exceed 1, and most of a short exposure may; 8 bits have values to 255."""
 SMALLEST_VALUE = -0.25
 """Of an image in 0..1: noise goes below 0, and images as many networks take them, of mean 0, far below."""
 
@@ -172,7 +173,19 @@ def check_bands(views: Views, wanted: int | None) -> None:
 
 def checked_image(rig: Rig, images: Images, name: str) -> Tensor:
     """A camera's image. Raises TypeError or ValueError unless it is (C, H, W), as large as the rig says."""
-    image, (h, w) = images[name], rig[name].hw
+    image = images[name]
+    exposed = rig[name].sensor.exposure is not None
+    smallest, largest = range_of(name, image, rig[name].hw, exposed=exposed)
+    if smallest == largest:
+        warn(f"the image of '{name}' is of one colour, with nothing to match: give another image")
+    return image
+
+
+def range_of(name: str, image: Any, hw: HW | None = None, *, exposed: bool = False) -> tuple[float, float]:
+    """The least and the greatest value of an image; where the rig states an exposure, most may exceed 1.
+
+    Raises TypeError or ValueError unless it is (C, H, W), of this size, in 0..1 but for noise and highlights.
+    """
     if not isinstance(image, Tensor):
         raise TypeError(
             f"the image of '{name}' is a {type(image).__name__}: give a tensor, as `read_image` does"
@@ -181,12 +194,13 @@ def checked_image(rig: Rig, images: Images, name: str) -> Tensor:
         raise ValueError(
             f"the image of '{name}' is {image.layout} on {image.device}: give a dense tensor with values"
         )
-    as_stored = image.ndim == 3 and tuple(image.shape[:2]) == (h, w) != tuple(image.shape[1:])
-    if image.ndim != 3 or not len(image) or as_stored or image.dtype not in (torch.float32, torch.float64):
+    first, last = tuple(image.shape[:2]), tuple(image.shape[1:])
+    as_stored = image.shape[-1:] <= (3,) if hw is None else first == hw != last
+    if image.ndim != 3 or not image.numel() or as_stored or image.dtype not in (torch.float32, torch.float64):
         got = f"{str(image.dtype).removeprefix('torch.')} of shape {tuple(image.shape)}"
         raise ValueError(f"the image of '{name}' is {got}: wanted float32 (C, H, W) in 0..1")
-    if tuple(image.shape[1:]) != (h, w):
-        got = f"{image.shape[2]}x{image.shape[1]}"
+    if hw is not None and last != hw:
+        got, (h, w) = f"{image.shape[2]}x{image.shape[1]}", hw
         raise ValueError(
             f"the image of '{name}' is {got}, the rig says {w}x{h}: resize the rig, or give the right image"
         )
@@ -198,13 +212,12 @@ def checked_image(rig: Rig, images: Images, name: str) -> Tensor:
             f"the image of '{name}' has values down to {smallest:g}: images are in 0..1, without a mean "
             "subtracted"
         )
-    if largest > LARGEST_VALUE:
+    brighter = 0.0 if exposed or largest <= 1 else float((image > 1).double().mean())
+    if largest > LARGEST_VALUE or brighter > 0.5:
         raise ValueError(
             f"the image of '{name}' has values up to {largest:g}: divide them, images are in 0..1"
         )
-    if smallest == largest:
-        warn(f"the image of '{name}' is of one colour, with nothing to match: give another image")
-    return image
+    return smallest, largest
 
 
 KEPT = 4_000_000

@@ -94,6 +94,7 @@ def chosen(inputs: Inputs, matches: Matches, network: Choice | None = None) -> M
 
 
 def _chosen(inputs: Inputs, matches: BetaMatches, network: Choice) -> BetaMatches:
+    """The matches with the candidate of the highest score at each pixel, in pieces."""
     typical = typical_facts(matches)
     weight = network.unet.last.weight
     if (weight.dtype, weight.device) != (matches.facts.dtype, matches.facts.device):

@@ -23,15 +23,12 @@ from . import semi_global_numba as kernels
 from .filters import LocalMoments, box_mean, numpy_of, smoothed
 from .inputs import Beta, Inputs
 from .likeness import likeness
-from .matches import BetaMatches, Matches, is_consistent
+from .matches import FILLS, BetaMatches, Matches, is_consistent
 from .normalisation import SETTINGS as NORMALISATION
 from .normalisation import Normalisation, combined_bands, explained_share, normalised
 from .positions import at_matches
 from .semi_global import DISPARITY_FILL
 from .spectral_mix import SpectralMix
-
-FILLS = 2
-"""Size: ways in which colour is diffused, along its regression on brightness, and as it is."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +75,7 @@ def transferred(inputs: Inputs, matches: Matches) -> Matches:
     any other has its own. With gradients if images or fields have some and gradients are recorded. Raises
     ValueError for matches of another size or number of betas.
     """
-    matches.check(inputs.hw, len(inputs.betas))
+    matches.check(inputs)
     agree, large = inputs.can_agree, len(inputs.pieces) > 1
     sharing = [agree and inputs.shows_all_bands(beta) for beta in inputs.betas]
 

@@ -13,6 +13,7 @@ from arraygeom.chunks import Box, slices
 from arraygeom.pixels import HW
 from arraygeom.sampling import on_image
 
+from .inputs import Inputs
 from .normalisation import Comparison
 from .positions import FINE, enlarged, matches
 from .semi_global import CONSISTENT
@@ -23,6 +24,8 @@ def is_consistent(facts: Float[Tensor, "b 3 h2 w2"]) -> Float[Tensor, "b 1 h w"]
     return enlarged((facts[:, :1] < CONSISTENT).to(facts))
 
 
+FILLS = 2
+"""Size: ways in which colour is diffused, along its regression on brightness, and as it is."""
 CHANNELS = {"disparity": 1, "chosen": 1, "facts": 3, "stated": 2, "certainty": 2, "bands": 0, "diffused": 0}
 """Of each plane of `BetaMatches`; 0: as many as beta has bands."""
 AT_HALF_SIZE = ("facts", "stated", "certainty")
@@ -84,21 +87,21 @@ class BetaMatches:
         where = matches(segments, self.surface, beyond_edge=True)
         return where, segments.valid & on_image(where, hw)
 
-    def check(self, hw: HW) -> None:
-        """Raises ValueError unless its planes are tensors of finite floats, of an alpha of this size."""
+    def check(self, inputs: Inputs) -> None:
+        """Raises ValueError unless its planes are tensors of finite floats, as of inputs of one beta."""
+        (batch, _, *hw), bands = inputs.alpha.shape, inputs.betas[0].image.shape[1]
         for name, channels in CHANNELS.items():
             plane = getattr(self, name)
             if plane is None and name not in ("disparity", "facts"):
                 continue
-            h, w = (n // FINE for n in hw) if name in AT_HALF_SIZE else hw
-            floats = isinstance(plane, Tensor) and plane.ndim >= 4 and plane.is_floating_point()
-            if not floats or plane.shape[-2:] != (h, w) or plane.shape[-3] != (channels or plane.shape[-3]):
+            fills = (FILLS,) if name == "diffused" else ()
+            sides = (n // FINE for n in hw) if name in AT_HALF_SIZE else hw
+            shape = (batch, *fills, channels or bands, *sides)
+            if not isinstance(plane, Tensor) or not plane.is_floating_point() or plane.shape != shape:
                 tensor = isinstance(plane, Tensor)
                 got = f"{plane.dtype} {tuple(plane.shape)}" if tensor else type(plane).__name__
-                raise ValueError(
-                    f"these matches' {name} is {got.removeprefix('torch.')}: wanted a tensor of floats "
-                    f"(B, {channels or 'bands'}, {h}, {w})"
-                )
+                got = got.removeprefix("torch.")
+                raise ValueError(f"these matches' {name} is {got}: wanted a tensor of floats {shape}")
             if not bool(plane.isfinite().all()):
                 raise ValueError(f"these matches' {name} is NaN or infinite: give any, with little certainty")
         if self.certainty is not None and not bool((self.certainty[:, 0] - 0.5).abs().max() <= 0.5):
@@ -144,14 +147,14 @@ class Matches:
             shared.setdefault(key, cropped.diffused)
         return Matches(tuple(replace(cropped, diffused=shared[key]) for key, cropped in parts))
 
-    def check(self, hw: HW, betas: int) -> None:
+    def check(self, inputs: Inputs) -> None:
         """Raises ValueError unless they are of so many betas, and `BetaMatches.check` has no objection."""
-        size = self.hw if self.betas else (0, 0)
-        if size != hw or len(self.betas) != betas:
-            (h, w), (height, width) = size, hw
+        size, betas = self.hw if self.betas else (0, 0), len(inputs.betas)
+        if size != inputs.hw or len(self.betas) != betas:
+            (h, w), (height, width) = size, inputs.hw
             raise ValueError(
                 f"these matches are of {w}x{h} pixels in {len(self.betas)} betas, "
                 f"the images are {width}x{height} with {betas}: match these images"
             )
-        for beta in self.betas:
-            beta.check(hw)
+        for beta, one in zip(self.betas, inputs.by_beta):
+            beta.check(one)

@@ -141,6 +141,7 @@ class Normalisation(NamedTuple):
         return ComparedViews(self.softened(alpha), other, to_bytes(alpha[:, 0]), self.blurs[0])
 
 
+@torch.no_grad()
 def equalising_blurs(
     image: Float[Tensor, "b 1 h w"], other: Float[Tensor, "b 1 hb wb"]
 ) -> tuple[list[float], list[float]]:

@@ -112,5 +112,5 @@ def required(matches: Matches | None, inputs: Inputs) -> Matches:
     """The matches, if they are of these inputs. Raises ValueError if there are none, or others."""
     if matches is None:
         raise ValueError("this network fuses by matches: call it as network(inputs, match(inputs))")
-    matches.check(inputs.hw, len(inputs.betas))
+    matches.check(inputs)
     return matches

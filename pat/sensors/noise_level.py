@@ -63,6 +63,7 @@ class NoiseLevel:
         return cls(1 / electrons, read / electrons, added_to)
 
     @classmethod
+    @torch.no_grad()
     def estimated(cls, image: Float[Tensor, "1 c h w"]) -> NoiseLevel:
         """The noise level of an sRGB image with white noise, from its smoothest parts, by brightness.
 

@@ -303,6 +303,19 @@ def test_ends_that_are_not_finite_are_not_on_a_grid():
     assert torch.equal(found.valid[0], pixel_grid((8, 8))[..., 0] < 4)
 
 
+def test_segments_far_beyond_the_image_are_clipped_to_it():
+    """Matching took as many labels as the longest has pixels: at 10^9 of them the memory was exhausted."""
+
+    def field(pair, x):
+        return Segments(x - x.new_tensor([1e9, 0]), x, x[..., 0] < 6)
+
+    on_grid = FieldOnGrid.of(field, Pair(View(hw=(8, 8)), View(hw=(9, 16))))
+    assert on_grid.samples == 6
+    for segments in (on_grid.straight, on_grid.at(torch.zeros(1, 2))):
+        assert float(segments.start.min()) == pytest.approx(-0.5, abs=1e-6)
+    assert on_grid.straight.valid[0].sum() == on_grid.blocks.valid[0].sum() * 4 == 8 * 6
+
+
 def test_lenses_and_missing_calibration_are_refused():
     pair = pair_of(known_by_f(random_rig(1)))
     with pytest.raises(ValueError, match="HomographyDisplacement or Rectified"):

@@ -45,6 +45,13 @@ def test_vmap_takes_and_gives_them():
     torch.testing.assert_close(found.R, torch.eye(3, dtype=torch.float64).expand(3, 3, 3))
 
 
+def test_vmap_takes_a_batch_with_one_depth_range():
+    batch = Rig(stack([random_rig(seed) for seed in range(3)]).cameras, depth=(1, 8))
+    found = torch.vmap(lambda rig: Epipolar()(rig.pair("alpha", "beta"), torch.ones(1, 2)).start)(batch)
+    wanted = [Epipolar()(rig.pair("alpha", "beta"), torch.ones(1, 2)).start for rig in batch]
+    torch.testing.assert_close(found, torch.stack(wanted))
+
+
 def test_gradients_by_a_whole_camera():
     camera, X = PLAIN["alpha"], torch.tensor([0.1, 0.2, 3.0], dtype=torch.float64)
     slopes = torch.func.grad(lambda c: c.project(X).x.sum())(camera)

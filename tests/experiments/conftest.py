@@ -1,11 +1,12 @@
 """What the tests of experiments share."""
 
+from functools import partial
+
 import pytest
 import torch
 from skimage.data import data_dir
 
 from experiments.__main__ import Experiments
-from pat.cli.main import main
 from pat.networks.configs import PATConfig
 from pat.networks.paper import PAT
 
@@ -29,13 +30,6 @@ def photos(tmp_path):
 
 
 @pytest.fixture
-def refusal(capsys):
-    """What a command says as it refuses its arguments."""
-
-    def said(*arguments, group=Experiments) -> str:
-        with pytest.raises(SystemExit) as stop:
-            main(list(arguments), group=group)
-        assert stop.value.code == 2
-        return capsys.readouterr().err
-
-    return said
+def refusal(refusal):
+    """What a command of the experiments says as it refuses its arguments."""
+    return partial(refusal, group=Experiments)

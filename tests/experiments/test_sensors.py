@@ -6,7 +6,8 @@ from arraygeom.camera import Camera, intrinsics
 from arraygeom.distortion import Distortion
 from arraygeom.pose import Pose, rotation_from_vector
 from arraygeom.rig import Rig
-from arraygeom.sensor import Band, Curve
+from arraygeom.sensor import Band, Curve, Sensor
+from experiments.__main__ import Experiments
 from experiments.sensors import (
     STEPS,
     DecodeSRGB,
@@ -17,7 +18,14 @@ from experiments.sensors import (
     read_chains,
     record_array,
 )
+from pat import fuse, load_weights
+from pat.cli.main import main
+from pat.data.windows import read_view
+from pat.farm.backends import LayeredSettings
+from pat.media.colour import luminance, srgb_from_linear
+from pat.media.images import read_image
 from pat.sensors import BoxBlur, Clip, GaussianBlur, Noise, Quantise, Resample, record
+from pat.synthesis.check import CheckLimits
 
 
 def generator() -> torch.Generator:
@@ -170,3 +178,50 @@ def test_a_chain_from_a_file_runs():
 def test_typos_are_named_with_their_entry(text, words):
     with pytest.raises(ValueError, match=words):
         read_chain(yaml.safe_load(text))
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory):
+    """Two layered scenes of two cameras."""
+    root, K = tmp_path_factory.mktemp("rendered"), intrinsics(70.0, (48, 64))
+    beside = Pose(torch.eye(3).double(), torch.tensor([-0.1, 0.0, 0.0]).double())
+    cameras = {
+        "mono": Camera(K=K, cam_from_world=Pose.identity(), hw=(48, 64), sensor=Sensor("mono")),
+        "colour": Camera(K=K, cam_from_world=beside, hw=(48, 64)),
+    }
+    renderer = LayeredSettings(layers=(4, 7), oversampling=1).renderer(
+        Rig(cameras, depth=(2.0, 12.0)), CheckLimits()
+    )
+    for seed in range(2):
+        renderer(seed, root / "scenes" / f"{seed:06d}")
+    return root
+
+
+def test_rendered_scenes_are_recorded_by_their_responses_for_fusion(rendered, tmp_path, capsys):
+    main(["data", "info", str(rendered)])
+    assert "2 scenes of mono 64x48, colour 64x48" in capsys.readouterr().out
+    main(["record", str(rendered), "--out", str(tmp_path)], group=Experiments)
+    assert {path.name for path in tmp_path.iterdir()} == {"000000", "000001"}
+    out, view = tmp_path / "000001", read_view(rendered / "scenes" / "000001", "mono")
+    mono, colour = (read_image(out / f"{name}.png") for name in ("mono", "colour"))
+    assert (mono.shape, colour.shape) == ((1, 48, 64), (3, 48, 64))
+    ideal = srgb_from_linear(luminance(view.rgb)).clamp(0, 1)
+    assert 0 < (mono - ideal).square().mean().sqrt() < 0.02
+    rig, images = Rig.load(out / "rig.yaml"), {"mono": mono, "colour": colour}
+    frame = fuse(load_weights("mono-colour-small"), rig, images, alpha="mono")
+    assert frame.image.shape == (3, 48, 64)
+
+
+def test_rendered_scenes_are_recorded_by_a_file_of_steps(rendered, tmp_path, refusal):
+    sensors = tmp_path / "sensors.yaml"
+    arguments = ["record", str(rendered), "--sensors", str(sensors), "--out", str(tmp_path / "out")]
+    sensors.write_text("colour: [{resample: 0.5}, {spectral: luminance}, clip, encode-srgb]\n")
+    main(arguments, group=Experiments)
+    rig = Rig.load(tmp_path / "out/000000/rig.yaml")
+    assert rig["colour"].hw == (24, 32)
+    assert float(rig["colour"].K[0, 0]) == 35
+    assert read_image(tmp_path / "out/000000/colour.png").shape == (1, 24, 32)
+    sensors.write_text("mono: [{spectrl: luminance}]\n")
+    assert "no step is called 'spectrl'; did you mean 'spectral'" in refusal(*arguments)
+    sensors.write_text("mno: [clip]\n")
+    assert "no camera 'mno'; did you mean 'mono'" in refusal(*arguments)

@@ -189,9 +189,7 @@ def test_what_is_missing_is_named(data, tmp_path, refusal, missing):
     shutil.copytree(data, folder)
     gone, given = folder / missing, ["--data", str(folder), "--out", str(tmp_path / "out")]
     shutil.rmtree(gone) if gone.is_dir() else gone.unlink()
-    error = refusal("showcase", *given, "--weights", str(data / "small.safetensors")).strip().splitlines()
-    assert error[-1].startswith("pat: ")
-    assert missing.split("/")[0] in error[-1]
+    assert missing.split("/")[0] in refusal("showcase", *given, "--weights", data / "small.safetensors")
     assert not (tmp_path / "out").exists()
 
 

@@ -395,7 +395,7 @@ def test_images_that_want_gradients_are_matched():
         match_cameras(images, alpha="top")
 
 
-def test_command_line(tmp_path, capsys):
+def test_command_line(tmp_path, capsys, refusal):
     rig, images = rectified_pair(), rectified_images()
     files = [f"--image={name}={tmp_path / name}.png" for name in images]
     for name, image in images.items():
@@ -409,9 +409,9 @@ def test_command_line(tmp_path, capsys):
     assert isinstance(better["right"], Camera)
     assert better["right"].hw == HW
     assert median_off(better, seen_points(rig, noise=0.0)) < 0.15
-    with pytest.raises(SystemExit):
-        main([*command, f"--image=left={tmp_path / 'left.png'}", "--out", str(tmp_path / "none.yaml")])
-    assert "--image" in capsys.readouterr().err
+    assert "--image" in refusal(
+        *command, f"--image=left={tmp_path / 'left.png'}", "--out", tmp_path / "none.yaml"
+    )
     assert not (tmp_path / "none.yaml").exists()
 
 

@@ -60,13 +60,6 @@ def arguments(folder, **changes):
     return ["fuse", *rig, *map(str, images), *extra]
 
 
-def fails(arguments, capsys) -> str:
-    with pytest.raises(SystemExit) as stop:
-        main(arguments)
-    assert stop.value.code == 2
-    return " ".join(capsys.readouterr().err.split())
-
-
 def test_fuse_writes_everything(small):
     main(arguments(small))
     assert sorted(p.name for p in (small / "out").iterdir()) == [
@@ -142,8 +135,8 @@ def test_help_names_the_commands(capsys):
         ({"mono": SAMPLE / "mono.png"}, "mono.png: is 640x400, the rig says 128x96"),
     ],
 )
-def test_mistakes_are_one_line_and_leave_nothing(changes, message, small, capsys):
-    assert message in fails(arguments(small, **changes), capsys)
+def test_mistakes_are_one_line_and_leave_nothing(changes, message, small, refusal):
+    assert message in refusal(*arguments(small, **changes))
     assert not (small / "out").exists()
 
 
@@ -166,37 +159,37 @@ def test_mistakes_are_one_line_and_leave_nothing(changes, message, small, capsys
         ),
     ],
 )
-def test_rig_mistakes_name_the_entry(edit, message, small, capsys):
+def test_rig_mistakes_name_the_entry(edit, message, small, refusal):
     rig = yaml.safe_load((small / "rig.yaml").read_text())
     edit(rig)
     (small / "rig.yaml").write_text(yaml.safe_dump(rig))
-    error = fails(arguments(small), capsys)
+    error = refusal(*arguments(small))
     assert message in error
     assert "rig.yaml" in error
 
 
-def test_a_rig_without_depth_range_is_answered_with_the_option_that_gives_one(small, capsys):
+def test_a_rig_without_depth_range_is_answered_with_the_option_that_gives_one(small, refusal):
     """As other tools' files are; only the native file's entry and Python were named."""
     Rig.load(small / "rig.yaml").replace(depth=None).save(small / "rig.yaml")
-    assert "`--depth NEAR FAR`" in fails(arguments(small), capsys)
+    assert "`--depth NEAR FAR`" in refusal(*arguments(small))
 
 
-def test_views_that_do_not_overlap(small, capsys):
+def test_views_that_do_not_overlap(small, refusal):
     rig = yaml.safe_load((small / "rig.yaml").read_text())
     rig["cameras"]["colour"] |= {"rotation": [0, 180, 0]}
     (small / "rig.yaml").write_text(yaml.safe_dump(rig))
-    assert "'colour's views do not overlap" in fails(arguments(small), capsys)
+    assert "'colour's views do not overlap" in refusal(*arguments(small))
 
 
-def test_images_with_an_alpha_channel_or_nan(small, capsys):
+def test_images_with_an_alpha_channel_or_nan(small, refusal):
     transparent = torch.rand(4, 96, 128)
     import cv2
 
     cv2.imwrite(str(small / "mono.png"), (transparent.movedim(0, -1).numpy() * 255).astype("uint8"))
-    assert "mono.png" in fails(arguments(small), capsys)
+    assert "mono.png" in refusal(*arguments(small))
     shutil.copy(small / "colour.png", small / "mono.tif")
     cv2.imwrite(str(small / "mono.tif"), torch.full((96, 128), torch.nan).numpy())
-    assert "NaN" in fails(arguments(small, mono=small / "mono.tif"), capsys)
+    assert "NaN" in refusal(*arguments(small, mono=small / "mono.tif"))
 
 
 def test_show_draws_the_rig_and_its_fields(small):
@@ -215,9 +208,9 @@ def test_show_draws_the_rig_and_its_fields(small):
     assert (small / "again" / "fields.png").is_file()
 
 
-def test_show_refuses_images_of_other_sizes_than_the_rigs(small, capsys):
+def test_show_refuses_images_of_other_sizes_than_the_rigs(small, refusal):
     write_image(small / "larger.png", torch.zeros(1, 100, 130))
-    said = fails(["show", str(small / "rig.yaml"), "--image", f"mono={small / 'larger.png'}"], capsys)
+    said = refusal("show", small / "rig.yaml", "--image", f"mono={small / 'larger.png'}")
     assert "larger.png: is 130x100, the rig says 128x96" in said
 
 
@@ -230,28 +223,28 @@ def test_rig_info_prints_the_numbers(small, capsys):
     assert "0.1241" in text
 
 
-def test_rig_convert_and_back(small, capsys):
+def test_rig_convert_and_back(small, refusal):
     main(["rig", "convert", str(small / "rig.yaml"), str(small / "chain.yaml"), "--write-as", "kalibr"])
     main(["rig", "convert", str(small / "chain.yaml"), str(small / "back.yaml")])
     first, again = Rig.load(small / "rig.yaml"), Rig.load(small / "back.yaml")
     for a, b in zip(first.cameras.values(), again.cameras.values()):
         assert torch.allclose(a.K, b.K)
         assert torch.allclose(a.cam_from_world.t, b.cam_from_world.t, atol=1e-9)
-    assert "known" in fails(["rig", "convert", str(small / "rig.yaml"), "x", "--write-as", "word"], capsys)
+    assert "known" in refusal("rig", "convert", small / "rig.yaml", "x", "--write-as", "word")
     rig = str(small / "rig.yaml")
     for words in (["rig", "convert", rig, str(small)], ["explore", rig, "--save", str(small)]):
-        assert f"{small} is a folder: name a file in it" in fails(words, capsys)
+        assert f"{small} is a folder: name a file in it" in refusal(*words)
 
 
-def test_the_size_of_files_that_state_none_or_several(small, tmp_path, capsys):
+def test_the_size_of_files_that_state_none_or_several(small, tmp_path, refusal):
     """The command had no way to say it: a ZED's file with images of 672x376 was of its largest size."""
     zed, rig = str(FIXTURES / "zed.conf"), str(tmp_path / "rig.yaml")
     main(["rig", "convert", zed, rig, "--size", "672", "376"])
     assert Rig.load(rig)["left"].hw == (376, 672)
-    assert "it has 1280x720, 672x376" in fails(["rig", "convert", zed, rig, "--size", "640", "480"], capsys)
-    stated = fails(["rig", "convert", str(small / "rig.yaml"), rig, "--size", "9", "9"], capsys)
+    assert "it has 1280x720, 672x376" in refusal("rig", "convert", zed, rig, "--size", "640", "480")
+    stated = refusal("rig", "convert", small / "rig.yaml", rig, "--size", "9", "9")
     assert "--size: the file states" in stated
-    assert "--size: wanted" in fails(["rig", "convert", zed, rig, "--size", "0", "9"], capsys)
+    assert "--size: wanted" in refusal("rig", "convert", zed, rig, "--size", "0", "9")
 
 
 def test_rig_info_of_one_camera_has_no_pairs(small, tmp_path, capsys):
@@ -335,20 +328,18 @@ def test_an_interruption_is_one_line_and_status_130(monkeypatch, capsys):
     assert "interrupted" in capsys.readouterr().err
 
 
-def test_what_the_system_says_of_a_file_is_said_without_its_number(monkeypatch, capsys):
+def test_what_the_system_says_of_a_file_is_said_without_its_number(monkeypatch, refusal):
     """As of a full disk: pat: [Errno 28] No space left on device: 'out/fused.png'."""
 
     def full(*_):
         raise OSError(28, "No space left on device", "out/fused.png")
 
     monkeypatch.setattr("pat.cli.demo.Demo.run", full)
-    assert fails(["demo"], capsys) == "pat: out/fused.png: No space left on device"
+    assert refusal("demo") == "pat: out/fused.png: No space left on device"
 
 
-def test_explore_says_what_is_missing(small, capsys):
-    told = fails(
-        ["explore", str(small / "rig.yaml"), "--image", f"mono={small / 'mono.png'}", "--no-browser"], capsys
-    )
+def test_explore_says_what_is_missing(small, refusal):
+    told = refusal("explore", small / "rig.yaml", "--image", f"mono={small / 'mono.png'}", "--no-browser")
     assert "at least one beta" in told
 
 
@@ -373,15 +364,15 @@ def test_warnings_are_one_line(small, capsys):
         ["rig", "doctor", "RIG"],
     ],
 )
-def test_a_camera_given_twice_is_refused_everywhere(command, small, capsys):
+def test_a_camera_given_twice_is_refused_everywhere(command, small, refusal):
     twice = [a for name in ("mono", "colour", "mono") for a in ("--image", f"{name}={small / 'mono.png'}")]
     command = [str(small / "rig.yaml") if word == "RIG" else word for word in command]
-    assert fails([*command, *twice], capsys) == "pat: --image: 'mono' is given twice; give it once"
+    assert refusal(*command, *twice) == "pat: --image: 'mono' is given twice; give it once"
 
 
-def test_other_names_given_twice(small, capsys):
+def test_other_names_given_twice(small, refusal):
     twice = ["--frame-rate", "mono=30", "--frame-rate", "mono=25"]
-    assert "--frame-rate: 'mono' is given twice" in fails([*arguments(small), *twice], capsys)
+    assert "--frame-rate: 'mono' is given twice" in refusal(*arguments(small), *twice)
     sigma = [
         "rig",
         "refine",
@@ -395,27 +386,25 @@ def test_other_names_given_twice(small, capsys):
         "focal=1",
         "focal=2",
     ]
-    assert "no such rig file" in fails(sigma, capsys)
+    assert "no such rig file" in refusal(*sigma)
     sigma[3] = str(small / "rig.yaml")
-    assert "--sigma: 'focal' is given twice" in fails(sigma, capsys)
-    assert "'mono' is not NAME=NUMBER" in fails([*arguments(small), "--time-offset", "mono"], capsys)
-    assert "'mono=' is not NAME=FILE" in fails([*arguments(small), "--image", "mono="], capsys)
+    assert "--sigma: 'focal' is given twice" in refusal(*sigma)
+    assert "'mono' is not NAME=NUMBER" in refusal(*arguments(small), "--time-offset", "mono")
+    assert "'mono=' is not NAME=FILE" in refusal(*arguments(small), "--image", "mono=")
 
 
-def test_what_train_refuses_is_one_line_too(capsys):
-    said = fails(["train", "mono-colour", "--steps", "0"], capsys)
+def test_what_train_refuses_is_one_line_too(refusal):
+    said = refusal("train", "mono-colour", "--steps", "0")
     assert said == "pat: steps must be at least 1, got 0 (`pat train --help` explains)"
-    assert fails(["train", "--stepps", "5"], capsys).startswith(
-        "pat: unknown here: --stepps, 5; did you mean"
-    )
+    assert refusal("train", "--stepps", "5").startswith("pat: unknown here: --stepps, 5; did you mean")
 
 
-def test_what_only_sequences_have_is_refused_of_frames(small, capsys):
+def test_what_only_sequences_have_is_refused_of_frames(small, refusal):
     timed = ["--frame-rate", "mono=30", "--time-offset", "mono=0", "--speed", "0"]
     said = "--frame-rate, --time-offset, --speed: for a --sequence only: give that, or leave out"
-    assert said in fails([*arguments(small), *timed], capsys)
+    assert said in refusal(*arguments(small), *timed)
     images = [str(small / f"{name}.png") for name in ("mono", "colour")]
-    assert "--speed: for a --sequence only" in fails(["fuse", *images, "--speed", "3"], capsys)
+    assert "--speed: for a --sequence only" in refusal("fuse", *images, "--speed", "3")
 
 
 @pytest.mark.parametrize("options", [["--bits", "32", "--kind", "tif"], ["--kind", "exr"]])
@@ -426,7 +415,7 @@ def test_a_video_of_frames_of_32_bits_is_said_to_be_none(small, capsys, monkeypa
     assert "--video: of frames of 32 bits there is none" in " ".join(capsys.readouterr().err.split())
 
 
-def test_what_several_frames_do_not_have_is_refused_before_a_rig_is_looked_for(small, capsys, monkeypatch):
+def test_what_several_frames_do_not_have_is_refused_before_a_rig_is_looked_for(small, refusal, monkeypatch):
     monkeypatch.setattr("pat.fusion.from_images.array_from_images", None)
     for name in ("mono", "colour"):
         (small / f"{name}s").mkdir()
@@ -435,11 +424,11 @@ def test_what_several_frames_do_not_have_is_refused_before_a_rig_is_looked_for(s
     folders = {name: small / f"{name}s" for name in ("mono", "colour")}
     single = ["--exposure", "auto", "--points"]
     for several in (arguments(small, **folders), ["fuse", *map(str, folders.values())]):
-        said = fails([*several, *single], capsys)
+        said = refusal(*several, *single)
         assert said == "pat: --points, --exposure auto: for a single frame only: leave out for several"
 
 
-def test_a_file_that_is_missing_or_a_video_is_named(small, capsys):
+def test_a_file_that_is_missing_or_a_video_is_named(small, refusal):
     (small / "several").mkdir()
     for name in ("several/0.png", "several/1.png", "clip.mp4"):
         shutil.copy(small / "mono.png", small / name)
@@ -448,17 +437,17 @@ def test_a_file_that_is_missing_or_a_video_is_named(small, capsys):
         "clip.mp4": "clip.mp4: is a video, which only",
     }.items():
         given = arguments(small, mono=small / "several", colour=small / name)
-        assert f"colour: {small}/{said}" in fails(given, capsys)
+        assert f"colour: {small}/{said}" in refusal(*given)
 
 
-def test_a_rig_is_an_argument_or_an_option_and_o_is_out_everywhere(small, capsys):
+def test_a_rig_is_an_argument_or_an_option_and_o_is_out_everywhere(small, capsys, refusal):
     rig = str(small / "rig.yaml")
     main(["rig", "info", rig])
     as_argument = capsys.readouterr().out
     for given in (["--rig", rig], [f"--rig={rig}"]):
         main(["rig", "info", *given])
         assert capsys.readouterr().out == as_argument
-    assert "--rig: give a file" in fails(["rig", "info", "--rig"], capsys)
+    assert "--rig: give a file" in refusal("rig", "info", "--rig")
     for option in ("-o", "--out"):
         main(["rig", "convert", "--rig", rig, option, str(small / f"{option}.yaml"), "--write-as", "kalibr"])
     assert (small / "-o.yaml").read_text() == (small / "--out.yaml").read_text()
@@ -509,12 +498,12 @@ def test_json_is_valid_where_the_rig_sees_to_infinity(small, capsys):
         (RecursionError("deep"), "pat: RecursionError: deep (--debug shows where)"),
     ],
 )
-def test_errors_are_one_line_and_a_traceback_for_debugging(error, words, monkeypatch, capsys):
+def test_errors_are_one_line_and_a_traceback_for_debugging(error, words, monkeypatch, refusal):
     def failing(self):
         raise error
 
     monkeypatch.setattr("pat.cli.demo.Demo.run", failing)
-    assert words in fails(["demo"], capsys)
+    assert words in refusal("demo")
     with pytest.raises(type(error)):
         main(["demo", "--debug"])
 
@@ -544,10 +533,10 @@ def test_a_rig_that_does_not_fit_ends_with_status_3_and_strict_writes_nothing(tm
     assert not (small / "out").exists()
 
 
-def test_one_image_for_two_cameras_is_refused(small, capsys):
+def test_one_image_for_two_cameras_is_refused(small, refusal):
     shutil.copy(small / "mono.png", small / "copy.png")
     for name in ("mono.png", "copy.png"):
-        error = fails(arguments(small, colour=small / name), capsys)
+        error = refusal(*arguments(small, colour=small / name))
         assert f"the images of 'mono' and 'colour' are the same image, {small / name}: give each" in error
         assert not (small / "out").exists()
 
@@ -570,9 +559,9 @@ def test_bands_are_listed_with_their_files(small, capsys):
         assert (fused.mean() - own.mean()).abs() < (fused.mean() - wrong.mean()).abs()
 
 
-def test_bands_that_the_weights_do_not_make_are_refused_with_which_to_take(small, capsys):
+def test_bands_that_the_weights_do_not_make_are_refused_with_which_to_take(small, refusal):
     write_image(small / "grey.png", read_image(small / "mono.png").flip(-1))
-    error = fails(arguments(small, colour=small / "grey.png"), capsys)
+    error = refusal(*arguments(small, colour=small / "grey.png"))
     assert "the betas have 1 band in all ('colour' 1), these weights make 3: its image is grey" in error
     assert "mono-spectral" in error
     assert not (small / "out").exists()
@@ -592,25 +581,23 @@ def test_an_alpha_in_colour_and_a_beta_without_are_said(small, capsys):
     assert "warning: the image of 'colour' has three equal bands" in text
 
 
-def test_a_bad_out_is_found_before_the_fusion(small, capsys, monkeypatch):
+def test_a_bad_out_is_found_before_the_fusion(small, refusal, monkeypatch):
     monkeypatch.setattr("pat.fusion.fuse.fuse", lambda *_, **__: pytest.fail("fused"))
     (small / "out").write_text("a file")
-    assert "out: cannot write there (" in fails(arguments(small), capsys)
+    assert "out: cannot write there (" in refusal(*arguments(small))
     folders = arguments(small, mono=f"{small}/mon*.png", extra=["--out", "/proc/out"])
-    assert "/proc/out: cannot write there (/proc/out: " in fails(folders, capsys)
+    assert "/proc/out: cannot write there (/proc/out: " in refusal(*folders)
     assert (small / "out").read_text() == "a file"
 
 
 @pytest.mark.parametrize("name", ["fused.png", "depth.png", "1_fused.png", "fused_red.png"])
-def test_images_that_results_would_replace_are_refused(small, name, capsys, monkeypatch):
+def test_images_that_results_would_replace_are_refused(small, name, refusal, monkeypatch):
     """A colour image that was called fused.png was overwritten by the result."""
     monkeypatch.setattr("pat.fusion.fuse.fuse", lambda *_, **__: pytest.fail("fused"))
     (small / "out").mkdir()
     given = (small / "colour.png").rename(small / "out" / name)
-    assert f"{name}: is called as a result" in fails(arguments(small, colour=given), capsys)
-    assert f"{name}: is called as a result" in fails(
-        ["fuse", str(small / "mono.png"), str(given), "-o", str(small / "out")], capsys
-    )
+    assert f"{name}: is called as a result" in refusal(*arguments(small, colour=given))
+    assert f"{name}: is called as a result" in refusal("fuse", small / "mono.png", given, "-o", small / "out")
 
 
 @pytest.mark.parametrize(
@@ -630,16 +617,13 @@ def test_images_that_results_would_replace_are_refused(small, name, capsys, monk
         (["ablate", "--rendered", "scenes", "--scenes", "1"], "new", "--scenes: of layered scenes"),
     ],
 )
-def test_a_bad_out_is_found_before_the_work(command, out, text, tmp_path, monkeypatch, capsys):
+def test_a_bad_out_is_found_before_the_work(command, out, text, tmp_path, monkeypatch, refusal):
     """Neither images nor folders of them exist, and the rig is empty: they are not read before."""
     (tmp_path / "folder").mkdir()
     (tmp_path / "file").write_text("")
     (tmp_path / "rig.yaml").write_text("")  # that it is there is looked for first, which is as quick
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit) as ended:
-        main([*command, "--out", out])
-    assert ended.value.code == 2
-    assert text in " ".join(capsys.readouterr().err.split())
+    assert text in refusal(*command, "--out", out)
 
 
 @pytest.mark.parametrize(
@@ -652,11 +636,11 @@ def test_a_bad_out_is_found_before_the_work(command, out, text, tmp_path, monkey
         (["start", "--image", "a=mono.png", "--image", "b=colour.png", "--focal", "a=nan"], "a=nan"),
     ],
 )
-def test_images_that_are_missing_are_asked_for(small, command, text, monkeypatch, capsys):
+def test_images_that_are_missing_are_asked_for(small, command, text, monkeypatch, refusal):
     """Without any, there were an IndexError and a division by zero; matches were ignored."""
     monkeypatch.chdir(small)
     out = ["-o", "new.yaml"] if "--focal" in command else []
-    said = fails(["rig", *command, *out], capsys)
+    said = refusal("rig", *command, *out)
     assert text in said
     assert "Error" not in said
     assert not (small / "new.yaml").exists()

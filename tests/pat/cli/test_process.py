@@ -14,7 +14,6 @@ from pat.cli import options
 from pat.cli.demo import Demo
 from pat.cli.main import Pat, command_paths, main
 from pat.cli.options import FIELD_NAMES, WEIGHT_NAMES, field_named
-from tests.pat.cli.test_cli import fails
 
 ROOT = Path(__file__).parents[3]
 
@@ -109,10 +108,10 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("words", REFUSED, ids=" ".join)
-def test_what_the_parser_refuses_is_one_line(words, capsys):
+def test_what_the_parser_refuses_is_one_line(words, refusal):
     """Boxes of ten lines."""
     path = " ".join(words[:2] if words[0] == "rig" else words[:1])
-    assert fails([*words], capsys) == f"pat: {REFUSED[words]} (`pat {path} --help` explains)"
+    assert refusal(*words) == f"pat: {REFUSED[words]} (`pat {path} --help` explains)"
 
 
 @pytest.mark.parametrize(
@@ -146,23 +145,23 @@ finally: assert "torch" not in sys.modules
     assert len(done.stderr.splitlines()) == 1
 
 
-def test_an_image_without_a_camera_is_explained(capsys):
-    said = fails(["fuse", str(ROOT / "README.md"), "--image", "mono.png"], capsys)
+def test_an_image_without_a_camera_is_explained(refusal):
+    said = refusal("fuse", ROOT / "README.md", "--image", "mono.png")
     assert "--image mono.png: which camera is it of? Give NAME=FILE, such as mono=mono.png" in said
 
 
 @pytest.mark.parametrize("command", ["fuse", "align"])
 @pytest.mark.parametrize("others", [(), ("mono.png",)], ids=["alone", "with an image"])
-def test_a_first_file_that_is_no_image_is_said_to_be_none(command, others, capsys):
+def test_a_first_file_that_is_no_image_is_said_to_be_none(command, others, refusal):
     sample = ROOT / "pat" / "data" / "sample"
-    said = fails([command, str(ROOT / "README.md"), *(str(sample / name) for name in others)], capsys)
+    said = refusal(command, ROOT / "README.md", *(str(sample / name) for name in others))
     assert f"{ROOT / 'README.md'}: is no image: images end in .png, .tif, .jpg" in said
 
 
-def test_commands_that_do_not_exist(capsys):
-    assert fails(["fues"], capsys) == "pat: no command 'pat fues'; did you mean 'fuse'?"
-    assert fails(["rig", "docter"], capsys) == "pat: no command 'pat rig docter'; did you mean 'doctor'?"
-    assert "known here: fuse, align" in fails(["--precision"], capsys)
+def test_commands_that_do_not_exist(refusal):
+    assert refusal("fues") == "pat: no command 'pat fues'; did you mean 'fuse'?"
+    assert refusal("rig", "docter") == "pat: no command 'pat rig docter'; did you mean 'doctor'?"
+    assert "known here: fuse, align" in refusal("--precision")
 
 
 @pytest.mark.parametrize(
@@ -178,12 +177,12 @@ def test_commands_that_do_not_exist(capsys):
         ),
     ],
 )
-def test_a_package_that_is_not_installed_is_one_line(error, said, monkeypatch, capsys):
+def test_a_package_that_is_not_installed_is_one_line(error, said, monkeypatch, refusal):
     def fail(self):
         raise error
 
     monkeypatch.setattr(Demo, "run", fail)
-    assert said in fails(["demo"], capsys)
+    assert said in refusal("demo")
 
 
 def test_a_closed_pipe_is_quiet():

@@ -64,15 +64,6 @@ def folder(halved, tmp_path_factory):
     return folder
 
 
-def fails(arguments, capsys) -> str:
-    with pytest.raises(SystemExit) as stop:
-        main(["fuse", *map(str, arguments)])
-    assert stop.value.code == 2
-    error = capsys.readouterr().err.splitlines()
-    assert len(error) <= 3, error
-    return error[-1]
-
-
 def test_images_alone_are_fused_about_as_well_as_with_the_rig(halved, folder):
     rig, images, ground_truth = halved
     assert sorted(path.name for path in (folder / "out").iterdir()) == ALL
@@ -163,16 +154,14 @@ def test_a_rig_of_ones_own_beside_the_result_is_kept(folder, tmp_path):
     assert (tmp_path / "found_rig.yaml").is_file()
 
 
-def test_exr_is_refused_before_anything_is_read(monkeypatch, capsys, tmp_path):
+def test_exr_is_refused_before_anything_is_read(monkeypatch, refusal, tmp_path):
     """It was refused once all was fused."""
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
     given = ["fuse", "no.png", "nothing.png", "--kind", "exr", "--bits", "32", "-o", str(tmp_path / "out")]
-    with pytest.raises(SystemExit):
-        main(given)
-    assert "writing EXR needs" in capsys.readouterr().err
+    assert "writing EXR needs" in refusal(*given)
 
 
-def test_what_cannot_be_fused_is_one_line_and_leaves_nothing(folder, tmp_path, capsys):
+def test_what_cannot_be_fused_is_one_line_and_leaves_nothing(folder, tmp_path, refusal):
     mono, colour = folder / "mono.png", folder / "colour.png"
     noise = np.random.default_rng(0).integers(0, 255, (200, 320, 3), np.uint8)
     ramp = np.tile(np.linspace(0, 255, 320, dtype=np.uint8), (200, 1))
@@ -198,30 +187,30 @@ def test_what_cannot_be_fused_is_one_line_and_leaves_nothing(folder, tmp_path, c
         (): "give two images or more",
     }
     for names, message in cases.items():
-        assert message in fails([mono, *(tmp_path / name for name in names), *out], capsys)
+        assert message in refusal("fuse", mono, *(tmp_path / name for name in names), *out)
         assert not (tmp_path / "out").exists()
-    assert "no camera 'tele'; the images' names are mono, colour" in fails(
-        [mono, colour, "--alpha", "tele"], capsys
+    assert "no camera 'tele'; the images' names are mono, colour" in refusal(
+        "fuse", mono, colour, "--alpha", "tele"
     )
     for noise, said in {
         "mono=-5": "must be 1 or more, such as 200, got -5",
         "tele=100": "--noise: no camera 'tele'",
     }.items():
-        assert said in fails([mono, colour, "--noise", noise, *out], capsys)
+        assert said in refusal("fuse", mono, colour, "--noise", noise, *out)
     assert not (tmp_path / "out").exists()
     named = f"mono={mono}"
-    assert f"give {mono} alone" in fails([named, colour, *out], capsys)
-    assert f"--image needs a rig: give --rig RIG, or the images alone: `pat fuse {mono}`" in fails(
-        ["--image", named, *out], capsys
+    assert f"give {mono} alone" in refusal("fuse", named, colour, *out)
+    assert f"--image needs a rig: give --rig RIG, or the images alone: `pat fuse {mono}`" in refusal(
+        "fuse", "--image", named, *out
     )
     unwritable = ["-o", folder / "mono.png" / "out"]
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr("pat.fusion.from_images.array_from_images", None)  # the rig is not looked for
-        assert "mono.png" in fails([mono, colour, *unwritable], capsys)
-    assert "--depth: needs a rig" in fails([mono, colour, "--depth", "1", "2"], capsys)
+        assert "mono.png" in refusal("fuse", mono, colour, *unwritable)
+    assert "--depth: needs a rig" in refusal("fuse", mono, colour, "--depth", "1", "2")
 
 
-def test_what_does_not_go_with_a_rig_or_with_many_frames_is_refused(folder, tmp_path, capsys):
+def test_what_does_not_go_with_a_rig_or_with_many_frames_is_refused(folder, tmp_path, refusal):
     images = []
     for name in ("mono", "colour"):
         (tmp_path / name).mkdir()
@@ -239,14 +228,14 @@ def test_what_does_not_go_with_a_rig_or_with_many_frames_is_refused(folder, tmp_
         "-o",
         tmp_path / "out",
     ]
-    assert "0.png: no camera of the rig has its name: give --image NAME=" in fails(stray, capsys)
-    assert "--points, --classical: for a single frame only" in fails(
-        [*given, "--points", "--classical"], capsys
+    assert "0.png: no camera of the rig has its name: give --image NAME=" in refusal("fuse", *stray)
+    assert "--points, --classical: for a single frame only" in refusal(
+        "fuse", *given, "--points", "--classical"
     )
     assert not (tmp_path / "out").exists()
 
 
-def test_a_found_rig_is_written_for_a_sequence_that_needs_more(folder, tmp_path, capsys):
+def test_a_found_rig_is_written_for_a_sequence_that_needs_more(folder, tmp_path, refusal):
     for name in ("mono", "colour"):
         (tmp_path / name).mkdir()
         for i in range(2):
@@ -259,9 +248,7 @@ def test_a_found_rig_is_written_for_a_sequence_that_needs_more(folder, tmp_path,
         "-o",
         str(tmp_path / "out"),
     ]
-    with pytest.raises(SystemExit):
-        main(given)
-    assert "the frame rate of 'mono' is not known" in capsys.readouterr().err
+    assert "the frame rate of 'mono' is not known" in refusal(*given)
     assert set(Rig.load(tmp_path / "out" / "found_rig.yaml").names) == {"mono", "colour"}
     (tmp_path / "out" / "found_rig.yaml").write_text("another job's")
     with pytest.raises(SystemExit):

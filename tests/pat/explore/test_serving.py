@@ -11,7 +11,6 @@ from pathlib import Path
 
 import pytest
 
-from pat.cli.main import main
 from pat.data.sample_array import SAMPLE, load_sample
 from pat.explore.page import opened
 
@@ -66,22 +65,15 @@ def test_foreign_hosts_are_refused_whatever_their_origin_and_ctrl_c_is_quiet(ser
 
 
 @pytest.mark.parametrize("port", ["99999", "-1"])
-def test_a_port_that_is_none_is_one_line(port, capsys):
-    with pytest.raises(SystemExit) as stop:
-        main([*EXPLORE, "--port", port])
-    assert stop.value.code == 2
-    assert capsys.readouterr().err == f"pat: --port {port}: wanted 1 to 65535, or 0 for a free one\n"
+def test_a_port_that_is_none_is_one_line(port, refusal):
+    said = refusal(*EXPLORE, "--port", port)
+    assert said == f"pat: --port {port}: wanted 1 to 65535, or 0 for a free one"
 
 
-def test_a_port_in_use_is_one_line(server, capsys):
+def test_a_port_in_use_is_one_line(server, refusal):
     _, port = server
-    with pytest.raises(SystemExit) as stop:
-        main([*EXPLORE, "--port", port])
-    assert stop.value.code == 2
-    assert (
-        capsys.readouterr().err
-        == f"pat: --port {port}: Address already in use: give another, or 0 for a free one\n"
-    )
+    said = refusal(*EXPLORE, "--port", port)
+    assert said == f"pat: --port {port}: Address already in use: give another, or 0 for a free one"
 
 
 def test_a_saved_grid_answers_for_the_pixels_of_its_cells():
@@ -95,10 +87,8 @@ def test_a_saved_grid_answers_for_the_pixels_of_its_cells():
     }
 
 
-def test_weights_without_attention_are_refused_and_no_page_is_written(tmp_path, capsys):
+def test_weights_without_attention_are_refused_and_no_page_is_written(tmp_path, refusal):
     for weights, said in {"mono-colour": "are not of the paper's network", "foo": "no weights 'foo'"}.items():
         page = tmp_path / f"{weights}.html"
-        with pytest.raises(SystemExit):
-            main([*EXPLORE, "--weights", weights, "--save", str(page)])
-        assert said in " ".join(capsys.readouterr().err.split())
+        assert said in refusal(*EXPLORE, "--weights", weights, "--save", page)
         assert not page.exists()

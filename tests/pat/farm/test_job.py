@@ -140,13 +140,6 @@ def test_refused_scenes_are_named_and_the_others_made(config, tmp_path, capfd):
     assert "0 made, 2 failed: the same command tries these again" in said
 
 
-def fails(arguments, capfd) -> str:
-    with pytest.raises(SystemExit) as stop:
-        main([str(a) for a in arguments])
-    assert stop.value.code == 2
-    return " ".join(capfd.readouterr().err.split())
-
-
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
@@ -168,21 +161,21 @@ def fails(arguments, capfd) -> str:
         ({"blender": {"settings": {"sample": 3}}}, "settings.sample: unknown key; did you mean 'samples'?"),
     ],
 )
-def test_typos_are_one_line(config, tmp_path, capfd, changes, words):
+def test_typos_are_one_line(config, tmp_path, refusal, changes, words):
     write(config, **changes)
-    said = fails(["render", config, "--scenes", 2, "--out", tmp_path / "data"], capfd)
+    said = refusal("render", config, "--scenes", 2, "--out", tmp_path / "data")
     assert words in said
     assert not (tmp_path / "data").exists()
 
 
-def test_other_mistakes_are_one_line(config, tmp_path, capfd):
+def test_other_mistakes_are_one_line(config, tmp_path, refusal):
     out = tmp_path / "data"
     two = ["--scenes", 2, "--out", out]
-    assert "no.yaml: no such file" in fails(["render", tmp_path / "no.yaml", *two], capfd)
-    assert "is not i/n" in fails(["render", config, *two, "--shard", "3/2"], capfd)
-    assert "at least one scene" in fails(["render", config, "--scenes", 0, "--out", out], capfd)
+    assert "no.yaml: no such file" in refusal("render", tmp_path / "no.yaml", *two)
+    assert "is not i/n" in refusal("render", config, *two, "--shard", "3/2")
+    assert "at least one scene" in refusal("render", config, "--scenes", 0, "--out", out)
     (tmp_path / "rig.yaml").write_text("cameras: {mono: {size: [8, 8]}}")
-    said = fails(["render", config, *two], capfd)
+    said = refusal("render", config, *two)
     assert "camera 'mono' is not calibrated: rendering needs its K, R and t" in said
 
 

@@ -129,6 +129,21 @@ def test_each_field_is_evaluated_once_a_pixel(tiled, monkeypatch):
     assert (len(pixels), len(blocks)) == (HW[0] * HW[1], HW[0] * HW[1] // 4)
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda image: image.numpy(), "is a ndarray: give a tensor"),
+        (lambda image: image[..., :60].movedim(0, -1), r"of shape \(64, 60, 3\): wanted"),
+        (lambda image: (image * 255).to(torch.uint8), "is uint8"),
+        (lambda image: image * 30, "values up to 3"),
+    ],
+)
+def test_images_without_a_rig_are_checked_alike(change, message):
+    """Counts ended in an error of torch's, others in advice on focus."""
+    with pytest.raises((TypeError, ValueError), match=f"the image of 'b' .*{message}"):
+        fuse({"a": smooth(1, 0), "b": change(smooth(3, 1))})
+
+
 def test_views_name_what_is_wrong():
     rig, images = rig_of("ab"), {"a": smooth(1, 0), "b": smooth(3, 1)}
     for wrong, message in (
@@ -138,6 +153,7 @@ def test_views_name_what_is_wrong():
         (images | {"b": images["b"][:, :-1]}, "the image of 'b' is 96x63, the rig says 96x64"),
         (images | {"b": images["b"] * torch.nan}, "NaN or infinite"),
         (images | {"b": images["b"] * 255}, r"the image of 'b' has values up to 2\d\d.*: divide them"),
+        (images | {"a": images["a"] * 30}, r"the image of 'a' has values up to 3\d.*: divide them"),
         (images | {"b": 2 * images["b"] - 1}, r"the image of 'b' has values down to -.*: images are in 0"),
         (
             images | {"b": (images["b"] * 255).to(torch.uint8)},
@@ -148,3 +164,6 @@ def test_views_name_what_is_wrong():
     ):
         with pytest.raises(ValueError, match=message):
             Views.of(rig, wrong, alpha="a")
+    exposed = rig.with_camera("b", rig["b"].replace(sensor=Sensor(exposure=0.01)))
+    Views.of(exposed, images | {"b": images["b"] * 4}, alpha="a")
+    Views.of(rig, images | {"b": images["b"] ** 8 * 16}, alpha="a")

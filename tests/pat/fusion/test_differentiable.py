@@ -81,13 +81,19 @@ def test_depths_follow_a_camera_that_moves_along_the_segments(cropped, kind, axi
     assert slope.item() == pytest.approx(change[likely].mean().item(), rel=0.15)
 
 
-def test_gradients_reach_rig_images_and_weights(cropped):
+@pytest.mark.parametrize("luminance", ["alpha", "mix"])
+def test_gradients_reach_rig_images_and_weights(cropped, luminance, recwarn):
+    """Torch warns once a process of numbers taken out of tensors with gradients, here always."""
     rig, images, _ = cropped
     network = load_weights("mono-colour-small").requires_grad_(True)
     angle = torch.zeros((), dtype=torch.float64, requires_grad=True)
     images = {name: image.clone().requires_grad_() for name, image in images.items()}
-    frame = fuse(network, rotated(rig, angle), images, alpha="mono", align=False, differentiable=True)
+    options = {"align": False, "luminance": luminance, "differentiable": True}
+    torch.set_warn_always(True)
+    frame = fuse(network, rotated(rig, angle), images, alpha="mono", **options)
+    torch.set_warn_always(False)
     frame.image.square().mean().backward()
+    assert not recwarn.list
     for tensor in (angle, *images.values(), *network.parameters()):
         assert tensor.grad is not None
         assert tensor.grad.isfinite().all()
@@ -105,8 +111,12 @@ def test_without_differentiable_everything_is_detached(cropped):
 def test_a_differentiable_fusion_is_of_the_whole_frame(cropped, tmp_path):
     rig, images, _ = cropped
     network = load_weights("mono-colour-small")
-    for more in ({"max_memory": "2GiB"}, {"store": tmp_path}):
-        with pytest.raises(ValueError, match="max_memory and store"):
+    for more, message in (
+        ({"max_memory": "2GiB"}, "max_memory and store"),
+        ({"store": tmp_path}, "max_memory and store"),
+        ({"noise": "estimate"}, "leave out noise"),
+    ):
+        with pytest.raises(ValueError, match=message):
             fuse(network, rig, images, alpha="mono", differentiable=True, **more)
 
 

@@ -179,7 +179,9 @@ def holed(plane):
         ("certainty", lambda plane: plane + 7, "certainty is not within 0 to 1"),
         ("disparity", Tensor.double, "disparity and facts are float64 and float32: give one type"),
         ("disparity", Tensor.long, r"disparity is int64 \(1, 1, 64, 96\): wanted a tensor of floats"),
-        ("facts", lambda plane: enlarged(plane), r"facts is float32 .*: wanted .* \(B, 3, 32, 48\)"),
+        ("facts", lambda plane: enlarged(plane), r"facts is float32 .*: wanted .* \(1, 3, 32, 48\)"),
+        ("bands", lambda plane: plane[:, :1], r"bands is float32 \(1, 1, .*: wanted .* \(1, 3, 64, 96\)"),
+        ("diffused", lambda plane: plane[:, :1], r"diffused is float32 .*: wanted .* \(1, 2, 3, 64, 96\)"),
         ("chosen", lambda plane: plane[..., ::2, ::2], r"chosen is float32 \(1, 1, 32, 48\): wanted"),
     ],
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from copy import deepcopy
 
 import pytest
@@ -9,7 +10,6 @@ import torch
 from torch import Tensor, nn
 
 from arraygeom.threads import limited_to, torch_in_one_thread
-from pat.cli.main import main
 from pat.networks.weights import misfit
 from pat.support.eight_bits import Conv2d, available, measured, packed, round_to_eight_bits
 
@@ -118,7 +118,7 @@ def test_a_change_of_weights_or_of_range_is_seen() -> None:
     assert torch.equal(other(x), part(x))
 
 
-def test_on_a_gpu_it_is_refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+def test_on_a_gpu_it_is_refused(monkeypatch: pytest.MonkeyPatch, refusal: Callable) -> None:
     """It was in float32 there, without a word."""
 
     class OnGPU(Tensor):
@@ -127,9 +127,9 @@ def test_on_a_gpu_it_is_refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
     with pytest.raises(ValueError, match="int8 is for the CPU: leave the precision at float32 on cuda"):
         ranged(padding=1)(rand(1, 16, 8, 8).as_subclass(OnGPU))
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    with pytest.raises(SystemExit):
-        main(["fuse", __file__, "--image", f"mono={__file__}", "--device", "auto", "--precision", "int8"])
-    assert "--precision int8 is for the CPU: leave it out, or --device" in capsys.readouterr().err
+    assert "--precision int8 is for the CPU: leave it out, or --device" in refusal(
+        "fuse", __file__, "--image", f"mono={__file__}", "--device", "auto", "--precision", "int8"
+    )
 
 
 def test_without_a_range_for_gradients_and_in_other_precisions_it_is_torchs() -> None:

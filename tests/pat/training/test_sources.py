@@ -18,7 +18,7 @@ from arraygeom.distortion import BROWN_CONRADY, Distortion
 from arraygeom.pixels import pixel_grid
 from arraygeom.sampling import sample
 from arraygeom.undistortion import resampled
-from pat.data.windows import RenderedView, read_view, undistorted, window
+from pat.data.windows import RenderedView, read_view, reduced_depth, undistorted, window
 from pat.farm.backends import LayeredSettings
 from pat.media.colour import luminance
 from pat.media.images import write_image
@@ -209,6 +209,17 @@ def test_windows_reach_beyond_images():
     torch.testing.assert_close(
         beyond.camera.project(X).x, camera.project(X).x - torch.tensor([3.0, -1.0]).double()
     )
+
+
+def test_reduced_depth_is_exact_on_planes_and_takes_sides_at_edges():
+    plane = (1 / (0.2 + 0.001 * torch.arange(16.0))).expand(1, 8, 16).clone()
+    wanted = 1 / (0.2 + 0.001 * ((torch.arange(4.0) + 0.5) * 4 - 0.5))
+    torch.testing.assert_close(reduced_depth(plane, (2, 4))[0, 0], wanted)
+    near = plane[0, 0, 5].item()
+    plane[..., 6:] = 1.0
+    found = reduced_depth(plane, (2, 4))[0, 0]
+    assert found[1].item() in (pytest.approx(near), 1.0)
+    torch.testing.assert_close(found[2:], torch.ones(2))
 
 
 def test_any_camera_is_alpha_and_betas_are_others(rendered):
