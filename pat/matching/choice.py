@@ -5,7 +5,7 @@ compared; and nearly always the right disparity is that of a pixel not far off. 
 its own, those of pixels around it at fixed distances, and the nearest consistent ones in its row and its
 column. A U-Net gives their scores by what alpha shows, what matching found, and how alike alpha is to beta at
 each. It was trained on what matching finds in pairs with true disparity (`experiments.choice`), all with
-alpha on the left: there surfaces hide in beta what is to their left. Elsewhere the planes are turned before, so
+alpha on the left: there surfaces hide in beta what is to their left. Elsewhere planes are turned before, so
 that it is to their left, too.
 """
 
