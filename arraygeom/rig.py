@@ -486,6 +486,7 @@ def focal_positions(K: Tensor) -> Tensor:
 
 
 def _perturbed_camera(name: str, camera: View, changes: Mapping[str, Tensor]) -> View:
+    """The camera with its part of the changes, by the names of `Rig.parameters`, added."""
     mine = {k.removeprefix(f"{name}."): v for k, v in changes.items() if k.startswith(f"{name}.")}
     if not mine or not isinstance(camera, LensView):
         return camera

@@ -67,6 +67,7 @@ def unit_oddity(rig: Rig) -> str | None:
 
 
 def _all(rig: Rig) -> Iterator[str]:
+    """Sentences on what is odd about a rig: units, lenses, K, overlap, positions, baselines, F."""
     if unit := unit_oddity(rig):
         yield f"the rig {unit}"
     for name, camera in rig.cameras.items():
@@ -107,6 +108,7 @@ def _grid(camera: View) -> Tensor:
 
 
 def _of_K(name: str, camera: Camera) -> Iterator[str]:
+    """On a mirrored image, an unlikely focal length, a principal point far off the middle."""
     (h, w), K = camera.hw, camera.K.double()
     focal = float(K[:2, :2].det().abs().sqrt())
     if K[:2, :2].det() < 0:
@@ -127,6 +129,7 @@ def _of_K(name: str, camera: Camera) -> Iterator[str]:
 
 
 def _of_lens(name: str, camera: LensView) -> Iterator[str]:
+    """On a lens model that covers too little of its image, or is not its own inverse."""
     if (lens := camera.distortion) is None:
         return
     points = map_homogeneous(torch.linalg.inv(camera.K)[..., :2, :], _grid(camera).to(camera.K))
@@ -171,6 +174,7 @@ def _of_positions(rig: Rig, pairs: Iterable[tuple[str, str]]) -> Iterator[str]:
 
 
 def _of_baseline(rig: Rig, a: str, b: str) -> Iterator[str]:
+    """On a baseline that is out of proportion to the depth range."""
     baseline, unit = float((rig[a].centre - rig[b].centre).norm()), length_unit(rig)
     question = f"are depth and poses both in {'metres' if unit == 'm' else unit}?"
     if baseline > 0 and rig.depth is not None:

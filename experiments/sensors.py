@@ -295,6 +295,7 @@ def read_chains(value: Any, where: str = "sensors") -> dict[str, tuple[Step, ...
 
 
 def _step(entry: Any, where: str) -> Step:
+    """One step of a chain. Raises ValueError naming the entry."""
     name, options = (
         next(iter(entry.items())) if isinstance(entry, Mapping) and len(entry) == 1 else (entry, {})
     )

@@ -230,6 +230,7 @@ Panels = dict[str, Tensor]
 
 
 def _still(job: SystemRun) -> tuple[list[str], Panels]:
+    """One frame fused and compared: lines of the table, and panels of the figure."""
     rig, recording, out = job.rig, job.recording, job.out
     alpha, ground_truth = job.system.alpha, recording.ground_truth[0]
     first = {name: paths[0] for name, paths in job.files.items()}
@@ -291,6 +292,7 @@ def fused_apart(job: SystemRun, files: Mapping[str, Path]) -> tuple[Frame, list[
 
 
 def _sequence(job: SystemRun) -> tuple[list[str], Panels]:
+    """All frames fused, with and without propagated colour, and compared."""
     alpha, rig, out, ground_truth = job.system.alpha, job.rig, job.out, job.recording.ground_truth
     frames = {name: ImageFiles(paths, rig, name, alpha=alpha) for name, paths in job.files.items()}
     settings = FuseSettings(max_memory=job.max_memory)
@@ -342,6 +344,7 @@ def _table(rows: Mapping[str, Tensor], ground_truth: Tensor, white: float) -> li
 def _sequence_table(
     methods: Mapping[str, list[Tensor]], ground_truth: list[Tensor], greys: list[Tensor]
 ) -> list[str]:
+    """Scores and flicker of each method, means over the frames."""
     rows = []
     for name, images in methods.items():
         scores = [score(p.clamp(0, 1), t) for p, t in zip(images, ground_truth)]

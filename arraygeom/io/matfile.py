@@ -85,6 +85,7 @@ def _unpacked(data: memoryview) -> memoryview:
 
 
 def _elements(data: memoryview, order: str) -> Iterator[_Element]:
+    """The elements one after the other. Raises ValueError for one that is not whole."""
     offset = 0
     while offset < len(data):
         if offset + 8 > len(data):
@@ -125,6 +126,7 @@ def _check_matrix(data: memoryview, order: str, depth: int) -> str | None:
 
 
 def _check_contents(parts: Iterator[_Element], order: str, depth: int, what: tuple[int, int, bool]) -> bool:
+    """Whether a matrix, and those in it, can be read. Raises ValueError for other sizes than it states."""
     kind, count, is_complex = what
     if kind in (CELL, STRUCT):
         wanted = count * (_fields(parts, order) if kind == STRUCT else 1)

@@ -56,6 +56,7 @@ def read_matches(path: str | Path, files: Mapping[str, str | Path], sizes: Mappi
 
 
 def _csv(path: Path, files: Mapping[str, Path]) -> PointPairs:
+    """The points of two images, x0,y0,x1,y1 a line. Raises ValueError naming a line that is none."""
     if len(files) != 2:
         raise ValueError(
             f"{path}: x0 y0 x1 y1 relate two images, and {len(files)} are given: give two, or a database"

@@ -205,6 +205,7 @@ class _Image(NamedTuple):
         return QUARTER_TURNS[orientation]
 
     def _pix4d(self) -> tuple[Tensor, LensModel | None]:
+        """K and the lens by Pix4D's tags; lengths are in millimetres or pixels."""
         kind, centre = self.text("ModelType"), self.needed("PrincipalPoint", 2)
         if "pixel" not in (self.text("PrincipalPointUnits") or "mm"):
             centre = centre * self.per_mm
@@ -232,6 +233,7 @@ class _Image(NamedTuple):
         return K, PolynomialFisheye(bends)
 
     def _dji(self) -> tuple[Tensor, Distortion | None]:
+        """K and the lens by DJI's DewarpData: fx, fy, cx, cy from the middle, k1, k2, p1, p2, k3."""
         (h, w), text = self.tags.hw, self.tags.text(DJI, "DewarpData") or ""
         dated, _, numbers = text.rpartition(";")
         if not dated:

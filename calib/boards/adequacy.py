@@ -78,6 +78,7 @@ def point_counts(parts: Iterable[Float[np.ndarray, "_ 2"]], hw: HW) -> Int[np.nd
 
 
 def _missing(coverage: Coverage, board: Board) -> Iterator[str]:
+    """What is missing, and what to photograph: parts of the image, depths, tilts."""
     thirds = coverage.cells.reshape(3, CELLS[0] // 3, CELLS[1])
     empty = [
         POSITIONS[i][j]

@@ -217,6 +217,7 @@ def homography_errors(p: Float[np.ndarray, "n 2"], x: Float[np.ndarray, "n 2"]) 
 
 
 def _circles(grey: Grey, board: Circles) -> Detection | None:
+    """The centres of a grid of circles, in the order of the board's points; None unless all are found."""
     kind = cv2.CALIB_CB_ASYMMETRIC_GRID if board.asymmetric else cv2.CALIB_CB_SYMMETRIC_GRID
     for flags in (kind, kind | cv2.CALIB_CB_CLUSTERING):
         succeeded, centres = cv2.findCirclesGrid(grey, (board.columns, board.rows), flags=flags)
@@ -296,6 +297,7 @@ def _plausible(detection: Detection, board: Board) -> bool:
 
 
 def _reason(grey: Grey, board: Board) -> str:
+    """The likeliest reason why a board is not found, and what to do."""
     low, high = np.percentile(grey, (2, 98))
     if high - low < 40:
         return "the images have hardly any contrast: expose them longer, or light the board"
@@ -315,6 +317,7 @@ def _reason(grey: Grey, board: Board) -> str:
 
 
 def _marker_reason(grey: Grey, board: MarkedBoard) -> str | None:
+    """The same by the markers that are visible; None if they say nothing."""
     border = board.border if isinstance(board, AprilGrid) else 1
     ids, last = _tags(grey, board.dictionary, border), board.markers[-1]
     if isinstance(board, AprilGrid) and len(_tags(grey, board.dictionary, 3 - border)) >= max(4, len(ids)):

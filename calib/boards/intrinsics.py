@@ -138,6 +138,7 @@ def near_homography(detection: Detection, board: Board) -> Detection:
 
 
 def _solved(name: str, views: BoardViews, board: Board, lens: Lens) -> tuple[Camera, dict[FrameKey, Pose]]:
+    """OpenCV's camera, and `cam_from_board` of each frame. Raises ValueError if it finds none."""
     model, count = LENSES[lens]
     pinhole = model in ("brown-conrady", "none")
     try:

@@ -155,6 +155,7 @@ def _usable(paths: Iterable[Path]) -> list[Path]:
 
 
 def _moments(name: str, files: list[Path]) -> dict[FrameKey, Photo]:
+    """A camera's photos by moment. Raises ValueError for mixed videos, orientations, or equal numbers."""
     videos = [f for f in files if f.suffix.lower() in VIDEOS]
     if len(videos) > 1 or (videos and len(videos) < len(files)):
         raise ValueError(f"{name}: {len(videos)} videos among {len(files)} files: keep one video, or images")

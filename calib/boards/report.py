@@ -206,6 +206,7 @@ def _mean_and_quantile(errors: np.ndarray, between: str = ", ") -> str:
 
 
 def _with_deviations(calibration: Calibration, name: str, camera: Camera, kind: str) -> str:
+    """The numbers of a kind of intrinsics (focal, centre, distortion), each with its deviation."""
     lens, deviations = camera.distortion, calibration.fit.deviations
     texts = []
     for entry, value in zip(parameter_names(camera), intrinsic_values(camera)):
@@ -408,6 +409,7 @@ def worst_images(calibration: Calibration, detected: Mapping[str, BoardViews]) -
 def _draw_image(
     axes: Any, calibration: Calibration, name: str, key: FrameKey, views: BoardViews, photos: Photos
 ) -> None:
+    """The image, its corners, those left out in red, and the residuals as arrows."""
     image_key = str(key).split(" board ")[0]  # of several boards in it
     photo = next((photo for other, photo in photos[name].items() if str(other) == image_key), None)
     if photo is not None:

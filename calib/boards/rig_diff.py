@@ -165,6 +165,7 @@ def rig_difference(
 
 
 def _same_cameras(a: Rig, b: Rig) -> tuple[str, ...]:
+    """Their names. Raises ValueError unless both rigs are of the same calibrated cameras, sizes and unit."""
     if set(a.names) != set(b.names):
         listed = f"{', '.join(a.names)}; and {', '.join(b.names)}"
         raise ValueError(f"the rigs are of other cameras ({listed}): give two calibrations of the same")
@@ -210,6 +211,7 @@ class _Part(NamedTuple):
 
 
 def _projections(a: Rig, b: Rig, motion: Pose, name: str, X: np.ndarray) -> _Part:
+    """How the pixels of points change from a to b, and by what: the rig's motion, each rig's parameters."""
     one, other, points = a[name], b[name], torch.from_numpy(X)
     moved = other.replace(cam_from_world=other.cam_from_world @ motion)
     J_a, J_b = camera_jacobian(one, X), camera_jacobian(moved, X)

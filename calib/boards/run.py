@@ -197,6 +197,7 @@ def _note(text: str) -> str:
 
 
 def _camera(session: Session, name: str) -> str:
+    """A camera's part of the page: what was found, advice, the last image, where points were."""
     images = session.images(name)
     count = sum(bool(boards) for _, boards in images.values())
     parts = [f"<h2>{escape(name)}: the board is in {count} of {len(images)} images</h2>"]
@@ -212,6 +213,7 @@ def _camera(session: Session, name: str) -> str:
 
 
 def _advice(calibration: Calibration, name: str) -> str:
+    """Its focal length, the view that would help most, and what is missing."""
     deviation = calibration.deviations().get(f"{name}.focal.0")
     stated = f" ± {deviation:.2g}" if deviation else ""
     parts = [f"<p>Focal length {float(calibration.rig[name].K[0, 0]):.1f} px{stated}.</p>"]

@@ -161,6 +161,7 @@ def compare_lenses(views: Mapping[str, BoardViews], board: Board) -> dict[str, L
 
 
 def _compared(name: str, views: BoardViews, board: Board) -> LensComparison:
+    """The errors of each lens model on frames that its fit was not given; none of too few frames."""
     if len(views.seen) < FEWEST_TO_COMPARE:
         return LensComparison({})
     kept = calibrate_single(name, views, board, final=False).views[name]

@@ -144,6 +144,7 @@ def observations(rigs: Sequence[Rig], pairs: Pairs) -> PointObservations:
 
 
 def _observations(pairs: Sequence[Pair], matches: PointMatches) -> PointObservations:
+    """Of hypothetical pairs: how far matches are off their lines, their depths, and whether in front."""
     off, depth = torch.zeros(2, len(pairs), len(matches.alpha), dtype=torch.float64)
     front = torch.zeros(off.shape, dtype=torch.bool)
     groups: dict[object, list[int]] = {}

@@ -190,6 +190,7 @@ def jacobian(
 
 
 def _differentiated(evaluated: Evaluated) -> tuple[Tensor, Tensor]:
+    """The residuals and their derivatives, as `jacobian`."""
     rows = []
     for residuals in evaluated.parts:
         u = torch.linspace(1, 2, len(residuals), dtype=residuals.dtype, requires_grad=True)

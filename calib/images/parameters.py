@@ -139,6 +139,7 @@ def _matching(parameters: Sequence[str], free: Iterable[str]) -> list[str]:
 
 
 def _free_parameter(rig: Rig, name: str, like: Tensor, sigma: Mapping[str, float]) -> FreeParameter:
+    """A parameter with its prior deviation, in its own unit and as it is shown."""
     camera, _, kind = name.rpartition(".")
     size = torch.full((like.shape[-1],), sigma[kind], dtype=torch.float64)
     view = rig[camera]

@@ -104,6 +104,7 @@ def match_depths(rig: Rig, pairs: Pairs) -> MatchDepths:
 
 
 def _depths(pair: Pair, a: Tensor, b: Tensor, valid: Tensor) -> MatchDepths:
+    """Depths of the points at which two rays are nearest to one another; NaN for pairs known by F."""
     if not pair.calibrated or pair.link is not None:
         never = torch.zeros_like(valid)
         return MatchDepths(torch.full_like(a[..., 2], torch.nan), never, never)

@@ -20,7 +20,7 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 
 from pat.data.pairs import PAPER_DISPARITY, StereoPair
 from pat.evaluation.protocols import hw_of, rectified_fusion
-from pat.evaluation.tables import distinct, markdown_table
+from pat.evaluation.tables import grouped, markdown_table
 from pat.matching.certainty import SETTINGS, CertaintyNetwork, measured, typical_facts
 from pat.matching.choice import Choice
 from pat.matching.inputs import Inputs
@@ -172,7 +172,7 @@ def fitted(pixels: Sequence[Judged], *, steps: int = STEPS) -> CertaintyNetwork:
 
 def by_thirds(pixels: Sequence[Judged], *, steps: int = STEPS) -> Callable[[Judged], Stated]:
     """What fits to two thirds of the pairs state of the others."""
-    pairs = distinct(j.pair for j in pixels)
+    pairs = list(grouped(pixels, "pair"))
     networks = [fitted([j for j in pixels if j.pair not in pairs[k::3]], steps=steps) for k in range(3)]
     return lambda one: Stated.by(networks[pairs.index(one.pair) % 3], one.numbers)
 
@@ -205,7 +205,7 @@ def held(pixels: Sequence[Judged], stating: Callable[[Judged], Stated]) -> dict[
         covered = float((error <= width).float().mean())
         return Held(Reliability.of(probability, right), covered)
 
-    names = distinct(j.condition for j in pixels)
+    names = grouped(pixels, "condition")
     return {n: of([i for i, j in enumerate(pixels) if n in (j.condition, "all")]) for n in [*names, "all"]}
 
 

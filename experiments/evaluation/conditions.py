@@ -36,7 +36,7 @@ from pat.evaluation.protocols import (
     rectified_rig,
 )
 from pat.evaluation.stereo import disparity_errors
-from pat.evaluation.tables import distinct, markdown_table
+from pat.evaluation.tables import grouped, markdown_table
 from pat.fusion.fuse import corrections_of
 from pat.media.colour import from_luma_chroma, luminance, to_bytes, to_luma_chroma
 from pat.media.figures import save_figure
@@ -266,18 +266,20 @@ def conditions_markdown(rows: Sequence[ConditionRow]) -> str:
 
 
 def _by_condition(rows: Sequence[ConditionRow]) -> str:
-    methods = [m for m in distinct(r.method for r in rows) if m != "bound of beta's resolution"]
+    methods = [m for m in grouped(rows, "method") if m != "bound of beta's resolution"]
     lines = []
-    for name in distinct(r.condition for r in rows):
-        cells = [_mean_cell([r for r in rows if (r.condition, r.method) == (name, m)]) for m in methods]
-        gains = _gains(rows, name)
+    for name, own in grouped(rows, "condition").items():
+        by_method = grouped(own, "method")
+        cells = [_mean_cell(by_method.get(m, ())) for m in methods]
+        gains = _gains(own)
         low, high = bootstrap_interval(gains)
         lines.append([name, *cells, f"{np.mean(gains):+.2f} ({low:+.2f} to {high:+.2f})"])
     return markdown_table(["condition", *methods, "fusion over classical, 95 %"], lines)
 
 
-def _gains(rows: Sequence[ConditionRow], condition: str) -> list[float]:
-    psnr = {(r.method, r.pair): r.psnr["whole"] for r in rows if r.condition == condition}
+def _gains(rows: Sequence[ConditionRow]) -> list[float]:
+    """Of fusion over classical, in one condition: decibels, pair by pair."""
+    psnr = {(r.method, r.pair): r.psnr["whole"] for r in rows}
     return [value - psnr["classical", pair] for (method, pair), value in psnr.items() if method == "fusion"]
 
 
@@ -290,8 +292,7 @@ def _mean_cell(rows: Sequence[ConditionRow]) -> str:
 def _by_region(rows: Sequence[ConditionRow]) -> str:
     ideal = [r for r in rows if r.condition == "ideal"]
     lines = []
-    for method in distinct(r.method for r in ideal):
-        ours = [r for r in ideal if r.method == method]
+    for method, ours in grouped(ideal, "method").items():
         values = [[r.psnr[region] for r in ours if region in r.psnr] for region in REGIONS]
         lines.append([method, *(f"{np.mean(v):.2f}" if v else "" for v in values)])
     names = ["whole", "seen by beta", "occluded", "beyond beta's edge"]
@@ -299,10 +300,10 @@ def _by_region(rows: Sequence[ConditionRow]) -> str:
 
 
 def _depth(rows: Sequence[ConditionRow]) -> str:
+    """A table of errors of disparity under ideal conditions."""
     lines = []
     with_disparity = [r for r in rows if r.condition in ("ideal", "x1") and r.within_one is not None]
-    for condition, method in distinct((r.condition, r.method) for r in with_disparity):
-        matching = [r for r in with_disparity if (r.condition, r.method) == (condition, method)]
+    for (condition, method), matching in grouped(with_disparity, "condition", "method").items():
         shares = [100 * float(np.mean([r.within_one[i] for r in matching if r.within_one])) for i in range(2)]
         errors = [r.end_point_error for r in matching if r.end_point_error is not None]
         name = "OpenCV's SGBM" if method == "classical" else method
@@ -349,8 +350,7 @@ def save_condition_curves(rows: Sequence[ConditionRow], path: Path) -> None:
 def _curve(rows: Sequence[ConditionRow], points: Mapping[int, str]) -> dict[str, list[tuple[float, float]]]:
     curves: dict[str, list[tuple[float, float]]] = {}
     for x, name in points.items():
-        for method in distinct(r.method for r in rows if r.condition == name):
+        for method, own in grouped([r for r in rows if r.condition == name], "method").items():
             if method != "bound of beta's resolution":
-                values = [r.psnr["whole"] for r in rows if (r.condition, r.method) == (name, method)]
-                curves.setdefault(method, []).append((x, float(np.mean(values))))
+                curves.setdefault(method, []).append((x, float(np.mean([r.psnr["whole"] for r in own]))))
     return curves

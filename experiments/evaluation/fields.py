@@ -38,7 +38,7 @@ from experiments.peaks import with_peak
 from pat.data.pairs import PAPER_DISPARITY, Disparity, StereoPair
 from pat.evaluation.metrics import score
 from pat.evaluation.protocols import enlarged, hw_of, mono_colour_task, rectified_rig
-from pat.evaluation.tables import distinct, markdown_table
+from pat.evaluation.tables import grouped, markdown_table
 from pat.media.figures import colour_depth
 from pat.networks.protocol import Comparing
 from pat.synthesis.photos import PhotoBank
@@ -194,11 +194,9 @@ def drawn_peaks(network: Comparing, cases: Iterable[Case]) -> dict[str, Tensor]:
 def fields_markdown(rows: Sequence[FieldRow]) -> str:
     """A table for each kind of cases: means over them, fields as lines."""
     parts = []
-    for kind in distinct(row.kind for row in rows):
-        some = [row for row in rows if row.kind == kind]
-        names = distinct(row.field for row in some)
-        lines = [_line(name, [row for row in some if row.field == name]) for name in names]
-        title = f"{kind} ({len(distinct(row.case for row in some))})"
+    for kind, of_kind in grouped(rows, "kind").items():
+        lines = [_line(name, own) for name, own in grouped(of_kind, "field").items()]
+        title = f"{kind} ({len(grouped(of_kind, 'case'))})"
         columns = [title, "PSNR", "SSIM", "peaks within 1 px", "CPU s", "MiB", ""]
         parts.append(markdown_table(columns, lines, align="lrrrrrl"))
     return "\n".join(parts)

@@ -19,7 +19,7 @@ from pat.evaluation.baseline import checked_disparity
 from pat.evaluation.metrics import score
 from pat.evaluation.protocols import MonoColourTask, enlarged, hw_of, mono_colour_task, rectified_rig
 from pat.evaluation.stereo import disparity_errors
-from pat.evaluation.tables import distinct, markdown_table
+from pat.evaluation.tables import grouped, markdown_table
 from pat.fusion.fuse import fuse
 from pat.media.colour import luminance, to_bytes
 from pat.networks.protocol import FusionNetwork
@@ -53,12 +53,16 @@ def evaluate_outside(pairs: Iterable[StereoPair], network: FusionNetwork) -> lis
 def outside_markdown(rows: Sequence[OutsideRow]) -> str:
     """A line for each source: means over the pairs."""
     lines = []
-    for source in distinct(row.source for row in rows):
-        of_source = [row for row in rows if row.source == source]
+    for source, of_source in grouped(rows, "source").items():
         psnr, error, within, seconds = np.mean([row[2:] for row in of_source], 0)
         lines.append([source, f"{psnr:.2f}", f"{error:.2f}", f"{within:.1%}", f"{seconds:.1f}"])
-    count = len(distinct(row.pair for row in rows))
-    columns = [f"disparity, {count} pairs", "dB", "mean error, px", "within 1 px", "seconds"]
+    columns = [
+        f"disparity, {len(grouped(rows, 'pair'))} pairs",
+        "dB",
+        "mean error, px",
+        "within 1 px",
+        "seconds",
+    ]
     return markdown_table(columns, lines)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from arraygeom.atomic import write_text
 from arraygeom.viz import new_figure
 from pat.evaluation.metrics import bootstrap_interval
-from pat.evaluation.tables import distinct, markdown_table
+from pat.evaluation.tables import grouped, markdown_table
 from pat.media.figures import save_figure
 
 from .sweeps import SWEEPS, Row
@@ -56,22 +56,22 @@ def markdown(rows: Sequence[Row]) -> str:
     PSNR is against the first field at the first value, scene by scene: scenes differ by more than fields.
     """
     return "\n".join(
-        f"#### {sweep}: {SWEEPS[sweep][0] if sweep in SWEEPS else 'rigs'}\n\n{_tables(rows, sweep)}"
-        for sweep in distinct(row.sweep for row in rows)
+        f"#### {sweep}: {SWEEPS[sweep][0] if sweep in SWEEPS else 'rigs'}\n\n{_tables(own)}"
+        for sweep, own in grouped(rows, "sweep").items()
     )
 
 
-def _tables(rows: Sequence[Row], sweep: str) -> str:
-    some = [row for row in rows if row.sweep == sweep]
-    values, fields = distinct(row.value for row in some), distinct(row.field for row in some)
-    parts = []
+def _tables(rows: Sequence[Row]) -> str:
+    """The tables of one sweep, and what could not be measured."""
+    values, parts = grouped(rows, "value"), []
     for measure, (label, form) in MEASURES.items():
-        drawn = {field: [_drawn(some, field, value, measure) for value in values] for field in fields}
+        fields = grouped(rows, "field")
+        drawn = {field: [_drawn(rows, field, value, measure) for value in values] for field in fields}
         lines = [
             [field, *(form.format(np.mean(v)) if v else "" for v in cells)] for field, cells in drawn.items()
         ]
         parts.append(markdown_table([label, *(f"{v:g}" for v in values)], lines))
-    notes = distinct(f"{row.field} at {row.value:g}: {row.note}" for row in some if row.note)
+    notes = dict.fromkeys(f"{row.field} at {row.value:g}: {row.note}" for row in rows if row.note)
     return "\n".join(parts) + "".join(f"\n{note}." for note in notes) + "\n" * bool(notes)
 
 
@@ -80,12 +80,12 @@ def curves(rows: Sequence[Row]) -> Figure:
 
     PSNR is drawn as in `markdown`.
     """
-    sweeps = distinct(row.sweep for row in rows)
+    sweeps = grouped(rows, "sweep")
     figure = new_figure(figsize=(3.2 * len(sweeps), 6.0))
     axes = figure.subplots(len(MEASURES), len(sweeps), squeeze=False)
     for line, measure in zip(axes, MEASURES):
-        for axis, sweep in zip(line, sweeps):
-            _draw(axis, [row for row in rows if row.sweep == sweep], measure)
+        for axis, (sweep, own) in zip(line, sweeps.items()):
+            _draw(axis, own, measure)
             axis.set_xlabel(SWEEPS[sweep][0].replace(", ", ",\n") if sweep in SWEEPS else sweep, fontsize=8)
     handles, labels = axes[0][0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="lower center", ncols=len(labels), frameon=False)
@@ -95,8 +95,8 @@ def curves(rows: Sequence[Row]) -> Figure:
 
 def _draw(axis: Axes, rows: Sequence[Row], measure: str) -> None:
     """The curves of one sweep."""
-    values = distinct(row.value for row in rows)
-    for field in distinct(row.field for row in rows):
+    values = grouped(rows, "value")
+    for field in grouped(rows, "field"):
         drawn = {value: _drawn(rows, field, value, measure) for value in values}
         measured = [value for value in values if drawn[value]]
         means = np.array([np.mean(drawn[value]) for value in measured])

@@ -79,6 +79,7 @@ def _write(
     fused: list[Frame],
     by_themselves: list[Frame],
 ) -> list[Path]:
+    """Frames, video, rig and figures; returns their paths."""
     for number, frame in zip(FAST_FRAMES, fused):
         save_frame(frame, out / "frames", name=str(number))
     write_video(out / "fused.mp4", [f.image for f in fused], rate=5)

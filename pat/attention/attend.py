@@ -45,8 +45,9 @@ CHUNK_SAMPLES = 2**22
 CHUNK_PIXELS = 2**18
 """How many segments a callable is asked for at a time."""
 LOCAL_SERVES = (
-    "nearest values, without statistics and derivatives, with a bias for each sample or none, of `Local` "
-    "windows of odd size and whole spacing in float32 images of one size on the CPU"
+    "nearest values, without statistics, their gradients by query, key and value and no other derivatives, "
+    "with a constant bias for each sample or none, of `Local` windows of odd size and whole spacing in "
+    "float32 images of one size on the CPU"
 )
 
 
@@ -139,9 +140,8 @@ def _attend(
         values_alone = nearest and samples is None and not measured
         asked = values_alone and backend in ("auto", "local")
         if isinstance(locations, Local) and asked and _local_serves(query, key, value, locations, bias):
-            return (torch_op.compiled("cpu").forward_local(query, key, value, locations, bias),)
-        alpha, beta = (View(hw=(t.shape[2], t.shape[3])) for t in (query, key))
-        locations = lazily(locations, Pair(alpha, beta))
+            return (_attend_local(query, key, value, locations, bias),)
+        locations = _lazily_between(query, key, locations)
     if backend == "local":
         raise RuntimeError(f"backend 'local' serves {LOCAL_SERVES} only: ask for 'auto'")
 
@@ -186,9 +186,23 @@ def _local_serves(query: Tensor, key: Tensor, value: Tensor, field: Local, bias:
     whole = field.size > 0 and field.size % 2 == 1 and float(field.spacing).is_integer()
     taken = query.dtype == torch.float32 and query.device.type == "cpu" and query.shape[2:] == key.shape[2:]
     tensors = query, key, value, bias
-    plain = torch_op.is_plain(*tensors) and not _missing(*tensors)
+    plain = torch_op.is_seen_by_autograd_alone(*tensors) and not _missing(*tensors)
     of_samples = bias is None or (bias.shape == (field.size**2,) and bias.dtype == torch.float32)
+    plain = plain and not torch_op.wants_gradient(bias)
     return whole and taken and plain and of_samples
+
+
+def _attend_local(query: Tensor, key: Tensor, value: Tensor, field: Local, bias: Tensor | None) -> Tensor:
+    def again(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
+        return attend(q, k, v, _lazily_between(q, k, field), interpolation="nearest", bias=bias)
+
+    return torch_op.attend_local(query, key, value, field, bias, again)
+
+
+def _lazily_between(query: Tensor, key: Tensor, field: Local | Dense) -> Callable[[Tensor], Locations]:
+    """The field of two views of which only the sizes are known."""
+    alpha, beta = (View(hw=(t.shape[2], t.shape[3])) for t in (query, key))
+    return lazily(field, Pair(alpha, beta))
 
 
 def _attend_dense(query: Tensor, key: Tensor, value: Tensor, stride: int, bias: Tensor | None) -> Tensor:

@@ -8,7 +8,7 @@ thread in an order that the inputs alone give.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 
 import numpy as np
@@ -45,19 +45,48 @@ def forward(inputs: AttentionInputs, measured: bool) -> tuple[Tensor, Tensor, Te
     return out.to(query.dtype).permute(0, 3, 1, 2), statistics, logsum, torch.empty(0, dtype=torch.int32)
 
 
-def forward_local(query: Tensor, key: Tensor, value: Tensor, field: Local, bias: Tensor | None) -> Tensor:
+def forward_local(
+    query: Tensor, key: Tensor, value: Tensor, field: Local, bias: Tensor | None
+) -> tuple[Tensor, Tensor]:
     """Values (b, dv, h, w), channels first, of windows of a whole number of pixels around the same pixel of
-    a view of the same size, the nearest look-up, float32. `bias`: (samples), the same for all; -inf costs
-    nothing."""
-    planes = [x.detach().contiguous().numpy() for x in (query, key, value)]
-    out, step = np.empty_like(planes[2]), round(field.spacing)
-    of_samples = np.zeros(field.size**2, np.float32) if bias is None else bias.detach().contiguous().numpy()
-    tops = range(0, out.shape[2], kernels.ROWS)
-    images = [*zip(*planes, out)]
-    which = np.flatnonzero(of_samples != -np.inf)
-    rows = [partial(kernels.attend_rows, *image, of_samples, which, field.size, step) for image in images]
-    in_parallel([partial(of_image, top) for of_image in rows for top in tops])
-    return torch.from_numpy(out)
+    a view of the same size, the nearest look-up, float32; and the logarithm of the sum of exponentials
+    (b, h, w), inf where nothing counts. `bias`: (samples), the same for all; -inf costs nothing."""
+    planes = [_planes(x) for x in (query, key, value)]
+    out = np.empty_like(planes[2])
+    logsum = np.empty((len(out), *out.shape[2:]), np.float32)
+    _by_rows(kernels.attend_rows, zip(*planes, out, logsum), out.shape[2], field, bias)
+    return torch.from_numpy(out), torch.from_numpy(logsum)
+
+
+def backward_local(
+    inputs: Sequence[Tensor],
+    field: Local,
+    bias: Tensor | None,
+    outputs: Sequence[Tensor],
+    upstream: Tensor,
+    wanted: Sequence[bool],
+) -> tuple[Tensor, ...]:
+    """Gradients by query, key and value, `wanted` or not defined, from what `forward_local` gave."""
+    planes, wide = [_planes(x) for x in inputs], _planes(upstream)
+    sums = _planes(torch.stack([outputs[1], (upstream * outputs[0]).sum(1)], 1))
+    gradients = [np.zeros_like(x) for x in planes]
+    images = ((*one[:5], one[5:], wanted) for one in zip(*planes, wide, sums, *gradients))
+    _by_rows(kernels.differentiate_rows, images, wide.shape[2], field, bias)
+    return tuple(map(torch.from_numpy, gradients))
+
+
+def _planes(images: Tensor) -> np.ndarray:
+    return images.detach().contiguous().numpy()
+
+
+def _by_rows(
+    kernel: Callable[..., None], images: Iterable[tuple], height: int, field: Local, bias: Tensor | None
+) -> None:
+    """Run one of the loops of windows for each of some images, some rows at a time."""
+    of_samples = np.zeros(field.size**2, np.float32) if bias is None else _planes(bias)
+    window = of_samples, np.flatnonzero(of_samples != -np.inf), field.size, round(field.spacing)
+    rows = [partial(kernel, *image, *window) for image in images]
+    in_parallel([partial(of_image, top) for of_image in rows for top in range(0, height, kernels.ROWS)])
 
 
 def backward(

@@ -7,6 +7,7 @@ The gradient of the gradient is the reference's.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
@@ -14,6 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn import Parameter
 
+from arraygeom.fields import Local
 from arraygeom.tracing import followed
 from pat.attention import reference
 from pat.attention.reference import Attended, AttentionInputs, SamplePositions
@@ -47,9 +49,53 @@ def is_plain(*operands: Tensor | None) -> bool:
 
     An operator's first call imports torch's compiler, which takes a second.
     """
-    tensors = [t for t in operands if t is not None]
-    gradient = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
-    return not (gradient or followed()) and all(type(t) in (Tensor, Parameter) for t in tensors)
+    return not wants_gradient(*operands) and is_seen_by_autograd_alone(*operands)
+
+
+def wants_gradient(*operands: Tensor | None) -> bool:
+    """Whether autograd records what is done with some of the operands."""
+    return torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in operands)
+
+
+def is_seen_by_autograd_alone(*operands: Tensor | None) -> bool:
+    """Whether nothing else of torch has to see each operation, and the operands are plain tensors."""
+    return not followed() and all(type(t) in (Tensor, Parameter) for t in operands if t is not None)
+
+
+def attend_local(
+    query: Tensor,
+    key: Tensor,
+    value: Tensor,
+    field: Local,
+    bias: Tensor | None,
+    again: Callable[[Tensor, Tensor, Tensor], Tensor],
+) -> Tensor:
+    """As `cpu.forward_local`, with gradients by query, key and value, and gradients of these by `again`: the
+    same values of the three by the general operator."""
+    if not wants_gradient(query, key, value):
+        return compiled("cpu").forward_local(query, key, value, field, bias)[0]
+    return _AttendLocal.apply(query, key, value, field, bias, again)
+
+
+class _AttendLocal(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, query, key, value, field, bias, again):
+        out, logsum = compiled("cpu").forward_local(query, key, value, field, bias)
+        ctx.save_for_backward(query, key, value, bias, out, logsum)
+        ctx.field, ctx.again = field, again
+        return out
+
+    @staticmethod
+    def backward(ctx, upstream):
+        *inputs, bias, out, logsum = ctx.saved_tensors
+        wanted = ctx.needs_input_grad[:3]
+        if torch.is_grad_enabled():
+            asked = [t for t, want in zip(inputs, wanted) if want]
+            of_asked = iter(torch.autograd.grad(ctx.again(*inputs), asked, upstream, create_graph=True))
+            found = [next(of_asked) if want else None for want in wanted]
+        else:
+            found = compiled("cpu").backward_local(inputs, ctx.field, bias, (out, logsum), upstream, wanted)
+        return *(g if want else None for g, want in zip(found, wanted)), None, None, None
 
 
 def compiled(backend: str) -> ModuleType:

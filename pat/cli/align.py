@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
     from arraygeom import Rig
 
+    from ..fusion.align import Aligned
+
 
 @dataclass
 class Align(Known):
@@ -60,6 +62,7 @@ class Align(Known):
                 self._align(frame)
 
     def _frames_with_rig(self, image: tuple[str, ...]) -> Iterator[_Frame]:
+        """The frames of the rig that is given, which the first one is checked against."""
         from ..fusion.frame_matching import matched_frames
         from ..fusion.healing import checked_rig
         from ..fusion.views import ViewFiles
@@ -74,6 +77,7 @@ class Align(Known):
             yield _Frame(views.developed, rig, views, one, alpha, name=_name_of(files, alpha, one))
 
     def _frames_without(self) -> Iterator[_Frame]:
+        """The frames of the rig that is found from the first one."""
         from ..fusion.batch import find_images
         from ..fusion.frame_matching import matched_frames
         from ..fusion.from_images import camera_names
@@ -92,42 +96,17 @@ class Align(Known):
             )
 
     def _align(self, frame: _Frame) -> None:
-        from arraygeom.atomic import write_text
-
-        from ..fusion.align import align
-        from ..fusion.aligned_files import RecordedFiles, save_aligned
-        from ..fusion.aligned_page import aligned_page
-        from ..fusion.report import Facts
+        """Align a frame, and write and say what comes of it."""
+        from ..fusion.aligned_files import save_aligned
         from ..fusion.results import FOUND_RIG
-        from ..networks.weights import load_weights
         from ..support.locks import folder_lock
 
         begin = time.monotonic()
-        settings = self.settings()
         options.say_when_compiling()
         with folder_lock(self.out):
             if frame.name:
                 self.refuse_several()
-            rig, field = self.with_known(frame.rig, frame.alpha, frame.files, options.field_named(self.field))
-            with options.working_by_plan(f"aligning {frame.name}".strip()) as announce:
-                aligned = align(
-                    rig,
-                    frame.images,
-                    alpha=frame.alpha,
-                    recorded=RecordedFiles(frame.recorded, frame.files),
-                    network=None if self.weights is None else load_weights(self.weights),
-                    field=field,
-                    interpolation=self.interpolation,
-                    min_confidence=self.confidence,
-                    fill=self.fill,
-                    max_memory=settings.max_memory,
-                    match_levels=settings.match_levels,
-                    response=settings.response,
-                    correct=self.correct,
-                    noise=settings.noise,
-                    explain=lambda line: self.note(f"{frame.name}: {line}" if frame.name else line),
-                    announce=None if frame.name else announce,
-                )
+            aligned = self._aligned(frame)
             written = save_aligned(
                 aligned,
                 self.out,
@@ -140,14 +119,51 @@ class Align(Known):
                 frame.recorded.save(self.out / FOUND_RIG)
                 written.append(self.out / FOUND_RIG)
             if self.report and not frame.name:
-                texts = [str(message) for message in options.WARNED]
-                weights = () if self.weights is None else (f"weights: {self.weights}",)
-                facts = Facts((*weights, *self._notes, *frame.notes), texts, time.monotonic() - begin)
-                write_text(self.out / "index.html", aligned_page(aligned, frame.recorded, facts))
+                self._write_page(aligned, frame, time.monotonic() - begin)
                 written.append(self.out / "index.html")
         prefix = f"{frame.name}_" if frame.name else ""
         print((self.out / f"{prefix}visibility.txt").read_text(), end="")
         say(f"written to {self.out}: {', '.join(path.name for path in written)}")
+
+    def _aligned(self, frame: _Frame) -> Aligned:
+        """The frame aligned, with the plan and a bar on the terminal."""
+        from ..fusion.align import align
+        from ..fusion.aligned_files import RecordedFiles
+        from ..networks.weights import load_weights
+
+        settings = self.settings()
+        rig, field = self.with_known(frame.rig, frame.alpha, frame.files, options.field_named(self.field))
+        with options.working_by_plan(f"aligning {frame.name}".strip()) as announce:
+            return align(
+                rig,
+                frame.images,
+                alpha=frame.alpha,
+                recorded=RecordedFiles(frame.recorded, frame.files),
+                network=None if self.weights is None else load_weights(self.weights),
+                field=field,
+                interpolation=self.interpolation,
+                min_confidence=self.confidence,
+                fill=self.fill,
+                max_memory=settings.max_memory,
+                match_levels=settings.match_levels,
+                response=settings.response,
+                correct=self.correct,
+                noise=settings.noise,
+                explain=lambda line: self.note(f"{frame.name}: {line}" if frame.name else line),
+                announce=None if frame.name else announce,
+            )
+
+    def _write_page(self, aligned: Aligned, frame: _Frame, seconds: float) -> None:
+        """Write index.html."""
+        from arraygeom.atomic import write_text
+
+        from ..fusion.aligned_page import aligned_page
+        from ..fusion.report import Facts
+
+        texts = [str(message) for message in options.WARNED]
+        weights = () if self.weights is None else (f"weights: {self.weights}",)
+        facts = Facts((*weights, *self._notes, *frame.notes), texts, seconds)
+        write_text(self.out / "index.html", aligned_page(aligned, frame.recorded, facts))
 
 
 @dataclass(frozen=True)

@@ -132,6 +132,7 @@ class Fuse(Known):
             self._with_rig() if with_rig else self._without_rig()
 
     def _with_rig(self) -> None:
+        """Fuse with the rig that is given, healed by the images where these say so clearly."""
         from ..fusion.healing import checked_rig
         from ..fusion.views import ViewFiles
         from ..media.raw import developed_rig
@@ -157,6 +158,7 @@ class Fuse(Known):
             self._one(developed_rig(rig, files), views, alpha, views.files, healing=compared.result)
 
     def _without_rig(self) -> None:
+        """Fuse images, folders or videos alone. Raises ValueError for options that need a rig."""
         from ..fusion.batch import find_images
         from ..fusion.from_images import camera_names, frames_of_videos
         from ..support.locks import folder_lock
@@ -289,10 +291,9 @@ class Fuse(Known):
         """Fuse one frame. `rig` is of the files as they are developed; `image_array` is what they say of it,
         where it was found from them; `healing` gives the rig healed by them, and the frame is fused again."""
         from arraygeom import Camera
-        from arraygeom.atomic import sweep, write_text
+        from arraygeom.atomic import sweep
 
         from ..fusion.inputs import measured_along
-        from ..fusion.report import report_page
         from ..fusion.views import Views
         from ..media.raw import developed_rig
         from ..support.locks import folder_lock
@@ -331,13 +332,9 @@ class Fuse(Known):
             written = self._saved(frame, rig, alpha, files, along=along, rig=found)
             shutil.rmtree(store, ignore_errors=True)
             if self.report:
-                facts = self._facts(
-                    rig, () if image_array is None else image_array.notes, time.monotonic() - begin
-                )
-                if self.classical:
-                    facts = facts._replace(classical=self._classical(rig, images, alpha, gain))
-                write_text(self.out / "index.html", report_page(frame, images, rig, alpha, facts))
-                written.append(self.out / "index.html")
+                adopted = () if image_array is None else image_array.notes
+                facts = self._facts(rig, adopted, time.monotonic() - begin)
+                written.append(self._page(frame, rig, images, alpha, facts, gain))
         say(f"written to {self.out}: {', '.join(path.name for path in written)}")
         if self.report:
             say(f"to see the result, open {self.out / 'index.html'} in a browser")
@@ -395,6 +392,20 @@ class Fuse(Known):
         warned = [str(message) for message in options.WARNED]
         return Facts(notes, warned, seconds, peak_memory(), length_unit(rig))
 
+    def _page(
+        self, frame: Frame, rig: Rig, images: Mapping[str, Tensor], alpha: str, facts: Facts, gain: float
+    ) -> Path:
+        """Write index.html, with the classical baseline if it is asked for."""
+        from arraygeom.atomic import write_text
+
+        from ..fusion.report import report_page
+
+        if self.classical:
+            facts = facts._replace(classical=self._classical(rig, images, alpha, gain))
+        path = self.out / "index.html"
+        write_text(path, report_page(frame, images, rig, alpha, facts))
+        return path
+
     def _classical(self, rig: Rig, images: Mapping[str, Tensor], alpha: str, gain: float) -> Tensor | None:
         """The classical baseline, bright as the fused image; None, and a line, if cameras do not allow it."""
         from ..evaluation.baseline import classical_view
@@ -419,6 +430,7 @@ class Fuse(Known):
         return frame._replace(image=exposed(frame.image, gain)), gain
 
     def _many(self, rig: Rig, files: dict[str, list[Path]], alpha: str) -> None:
+        """Fuse many frames, or a sequence, by workers; exit with status 1 if some fail."""
         from ..fusion.batch import Batch
         from ..support.jobs import Workers, cores
 

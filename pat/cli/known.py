@@ -15,7 +15,9 @@ from . import options
 from .options import WEIGHTS_HELP, Depth, FieldName, Images, Memory, optional, say
 
 if TYPE_CHECKING:
-    from arraygeom import ReceptiveField, Rig
+    from torch import Tensor
+
+    from arraygeom import Pair, ReceptiveField, Rig
 
     from ..fusion.from_images import ImageArray
     from ..fusion.fuse import FuseSettings
@@ -144,6 +146,7 @@ class Known:
             raise ValueError("--depth-map, --matches: for a single frame only: give one image of each camera")
 
     def _around_depth(self, rig: Rig, alpha: str) -> ReceptiveField:
+        """The field around the depth map. Raises ValueError for depths outside the rig's range."""
         import torch
 
         from arraygeom import Camera
@@ -172,10 +175,10 @@ class Known:
     def _around_matches(
         self, rig: Rig, alpha: str, files: Mapping[str, str | Path], field: ReceptiveField | None
     ) -> Mapping[str, ReceptiveField | None]:
-        from arraygeom import LensView, depth_of
+        """Each beta's field: around its matches with alpha, if it has some. Raises as `_check_matches`."""
+        from arraygeom import LensView
         from arraygeom.fields import AroundMatches
         from arraygeom.io.point_matches import read_matches
-        from arraygeom.warned import warn
 
         assert self.matches is not None
         fields = dict.fromkeys(rig.betas(alpha), field)
@@ -187,24 +190,34 @@ class Known:
             alpha_view, beta_view = rig[a[0]], rig[a[1]]
             assert isinstance(alpha_view, LensView)
             assert isinstance(beta_view, LensView)
-            if rig.pair(a[0], a[1]).calibrated:
-                found_depth = depth_of(rig.pair(a[0], a[1]), *b)
-                behind = float((~found_depth.valid).float().mean())
-                if behind > OUT_OF_RANGE:
-                    raise ValueError(
-                        f"{self.matches}: {behind:.0%} of the matches of '{a[0]}' and '{a[1]}' are behind "
-                        "the cameras by the rig: are its columns in the order of the images?"
-                    )
-                view, other = rig.pair(a[0], a[1]).cameras
-                nearest = other.project(view.unproject(b[0], found_depth.depth)).x
-                off = float((nearest - b[1]).norm(dim=-1)[found_depth.valid].median())
-                if off > OFF_LINES:
-                    warn(
-                        f"{self.matches}: matches of '{a[0]}' and '{a[1]}' lie {off:.0f} px (median) off the "
-                        "lines that the rig allows: are they of these images, x before y? Else mend the rig: "
-                        "`pat rig doctor`"
-                    )
+            if rig.pair(*a).calibrated:
+                _check_matches(self.matches, a, rig.pair(*a), *b)
             fields[a[1]] = AroundMatches.from_points(
                 *b, alpha_view.hw, views=(alpha_view, beta_view), field=field
             )
         return fields
+
+
+def _check_matches(file: Path, names: tuple[str, str], pair: Pair, x: Tensor, x_beta: Tensor) -> None:
+    """Warn if the matches (n, 2) of two cameras are far off the lines of their calibrated pair.
+
+    Raises ValueError if most lie behind the cameras.
+    """
+    from arraygeom import depth_of
+    from arraygeom.warned import warn
+
+    of_pair, found = f"of '{names[0]}' and '{names[1]}'", depth_of(pair, x, x_beta)
+    behind = float((~found.valid).float().mean())
+    if behind > OUT_OF_RANGE:
+        raise ValueError(
+            f"{file}: {behind:.0%} of the matches {of_pair} are behind the cameras by the rig: "
+            "are its columns in the order of the images?"
+        )
+    alpha, beta = pair.cameras
+    nearest = beta.project(alpha.unproject(x, found.depth)).x
+    off = float((nearest - x_beta).norm(dim=-1)[found.valid].median())
+    if off > OFF_LINES:
+        warn(
+            f"{file}: matches {of_pair} lie {off:.0f} px (median) off the lines that the rig allows: "
+            "are they of these images, x before y? Else mend the rig: `pat rig doctor`"
+        )

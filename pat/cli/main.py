@@ -67,6 +67,7 @@ def main(arguments: list[str] | None = None, *, group: Any = Pat, prog: str = "p
 
 
 def _run(arguments: list[str], group: Any, prog: str, *, debug: bool) -> None:
+    """Run the command; whatever it raises becomes one line and an exit status."""
     try:
         with warnings.catch_warnings():
             warnings.showwarning = warn

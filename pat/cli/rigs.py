@@ -496,6 +496,7 @@ class RigDiff:
             say(f"written: {self.out}")
 
     def _on_images(self, a: Rig, b: Rig) -> str:
+        """Which rig's lines points that are matched in the images are nearer to."""
         from calib.images.matches import match_cameras
         from calib.images.residuals import line_distances, nearer
 

@@ -64,7 +64,7 @@ from ..synthesis.rig_distribution import RigDistribution
 from .baseline import classical
 from .metrics import bootstrap_interval, score
 from .rectified import rectified
-from .tables import distinct, markdown_table, write_csv
+from .tables import grouped, markdown_table, write_csv
 
 LOG = logging.getLogger(__name__)
 
@@ -339,8 +339,7 @@ def markdown(rows: Sequence[AblationRow]) -> str:
     between = [f"ratio {low:g} to {high:g}" for low, high in pairwise(RATIOS)]
     bins = [f"ratio below {RATIOS[0]:g}", *between, f"ratio from {RATIOS[-1]:g}"]
     columns = ["family", "PSNR", "SSIM", "against calibrated", *bins, "off, px", "within 1 px", ""]
-    names = distinct(row.family for row in rows)
-    lines = [[name, *_cells([row for row in rows if row.family == name], rows)] for name in names]
+    lines = [[name, *_cells(own, rows)] for name, own in grouped(rows, "family").items()]
     scenes = len({row.scene for row in rows})
     interval = ", behind it a 95% interval" if scenes > 1 else ""
     note = (
@@ -354,6 +353,7 @@ def markdown(rows: Sequence[AblationRow]) -> str:
 
 
 def _cells(rows: Sequence[AblationRow], every: Sequence[AblationRow]) -> list[str]:
+    """One family's line of the table: its own rows, and all rows for the reference."""
     served = [row for row in rows if not math.isnan(row.psnr)]
     if not served:
         return [""] * (len(RATIOS) + 6) + [rows[0].note]

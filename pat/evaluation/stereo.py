@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,7 +18,7 @@ from ..data.pairs import PAPER_DISPARITY, Disparity, StereoPair, folder_pairs, m
 from ..media.images import write_image
 from .metrics import bootstrap_interval, score
 from .protocols import MonoColourTask, StereoMethod, StereoResult, enlarged, hw_of, mono_colour_task
-from .tables import distinct, markdown_table
+from .tables import grouped, markdown_table
 
 DATA_SETS: dict[str, Callable[[Path], Iterable[StereoPair]]] = {
     "kitti": folder_pairs,
@@ -104,18 +105,16 @@ def markdown(rows: Sequence[StereoRow], *, printed: PrintedScores = {}) -> str: 
 
     `printed` figures of the paper get a column with a mean only.
     """
-    rates = distinct(row.rate for row in rows)
-    return "\n".join(_table([row for row in rows if row.rate == rate], printed.get(rate)) for rate in rates)
+    return "\n".join(_table(own, printed.get(rate)) for rate, own in grouped(rows, "rate").items())
 
 
 def _table(rows: Sequence[StereoRow], printed: tuple[float, float] | None = None) -> str:
     """The table of one rate."""
-    methods = distinct(row.method for row in rows)
+    methods = grouped(rows, "method")
     scores = {(row.pair, row.method): f"{row.psnr:.2f} / {row.ssim:.4f}" for row in rows}
     columns = [f"beta reduced {rows[0].rate}x" if rows[0].rate > 1 else "beta as it is", *methods]
-    pairs = distinct(row.pair for row in rows)
-    lines = [[pair, *(scores.get((pair, m), "") for m in methods)] for pair in pairs]
-    lines.append(["**mean**", *(_mean_cell([row for row in rows if row.method == m]) for m in methods)])
+    lines = [[pair, *(scores.get((pair, m), "") for m in methods)] for pair in grouped(rows, "pair")]
+    lines.append(["**mean**", *map(_mean_cell, methods.values())])
     if printed:
         columns.append("the paper, printed, on its own data")
         cells = [""] * (len(lines) - 1) + [f"{printed[0]:.2f} / {printed[1]:.4f}"]
@@ -135,15 +134,11 @@ def depth_markdown(rows: Sequence[StereoRow]) -> str:
     with_disparity = [row for row in rows if row.end_point_error is not None]
     if not with_disparity:
         return ""
-    methods = distinct(row.method for row in with_disparity)
-    rates = distinct(row.rate for row in with_disparity)
-    columns = [(method, rate) for method in methods for rate in rates]
-    groups = {key: [row for row in with_disparity if (row.method, row.rate) == key] for key in columns}
-    lines = [
-        [pair, *(_depth_cell([row for row in groups[key] if row.pair == pair]) for key in columns)]
-        for pair in distinct(row.pair for row in with_disparity)
-    ]
-    lines.append(["**mean**", *(_depth_cell(groups[key]) for key in columns)])
+    columns = list(product(grouped(with_disparity, "method"), grouped(with_disparity, "rate")))
+    lines = []
+    for pair, own in [*grouped(with_disparity, "pair").items(), ("**mean**", with_disparity)]:
+        groups = grouped(own, "method", "rate")
+        lines.append([pair, *(_depth_cell(groups.get(key, ())) for key in columns)])
     return markdown_table(["depth", *(f"{method}, {rate}x" for method, rate in columns)], lines)
 
 

@@ -5,17 +5,21 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterable, Sequence
+from operator import attrgetter
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from arraygeom.atomic import write_text
 
 T = TypeVar("T")
 
 
-def distinct(items: Iterable[T]) -> list[T]:
-    """Each once, in the order in which they first appear."""
-    return list(dict.fromkeys(items))
+def grouped(rows: Iterable[T], *names: str) -> dict[Any, list[T]]:
+    """Rows by what they have in these attributes (a tuple if several), in order of first appearance."""
+    groups: dict[Any, list[T]] = {}
+    for row in rows:
+        groups.setdefault(attrgetter(*names)(row), []).append(row)
+    return groups
 
 
 def markdown_table(columns: Sequence[str], rows: Iterable[Sequence[object]], *, align: str = "lr") -> str:

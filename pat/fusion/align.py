@@ -183,13 +183,7 @@ def align(
     Raises ValueError as `fuse`, for a network that uses no matches, and for recorded values that are missing,
     no numbers, or of another size than the rig says.
     """
-    if interpolation not in INTERPOLATIONS or fill not in ("none", "propagate"):
-        raise ValueError(
-            "interpolation is nearest, bilinear or cubic, and fill none or propagate; "
-            f"got {interpolation}, {fill}"
-        )
-    if not 0 <= min_confidence <= 1:
-        raise ValueError(f"the least confidence is {min_confidence:g}: give a number from 0 to 1")
+    rule = _ViewRule(interpolation, min_confidence, fill)
     limit = None if max_memory is None else parse_bytes(max_memory)
     rig = with_pixels(rig if depth is None else rig.replace(depth=depth))
     views, low_light = denoised_views(Views.of(rig, images, alpha=alpha, field=field), noise)
@@ -225,18 +219,14 @@ def align(
         fused = fused_in_tiles(network, inputs, matches, plan.tiles, progress=progress)
         warn_of_confidence(network, fused.frame, inputs)
         depths = undone(fused.frame, undo).depth
-        values, hw = _as_array(recordings[alpha], alpha, rig[alpha].hw), rig[alpha].hw
-        planes = pixel_grid(hw).numpy(), np.full(hw, SEEN, np.uint8), np.ones(hw, np.float32)
-        names, response_of = _band_names(alpha, len(values)), rig[alpha].sensor.response
-        aligned = {alpha: AlignedView(values, *planes, names, response_of)}
+        aligned = {alpha: _own_view(rig[alpha], alpha, recordings[alpha])}
         for i, name in enumerate(betas):
             LOG.info("aligning %s", name)
             place = inputs.placements[i]
             located = _located(inputs, i, matches.betas[i], rig[alpha])
             confidence = _as_recorded(fused.matched[i, 2:], place.pair.alpha, rig[alpha])
             values = _as_array(recordings[name], name, rig[name].hw)
-            how = min_confidence, interpolation, fill
-            aligned[name] = _aligned_view(rig[name], name, place, located, confidence, values, *how)
+            aligned[name] = rule.view(rig[name], name, place, located, confidence, values)
     return Aligned(alpha, aligned, depths.cpu().numpy())
 
 
@@ -305,32 +295,60 @@ def _between_pixels(disparity: Float[Tensor, "1 h w"], x: Float[Tensor, "h2 w2 2
     return torch.where((smooth - nearest).abs() < SMOOTH, smooth, nearest)
 
 
-def _aligned_view(
-    camera: LensView,
-    name: str,
-    place: Placement,
-    located: tuple[Float[Tensor, "h w 2"], Bool[Tensor, "h w"]],
-    confidence: Float[Tensor, "h w"],
-    values: NDArray[Any],
-    min_confidence: float,
-    interpolation: Resampling,
-    fill: Fill,
-) -> AlignedView:
-    now = place.pair.beta
-    assert isinstance(now, LensView)
-    where, valid = chunked(lambda x: recorded_pixels(x, now, camera), located[0].double(), axis=0)
-    where, confidence, visible = where.float().cpu(), confidence.float().cpu(), confidence >= min_confidence
-    inside, visible = (located[1] & valid).cpu() & on_image(where, camera.hw), visible.cpu()
-    visibility = torch.where(inside, torch.where(visible, SEEN, OCCLUDED), OUTSIDE).to(torch.uint8).numpy()
-    taken = filled(resampled_values(values, where.numpy(), interpolation), visibility == SEEN, fill)
-    return AlignedView(
-        taken,
-        torch.where(inside[..., None], where, torch.nan).numpy(),
-        visibility,
-        torch.where(inside, confidence, 0.0).numpy(),
-        _band_names(name, len(values)),
-        camera.sensor.response,
-    )
+def _own_view(camera: View, name: str, recorded: Any) -> AlignedView:
+    """Alpha's own values, all of them seen where they are."""
+    hw, values = camera.hw, _as_array(recorded, name, camera.hw)
+    planes = pixel_grid(hw).numpy(), np.full(hw, SEEN, np.uint8), np.ones(hw, np.float32)
+    return AlignedView(values, *planes, _band_names(name, len(values)), camera.sensor.response)
+
+
+@dataclass(frozen=True)
+class _ViewRule:
+    """How a beta's values are taken, and from which confidence on they count as seen."""
+
+    interpolation: Resampling
+    min_confidence: float
+    fill: Fill
+
+    def __post_init__(self) -> None:
+        if self.interpolation not in INTERPOLATIONS or self.fill not in ("none", "propagate"):
+            raise ValueError(
+                "interpolation is nearest, bilinear or cubic, and fill none or propagate; "
+                f"got {self.interpolation}, {self.fill}"
+            )
+        if not 0 <= self.min_confidence <= 1:
+            raise ValueError(f"the least confidence is {self.min_confidence:g}: give a number from 0 to 1")
+
+    def view(
+        self,
+        camera: LensView,
+        name: str,
+        place: Placement,
+        located: tuple[Float[Tensor, "h w 2"], Bool[Tensor, "h w"]],
+        confidence: Float[Tensor, "h w"],
+        values: NDArray[Any],
+    ) -> AlignedView:
+        """A beta's values at alpha's pixels, which are `located` in it as prepared."""
+        now = place.pair.beta
+        assert isinstance(now, LensView)
+        where, valid = chunked(lambda x: recorded_pixels(x, now, camera), located[0].double(), axis=0)
+        visible, where, confidence = (
+            confidence >= self.min_confidence,
+            where.float().cpu(),
+            confidence.float(),
+        )
+        inside = (located[1] & valid).cpu() & on_image(where, camera.hw)
+        seen = torch.where(inside, torch.where(visible.cpu(), SEEN, OCCLUDED), OUTSIDE)
+        visibility = seen.to(torch.uint8).numpy()
+        taken = resampled_values(values, where.numpy(), self.interpolation)
+        return AlignedView(
+            filled(taken, visibility == SEEN, self.fill),
+            torch.where(inside[..., None], where, torch.nan).numpy(),
+            visibility,
+            torch.where(inside, confidence.cpu(), 0.0).numpy(),
+            _band_names(name, len(values)),
+            camera.sensor.response,
+        )
 
 
 def _as_array(values: Any, name: str, hw: tuple[int, int]) -> NDArray[Any]:

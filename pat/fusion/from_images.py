@@ -300,22 +300,11 @@ def _calibrated(
     links: dict[tuple[str, str], Link] = {}
     for i, name in enumerate(betas):
         log_step(LOG, LINES + (1 - LINES) * i / len(betas), "calibrating %s and %s", alpha, name)
-        link = uncalibrated.rig.links[alpha, name]
-        views = {n: uncalibrated.rig[n] for n in (alpha, name)}
-        pair = self_calibrated(views, link, uncalibrated.matches[alpha, name], focal=focal)
+        pair = _calibrated_pair(uncalibrated, alpha, name, focal, note)
         if pair is None or not pair.exact:
-            links[alpha, name] = link
-            lines = uncalibrated.as_text().splitlines()
-            note(next(line for line in lines if line.startswith(f"{alpha} > {name}")))
+            links[alpha, name] = uncalibrated.rig.links[alpha, name]
         if pair is None:
-            note(
-                f"no depth by {name}: "
-                f"its points show no parallax, beside {alpha} it is too near, or its scene too far or flat"
-            )
             continue
-        exact = f"{pair.points} points, {pair.distance:.2f} px from their lines; refining"
-        rough = f"lines by F; depths are rough, by poses whose lines are {pair.distance:.2f} px off"
-        note(f"{alpha} > {name}: {exact if pair.exact else rough}")
         pairs[name] = pair
         if pair.exact or len(betas) > 1:
             pairs[name], depths[name] = _refined(pair, images, network, links)
@@ -340,6 +329,28 @@ def _calibrated(
         if name not in pairs:
             rig = rig.with_camera(name, uncalibrated.rig[name])
     return rig.replace(cameras={name: rig[name] for name in (alpha, *betas)}, links=links)
+
+
+def _calibrated_pair(
+    uncalibrated: UncalibratedRig, alpha: str, name: str, focal: Mapping[str, float], note: Say
+) -> RefinedPair | None:
+    """Alpha and one beta with poses by their points; None without parallax. What was found is said."""
+    views = {n: uncalibrated.rig[n] for n in (alpha, name)}
+    link, matches = uncalibrated.rig.links[alpha, name], uncalibrated.matches[alpha, name]
+    pair = self_calibrated(views, link, matches, focal=focal)
+    if pair is None or not pair.exact:
+        lines = uncalibrated.as_text().splitlines()
+        note(next(line for line in lines if line.startswith(f"{alpha} > {name}")))
+    if pair is None:
+        note(
+            f"no depth by {name}: "
+            f"its points show no parallax, beside {alpha} it is too near, or its scene too far or flat"
+        )
+        return None
+    exact = f"{pair.points} points, {pair.distance:.2f} px from their lines; refining"
+    rough = f"lines by F; depths are rough, by poses whose lines are {pair.distance:.2f} px off"
+    note(f"{alpha} > {name}: {exact if pair.exact else rough}")
+    return pair
 
 
 def _refined(

@@ -208,6 +208,7 @@ def fuse_tile(network: FusionNetwork, frame: FrameInputs, matches: Matches | Non
 def _fused(
     network: FusionNetwork, inputs: Inputs, matches: Matches | None, frame: FrameInputs, tile: Tile
 ) -> FusedTile:
+    """A tile by the network, cut to its inner part, with depth and confidence by the betas."""
     top, bottom, left, right = tile.inner
     box = (top - tile.outer[0], bottom - tile.outer[0], left - tile.outer[2], right - tile.outer[2])
     with convolutions_in_parallel():

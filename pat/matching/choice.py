@@ -4,18 +4,21 @@ Semi-global matching is wrong beside edges of depth, in what beta does not see, 
 compared; and nearly always the right disparity is that of a pixel not far off. So each pixel has candidates:
 its own, those of pixels around it at fixed distances, and the nearest consistent ones in its row and its
 column. A U-Net gives their scores by what alpha shows, what matching found, and how alike alpha is to beta at
-each. It was trained on what matching finds in pairs with true disparity (`experiments.choice`).
+each. It was trained on what matching finds in pairs with true disparity (`experiments.choice`), all with
+alpha on the left: there surfaces hide in beta what is to their left. Elsewhere planes are turned before, so
+that it is to their left, too.
 """
 
 from __future__ import annotations
 
+import math
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn.functional import pad, pixel_shuffle
 
@@ -91,24 +94,58 @@ def chosen(inputs: Inputs, matches: Matches, network: Choice | None = None) -> M
 
 
 def _chosen(inputs: Inputs, matches: BetaMatches, network: Choice) -> BetaMatches:
+    """The matches with the candidate of the highest score at each pixel, in pieces."""
     typical = typical_facts(matches)
     weight = network.unet.last.weight
     if (weight.dtype, weight.device) != (matches.facts.dtype, matches.facts.device):
         network = deepcopy(network).to(matches.facts)  # another thread may need it as it is
 
-    def of(piece: Inputs, of_piece: BetaMatches) -> tuple[Tensor, Tensor]:
-        (beta,), (h, w) = piece.betas, of_piece.disparity.shape[-2:]
-        views = matches.comparison.views(piece.alpha, beta.image)
-        with torch.no_grad(), convolutions_in_parallel():
-            planes = features(views, beta.field.straight, of_piece, candidates(of_piece), typical)
-            answer = network(planes)
-            del planes  # most of the memory; candidates are made twice for the same reason
-            scores, stated = answer.split([CANDIDATES, 2], 1)
-            best = pixel_shuffle(scores.max(1).indices.float(), FINE)[..., :h, :w].long()
-        return candidates(of_piece).gather(1, best), stated.mean(2)[..., : h // FINE, : w // FINE]
+    def of(piece: Inputs, of_piece: BetaMatches) -> tuple[Tensor, ...]:
+        (beta,), segments = piece.betas, piece.betas[0].field.straight
+        views, turns = matches.comparison.views(piece.alpha, beta.image), quarter_turns(segments)
+        first, *others = turns[segments.valid].unique().tolist() or [0]
+        made = _answered(first, views, segments, of_piece, typical, network)
+        for k in others:
+            answer, there = _answered(k, views, segments, of_piece, typical, network), (turns != k)[:, None]
+            made = made[0].where(there, answer[0]), made[1].where(there[..., ::FINE, ::FINE], answer[1])
+            del answer
+        return made
 
     disparity, stated = inputs.in_pieces(of, replace(matches, bands=None, diffused=None, certainty=None))
     return replace(matches, chosen=None if inputs.betas[0].around else disparity, stated=stated)
+
+
+def _answered(
+    k: int, views: ComparedViews, segments: Segments, matches: BetaMatches, typical: Tensor, network: Choice
+) -> tuple[Float[Tensor, "b 1 h w"], Float[Tensor, "b 2 h2 w2"]]:
+    """The disparity chosen, and what is stated of it, all turned so many quarter turns for the network."""
+
+    def turned(x: Tensor, by: int = k, sides: tuple[int, int] = (-2, -1)) -> Tensor:
+        return x.rot90(by, sides) if k else x  # turned by nothing it would be a copy
+
+    one = replace(matches, disparity=turned(matches.disparity), facts=turned(matches.facts))
+    (h, w), ends = one.hw, (segments.start, segments.end, segments.valid)
+    with torch.no_grad(), convolutions_in_parallel():
+        planes = features(
+            views._replace(alpha=turned(views.alpha)),
+            Segments(*(turned(x, sides=(1, 2)) for x in ends)),
+            one,
+            candidates(one),
+            typical,
+        )
+        answer = network(planes)
+        del planes  # most of the memory; candidates are made twice for the same reason
+        scores, stated = answer.split([CANDIDATES, 2], 1)
+        best = pixel_shuffle(scores.max(1).indices.float(), FINE)[..., :h, :w].long()
+    chosen, stated = candidates(one).gather(1, best), stated.mean(2)[..., : h // FINE, : w // FINE]
+    return turned(chosen, -k), turned(stated, -k)
+
+
+def quarter_turns(segments: Segments) -> Int[Tensor, "b h w"]:
+    """By how many quarter turns (`Tensor.rot90`), 0 to 3, a segment's near end comes to be left of its far
+    end, as in rectified views whose alpha is on the left."""
+    x, y = Extent.of(segments).towards.unbind(-1)
+    return (torch.atan2(0 - y, 0 - x) / (math.pi / 2)).round().to(torch.int8) % 4  # not -0: points are 0
 
 
 def candidates(matches: BetaMatches) -> Float[Tensor, "b n h w"]:

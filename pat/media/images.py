@@ -346,6 +346,7 @@ def _unit_range(planes: NDArray, label: str, bits: int | None, white: int) -> ND
 
 
 def _counts(planes: NDArray, label: str, bits: int | None, white: int) -> NDArray[np.float32]:
+    """Whole numbers as 0..1. Raises ValueError for values beyond the bits that are stated."""
     stored, largest = max(white.bit_length(), 8), int(planes.max())
     if bits and bits > stored:
         raise ValueError(
@@ -396,6 +397,7 @@ def _write_exr(path: Path, planes: NDArray, bits: int) -> None:
 
 
 def _encode(path: Path, colours: NDArray, bits: int) -> bytes:
+    """An image file's bytes, by the path's suffix. Raises ValueError for one that cannot hold it."""
     suffix = path.suffix.lower()
     if suffix in (".jpg", ".jpeg") and bits != 8:
         raise ValueError(f"{path}: JPEG holds 8 bits, not {bits}: write .png or .tif")

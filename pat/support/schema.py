@@ -80,6 +80,7 @@ def _default(field: dataclasses.Field[Any]) -> Any:
 
 
 def _read(kind: Any, value: Any, entry: str) -> Any:
+    """A value of a document as a type, by what kind of type it is."""
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if dataclasses.is_dataclass(kind):
         return _read_dataclass(kind, value, entry)
@@ -103,6 +104,7 @@ def _short(value: object) -> str:
 
 
 def _read_dataclass(kind: Any, value: Any, entry: str) -> Any:
+    """A mapping as a dataclass. Raises ValueError naming keys that are missing or unknown."""
     fields = {f.name: f for f in dataclasses.fields(kind) if f.init}
     for key in _mapping(value, entry or kind.__name__):
         if key not in fields:
@@ -149,6 +151,7 @@ def _read_union(arguments: tuple[Any, ...], value: Any, entry: str) -> Any:
 
 
 def _read_plain(kind: Any, value: Any, entry: str) -> Any:
+    """A number, text or path; text like 1e3 is a number, 2.0 whole. Raises ValueError naming the entry."""
     if kind is Any:
         return value
     if kind is float and isinstance(value, int | float) and not isinstance(value, bool):

@@ -82,6 +82,7 @@ class _Planes(NamedTuple):
 
 
 def _planes(rigs: RigBatch, shape: tuple[int, int], g: Generator) -> _Planes:
+    """Planes before alpha, drawn; in some scenes one is a ground, and one a wall."""
     alpha = rigs.cameras[0]
     wh = torch.tensor(alpha.hw[::-1], dtype=torch.float64)
     ray = _rays(alpha, uniform((-0.15, 1.15), (*shape, 2), g) * wh)  # up to 15 % of the image outside it

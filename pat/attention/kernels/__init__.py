@@ -19,7 +19,7 @@ from .channels import scatter
 from .emit import LANES
 from .forward import forward
 from .layout import Call, Geometry, Gradients, Outputs, Saved, Share, TapList, block_scratch
-from .local import ROWS, attend_rows
+from .local import ROWS, attend_rows, differentiate_rows
 
 __all__ = [
     "LANES",
@@ -35,6 +35,7 @@ __all__ = [
     "attend_rows",
     "backward",
     "block_scratch",
+    "differentiate_rows",
     "forward",
     "scatter",
 ]
@@ -42,5 +43,5 @@ __all__ = [
 
 SOURCES = [*Path(__file__).parent.glob("*.py")]
 
-for _entry in (forward, backward, scatter, attend_rows):
+for _entry in (forward, backward, scatter, attend_rows, differentiate_rows):
     renew_with(_entry, SOURCES)

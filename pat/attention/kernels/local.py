@@ -22,13 +22,14 @@ LOWEST = np.finfo(np.float32).min
 
 
 @compiled(nogil=True, cache=True, fastmath={"contract"})
-def attend_rows(query, key, value, out, bias, which, size, spacing, top):
+def attend_rows(query, key, value, out, logsum, bias, which, size, spacing, top):
     """`ROWS` rows of `out`, from `top` on, of one image (channels, h, w): the mean of the values at some
     (`which`) of `size` x `size` pixels, `spacing` apart, by the softmax of inner products and the samples'
-    bias. What is outside the image does not count."""
+    bias. What is outside the image does not count. And the logarithm of the sum of exponentials (h, w), inf
+    where nothing counts."""
     channels, height, width = query.shape
     scores = np.empty((len(which), -(-width // LANES) * LANES), np.float32)
-    total = np.empty(scores.shape[1], np.float32)
+    total, top_score = np.empty(scores.shape[1], np.float32), np.empty(scores.shape[1], np.float32)
     for y in range(top, min(top + ROWS, height)):
         scores[:] = -np.inf
         for i, t in enumerate(which):
@@ -39,7 +40,9 @@ def attend_rows(query, key, value, out, bias, which, size, spacing, top):
                 query_row, sampled_row = query[c, y, first:last], key[c, row, first + step : last + step]
                 for x in range(last - first):
                     score[x] += query_row[x] * sampled_row[x]
-        _exponentiate(pointers((scores, total)), scores.shape)
+        _exponentiate(pointers((scores, total, top_score)), scores.shape)
+        for x in range(width):
+            logsum[y, x] = top_score[x] + np.log(total[x]) if total[x] != 0 else np.inf
         for c in range(len(value)):
             mean = out[c, y]
             mean[:] = 0
@@ -66,8 +69,8 @@ def _sampled(t, y, size, spacing, height, width):
 
 @compiled
 def _exponentiate(rows, shape):
-    """From scores (samples, pixels) to exp(score - the pixel's largest), in place, and their sums."""
-    scores, total = rows
+    """From scores (samples, pixels) to exp(score - the pixel's largest), in place; their sums, and these."""
+    scores, total, top_score = rows
     for x in range(0, shape[1], LANES):
         top, mass = splat(LOWEST), splat(np.float32(0))
         for t in range(shape[0]):
@@ -77,3 +80,61 @@ def _exponentiate(rows, shape):
             store(of(scores, t), x, weight)
             mass = add(mass, weight)
         store(total, x, mass)
+        store(top_score, x, top)
+
+
+@compiled(nogil=True, cache=True, fastmath={"contract"})
+def differentiate_rows(query, key, value, upstream, sums, gradients, wanted, bias, which, size, spacing, top):
+    """`ROWS` rows of the gradients by query, key and value, from `top` on, as far as `wanted`.
+
+    `sums` (2, h, w) are the logarithm of the sum of exponentials, and the inner product of `upstream`, the
+    gradient by the output, with the output. A pixel is looked at from as many as it looks at: with the roles
+    of the two exchanged, what belongs to keys and values is gathered, too.
+    """
+    (channels, height, width), (by_query, by_key, by_value) = query.shape, gradients
+    weight, slope = np.zeros((2, -(-width // LANES) * LANES), np.float32)
+    for y in range(top, min(top + ROWS, height)):
+        for t in which:
+            row, first, last, step = _sampled(t, y, size, spacing, height, width)
+            if wanted[0] and last > first:
+                here, there = (y, first, last), (row, first + step, last + step)
+                _weigh(query, key, value, upstream, sums, bias[t], here, there, weight, slope)
+                for c in range(channels):
+                    _accumulate(by_query[c, y, first:last], slope, key[c, row, first + step : last + step])
+            row, first, last, step = _sampled(size * size - 1 - t, y, size, spacing, height, width)
+            if (wanted[1] or wanted[2]) and last > first:
+                here, there = (row, first + step, last + step), (y, first, last)
+                _weigh(query, key, value, upstream, sums, bias[t], here, there, weight, slope)
+                for c in range(channels if wanted[1] else 0):
+                    _accumulate(by_key[c, y, first:last], slope, query[c, row, first + step : last + step])
+                for c in range(len(value) if wanted[2] else 0):
+                    _accumulate(
+                        by_value[c, y, first:last], weight, upstream[c, row, first + step : last + step]
+                    )
+
+
+@compiled
+def _weigh(query, key, value, upstream, sums, bias, here, there, weight, slope):
+    """Weights of the pixels `there` (row, first, last) for those `here`, and the gradients by scores."""
+    (y, first, last), (row, start, stop) = here, there
+    count = last - first
+    logsum, mean_slope = sums[0, y, first:last], sums[1, y, first:last]
+    for x in range(count):
+        weight[x] = bias - logsum[x]
+        slope[x] = -mean_slope[x]
+    for c in range(len(query)):
+        _accumulate(weight[:count], query[c, y, first:last], key[c, row, start:stop])
+    for c in range(len(value)):
+        _accumulate(slope[:count], upstream[c, y, first:last], value[c, row, start:stop])
+    (at,) = pointers((weight,))
+    for x in range(0, count, LANES):
+        store(at, x, exponentials(load(at, x)))
+    for x in range(count):
+        slope[x] *= weight[x]
+
+
+@compiled
+def _accumulate(total, factor, row):
+    """Add products of two rows."""
+    for x in range(len(total)):
+        total[x] += factor[x] * row[x]

@@ -66,15 +66,56 @@ def test_threads_change_no_bit():
     try:
         for n in (1, 2, 5):
             torch.set_num_threads(n)
-            found.append(attend(*given, Local(7, 3), interpolation="nearest", backend="local"))
+            values = attend(*given, Local(7, 3), interpolation="nearest", backend="local")
+            found.append((values, *windows_gradients(given, Local(7, 3), "local")))
     finally:
         torch.set_num_threads(before)
-    assert all(torch.equal(one, found[0]) for one in found)
+    assert all(torch.equal(one, first) for outputs in found for one, first in zip(outputs, found[0]))
 
 
-def with_gradient():
+def windows_gradients(given, field, backend, *, order=1, **options):
+    """Gradients by query, key and value of a function of the values; or of these gradients' squares."""
+    query, key, value = (t.clone().requires_grad_() for t in given)
+    out = attend(query, 2 * key, value, field, interpolation="nearest", backend=backend, **options)
+    found = out.sin().sum()
+    for _ in range(order):
+        gradients = torch.autograd.grad(found, (query, key, value), create_graph=order == 2)
+        found = sum(g.square().sum() for g in gradients)
+    return gradients
+
+
+@pytest.mark.parametrize("backend", ["local", "auto"])
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("field", [Local(7), Local(7, 3), Local(7, 12), Local(1)], ids=str)
+def test_its_gradients_are_the_references(field, order, backend):
+    given = features((2 * ROWS + 3, 33))
+    found = windows_gradients(given, field, backend, order=order)
+    wanted = windows_gradients([t.double() for t in given], field, "reference", order=order)
+    for one, other in zip(found, wanted):
+        torch.testing.assert_close(
+            one.double(), other, rtol=1e-4, atol=5e-5 * (1 + other.abs().amax().item())
+        )
+
+
+@pytest.mark.parametrize("left", [0, 1, 12])
+def test_its_gradients_leave_out_what_a_bias_does(left):
+    given, bias = features(), torch.full((25,), -torch.inf)
+    bias[torch.randperm(25, generator=torch.Generator().manual_seed(1))[:left]] = 0.5
+    found, wanted = (
+        windows_gradients(given, Local(5), backend, bias=bias) for backend in ("local", "reference")
+    )
+    torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-5)
+
+
+def test_it_finds_the_gradients_that_are_wanted_only():
     query, key, value = features()
-    return query, key.requires_grad_(), value
+    for wanted in (query, key, value):
+        wanted.requires_grad_()
+        out = attend(query, key, value, Local(3), interpolation="nearest", backend="local")
+        out.sum().backward()
+        assert [t.grad is not None for t in (query, key, value)] == [t is wanted for t in (query, key, value)]
+        wanted.requires_grad_(False)
+        wanted.grad = None
 
 
 UNSERVED = {
@@ -85,7 +126,7 @@ UNSERVED = {
     "half a pixel": (features(), Local(3, 1.5), {}),
     "float64": (features(dtype=torch.float64), Local(3), {}),
     "16 bits": (features(dtype=torch.bfloat16), Local(3), {}),
-    "gradient": (with_gradient(), Local(3), {}),
+    "a gradient by the bias": (features(), Local(3), {"bias": torch.rand(9, requires_grad=True)}),
     "two sizes": ((features()[0], *features((10, 15))[1:]), Local(3), {}),
     "any function": (features(), lazily(Local(3), Pair(View(hw=(20, 30)), View(hw=(20, 30)))), {}),
 }
@@ -121,7 +162,7 @@ def test_statistics_are_by_the_others():
 
 def test_it_is_chosen_where_it_serves(monkeypatch):
     given, called = features(), []
-    monkeypatch.setattr(cpu, "forward_local", lambda *inputs: called.append(inputs) or inputs[2])
+    monkeypatch.setattr(cpu, "forward_local", lambda *inputs: called.append(inputs) or inputs[2:])
     attend(*given, Local(3), interpolation="nearest")
     attend(*given, Local(3), interpolation="nearest", backend="cpu")
     assert len(called) == 1

@@ -9,6 +9,7 @@ from skimage.data import stereo_motorcycle
 from torch.nn.functional import grid_sample
 
 from arraygeom import Rectified, Segments, pixel_grid
+from arraygeom.fields.default import default_field
 from arraygeom.fields.grid import FieldOnGrid
 from pat.data.sample_array import load_motorcycle
 from pat.evaluation.protocols import rectified_rig
@@ -16,7 +17,7 @@ from pat.fusion.fuse import fuse
 from pat.matching import choice
 from pat.matching import inputs as parts
 from pat.matching.certainty import typical_facts
-from pat.matching.choice import AROUND, CANDIDATES, Choice, candidates, chosen, features
+from pat.matching.choice import AROUND, CANDIDATES, Choice, candidates, chosen, features, quarter_turns
 from pat.matching.inputs import Inputs
 from pat.matching.match import located_in_one, match
 from pat.matching.matches import BetaMatches, Matches
@@ -140,6 +141,36 @@ def test_pieces_choose_as_the_whole(motorcycle, monkeypatch):
     assert float((apart > 1).float().mean()) < 0.02
     seen, also = (found.stated[:, 0].sigmoid() for found in (pieces, whole))
     assert float((seen - also).abs().mean()) < 0.01
+
+
+def turned(inputs, k):
+    """The motorcycle's inputs, as recorded by cameras that both are turned."""
+    rig, (beta,) = load_motorcycle().rig, inputs.betas
+    for name, image in (("mono", inputs.alpha), ("colour", beta.image)):
+        hw = image.shape[-2:]
+        rig = rig.with_camera(name, rig[name].resize((500, 740)).replace(hw=hw)).rot90(name, k)
+    alpha, other = (image.rot90(k, (-2, -1)) for image in (inputs.alpha, beta.image))
+    pair = rig.pair("mono", "colour")
+    field = FieldOnGrid.of(default_field(pair), pair, hw=alpha.shape[-2:], blocks=True)
+    return replace(inputs, alpha=alpha, betas=(replace(beta, image=other, field=field),))
+
+
+def test_quarter_turns_bring_near_ends_to_the_left():
+    towards = torch.tensor([[-1, 0], [0, -1], [1, 0], [0, 1], [-0.8, 0.6], [0, 0]])[None, None]
+    segments = Segments(towards, torch.zeros_like(towards), torch.ones(1, 1, 6, dtype=torch.bool))
+    assert quarter_turns(segments).tolist() == [[[0, 1, 2, 3, 0, 0]]]
+
+
+@pytest.mark.parametrize("k", [1, 2, 3])
+def test_beta_may_be_on_any_side(motorcycle, k):
+    """It was trained with beta on the right: of turned views all is chosen and stated as of upright ones."""
+    inputs, (found,) = motorcycle[0], motorcycle[1].betas
+    (upright,) = chosen(turned(inputs, 0), Matches((found,))).betas
+    planes = {n: getattr(found, n).rot90(k, (-2, -1)) for n in ("disparity", "facts")}
+    (sideways,) = chosen(turned(inputs, k), Matches((replace(found, **planes),))).betas
+    apart = (sideways.chosen.rot90(-k, (-2, -1)) - upright.chosen).abs()
+    assert float((apart > 0.01).float().mean()) < 0.001
+    torch.testing.assert_close(sideways.stated.rot90(-k, (-2, -1)), upright.stated, atol=0.02, rtol=0)
 
 
 def test_what_is_known_of_a_pixel_stays_its_own(motorcycle):
