@@ -411,7 +411,7 @@ def _read(name: str, path: Path, note: Say) -> Float[Tensor, "c h w"]:
 
 def _textured(label: str, image: Float[Tensor, "c h w"]) -> Float[Tensor, "_ h w"]:
     """The image, one band of it where all are equal. Raises ValueError for an image of one colour."""
-    if float(image.flatten(1).std(-1).amax()) < EVEN:
+    if float(image.flatten(1).std(-1, correction=0).amax()) < EVEN:
         raise ValueError(f"{label}: is of one colour, with nothing to match: give another image")
     return image[:1] if len(image) == 3 and not is_in_colour(image) else image
 
