@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import struct
 import zlib
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BytesIO
@@ -38,11 +37,8 @@ def decodable(content: bytes) -> bytes | None:
     """
     if content.startswith(PNG):
         chunks = png_chunks(content)
-        if (
-            not chunks
-            or chunks[-1][0] != b"IEND"
-            or not all(_is_undamaged(content, chunk) for chunk in chunks)
-        ):
+        ends = [kind for kind, _, _ in chunks[-1:]] == [b"IEND"]
+        if not (ends and all(_is_undamaged(content, chunk) for chunk in chunks)):
             return None
         return PNG + b"".join(content[start:end] for kind, start, end in chunks if kind not in ANIMATION)
     if content[:4] in TIFF and not _is_whole(content):
@@ -51,7 +47,7 @@ def decodable(content: bytes) -> bytes | None:
 
 
 def png_chunks(content: bytes) -> list[tuple[bytes, int, int]]:
-    """Kind, start and end of each chunk of a PNG file, whose last may be cut; not of what follows the file."""
+    """Kind, start and end of each chunk of a PNG file, whose last may be cut; nothing of what follows it."""
     chunks: list[tuple[bytes, int, int]] = []
     start = len(PNG)
     while start + 8 <= len(content) and not (chunks and chunks[-1][0] == b"IEND"):
