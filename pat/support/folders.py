@@ -24,7 +24,7 @@ def files_below(folder: str | Path, within: frozenset[str] = frozenset()) -> lis
 
 
 def error_text(error: Exception) -> str:
-    """What an error says, in one line: the file and the cause, without the number that the system has for it."""
+    """What an error says, in one line: the file and the cause, without the system's number for it."""
     text = f"{error}"
     if isinstance(error, OSError) and error.filename:
         text = f"{error.filename}: {error.strerror}"
