@@ -221,7 +221,7 @@ def test_a_full_disk_leaves_whole_files_only(material, tmp_path, monkeypatch):
 
     monkeypatch.setattr(arraygeom.atomic, "flush", full)
     job = batch(material, tmp_path / "out")
-    with pytest.raises(JobError, match="No space left"):
+    with pytest.raises(JobError, match=r"fused\.png: No space left"):
         job.run()
     images = [p for p in (tmp_path / "out").iterdir() if p.name.endswith("fused.png")]
     assert len(images) == 2
