@@ -29,13 +29,17 @@ DAMAGED = (OSError, SyntaxError, ValueError, struct.error, LookupError, TypeErro
 
 
 def decodable(content: bytes) -> bytes | None:
-    """The bytes to give to OpenCV: a PNG without its animation, a TIFF if it is whole, a PNM of text with a
-    line break at its end, others as they are.
+    """The bytes to give to OpenCV: a PNG without its animation, if it is whole as a TIFF has to be, a PNM of
+    text with a line break at its end, others as they are.
 
-    None for a TIFF that lacks some of its pixels.
+    None for a PNG that is cut or fails its own checks, which OpenCV leaves to a library that writes to the
+    terminal, and for a TIFF that lacks some of its pixels.
     """
     if content.startswith(PNG):
         chunks = png_chunks(content)
+        ends = [kind for kind, _, _ in chunks[-1:]] == [b"IEND"]
+        if not (ends and all(_is_undamaged(content, chunk) for chunk in chunks)):
+            return None
         return PNG + b"".join(content[start:end] for kind, start, end in chunks if kind not in ANIMATION)
     if content[:4] in TIFF and not _is_whole(content):
         return None
@@ -43,13 +47,21 @@ def decodable(content: bytes) -> bytes | None:
 
 
 def png_chunks(content: bytes) -> list[tuple[bytes, int, int]]:
-    """Kind, start and end of each chunk of a PNG file, whose last may be cut."""
-    chunks, start = [], len(PNG)
-    while start + 8 <= len(content):
+    """Kind, start and end of each chunk of a PNG file, whose last may be cut; nothing of what follows it."""
+    chunks: list[tuple[bytes, int, int]] = []
+    start = len(PNG)
+    while start + 8 <= len(content) and not (chunks and chunks[-1][0] == b"IEND"):
         length, kind = struct.unpack_from(">I4s", content, start)
         chunks.append((kind, start, start + 12 + length))
         start += 12 + length
     return chunks
+
+
+def _is_undamaged(content: bytes, chunk: tuple[bytes, int, int]) -> bool:
+    """Whether a chunk that is needed, by its kind's first letter, is all there and has its own checksum."""
+    kind, start, end = chunk
+    found = zlib.crc32(memoryview(content)[start + 4 : end - 4])
+    return kind[:1].islower() or content[end - 4 : end] == found.to_bytes(4, "big")
 
 
 def first_tiff_page(content: bytes) -> Any:

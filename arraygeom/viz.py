@@ -319,9 +319,9 @@ def show_image(axes: Axes, hw: HW, image: Any = None) -> None:
         pixels = np.asarray(image.detach().cpu() if isinstance(image, Tensor) else image)
         pixels = pixels.transpose(1, 2, 0) if pixels.ndim == 3 and pixels.shape[0] in (1, 3) else pixels
         white = 1.0 if np.issubdtype(pixels.dtype, np.floating) else np.iinfo(pixels.dtype).max
-        axes.imshow(
-            np.squeeze(pixels), cmap="gray", vmin=0, vmax=white, interpolation="antialiased", aspect="equal"
-        )
+        grey = pixels.ndim == 3 and pixels.shape[-1] == 1
+        options: dict[str, Any] = {"cmap": "gray", "interpolation": "antialiased", "aspect": "equal"}
+        axes.imshow(pixels[..., 0] if grey else pixels, vmin=0, vmax=white, **options)
     axes.set(xlim=(-0.5, w - 0.5), ylim=(h - 0.5, -0.5), aspect="equal", xticks=[], yticks=[])
     axes.set_facecolor("0.94")
 

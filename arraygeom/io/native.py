@@ -107,8 +107,10 @@ def write(rig: Rig) -> str:
 
 def _rig(document: Entry) -> Rig:
     _check_keys(document, TOP)
-    if not str(document.get("format", FORMAT).value).startswith("arraygeom-rig"):
-        raise document["format"].fail(f"is {short(document['format'].value)}, wanted '{FORMAT}'")
+    if document.get("format", FORMAT).value != FORMAT:
+        raise document["format"].fail(
+            f"is {short(document['format'].value)}, wanted '{FORMAT}'; of a later version? Update arraygeom"
+        )
     metres = UNITS[_one_of(document.get("units", "metres"), UNITS)]
     origin = float(_one_of(document.get("first_pixel_centre", 0), (0, 0.5, 1)))
     if not document.get("cameras").value:

@@ -72,7 +72,7 @@ def find_misfit(rig: Rig, images: Images) -> Misfit | None:
     reduced = "" if scales[LARGEST_SIDE] == 1 else f", in images reduced to {LARGEST_SIDE} px"
     text = (
         "the rig fits these images badly: "
-        f"{points} matched points lie {off:.1f} px from their lines (median{reduced})"
+        f"{points} matched points lie {off:.3g} px from their lines (median{reduced})"
     )
     if outside > OUTSIDE:
         text += f", {outside:.0%} of them behind the cameras or outside the depth range"

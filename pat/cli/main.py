@@ -16,6 +16,7 @@ from typing import Annotated, Any, ClassVar, NoReturn, Union
 
 import tyro
 
+from ..support.folders import error_text
 from . import align, calibration, demo, fuse, research, rigs
 from .options import WARNED, refuse_missing, respelled, say, warn
 
@@ -82,7 +83,7 @@ def _run(arguments: list[str], group: Any, prog: str, *, debug: bool) -> None:
     except BrokenPipeError:
         raise
     except OSError as error:
-        _fail(error, f"{error.filename}: {error.strerror}" if error.filename else f"{error}", debug)
+        _fail(error, error_text(error), debug)
     except (ValueError, FloatingPointError) as error:
         _fail(error, f"{error}", debug)
     except ImportError as error:

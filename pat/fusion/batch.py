@@ -348,10 +348,10 @@ def find_images(text: str | Path, *, name: str = "") -> list[Path]:
         )
     if path.is_dir():
         files = _images_in(path)
-    elif any(c in path.name for c in "*?["):
-        files = [p for p in path.parent.glob(path.name) if p.is_file()]
+    elif path.exists():
+        files = [path]
     else:
-        files = [path] if path.exists() else []
+        files = [p for p in path.parent.glob(path.name) if p.is_file()]
     files = sorted((p for p in files if p == path or not p.name.startswith(".")), key=_natural)
     if not files:
         below = [str(p) for p in sorted(path.iterdir()) if _images_in(p)] if path.is_dir() else []

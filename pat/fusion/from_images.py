@@ -121,20 +121,21 @@ def array_from_images(
         lengths = _focal_lengths(images, files, focal, note)
         network = load_weights(weights or _weights_of(images, alpha))
         rig, names = found_rig(images, alpha, lengths, network, note)
-        for name in names:
-            sensor = Sensor({1: "mono", 3: "rgb"}.get(len(images[name])))
-            rig = rig.with_camera(name, rig[name].replace(sensor=sensor))
+        sensors = {name: Sensor({1: "mono", 3: "rgb"}.get(len(images[name]))) for name in names}
+        recorded = rig = _with_sensors(rig, sensors)
     else:
         rig, names = _translated_rig(tagged, images, alpha, note)
+        recorded = _with_sensors(rig, {name: tagged[name].sensor for name in names})
     images = {name: images[name] for name in names}
     weights = weights or _weights_of(images, alpha)
     several = len(names) > 2 and all(len(images[name]) == 1 for name in names[1:])
     if several:
         note("radiometry: each band is brought to alpha's mean and contrast, as for a grey world")
-    recorded = rig
-    if tagged is not None:
-        recorded = rig.replace(cameras={n: rig[n].replace(sensor=tagged[n].sensor) for n in rig.names})
     return ImageArray(rig, recorded, images, alpha, weights, several, tuple(notes))
+
+
+def _with_sensors(rig: Rig, sensors: Mapping[str, Sensor]) -> Rig:
+    return rig.replace(cameras={name: rig[name].replace(sensor=sensor) for name, sensor in sensors.items()})
 
 
 def _by_camera(sources: ImageSources) -> Mapping[str, str | Path | Tensor]:
@@ -410,7 +411,7 @@ def _read(name: str, path: Path, note: Say) -> Float[Tensor, "c h w"]:
 
 def _textured(label: str, image: Float[Tensor, "c h w"]) -> Float[Tensor, "_ h w"]:
     """The image, one band of it where all are equal. Raises ValueError for an image of one colour."""
-    if float(image.flatten(1).std(-1).amax()) < EVEN:
+    if float(image.flatten(1).std(-1, correction=0).amax()) < EVEN:
         raise ValueError(f"{label}: is of one colour, with nothing to match: give another image")
     return image[:1] if len(image) == 3 and not is_in_colour(image) else image
 

@@ -165,14 +165,8 @@ def fuse(
     noise = "auto" if automatic else noise
     network, rig, images, alpha, grey_world = _with_rig(network, rig, images, alpha, explain)
     align = not differentiable if settings.align is None else settings.align
-    if differentiable and not (settings.max_memory is None and store is None):
-        raise ValueError("differentiable=True fuses the whole frame at once: leave out max_memory and store")
-    if differentiable and noise:
-        raise ValueError("differentiable=True has no gradients through denoising: leave out noise")
-    if transformations():
-        raise NotImplementedError(
-            "fuse has no gradients by torch.func: ask for them by differentiable=True and torch.autograd"
-        )
+    in_parts = settings.max_memory is not None or store is not None
+    _check_gradients(differentiable, in_parts=in_parts, noisy=bool(noise))
     check_luminance(network, luminance, noisy=noise is not None)
     limit = None if settings.max_memory is None else parse_bytes(settings.max_memory)
     views, low_light = _seen(network, rig, images, alpha, settings, noise)
@@ -225,6 +219,18 @@ def fuse(
         if in_colour and len(frame.image) == 3 and frame.by_band is None and not noisy:
             frame = with_own_colours(frame, images[alpha])
         return frame if differentiable else frame.mapped(Tensor.detach)
+
+
+def _check_gradients(differentiable: bool, *, in_parts: bool, noisy: bool) -> None:
+    """Raise for what has no gradients: ValueError if they are asked for, and within `torch.func`."""
+    if differentiable and in_parts:
+        raise ValueError("differentiable=True fuses the whole frame at once: leave out max_memory and store")
+    if differentiable and noisy:
+        raise ValueError("differentiable=True has no gradients through denoising: leave out noise")
+    if transformations():
+        raise NotImplementedError(
+            "fuse has no gradients by torch.func: ask for them by differentiable=True and torch.autograd"
+        )
 
 
 def _with_rig(

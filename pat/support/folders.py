@@ -1,4 +1,4 @@
-"""Files of a folder and of those within it."""
+"""Files of a folder and of those within it, and what the system says of a file."""
 
 from __future__ import annotations
 
@@ -21,3 +21,11 @@ def files_below(folder: str | Path, within: frozenset[str] = frozenset()) -> lis
         return []
     below = [file for path in entries if path.is_dir() for file in files_below(path, within | {real})]
     return sorted([path for path in entries if path.is_file()] + below)
+
+
+def error_text(error: Exception) -> str:
+    """What an error says, in one line: the file and the cause, without the system's number for it."""
+    text = f"{error}"
+    if isinstance(error, OSError) and error.filename:
+        text = f"{error.filename}: {error.strerror}"
+    return " ".join(text.split())

@@ -36,6 +36,7 @@ from rich.progress import (
 from arraygeom.extras import needs
 from arraygeom.warned import warn
 
+from .folders import error_text
 from .steps import about, steps_shown
 
 if TYPE_CHECKING:
@@ -374,7 +375,7 @@ def attempt(task: Task, threads: int) -> TaskOutcome:
         except JobError:
             raise
         except (ValueError, OSError) as failure:
-            error = " ".join(str(failure).split())
+            error = error_text(failure)
         except Warning as failure:
             error, raised = f"{failure}", [failure]
     caught_warnings = [entry.message for entry in caught if isinstance(entry.message, Warning)]

@@ -1,6 +1,7 @@
 """Rigs that the tests look at."""
 
 import math
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
@@ -21,6 +22,11 @@ from arraygeom import (
 HW_ALPHA, HW_BETA = (48, 64), (40, 60)
 PAIRS_HW = (800, 1280)
 BARREL = Distortion("brown-conrady", torch.tensor([-0.1, 0.02, 1e-3, -5e-4], dtype=torch.float64))
+
+
+def number(*values: float) -> Tensor:
+    """One float64 number, or a vector of several."""
+    return torch.tensor(values if len(values) > 1 else values[0], dtype=torch.float64)
 
 
 def uniform(g: torch.Generator, low: float, high: float, *shape: int) -> Tensor:
@@ -73,6 +79,19 @@ def scene_points(rig: Rig, n: int = 200, *, seed: int = 0) -> Tensor:
     x = torch.stack([uniform(g, 0, w - 1, n), uniform(g, 0, h - 1, n)], -1)
     inverse = torch.lerp(1 / far, 1 / near, torch.rand(n, generator=g, dtype=torch.float64))
     return alpha.unproject(x, 1 / inverse)
+
+
+def parallel_rig(
+    focal: float,
+    hw: tuple[int, int],
+    places: Mapping[str, tuple[float, ...]],
+    depth: tuple[float, float] | None = None,
+    **fields: object,
+) -> Rig:
+    """Equal cameras with parallel axes at places in metres: x, or x and y, or all three."""
+    centres = {name: torch.tensor([*place, 0, 0, 0][:3]).double() for name, place in places.items()}
+    one = Camera(K=intrinsics(focal, hw), cam_from_world=Pose.identity(), hw=hw, **fields)
+    return Rig({n: one.replace(cam_from_world=Pose(one.R, 0 - c)) for n, c in centres.items()}, depth=depth)
 
 
 def two_cameras(

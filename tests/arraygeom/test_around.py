@@ -6,29 +6,25 @@ import pytest
 import torch
 
 from arraygeom import (
-    Camera,
     Distortion,
     Link,
     Pair,
-    Pose,
     Rectified,
     Rig,
     View,
-    intrinsics,
     pinhole_view,
     pixel_grid,
     stack,
 )
 from arraygeom.fields import AroundDepth, AroundMatches, Epipolar
+from tests.arraygeom.rigs import parallel_rig
 
 HW = (60, 90)
 LENS = Distortion("brown-conrady", torch.tensor([-0.15, 0.02, 1e-3, 0.0], dtype=torch.float64))
 
 
 def rig_of(lens: Distortion | None = None) -> Rig:
-    alpha = Camera(K=intrinsics(80.0, HW), cam_from_world=Pose.identity(), hw=HW, distortion=lens)
-    beside = alpha.replace(cam_from_world=Pose(alpha.R, alpha.t.new_tensor([-0.2, 0.01, 0.0])))
-    return Rig({"a": alpha, "b": beside}, depth=(1.0, 50.0))
+    return parallel_rig(80.0, HW, {"a": (), "b": (0.2, -0.01)}, (1.0, 50.0), distortion=lens)
 
 
 def straightened(rig: Rig, turns: int = 0) -> Rig:

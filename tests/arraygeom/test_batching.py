@@ -27,7 +27,7 @@ from arraygeom.batching import tensors_of
 from arraygeom.checks import check_hw
 from arraygeom.rectification import rectify
 from arraygeom.text import UNSCALED
-from tests.arraygeom.rigs import random_rig, scene_points
+from tests.arraygeom.rigs import parallel_rig, random_rig, scene_points
 
 F64 = torch.float64
 
@@ -251,9 +251,8 @@ def test_a_pair_says_what_relates_it():
 
 def test_a_pair_of_unknown_scale_says_so():
     """Its lengths were said to be metres."""
-    camera = Camera(K=intrinsics(999.0, (497, 741)), cam_from_world=Pose.identity(), hw=(497, 741))
-    beta = camera.replace(cam_from_world=Pose(camera.R, torch.tensor([-1.0, 0, 0], dtype=F64)))
-    pair = Rig({"a": camera, "b": beta}, depth=(2, 5), name=UNSCALED).pair("a", "b")
+    rig = parallel_rig(999.0, (497, 741), {"a": (), "b": (1.0,)}, (2, 5))
+    pair = rig.replace(name=UNSCALED).pair("a", "b")
     assert repr(pair).endswith("; baseline 1; 2-5 baselines")
     assert repr(rectify(pair).pair).endswith("; baseline 1; 2-5 baselines")
 

@@ -25,7 +25,6 @@ from arraygeom import (
     depth_of,
     epipolar_lines,
     epipoles,
-    intrinsics,
     pixel_grid,
     rectify,
     sampling_locations,
@@ -33,7 +32,7 @@ from arraygeom import (
 )
 from arraygeom.distortion import COEFFICIENT_COUNTS
 from arraygeom.fields.straight import covering_displacement
-from tests.arraygeom.rigs import BARREL, random_rig, with_lenses
+from tests.arraygeom.rigs import BARREL, parallel_rig, random_rig, with_lenses
 from tests.arraygeom.test_camera_models import MODELS
 from tests.arraygeom.test_precision import FIELDS, WHOLE
 
@@ -200,9 +199,7 @@ def test_a_displacement_follows_its_pair():
 def test_cameras_of_108_megapixels(dtype):
     """Segments to 0.02 px in float32, of which a pixel of 12,000 is known to 1e-3."""
     hw = (9000, 12_000)
-    alpha = Camera(K=intrinsics(12_000.0, hw), cam_from_world=Pose.identity(), hw=hw)
-    shift = torch.tensor([-0.1, 0.003, 0.002], dtype=F64)
-    rig = Rig({"alpha": alpha, "beta": alpha.replace(cam_from_world=Pose(alpha.R, shift))}, depth=(2.0, 50.0))
+    rig = parallel_rig(12_000.0, hw, {"alpha": (), "beta": (0.1, -0.003, -0.002)}, (2.0, 50.0))
     x = pixel_grid((90, 120), dtype=F64) * 100
     exact = Epipolar()(rig.pair("alpha", "beta"), x)
     found = Epipolar()(rig.to(dtype).pair("alpha", "beta"), x.to(dtype))

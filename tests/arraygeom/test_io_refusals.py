@@ -298,6 +298,11 @@ def test_what_is_wrong_with_a_camera_of_our_own_format_is_named(camera, message,
     assert re.search(message, refusal(tmp_path / "rig.yaml"))
 
 
+def test_a_later_version_of_our_own_format_is_refused(tmp_path):
+    (tmp_path / "rig.yaml").write_text("format: arraygeom-rig 2\ncameras:\n  a: {size: [6, 4]}\n")
+    assert re.search("format: is 'arraygeom-rig 2', wanted .* later version", refusal(tmp_path / "rig.yaml"))
+
+
 CUT = {
     "aniposelib": (FIXTURES / "aniposelib.toml", r"(?s)(\[cam_1\]\n).*", r"\1", "cam_1: has no matrix"),
     "kitti": (FIXTURES / "kitti_calib.txt", "(?m)^P", "Q", "P0: is missing; is this a KITTI"),

@@ -16,7 +16,7 @@ from arraygeom import (
     triangulate,
 )
 from arraygeom.fields.ray_depth import ray_depth
-from tests.arraygeom.rigs import random_camera, uniform
+from tests.arraygeom.rigs import parallel_rig, random_camera, uniform
 from tests.oracles import Oracle
 
 cv2 = Oracle("cv2")
@@ -152,9 +152,7 @@ def test_depth_and_its_deviation_along_a_field(model):
 
 def wide_pair(dtype: torch.dtype = torch.float64) -> list[Camera]:
     """Two of 12 megapixels, 10 cm apart: 400 / depth pixels of disparity."""
-    a = Camera(K=intrinsics(4000.0, (3000, 4000)), cam_from_world=Pose.identity(), hw=(3000, 4000))
-    b = a.replace(cam_from_world=Pose(torch.eye(3, dtype=torch.float64), torch.tensor([-0.1, 0, 0]).double()))
-    return [a.to(dtype), b.to(dtype)]
+    return list(parallel_rig(4000.0, (3000, 4000), {"a": (), "b": (0.1,)}).to(dtype).cameras.values())
 
 
 def noisy_matches(disparity: torch.Tensor, noise: float) -> tuple[torch.Tensor, torch.Tensor]:

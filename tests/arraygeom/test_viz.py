@@ -67,6 +67,12 @@ def test_fields_are_drawn_at_their_sampling_locations():
     np.testing.assert_allclose(np.concatenate(drawn), segments.start[segments.valid].numpy())
 
 
+def test_images_of_a_single_row_are_drawn():
+    figure = viz.new_figure()
+    viz.show_image(figure.subplots(), (1, 40), torch.rand(1, 1, 40))
+    assert len(png(figure)) > 1000
+
+
 def test_any_field_can_be_drawn():
     def here(pair, x):
         return Segments(x, x + 3, torch.ones_like(x[..., 0], dtype=torch.bool))

@@ -16,13 +16,14 @@ import numpy as np
 import tyro
 from tyro.conf import Positional
 
-from arraygeom import Camera, Pose, Rig, intrinsics
+from arraygeom import Rig
 from pat import fuse, load_weights
 from pat.data.windows import read_view, reduced, scene_folders, scene_rig
 from pat.evaluation.metrics import score
 from pat.evaluation.tables import markdown_header, markdown_row
 from pat.media.colour import luminance, srgb_image
 from pat.networks.protocol import FusionNetwork
+from tests.arraygeom.rigs import parallel_rig
 from tests.benchmarks.printed import print_tables
 
 CENTRES = {"left": (-0.09, 0.0), "right": (0.09, 0.0), "up": (0.0, -0.07), "down": (0.0, 0.07)}
@@ -32,12 +33,7 @@ SETS = (("left",), ("right",), ("left", "right"), ("up", "down"), tuple(CENTRES)
 
 def array() -> Rig:
     """The rig that is rendered."""
-    alpha = Camera(K=intrinsics(430.0, (288, 416)), cam_from_world=Pose.identity(), hw=(288, 416))
-    betas = {
-        n: alpha.replace(cam_from_world=Pose(alpha.R, alpha.t.new_tensor([-x, -y, 0])))
-        for n, (x, y) in CENTRES.items()
-    }
-    return Rig({"alpha": alpha, **betas}, depth=(1.0, 8.0))
+    return parallel_rig(430.0, (288, 416), {"alpha": (), **CENTRES}, (1.0, 8.0))
 
 
 def scores(network: FusionNetwork, folder: Path) -> list[float]:

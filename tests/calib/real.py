@@ -11,9 +11,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from arraygeom import Camera, Pose, Rig, intrinsics
+from arraygeom import Camera, Pose, Rig
 from arraygeom.io import read_rig
 from pat.media.images import read_image
+from tests.arraygeom.rigs import parallel_rig
 
 SYNTIM = (
     *("Color", "Serfaty", "Poly", "BatInria", "BatSynt", "Billet", "Cube", "Jallut", "LaMire", "Money"),
@@ -76,9 +77,7 @@ def middlebury(data: Path) -> Iterator[RealPair]:
     for name, factor in MIDDLEBURY.items():
         files = {side: data / "middlebury" / name / f"view{i}.png" for side, i in (("left", 1), ("right", 5))}
         hw = tuple(read_image(files["left"]).shape[1:])
-        K = intrinsics(3740.0 / factor, hw)
-        poses = [Pose(torch.eye(3).double(), torch.tensor([x, 0.0, 0.0]).double()) for x in (0.0, -0.16)]
-        rig = Rig({side: Camera(K=K, cam_from_world=pose, hw=hw) for side, pose in zip(files, poses)})
+        rig = parallel_rig(3740.0 / factor, hw, {"left": (), "right": (0.16,)})
         yield named(f"Middlebury {name}", rig, files)
 
 

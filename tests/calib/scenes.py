@@ -8,6 +8,7 @@ from arraygeom import Camera, Distortion, Pose, Rig, intrinsics, rotation_from_v
 from calib.images.least_squares import Solution
 from calib.images.matches import PointMatches
 from calib.images.refinement import RefinementProblem
+from tests.arraygeom.rigs import parallel_rig
 
 HW = (240, 320)
 
@@ -45,9 +46,7 @@ def unlike_pair(*, lens: bool = False) -> Rig:
 
 def rectified_pair() -> Rig:
     """Two equal cameras side by side."""
-    left = Camera(K=intrinsics(300.0, HW), cam_from_world=Pose.identity(), hw=HW)
-    right = left.replace(cam_from_world=Pose(torch.eye(3).double(), vector(-0.2, 0, 0)))
-    return Rig({"left": left, "right": right}, depth=(1.5, 8.0))
+    return parallel_rig(300.0, HW, {"left": (), "right": (0.2,)}, (1.5, 8.0))
 
 
 def uninformed(fit: RefinementProblem) -> Solution:

@@ -26,6 +26,7 @@ from pat.media.colour import luminance, srgb_from_linear
 from pat.media.images import read_image
 from pat.sensors import BoxBlur, Clip, GaussianBlur, Noise, Quantise, Resample, record
 from pat.synthesis.check import CheckLimits
+from tests.arraygeom.rigs import parallel_rig
 
 
 def generator() -> torch.Generator:
@@ -183,15 +184,10 @@ def test_typos_are_named_with_their_entry(text, words):
 @pytest.fixture(scope="module")
 def rendered(tmp_path_factory):
     """Two layered scenes of two cameras."""
-    root, K = tmp_path_factory.mktemp("rendered"), intrinsics(70.0, (48, 64))
-    beside = Pose(torch.eye(3).double(), torch.tensor([-0.1, 0.0, 0.0]).double())
-    cameras = {
-        "mono": Camera(K=K, cam_from_world=Pose.identity(), hw=(48, 64), sensor=Sensor("mono")),
-        "colour": Camera(K=K, cam_from_world=beside, hw=(48, 64)),
-    }
-    renderer = LayeredSettings(layers=(4, 7), oversampling=1).renderer(
-        Rig(cameras, depth=(2.0, 12.0)), CheckLimits()
-    )
+    root = tmp_path_factory.mktemp("rendered")
+    rig = parallel_rig(70.0, (48, 64), {"mono": (), "colour": (0.1,)}, (2.0, 12.0))
+    rig = rig.with_camera("mono", rig["mono"].replace(sensor=Sensor("mono")))
+    renderer = LayeredSettings(layers=(4, 7), oversampling=1).renderer(rig, CheckLimits())
     for seed in range(2):
         renderer(seed, root / "scenes" / f"{seed:06d}")
     return root

@@ -10,13 +10,14 @@ import tifffile
 import torch
 from torch.nn.functional import interpolate
 
-from arraygeom import Camera, Pose, Rig, intrinsics
+from arraygeom import Rig
 from pat.cli.fuse import Fuse
 from pat.cli.known import Known
 from pat.cli.main import main
 from pat.fusion.align import OCCLUDED
 from pat.fusion.align import align as aligned
 from pat.media.images import read_image, write_image
+from tests.arraygeom.rigs import parallel_rig
 
 H, W = 96, 160
 WALL, POST, BASELINE = 4.0, 2.0, 0.25
@@ -29,9 +30,8 @@ ON_POST = slice(70, 90)
 def folder(tmp_path_factory):
     """Rig, images and what is known of them; beta's image has nothing to do with alpha's in `blind.png`."""
     folder = tmp_path_factory.mktemp("known")
-    camera = Camera(K=intrinsics(float(W), (H, W)), cam_from_world=Pose.identity(), hw=(H, W))
-    beside = camera.replace(cam_from_world=Pose(camera.R, camera.t.new_tensor([-BASELINE, 0.0, 0.0])))
-    Rig({"mono": camera, "colour": beside}, depth=(1.0, 50.0)).save(folder / "rig.yaml")
+    rig = parallel_rig(float(W), (H, W), {"mono": (), "colour": (BASELINE,)}, (1.0, 50.0))
+    rig.save(folder / "rig.yaml")
     noise = torch.rand(2, 3, H // 2, W // 2 + 10, generator=torch.Generator().manual_seed(0))
     wall, post = interpolate(noise, size=(H, W + 20), mode="bicubic", align_corners=False).clamp(0, 1)
     mono, colour, depth = wall[..., :W].clone(), wall[..., FAR : FAR + W].clone(), torch.full((H, W), WALL)

@@ -35,6 +35,7 @@ from pat.matching.matches import Matches
 from pat.media.images import read_image, read_recorded
 from pat.networks.configs import PATConfig
 from pat.networks.paper import PAT
+from tests.arraygeom.rigs import parallel_rig
 
 HW = (96, 160)
 DEPTH = 4.4
@@ -59,10 +60,8 @@ def recorded_by(camera: Camera) -> torch.Tensor:
 
 
 def array(lens: Distortion | None = None, turns: int = 0) -> tuple[Rig, dict[str, torch.Tensor]]:
-    alpha = Camera(K=intrinsics(150.0, HW), cam_from_world=Pose.identity(), hw=HW, distortion=lens)
-    t = torch.tensor([-0.15, 0.0, 0.0], dtype=torch.float64)
-    beta = alpha.replace(cam_from_world=Pose(alpha.R, t), sensor=Sensor(response=Band(840.0, 40.0)))
-    rig = Rig({"mono": alpha, "nir": beta}, depth=(2.0, 20.0))
+    rig = parallel_rig(150.0, HW, {"mono": (), "nir": (0.15,)}, (2.0, 20.0), distortion=lens)
+    rig = rig.with_camera("nir", rig["nir"].replace(sensor=Sensor(response=Band(840.0, 40.0))))
     images = {name: recorded_by(rig[name]) for name in rig.names}
     if turns:
         rig, images["nir"] = rig.rot90("nir", turns), images["nir"].rot90(turns, (-2, -1))

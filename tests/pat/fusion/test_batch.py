@@ -91,6 +91,13 @@ def test_files_of_the_system_are_no_frames_and_two_of_one_are_refused(tmp_path):
     assert len(find_images(tmp_path / "*.png")) == 2
 
 
+def test_a_file_whose_name_looks_like_a_pattern_is_that_file(tmp_path):
+    for name in ("b[o]x.png", "st*r.png", "star.png"):
+        (tmp_path / name).touch()
+    for name in ("b[o]x.png", "st*r.png"):
+        assert find_images(tmp_path / name) == [tmp_path / name]
+
+
 def test_folders_are_no_frames_and_those_that_hold_images_are_named(tmp_path):
     for name in ("day/thumbnails/1.png", "day/2.png/x", "day/3.png"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
@@ -214,7 +221,7 @@ def test_a_full_disk_leaves_whole_files_only(material, tmp_path, monkeypatch):
 
     monkeypatch.setattr(arraygeom.atomic, "flush", full)
     job = batch(material, tmp_path / "out")
-    with pytest.raises(JobError, match="No space left"):
+    with pytest.raises(JobError, match=r"fused\.png: No space left"):
         job.run()
     images = [p for p in (tmp_path / "out").iterdir() if p.name.endswith("fused.png")]
     assert len(images) == 2

@@ -8,7 +8,7 @@ import torch
 
 import pat.fusion.tiles
 import pat.fusion.views
-from arraygeom import Camera, Distortion, Epipolar, Pose, Rig, Sensor, intrinsics
+from arraygeom import Distortion, Epipolar, Sensor
 from arraygeom.chunks import tiles_of
 from pat.fusion.frames import ImageFiles
 from pat.fusion.fuse import fuse
@@ -19,6 +19,7 @@ from pat.media.images import write_image
 from pat.networks.bandwise import BandwisePAT
 from pat.networks.configs import BandwisePATConfig, GuidedPATConfig
 from pat.networks.guided import GuidedPAT
+from tests.arraygeom.rigs import parallel_rig
 
 HW = (64, 96)
 SMALL = {"widths": (8, 8, 8, 8)}
@@ -29,12 +30,8 @@ def rig_of(names, *, lens=False, places=None, **sensor):
     distortion = (
         Distortion("brown-conrady", torch.tensor([-0.05, 0, 0, 0], dtype=torch.float64)) if lens else None
     )
-    alpha = Camera(K=intrinsics(100.0, HW), cam_from_world=Pose.identity(), hw=HW, distortion=distortion)
-    steps = places or range(len(names))
-    moved = {n: Pose(alpha.R, alpha.t.new_tensor([-0.1 * i, 0, 0])) for n, i in zip(names, steps)}
-    return Rig(
-        {n: alpha.replace(cam_from_world=p, sensor=Sensor(**sensor)) for n, p in moved.items()}, depth=(1, 8)
-    )
+    centres = {n: (0.1 * i,) for n, i in zip(names, places or range(len(names)))}
+    return parallel_rig(100.0, HW, centres, (1, 8), distortion=distortion, sensor=Sensor(**sensor))
 
 
 def smooth(channels, seed):

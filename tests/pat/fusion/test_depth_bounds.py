@@ -16,16 +16,13 @@ from pat.matching.inputs import Beta, Inputs
 from pat.networks.configs import PATConfig
 from pat.networks.paper import PAT
 from pat.networks.protocol import FusionOutput
+from tests.arraygeom.rigs import parallel_rig
 
 NEAR, FAR, HW = 1.4, 20.0, (12, 40)
 
 
 def pair():
-    K = intrinsics((300.0, 300.0), HW)
-    cameras = {"a": Camera(K=K, hw=HW, cam_from_world=Pose.identity())}
-    t = torch.tensor([-0.1, 0.02, 0.01], dtype=torch.float64)
-    cameras["b"] = Camera(K=K, hw=HW, cam_from_world=Pose(torch.eye(3, dtype=torch.float64), t))
-    return Rig(cameras, depth=(NEAR, FAR)).pair("a", "b")
+    return parallel_rig(300.0, HW, {"a": (), "b": (0.1, -0.02, -0.01)}, (NEAR, FAR)).pair("a", "b")
 
 
 @pytest.mark.parametrize("share", [-0.5, -1e-3, 0.0, 0.3, 1.0, 1.001, 1.2])

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from arraygeom import Camera, Local, Pose, Rig, intrinsics, pixel_grid
+from arraygeom import Local, pixel_grid
 from arraygeom.fields.grid import FieldOnGrid
 from pat.fusion.fuse import fuse
 from pat.fusion.inputs import frame_inputs
@@ -20,6 +20,7 @@ from pat.matching.positions import enlarged
 from pat.media.colour import luminance
 from pat.networks.protocol import FusionOutput, fused_at_once
 from pat.networks.weights import load_weights
+from tests.arraygeom.rigs import parallel_rig
 
 H, W = 64, 96
 DEPTH, BASELINE = 4.0, 0.25
@@ -33,14 +34,12 @@ def network():
 @pytest.fixture(scope="module")
 def flat():
     """A wall at 4 m: every disparity is 6 pixels."""
-    camera = Camera(K=intrinsics(float(W), (H, W)), cam_from_world=Pose.identity(), hw=(H, W))
-    beside = camera.replace(cam_from_world=Pose(camera.R, camera.t.new_tensor([-BASELINE, 0.0, 0.0])))
     noise = torch.rand(1, 3, H // 2, (W + 16) // 2, generator=torch.Generator().manual_seed(0))
     wall = torch.nn.functional.interpolate(noise, size=(H, W + 16), mode="bicubic", align_corners=False)[
         0
     ].clamp(0, 1)
     images = {"mono": luminance(wall[..., :W]), "colour": wall[..., 6 : 6 + W]}
-    return Rig({"mono": camera, "colour": beside}, depth=(2.0, 50.0)), images
+    return parallel_rig(float(W), (H, W), {"mono": (), "colour": (BASELINE,)}, (2.0, 50.0)), images
 
 
 @pytest.fixture(scope="module")

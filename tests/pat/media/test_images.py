@@ -149,12 +149,17 @@ def test_a_file_that_is_no_image_is_refused(tmp_path, content, capfd):
     assert not capfd.readouterr().err
 
 
-def test_half_a_image_is_refused(tmp_path):
+@pytest.mark.parametrize("damage", ["cut", "without end", "one byte"])
+def test_a_damaged_image_is_refused(damage, tmp_path, capfd):
+    """The library that OpenCV reads PNG by wrote a line of its own, or read other pixels."""
     write_image(tmp_path / "a.png", torch.rand(3, 64, 64))
-    content = (tmp_path / "a.png").read_bytes()
-    (tmp_path / "a.png").write_bytes(content[: len(content) // 2])
-    with pytest.raises(ValueError, match=r"a.png: "):
+    whole = (tmp_path / "a.png").read_bytes()
+    head, middle, tail = whole[:5000], whole[5000], whole[5001:]
+    damaged = {"cut": head, "without end": whole[:-12], "one byte": head + bytes([middle ^ 1]) + tail}
+    (tmp_path / "a.png").write_bytes(damaged[damage])
+    with pytest.raises(ValueError, match=r"a.png: not an image that can be read"):
         read_image(tmp_path / "a.png")
+    assert capfd.readouterr().err == ""
 
 
 def planar_tiff(**options) -> bytes:

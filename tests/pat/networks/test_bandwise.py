@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from arraygeom import Camera, Pair, Pose, Rectified, Rig, View, intrinsics
+from arraygeom import Pair, Rectified, Rig, View
 from arraygeom.fields.grid import FieldOnGrid
 from pat.fusion.fuse import fuse
 from pat.fusion.steps import co_located
@@ -12,6 +12,7 @@ from pat.networks.bandwise import BandwisePAT
 from pat.networks.configs import BandwisePATConfig
 from pat.networks.protocol import fused_at_once
 from pat.networks.weights import load_weights, save_weights
+from tests.arraygeom.rigs import parallel_rig
 from tests.pat.matching.test_spectral_mix import texture
 
 HW = (32, 48)
@@ -60,12 +61,8 @@ def test_permuting_the_bands_of_a_beta_permutes_the_output_bands(network, count)
 
 def rig_of(names, places):
     """Alpha, and betas 10 cm times their place to the right of it."""
-    alpha = Camera(K=intrinsics(100.0, (64, 96)), cam_from_world=Pose.identity(), hw=(64, 96))
-    betas = {
-        name: alpha.replace(cam_from_world=Pose(alpha.R, alpha.t.new_tensor([-0.1 * place, 0.0, 0.0])))
-        for name, place in zip(names, places)
-    }
-    return Rig({"alpha": alpha, **betas}, depth=(1.0, 8.0))
+    betas = {name: (0.1 * place,) for name, place in zip(names, places)}
+    return parallel_rig(100.0, (64, 96), {"alpha": (), **betas}, (1.0, 8.0))
 
 
 def test_co_located_cameras_are_one_with_several_bands(network):

@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from arraygeom import Camera, Pose, Rig, intrinsics
 from arraygeom.chunks import Tile
 from pat.fusion.inputs import frame_inputs
 from pat.fusion.tiles import fuse_tile, working_memory
@@ -18,6 +17,7 @@ from pat.matching.multiview import agreed
 from pat.matching.normalisation import Comparison
 from pat.networks.weights import load_weights
 from pat.support.memory import give_back, limited, peak_memory, resident
+from tests.arraygeom.rigs import parallel_rig
 
 RESETS_PEAK = Path("/proc/self/clear_refs").exists()
 REPEATS = 2
@@ -26,14 +26,9 @@ SIDE, TILE = 768, (192, 576, 192, 576)
 
 def frame_of(side, betas):
     """A frame of noise, its betas beside alpha by as many centimetres."""
-    camera = Camera(K=intrinsics(float(side), (side, side)), cam_from_world=Pose.identity(), hw=(side, side))
-    names = [f"colour{i}" for i in range(1, betas + 1)]
-    apart = {
-        n: camera.replace(cam_from_world=Pose(camera.R, camera.t.new_tensor([-i / 100, 0, 0])))
-        for i, n in enumerate(names, 1)
-    }
-    images = {"mono": torch.rand(1, side, side), **{name: torch.rand(3, side, side) for name in names}}
-    rig = Rig({"mono": camera, **apart}, depth=(0.03, 20.0))
+    places = {"mono": (), **{f"colour{i}": (i / 100,) for i in range(1, betas + 1)}}
+    rig = parallel_rig(float(side), (side, side), places, (0.03, 20.0))
+    images = {name: torch.rand(1 if name == "mono" else 3, side, side) for name in rig.names}
     network = load_weights("mono-colour")
     return network, frame_inputs(network, Views.of(rig, images, alpha="mono"))
 
