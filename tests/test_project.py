@@ -64,10 +64,14 @@ def sources(*packages: str) -> list[Path]:
 
 
 @functools.cache
-def imports(path: Path) -> set[str]:
-    """The outermost names of all modules that a file imports from other packages."""
+def imports(path: Path, *, at_once: bool = False) -> set[str]:
+    """The outermost names of all modules that a file imports from other packages.
+
+    `at_once`: by being imported, so not those in functions, nor for type checkers.
+    """
     names: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    tree = ast.parse(path.read_text())
+    for node in tree.body if at_once else ast.walk(tree):
         if isinstance(node, ast.Import):
             names |= {alias.name.partition(".")[0] for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
@@ -170,17 +174,6 @@ def test_one_module_uses_grid_sample():
     assert [module_name(p) for p in sources(*PACKAGES) if "grid_sample" in names(p)] == ["arraygeom.sampling"]
 
 
-def imported_at_once(path: Path) -> set[str]:
-    """The outermost names of what importing a file imports: not in functions, nor for type checkers."""
-    found: set[str] = set()
-    for node in ast.parse(path.read_text()).body:
-        if isinstance(node, ast.Import):
-            found |= {alias.name.partition(".")[0] for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
-            found.add(node.module.partition(".")[0])
-    return found
-
-
 GEOMETRY_NEEDS = {"torch", "kornia", "numpy", "yaml", "jaxtyping", *sys.stdlib_module_names}
 GEOMETRY_MAY_USE = {
     "atomic.py": {"filelock"},
@@ -196,7 +189,7 @@ GEOMETRY_MAY_USE = {
 
 @each(sources("arraygeom"))
 def test_arraygeom_needs_few_packages(path):
-    assert imported_at_once(path) <= GEOMETRY_NEEDS - {"kornia"}, (
+    assert imports(path, at_once=True) <= GEOMETRY_NEEDS - {"kornia"}, (
         "kornia takes 0.4 s to import: import it where used"
     )
     assert imports(path) <= GEOMETRY_NEEDS | GEOMETRY_MAY_USE.get(path.name, set())

@@ -24,6 +24,11 @@ PAIRS_HW = (800, 1280)
 BARREL = Distortion("brown-conrady", torch.tensor([-0.1, 0.02, 1e-3, -5e-4], dtype=torch.float64))
 
 
+def number(*values: float) -> Tensor:
+    """One float64 number, or a vector of several."""
+    return torch.tensor(values if len(values) > 1 else values[0], dtype=torch.float64)
+
+
 def uniform(g: torch.Generator, low: float, high: float, *shape: int) -> Tensor:
     return low + (high - low) * torch.rand(shape, generator=g, dtype=torch.float64)
 

@@ -32,12 +32,9 @@ from arraygeom.lenses import (
     Splined,
     beside_points,
 )
+from tests.arraygeom.rigs import number
 
 HW = (96, 128)
-
-
-def number(*values: float) -> torch.Tensor:
-    return torch.tensor(values if len(values) > 1 else values[0], dtype=torch.float64)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

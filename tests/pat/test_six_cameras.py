@@ -33,6 +33,7 @@ from pat.cli.main import main
 from pat.evaluation.ablation import AblationCase, FieldFamily, ablate, families
 from pat.evaluation.metrics import score
 from pat.explore.page import opened
+from tests.arraygeom.rigs import number
 from tests.pat.any_camera import hit, recorded
 from tests.pat.own_cameras import (
     WIDE,
@@ -46,10 +47,6 @@ from tests.pat.own_cameras import (
 
 HW = (120, 160)
 K2, K3, STEP, DISTANCE, INDEX = 0.02, -0.03, (0.03, 0.01, 0.02), 0.05, 1.333
-
-
-def number(*values: float) -> torch.Tensor:
-    return torch.tensor(values if len(values) > 1 else values[0], dtype=torch.float64)
 
 
 SIX = {

@@ -10,13 +10,10 @@ from arraygeom import Camera, Pose, Rig, intrinsics, pixel_grid, rotation_from_v
 from arraygeom.lenses import Equirectangular, FlatPort, Orthographic, PolynomialFisheye, RollingShutter
 from pat import fuse, load_weights
 from pat.evaluation.metrics import score
+from tests.arraygeom.rigs import number
 from tests.pat.any_camera import hit, recorded
 
 HW = (160, 208)
-
-
-def number(*values: float) -> torch.Tensor:
-    return torch.tensor(values if len(values) > 1 else values[0], dtype=torch.float64)
 
 
 PORT = {"distance": 0.05, "thickness": 0.01, "glass": 1.52, "water": 1.333}
