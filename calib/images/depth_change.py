@@ -126,7 +126,7 @@ def log_depths(
         return None
     parts = zip(pairs.items(), observable.split([len(matches.alpha) for matches in pairs.values()]))
     kept = {names: matches.only(observed) for (names, matches), observed in parts if bool(observed.any())}
-    return lambda z: [match_depths(after(z), kept).depth.clamp(min=1e-6).log()]
+    return lambda z: [match_depths(after(z), kept).depth.clamp(min=torch.finfo(torch.float64).tiny).log()]
 
 
 class DepthModes(NamedTuple):

@@ -289,6 +289,6 @@ def _rotation_to_plausible_depth(rig: Rig, pairs: Pairs) -> float:
         if (pair := rig.pair(*names)).calibrated and pair.link is None:
             baseline = float(pair.beta_from_alpha.t.norm())
             parallax = (baseline / match_depths(rig, {names: matches}).depth).nan_to_num()
-            low, high = baseline / (2 * far), baseline / max(near / 2, 1e-12)
+            low, high = baseline / (2 * far), 2 * baseline / near if near else math.inf
             rotations.append((low - parallax).clamp(min=0) + (parallax - high).clamp(min=0))
     return float(torch.cat(rotations).median()) / SIGMA["rotation"] if rotations else 0.0

@@ -150,7 +150,7 @@ def _free_parameter(rig: Rig, name: str, like: Tensor, sigma: Mapping[str, float
         size = natural * (sigma[kind] if isinstance(view, Camera) else LENS_SIGMA)
     if kind == "translation":
         centres = torch.stack([c.centre for c in rig.cameras.values() if isinstance(c, Camera)])
-        size = size * (max(float(torch.pdist(centres).max()), 1e-6) if len(centres) > 1 else 1.0)
+        size = size * (float(torch.pdist(centres).max()) or 1e-6 if len(centres) > 1 else 1.0)
     unit, factor = UNITS.get(kind, ("", 1.0))
     if kind == "translation" and (rig_unit := length_unit(rig)) != "m":
         unit, factor = rig_unit, 1.0

@@ -180,7 +180,9 @@ class Fuse(Known):
         if videos and (others := [path for path in cameras.values() if path not in videos]):
             raise ValueError(f"{videos[0]} is a video and {others[0]} is not: give images alone, or videos")
         if not videos:
-            return self._without_rig_from({name: find_images(path) for name, path in cameras.items()}, {})
+            files = {name: find_images(path) for name, path in cameras.items()}
+            refuse_same(files)
+            return self._without_rig_from(files, {})
         with TemporaryDirectory() as folder:
             self._without_rig_from(*frames_of_videos(cameras, Path(folder)))
 
@@ -543,12 +545,17 @@ def files_by_camera(
     if unknown := [path for path in paths[1:] if path.stem not in rig.names]:
         raise ValueError(f"{unknown[0]}: no camera of the rig has its name: give --image NAME={unknown[0]}")
     files_of = {rig.require(name): find_images(path, name=name) for name, path in files.items()}
-    for (a, (first, *_)), (b, (second, *_)) in combinations(files_of.items(), 2):
+    refuse_same(files_of)
+    return rig.require(alpha), files_of
+
+
+def refuse_same(files: Mapping[str, Sequence[Path]]) -> None:
+    """Raise ValueError if the first files of two cameras hold the same."""
+    for (a, (first, *_)), (b, (second, *_)) in combinations(files.items(), 2):
         if first.is_file() and second.is_file() and filecmp.cmp(first, second, shallow=False):
             raise ValueError(
                 f"the images of '{a}' and '{b}' are the same image, {second}: give each camera its own"
             )
-    return rig.require(alpha), files_of
 
 
 def is_rig_file(path: Path) -> bool:

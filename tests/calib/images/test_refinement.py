@@ -205,6 +205,14 @@ def test_a_rig_of_unknown_scale_is_not_refined_in_millimetres():
     assert max(map(abs, change.amount)) < 0.1
 
 
+def test_units_of_length_do_not_matter():
+    """Depths and baselines were compared with a millionth of a metre."""
+    rig, bad = small_drift()
+    points = simulated_matches(rig, "narrow", np.random.default_rng(6))
+    found = [refine_matches(bad.scaled(factor), [points]) for factor in (1.0, 1e-8, 1e8)]
+    assert len({str(refined.depth) for refined in found}) == 1
+
+
 def test_a_tight_prior_holds():
     rig = unlike_pair()
     found = refine_matches(

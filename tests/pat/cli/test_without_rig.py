@@ -175,12 +175,19 @@ def test_what_cannot_be_fused_is_one_line_and_leaves_nothing(folder, tmp_path, r
     write_video(tmp_path / "clip.mp4", [torch.rand(3, 32, 32)])
     (tmp_path / "x.heic").write_bytes(b"\0\0\0\x18ftypheic\0\0\0\0mif1heic")
     shutil.copy(mono, tmp_path / "copy.png")
+    for name in ("again.png", "again_copy.png"):
+        shutil.copy(colour, tmp_path / name)
     out = ["-o", tmp_path / "out"]
     cases = {
         ("other.png",): "points seen in both 'mono' and 'other' agree",
         ("flat.png",): "flat.png: is of one colour",
         ("ramp.png",): "hardly any texture",
         ("copy.png",): "are the same image",
+        (
+            "again.png",
+            "other.png",
+            "again_copy.png",
+        ): "the images of 'again' and 'again_copy' are the same image",
         ("clip.mp4",): "clip.mp4 is a video and",
         ("x.heic",): "x.heic: ",
         ("none.png",): "none.png: no such image",
