@@ -2,13 +2,15 @@
 
 What one beta cannot see another can. Each beta is matched alone; of the inverse depths that they propose for
 a pixel, the one that most others support is taken, and where no match is consistent it is diffused. From it
-follow where the pixel is in every beta, and, by a depth buffer, which betas see it.
+follow where the pixel is in every beta, and, by a depth buffer, which betas see it. For the depth of what
+alpha sees, but not for where its colours are from, what was chosen for each beta is proposed, and supports as
+far as it is certain.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import NamedTuple
@@ -88,12 +90,14 @@ NO_AMBIGUITY = Ambiguity(1.0, (0.0, 0.0, 0.0))
 
 @dataclass(frozen=True)
 class MatchedBeta:
-    """One beta at alpha's pixels, (h, w): segments, tracks, matches and their facts."""
+    """One beta at alpha's pixels, (h, w): segments, tracks, matches, their facts, and by how much they
+    support an inverse depth (0: they propose none)."""
 
     segments: Segments
     track: Track
     disparity: Float[Tensor, "h w"]
     facts: Float[Tensor, "3 h w"]
+    weight: Float[Tensor, "h w"]
     hw: tuple[int, int]
 
     @classmethod
@@ -101,17 +105,22 @@ class MatchedBeta:
         cls, beta: Beta, matches: BetaMatches, rows: tuple[int, int], ambiguity: Ambiguity = NO_AMBIGUITY
     ) -> MatchedBeta:
         """Of a beta with a track and its own matches, at some rows of alpha: from an even to an even one."""
-        top, bottom = rows
-        pixels, disparity = beta.field.straight, matches.disparity[0, 0, top:bottom]
+        (top, bottom), pixels = rows, beta.field.straight
+        half = slice(top // FINE, bottom // FINE)
         start, end = (x[0, top:bottom].double() for x in (pixels.start, pixels.end))
         assert beta.track is not None
-        x = pixel_grid((bottom - top, disparity.shape[1]), dtype=torch.float64, device=end.device)
+        x = pixel_grid(end.shape[:2], dtype=torch.float64, device=end.device)
         x = x + end.new_tensor([0.0, top])
         size = (beta.image.shape[-2], beta.image.shape[-1])
-        facts = enlarged(matches.facts[0, :, top // FINE : bottom // FINE])
+        facts = enlarged(matches.facts[0, :, half])
+        weight, disparity = (facts[0] < CONSISTENT) * (0.1 + facts[1]), matches.disparity
+        if matches.chosen is not None:
+            assert matches.certainty is not None
+            weight, disparity = enlarged(matches.certainty[0, :1, half])[0], matches.chosen
         segments = Segments(start, end, pixels.valid[0, top:bottom])
         track = beta.track(x) if ambiguity == NO_AMBIGUITY else ambiguity.of(beta.track(x), x)
-        return cls(segments, track, disparity.to(end), facts.to(end), size)
+        disparity = disparity[0, 0, top:bottom].to(end)
+        return cls(segments, track, disparity, facts.to(end), weight.to(end), size)
 
     @cached_property
     def extent(self) -> Extent:
@@ -126,10 +135,10 @@ class MatchedBeta:
 
     @property
     def inverse_depth(self) -> tuple[Float[Tensor, "h w"], Bool[Tensor, "h w"]]:
-        """Of the matches, and where these are consistent and have one."""
+        """Of the matches, and where these propose one."""
         x = self.segments.end + self.disparity[..., None] * self.extent.towards
         depth = depth_from_track(self.track, x)
-        valid = depth.valid & self.segments.valid & (self.facts[0] < CONSISTENT)
+        valid = depth.valid & self.segments.valid & (self.weight > 0)
         return torch.where(valid, 1 / torch.where(valid, depth.depth, 1.0), 0.0), valid
 
     def _seen(self, inverse_depth: Float[Tensor, "h w"]) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
@@ -191,7 +200,7 @@ class Agreement(NamedTuple):
     def of(cls, views: Sequence[MatchedBeta], like: Tensor) -> Agreement:
         """The inverse depth that is supported best, in the type of another tensor."""
         proposals = [view.inverse_depth for view in views]
-        weights = torch.stack([valid * (0.1 + view.facts[1]) for view, (_, valid) in zip(views, proposals)])
+        weights = torch.stack([valid * view.weight for view, (_, valid) in zip(views, proposals)])
         near = [[(v.disparity_of(w) - v.disparity).abs() < NEAR for v in views] for w, _ in proposals]
         support = torch.stack([weights * torch.stack(one) for one in near])  # proposal, beta, h, w
         total = torch.where(torch.stack([valid for _, valid in proposals]), support.sum(1), -1.0)
@@ -208,23 +217,32 @@ class Agreement(NamedTuple):
 
 
 def agreed(inputs: Inputs, matches: Matches) -> Matches:
-    """The matches of each beta, with `disparity` and `facts` from the inverse depths on which all agree.
-
-    Those are better than what was chosen for each beta alone.
-    """
-    of_betas = matches.betas
+    """The matches of each beta, with `disparity` and `facts` from the inverse depths on which all agree; and
+    if one was chosen for each alone, `chosen` from those on which these agree."""
+    of_betas = [replace(one, chosen=None) for one in matches.betas]
     between = ambiguities(inputs, of_betas)
 
-    def at(i: int, rows: tuple[int, int]) -> MatchedBeta:
-        return MatchedBeta.of(inputs.betas[i], of_betas[i], rows, between[i])
+    def views(of_betas: Sequence[BetaMatches]) -> list[Callable[[tuple[int, int]], MatchedBeta]]:
+        given = zip(inputs.betas, of_betas)
+        return [partial(MatchedBeta.of, *one, ambiguity=same) for one, same in zip(given, between)]
 
-    (height, width), betas = matches.hw, range(len(of_betas))
+    betas = _of_all(inputs, views(of_betas), of_betas)
+    if all(one.chosen is not None for one in matches.betas):
+        chosen = _of_all(inputs, views(matches.betas), of_betas)
+        betas = (replace(one, chosen=other.disparity) for one, other in zip(betas, chosen))
+    return Matches(tuple(replace(one, prior=prior) for one, prior in zip(betas, _priors(inputs))))
+
+
+def _of_all(
+    inputs: Inputs, views: Sequence[Callable[[tuple[int, int]], MatchedBeta]], initial: Sequence[BetaMatches]
+) -> Iterator[BetaMatches]:
+    """The matches of each beta from the inverse depths on which all agree; `views` are by rows of alpha."""
+    height, width = inputs.hw
     strips = spans(height, max(STRIP // width // FINE, 1) * FINE)
-    parts = [Agreement.of([at(i, rows) for i in betas], inputs.alpha) for rows in strips]
+    parts = [Agreement.of([at(rows) for at in views], inputs.alpha) for rows in strips]
     agreement = _dense(Agreement(*(torch.cat(planes, 1) for planes in zip(*parts))), inputs)
     del parts
-    agreeing = (_of_beta(partial(at, i), agreement, strips, of_betas[i]) for i in betas)
-    return Matches(tuple(replace(one, prior=prior) for one, prior in zip(agreeing, _priors(inputs))))
+    return (_of_beta(at, agreement, strips, one) for at, one in zip(views, initial))
 
 
 def ambiguities(inputs: Inputs, of_betas: Sequence[BetaMatches]) -> list[Ambiguity]:
@@ -341,4 +359,4 @@ def _of_beta(
         unlike = torch.where(agreement.known[0, top:bottom], unlike, 1.0)
         facts[0, :1, half] = avg_pool2d(unlike[None], FINE)
         facts[0, 1:, half] = agreement.facts[:, half]
-    return replace(initial, disparity=disparity, facts=facts, chosen=None)
+    return replace(initial, disparity=disparity, facts=facts)

@@ -112,7 +112,8 @@ def following(inputs: Inputs, matches: Matches) -> Matches:
         segments = beta.field.straight
         if any(x.requires_grad for x in (alpha, beta.image, segments.start, segments.end)):
             views = one.comparison.views(alpha, beta.image)
-            one = replace(one, disparity=with_gradients(views, segments, one.disparity))
+            chosen = None if one.chosen is None else with_gradients(views, segments, one.chosen)
+            one = replace(one, disparity=with_gradients(views, segments, one.disparity), chosen=chosen)
         betas.append(one)
     return Matches(tuple(betas))
 

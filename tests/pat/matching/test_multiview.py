@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from arraygeom import Camera, Pose, Rig, Segments, intrinsics
+from arraygeom import Camera, Pose, Rig, Segments, intrinsics, pixel_grid
 from arraygeom.chunks import tiles_of
 from arraygeom.fields import pinhole_track
 from pat.evaluation.metrics import score
@@ -15,9 +15,10 @@ from pat.fusion.inputs import frame_inputs
 from pat.fusion.views import Views
 from pat.matching import inputs as inputs_module
 from pat.matching import multiview as several
-from pat.matching.match import located, match
+from pat.matching.match import in_each_beta, located, match
+from pat.matching.matches import Matches
 from pat.matching.multiview import NEAR as AGREES
-from pat.matching.multiview import MatchedBeta
+from pat.matching.multiview import MatchedBeta, agreed
 from pat.media.colour import luminance
 from pat.networks.guided import SETTINGS as GUIDED
 from pat.networks.guided import BetaEstimate, combined
@@ -205,7 +206,8 @@ def test_the_depth_buffer_finds_what_is_hidden():
     near = torch.full(hw, 1 / NEAR, dtype=torch.float64)
     far = torch.full(hw, 1 / FAR, dtype=torch.float64)
     segments = Segments(track.at(near), track.at(far), torch.ones(hw, dtype=torch.bool))
-    view = MatchedBeta(segments, track, torch.zeros(hw).double(), torch.zeros(3, *hw).double(), (H, W))
+    none, facts = torch.zeros(hw).double(), torch.zeros(3, *hw).double()
+    view = MatchedBeta(segments, track, none, facts, none, (H, W))
     depths = far.clone()
     depths[1, 7] = 1 / NEAR
     buffer = view.depth_buffer()
@@ -277,3 +279,31 @@ def test_a_plane_is_no_ambiguity():
     found = several._Sampled(scaled, known, rise).against(other, x, y)
     assert found.scale == pytest.approx(1.5, rel=1e-3)
     assert found.plane == pytest.approx((0, 1e-3, -0.02), abs=1e-5)
+
+
+def test_depth_is_what_betas_agree_on_of_what_was_chosen_for_each(network, scene):
+    """The more certain one counts; `disparity`, where colours are from, stays what it is without a choice."""
+    rig, images, _ = scene
+    inputs = frame_inputs(network, Views.of(rig, images, alpha="mono")).inputs
+    alone, depth = in_each_beta(inputs), torch.full((H, W), FAR, dtype=torch.float64)
+    depth[28:68, 72:120] = NEAR
+    true = [disparity_of(depth, beta) for beta in inputs.betas]
+    given = [
+        replace(one, chosen=disparity + off, certainty=torch.full_like(one.facts[:, :2], probability))
+        for one, disparity, off, probability in zip(alone.betas, true, (0.0, 5.0), (0.9, 0.1))
+    ]
+    found, seen = agreed(inputs, Matches(tuple(given))), inputs.betas[0].field.straight.valid[0, :H, :W]
+    for one, without, disparity in zip(found.betas, agreed(inputs, alone).betas, true):
+        torch.testing.assert_close(one.disparity, without.disparity)
+        torch.testing.assert_close(one.facts, without.facts)
+        assert without.chosen is None
+        off = (one.chosen - disparity)[0, 0, :H, :W].abs()
+        assert (off[seen] < 0.01).double().mean() > 0.99
+
+
+def disparity_of(depth, beta):
+    """(1, 1, H, W), of alpha's pixels: how far along their segments, from the end, beta's are."""
+    segments, x = beta.field.straight, pixel_grid((H, W), dtype=torch.float64)
+    towards = segments.start[0, :H, :W] - segments.end[0, :H, :W]
+    along = beta.track(x).at(1 / depth) - segments.end[0, :H, :W]
+    return ((along * towards).sum(-1) / towards.norm(dim=-1))[None, None].float().nan_to_num()
