@@ -109,7 +109,7 @@ class MatchedBeta:
         half = slice(top // FINE, bottom // FINE)
         start, end = (x[0, top:bottom].double() for x in (pixels.start, pixels.end))
         assert beta.track is not None
-        x = pixel_grid(end.shape[:2], dtype=torch.float64, device=end.device)
+        x = pixel_grid((bottom - top, end.shape[1]), dtype=torch.float64, device=end.device)
         x = x + end.new_tensor([0.0, top])
         size = (beta.image.shape[-2], beta.image.shape[-1])
         facts = enlarged(matches.facts[0, :, half])
