@@ -66,7 +66,7 @@ def backward_local(
     upstream: Tensor,
     wanted: Sequence[bool],
 ) -> tuple[Tensor, ...]:
-    """Gradients by query, key and value, `wanted` or not defined, from what `forward_local` gave."""
+    """Gradients by query, key and value, 0 where not `wanted`, from what `forward_local` gave."""
     planes, wide = [_planes(x) for x in inputs], _planes(upstream)
     sums = _planes(torch.stack([outputs[1], (upstream * outputs[0]).sum(1)], 1))
     gradients = [np.zeros_like(x) for x in planes]

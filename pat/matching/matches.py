@@ -45,7 +45,8 @@ class BetaMatches:
     diffused: (B, fills, C, H, W), the same diffused from pixels of high weight to the others.
     prior: how much more, as a logit, its colours count than another beta's.
     chosen: (B, 1, H, W), of the disparities found there and around that of what alpha sees, which may be
-        hidden in beta or fill in for what is; None before one is chosen.
+        hidden in beta or fill in for what is; of several betas, what they agree on of those; None before one
+        is chosen.
     stated: (B, 2, H / 2, W / 2), what the choice says of it: the logit of that it is right, and the logarithm
         of how far it may be off, pixels; None before one is chosen.
     certainty: (B, 2, H / 2, W / 2), the probability that beta sees the point and the match is within a pixel
