@@ -15,7 +15,6 @@ from arraygeom import (
 from arraygeom.pixels import pixel_grid, to_homogeneous
 from tests.arraygeom.rigs import random_rig, scene_points, two_cameras
 
-
 seeds = st.integers(0, 10**9)
 
 
