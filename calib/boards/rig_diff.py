@@ -33,7 +33,7 @@ FARTHEST = 50.0
 LEVEL = 0.001
 """Probability with which a rig that has not moved is said to have moved."""
 LEAST = 1e-3
-"""Combinations of parameters that change pixels by less (RMS, pixels) are not tested, nor sought as motions."""
+"""Changes of pixels by less (RMS) count as none: their parameters are not tested, a motion is found."""
 STEP = 1e-3
 """Relative change of depth by which a derivative is taken."""
 ITERATIONS = 5
