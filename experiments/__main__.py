@@ -50,16 +50,12 @@ class Alignment:
     """Some of these, or motorcycle, which needs no data."""
     out: Out = Path("out/alignment")
     """Folder for alignment.md and a figure of each scene."""
-    confidence: float = 0.5
-    """As of `pat align`: from which confidence on a camera counts as seeing a point."""
 
     def run(self) -> None:
         """Write and print the table. Raises ValueError or FileNotFoundError naming what is missing."""
         writable(self.out, folder=True)
         with working("aligning") as retitle:
-            text = evaluate_alignment(
-                self.data, self.out, self.scenes, min_confidence=self.confidence, each=retitle
-            )
+            text = evaluate_alignment(self.data, self.out, self.scenes, each=retitle)
         print(text, end="")
         say(f"written: {self.out / 'alignment.md'}, and figures")
 
@@ -87,8 +83,6 @@ class SystemsRun:
     """At the full size of the paper's cameras; by default reduced, minutes on two cores."""
     scene: Literal["layered", "rendered"] = "layered"
     """Photographs on planes; or a still life (visible-nir: landscape) rendered by Blender, as one sees it."""
-    photos: MaybePath = None
-    """Folder of photographs for layers' surfaces; by default patterns and images scikit-image ships."""
     recording: MaybePath = None
     """For fast-slow: the paper's frames, not a rendered scene: a folder with pillow_1 and the matrices."""
     out: MaybeOut = None
@@ -101,7 +95,7 @@ class SystemsRun:
         """Print the scores, and the expected ones where they are of the same settings."""
         out = writable(self.out or Path("out/systems") / self.name, folder=True)
         if self.recording is None:
-            same = ("full", "scene", "photos", "weights", "max_memory")
+            same = ("full", "scene", "weights", "max_memory")
             result = run_system(self.name, out, say=say, **{name: getattr(self, name) for name in same})
         elif self.name == "fast-slow":
             result = run_recorded(self.recording, out, weights=self.weights, say=say)

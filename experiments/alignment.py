@@ -112,24 +112,18 @@ class AlignmentScene(NamedTuple):
     truth: Disparity | None = None
 
 
-def evaluate_alignment(
-    data: Path,
-    out: Path,
-    names: Sequence[str],
-    *,
-    min_confidence: float = LEAST_CONFIDENCE,
-    each: Callable[[str], None] = lambda line: None,
-) -> str:
+def evaluate_alignment(data: Path, out: Path, names: Sequence[str], *, each: Callable[[str], None]) -> str:
     """Align the scenes of these names (`SCENES`) below `data`; write alignment.md, figures. Returns the text.
 
-    Raises ValueError for a name that there is not, FileNotFoundError for missing images.
+    `each` is given each scene's name before it is aligned. Raises ValueError for a name that there is not,
+    FileNotFoundError for missing images.
     """
     refuse_unknown("no scene", names, SCENES)
     rows: list[AlignmentRow] = []
     for name in names:
         for scene in SCENES[name](data):
             each(scene.name)
-            aligned = aligned_scene(scene, min_confidence)
+            aligned = aligned_scene(scene)
             rows += alignment_rows(scene, aligned)
             layers = {} if scene.truth is not None else shown_layers(aligned, scene.recorded_rig)
             name = f"{scene.name.replace('/', '-')}.png"

@@ -22,7 +22,7 @@ from torch.nn.functional import binary_cross_entropy_with_logits, pixel_shuffle
 
 from arraygeom import Segments, pixel_grid
 from experiments.completion.capture import fused_at_random
-from experiments.completion.samples import KINDS, Made, PairTraining
+from experiments.completion.samples import KINDS, PairTraining
 from experiments.fit import command, recipe_text
 from pat.data.pairs import Disparity, StereoPair
 from pat.matching.certainty import SETTINGS, typical_facts
@@ -35,7 +35,7 @@ from pat.matching.positions import FINE
 from pat.media.colour import to_bytes
 from pat.networks.guided import GuidedPAT
 from pat.sensors import generator_for
-from pat.support.tensor_files import read_tensors, write_tensors
+from pat.support.tensor_files import write_tensors
 from pat.synthesis.rigs import below
 
 NEAR = 0.8
@@ -92,7 +92,8 @@ def train_choice(config: ChoiceTraining) -> Path:
     """
     with config.folder():
         network = config.network()
-        samples = [kept(config.out / kind, network, config.pairs(kind), config.without) for kind in KINDS]
+        keep = partial(matched, network, without=config.without)
+        samples = [[Kept(**sample) for sample in config.kept(kind, keep)] for kind in KINDS]
         choice = Choice().to(config.device)
         config.train(choice, partial(losses, config, samples, choice))
         state = choice.half().state_dict()
@@ -100,24 +101,13 @@ def train_choice(config: ChoiceTraining) -> Path:
     return config.out / "best.safetensors"
 
 
-def kept(folder: Path, network: GuidedPAT, pairs: Iterator[Made], without: Sequence[str] = ()) -> list[Kept]:
-    """Of pairs with true disparity, matched where they are not yet."""
-    folder.mkdir(parents=True, exist_ok=True)
-    samples = []
-    for i, make in enumerate(pairs):
-        file = folder / f"{i:05}.safetensors"
-        if not file.exists():
-            pair = make()
-            if pair.disparity is None or any(fragment in pair.name for fragment in without):
-                continue
-            write_tensors(file, matched(network, pair, i)._asdict())
-        samples.append(Kept(**read_tensors(file)[0]))
-    return samples
-
-
-def matched(network: GuidedPAT, pair: StereoPair, seed: int) -> Kept:
-    """What matching finds in a pair recorded at random, left as alpha, before anything is chosen."""
-    assert pair.disparity is not None
+def matched(
+    network: GuidedPAT, pair: StereoPair, seed: int, *, without: Sequence[str]
+) -> dict[str, Tensor] | None:
+    """What matching finds in a pair recorded at random, left as alpha, before anything is chosen: a `Kept`.
+    None without true disparity, and for pairs with one of these parts in their name."""
+    if pair.disparity is None or any(fragment in pair.name for fragment in without):
+        return None
     given: list[tuple[ComparedViews, BetaMatches]] = []
 
     def matcher(inputs: Inputs) -> Matches:
@@ -136,7 +126,7 @@ def matched(network: GuidedPAT, pair: StereoPair, seed: int) -> Kept:
     truth = (true_disparity.value * true_disparity.valid)[None].half()
     visible = true_disparity.regions().seen[None]
     planes = alpha, beta, disparity, facts, truth, visible, blurs
-    return Kept(*(plane.contiguous() for plane in planes))
+    return Kept(*(plane.contiguous() for plane in planes))._asdict()
 
 
 def losses(

@@ -1,38 +1,14 @@
-"""The most memory that a process has, and that some work takes."""
+"""The most memory that some work takes."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from pathlib import Path
-from threading import Thread
 from typing import TypeVar
 
 from pat.support.memory import give_back, peak_memory, resident
 
 Result = TypeVar("Result")
-
-
-def watch_peak(pid: int, *, every: float = 0.2) -> Callable[[], float]:
-    """Watch a process until it ends; the function returned waits for that, gives peak resident bytes or 0.
-
-    `wait4` would count what the parent had resident when it started the process.
-    """
-    largest = [0.0]
-
-    def watch() -> None:
-        while (resident := peak_memory(pid)) is not None:
-            largest[0] = resident
-            time.sleep(every)
-
-    watching = Thread(target=watch, daemon=True)
-    watching.start()
-
-    def peak() -> float:
-        watching.join()
-        return largest[0]
-
-    return peak
 
 
 def with_peak(work: Callable[[], Result]) -> tuple[Result, float | None]:

@@ -39,6 +39,7 @@ from pat.media.colour import REC601, linear_from_srgb, srgb_from_linear
 from pat.media.images import write_image
 from pat.sensors import BoxBlur, Clip, GaussianBlur, Jitter, Noise, Quantise, Resample, Step, generator_for
 from pat.support.schema import from_document, near
+from pat.synthesis.rendered import Rendered
 
 CHANNELS = ((600.0, 35.0), (540.0, 35.0), (460.0, 35.0), (850.0, 60.0))
 """Assumed responses of the channels R, G, B and NIR of an ideal image: Gaussians, centre and sigma in nm."""
@@ -137,7 +138,7 @@ class Spectral(Step):
             return (*REC601, 0.0)[:channels]
         if self.response == "nir":
             if channels == 3:
-                raise ValueError("the response 'nir' needs an image with a NIR channel, got RGB alone")
+                raise ValueError("the response 'nir' needs an image with NIR, got RGB: render infrared too")
             return 0.0, 0.0, 0.0, 1.0
         if isinstance(self.response, Band):
             return band_weights(self.response, channels)
@@ -242,14 +243,28 @@ def record_rendered(
 ) -> None:
     """Write the images (16-bit PNG) that a rig's cameras record of a rendered scene, and their rig.yaml.
 
-    `chains` are `default_chains` of the rig unless given. Raises ValueError for a scene that cannot be read.
+    `chains` are `default_chains` of the rig unless given; one without a spectral response is of colours. Near
+    infrared is recorded where the scene was rendered with it. Raises ValueError for a scene that cannot be
+    read.
     """
     rig = scene_rig(folder)
-    images = {name: read_view(folder, name).rgb[None] for name in rig.names}
-    recorded = record_array(images, rig, default_chains(rig) if chains is None else chains, seed=seed)
+    images = {name: _ideal(folder, name)[None] for name in rig.names}
+    given = default_chains(rig) if chains is None else {**dict.fromkeys(rig.names, ()), **chains}
+    coloured = {name: c if _has_response(c) else (Spectral("rgb"), *c) for name, c in given.items()}
+    recorded = record_array(images, rig, coloured, seed=seed)
     for name, image in recorded.images.items():
         write_image(out / f"{name}.png", image[0], bits=16)
     recorded.rig.save(out / "rig.yaml")
+
+
+def _ideal(folder: Path, name: str) -> Float[Tensor, "c h w"]:
+    """What a camera of a scene sees: red, green, blue, and near infrared if that was rendered."""
+    rgb, nir = read_view(folder, name).rgb, Rendered(folder).frame(name).nir
+    return rgb if nir is None else torch.cat([rgb, nir])
+
+
+def _has_response(chain: Sequence[Step]) -> bool:
+    return any(isinstance(step, Spectral) for step in chain)
 
 
 def default_chains(rig: Rig) -> dict[str, tuple[Step, ...]]:
@@ -263,7 +278,8 @@ def default_chains(rig: Rig) -> dict[str, tuple[Step, ...]]:
 def _spectral(sensor: Sensor) -> Spectral:
     if isinstance(sensor.response, Band | Curve):
         return Spectral(sensor.response)
-    return Spectral("luminance" if sensor.response in ("mono", "luminance") else "rgb")
+    names: dict[Any, Literal["luminance", "nir"]] = {"mono": "luminance", "nir": "nir"}
+    return Spectral(names.get(sensor.response, "rgb"))
 
 
 _CLASSES: tuple[type[Step], ...] = (

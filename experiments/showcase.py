@@ -34,8 +34,8 @@ from pat.networks.protocol import FusionNetwork
 from pat.networks.weights import load_weights
 
 PAIRS = ("kitti", "middlebury", "flickr1024")
-SYNTIM = ("Serfaty",)
-"""Scenes in colour whose calibration fits their images to about a pixel, and on which nothing was chosen."""
+SYNTIM = "Serfaty"
+"""A scene in colour whose calibration fits its images to about a pixel, and on which nothing was chosen."""
 FAST, SLOW = "fast", {"cam1": "F1_ref_to_cam1", "cam2": "F2_ref_to_cam2", "cam3": "F3_ref_to_cam3"}
 """The fast camera is alpha; the slow ones see about 600, 550 and 450 nm: red, green, blue."""
 PAIRS_TEXT = """### Stereo pairs
@@ -76,10 +76,10 @@ def showcase(data: Path, out: Path, weights: str = "mono-colour", rates: Sequenc
         if not (data / folder).is_dir():
             raise FileNotFoundError(f"{data / folder}: no such folder: give the folder that holds {folder}")
     network = load_weights(weights)
-    scenes = [syntim_scene(data / "syntim", name) for name in SYNTIM]
+    scene = syntim_scene(data / "syntim", SYNTIM)
     array = fast_and_slow_array(data / "hfr_lfr")
     pairs = _pairs(network, data, out, rates)
-    text = "\n".join([pairs, _syntim(network, scenes, out), _fast_and_slow(network, array, out)])
+    text = "\n".join([pairs, _syntim(network, scene, out), _fast_and_slow(network, array, out)])
     write_text(out / "showcase.md", text)
     return text
 
@@ -109,14 +109,7 @@ def syntim_scene(folder: Path, name: str) -> SyntimScene:
     return SyntimScene(name, rig.replace(depth=depth, name=f"SYNTIM {name}"), left, right)
 
 
-def _syntim(network: FusionNetwork, scenes: Sequence[SyntimScene], out: Path) -> str:
-    rows = [row for scene in scenes for row in _fused_scene(network, scene, out)]
-    figures = "".join(f"![{scene.name}](syntim_{scene.name}.png)\n" for scene in scenes)
-    return f"{SYNTIM_TEXT}{markdown(rows)}\n{structure_kept(rows)}\n\n{figures}"
-
-
-def _fused_scene(network: FusionNetwork, scene: SyntimScene, out: Path) -> list[StereoRow]:
-    """The scores of one scene; its rig file and figure go into `out`."""
+def _syntim(network: FusionNetwork, scene: SyntimScene, out: Path) -> str:
     name, rig, left, right = scene
     images = {"left": luminance_of(left), "right": right}
     frame = fuse(network, rig, images, alpha="left")
@@ -130,7 +123,8 @@ def _fused_scene(network: FusionNetwork, scene: SyntimScene, out: Path) -> list[
     shown["depth"] = colour_depth(frame.depth)
     save_panels(shown, out / f"syntim_{name}.png", columns=3)
     rig.save(out / f"syntim_{name}.yaml")
-    return [StereoRow(name, 1, method, *score(image, left)) for method, image in results.items()]
+    rows = [StereoRow(name, 1, method, *score(image, left)) for method, image in results.items()]
+    return f"{SYNTIM_TEXT}{markdown(rows)}\n{structure_kept(rows)}\n\n![{name}](syntim_{name}.png)\n"
 
 
 def _syntim_image(folder: Path, scene: str, side: int) -> Tensor:

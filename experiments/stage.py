@@ -20,7 +20,6 @@ from pat.media.colour import srgb_from_linear
 from pat.synthesis.blender import RenderSettings, render
 from pat.synthesis.layered import LayeredScenes
 from pat.synthesis.layers import Layers, draw_layers
-from pat.synthesis.photos import PhotoBank
 from pat.synthesis.rig_distribution import RigDistribution
 from pat.synthesis.rigs import RigBatch, in_frame_of
 
@@ -39,22 +38,12 @@ def purpose_generator(seed: int, purpose: str) -> Generator:
 class SystemScene(LayeredScenes):
     """A scene in front of a rig's alpha, between two depths in metres.
 
-    Textures are the images of a folder, or patterns and the images that scikit-image ships; `seed` determines
-    all.
+    Textures are patterns and the images that scikit-image ships; `seed` determines all.
     """
 
-    def __init__(
-        self,
-        rig: Rig,
-        alpha: str,
-        *,
-        depths: tuple[float, float],
-        layers: int,
-        photos: Path | None,
-        seed: int,
-    ) -> None:
+    def __init__(self, rig: Rig, alpha: str, *, depths: tuple[float, float], layers: int, seed: int) -> None:
         self.rig, self.alpha, self.seed = rig, alpha, seed
-        bank = PhotoBank.load(photos, seed=seed) if photos else sample_photographs(count=10, seed=seed)
+        bank = sample_photographs(count=10, seed=seed)
         super().__init__(bank, RigDistribution(), hw=rig[alpha].hw, layers=(layers, layers), seed=seed)
         near, far = (torch.tensor([d], dtype=torch.float64) for d in depths)
         rigs = RigBatch([self.camera(name) for name in (alpha, *rig.betas(alpha))], near, far)

@@ -27,7 +27,6 @@ from arraygeom.atomic import write_text
 from arraygeom.io.native import write as rig_text
 from experiments.hdr import merged, missed, tone_curve, usable_range
 from experiments.names import refuse_unknown
-from experiments.peaks import watch_peak
 from pat.evaluation.baseline import classical_baseline
 from pat.evaluation.metrics import score
 from pat.evaluation.tables import markdown_table
@@ -44,6 +43,7 @@ from pat.media.raw import match_luminance
 from pat.media.video import write_video
 from pat.networks.protocol import FusionNetwork
 from pat.networks.weights import load_weights
+from pat.support.memory import peak_memory
 from pat.support.tensor_files import read_tensors, write_tensors
 
 SceneKind = Literal["layered", "rendered"]
@@ -131,7 +131,6 @@ def run_system(
     full: bool = False,
     scale: float = 1.0,
     scene: SceneKind = "layered",
-    photos: Path | None = None,
     weights: str = "mono-colour",
     max_memory: str | None = None,
     say: Callable[[str], None] = lambda text: None,
@@ -139,12 +138,11 @@ def run_system(
     """Render, record, fuse and compare; inputs, images, figure.png and scores.md go to `out`.
 
     At `full` size, or at `scale` times the reduced one, which is minutes on two cores; half of it is seconds.
-    `scene` is layered photographs, or a believable one rendered with Blender. `photos` is a folder of images
-    for the layers' textures; without, patterns and scikit-image's images are used.
+    `scene` is layered photographs, or a believable one rendered with Blender.
     """
     system = load_system(name)
     rig = system.sized(full, scale=scale)
-    recording, files = recorded(system, rig, out / "inputs", scene=scene, photos=photos, say=say)
+    recording, files = recorded(system, rig, out / "inputs", scene=scene, say=say)
     say("fusing")
     run = _sequence if len(recording.ground_truth) > 1 else _still
     lines, panels = run(SystemRun(system, rig, files, recording, out, weights, max_memory, say))
@@ -168,17 +166,11 @@ class SystemRun(NamedTuple):
 
 
 def recorded(
-    system: ArraySystem,
-    rig: Rig,
-    out: Path,
-    *,
-    scene: SceneKind = "layered",
-    photos: Path | None,
-    say: Callable[[str], None],
+    system: ArraySystem, rig: Rig, out: Path, *, scene: SceneKind, say: Callable[[str], None]
 ) -> tuple[SystemRecording, dict[str, list[Path]]]:
     """The recording of the system's scene, its files; rendered unless done with the same settings."""
     module, cache = system.module, out / "recorded.safetensors"
-    key = f"{system.name}, {scene}, seed {module.SEED}, textures {photos or 'our own'}\n{rig_text(rig)}"
+    key = f"{system.name}, {scene}, seed {module.SEED}\n{rig_text(rig)}"
     if cache.is_file():
         tensors, facts = read_tensors(cache)
         if facts["key"] == key:
@@ -186,21 +178,21 @@ def recorded(
             return SystemRecording.of(tensors), _files(out, json.loads(facts["counts"]))
     say(f"rendering and recording {', '.join(f'{n} {rig[n].hw[1]}x{rig[n].hw[0]}' for n in rig.names)}")
     cache.unlink(missing_ok=True)
-    recording = module.record_scene(_stage(system, rig, scene, photos))
+    recording = module.record_scene(_stage(system, rig, scene))
     write_recording(recording, rig, out)
     counts = {name: len(images) for name, images in recording.raw.items()}
     write_tensors(cache, recording.reference, {"key": key, "counts": json.dumps(counts)})
     return recording, _files(out, counts)
 
 
-def _stage(system: ArraySystem, rig: Rig, scene: SceneKind, photos: Path | None) -> Any:
+def _stage(system: ArraySystem, rig: Rig, scene: SceneKind) -> Any:
     """The scene before the cameras, with what a system's module asks of it."""
     from .stage import RenderedScene, SystemScene
 
     module = system.module
     if scene == "layered":
         depths, layers = module.DEPTHS, module.LAYERS
-        return SystemScene(rig, system.alpha, depths=depths, layers=layers, photos=photos, seed=module.SEED)
+        return SystemScene(rig, system.alpha, depths=depths, layers=layers, seed=module.SEED)
     frames, rate = getattr(module, "FRAMES", 1), rig[system.alpha].sensor.frame_rate or 1.0
     duration = 0.0 if frames == 1 else frames / rate
     moving, infrared = getattr(module, "MOVING", 0.0), "nir" in rig.names
@@ -274,8 +266,9 @@ def fused_apart(job: SystemRun, files: Mapping[str, Path]) -> tuple[Frame, list[
     command += ["--max-memory", str(job.max_memory)]
     begin, planned = time.monotonic(), ""
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    most = watch_peak(process.pid)
+    most = 0.0  # `wait4` would count what this process had resident when it started the other
     for line in process.stderr or ():
+        most = max(most, peak_memory(process.pid) or 0.0)
         planned = line.strip() if line.startswith("plan:") else planned
         if line.strip():
             job.say(line.rstrip())
@@ -283,7 +276,7 @@ def fused_apart(job: SystemRun, files: Mapping[str, Path]) -> tuple[Frame, list[
     if os.waitstatus_to_exitcode(status) not in (0, LowConfidenceWarning.exit_status):
         raise ValueError(f"fusing in a process of its own failed (wait status {status})")
     took = f"{time.monotonic() - begin:.0f} s, {used.ru_utime + used.ru_stime:.0f} s of a core"
-    peak = f"allowed {job.max_memory}, at most {most() / 2**30:.2f} GiB resident"
+    peak = f"allowed {job.max_memory}, at most {most / 2**30:.2f} GiB resident"
     depth = torch.from_numpy(imread(out / "depth.tif")) if (out / "depth.tif").is_file() else None
     image, confidence = read_image(out / "fused.png"), read_image(out / "confidence.png")[0]
     depth = torch.full_like(confidence, torch.nan) if depth is None else depth

@@ -1,22 +1,19 @@
-"""What the fusion of pairs gives to the completion, kept as one small file each.
+"""What the fusion of pairs gives to the completion, kept as planes of 8 bits.
 
-Planes of 8 bits, below each other in one grey image: alpha, confidence, and chroma of the ground truth, of
-the image as it is, and of the candidates' differences from that.
+They are alpha, confidence, and chroma of the ground truth, of the image as it is, and of the candidates'
+differences from that.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from arraygeom.atomic import write_atomically
 from pat.data.pairs import StereoPair
 from pat.evaluation.protocols import mono_colour_task, rectified_fusion
 from pat.media.colour import to_luma_chroma
@@ -29,13 +26,9 @@ RATES = (1, 2, 2, 2, 4, 4, 8)
 NOISY = 0.15
 """Share of recordings in low light, 50 to 2,000 electrons at white."""
 READ_NOISE = 2.0
-QUALITY = 88
-"""Of the compression."""
 LEVELS = 180.0
 """Levels of 8 bits to 1, of chroma."""
 PLANES = 2 + 2 * (2 + CANDIDATES)
-HIGHEST = 16383 // PLANES
-"""Rows of a frame at most, as WebP has them."""
 
 
 class Recorder(Completion):
@@ -77,25 +70,12 @@ def captured(network: GuidedPAT, pair: StereoPair, seed: int, **options: Any) ->
     return torch.cat([planes[:2], to_luma_chroma(truth)[1], planes[2:]])
 
 
-def write_planes(planes: Float[Tensor, "p h w"], path: Path) -> None:
-    """Keep them, as WebP. Raises OSError if that fails."""
-    levels = torch.cat([planes[:2] * 255, planes[2:] * LEVELS + 128]).round().clamp(0, 255).byte()
-    written, data = cv2.imencode(".webp", levels.flatten(0, 1).numpy(), [cv2.IMWRITE_WEBP_QUALITY, QUALITY])
-    if not written:
-        raise OSError(f"{path}: cannot be compressed")
-    with write_atomically(path) as temporary:
-        temporary.write_bytes(data.tobytes())
-
-
-def read_planes(path: Path) -> Tensor:
-    """Planes as bytes (p, h, w); `values` makes numbers of them. Raises ValueError for another file."""
-    grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    if grey is None or len(grey) % PLANES:
-        raise ValueError(f"{path}: not {PLANES} planes below each other; capture again")
-    return torch.from_numpy(grey).unflatten(0, (PLANES, -1))
+def levels(planes: Float[Tensor, "p h w"]) -> Tensor:
+    """Planes as bytes; `values` is the inverse."""
+    return torch.cat([planes[:2] * 255, planes[2:] * LEVELS + 128]).round().clamp(0, 255).byte()
 
 
 def values(planes: Tensor) -> Float[Tensor, "*b p h w"]:
-    """Numbers of planes that were read."""
+    """Numbers of planes as bytes."""
     light, colours = planes.float().split([2, PLANES - 2], -3)
     return torch.cat([light / 255, (colours - 128) / LEVELS], -3)

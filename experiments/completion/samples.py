@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import numpy as np
+from torch import Tensor
 
 from experiments.evaluation.halves import of_half
 from experiments.fit import Recipe
@@ -15,6 +16,7 @@ from pat.data.pairs import StereoPair, folder_pairs, middlebury_pairs
 from pat.networks.guided import GuidedPAT
 from pat.networks.weights import load_weights
 from pat.support.folders import files_below
+from pat.support.tensor_files import read_tensors, write_tensors
 
 from .pairs import mirrored, photo_pair, varied_pair
 from .shapes import shape_pair
@@ -54,6 +56,22 @@ class PairTraining(Recipe):
         """Those of one of the `KINDS`. Raises ValueError where there are no photographs."""
         made = {"pairs": self._real_pairs, "shapes": self._shape_pairs, "photos": self._photo_pairs}
         return made[kind]()
+
+    def kept(
+        self, kind: str, make: Callable[[StereoPair, int], Mapping[str, Tensor] | None]
+    ) -> list[dict[str, Tensor]]:
+        """What `make` gives of each pair of a kind and its number, computed where the run's folder does not
+        hold it yet; None leaves a pair out."""
+        samples = []
+        for i, pair in enumerate(self.pairs(kind)):
+            file = self.out / kind / f"{i:05}.safetensors"
+            if not file.exists():
+                made = make(pair(), i)
+                if made is None:
+                    continue
+                write_tensors(file, made)
+            samples.append(read_tensors(file)[0])
+        return samples
 
     def _photo_pairs(self) -> Iterator[Made]:
         files = self._photographs()

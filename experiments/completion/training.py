@@ -19,6 +19,7 @@ from torch import Generator, Tensor
 
 from experiments.evaluation.certainty import unseeing
 from experiments.fit import command, recipe_text
+from pat.data.pairs import StereoPair
 from pat.matching.match import match
 from pat.media.colour import from_luma_chroma
 from pat.networks.completion import CANDIDATES, Completion, features
@@ -28,7 +29,7 @@ from pat.sensors import generator_for
 from pat.synthesis.rigs import below
 from pat.training.losses import image_loss
 
-from .capture import HIGHEST, captured, read_planes, values, write_planes
+from .capture import captured, levels, values
 from .samples import KINDS, PairTraining
 
 
@@ -54,7 +55,10 @@ def train_completion(config: CompletionTraining) -> Path:
     """
     with config.folder():
         network = config.network()
-        frames = [kept(config, network, kind) for kind in KINDS]
+        frames = [
+            [sample["planes"] for sample in config.kept(kind, partial(planes_of, config, network, kind))]
+            for kind in KINDS
+        ]
         completion = Completion(config.widths).to(config.device)
         config.train(completion, partial(losses, config, frames, completion))
         made = GuidedPAT(replace(network.config, completion=config.widths))
@@ -66,21 +70,13 @@ def train_completion(config: CompletionTraining) -> Path:
     return config.out / "best.safetensors"
 
 
-def kept(config: CompletionTraining, network: GuidedPAT, kind: str) -> list[Tensor]:
-    """Planes of pairs of a kind, captured where they are not yet."""
-    folder = config.out / kind
-    folder.mkdir(parents=True, exist_ok=True)
-    samples = []
-    for i, make in enumerate(config.pairs(kind)):
-        file = folder / f"{i:05}.webp"
-        if not file.exists():
-            pair = make()
-            learned = config.choices and kind in ("pairs", "shapes") and pair.disparity is not None
-            best = unseeing(config.choices, pair.name) if learned else None
-            planes = captured(network, pair, i, matcher=partial(match, choice=best))
-            write_planes(planes[:, :HIGHEST], file)
-        samples.append(read_planes(file))
-    return samples
+def planes_of(
+    config: CompletionTraining, network: GuidedPAT, kind: str, pair: StereoPair, seed: int
+) -> dict[str, Tensor]:
+    """What is kept of a pair of a kind."""
+    learned = config.choices and kind in ("pairs", "shapes") and pair.disparity is not None
+    best = unseeing(config.choices, pair.name) if learned else None
+    return {"planes": levels(captured(network, pair, seed, matcher=partial(match, choice=best)))}
 
 
 def losses(

@@ -143,17 +143,13 @@ class Outside(Pairs):
 
 
 @dataclass
-class Certainty:
-    """How well stated certainty holds, on Middlebury's pairs under many conditions; and the fit of it."""
+class Certainty(Pairs):
+    """How well stated certainty holds, on pairs of true disparity under many conditions; and its fit."""
 
-    middlebury: Path
-    """Folder of Middlebury's scenes."""
     half: Half = "report"
     """Pairs that take part: it is fitted to tune."""
     conditions: tuple[str, ...] = ()
     """Of the conditions, by name; those on which it was fitted if none is given."""
-    weights: Weights = "mono-colour"
-    """The network that fuses."""
     fit: MaybePath = None
     """Fit to these pairs, and write that here."""
     choices: tuple[Path, ...] = ()
@@ -166,7 +162,7 @@ class Certainty:
         names = self.conditions or certainty.FITTED_ON
         refuse_unknown("--conditions: no condition", names, conditions.CONDITIONS)
         writable(self.out, folder=True)
-        pairs = list(of_half(middlebury_pairs(self.middlebury), self.half))
+        pairs = self.pairs()
         shown = progress("fusing")(pairs, len(pairs))
         judged_pixels = with_truth(
             list(certainty.judged(load_weights(self.weights), shown, names, self.choices)), self.half
@@ -241,8 +237,6 @@ class Sweeps(OnScenes):
     """Of rotation, "principal point", baseline, "focal ratio" and ahead; all by default."""
     hw: Annotated[tuple[int, int], arg(metavar="H W")] = (96, 128)
     """Height and width of both images."""
-    seed: int = 0
-    """Of the scenes."""
 
     def run(self) -> None:
         """Write ablation.md, .json, .svg, .png; print the table. Raises ValueError for an unknown sweep."""
@@ -250,7 +244,7 @@ class Sweeps(OnScenes):
         chosen = self.chosen(sweeps.FIELDS)
         rigs = list(sweeps.points(self.sweeps or tuple(sweeps.SWEEPS), hw=self.hw))
         shown = progress("ablating")(rigs, len(rigs))
-        rows = sweeps.ablate(network, shown, chosen, scenes=self.scenes, photos=self.bank(), seed=self.seed)
+        rows = sweeps.ablate(network, shown, chosen, scenes=self.scenes, photos=self.bank())
         write_report(rows, self.out)
         self.say_written()
 

@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float
 from torch import Generator, Tensor
 from torch.nn.functional import interpolate
 
+from arraygeom import Rectified
 from arraygeom.sampling import sample
 from arraygeom.viz import new_figure
 from pat.data.pairs import PAPER_DISPARITY, Disparity, StereoPair
@@ -31,7 +32,6 @@ from pat.evaluation.protocols import (
     enlarged,
     hw_of,
     mono_colour_task,
-    rectified_field,
     rectified_fusion,
     rectified_rig,
 )
@@ -172,7 +172,7 @@ def corrected_classical(
 ) -> StereoResult:
     """The classical baseline with alpha's response as the fusion finds it."""
     rig = rectified_rig(hw_of(alpha), {"beta": hw_of(beta)}, max_disparity)
-    images, field = {"alpha": alpha, "beta": beta}, rectified_field(max_disparity)
+    images, field = {"alpha": alpha, "beta": beta}, Rectified(max_disparity, alpha_is="left")
     response = corrections_of(network, rig, images, alpha="alpha", field=field, align=False).response
     image = classical_fusion(response.of_alpha(alpha), response.of_beta(beta), max_disparity)
     return StereoResult(response.undone(image))

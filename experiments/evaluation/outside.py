@@ -17,10 +17,9 @@ from arraygeom.fields import AroundDepth
 from pat.data.pairs import PAPER_DISPARITY, Disparity, StereoPair
 from pat.evaluation.baseline import checked_disparity
 from pat.evaluation.metrics import score
-from pat.evaluation.protocols import MonoColourTask, enlarged, hw_of, mono_colour_task, rectified_rig
+from pat.evaluation.protocols import MonoColourTask, enlarged, hw_of, mono_colour_task, rectified_fusion
 from pat.evaluation.stereo import disparity_errors
 from pat.evaluation.tables import grouped, markdown_table
-from pat.fusion.fuse import fuse
 from pat.media.colour import luminance, to_bytes
 from pat.networks.protocol import FusionNetwork
 
@@ -56,14 +55,8 @@ def outside_markdown(rows: Sequence[OutsideRow]) -> str:
     for source, of_source in grouped(rows, "source").items():
         psnr, error, within, seconds = np.mean([row[2:] for row in of_source], 0)
         lines.append([source, f"{psnr:.2f}", f"{error:.2f}", f"{within:.1%}", f"{seconds:.1f}"])
-    columns = [
-        f"disparity, {len(grouped(rows, 'pair'))} pairs",
-        "dB",
-        "mean error, px",
-        "within 1 px",
-        "seconds",
-    ]
-    return markdown_table(columns, lines)
+    pairs = f"disparity, {len(grouped(rows, 'pair'))} pairs"
+    return markdown_table([pairs, "dB", "mean error, px", "within 1 px", "seconds"], lines)
 
 
 FieldOf = Callable[[MonoColourTask], ReceptiveField | None]
@@ -72,16 +65,14 @@ FieldOf = Callable[[MonoColourTask], ReceptiveField | None]
 def _row(
     pair: str, task: MonoColourTask, network: FusionNetwork, source: str, field_of: FieldOf
 ) -> OutsideRow:
-    hw = hw_of(task.alpha)
-    rig = rectified_rig(hw, {"beta": hw_of(task.beta)}, PAPER_DISPARITY)
     began = time.perf_counter()
-    field = field_of(task)
-    frame = fuse(network, rig, {"alpha": task.alpha, "beta": task.beta}, alpha="alpha", field=field)
+    fused = rectified_fusion(network, field=field_of(task))(task.alpha, task.beta, PAPER_DISPARITY)
     seconds = time.perf_counter() - began
-    error, within = disparity_errors(hw[1] / frame.depth, _truth(task))
+    assert fused.disparity is not None
+    error, within = disparity_errors(fused.disparity, _truth(task))
     assert error is not None
     assert within is not None
-    psnr = score(frame.image.clamp(0, 1), task.ground_truth).psnr
+    psnr = score(fused.image.clamp(0, 1), task.ground_truth).psnr
     return OutsideRow(pair, source, psnr, error, within, seconds)
 
 

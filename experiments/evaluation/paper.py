@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from arraygeom import Pair, Positions, ReceptiveField, Segments
+from arraygeom import Pair, Positions, ReceptiveField, Rectified, Segments
 from pat.data.pairs import Disparity, StereoPair
 from pat.data.sample_array import BETA, SAMPLE
 from pat.evaluation.protocols import (
@@ -22,7 +22,6 @@ from pat.evaluation.protocols import (
     StereoResult,
     cut_to_multiple,
     hw_of,
-    rectified_field,
     rectified_fusion,
 )
 from pat.evaluation.stereo import StereoRow
@@ -100,7 +99,7 @@ def controls(network: FusionNetwork, *, bands: bool = False) -> dict[str, Stereo
     fusion = rectified_fusion(network, bands=bands)
 
     def shuffled(alpha: Tensor, beta: Tensor, max_disparity: float) -> StereoResult:
-        field = ShuffledField(rectified_field(max_disparity))
+        field = ShuffledField(Rectified(max_disparity, alpha_is="left"))
         return rectified_fusion(network, bands=bands, field=field)(alpha, beta, max_disparity)
 
     return {

@@ -194,12 +194,11 @@ def layered_cases(
     *,
     photos: Sequence[Path] = (),
     hw: HW = (240, 320),
-    rigs: RigDistribution = RIGS,
     seed: int = 0,
 ) -> Iterator[AblationCase]:
     """Scenes of layered photographs (scikit-image's, if none are given), recorded with some noise."""
     bank = PhotoBank.load(*photos) if photos else sample_photographs()
-    scenes, g = LayeredScenes(bank, rigs, hw=hw, seed=seed), Generator().manual_seed(seed)
+    scenes, g = LayeredScenes(bank, RIGS, hw=hw, seed=seed), Generator().manual_seed(seed)
     for number in range(count):
         made = scenes.sample(1, g)
         ground_truth, beta_image = (image[0] for image in made.images)

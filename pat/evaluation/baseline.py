@@ -79,8 +79,27 @@ def classical_view(
 
 
 def classical(rig: Rig, images: Mapping[str, Tensor], alpha: str, beta: str) -> Float[Tensor, "_ h w"]:
-    """The classical fusion of two calibrated pinhole cameras of a rig; see `classical_calibrated`."""
-    return classical_calibrated(luminance_of(images[alpha]), images[beta], rig.pair(alpha, beta))
+    """Beta's colours, or its one band, at alpha's view, for two pinholes with any pose and a depth range.
+
+    Both are rectified to one image plane with about alpha's resolution and matched there for depths near to
+    far; the colour differences (for one band: what beta has more than alpha) are warped back to alpha. Values
+    0..1. Raises ValueError for lenses, and for cameras that look along the line between them.
+    """
+    pair, mono, other = rig.pair(alpha, beta), luminance_of(images[alpha]), images[beta]
+    if pair.has_lens:
+        raise ValueError("the classical baseline needs pinhole cameras: undistort the images first")
+    plane = _rectified_plane(pair)
+    left = _warped(_planes(mono), plane.from_alpha, plane.wh)
+    right = _warped(_planes(other), plane.from_beta, plane.wh)
+    ones = np.ones(pair.beta.hw, np.float32)
+    inside: Image = cv2.warpPerspective(ones, plane.from_beta, plane.wh, flags=cv2.INTER_NEAREST)
+    one, two = pair.cameras
+    to_alpha, wh = np.linalg.inv(plane.from_alpha), (mono.shape[2], mono.shape[1])
+    matched = left, right, inside, plane.max_disparity, float(two.K[0, 0] / one.K[0, 0])
+    if len(other) == 3:
+        return _recoloured(mono, _warped(_warped_chroma(*matched), to_alpha, wh))
+    difference = _warped(_warped_band(*matched), to_alpha, wh)
+    return (mono + torch.from_numpy(difference)[None].to(mono)).clamp(0, 1)
 
 
 def classical_fusion(
@@ -98,37 +117,6 @@ def classical_fusion(
     sharpness = beta.shape[2] / alpha.shape[2]
     chroma = _warped_chroma(mono, colours, np.ones_like(mono), max_disparity, sharpness)
     return _recoloured(alpha, chroma)
-
-
-def classical_calibrated(
-    alpha: Float[Tensor, "1 h w"], beta: Float[Tensor, "_ hb wb"], pair: Pair
-) -> Float[Tensor, "_ h w"]:
-    """Beta's colours, or its one band, at alpha's view, for two pinholes with any pose and a depth range.
-
-    Both are rectified to one image plane with about alpha's resolution and matched there for depths near to
-    far; the colour differences (for one band: what beta has more than alpha) are warped back to alpha. Values
-    0..1. Raises ValueError if 0 < near < far does not hold, for lenses, and for cameras that look along the
-    line between them.
-    """
-    if pair.has_lens:
-        raise ValueError("the classical baseline needs pinhole cameras: undistort the images first")
-    near, far = (float(d) for d in pair.depth_range)
-    if not 0 < near < far:
-        raise ValueError(f"depth must be 0 < near < far, got {near} to {far}")
-    plane = _rectified_plane(pair, (near, far))
-    mono = _warped(_planes(alpha), plane.from_alpha, plane.wh)
-    other = _warped(_planes(beta), plane.from_beta, plane.wh)
-    ones = np.ones(pair.beta.hw, np.float32)
-    inside: Image = cv2.warpPerspective(ones, plane.from_beta, plane.wh, flags=cv2.INTER_NEAREST)
-    cameras = pair.cameras
-    sharpness = float(cameras[1].K[0, 0] / cameras[0].K[0, 0])
-    to_alpha = np.linalg.inv(plane.from_alpha)
-    wh = (alpha.shape[2], alpha.shape[1])
-    if beta.shape[0] == 3:
-        chroma = _warped_chroma(mono, other, inside, plane.max_disparity, sharpness)
-        return _recoloured(alpha, _warped(chroma, to_alpha, wh))
-    difference = _warped_band(mono, other, inside, plane.max_disparity, sharpness)
-    return (alpha + torch.from_numpy(_warped(difference, to_alpha, wh))[None].to(alpha)).clamp(0, 1)
 
 
 def non_local_means(image: Float[Tensor, "c h w"], deviation: float) -> Float[Tensor, "c h w"]:
@@ -165,7 +153,7 @@ class _Plane(NamedTuple):
     max_disparity: float
 
 
-def _rectified_plane(pair: Pair, depth: tuple[float, float]) -> _Plane:
+def _rectified_plane(pair: Pair) -> _Plane:
     """Both cameras rotated so that x runs along the baseline (Fusiello et al. 2000).
 
     `arraygeom.rectify` rotates each camera half way (Bouguet) and keeps one image size: other pixels, and the
@@ -182,7 +170,11 @@ def _rectified_plane(pair: Pair, depth: tuple[float, float]) -> _Plane:
     right, bottom = hw[1] - 1, hw[0] - 1
     ends = np.array([[0, 0, 1], [right, 0, 1], [0, bottom, 1], [right, bottom, 1.0]])
     corners, z = _project(K @ rotation @ np.linalg.inv(K_alpha), ends)
-    shift = -(rotation @ R.T @ t)[0] * focal / (np.array(depth) * [z.min(), z.max()])
+    shift = (
+        -(rotation @ R.T @ t)[0]
+        * focal
+        / (np.array([float(d) for d in pair.depth_range]) * [z.min(), z.max()])
+    )
     max_disparity = float(np.ptp(shift))
     K[:2, 2] = -corners.min(0) + [max_disparity, 0]
     sides = np.ceil(np.ptp(corners, axis=0) + np.array([max_disparity + 1, 1]))

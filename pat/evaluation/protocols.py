@@ -112,16 +112,11 @@ def rectified_fusion(
     def fused(alpha: Tensor, beta: Tensor, max_disparity: float) -> StereoResult:
         betas = dict(zip("rgb", beta.split(1))) if bands else {"beta": beta}
         rig = rectified_rig(hw_of(alpha), {name: hw_of(band) for name, band in betas.items()}, max_disparity)
-        looked_at = field or rectified_field(max_disparity)
+        looked_at = field or Rectified(max_disparity, alpha_is="left")
         frame = fuse(network, rig, {"alpha": alpha, **betas}, alpha="alpha", field=looked_at, **options)
         return StereoResult(frame.image, alpha.shape[-1] / frame.depth)
 
     return fused
-
-
-def rectified_field(max_disparity: float) -> ReceptiveField:
-    """Rows of `max_disparity` pixels, alpha on the left."""
-    return Rectified(max_disparity, alpha_is="left")
 
 
 def rectified_rig(hw: HW, betas: Mapping[str, HW], max_disparity: float) -> Rig:

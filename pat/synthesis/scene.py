@@ -7,7 +7,6 @@ near infrared beside them.
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -18,7 +17,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from arraygeom.atomic import write_text
-from arraygeom.safe_yaml import dump_yaml, load_json
+from arraygeom.safe_yaml import dump_yaml
 
 from ..support.schema import from_document, parse_yaml, to_document
 
@@ -111,21 +110,20 @@ class Motion:
 
     def at(self, time: float) -> ObjectPose:
         """Where the object is at a time in seconds."""
-        a, b, fraction = self._between(time)
-        from scipy.spatial.transform import Rotation  # here, as it takes .2 s to import
+        from scipy.spatial.transform import Rotation, Slerp  # here, as it takes .2 s to import
 
-        start = Rotation.from_rotvec(a.rotation)
-        rotation = (Rotation.from_rotvec(b.rotation) * start.inv()).as_rotvec()
-        R = (Rotation.from_rotvec(fraction * rotation) * start).as_matrix()
-        return ObjectPose(R, _mix(a.position, b.position, fraction), _mix(a.extent, b.extent, fraction))
-
-    def _between(self, time: float) -> tuple[Key, Key, float]:
-        after = next((i for i, k in enumerate(self.keys) if k.time > time), len(self.keys))
-        if after in (0, len(self.keys)):
-            edge = self.keys[min(after, len(self.keys) - 1)]
-            return edge, edge, 0.0
-        a, b = self.keys[after - 1], self.keys[after]
-        return a, b, (time - a.time) / (b.time - a.time)
+        times, rotations, positions, extents = (
+            np.array([getattr(key, name) for key in self.keys], float)
+            for name in ("time", "rotation", "position", "extent")
+        )
+        if len(times) == 1:
+            return ObjectPose(Rotation.from_rotvec(rotations[0]).as_matrix(), positions[0], extents[0])
+        turn = Slerp(times, Rotation.from_rotvec(rotations))(np.clip(time, times[0], times[-1]))
+        position, extent = (
+            np.array([np.interp(time, times, along) for along in of_keys.T])
+            for of_keys in (positions, extents)
+        )
+        return ObjectPose(turn.as_matrix(), position, extent)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -201,11 +199,8 @@ class Scene:
 
     @classmethod
     def from_yaml(cls, text: str, source: str = "scene") -> Scene:
-        """The scene of a file's text (YAML or JSON). Raises ValueError naming `source` and the entry."""
-        try:
-            document = load_json(text) if text.lstrip().startswith("{") else parse_yaml(text, source)
-        except json.JSONDecodeError as error:
-            raise ValueError(f"{source}: not valid JSON: {error}") from None
+        """The scene of a file's text. Raises ValueError naming `source` and the entry."""
+        document = parse_yaml(text, source)
         if not isinstance(document, dict) or document.pop("format", None) != FORMAT:
             raise ValueError(f"{source}: not a scene file: its first line must be 'format: {FORMAT}'")
         try:
@@ -221,7 +216,3 @@ class Scene:
     def load(cls, path: str | Path) -> Scene:
         """Read a scene file. Raises ValueError naming the file and the entry."""
         return cls.from_yaml(Path(path).read_text(encoding="utf-8"), str(path))
-
-
-def _mix(a: Vec3, b: Vec3, fraction: float) -> NDArray:
-    return (1 - fraction) * np.asarray(a) + fraction * np.asarray(b)

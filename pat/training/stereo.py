@@ -58,8 +58,20 @@ class PairCrops(Crops):
         self._pictures = lru_cache(ACTIVE)(lambda i: self.read(self.pairs[i]))
 
     def check(self, pair: PairFiles) -> None:
-        """Raise ValueError for a pair that cannot be used."""
-        check_pair(pair, self.hw)
+        """Raise ValueError unless both images are in colour, of one size, and at least `hw`."""
+        left, right = _header(pair.left), _header(pair.right)
+        if left != right:
+            raise ValueError(
+                f"{pair.left} is {_described(left)} and {pair.right.name} "
+                f"{_described(right)}: pairs must be alike"
+            )
+        if left[2] == 1:
+            raise ValueError(f"{pair.left} is grey: pairs to train on must be in colour")
+        h, w = self.hw
+        if left[0] < h or left[1] < w:
+            raise ValueError(
+                f"{pair.left} is {_described(left)}, smaller than the samples, {w}x{h}: lower `hw`"
+            )
 
     def read(self, pair: PairFiles) -> Pictures:
         """The images of a pair."""
@@ -159,22 +171,6 @@ def assumed_cameras(
     near = w / disparity
     bounds = torch.stack([near, torch.full_like(near, torch.inf)], -1).to(device, torch.float32)
     return ArrayBatch([p.to(device) for p in images], [], cameras, bounds)
-
-
-def check_pair(pair: PairFiles, hw: HW) -> None:
-    """Raises ValueError unless both images are in colour, of one size, and at least `hw`."""
-    left, right = _header(pair.left), _header(pair.right)
-    if left != right:
-        raise ValueError(
-            f"{pair.left} is {_described(left)} and {pair.right.name} "
-            f"{_described(right)}: pairs must be alike"
-        )
-    if left[2] == 1:
-        raise ValueError(f"{pair.left} is grey: pairs to train on must be in colour")
-    if left[0] < hw[0] or left[1] < hw[1]:
-        raise ValueError(
-            f"{pair.left} is {_described(left)}, smaller than the samples, {hw[1]}x{hw[0]}: lower `hw`"
-        )
 
 
 def _header(file: Path) -> tuple[int, int, int]:

@@ -4,7 +4,7 @@ import torch
 from torch.nn.functional import interpolate, pad
 
 from arraygeom import Camera, Distortion, Pose, intrinsics, rotation_from_vector
-from tests.arraygeom.rigs import random_camera, random_rig, scene_points, uniform
+from tests.arraygeom.rigs import random_camera, uniform
 from tests.arraygeom.test_pixels import blob, centroid
 from tests.oracles import Oracle
 
@@ -155,11 +155,3 @@ def test_contains_is_the_images_area():
 def test_intrinsics_put_the_principal_point_in_the_middle():
     K = intrinsics((500, 510), (480, 640))
     assert K.tolist() == [[500, 0, 319.5], [0, 510, 239.5], [0, 0, 1]]
-
-
-def test_scene_points_are_in_the_image():
-    rig = random_rig(0)
-    x, depth, valid = rig["alpha"].project(scene_points(rig))
-    assert valid.all()
-    assert rig["alpha"].contains(x).all()
-    assert (depth >= rig.depth[0]).all()

@@ -13,7 +13,7 @@ from arraygeom.lenses import PolynomialFisheye
 from arraygeom.lenses.central import MODELS
 from arraygeom.lenses.model import LensModel
 from tests.arraygeom.rigs import directions
-from tests.arraygeom.test_distortion import BROWN, FISHEYES
+from tests.arraygeom.test_distortion import BROWN, COUNTS, FISHEYES
 from tests.oracles import Oracle
 
 cv2 = Oracle("cv2")
@@ -107,6 +107,11 @@ FORMULAS = {
     "scaramuzza": (scaramuzza, [(-0.3, 0.02, -0.01), (-0.2, 0.0, 0.0), (0.05, -0.1, -0.02), (0.0, 0.0, 0.0)]),
 }
 CASES = [(model, c) for model, (_, sets) in FORMULAS.items() for c in sets]
+EVERY = [
+    *CASES,
+    *(("brown-conrady", tuple(BROWN[:n])) for n in COUNTS),
+    *(("kannala-brandt", tuple(k)) for k in FISHEYES),
+]
 BEHIND = ("double-sphere", "extended-unified", "unified", "polynomial-fisheye", "scaramuzza")
 
 
@@ -157,7 +162,7 @@ def test_unified_is_opencvs_omnidir(c):
     assert np.abs(found.numpy() - expected)[valid.numpy()].max() < 1e-12
 
 
-@pytest.mark.parametrize(("model", "c"), CASES)
+@pytest.mark.parametrize(("model", "c"), EVERY)
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_round_trips(model, c, dtype):
     d, X = lens(model, c, dtype), directions(3000).to(dtype)
@@ -178,7 +183,7 @@ def test_round_trips(model, c, dtype):
     )
 
 
-@pytest.mark.parametrize(("model", "c"), CASES)
+@pytest.mark.parametrize(("model", "c"), EVERY)
 def test_every_pixel_has_one_ray_or_is_not_valid(model, c):
     """Pixels of a wide area: what is valid comes back, what is not stays finite, both have gradients."""
     xy_d = (torch.rand(2000, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(1)) - 0.5) * 8
@@ -195,7 +200,7 @@ def test_every_pixel_has_one_ray_or_is_not_valid(model, c):
     assert all(slope.isfinite().all() for slope in slopes)
 
 
-@pytest.mark.parametrize(("model", "c"), CASES)
+@pytest.mark.parametrize(("model", "c"), EVERY)
 def test_gradients_are_finite_everywhere(model, c):
     X = torch.cat(
         [directions(300), torch.tensor([[0, 0, 0], [0, 0, 1], [0, 0, -1], [1, 0, 0], [0, -1e-200, -1]])]
@@ -210,7 +215,7 @@ def test_gradients_are_finite_everywhere(model, c):
     assert all(slope.isfinite().all() for slope in torch.autograd.grad(xy_d.sum(), (X, coefficients)))
 
 
-@pytest.mark.parametrize(("model", "c"), CASES)
+@pytest.mark.parametrize(("model", "c"), EVERY)
 def test_derivatives(model, c):
     X = torch.tensor(
         [[0.2, -0.1, 1.0], [0.5, 0.6, 0.9], [1e-3, 0.0, 2.0]], dtype=torch.float64, requires_grad=True

@@ -56,28 +56,6 @@ def distance_to_polyline(points: torch.Tensor, line: torch.Tensor) -> torch.Tens
     return (points[:, :, None] - foot).norm(dim=-1).amin(-1)
 
 
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_points_at_twenty_depths_lie_on_the_curve(dtype):
-    rig = fisheye_rig()
-    pair = rig.pair("alpha", "beta")
-    x = pixel_grid((400, 480), dtype=torch.float64)[10::23, 7::29].reshape(-1, 2)
-    near, far = rig.depth
-    depth = 1 / torch.linspace(1 / float(far), 1 / float(near), 20, dtype=torch.float64)
-    seen = [rig["beta"].project(rig["alpha"].unproject(x, d.expand(len(x)))) for d in depth]
-    xy = torch.stack([s.x for s in seen], 1)
-    visible = torch.stack([s.valid & rig["beta"].contains(s.x) for s in seen], 1)
-    positions = Curved()(pair, x.to(dtype))
-    wanted = visible.any(-1)
-    assert wanted.sum() > 100
-    assert positions.mask.any(-1)[visible.sum(-1) > 1].all()
-    whole = positions.mask.all(-1) & wanted
-    off = distance_to_polyline(xy[whole], positions.xy[whole].double())[visible[whole]]
-    assert off.max() < 0.05
-    # the lines are truly curved: straight segments between the ends would miss
-    chord = positions.xy[whole][:, [0, -1]].double()
-    assert distance_to_polyline(xy[whole], chord)[visible[whole]].max() > 4
-
-
 def test_spacing_is_even_in_pixels():
     pair = fisheye_rig().pair("alpha", "beta")
     x = pixel_grid((400, 480), dtype=torch.float64)[10::23, 7::29].reshape(-1, 2)
@@ -85,29 +63,6 @@ def test_spacing_is_even_in_pixels():
     steps = p.xy.diff(dim=-2).norm(dim=-1)[p.mask.all(-1)]
     long = steps.sum(-1) > 10
     assert ((steps / steps.mean(-1, keepdim=True))[long] - 1).abs().max() < 0.1
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_without_lenses_it_is_the_epipolar_segment(seed):
-    pair = random_rig(seed).pair("alpha", "beta")
-    x = pixel_grid(pair.alpha.hw, dtype=torch.float64)[::5, ::5]
-    curved, straight = Curved(32)(pair, x), Epipolar()(pair, x)
-    assert torch.equal(curved.mask[..., 16], straight.valid)
-    expected = straight.positions(32)
-    off = (curved.xy - expected.xy).norm(dim=-1)[straight.valid]
-    assert off.max() < 0.05
-
-
-def test_brown_conrady_rigs_hold_what_is_seen():
-    rig = with_lenses(random_rig(2), BARREL, BARREL)
-    pair = rig.pair("alpha", "beta")
-    x = pixel_grid(pair.alpha.hw, dtype=torch.float64)[::5, ::5].reshape(-1, 2)
-    depth = torch.full((len(x),), 3.0, dtype=torch.float64)
-    seen = rig["beta"].project(rig["alpha"].unproject(x, depth))
-    positions = Curved()(pair, x)
-    both = seen.valid & rig["beta"].contains(seen.x) & positions.mask.all(-1)
-    assert both.sum() > 50
-    assert distance_to_polyline(seen.x[both][:, None], positions.xy[both]).max() < 0.05
 
 
 def test_gradients_in_every_parameter_lenses_included():

@@ -17,7 +17,6 @@ from arraygeom import (
     NearestVoxels,
     Pose,
     Positions,
-    Rectified,
     Rig,
     ThroughLenses,
     View,
@@ -123,11 +122,6 @@ def test_no_pixels_have_no_positions(rig, dtype):
 
 def test_nearest_voxels_of_no_pixels_keep_their_shape():
     assert NearestVoxels(7, 4)(pinholes().pair("alpha", "beta"), EMPTY).xy.shape == (0, 7, 2)
-
-
-def test_alpha_is_left_right_or_either():
-    with pytest.raises((ValueError, TypeError), match="'up'"):  # a TypeError is the tests' own check of types
-        Rectified(alpha_is="up")
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, F64])

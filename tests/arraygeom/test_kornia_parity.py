@@ -225,13 +225,6 @@ def test_kornia_cameras_are_kept_up_to_date_by_gradients():
     torch.testing.assert_close(t.grad, again)
 
 
-def test_our_tensors_go_through_kornia_and_back():
-    K = intrinsics(50.0, (48, 64))
-    found = epipolar.triangulate_points(projection(ALPHA), projection(BETA), X_ALPHA, X_BETA)
-    torch.testing.assert_close(BETA.project(found).x, X_BETA)
-    assert Camera.from_kornia(ALPHA.replace(K=K).to_kornia()).K.equal(K)
-
-
 def test_rigs_go_there_and_back():
     for rig in (RIG, stack([RIG, RIG.perturbed({"alpha.focal": torch.tensor([1.0, 2.0], dtype=F64)})])):
         assert Rig.from_kornia(rig.to_kornia(), depth=rig.depth) == rig

@@ -184,12 +184,6 @@ def test_depth_maps_that_agree_are_fused():
     assert not consistent_depth(rig, noisy, "alpha", views=2).valid.any()
 
 
-def test_depth_maps_of_another_size_are_refused():
-    rig = random_rig(1)
-    with pytest.raises(ValueError, match="depth map of 'alpha' is"):
-        consistent_depth(rig, {"alpha": torch.ones(4, 4), "beta": torch.ones(40, 60)}, "alpha")
-
-
 def test_float32_rays_at_12_megapixels():
     camera = Camera(K=intrinsics(4000.0, (3000, 4000)), cam_from_world=Pose.identity(), hw=(3000, 4000))
     x = torch.rand(1000, 2, generator=torch.Generator().manual_seed(0)) * torch.tensor([4000.0, 3000])

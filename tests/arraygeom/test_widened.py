@@ -113,11 +113,6 @@ def test_directions_of_nothing_have_no_slope():
     assert step.grad.tolist() == [[0.0, 0.0]]
 
 
-def test_negative_widths_are_refused():
-    with pytest.raises(ValueError, match="0 or more"):
-        Widened(Epipolar(), across=-1.0)
-
-
 def test_samples_that_do_not_count_turn_no_tangent():
     xy = torch.stack([torch.arange(9.0), torch.full((9,), 20.0)], -1) + 10
     mask = torch.ones(9, dtype=torch.bool)

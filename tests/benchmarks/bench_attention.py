@@ -12,7 +12,6 @@ RESULTS.md.
 from __future__ import annotations
 
 import json
-import math
 import os
 import platform
 import statistics
@@ -354,56 +353,6 @@ def table(device: str, *, quick: bool) -> list[str]:
         done[job.name] = {"failed": reason} if reason else in_own_process(job)
         lines.append(row(job, done, rates, bandwidth))
         print(lines[-1], flush=True)
-    found = bars(done, rates) if device == "cpu" else []
-    print("\n".join(found), flush=True)
-    return lines + found
-
-
-def bars(done: dict, rates: dict) -> list[str]:
-    """What was asked for, of the CPU, against what was measured."""
-
-    def get(
-        what: str,
-        backward: bool,
-        method: str,
-        interpolation: str = "nearest",
-        hw: tuple[int, int] = LARGE,
-        samples: int = 80,
-        dtype: str = "float32",
-    ) -> float:
-        job = Job("cpu", method, interpolation, *hw, samples, backward, dtype)
-        return done.get(job.name, {}).get(what, math.nan)
-
-    own = {(b, i): get("time", b, "cpu", i) for b in (False, True) for i in ("nearest", "bilinear")}
-    one = {i: get("time", False, ONE_THREAD, i) for i in ("nearest", "bilinear")}
-    memory = {(b, n): get("extra", b, "cpu", samples=n) for b in (False, True) for n in (40, 80, 640)}
-    unit = get("unit", False, "cpu")
-    flops = 4 * LARGE[0] * LARGE[1] * 80 * 64
-    peak, needed = (get(what, False, "cpu", hw=WHOLE, dtype="bfloat16") for what in ("peak", "unit"))
-    slow, slow_backward = (get("time", b, "index") for b in (False, True))
-    asked = [
-        ("nearest forward, times faster than (a)", slow / own[False, "nearest"], ">=", 80),
-        ("nearest forward + backward, times faster", slow_backward / own[True, "nearest"], ">=", 45),
-        ("nearest forward, of the matmul rate", flops / own[False, "nearest"] / rates[False], ">=", 0.3),
-        ("the same with one thread, of one thread's rate", flops / one["nearest"] / rates[True], ">=", 0.3),
-        ("bilinear forward, times nearest", own[False, "bilinear"] / own[False, "nearest"], "<=", 2),
-        ("the same with one thread", one["bilinear"] / one["nearest"], "<=", 2),
-        ("extra memory, forward", memory[False, 80] / unit, "<=", 1.2),
-        ("extra memory, forward + backward", memory[True, 80] / unit, "<=", 3),
-        ("extra memory, forward, 640 over 40 samples", memory[False, 640] / memory[False, 40], "<=", 1.1),
-        ("extra memory, forward + backward, 640 over 40", memory[True, 640] / memory[True, 40], "<=", 1.1),
-        ("4024x3036 bfloat16, peak beyond Q + K + V + out, GiB", (peak - needed) / GIB, "<=", 1),
-    ]
-    lines = [
-        "",
-        "512x256, 80 samples, D = 64, float32, if not said otherwise:",
-        "",
-        markdown_header(["asked", "", "measured", ""], align="l"),
-    ]
-    for what, value, sign, bar in asked:
-        reached = value >= bar if sign == ">=" else value <= bar
-        verdict = "not measured" if math.isnan(value) else "reached" if reached else "missed"
-        lines.append(markdown_row([what, f"{sign} {bar}", f"{value:.2f}", verdict]))
     return lines
 
 

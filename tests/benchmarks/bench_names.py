@@ -7,7 +7,7 @@ eleven others); a mistake is made with the rig. Of real pairs only gross mistake
 points lie farther from their lines by 0.5 px and three times, or most of them behind the cameras or outside
 the depth range. *as good*: the right name is one of several that are said to explain the points as well.
 *worse*: a wrong name whose repair has a larger error of depth than the rig had, or lies farther from the
-points. The mistakes of images (another size, cropped, rotated) are in `bench_doctor`.
+points.
 """
 
 from __future__ import annotations

@@ -9,13 +9,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-import cv2
 import pytest
 import tyro
 
-from tests.benchmarks import bench_doctor
 from tests.benchmarks.bench_job import STAGE_NAMES, Case, fuse_arguments
-from tests.benchmarks.printed import print_tables
 
 BENCHES = sorted(path.stem for path in Path(__file__).parent.glob("bench_*.py"))
 
@@ -38,17 +35,3 @@ def test_every_part_of_a_frame_is_met(tmp_path):
     fuse = fuse_arguments(Case("tiny", (160, 120)), tmp_path, tmp_path / "out")
     printed = subprocess.run([*part, "stages", *fuse], capture_output=True, text=True, check=False).stdout
     assert json.loads(printed.splitlines()[-1])["stages"].keys() == set(STAGE_NAMES)
-
-
-def test_the_doctors_mistakes_are_known_before_anything_is_read(tmp_path):
-    with pytest.raises(ValueError, match=r"--only: no mistake 'lenses': there are nothing, resized, "):
-        bench_doctor.main(tmp_path / "absent", only=("units", "lenses"))
-
-
-def test_opencv_is_seeded_by_the_doctors_seed_and_not_by_printing(monkeypatch, tmp_path):
-    seeds = []
-    monkeypatch.setattr(cv2, "setRNGSeed", seeds.append)
-    monkeypatch.setattr(bench_doctor, "subjects", lambda data: [])
-    print_tables("none", [[]], None)
-    bench_doctor.main(tmp_path / "absent", seed=3, only=())
-    assert seeds == [3]

@@ -69,3 +69,11 @@ def simulated_matches(
         here = g.normal(0, NOISE, x.shape)
         found[names] = PointMatches(x + torch.from_numpy(here), y + torch.from_numpy(off))
     return found
+
+
+def worse(rig: Rig, g: torch.Generator) -> Rig:
+    """Every camera rotated by 0.3 degrees, its principal point moved by 5 px, in random directions."""
+    sizes = {"rotation": math.radians(0.3), "centre": 5.0}
+    changes = rig.parameters(free=[f"*.{kind}" for kind in sizes])
+    drawn = {k: torch.randn(v.shape, generator=g, dtype=torch.float64) for k, v in changes.items()}
+    return rig.perturbed({k: v / v.norm() * sizes[k.rpartition(".")[2]] for k, v in drawn.items()})

@@ -1,3 +1,6 @@
+import shutil
+from dataclasses import replace
+
 import pytest
 import torch
 import yaml
@@ -26,6 +29,7 @@ from pat.media.colour import luminance, srgb_from_linear
 from pat.media.images import read_image
 from pat.sensors import BoxBlur, Clip, GaussianBlur, Noise, Quantise, Resample, record
 from pat.synthesis.check import CheckLimits
+from pat.synthesis.rendered import Rendered, save_frame
 from tests.arraygeom.rigs import parallel_rig
 
 
@@ -206,6 +210,25 @@ def test_rendered_scenes_are_recorded_by_their_responses_for_fusion(rendered, tm
     rig, images = Rig.load(out / "rig.yaml"), {"mono": mono, "colour": colour}
     frame = fuse(load_weights("mono-colour-small"), rig, images, alpha="mono")
     assert frame.image.shape == (3, 48, 64)
+
+
+def test_near_infrared_is_recorded_where_it_was_rendered(rendered, tmp_path, refusal):
+    """All cameras recorded colours, whatever their response."""
+    shutil.copytree(rendered / "scenes" / "000000", tmp_path / "scene")
+    source = Rendered(tmp_path / "scene")
+    rig = source.rig.with_camera("mono", source.rig["mono"].replace(sensor=Sensor("nir")))
+    rig.save(source.folder / "rig.yaml")
+    arguments = ["record", str(source.folder), "--out", str(tmp_path / "out")]
+    assert "render infrared too" in refusal(*arguments)
+    frames = {name: source.frame(name) for name in rig.names}
+    for name, frame in frames.items():
+        nir = 1 - frame.rgb[:1].clamp(0, 1)
+        save_frame(source.folder / source.about["frames"][name][0]["file"], replace(frame, nir=nir))
+    main(arguments, group=Experiments)
+    mono, colour = (read_image(tmp_path / "out" / "scene" / f"{name}.png") for name in rig.names)
+    wanted = srgb_from_linear(1 - frames["mono"].rgb[:1].clamp(0, 1))
+    assert (mono - wanted).square().mean().sqrt() < 0.02
+    assert colour.shape == (3, 48, 64)
 
 
 def test_rendered_scenes_are_recorded_by_a_file_of_steps(rendered, tmp_path, refusal):

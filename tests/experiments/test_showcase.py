@@ -84,12 +84,11 @@ def write_syntim(folder):
     pose = pair.beta_from_alpha
     normal, d = torch.tensor([0.0, 0, 1], dtype=torch.float64), torch.tensor(-PLANE, dtype=torch.float64)
     H = plane_homography(a.K, b.K, pose.R, pose.t, normal=normal, d=d)
-    for seed, scene in enumerate(SYNTIM):
-        left = texture(SYNTIM_HW, seed)
-        write_image(folder / f"{scene}0_OG0.png", left)
-        write_image(folder / f"{scene}1_OG0.png", moved(left, H, SYNTIM_HW))
-        (folder / f"cam_{scene}_g").write_text(syntim_text(rig["left"]))
-        (folder / f"cam_{scene}_d").write_text(syntim_text(rig["right"]))
+    left = texture(SYNTIM_HW)
+    write_image(folder / f"{SYNTIM}0_OG0.png", left)
+    write_image(folder / f"{SYNTIM}1_OG0.png", moved(left, H, SYNTIM_HW))
+    (folder / f"cam_{SYNTIM}_g").write_text(syntim_text(rig["left"]))
+    (folder / f"cam_{SYNTIM}_d").write_text(syntim_text(rig["right"]))
 
 
 def slow_map(k: int) -> torch.Tensor:

@@ -67,7 +67,7 @@ def tiny(monkeypatch):
 def stage(name: str, **changes) -> SystemScene:
     system = load_system(name)
     m = system.module
-    options = {"depths": m.DEPTHS, "layers": m.LAYERS, "photos": None, "seed": m.SEED, **changes}
+    options = {"depths": m.DEPTHS, "layers": m.LAYERS, "seed": m.SEED, **changes}
     return SystemScene(system.sized(False), system.alpha, **options)
 
 

@@ -30,18 +30,9 @@ class RenderSettings:
     duration: float = 0.0
     limits: CheckLimits = field(default_factory=CheckLimits)
 
-    @classmethod
-    def preset(cls, name: str, **changes: Any) -> RenderSettings:
-        """ "fast" (512 pixels wide, 8 samples, quick denoising and light) or "paper" (2048, more of each).
-
-        Raises ValueError for another name.
-        """
-        if name not in PRESETS:
-            raise ValueError(f"unknown preset '{name}' (known: {', '.join(PRESETS)})")
-        return cls(**{**PRESETS[name], **changes})
-
 
 PRESETS: dict[str, dict[str, Any]] = {
     "fast": {"width": 512},
     "paper": {"width": 2048, "samples": 32, "denoise": "accurate", "fast_light": False, "bounces": 4},
 }
+"""What differs from the defaults, by name: 512 pixels wide, or as the paper's, 2048 and more of each."""

@@ -20,7 +20,6 @@ from pat.cli.main import main
 from pat.media.images import write_image
 from tests.benchmarks.bench_drift import DRIFTS, drifted, with_lens_mistake
 from tests.benchmarks.bench_drift import error as depth_error
-from tests.benchmarks.bench_refine import worse
 from tests.calib.real import bumblebee, syntim
 from tests.calib.scenes import (
     HW,
@@ -32,7 +31,7 @@ from tests.calib.scenes import (
     unlike_pair,
     vector,
 )
-from tests.calib.simulated import simulated_matches, simulated_rig
+from tests.calib.simulated import simulated_matches, simulated_rig, worse
 
 
 def drawn(rig: Rig) -> Rig:

@@ -3,9 +3,9 @@ import numpy as np
 import pytest
 import torch
 
-from arraygeom import Camera, Pair, Pose
+from arraygeom import Camera, Pose, Rig
 from pat.data import StereoPair, middlebury_pairs
-from pat.evaluation.baseline import _rectified_plane, _regressed, classical_calibrated, classical_fusion
+from pat.evaluation.baseline import _rectified_plane, _regressed, classical, classical_fusion
 from pat.evaluation.metrics import score
 from pat.evaluation.protocols import mono_colour_task
 from pat.media.colour import luminance, to_luma_chroma
@@ -93,8 +93,8 @@ def camera(focal, hw, R=None, t=(0.0, 0.0, 0.0)):
     return Camera(K=K, cam_from_world=pose, hw=hw)
 
 
-def pair_of(alpha, beta, depth):
-    return Pair(alpha, beta, tuple(torch.tensor(d).double() for d in depth))
+def rig_of(alpha, beta, depth):
+    return Rig({"alpha": alpha, "beta": beta}, depth=depth)
 
 
 POSES = {
@@ -109,9 +109,10 @@ POSES = {
 def test_rectifying_puts_points_on_one_row_and_disparities_in_range(pose):
     R, t = POSES[pose][0].numpy(), np.array(POSES[pose][1])
     near, far = 2.0, 6.0
-    pair = pair_of(camera(200.0, (96, 160)), camera(120.0, (70, 100), *POSES[pose]), (near, far))
+    rig = rig_of(camera(200.0, (96, 160)), camera(120.0, (70, 100), *POSES[pose]), (near, far))
+    pair = rig.pair("alpha", "beta")
     K_alpha, K_beta = (c.K.numpy() for c in pair.cameras)
-    plane = _rectified_plane(pair, (near, far))
+    plane = _rectified_plane(pair)
     rng = np.random.default_rng(0)
     pixels = np.c_[rng.uniform(0, 159, 200), rng.uniform(0, 95, 200), np.ones(200)]
     points = pixels @ np.linalg.inv(K_alpha).T * rng.uniform(near, far, (200, 1))
@@ -131,8 +132,8 @@ def test_rectifying_puts_points_on_one_row_and_disparities_in_range(pose):
 def test_a_slanted_plane_seen_by_unrectified_cameras_is_coloured(pose):
     R, t = POSES[pose][0], torch.tensor(POSES[pose][1]).double()
     hw, beta_hw = (96, 160), (80, 120)
-    pair = pair_of(camera(200.0, hw), camera(140.0, beta_hw, *POSES[pose]), (2.0, 6.0))
-    K_alpha, K_beta = (c.K for c in pair.cameras)
+    rig = rig_of(camera(200.0, hw), camera(140.0, beta_hw, *POSES[pose]), (2.0, 6.0))
+    K_alpha, K_beta = (c.K for c in rig.cameras.values())
     normal, distance = torch.tensor([0.1, 0.2, -1.0]).double(), 3.0
     H = K_beta @ (R - t[:, None] * normal / distance) @ K_alpha.inverse()
     ground_truth = patches(*hw)
@@ -145,7 +146,7 @@ def test_a_slanted_plane_seen_by_unrectified_cameras_is_coloured(pose):
     )
     beta = torch.from_numpy(beta).permute(2, 0, 1)
     alpha = luminance(ground_truth)
-    result = classical_calibrated(alpha, beta, pair)
+    result = classical(rig, {"alpha": alpha, "beta": beta}, "alpha", "beta")
     seen = cv2.warpPerspective(np.ones(beta_hw, np.uint8), H.inverse().numpy(), hw[::-1]) > 0
     seen = torch.from_numpy(cv2.erode(seen.astype(np.uint8), np.ones((9, 9)), borderValue=1)) > 0
     error = (result - ground_truth)[:, seen].square().mean().sqrt()
@@ -154,19 +155,18 @@ def test_a_slanted_plane_seen_by_unrectified_cameras_is_coloured(pose):
 
 
 @pytest.mark.parametrize(
-    ("t", "depth", "complaint"),
+    ("t", "complaint"),
     [
-        ([0.0, 0.0, 0.3], (2.0, 6.0), "along the line between"),
-        ([0.05, 0.0, 0.3], (2.0, 6.0), "along the line between"),
-        ([0.0, 0.0, 0.0], (2.0, 6.0), "t is zero"),
-        ([0.3, 0.0, 0.0], (6.0, 2.0), "near < far"),
-        ([0.3, 0.0, 0.0], (0.0, 2.0), "near < far"),
+        ([0.0, 0.0, 0.3], "along the line between"),
+        ([0.05, 0.0, 0.3], "along the line between"),
+        ([0.0, 0.0, 0.0], "t is zero"),
     ],
 )
-def test_rigs_that_cannot_be_rectified_are_refused(t, depth, complaint):
-    pair = pair_of(camera(200.0, (24, 32)), camera(200.0, (24, 32), t=t), depth)
+def test_rigs_that_cannot_be_rectified_are_refused(t, complaint):
+    rig = rig_of(camera(200.0, (24, 32)), camera(200.0, (24, 32), t=t), (2.0, 6.0))
+    images = {"alpha": torch.rand(1, 24, 32), "beta": torch.rand(3, 24, 32)}
     with pytest.raises(ValueError, match=complaint):
-        classical_calibrated(torch.rand(1, 24, 32), torch.rand(3, 24, 32), pair)
+        classical(rig, images, "alpha", "beta")
 
 
 def test_teddy_keeps_its_colours(shared_data):
