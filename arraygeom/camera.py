@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
 from .batching import Batched
-from .checks import check_batches, check_hw, check_K, check_origin, checking
+from .checks import check_batches, check_hw, check_K, checking
 from .distortion import Distortion
 from .lenses.common import on_plane
 from .lenses.model import LensModel, check_model
@@ -237,7 +237,6 @@ class Camera(LensView):
                 )
             shapes = self.K.shape[:-2], self._lens_batch, self.cam_from_world.batch_shape
             check_batches("K, lens and cam_from_world", *shapes)
-            check_origin(self.cam_from_world.t)
 
     def scaled(self, factor: float) -> Camera:
         """The camera with all lengths times a positive factor. Raises ValueError as `LensModel.scaled`."""

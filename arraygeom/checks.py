@@ -24,7 +24,7 @@ T = TypeVar("T")
 LARGEST_SIDE, MOST_PIXELS = 65_535, 2**30
 """A size beyond these is more likely a damaged number than an image (the largest sensors have 4e8 pixels)."""
 ROUNDED = 1e-3
-"""Numbers in text files are rounded: up to this much of R R^T - I, or in the last row of K, is rounding."""
+"""Numbers are rounded: this much of R R^T - I, in the last row of K, or of the near bound, does not count."""
 SINGULAR = 1e-9
 """A K whose upper block has a smaller determinant, pixels squared, maps the plane to a line."""
 
@@ -68,21 +68,18 @@ def check_numbers(value: Any, shape: tuple[int, ...], what: str) -> Tensor:
     return value
 
 
-def check_origin(t: Tensor) -> None:
-    """Raises ValueError for float32 translations (\\*b, 3) of which a millimetre is lost to rounding."""
-    if t.dtype != torch.float32 or t.is_meta:
-        return
-    largest = float(t.detach().abs().max()) if t.numel() else 0.0
-    rounding = largest * torch.finfo(t.dtype).eps
-    if rounding > LOST:
-        raise ValueError(
-            f"a camera is {largest:,.0f} m from the origin, which float32 holds to {rounding:.1g} m: "
-            "give float64, or put the origin near the cameras"
-        )
-
-
-LOST = 1e-3
-"""Metres."""
+def check_origin(near: Tensor, *translations: Tensor, unit: str) -> None:
+    """Raises ValueError for float32 translations (\\*b, 3) rounded visibly for a scene at `near` (\\*b)."""
+    for t in translations:
+        if t.dtype != torch.float32 or t.is_meta or near.is_meta or not t.numel():
+            continue
+        largest = t.detach().abs().amax(-1)
+        rounding = largest * torch.finfo(t.dtype).eps
+        if bool((rounding > ROUNDED * near.detach()).any()):
+            raise ValueError(
+                f"a camera is {float(largest.max()):,.0f} {unit} from the origin, which float32 holds to "
+                f"{float(rounding.max()):.1g} {unit}: give float64, or put the origin near the cameras"
+            )
 
 
 def check_rotation(R: Any) -> None:

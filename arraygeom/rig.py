@@ -101,9 +101,8 @@ class Pair(Batched):
     def beta_from_alpha(self) -> Pose:
         """X_beta = R X_alpha + t; t is 0 where it is no more than the rounding of the cameras' poses."""
         alpha, beta = self.cameras
-        if checking():
-            check_origin(alpha.t)
-            check_origin(beta.t)
+        if checking() and self.depth is not None:
+            check_origin(self.depth[0], alpha.t, beta.t, unit=self.unit)
         # torch.compile cannot trace @ of these
         pose = beta.cam_from_world.__matmul__(alpha.cam_from_world.inverse())
         baseline, *sides = (t.detach().norm(dim=-1, keepdim=True) for t in (pose.t, alpha.t, beta.t))

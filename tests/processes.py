@@ -18,6 +18,17 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 
 
+@contextmanager
+def room_for(nbytes: int) -> Iterator[None]:
+    """Files become no larger than that, as on a full disk."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (nbytes, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
 def forked(act: Callable[[], int], log: Path) -> int:
     """The number of a forked process that does something and ends with its result, 2 if it raises.
 

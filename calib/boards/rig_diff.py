@@ -33,11 +33,11 @@ FARTHEST = 50.0
 LEVEL = 0.001
 """Probability with which a rig that has not moved is said to have moved."""
 LEAST = 1e-3
-"""Combinations of parameters that change pixels by less (RMS, pixels) are not tested."""
+"""Changes of pixels by less (RMS) count as none: their parameters are not tested, a motion is found."""
 STEP = 1e-3
 """Relative change of depth by which a derivative is taken."""
-ITERATIONS, CONVERGED = 5, 1e-6
-"""Steps of the motion at most, and the size of a last one (radians, metres)."""
+ITERATIONS = 5
+"""Steps of the motion at most."""
 
 
 class Difference(NamedTuple):
@@ -240,11 +240,10 @@ def _best_motion(a: Rig, b: Rig, grids: Mapping[str, Grid]) -> Pose:
     for _ in range(ITERATIONS):
         parts = [_projections(a, b, motion, name, X) for name, (_, X, _) in grids.items()]
         change = np.concatenate([projected.change.ravel() for projected in parts])
-        step = np.linalg.lstsq(
-            np.concatenate([projected.by_motion for projected in parts]), -change, rcond=None
-        )[0]
+        by_motion = np.concatenate([projected.by_motion for projected in parts])
+        step = np.linalg.lstsq(by_motion, -change, rcond=None)[0]
         motion = motion.perturbed(*(torch.from_numpy(p) for p in np.split(step, 2)))
-        if np.abs(step).max() < CONVERGED:
+        if np.abs(by_motion @ step).max() < LEAST:
             break
     return motion
 

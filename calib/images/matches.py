@@ -118,9 +118,9 @@ def detect_features(image: Float[Tensor, "_ h w"]) -> SiftFeatures:
 
 
 def contrast_equalised(image: Float[Tensor, "_ h w"]) -> UInt8[NDArray, "h w"]:
-    """An image's luminance, its contrast equalised (CLAHE)."""
+    """An image's luminance, or the mean of bands other than three, its contrast equalised (CLAHE)."""
     values = image.detach().cpu().movedim(0, -1).float().contiguous().numpy()
-    grey = cv2.cvtColor(values, cv2.COLOR_RGB2GRAY) if image.shape[0] == 3 else values[..., 0]
+    grey = cv2.cvtColor(values, cv2.COLOR_RGB2GRAY) if image.shape[0] == 3 else values.mean(-1)
     return cv2.createCLAHE(3, (8, 8)).apply(np.rint(grey.clip(0, 1) * 255).astype(np.uint8))
 
 

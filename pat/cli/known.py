@@ -88,12 +88,11 @@ class Known:
     def judged(self) -> Iterator[None]:
         """A block of work within --max-memory; exit status 3 if the rig does not fit the images."""
         from ..fusion.checks import LowConfidenceWarning, confidence_checked
-        from ..support.memory import limited, parse_bytes
+        from ..support.memory import limited
 
-        limit = None if self.max_memory is None else parse_bytes(self.max_memory)
         self._notes: list[str] = []
         try:
-            with limited(limit), confidence_checked(strict=self.strict):
+            with limited(self.settings().limit), confidence_checked(strict=self.strict):
                 yield
         except Exception as error:
             if not isinstance(error.__cause__ or error, LowConfidenceWarning):

@@ -9,7 +9,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, Literal, TypeGuard
 
 import cv2
@@ -30,17 +29,14 @@ from ..matching.matches import BetaMatches
 from ..matching.radiometry import ResponseSpec
 from ..media.images import Images
 from ..networks.protocol import FusionNetwork
-from ..networks.weights import load_weights, weights_for
 from ..support.blocks import without_autocast
-from ..support.memory import limited, parse_bytes
+from ..support.memory import limited
 from .checks import warn_of_confidence
-from .corrections import expected_work, find_corrections
-from .fuse import Progress
-from .inputs import FrameInputs, Placement, prepared
-from .low_light import Noise, denoised_views
-from .steps import FusionStep, equal_resolution, has_lens, normalise_betas, undistort, undone, upright
-from .tiles import Plan, fused_in_tiles, plan_frame
-from .views import Views, check_bands
+from .fuse import FuseSettings, Progress, matches_by, ready_frame
+from .inputs import FrameInputs, Placement
+from .low_light import Noise
+from .steps import has_lens, undone
+from .tiles import Plan, fused_in_tiles
 
 LOG = logging.getLogger(__name__)
 
@@ -184,38 +180,18 @@ def align(
     no numbers, or of another size than the rig says.
     """
     rule = _ViewRule(interpolation, min_confidence, fill)
-    limit = None if max_memory is None else parse_bytes(max_memory)
-    rig = with_pixels(rig if depth is None else rig.replace(depth=depth))
-    views, low_light = denoised_views(Views.of(rig, images, alpha=alpha, field=field), noise)
-    betas, recordings = views.betas, images if recorded is None else recorded
+    rig = with_pixels(rig)
+    betas = [name for name in rig.betas(alpha) if name in images]
+    recordings = images if recorded is None else recorded
     _check_recorded(rig, recordings, (alpha, *betas))
-    if network is None:
-        weights = weights_for([len(views.images[name]) for name in betas])
-        network = load_weights(weights)
-        if explain:
-            explain(f"weights: {weights}")
-    if not network.uses_matches:
+    if network is not None and not network.uses_matches:
         raise ValueError("these weights use no matches to align by: take others, such as mono-spectral")
-    check_bands(views, network.bands)
-    inputs, undo = prepared(network, views, _steps(network, normalise=match_levels))
-    del views
-    plan = plan_frame(
-        network,
-        inputs,
-        limit=limit,
-        estimate=announce is not None,
-        stored=False,
-        before=expected_work(inputs, response, align=correct),
-        kept=low_light.kept(inputs.hw, len(betas)),
+    how = FuseSettings(depth, field, max_memory, match_levels, response, align=correct, noise=noise)
+    network, inputs, undo, plan, *_ = ready_frame(
+        network, rig, images, alpha, how, joined=False, explain=explain, announce=announce
     )
-    if announce:
-        announce(plan)
-    corrections = find_corrections(network, inputs, response, align=correct)
-    for line in corrections.described(inputs.hw) if explain else ():
-        explain(line)
-    inputs = inputs._replace(inputs=corrections.applied(inputs.inputs, inputs.hw))
-    with limited(limit), torch.no_grad():
-        matches = matcher(inputs.inputs)
+    with limited(how.limit), torch.no_grad():
+        matches = matches_by(matcher, inputs.inputs)
         fused = fused_in_tiles(network, inputs, matches, plan.tiles, progress=progress)
         warn_of_confidence(network, fused.frame, inputs)
         depths = undone(fused.frame, undo).depth
@@ -247,12 +223,6 @@ def _as_recorded(confidence: Float[Tensor, "1 h w"], now: View, recorded: View) 
         assert isinstance(now, LensView)
         confidence = resampled(confidence, now, recorded, interpolation="bilinear").values[0]
     return confidence[0]
-
-
-def _steps(network: FusionNetwork, *, normalise: bool) -> list[FusionStep]:
-    """Those of a fusion that change where pixels are, and the radiometry that matching sees."""
-    resize = [partial(equal_resolution, network)] if network.equal_resolution else []
-    return [undistort, upright, *resize, *([normalise_betas] if normalise else [])]
 
 
 def _located(

@@ -38,7 +38,7 @@ from ..networks.weights import Precision, find_weights, load_weights
 from ..sensors import NoiseLevel
 from ..support.jobs import HERE, JobReport, OnError, Task, Workers, run_tasks
 from ..support.locks import folder_lock
-from ..support.memory import limited, parse_bytes
+from ..support.memory import limited
 from ..support.schema import entries_of
 from ..support.tensor_files import read_tensors, write_tensors
 from .checks import confidence_checked
@@ -151,8 +151,8 @@ class Batch:
                 self.fusion.timeline.warn_of_ends()
             if self.sequence and not self.alone:
                 missing = [i for i in many if not (resume and self.fused_file(i).exists())]
-                alphas, keys = self.files[self.alpha], self.fusion.keys_of(missing)
-                first = [Task(self._key_file(k), fuse_key, (plan, k), str(alphas[k.alpha])) for k in keys]
+                keys = [(k, f"key frame {self.names[k.alpha]}") for k in self.fusion.keys_of(missing)]
+                first = [Task(self._key_file(k), fuse_key, (plan, k), about) for k, about in keys]
                 run_tasks(first, title="key frames", **how)
             tasks = [Task(self.fused_file(i), fuse_one, (plan, i)) for i in many]
             report = run_tasks(tasks, title="frames", **how)
@@ -234,8 +234,7 @@ class Batch:
 
     def fuse_one(self, i: int) -> None:
         """Write a frame."""
-        limit = self.settings.max_memory
-        with limited(None if limit is None else parse_bytes(limit)):
+        with limited(self.settings.limit):
             with confidence_checked(strict=self.strict):
                 frame = self._frame(i)
             view = view_of(self.rig, self.alpha, bits=self.bits, bands=len(frame.image))

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -24,17 +24,18 @@ from ..matching.matches import Matches
 from ..matching.radiometry import ResponseSpec, given_response
 from ..media.images import Images
 from ..networks.protocol import FusionNetwork
+from ..networks.weights import load_weights, weights_for
 from ..support.blocks import without_autocast
 from ..support.memory import limited, parse_bytes, planned
 from .checks import warn_of_confidence
 from .corrections import Corrections, expected_work, find_corrections
 from .depth_edges import beside_edges
 from .depth_filling import background_filled
-from .inputs import bytes_beside, prepared
+from .inputs import FrameInputs, bytes_beside, prepared
 from .low_light import LowLight, Noise, check_noise, denoised_views
 from .luminance import SHARES, Luminance, check_luminance, with_alpha_detail, with_own_colours
 from .results import Frame
-from .steps import steps_for, undone
+from .steps import Undo, steps_for, undone
 from .tiles import LARGE, Plan, fused_in_tiles, plan_frame
 from .views import Views, check_bands
 
@@ -87,6 +88,11 @@ class FuseSettings:
     def __post_init__(self) -> None:
         check_noise(self.noise)
         given_response(self.response)
+
+    @property
+    def limit(self) -> float | None:
+        """The memory limit in bytes, if there is one."""
+        return None if self.max_memory is None else parse_bytes(self.max_memory)
 
     def changed(self, changes: Mapping[str, Any]) -> FuseSettings:
         """The settings with some of them changed. Raises TypeError for a name that is none of theirs."""
@@ -160,46 +166,37 @@ def fuse(
             as `warnings.simplefilter("error", LowConfidenceWarning)`.
     """
     settings = _given(FuseSettings, settings).changed(changes)
-    noise, luminance, response = settings.noise, settings.luminance, settings.response
-    automatic = noise is None and rig is None and luminance == "alpha" and not differentiable
-    noise = "auto" if automatic else noise
+    automatic = rig is None and settings.luminance == "alpha" and not differentiable
     network, rig, images, alpha, grey_world = _with_rig(network, rig, images, alpha, explain)
-    align = not differentiable if settings.align is None else settings.align
-    in_parts = settings.max_memory is not None or store is not None
-    _check_gradients(differentiable, in_parts=in_parts, noisy=bool(noise))
-    check_luminance(network, luminance, noisy=noise is not None)
-    limit = None if settings.max_memory is None else parse_bytes(settings.max_memory)
-    views, low_light = _seen(network, rig, images, alpha, settings, noise)
-    if noise == "auto" and low_light.noisy and explain:
-        explain(low_light.described())
-    betas, in_colour, noisy = views.betas, views.alpha_in_colour, bool(low_light.noisy)
-    normalise = settings.match_levels or grey_world
-    inputs, undo = prepared(network, views, steps_for(network, normalise=normalise))
-    held = bytes_beside(inputs.inputs, [views.own, *(images.values() if isinstance(images, dict) else ())])
-    del views  # whose images are there again, padded
-    LOG.info("planning")
-    plan = plan_frame(
-        network,
-        inputs,
-        limit=limit,
-        estimate=announce is not None,
-        stored=store is not None,
-        before=0.0 if corrections else expected_work(inputs, response, align=align),
-        after=low_light.seconds_left,
-        kept=held + low_light.kept(inputs.hw, len(betas)),
+    settings = replace(
+        settings,
+        noise="auto" if automatic and settings.noise is None else settings.noise,
+        align=not differentiable if settings.align is None else settings.align,
+        match_levels=settings.match_levels or grey_world,
     )
-    if announce:
-        announce(plan)
-    fitted = corrections and _given(Corrections, corrections)
-    fitted = fitted or find_corrections(network, inputs, response, align=align)
-    for line in fitted.described(inputs.hw) if explain else ():
-        explain(line)
-    right = fitted.applied(inputs.inputs, inputs.hw)
-    right = replace(right, luminance=SHARES[luminance], denoised=noisy)
+    in_parts, luminance = settings.max_memory is not None or store is not None, settings.luminance
+    _check_gradients(differentiable, in_parts=in_parts, noisy=bool(settings.noise))
+    check_luminance(network, luminance, noisy=settings.noise is not None)
+    _, inputs, undo, plan, fitted, low_light, in_colour = ready_frame(
+        network,
+        rig,
+        images,
+        alpha,
+        settings,
+        corrections=corrections and _given(Corrections, corrections),
+        stored=store is not None,
+        explain=explain,
+        announce=announce,
+    )
+    if in_colour:
+        text = "is in colour: colours come from the betas, its own only where they do not see"
+        warn(f"the image of alpha, '{alpha}', {text}")
+    noisy = bool(low_light.noisy)
+    right = replace(inputs.inputs, luminance=SHARES[luminance], denoised=noisy)
     inputs = inputs._replace(inputs=right)
-    with limited(planned(limit, plan.memory, large=math.prod(inputs.hw) > LARGE)):
+    with limited(planned(settings.limit, plan.memory, large=math.prod(inputs.hw) > LARGE)):
         with torch.set_grad_enabled(differentiable):
-            matches = _matched(matcher, inputs.inputs) if network.uses_matches else None
+            matches = matches_by(matcher, inputs.inputs) if network.uses_matches else None
             LOG.info("fusing %d tile%s", len(plan.tiles), "s" * (len(plan.tiles) > 1))
             fused = fused_in_tiles(
                 network, inputs, matches, plan.tiles, keep_matched=noisy, progress=progress, store=store
@@ -219,6 +216,73 @@ def fuse(
         if in_colour and len(frame.image) == 3 and frame.by_band is None and not noisy:
             frame = with_own_colours(frame, images[alpha])
         return frame if differentiable else frame.mapped(Tensor.detach)
+
+
+class ReadyFrame(NamedTuple):
+    """A frame ready to be matched: the network, its inputs as they are put right, how a frame of these is
+    taken back to alpha's pixels, the plan, what was put right, what is known of noise, and whether alpha was
+    in colour."""
+
+    network: FusionNetwork
+    inputs: FrameInputs
+    undo: list[Undo]
+    plan: Plan
+    corrections: Corrections
+    low_light: LowLight
+    in_colour: bool
+
+
+def ready_frame(
+    network: FusionNetwork | None,
+    rig: Rig,
+    images: Images,
+    alpha: str,
+    settings: FuseSettings,
+    *,
+    joined: bool = True,
+    corrections: Corrections | None = None,
+    stored: bool = False,
+    explain: Callable[[str], None] | None,
+    announce: Callable[[Plan], None] | None,
+) -> ReadyFrame:
+    """What fusion and alignment have in common: all that comes before alpha's pixels are matched.
+
+    Arguments are as of `fuse`; without a network that of the shipped weights for bands as the betas'.
+    `joined` takes co-located betas for one of several bands. Raises as `fuse`.
+    """
+    say = explain or (lambda line: None)
+    views, low_light = _seen(rig, images, alpha, settings)
+    if network is None:
+        weights = weights_for([len(views.images[name]) for name in views.betas])
+        network = load_weights(weights)
+        say(f"weights: {weights}")
+    check_bands(views, network.bands)
+    if settings.noise == "auto" and low_light.noisy:
+        say(low_light.described())
+    betas, in_colour = views.betas, views.alpha_in_colour
+    steps = steps_for(network, normalise=settings.match_levels, joined=joined)
+    inputs, undo = prepared(network, views, steps)
+    held = bytes_beside(inputs.inputs, [views.own, *(images.values() if isinstance(images, dict) else ())])
+    del views  # whose images are there again, padded
+    LOG.info("planning")
+    align = settings.align is not False
+    plan = plan_frame(
+        network,
+        inputs,
+        limit=settings.limit,
+        estimate=announce is not None,
+        stored=stored,
+        before=0.0 if corrections else expected_work(inputs, settings.response, align=align),
+        after=low_light.seconds_left,
+        kept=held + low_light.kept(inputs.hw, len(betas)),
+    )
+    if announce:
+        announce(plan)
+    fitted = corrections or find_corrections(network, inputs, settings.response, align=align)
+    for line in fitted.described(inputs.hw):
+        say(line)
+    inputs = inputs._replace(inputs=fitted.applied(inputs.inputs, inputs.hw))
+    return ReadyFrame(network, inputs, undo, plan, fitted, low_light, in_colour)
 
 
 def _check_gradients(differentiable: bool, *, in_parts: bool, noisy: bool) -> None:
@@ -253,7 +317,6 @@ def _with_rig(
             'fuse takes a network, a rig, images and alpha=NAME, such as `load_weights("mono-colour")`, '
             "`Rig.load(FILE)` and {NAME: read_image(FILE)}; or images alone, to find the rig"
         )
-    from ..networks.weights import load_weights
     from .from_images import array_from_images
 
     array = array_from_images(network, alpha=alpha, say=explain or (lambda line: None))
@@ -276,7 +339,8 @@ def corrections_of(
     Arguments and errors are as of `fuse`.
     """
     settings = _given(FuseSettings, settings).changed(changes)
-    views, _ = _seen(network, rig, images, alpha, settings, settings.noise)
+    views, _ = _seen(rig, images, alpha, settings)
+    check_bands(views, network.bands)
     inputs, _ = prepared(network, views, steps_for(network, normalise=settings.match_levels))
     return find_corrections(network, inputs, settings.response, align=settings.align is not False)
 
@@ -288,21 +352,14 @@ def _given(kind: type[T], value: T) -> T:
     return value
 
 
-def _matched(matcher: Matcher, inputs: Inputs) -> Matches:
+def matches_by(matcher: Matcher, inputs: Inputs) -> Matches:
     """What a matcher finds. Raises TypeError or ValueError for what are no matches of these inputs."""
     matches = _given(Matches, matcher(inputs))
     matches.check(inputs)
     return matches
 
 
-def _seen(
-    network: FusionNetwork, rig: Rig, images: Images, alpha: str, settings: FuseSettings, noise: Noise | None
-) -> tuple[Views, LowLight]:
-    """The views to fuse, denoised, and what is known of their noise."""
+def _seen(rig: Rig, images: Images, alpha: str, settings: FuseSettings) -> tuple[Views, LowLight]:
+    """The views of a frame, denoised, and what is known of their noise."""
     views = Views.of(rig, images, alpha=alpha, depth=settings.depth, field=settings.field)
-    if views.alpha_in_colour:
-        text = "is in colour: colours come from the betas, its own only where they do not see"
-        warn(f"the image of alpha, '{alpha}', {text}")
-    views, low_light = denoised_views(views, noise)
-    check_bands(views, network.bands)
-    return views, low_light
+    return denoised_views(views, settings.noise)

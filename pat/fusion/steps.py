@@ -59,11 +59,12 @@ class StepResult(NamedTuple):
 FusionStep = Callable[[Views], StepResult]
 
 
-def steps_for(network: FusionNetwork, *, normalise: bool) -> list[FusionStep]:
-    """The steps that a network needs, in order."""
+def steps_for(network: FusionNetwork, *, normalise: bool, joined: bool = True) -> list[FusionStep]:
+    """The steps that a network needs, in order; betas are `joined` unless each is wanted by itself."""
     resize = [partial(equal_resolution, network)] if network.equal_resolution else []
     radiometry = [partial(normalise_betas, undone=not network.keeps_luminance)] if normalise else []
-    return [undistort, linear_luminance, upright, *resize, *radiometry, partial(join, network.joins_bands)]
+    together = [partial(join, network.joins_bands)] if joined else []
+    return [undistort, linear_luminance, upright, *resize, *radiometry, *together]
 
 
 def undistort(views: Views) -> StepResult:

@@ -27,7 +27,7 @@ from arraygeom.batching import tensors_of
 from arraygeom.checks import check_hw
 from arraygeom.rectification import rectify
 from arraygeom.text import UNSCALED
-from tests.arraygeom.rigs import parallel_rig, random_rig, scene_points
+from tests.arraygeom.rigs import parallel_rig, random_rig
 
 F64 = torch.float64
 
@@ -118,13 +118,6 @@ def test_what_is_not_computed_with_does_not_count():
     pair.memo["widest"] = torch.zeros(1)
     assert pair == random_rig(1).pair("alpha", "beta")
     assert not stack([pair, pair]).memo
-
-
-def test_a_batch_projects_as_its_items():
-    rigs = [random_rig(seed) for seed in (1, 2)]
-    X = torch.stack([scene_points(rig) for rig in rigs])
-    together = stack(rigs)["beta"].project(X).x
-    torch.testing.assert_close(together, torch.stack([rig["beta"].project(P).x for rig, P in zip(rigs, X)]))
 
 
 def test_tensors_without_batch_axes_are_shared():

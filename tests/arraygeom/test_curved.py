@@ -107,14 +107,6 @@ def test_degenerate_rigs_give_finite_values_and_gradients(lens, centre, turned):
         assert all(s is None or s.isfinite().all() for s in slopes)
 
 
-def test_identical_cameras_sample_the_same_pixel():
-    rig = with_lenses(two_cameras(), FISHEYE, FISHEYE)
-    x = pixel_grid((48, 64))
-    p = sampling_locations(Curved(8), rig.pair("alpha", "beta"))
-    assert p.mask.all()
-    torch.testing.assert_close(p.xy, x[..., None, :].expand(48, 64, 8, 2), atol=1e-3, rtol=0)
-
-
 def test_batched_rigs_agree_with_single_ones():
     rigs = [with_lenses(random_rig(i), FISHEYE, None) for i in range(2)]
     g = torch.Generator().manual_seed(0)

@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from arraygeom import (
-    Camera,
     Curved,
     Distortion,
     Epipolar,
@@ -15,6 +14,7 @@ from arraygeom import (
     Link,
     Moved,
     NearestVoxels,
+    Pair,
     Pose,
     Positions,
     Rig,
@@ -241,6 +241,18 @@ def test_rigs_in_map_coordinates_are_right_or_refused(rig):
         ValueError, match=r"m from the origin, which float32 holds to 0\.[3-6] m: give float64"
     ):
         default_field(single)(single, torch.tensor([[20.0, 12.0]]))
-    camera = there.cameras[0]
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1, 1e3])
+def test_a_place_far_off_is_judged_by_the_scene_whatever_its_unit(unit):
+    """10 km from the origin float32 holds a millimetre: nothing at 100 m, too little at half a metre."""
+    x = torch.tensor([[20.0, 12.0]])
+
+    def pair(baseline: float, near: float) -> Pair:
+        places = {"alpha": (1e4,), "beta": (1e4 + baseline,)}
+        rig = parallel_rig(50.0, (48, 64), places, (near, 10 * near))
+        return rig.scaled(unit).to(torch.float32).pair("alpha", "beta")
+
+    assert Epipolar()(pair(10.0, 100.0), x).valid.all()
     with pytest.raises(ValueError, match="put the origin near the cameras"):
-        Camera(K=camera.K.float(), cam_from_world=Pose(camera.R.float(), camera.t.float()), hw=camera.hw)
+        Epipolar()(pair(0.1, 0.5), x)

@@ -74,19 +74,10 @@ def test_hand_written_pairs(file, format, names, options):
     assert_is_the_pair(read_rig(FIXTURES / file, format=format, **options), names)
 
 
-@pytest.mark.parametrize("file", sorted({path.name for path in FIXTURES.glob("*.*")} - {"README.md"}))
-def test_a_mark_at_the_beginning_of_a_file_changes_nothing(file, tmp_path):
-    """Editors write one; of some formats it hid the first line."""
-    (tmp_path / file).write_text((FIXTURES / file).read_text(encoding="utf-8"), encoding="utf-8-sig")
-    assert recognise(tmp_path / file) == recognise(FIXTURES / file)
-    marked, plain = (read_rig(folder / file, hw=(720, 1280)) for folder in (tmp_path, FIXTURES))
-    assert marked.names == plain.names
-
-
 @pytest.mark.parametrize("file", sorted({path.name for path in FIXTURES.iterdir()} - {"README.md"}))
-@pytest.mark.parametrize("encoding", ["utf-16-le", "utf-16-be"])
-def test_files_in_utf_16_are_read(file, encoding, tmp_path):
-    """PowerShell writes what tools print so."""
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16-le", "utf-16-be"])
+def test_files_are_read_behind_a_mark(file, encoding, tmp_path):
+    """As editors write, and PowerShell what tools print; of some formats it hid the first line."""
     for old in [p for p in FIXTURES.rglob("*") if p.is_file()]:
         new = tmp_path / old.relative_to(FIXTURES)
         new.parent.mkdir(exist_ok=True)

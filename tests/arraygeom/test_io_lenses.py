@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from arraygeom import Curved, Distortion, Rig
+from arraygeom import Rig
 from arraygeom.io import RigFileError, RigFileWarning, read_rig, recognise, write_rig
 from tests.arraygeom.test_central_lenses import FORMULAS
 from tests.arraygeom.test_io import FIXTURES
@@ -300,11 +300,3 @@ def test_nerfstudios_fisheye(tmp_path):
     np.testing.assert_allclose(
         pixels(read_rig(tmp_path / "transforms.json"), "a.png", POINTS), expected, atol=1e-9
     )
-
-
-def test_fields_work_with_what_was_read():
-    rig = read_rig(FIXTURES / "kalibr_wide.yaml").replace(depth=(1.0, 10.0))
-    for alpha, beta in (("cam0", "cam1"), ("cam1", "cam2"), ("cam3", "cam0")):
-        found = Curved(32)(rig.pair(alpha, beta), torch.tensor([[320.0, 240.0], [200.0, 300.0]]))
-        assert found.mask.all(-1).all()
-        assert isinstance(rig[beta].distortion, Distortion)

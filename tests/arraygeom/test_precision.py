@@ -207,6 +207,8 @@ def test_a_batch_of_cameras_meets_the_leading_axes_of_points(shape):
     for i, rig in enumerate(rigs):
         torch.testing.assert_close(found.x[i], rig["alpha"].project(X[i]).x)
     torch.testing.assert_close(back, X)
+    turned = cameras.rot90(1)
+    torch.testing.assert_close(turned.unproject(turned.project(X).x, found.depth), X)
 
 
 @pytest.mark.parametrize("shape", [(), (5,), (4, 3)])

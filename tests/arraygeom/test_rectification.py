@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from arraygeom import Epipolar, Pair, Pose, Rectified, apply_homography, rectify, rotation_from_vector
+from arraygeom import Pair, Pose, apply_homography, rectify, rotation_from_vector
 from arraygeom.rectification import rotation_to, rotation_vector
 from tests.arraygeom.rigs import random_rig, scene_points, two_cameras
 from tests.oracles import Oracle
@@ -62,19 +62,6 @@ def test_vertical_pairs_get_rows_too():
     torch.testing.assert_close(
         (F / F[1, 2]).abs(), torch.tensor([[0.0, 0, 0], [0, 0, 1], [0, 1, 0]]).double(), atol=1e-9, rtol=0
     )
-
-
-def test_the_rectified_field_serves_the_rectified_pair():
-    rig = two_cameras(
-        rotation_from_vector(torch.tensor([0.02, 0.03, 0.05], dtype=torch.float64)), centre=(0.3, 0.05, 0.02)
-    )
-    pair = rectify(rig.replace(depth=(2.0, float("inf"))).pair("alpha", "beta")).pair
-    x = torch.tensor([[40.0, 20.0], [30.0, 30.0]])
-    exact = Epipolar()(pair, x)
-    largest = float(pair.alpha.K[0, 0] * pair.beta_from_alpha.t.norm() / 2)
-    run = Rectified(largest, "left" if pair.beta_from_alpha.t[0] < 0 else "right")(pair, x)
-    torch.testing.assert_close(exact.start, run.start, atol=1e-4, rtol=0)
-    torch.testing.assert_close(exact.end, run.end, atol=1e-4, rtol=0)
 
 
 def test_differentiable_in_the_rig():

@@ -223,17 +223,6 @@ def test_a_poorly_constrained_camera_stays_plausible():
     assert np.abs(found.K[:2, 2].numpy() - (319.5, 239.5)).max() < 0.06 * 640
 
 
-def test_fisheyes():
-    first = camera(240.0, (480, 640), lens=(0.02, -0.01, 0.003, -0.001), model="kannala-brandt")
-    lens = (0.03, -0.01, 0.0, 0.0)
-    rig = Rig({"a": first, "b": camera(260.0, (480, 640), (0.2, 0, 0), (0, -5, 0), lens, "kannala-brandt")})
-    boards = board_poses(10, depth=(0.4, 0.9), spread=0.7)
-    result = calibrate(see(rig, boards, noise=0.05), BOARD, lens="kannala-brandt")
-    assert result.rms < 0.09
-    assert float((result.rig["b"].centre - rig["b"].centre).norm()) < 1e-3
-    assert abs(float(result.rig["a"].K[0, 0]) - 240) < 1
-
-
 @pytest.mark.parametrize("seed", [0, 1, 3])
 def test_a_narrow_view_by_a_fisheyes_model(seed):
     """OpenCV was started from half a sphere: good images were left out, or did not suffice."""

@@ -109,6 +109,19 @@ def test_differences_are_those_of_the_motion(rig, name):
         assert np.median(np.abs(found.depths["c4"].change[at])) == pytest.approx(relative, rel=0.5)
 
 
+@pytest.mark.parametrize("unit", [1e-3, 1e3])
+def test_pixels_differ_alike_in_any_unit_of_length(rig, unit):
+    """Of large units the motion was sought until it changed no more, of small ones until to a millionth."""
+    pose = rig["nir"].cam_from_world.perturbed(
+        torch.zeros(3).double(), torch.tensor([0.1, 0.1, 0.1]).double()
+    )
+    moved = rig.with_camera("nir", rig["nir"].replace(cam_from_world=pose))
+    bounds = (unit * DEPTH[0], unit * DEPTH[1])
+    found = rig_difference(rig.scaled(unit), moved.scaled(unit), depth=bounds).cameras
+    for name, expected in rig_difference(rig, moved, depth=DEPTH).cameras.items():
+        np.testing.assert_allclose(found[name].change, expected.change, rtol=0, atol=1e-9)
+
+
 def test_the_depths_deviation_is_that_of_recalibrations(rig):
     fits = [recalibrated(rig, seed) for seed in range(11)]
     found = [compared(*pair).depths["nir"] for pair in pairwise(fits)]

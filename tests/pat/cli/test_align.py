@@ -10,10 +10,10 @@ import torch
 from PIL import Image
 
 from arraygeom import Rig
-from pat.cli.main import main
 from pat.media.profiles import srgb_profile
 from tests.arraygeom.test_xmp import FISHEYE, PERSPECTIVE, image_of
 from tests.pat.cli.test_known import FAR, NEAR, ON_POST, H, W, folder  # noqa: F401
+from tests.pat.commands import images, pat
 
 HIDDEN = slice(ON_POST.start - (NEAR - FAR), ON_POST.start)
 """Columns of the wall that the post hides from the second camera."""
@@ -28,14 +28,14 @@ def counts(folder, tmp_path):  # noqa: F811
     return tmp_path
 
 
-def align(folder, images, *options, alpha="mono"):  # noqa: F811
-    files = [word for name in ("mono", "colour") for word in ("--image", f"{name}={images / f'{name}.png'}")]
-    main(["align", str(folder / "rig.yaml"), "--to", alpha, *files, "-o", str(images / "out"), *options])
-    return images / "out"
+def align(folder, recorded, options="", alpha="mono"):  # noqa: F811
+    files = images(recorded, "mono", "colour")
+    pat(f"align {folder / 'rig.yaml'} --to {alpha} {files} -o {recorded / 'out'} {options}")
+    return recorded / "out"
 
 
 def test_files(folder, counts, capsys):  # noqa: F811
-    out = align(folder, counts, "--no-correct", "--response", "rec601")
+    out = align(folder, counts, "--no-correct --response rec601")
     bands = tifffile.imread(out / "aligned.tif")
     assert bands.shape == (4, H, W)
     assert bands.dtype == np.uint16
@@ -77,7 +77,7 @@ def test_warnings_are_said_once_and_are_on_the_page(folder, tmp_path, capsys):  
     for name in ("mono", "colour"):
         turned = Image.open(folder / f"{name}.png").rotate(180)
         turned.save(tmp_path / f"{name}.png", exif=orientation, icc_profile=srgb_profile())
-    out = align(folder, tmp_path, "--no-correct", "--response", "rec601")
+    out = align(folder, tmp_path, "--no-correct --response rec601")
     said = capsys.readouterr().err.split("pat: warning: ")[1:]
     assert len(said) == len(set(said)) == 2
     assert (out / "index.html").read_text().count("orientation tag 3 is applied") == 2
@@ -85,17 +85,8 @@ def test_warnings_are_said_once_and_are_on_the_page(folder, tmp_path, capsys):  
 
 def test_options(folder, counts):  # noqa: F811
     """Filled, nearest, a file of each camera, positions as TIFF; no page."""
-    options = [
-        "--fill",
-        "propagate",
-        "--interpolation",
-        "nearest",
-        "--separate",
-        "--positions",
-        "tif",
-        "--no-report",
-    ]
-    out = align(folder, counts, *options, "--no-correct", "--response", "rec601")
+    options = "--fill propagate --interpolation nearest --separate --positions tif --no-report"
+    out = align(folder, counts, f"{options} --no-correct --response rec601")
     values = tifffile.imread(out / "colour.tif")
     recorded = cv2.imread(str(counts / "colour.png"), cv2.IMREAD_UNCHANGED)[..., ::-1].transpose(2, 0, 1)
     for band, own in zip(values, recorded):
@@ -111,22 +102,12 @@ def test_images_are_not_overwritten_by_what_is_made_of_them(folder, tmp_path, re
     for name in ("mono", "colour"):
         tifffile.imwrite(tmp_path / f"{name}.tif", cv2.imread(str(folder / f"{name}.png"))[..., ::-1])
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
-    images = [word for path in before for word in ("--image", f"{path.stem}={path}")]
-    command = [
-        "align",
-        str(folder / "rig.yaml"),
-        "--to",
-        "mono",
-        *images,
-        "-o",
-        str(tmp_path),
-        "--no-correct",
-    ]
-    assert ".tif: is one of the images: give another --out" in refusal(
-        *command, "--separate", "--response", "rec601"
-    )
+    files = " ".join(f"--image {path.stem}={path}" for path in before)
+    command = f"align {folder / 'rig.yaml'} --to mono {files} -o {tmp_path} --no-correct --response rec601"
+    said = refusal(*command.split(), "--separate")
+    assert ".tif: is one of the images: give another --out" in said
     assert {path: path.read_bytes() for path in tmp_path.glob("*.*")} == before
-    main([*command, "--response", "rec601"])
+    pat(command)
     assert (tmp_path / "aligned.tif").is_file()
 
 
@@ -143,7 +124,7 @@ def test_to_the_other_camera(folder, counts):  # noqa: F811
 def test_confidence_decides_what_is_seen(folder, counts):  # noqa: F811
     shares = []
     for confidence in ("0", "0.5", "1"):
-        out = align(folder, counts, "--confidence", confidence, "--no-report", "--no-correct")
+        out = align(folder, counts, f"--confidence {confidence} --no-report --no-correct")
         shares.append(float((cv2.imread(str(out / "colour_visibility.png"), 0) == 255).mean()))
     assert shares[0] > shares[1] > shares[2]
 
@@ -197,26 +178,25 @@ def test_captures_that_do_not_go_together(capture, tmp_path, refusal, options, m
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--depth-map", "{}/small.tif"], "small.tif: is 80x48, alpha's image is 160x96"),
-        (["--depth-map", "{}/depth.png", "--depth-scale", "1"], "state its unit with --depth-scale"),
-        (["--matches", "{}/far.csv"], "outside"),
-        (["--confidence", "2"], "the least confidence is 2: give a number from 0 to 1"),
-        (["--alpha", "nir"], "no camera 'nir'"),
+        ("--depth-map {}/small.tif", "small.tif: is 80x48, alpha's image is 160x96"),
+        ("--depth-map {}/depth.png --depth-scale 1", "state its unit with --depth-scale"),
+        ("--matches {}/far.csv", "outside"),
+        ("--confidence 2", "the least confidence is 2: give a number from 0 to 1"),
+        ("--alpha nir", "no camera 'nir'"),
     ],
 )
 def test_bad_input_is_one_line(folder, tmp_path, refusal, options, message):  # noqa: F811
     tifffile.imwrite(folder / "small.tif", np.full((48, 80), 4, np.float32))
     np.savetxt(folder / "far.csv", np.array([[900.0, 20, 890, 20]] * 30), delimiter=",")
-    files = [word for name in ("mono", "colour") for word in ("--image", f"{name}={folder / f'{name}.png'}")]
-    words = [word.format(folder) for word in options]
-    words += [] if "--alpha" in words else ["--alpha", "mono"]
-    assert message in refusal("align", folder / "rig.yaml", *files, "-o", tmp_path / "out", *words)
+    options += "" if "--alpha" in options else " --alpha mono"
+    command = f"align {folder / 'rig.yaml'} {images(folder, 'mono', 'colour')} -o {tmp_path / 'out'}"
+    assert message in refusal(*command.split(), *options.format(folder).split())
 
 
 def test_without_a_rig_the_files_rig_is_written(folder, counts, capsys):  # noqa: F811
     """Its sensors are those of the files: it serves for the next frame."""
     out = counts / "found"
-    main(["align", str(counts / "mono.png"), str(counts / "colour.png"), "-o", str(out), "--no-report"])
+    pat(f"align {counts / 'mono.png'} {counts / 'colour.png'} -o {out} --no-report")
     assert "weights: mono-colour (--weights NAME takes others)" in capsys.readouterr().err
     assert set(Rig.load(out / "found_rig.yaml").names) == {"mono", "colour"}
 
@@ -227,20 +207,6 @@ def test_frames_are_matched_by_their_names(folder, counts):  # noqa: F811
         (counts / name).mkdir()
         for i in frames:
             shutil.copy(counts / f"{name}.png", counts / name / f"{i}.png")
-    images = [word for name in ("mono", "colour") for word in ("--image", f"{name}={counts / name}")]
-    main(
-        [
-            "align",
-            str(folder / "rig.yaml"),
-            "--to",
-            "mono",
-            *images,
-            "-o",
-            str(counts / "out"),
-            "--no-correct",
-        ]
-    )
-    assert sorted(p.name for p in (counts / "out").glob("*_aligned.tif")) == [
-        "0_aligned.tif",
-        "2_aligned.tif",
-    ]
+    folders = f"--image mono={counts / 'mono'} --image colour={counts / 'colour'}"
+    pat(f"align {folder / 'rig.yaml'} --to mono {folders} -o {counts / 'out'} --no-correct")
+    assert {p.name for p in (counts / "out").glob("*_aligned.tif")} == {"0_aligned.tif", "2_aligned.tif"}

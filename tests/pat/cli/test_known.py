@@ -13,11 +13,11 @@ from torch.nn.functional import interpolate
 from arraygeom import Rig
 from pat.cli.fuse import Fuse
 from pat.cli.known import Known
-from pat.cli.main import main
 from pat.fusion.align import OCCLUDED
 from pat.fusion.align import align as aligned
 from pat.media.images import read_image, write_image
 from tests.arraygeom.rigs import parallel_rig
+from tests.pat.commands import images, pat
 
 H, W = 96, 160
 WALL, POST, BASELINE = 4.0, 2.0, 0.25
@@ -50,21 +50,22 @@ def folder(tmp_path_factory):
     return folder
 
 
-def run(folder, command, *options, colour="colour.png"):
-    images = ["--image", f"mono={folder / 'mono.png'}", "--image", f"colour={folder / colour}"]
-    main([command, str(folder / "rig.yaml"), "--alpha", "mono", *images, "-o", str(folder / "out"), *options])
+def run(folder, command, options="", colour="colour.png"):
+    """`{}` in the options stands for the folder."""
+    files = f"--image mono={folder / 'mono.png'} --image colour={folder / colour}"
+    rest = options.replace("{}", str(folder))
+    pat(f"{command} {folder / 'rig.yaml'} --alpha mono {files} -o {folder / 'out'} {rest}")
 
 
 def depth_of(folder):
     return tifffile.imread(folder / "out" / "depth.tif")[:, 40:]
 
 
-@pytest.mark.parametrize("file", [["depth.tif"], ["depth.png", "--depth-scale", "0.0002"]])
+@pytest.mark.parametrize("file", ["depth.tif", "depth.png --depth-scale 0.0002"])
 def test_a_depth_map_is_taken_as_it_is(folder, file):
     """Whatever the images show: beta's is of something else."""
-    name, *scale = file
-    known = ["--depth-map", str(folder / name), *scale, "--depth-tolerance", "0", "--no-align"]
-    run(folder, "fuse", *known, "--response", "rec601", colour="blind.png")
+    options = f"--depth-map {{}}/{file} --depth-tolerance 0 --no-align --response rec601"
+    run(folder, "fuse", options, colour="blind.png")
     found, true = depth_of(folder), tifffile.imread(folder / "depth.tif")[:, 40:]
     known = np.isfinite(found)
     assert known.mean() > 0.8
@@ -75,11 +76,10 @@ def test_what_the_post_hides_is_occluded(folder):
     from arraygeom.fields import AroundDepth
 
     rig = Rig.load(folder / "rig.yaml")
-    images = {name: read_image(folder / f"{name}.png") for name in rig.names}
+    given = {name: read_image(folder / f"{name}.png") for name in rig.names}
     depth = torch.from_numpy(tifffile.imread(folder / "depth.tif"))
-    view = aligned(rig, images, alpha="mono", correct=False, field=AroundDepth(depth, 0.02, rig["mono"]))[
-        "colour"
-    ]
+    field = AroundDepth(depth, 0.02, rig["mono"])
+    view = aligned(rig, given, alpha="mono", correct=False, field=field)["colour"]
     hidden = slice(ON_POST.start - (NEAR - FAR), ON_POST.start)
     assert (view.visibility[:, hidden][:, 2:-2] == OCCLUDED).mean() > 0.9
     assert view.valid[:, ON_POST].mean() > 0.9
@@ -90,30 +90,28 @@ def test_what_a_field_of_ones_own_raises_is_a_line(folder, tmp_path, monkeypatch
     (tmp_path / "fields_of_mine.py").write_text("def slanted(pair, x):\n    return x + 'pixels'\n")
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(SystemExit):
-        run(folder, "align", "--field", "fields_of_mine:slanted")
+        run(folder, "align", "--field fields_of_mine:slanted")
     last = capsys.readouterr().err.splitlines()[-1]
     assert last.startswith("pat: TypeError: ")
     assert last.endswith("'str', raised by the field slanted (--debug shows where)")
     with pytest.raises(TypeError, match="str"):
-        run(folder, "align", "--field", "fields_of_mine:slanted", "--debug")
+        run(folder, "align", "--field fields_of_mine:slanted --debug")
 
 
 def test_matches_guide_the_search(folder):
-    run(folder, "align", "--matches", str(folder / "matches.csv"))
+    run(folder, "align", "--matches {}/matches.csv")
     inner = depth_of(folder)
     assert np.nanmedian(np.abs(inner - tifffile.imread(folder / "depth.tif")[:, 40:])) < 0.05
 
 
 def test_rig_commands_take_matches(folder, capsys):
-    images = ["--image", f"mono={folder / 'mono.png'}", "--image", f"colour={folder / 'colour.png'}"]
-    matches = ["--matches", str(folder / "matches.csv")]
-    main(["rig", "doctor", str(folder / "rig.yaml"), *images, *matches])
+    given = f"{images(folder, 'mono', 'colour')} --matches {folder / 'matches.csv'}"
+    pat(f"rig doctor {folder / 'rig.yaml'} {given}")
     assert "204 points" in capsys.readouterr().out
-    main(["rig", "start", *images, *matches, "-o", str(folder / "started.yaml")])
+    pat(f"rig start {given} -o {folder / 'started.yaml'}")
     assert "points" in capsys.readouterr().out
     assert Rig.load(folder / "started.yaml").links
-    out = ["-o", str(folder / "refined.yaml"), "--no-photometric"]
-    main(["rig", "refine", str(folder / "rig.yaml"), *images, *matches, *out])
+    pat(f"rig refine {folder / 'rig.yaml'} {given} -o {folder / 'refined.yaml'} --no-photometric")
 
 
 def test_matches_off_the_lines_of_the_rig_are_said(folder, capsys):
@@ -121,32 +119,32 @@ def test_matches_off_the_lines_of_the_rig_are_said(folder, capsys):
     rows = np.loadtxt(folder / "matches.csv", delimiter=",")
     rows[:, 3] = H - 1 - rows[:, 3]
     np.savetxt(folder / "rows.csv", rows, delimiter=",")
-    run(folder, "align", "--matches", str(folder / "rows.csv"))
+    run(folder, "align", "--matches {}/rows.csv")
     assert re.search(
         r"rows.csv: matches of 'mono' and 'colour' lie \d+ px .*x before y", capsys.readouterr().err
     )
-    run(folder, "align", "--matches", str(folder / "matches.csv"))
+    run(folder, "align", "--matches {}/matches.csv")
     assert "matches of" not in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
-        (["--depth-map", "{}/depth.tif", "--matches", "{}/matches.csv"], "each excludes the others"),
-        (["--depth-map", "{}/depth.png", "--depth-scale", "1"], "holds 1e+04 to 2e+04 m, the rig's"),
-        (["--depth-map", "{}/mono.png"], "8 bits, too few"),
-        (["--depth-map", "{}/none.png"], "no such depth map"),
-        (["--depth-scale", "1"], "--depth-scale: needs --depth-map"),
-        (["--depth-tolerance", "0"], "--depth-tolerance: needs --depth-map"),
-        (["--matches", "{}/mono.png"], "neither CSV nor a COLMAP database"),
-        (["--depth-map", "{}/depth.tif", "--depth-tolerance", "-1"], "tolerance is -1.0"),
-        (["--matches", "{}/exchanged.csv"], "behind the cameras by the rig: are its columns in the order"),
-        (["--threads", "0"], "--workers and --threads are 1 or more"),
+        ("--depth-map {}/depth.tif --matches {}/matches.csv", "each excludes the others"),
+        ("--depth-map {}/depth.png --depth-scale 1", "holds 1e+04 to 2e+04 m, the rig's"),
+        ("--depth-map {}/mono.png", "8 bits, too few"),
+        ("--depth-map {}/none.png", "no such depth map"),
+        ("--depth-scale 1", "--depth-scale: needs --depth-map"),
+        ("--depth-tolerance 0", "--depth-tolerance: needs --depth-map"),
+        ("--matches {}/mono.png", "neither CSV nor a COLMAP database"),
+        ("--depth-map {}/depth.tif --depth-tolerance -1", "tolerance is -1.0"),
+        ("--matches {}/exchanged.csv", "behind the cameras by the rig: are its columns in the order"),
+        ("--threads 0", "--workers and --threads are 1 or more"),
     ],
 )
 def test_bad_input_is_one_line(folder, options, expected, capsys):
     with pytest.raises(SystemExit) as stop:
-        run(folder, "fuse", *(word.format(folder) for word in options))
+        run(folder, "fuse", options)
     assert stop.value.code == 2
     assert expected in capsys.readouterr().err.splitlines()[-1]
 

@@ -17,7 +17,6 @@ from arraygeom import Camera, Pose, Rig, Sensor, View
 from experiments.evaluation.paper import with_found_rig
 from pat import fuse, load_weights
 from pat.cli.fuse import Fuse
-from pat.cli.main import main
 from pat.data.sample_array import load_sample
 from pat.evaluation.metrics import score
 from pat.fusion.from_images import ImageArray, array_from_images, camera_names, found_rig
@@ -26,17 +25,10 @@ from pat.media.headers import focal_length
 from pat.media.images import read_image, write_image
 from pat.media.video import read_video, write_video
 from pat.support.jobs import JobReport
+from tests.pat.commands import images, pat
 
-ALL = [
-    *(f"{n}.png" for n in ("confidence", "depth")),
-    "depth.tif",
-    "depth_16.png",
-    "depth_farthest.tif",
-    "depth_nearest.tif",
-    "fused.png",
-    "index.html",
-]
-ALL = sorted([*ALL, "found_rig.yaml", "view.yaml"])
+DEPTHS = {"depth.png", "depth.tif", "depth_16.png", "depth_farthest.tif", "depth_nearest.tif"}
+ALL = {"confidence.png", *DEPTHS, "fused.png", "index.html", "found_rig.yaml", "view.yaml"}
 
 
 @pytest.fixture(scope="module")
@@ -60,13 +52,13 @@ def folder(halved, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patched:
         # the images are larger, as photographs are than 1600
         patched.setattr("pat.fusion.from_images.MATCHED", 300)
-        main(["fuse", str(folder / "colour.png"), str(folder / "mono.png"), "-o", str(folder / "out")])
+        pat(f"fuse {folder / 'colour.png'} {folder / 'mono.png'} -o {folder / 'out'}")
     return folder
 
 
 def test_images_alone_are_fused_about_as_well_as_with_the_rig(halved, folder):
     rig, images, ground_truth = halved
-    assert sorted(path.name for path in (folder / "out").iterdir()) == ALL
+    assert {path.name for path in (folder / "out").iterdir()} == ALL
     known = fuse(load_weights("mono-colour"), rig, images, alpha="mono")
     with_rig = score(known.image.clamp(0, 1), ground_truth).psnr
     assert score(read_image(folder / "out" / "fused.png"), ground_truth).psnr > with_rig - 0.5
@@ -100,18 +92,8 @@ def test_the_rig_that_was_found_serves_the_next_command(folder):
     rig = Rig.load(folder / "out" / "found_rig.yaml")
     assert rig.names == ("mono", "colour")
     assert all(isinstance(camera, Camera) for camera in rig.cameras.values())
-    images = [str(folder / f"{name}.png") for name in rig.names]
-    main(
-        [
-            "fuse",
-            str(folder / "out" / "found_rig.yaml"),
-            *images,
-            "--alpha",
-            "mono",
-            "-o",
-            str(folder / "next"),
-        ]
-    )
+    files = f"{folder / 'mono.png'} {folder / 'colour.png'}"
+    pat(f"fuse {folder / 'out' / 'found_rig.yaml'} {files} --alpha mono -o {folder / 'next'}")
     again, first = (read_image(folder / out / "fused.png") for out in ("next", "out"))
     assert float((again - first).abs().max()) <= 2 / 255
     assert all(" baselines" in (folder / out / "index.html").read_text() for out in ("next", "out"))
@@ -124,10 +106,10 @@ def test_the_rig_that_is_written_is_of_the_files_as_they_were_recorded(folder, t
     raw = rig.with_camera(
         "colour", rig["colour"].replace(sensor=Sensor(coding="linear", bits=16, black_level=64.0))
     )
-    images = {name: read_image(folder / f"{name}.png") for name in rig.names}
-    found = ImageArray(rig, raw, images, "mono", "mono-colour-small", False, ())
+    given = {name: read_image(folder / f"{name}.png") for name in rig.names}
+    found = ImageArray(rig, raw, given, "mono", "mono-colour-small", False, ())
     monkeypatch.setattr("pat.fusion.from_images.array_from_images", lambda *a, **k: found)
-    main(["fuse", *(str(folder / f"{n}.png") for n in rig.names), "--no-report", "-o", str(tmp_path)])
+    pat(f"fuse {folder / 'mono.png'} {folder / 'colour.png'} --no-report -o {tmp_path}")
     assert Rig.load(tmp_path / "found_rig.yaml")["colour"].sensor == raw["colour"].sensor
 
 
@@ -143,6 +125,13 @@ def test_weights_are_for_the_cameras_that_are_fused(halved, monkeypatch):
         array = array_from_images(bands, alpha="mono")
         assert array.weights == weights
         assert {array.rig[name].sensor.response for name in array.images} == {"mono"}
+
+
+def test_a_beta_of_four_bands_is_matched_by_their_mean(halved):
+    """By the first band alone, here one that is dark where others are bright, no point matched."""
+    colour = halved[1]["colour"]
+    array = array_from_images({**halved[1], "colour": torch.cat([1 - colour[1:2], colour])})
+    assert (array.weights, array.rig.names) == ("mono-spectral", ("mono", "colour"))
 
 
 def test_a_rig_of_ones_own_beside_the_result_is_kept(folder, tmp_path):
@@ -165,11 +154,7 @@ def test_what_cannot_be_fused_is_one_line_and_leaves_nothing(folder, tmp_path, r
     mono, colour = folder / "mono.png", folder / "colour.png"
     noise = np.random.default_rng(0).integers(0, 255, (200, 320, 3), np.uint8)
     ramp = np.tile(np.linspace(0, 255, 320, dtype=np.uint8), (200, 1))
-    files = {
-        "other": cv2.GaussianBlur(noise, (0, 0), 2),
-        "flat": np.full((200, 320, 3), 90, np.uint8),
-        "ramp": ramp,
-    }
+    files = {"other": cv2.GaussianBlur(noise, (0, 0), 2), "flat": np.full_like(noise, 90), "ramp": ramp}
     for name, values in files.items():
         cv2.imwrite(str(tmp_path / f"{name}.png"), values)
     write_video(tmp_path / "clip.mp4", [torch.rand(3, 32, 32)])
@@ -179,87 +164,64 @@ def test_what_cannot_be_fused_is_one_line_and_leaves_nothing(folder, tmp_path, r
         shutil.copy(colour, tmp_path / name)
     out = ["-o", tmp_path / "out"]
     cases = {
-        ("other.png",): "points seen in both 'mono' and 'other' agree",
-        ("flat.png",): "flat.png: is of one colour",
-        ("ramp.png",): "hardly any texture",
-        ("copy.png",): "are the same image",
-        (
-            "again.png",
-            "other.png",
-            "again_copy.png",
-        ): "the images of 'again' and 'again_copy' are the same image",
-        ("clip.mp4",): "clip.mp4 is a video and",
-        ("x.heic",): "x.heic: ",
-        ("none.png",): "none.png: no such image",
-        (): "give two images or more",
+        "other.png": "points seen in both 'mono' and 'other' agree",
+        "flat.png": "flat.png: is of one colour",
+        "ramp.png": "hardly any texture",
+        "copy.png": "are the same image",
+        "again.png other.png again_copy.png": "images of 'again' and 'again_copy' are the same image",
+        "clip.mp4": "clip.mp4 is a video and",
+        "x.heic": "x.heic: ",
+        "none.png": "none.png: no such image",
+        "": "give two images or more",
     }
     for names, message in cases.items():
-        assert message in refusal("fuse", mono, *(tmp_path / name for name in names), *out)
+        assert message in refusal("fuse", mono, *(tmp_path / name for name in names.split()), *out)
         assert not (tmp_path / "out").exists()
-    assert "no camera 'tele'; the images' names are mono, colour" in refusal(
-        "fuse", mono, colour, "--alpha", "tele"
-    )
-    for noise, said in {
-        "mono=-5": "must be 1 or more, such as 200, got -5",
-        "tele=100": "--noise: no camera 'tele'",
+    for options, said in {
+        "--alpha tele": "no camera 'tele'; the images' names are mono, colour",
+        "--noise mono=-5": "must be 1 or more, such as 200, got -5",
+        "--noise tele=100": "--noise: no camera 'tele'",
+        "--depth 1 2": "--depth: needs a rig",
     }.items():
-        assert said in refusal("fuse", mono, colour, "--noise", noise, *out)
+        assert said in refusal("fuse", mono, colour, *options.split(), *out)
     assert not (tmp_path / "out").exists()
     named = f"mono={mono}"
     assert f"give {mono} alone" in refusal("fuse", named, colour, *out)
-    assert f"--image needs a rig: give --rig RIG, or the images alone: `pat fuse {mono}`" in refusal(
-        "fuse", "--image", named, *out
-    )
+    said = refusal("fuse", "--image", named, *out)
+    assert f"--image needs a rig: give --rig RIG, or the images alone: `pat fuse {mono}`" in said
     unwritable = ["-o", folder / "mono.png" / "out"]
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr("pat.fusion.from_images.array_from_images", None)  # the rig is not looked for
         assert "mono.png" in refusal("fuse", mono, colour, *unwritable)
-    assert "--depth: needs a rig" in refusal("fuse", mono, colour, "--depth", "1", "2")
 
 
 def test_what_does_not_go_with_a_rig_or_with_many_frames_is_refused(folder, tmp_path, refusal):
-    images = []
-    for name in ("mono", "colour"):
-        (tmp_path / name).mkdir()
-        for i in range(2):
-            shutil.copy(folder / f"{name}.png", tmp_path / name / f"{i}.png")
-        images += ["--image", f"{name}={tmp_path / name}"]
-    given = [folder / "out" / "found_rig.yaml", "--alpha", "mono", *images, "-o", tmp_path / "out"]
-    rig = folder / "out" / "found_rig.yaml"
-    stray = [
-        rig,
-        "--alpha",
-        "mono",
-        tmp_path / "mono" / "0.png",
-        folder / "colour.png",
-        "-o",
-        tmp_path / "out",
-    ]
-    assert "0.png: no camera of the rig has its name: give --image NAME=" in refusal("fuse", *stray)
-    assert "--points, --classical: for a single frame only" in refusal(
-        "fuse", *given, "--points", "--classical"
-    )
+    in_folders = two_frames_each(folder, tmp_path)
+    given = [folder / "out" / "found_rig.yaml", "--alpha", "mono", "-o", tmp_path / "out"]
+    stray = tmp_path / "mono" / "0.png", folder / "colour.png"
+    assert "0.png: no camera of the rig has its name: give --image NAME=" in refusal("fuse", *given, *stray)
+    named = [word for path in in_folders for word in ("--image", f"{path.name}={path}")]
+    said = refusal("fuse", *given, *named, "--points", "--classical")
+    assert "--points, --classical: for a single frame only" in said
     assert not (tmp_path / "out").exists()
 
 
-def test_a_found_rig_is_written_for_a_sequence_that_needs_more(folder, tmp_path, refusal):
+def two_frames_each(folder, into):
+    """A folder for each camera with its image twice."""
     for name in ("mono", "colour"):
-        (tmp_path / name).mkdir()
+        (into / name).mkdir()
         for i in range(2):
-            shutil.copy(folder / f"{name}.png", tmp_path / name / f"{i}.png")
-    given = [
-        "fuse",
-        str(tmp_path / "mono"),
-        str(tmp_path / "colour"),
-        "--sequence",
-        "-o",
-        str(tmp_path / "out"),
-    ]
+            shutil.copy(folder / f"{name}.png", into / name / f"{i}.png")
+    return into / "mono", into / "colour"
+
+
+def test_a_found_rig_is_written_for_a_sequence_that_needs_more(folder, tmp_path, refusal):
+    given = ["fuse", *two_frames_each(folder, tmp_path), "--sequence", "-o", tmp_path / "out"]
     assert "the frame rate of 'mono' is not known" in refusal(*given)
     assert set(Rig.load(tmp_path / "out" / "found_rig.yaml").names) == {"mono", "colour"}
     (tmp_path / "out" / "found_rig.yaml").write_text("another job's")
     with pytest.raises(SystemExit):
-        main(given)
+        pat("", *given)
     assert (tmp_path / "out" / "found_rig.yaml").read_text() == "another job's"
 
 
@@ -346,20 +308,9 @@ def test_a_wrong_rig_is_refused_before_the_work_with_the_doctors_verdict(
     rig = halved[0]
     wrong = {n: c.replace(cam_from_world=Pose(c.R, factor * c.t)) for n, c in rig.cameras.items()}
     rig.replace(cameras=wrong).save(tmp_path / "wrong.yaml")
-    images = [f"--image={name}={folder / name}.png" for name in rig.names]
+    files = images(folder, *rig.names)
     with pytest.raises(SystemExit) as stop:
-        main(
-            [
-                "fuse",
-                str(tmp_path / "wrong.yaml"),
-                "--alpha",
-                "mono",
-                *images,
-                "--strict",
-                "-o",
-                str(tmp_path / "out"),
-            ]
-        )
+        pat(f"fuse {tmp_path / 'wrong.yaml'} --alpha mono {files} --strict -o {tmp_path / 'out'}")
     assert stop.value.code == 3
     text = " ".join(capsys.readouterr().err.split())
     assert "behind the cameras or outside the depth range" in text

@@ -45,7 +45,7 @@ def in_place() -> FieldOnGrid:
     )
 
 
-def matched_with(mix: SpectralMix | None = None, count: int = 1) -> Matches:
+def matched_with(mix: SpectralMix | None, count: int) -> Matches:
     """Of betas at alpha's place, whose bands were combined so."""
     level = Normalisation(torch.zeros(3, 1, 1, 1, 1), ([0.0], [0.0]))
     comparison = Comparison(mix, level, level)
@@ -82,13 +82,19 @@ def test_parts_of_a_beta_give_the_same(rate):
     assert torch.allclose(of_whole[inner], of_part[inner], atol=1e-5)
 
 
+def put_right(image, *betas, mix=None, confidence=None, keeps_luminance=True) -> torch.Tensor:
+    """The image, put right by betas at alpha's place."""
+    count, sure = len(betas), torch.ones(1, H, W).double() if confidence is None else confidence
+    output = FusionOutput(image, [position()] * count, [sure] * count, [sure] * count)
+    inputs = Inputs(luminance(image), betas)
+    return back_projected(output, matched_with(mix, count), inputs, keeps_luminance=keeps_luminance).image
+
+
 def test_luminance_stays_and_what_is_not_matched():
     truth, image = colours(), colours(1)
     confidence = torch.ones(1, H, W).double()
     confidence[..., 24:] = 0
-    output = FusionOutput(image, [position()], [torch.ones(1, H, W)], [confidence])
-    inputs = Inputs(luminance(image), (enlarged_beta(truth, 2),))
-    better = back_projected(output, matched_with(), inputs, keeps_luminance=True).image
+    better = put_right(image, enlarged_beta(truth, 2), confidence=confidence)
     assert torch.allclose(luminance(better), luminance(image), atol=1e-9)
     assert torch.equal(better[..., 24:], image[..., 24:])
     assert (better - image)[..., :24].abs().max() > 0.01
@@ -96,16 +102,8 @@ def test_luminance_stays_and_what_is_not_matched():
 
 def test_bands_of_several_betas_are_each_ones_own():
     truth, image = colours(), colours(1)
-    betas = tuple(enlarged_beta(truth[:, i : i + 1], 2) for i in range(3))
-    confidence = torch.ones(1, H, W).double()
-    output = FusionOutput(image, [position()] * 3, [confidence] * 3, [confidence] * 3)
-    together = FusionOutput(image, [position()], [confidence], [confidence])
-    apart = back_projected(
-        output, matched_with(count=3), Inputs(luminance(image), betas), keeps_luminance=True
-    ).image
-    joined = back_projected(
-        together, matched_with(), Inputs(luminance(image), (enlarged_beta(truth, 2),)), keeps_luminance=True
-    ).image
+    apart = put_right(image, *(enlarged_beta(truth[:, i : i + 1], 2) for i in range(3)))
+    joined = put_right(image, enlarged_beta(truth, 2))
     assert torch.allclose(apart, joined, atol=1e-9)
 
 
@@ -114,13 +112,9 @@ def test_of_measured_bands_the_combination_that_alpha_sees_stays():
     weights = torch.tensor([[0.5, 0.3, 0.2]]).double()
     slopes = torch.tensor([[0.8, 1.2, 1.2]]).double()  # weights @ slopes = 1
     mix = SpectralMix(weights, torch.tensor([0.1]).double(), slopes, torch.tensor([1.0]).double())
-    confidence, beta = torch.ones(1, H, W).double(), enlarged_beta(truth, 2)
-    output, inputs = (
-        FusionOutput(image, [position()], [confidence], [confidence]),
-        Inputs(luminance(image), (beta,)),
-    )
-    better = back_projected(output, matched_with(mix), inputs, keeps_luminance=False).image
-    whole = back_projected(output, matched_with(), inputs, keeps_luminance=False).image
+    beta = enlarged_beta(truth, 2)
+    better = put_right(image, beta, mix=mix, keeps_luminance=False)
+    whole = put_right(image, beta, keeps_luminance=False)
     assert torch.allclose(mix.of(better), mix.of(image), atol=1e-6)
     assert (better - image).abs().max() > 0.01
     assert (mix.of(whole) - mix.of(image)).abs().max() > 0.01  # nothing is known to stay
@@ -128,18 +122,8 @@ def test_of_measured_bands_the_combination_that_alpha_sees_stays():
 
 def test_two_betas_of_the_same_colours_count_as_one():
     truth, image = colours(), colours(1)
-    confidence, beta = torch.ones(1, H, W).double(), enlarged_beta(truth, 2)
-    one = FusionOutput(image, [position()], [confidence], [confidence])
-    two = FusionOutput(image, [position()] * 2, [confidence] * 2, [confidence] * 2)
-    expected = back_projected(
-        one, matched_with(), Inputs(luminance(image), (beta,)), keeps_luminance=True
-    ).image
-    assert torch.allclose(
-        back_projected(
-            two, matched_with(count=2), Inputs(luminance(image), (beta, beta)), keeps_luminance=True
-        ).image,
-        expected,
-    )
+    beta = enlarged_beta(truth, 2)
+    assert torch.allclose(put_right(image, beta, beta), put_right(image, beta))
 
 
 def test_gradients_are_those_of_differences():

@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from arraygeom import Rig
-from pat.cli.main import main
 from pat.data.sample_array import load_sample
 from pat.fusion.checks import LowConfidenceWarning, noise_advice, warn_of_confidence
 from pat.fusion.from_images import _ordered_betas, show_colour
@@ -18,6 +17,7 @@ from pat.fusion.results import Frame, band_names, save_frame
 from pat.matching.inputs import Inputs
 from pat.networks.weights import load_weights
 from pat.sensors import NoiseLevel
+from tests.pat.commands import pat
 
 
 def sample_of_bands(scales: dict[str, float]) -> tuple[Rig, dict[str, torch.Tensor]]:
@@ -120,22 +120,9 @@ def test_sixteen_bits_are_written_for_sixteen(tmp_path):
         deep = name == "a"
         values = (image[0].numpy() * (65535 if deep else 255)).round().astype(np.uint16 if deep else np.uint8)
         cv2.imwrite(str(tmp_path / f"{name}.png"), values)
-    given = [
-        str(tmp_path / "rig.yaml"),
-        *(str(tmp_path / f"{name}.png") for name in images),
-        "--alpha",
-        "mono",
-    ]
-    for extra, kind in (([], np.uint16), (["--bits", "8"], np.uint8)):
-        rest = [
-            "--weights",
-            "mono-spectral",
-            "--no-report",
-            "--no-align",
-            "-o",
-            str(tmp_path / "out"),
-            *extra,
-        ]
-        main(["fuse", *given, *rest])
+    files = " ".join(str(tmp_path / f"{name}.png") for name in images)
+    given = f"{tmp_path / 'rig.yaml'} {files} --alpha mono --weights mono-spectral --no-report --no-align"
+    for extra, kind in (("", np.uint16), ("--bits 8", np.uint8)):
+        pat(f"fuse {given} -o {tmp_path / 'out'} {extra}")
         for name in ("fused", "fused_a", "fused_b"):
             assert cv2.imread(str(tmp_path / "out" / f"{name}.png"), cv2.IMREAD_UNCHANGED).dtype == kind

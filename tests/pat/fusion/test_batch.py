@@ -15,7 +15,6 @@ import torch
 import arraygeom.atomic
 from arraygeom import Epipolar, EpipolarLine, HomographyDisplacement, Rectified, Rig, ThroughLenses, Widened
 from arraygeom.io.native import write as rig_text
-from pat.cli.main import main
 from pat.fusion.batch import KEYS, PLAN, Batch, find_images, fuse_one
 from pat.fusion.checks import LowConfidenceWarning
 from pat.fusion.from_images import frames_of_videos
@@ -29,6 +28,7 @@ from pat.networks.guided import GuidedPAT
 from pat.networks.weights import save_weights
 from pat.sensors import NoiseLevel
 from pat.support.jobs import JobError
+from tests.pat.commands import pat
 from tests.pat.fusion import moving
 
 
@@ -194,6 +194,14 @@ def test_a_corrupt_image_costs_its_frame_or_stops_the_job(material, tmp_path):
     assert contents(tmp_path / "bad") == wanted
 
 
+def test_a_file_of_a_sequence_that_cannot_be_read_is_named_once(material, tmp_path):
+    """Alpha's was named twice: as what the task is about, and by the error."""
+    files = spoiled(material, tmp_path, 0) | {"slow": find_images(material / "slow")}
+    with pytest.raises(JobError, match=r"^key frame fast_8: fast: .*fast_8\.png: ") as stopped:
+        batch(material, tmp_path / "out", sequence=True, files=files).run()
+    assert str(stopped.value).count("fast_8.png") == 1
+
+
 def test_a_missing_beta_of_a_key_frame_leaves_the_other_key_frames(material, tmp_path):
     files = {name: find_images(material / name) for name in ("fast", "slow")}
     gone = tmp_path / "gone.png"
@@ -230,27 +238,18 @@ def test_a_full_disk_leaves_whole_files_only(material, tmp_path, monkeypatch):
 
 
 def test_the_command_line_fuses_a_sequence(material, tmp_path, capsys, refusal):
-    images = [a for name in ("fast", "slow") for a in ("--image", f"{name}={material / name}")]
-    given = [
-        "fuse",
-        "--rig",
-        str(material / "rig.yaml"),
-        "--alpha",
-        "fast",
-        *images,
-        "--out",
-        str(tmp_path / "out"),
-    ]
-    given += ["--weights", str(material / "tiny.safetensors"), "--sequence", "--bits", "16"]
-    main(given)
+    images = " ".join(f"--image {name}={material / name}" for name in ("fast", "slow"))
+    given = f"fuse --rig {material / 'rig.yaml'} --alpha fast {images} --out {tmp_path / 'out'}"
+    given += f" --weights {material / 'tiny.safetensors'} --bits 16"
+    pat(f"{given} --sequence")
     assert read_image(tmp_path / "out" / "fast_14_fused.png").shape == (3, *moving.HW)
     assert (tmp_path / "out" / "fused.mp4").stat().st_size > 1000
     assert Rig.load(tmp_path / "out" / "view.yaml").names == ("fast",)
     capsys.readouterr()
-    main([*given, "--resume"])
+    pat(f"{given} --sequence --resume")
     assert "0 made, 7 there already" in " ".join(capsys.readouterr().err.split())
-    assert "near one of alpha in time" in refusal(*given, "--time-offset", "slow=9")
-    assert "as many images of each camera" in refusal(*[a for a in given if a != "--sequence"])
+    assert "near one of alpha in time" in refusal(*given.split(), "--sequence", "--time-offset", "slow=9")
+    assert "as many images of each camera" in refusal(*given.split())
 
 
 def test_the_light_that_alpha_measured_is_known_of_sequences_too(material, tmp_path):

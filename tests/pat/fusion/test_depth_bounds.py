@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from arraygeom import Camera, Curved, Distortion, Epipolar, Pose, Rig, Segments, intrinsics, pixel_grid
+from arraygeom import Curved, Distortion, Epipolar, Segments, pixel_grid
 from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.lenses import Equirectangular
 from pat.fusion.depth import measured_depth
@@ -58,18 +58,16 @@ LENSES = {
 def test_bounds_are_those_of_the_field_where_it_has_some(lens, true, depth):
     """Depth through lenses was any, distances of a wide fisheye were within the rig's range or an error."""
     wide = lens == "fisheye"
-    K, hw = intrinsics(20.0 if wide else 60.0, (24, 64)), (24, 64)
-    near, far = 0.5, 30.0
-    t = torch.tensor([-0.02, 0.01, 0.005], dtype=torch.float64)
-    poses = {"a": Pose.identity(), "b": Pose(torch.eye(3, dtype=torch.float64), t)}
-    cameras = {n: Camera(K=K, hw=hw, cam_from_world=p, distortion=LENSES[lens]) for n, p in poses.items()}
+    hw, near, far = (24, 64), 0.5, 30.0
+    places = {"a": (), "b": (0.02, -0.01, -0.005)}
+    rig = parallel_rig(20.0 if wide else 60.0, hw, places, depth, distortion=LENSES[lens])
     field = Epipolar(near, far) if lens == "none" else Curved(near=near, far=far, bounds=BOUNDS[wide])
     images = {"a": torch.zeros(1, *hw), "b": torch.zeros(3, *hw)}
-    views = Views.of(Rig(cameras, depth=depth), images, alpha="a", field=field)
+    views = Views.of(rig, images, alpha="a", field=field)
     found = frame_inputs(PAT(PATConfig(dim=4)), views)
-    rays, _ = cameras["a"].rays(pixel_grid(hw, dtype=torch.float64))
+    rays, _ = rig["a"].rays(pixel_grid(hw, dtype=torch.float64))
     rays = rays / (rays.norm(dim=-1, keepdim=True) if wide else rays[..., 2:])
-    x_beta = cameras["b"].project_local(rays + t / true).x
+    x_beta = rig["b"].project_local(rays + rig["b"].t / true).x
     position, ones = x_beta.movedim(-1, 0)[None], torch.ones(1, *hw, dtype=torch.float64)
     output = FusionOutput(torch.zeros(1, 3, *hw).double(), [position], [ones], [ones])
     inner = (slice(4, 20), slice(16, 48))  # whose segments are not cut by the edge of the image
@@ -83,11 +81,9 @@ BOUNDS = {False: "depth", True: "distance"}
 
 def test_a_field_with_bounds_needs_none_of_the_rig_in_cameras_of_any_model():
     """Whether beta was upright was asked of the middle of the rig's depth range."""
-    whole = Camera(
-        K=intrinsics(10.0, HW), cam_from_world=Pose.identity(), hw=HW, distortion=Equirectangular()
-    )
+    rig = parallel_rig(10.0, HW, {"a": (), "b": ()}, distortion=Equirectangular())
     images = {"a": torch.zeros(1, *HW), "b": torch.zeros(3, *HW)}
-    views = Views.of(Rig({"a": whole, "b": whole}), images, alpha="a", field=Curved(near=1.0, far=3.0))
+    views = Views.of(rig, images, alpha="a", field=Curved(near=1.0, far=3.0))
     assert quarter_turns(views.pair("b")) == 0
 
 
@@ -102,8 +98,7 @@ def test_a_field_with_bounds_needs_none_of_the_rig_in_cameras_of_any_model():
     ],
 )
 def test_what_depth_is_measured_along(lens, field, along):
-    here = {"K": intrinsics(10.0, HW), "hw": HW, "cam_from_world": Pose.identity()}
-    rig = Rig({name: Camera(**here, distortion=lens) for name in "ab"}, depth=(NEAR, FAR))
+    rig = parallel_rig(10.0, HW, {"a": (), "b": ()}, (NEAR, FAR), distortion=lens)
     images = {"a": torch.zeros(1, *HW), "b": torch.zeros(3, *HW)}
     assert measured_along(Views.of(rig, images, alpha="a", field=field)) == along
 
@@ -210,20 +205,23 @@ def test_gradients_pass_where_depth_is_that_of_a_match():
     assert torch.equal(depth.grad, (confidence == 1).to(depth))
 
 
-@pytest.mark.parametrize("other", [[-4.0, 0.0], [0.0, 4.0]])
-def test_depth_stays_where_betas_are_on_several_sides(other):
+def wrong_in_the_middle():
+    """A frame that is not confident there."""
     depth = torch.full((6, 6), 5.0)
     depth[:, 2:4] = 1.0
-    frame = frame_of(depth, torch.where(depth < 2, 0.1, 1.0))
-    assert torch.equal(background_filled(frame, fields_along([4.0, 0.0], other)), depth)
+    return frame_of(depth, torch.where(depth < 2, 0.1, 1.0))
+
+
+@pytest.mark.parametrize("other", [[-4.0, 0.0], [0.0, 4.0]])
+def test_depth_stays_where_betas_are_on_several_sides(other):
+    frame = wrong_in_the_middle()
+    assert torch.equal(background_filled(frame, fields_along([4.0, 0.0], other)), frame.depth)
     beside = background_filled(frame, fields_along([4.0, 0.0], [3.0, 0.5]))
     torch.testing.assert_close(beside, torch.full((6, 6), 5.0))
 
 
 @pytest.mark.parametrize("half_width", [0.0, torch.nan])
 def test_depth_stays_where_its_interval_is_not_known(half_width):
-    depth = torch.full((6, 6), 5.0)
-    depth[:, 2:4] = 1.0
-    frame = frame_of(depth, torch.where(depth < 2, 0.1, 1.0))
-    frame = frame._replace(half_width=torch.full_like(depth, half_width))
-    assert torch.equal(background_filled(frame, fields_along([4.0, 0.0])), depth)
+    frame = wrong_in_the_middle()
+    frame = frame._replace(half_width=torch.full_like(frame.depth, half_width))
+    assert torch.equal(background_filled(frame, fields_along([4.0, 0.0])), frame.depth)

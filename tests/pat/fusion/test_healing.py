@@ -5,12 +5,12 @@ import torch
 from torch.nn.functional import avg_pool2d
 
 from arraygeom import Pose, Rig, Sensor, rotation_from_vector
-from pat.cli.main import main
 from pat.data.sample_array import load_sample
 from pat.evaluation.metrics import score
 from pat.fusion.healing import checked_rig
 from pat.fusion.views import ViewFiles
 from pat.media.images import read_image, write_image
+from tests.pat.commands import images, pat
 
 
 @pytest.fixture(scope="module")
@@ -30,23 +30,10 @@ def material(tmp_path_factory):
     return folder, avg_pool2d(sample.ground_truth, 2)
 
 
-def fused(folder, rig, out, *more):
-    images = [f"--image={name}={folder / name}.png" for name in ("mono", "colour")]
-    main(
-        [
-            "fuse",
-            str(folder / rig),
-            "--alpha",
-            "mono",
-            *images,
-            "--weights",
-            "mono-colour-small",
-            "--no-report",
-            "-o",
-            str(folder / out),
-            *more,
-        ]
-    )
+def fused(folder, rig, out):
+    files = images(folder, "mono", "colour")
+    how = "--weights mono-colour-small --no-report"
+    pat(f"fuse {folder / rig} --alpha mono {files} {how} -o {folder / out}")
     return read_image(folder / out / "fused.png")
 
 
@@ -95,18 +82,9 @@ def test_a_right_rig_is_left_as_it_is(material):
 
 def test_a_refusal_of_refine_has_a_status_of_its_own_and_says_what_to_do(material, capsys):
     folder, _ = material
-    images = [f"--image={name}={folder / name}.png" for name in ("mono", "colour")]
-    given = [
-        "rig",
-        "refine",
-        str(folder / "rough.yaml"),
-        *images,
-        "--no-photometric",
-        "-o",
-        str(folder / "x.yaml"),
-    ]
+    files = images(folder, "mono", "colour")
     with pytest.raises(SystemExit) as stop:
-        main(given)
+        pat(f"rig refine {folder / 'rough.yaml'} {files} --no-photometric -o {folder / 'x.yaml'}")
     assert stop.value.code == 4
     said = " ".join(capsys.readouterr().err.split())
     assert f"or fuse without a rig: `pat fuse {folder / 'colour.png'} {folder / 'mono.png'}`" in said

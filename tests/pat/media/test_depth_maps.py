@@ -70,15 +70,12 @@ def test_what_is_no_depth_map_is_refused(tmp_path):
     tifffile.imwrite(tmp_path / "nothing.tif", np.zeros((20, 30), np.float32))
     with pytest.raises(ValueError, match="no pixel has a positive depth"):
         read_depth(tmp_path / "nothing.tif")
-    (tmp_path / "short.pfm").write_bytes(b"Pf\n30 20\n-1\n" + bytes(100))
-    with pytest.raises(ValueError, match="not whole"):
-        read_depth(tmp_path / "short.pfm")
-    (tmp_path / "cut.pfm").write_bytes(b"Pf\n30 20\n-1\n" + bytes(101))
-    with pytest.raises(ValueError, match=r"cut.pfm: .* not whole"):
-        read_depth(tmp_path / "cut.pfm")
-    (tmp_path / "scale.pfm").write_bytes(b"Pf\n30 20\n-1.0.2\n" + bytes(2400))
-    with pytest.raises(ValueError, match=r"scale.pfm: not a grey PFM"):
-        read_depth(tmp_path / "scale.pfm")
-    (tmp_path / "colour.pfm").write_bytes(b"PF\n30 20\n-1\n" + bytes(7200))
-    with pytest.raises(ValueError, match="not a grey PFM"):
-        read_depth(tmp_path / "colour.pfm")
+    for name, content, said in (
+        ("short", b"Pf\n30 20\n-1\n" + bytes(100), "not whole"),
+        ("cut", b"Pf\n30 20\n-1\n" + bytes(101), "not whole"),
+        ("scale", b"Pf\n30 20\n-1.0.2\n" + bytes(2400), "not a grey PFM"),
+        ("colour", b"PF\n30 20\n-1\n" + bytes(7200), "not a grey PFM"),
+    ):
+        (tmp_path / f"{name}.pfm").write_bytes(content)
+        with pytest.raises(ValueError, match=rf"{name}\.pfm: .*{said}"):
+            read_depth(tmp_path / f"{name}.pfm")

@@ -2,7 +2,6 @@ import errno
 import io
 import os
 import re
-import resource
 import struct
 import sys
 import warnings
@@ -21,6 +20,7 @@ from arraygeom.atomic import sweep, write_atomically, write_together
 from pat.media.colour import from_luma_chroma, luminance, to_luma_chroma
 from pat.media.headers import image_header
 from pat.media.images import decoded_photograph, read_image, read_recorded, write_image
+from tests.processes import room_for
 
 RED = torch.tensor([1.0, 0.0, 0.0])[:, None, None]
 
@@ -283,26 +283,21 @@ def test_what_cannot_be_written_leaves_nothing_behind(tmp_path, name, image, bit
     assert os.listdir(tmp_path) == []
 
 
-def test_an_error_while_writing_keeps_the_former_file(tmp_path):
-    def write_half(path):
-        with write_atomically(path) as temporary:
-            temporary.write_text("new")
+def test_the_written_file_takes_the_place_of_the_former_but_after_an_error(tmp_path):
+    def write_half():
+        with write_atomically(file) as temporary:
+            temporary.write_text("half")
             raise RuntimeError
 
-    (tmp_path / "a.txt").write_text("old")
-    with pytest.raises(RuntimeError):
-        write_half(tmp_path / "a.txt")
-    assert os.listdir(tmp_path) == ["a.txt"]
-    assert (tmp_path / "a.txt").read_text() == "old"
-
-
-def test_the_written_file_takes_the_place_of_the_former_and_makes_its_folder(tmp_path):
+    file = tmp_path / "b" / "a.txt"  # whose folder is made
     for text in ("old", "new"):
-        with write_atomically(tmp_path / "b" / "a.txt") as temporary:
+        with write_atomically(file) as temporary:
             assert temporary.suffix == ".txt"
             temporary.write_text(text)
+    with pytest.raises(RuntimeError):
+        write_half()
     assert os.listdir(tmp_path / "b") == ["a.txt"]
-    assert (tmp_path / "b" / "a.txt").read_text() == "new"
+    assert file.read_text() == "new"
 
 
 def test_luminance_is_opencvs():
@@ -317,6 +312,8 @@ def test_luma_and_chroma_come_back():
     torch.testing.assert_close(from_luma_chroma(luma, chroma), image, atol=1e-14, rtol=0)
     grey = image[:, :1].expand(-1, 3, -1, -1)
     assert to_luma_chroma(grey)[1].abs().max() < 1e-14
+    others = torch.randn_like(chroma)  # of no image: the luminance is the given one all the same
+    torch.testing.assert_close(luminance(from_luma_chroma(luma, others)), luma, atol=1e-14, rtol=0)
 
 
 def test_a_file_system_that_is_read_only_is_said_of_the_file_itself(tmp_path, monkeypatch):
@@ -337,27 +334,17 @@ def test_a_file_system_that_is_read_only_is_said_of_the_file_itself(tmp_path, mo
 
 def test_no_room_is_said_of_the_file_whoever_writes(tmp_path):
     """NumPy's own error was "176128 requested and 101744 written"."""
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
-    try:
-        with (
-            pytest.raises(OSError, match=r"a\.npy: not written whole \(.* written\): is there room\?"),
-            write_atomically(tmp_path / "a.npy") as temporary,
-        ):
-            np.save(temporary, np.zeros(1000))
-        with (
-            pytest.raises(OSError, match=rf"{re.escape(str(tmp_path))}: not written whole \("),
-            write_together(tmp_path, last="b.npy") as folder,
-        ):
-            np.save(folder / "b.npy", np.zeros(1000))
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    said = r"a\.npy: not written whole \(.* written\): is there room\?"
+    with (
+        room_for(1000),
+        pytest.raises(OSError, match=said),
+        write_atomically(tmp_path / "a.npy") as temporary,
+    ):
+        np.save(temporary, np.zeros(1000))
+    said = rf"{re.escape(str(tmp_path))}: not written whole \("
+    with room_for(1000), pytest.raises(OSError, match=said), write_together(tmp_path, last="b.npy") as folder:
+        np.save(folder / "b.npy", np.zeros(1000))
     assert os.listdir(tmp_path) == []
-
-
-def test_the_luminance_of_a_recoloured_image_is_the_given_one():
-    luma, chroma = torch.rand(1, 5, 6, dtype=torch.float64), torch.randn(2, 5, 6, dtype=torch.float64)
-    torch.testing.assert_close(luminance(from_luma_chroma(luma, chroma)), luma, atol=1e-14, rtol=0)
 
 
 def test_what_a_killed_process_left_is_swept_away_and_nothing_else(tmp_path):
@@ -418,13 +405,7 @@ def test_orientation_does_not_depend_on_the_type_of_values(tmp_path, kind):
 
 def png_that_claims(width: int, height: int) -> bytes:
     head = struct.pack(">II5B", width, height, 8, 2, 0, 0, 0)
-    return (
-        b"\x89PNG\r\n\x1a\n"
-        + struct.pack(">I", 13)
-        + b"IHDR"
-        + head
-        + struct.pack(">I", zlib.crc32(b"IHDR" + head))
-    )
+    return b"\x89PNG\r\n\x1a\n" + png_chunk(b"IHDR", head)
 
 
 def test_the_size_is_compared_before_anything_is_decoded(tmp_path, monkeypatch):

@@ -256,10 +256,6 @@ def test_mistakes_are_named():
     for sigma in (-1.0, math.nan):
         with pytest.raises(ValueError, match="sigma must be 0 or more pixels"):
             GaussianBlur(sigma)
+    halved = DegradationCase("halve", beta=(Resample(0.5),))
     with pytest.raises(ValueError, match="must keep the size"):
-        augment(
-            noise_image(1, 1, 8, 8),
-            noise_image(1, 3, 8, 8),
-            [DegradationCase("halve", beta=(Resample(0.5),))],
-            generator(),
-        )
+        augment(noise_image(1, 1, 8, 8), noise_image(1, 3, 8, 8), [halved], generator())
