@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import json
 import os
 import subprocess
 import sys
@@ -24,7 +23,6 @@ from torch import Tensor
 
 from arraygeom import Rig
 from arraygeom.atomic import write_text
-from arraygeom.io.native import write as rig_text
 from experiments.hdr import merged, missed, tone_curve, usable_range
 from experiments.names import refuse_unknown
 from pat.evaluation.baseline import classical_baseline
@@ -44,7 +42,6 @@ from pat.media.video import write_video
 from pat.networks.protocol import FusionNetwork
 from pat.networks.weights import load_weights
 from pat.support.memory import peak_memory
-from pat.support.tensor_files import read_tensors, write_tensors
 
 SceneKind = Literal["layered", "rendered"]
 NAMES = ("wide-narrow", "visible-nir", "exposures", "fast-slow")
@@ -60,22 +57,6 @@ class SystemRecording:
     raw: Mapping[str, list[Float[Tensor, "_ _ _"]]]
     ground_truth: list[Float[Tensor, "3 h w"]]
     light: Mapping[str, Float[Tensor, "1 _ _"]] = field(default_factory=dict)
-
-    @property
-    def reference(self) -> dict[str, Tensor]:
-        """All but the raw images, by name."""
-        tensors = {f"ground truth/{i:03d}": image for i, image in enumerate(self.ground_truth)}
-        tensors |= {f"light/{name}": image for name, image in self.light.items()}
-        return {name: image.contiguous() for name, image in tensors.items()}
-
-    @classmethod
-    def of(cls, reference: Mapping[str, Tensor]) -> SystemRecording:
-        """The recording of a `reference`, without the raw images."""
-        kinds: dict[str, dict[str, Tensor]] = {"ground truth": {}, "light": {}}
-        for name, tensor in sorted(reference.items()):
-            kind, _, which = name.partition("/")
-            kinds[kind][which] = tensor
-        return cls({}, list(kinds["ground truth"].values()), kinds["light"])
 
 
 @dataclass(frozen=True)
@@ -142,7 +123,9 @@ def run_system(
     """
     system = load_system(name)
     rig = system.sized(full, scale=scale)
-    recording, files = recorded(system, rig, out / "inputs", scene=scene, say=say)
+    say(f"rendering and recording {', '.join(f'{n} {rig[n].hw[1]}x{rig[n].hw[0]}' for n in rig.names)}")
+    recording = system.module.record_scene(_stage(system, rig, scene))
+    files = write_recording(recording, rig, out / "inputs")
     say("fusing")
     run = _sequence if len(recording.ground_truth) > 1 else _still
     lines, panels = run(SystemRun(system, rig, files, recording, out, weights, max_memory, say))
@@ -165,26 +148,6 @@ class SystemRun(NamedTuple):
     say: Callable[[str], None]
 
 
-def recorded(
-    system: ArraySystem, rig: Rig, out: Path, *, scene: SceneKind, say: Callable[[str], None]
-) -> tuple[SystemRecording, dict[str, list[Path]]]:
-    """The recording of the system's scene, its files; rendered unless done with the same settings."""
-    module, cache = system.module, out / "recorded.safetensors"
-    key = f"{system.name}, {scene}, seed {module.SEED}\n{rig_text(rig)}"
-    if cache.is_file():
-        tensors, facts = read_tensors(cache)
-        if facts["key"] == key:
-            say(f"using the recording in {out}")
-            return SystemRecording.of(tensors), _files(out, json.loads(facts["counts"]))
-    say(f"rendering and recording {', '.join(f'{n} {rig[n].hw[1]}x{rig[n].hw[0]}' for n in rig.names)}")
-    cache.unlink(missing_ok=True)
-    recording = module.record_scene(_stage(system, rig, scene))
-    write_recording(recording, rig, out)
-    counts = {name: len(images) for name, images in recording.raw.items()}
-    write_tensors(cache, recording.reference, {"key": key, "counts": json.dumps(counts)})
-    return recording, _files(out, counts)
-
-
 def _stage(system: ArraySystem, rig: Rig, scene: SceneKind) -> Any:
     """The scene before the cameras, with what a system's module asks of it."""
     from .stage import RenderedScene, SystemScene
@@ -201,21 +164,19 @@ def _stage(system: ArraySystem, rig: Rig, scene: SceneKind) -> Any:
     )
 
 
-def _files(out: Path, counts: Mapping[str, int]) -> dict[str, list[Path]]:
-    return {name: [out / f"{name}_{i:03d}.png" for i in range(count)] for name, count in counts.items()}
-
-
-def write_recording(recording: SystemRecording, rig: Rig, out: Path) -> None:
-    """The raw images as 16-bit files with the rig's counts, the ground truth, and the rig."""
+def write_recording(recording: SystemRecording, rig: Rig, out: Path) -> dict[str, list[Path]]:
+    """The raw images as 16-bit files with the rig's counts, which are returned; the ground truth, the rig."""
     out.mkdir(parents=True, exist_ok=True)
     rig.save(out / "rig.yaml")
+    files = {}
     for name, images in recording.raw.items():
         white = 2 ** (rig[name].sensor.bits or 16) - 1
-        for i, image in enumerate(images):
-            counts = (image.clamp(0, 1) * white).round()
-            write_image(out / f"{name}_{i:03d}.png", counts / 65535, bits=16)
+        files[name] = [out / f"{name}_{i:03d}.png" for i in range(len(images))]
+        for file, image in zip(files[name], images):
+            write_image(file, (image.clamp(0, 1) * white).round() / 65535, bits=16)
     for i, image in enumerate(recording.ground_truth):
         write_image(out / f"ground_truth_{i:03d}.png", image, bits=16)
+    return files
 
 
 Panels = dict[str, Tensor]
