@@ -170,11 +170,8 @@ def _rectified_plane(pair: Pair) -> _Plane:
     right, bottom = hw[1] - 1, hw[0] - 1
     ends = np.array([[0, 0, 1], [right, 0, 1], [0, bottom, 1], [right, bottom, 1.0]])
     corners, z = _project(K @ rotation @ np.linalg.inv(K_alpha), ends)
-    shift = (
-        -(rotation @ R.T @ t)[0]
-        * focal
-        / (np.array([float(d) for d in pair.depth_range]) * [z.min(), z.max()])
-    )
+    near, far = (float(d) for d in pair.depth_range)
+    shift = -(rotation @ R.T @ t)[0] * focal / np.array([near * z.min(), far * z.max()])
     max_disparity = float(np.ptp(shift))
     K[:2, 2] = -corners.min(0) + [max_disparity, 0]
     sides = np.ceil(np.ptp(corners, axis=0) + np.array([max_disparity + 1, 1]))

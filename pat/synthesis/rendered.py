@@ -23,8 +23,6 @@ from arraygeom.atomic import flush
 from arraygeom.rig import Rig
 from arraygeom.sampling import sample
 
-from .scene import Scene
-
 RENDER_FILE = "render.json"
 """The last file written: a folder that has it is complete."""
 
@@ -61,16 +59,6 @@ class Rendered:
     def rig(self) -> Rig:
         """The cameras as rendered: sizes included, calibrated, with their lenses."""
         return Rig.load(self.folder / "rig.yaml")
-
-    @cached_property
-    def scene(self) -> Scene:
-        """What was rendered."""
-        return Scene.load(self.folder / "scene.yaml")
-
-    @property
-    def accepted(self) -> bool:
-        """Whether the check accepted it."""
-        return bool(self.about["check"]["accepted"])
 
     def frames(self, camera: str) -> int:
         """How many frames of a camera there are."""

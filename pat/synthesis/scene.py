@@ -7,7 +7,7 @@ near infrared beside them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from arraygeom.atomic import write_text
 from arraygeom.safe_yaml import dump_yaml
 
-from ..support.schema import from_document, parse_yaml, to_document
+from ..support.schema import to_document
 
 Vec3 = tuple[float, float, float]
 Shape = Literal["plane", "cube", "sphere", "cylinder", "cone", "torus", "lathe", "room"]
@@ -103,11 +103,6 @@ class Motion:
         if not times or any(a >= b for a, b in pairwise(times)):
             raise ValueError(f"a motion needs keys whose times rise, got times {times}")
 
-    @property
-    def still(self) -> bool:
-        """Whether nothing ever changes."""
-        return all(replace(k, time=0.0) == replace(self.keys[0], time=0.0) for k in self.keys)
-
     def at(self, time: float) -> ObjectPose:
         """Where the object is at a time in seconds."""
         from scipy.spatial.transform import Rotation, Slerp  # here, as it takes .2 s to import
@@ -120,8 +115,7 @@ class Motion:
             return ObjectPose(Rotation.from_rotvec(rotations[0]).as_matrix(), positions[0], extents[0])
         turn = Slerp(times, Rotation.from_rotvec(rotations))(np.clip(time, times[0], times[-1]))
         position, extent = (
-            np.array([np.interp(time, times, along) for along in of_keys.T])
-            for of_keys in (positions, extents)
+            np.array([np.interp(time, times, axis) for axis in values.T]) for values in (positions, extents)
         )
         return ObjectPose(turn.as_matrix(), position, extent)
 
@@ -192,27 +186,7 @@ class Scene:
     generator: str = ""
     seed: int = 0
 
-    def to_yaml(self) -> str:
-        """The text of a scene file."""
-        document = {"format": FORMAT, **to_document(self)}
-        return dump_yaml(document, width=120, default_flow_style=None)
-
-    @classmethod
-    def from_yaml(cls, text: str, source: str = "scene") -> Scene:
-        """The scene of a file's text. Raises ValueError naming `source` and the entry."""
-        document = parse_yaml(text, source)
-        if not isinstance(document, dict) or document.pop("format", None) != FORMAT:
-            raise ValueError(f"{source}: not a scene file: its first line must be 'format: {FORMAT}'")
-        try:
-            return from_document(cls, document)
-        except ValueError as error:
-            raise ValueError(f"{source}: {error}") from None
-
     def save(self, path: str | Path) -> None:
-        """Write the scene file atomically."""
-        write_text(path, self.to_yaml())
-
-    @classmethod
-    def load(cls, path: str | Path) -> Scene:
-        """Read a scene file. Raises ValueError naming the file and the entry."""
-        return cls.from_yaml(Path(path).read_text(encoding="utf-8"), str(path))
+        """Write the scene to a YAML file, atomically, for the record."""
+        document = {"format": FORMAT, **to_document(self)}
+        write_text(path, dump_yaml(document, width=120, default_flow_style=None))

@@ -14,9 +14,6 @@ from arraygeom.lenses.central import MODELS
 from arraygeom.lenses.model import LensModel
 from tests.arraygeom.rigs import directions
 from tests.arraygeom.test_distortion import BROWN, COUNTS, FISHEYES
-from tests.oracles import Oracle
-
-cv2 = Oracle("cv2")
 
 
 def double_sphere(X, xi, alpha):
@@ -148,18 +145,6 @@ def test_the_tools_own_formula(model, c):
     assert valid.float().mean() > 0.2
     error = np.abs(found.numpy() - expected)[valid.numpy()]
     assert (error / (1 + radius[valid.numpy(), None])).max() < 1e-11
-
-
-@pytest.mark.parametrize("c", [(0.9, -0.1, 0.02, 1e-3, -2e-3), (1.7, -0.2, 0.05, 0.0, 1e-3)])
-def test_unified_is_opencvs_omnidir(c):
-    X = directions(500)
-    X = X[X[:, 2] > 0.3]
-    expected = cv2.omnidir.projectPoints(
-        X.numpy()[None], np.zeros(3), np.zeros(3), np.eye(3), c[0], np.array(c[1:])[None]
-    )[0][0]
-    found, valid = lens("unified", c).project(X)
-    assert valid.float().mean() > 0.8
-    assert np.abs(found.numpy() - expected)[valid.numpy()].max() < 1e-12
 
 
 @pytest.mark.parametrize(("model", "c"), EVERY)

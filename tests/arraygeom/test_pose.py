@@ -55,14 +55,6 @@ def test_group_axioms():
     torch.testing.assert_close((a @ b).apply(X), a.apply(b.apply(X)))
 
 
-def test_batches_agree_with_singles():
-    a, b = random_pose(0, 4), random_pose(1, 4)
-    X = torch.randn(4, 5, 3, dtype=torch.float64)
-    together = (a @ b).apply(X)
-    for i in range(4):
-        torch.testing.assert_close(together[i], Pose(a.R[i], a.t[i]).apply(Pose(b.R[i], b.t[i]).apply(X[i])))
-
-
 def test_centre_is_where_the_camera_is():
     R, centre = random_pose(3).R, torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64)
     pose = Pose.from_centre(R, centre)

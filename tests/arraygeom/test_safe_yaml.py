@@ -49,14 +49,13 @@ def test_rig_files_that_would_grow_are_refused_at_once(head, attack, tmp_path):
 
 
 @pytest.mark.parametrize("attack", [bomb(), "[" * 100_000, "seed: 1\nsteps: 5\nseed: 2"])
-def test_recipes_scenes_and_other_documents_too(attack, tmp_path):
+def test_recipes_and_other_documents_too(attack, tmp_path):
     pytest.importorskip("tyro", reason="pat needs more than arraygeom does")
     from pat.support.schema import read_yaml
-    from pat.synthesis.scene import Scene
     from pat.training.config import parse_config
 
     (tmp_path / "a.yaml").write_text(attack)
-    for read in (parse_config, Scene.from_yaml, lambda _: read_yaml(tmp_path / "a.yaml")):
+    for read in (parse_config, lambda _: read_yaml(tmp_path / "a.yaml")):
         with pytest.raises(ValueError, match="YAML"):
             read(attack)
 

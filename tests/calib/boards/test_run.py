@@ -121,21 +121,6 @@ def test_other_mistakes(mine, capsys):
     assert "charuko:8x6:30mm" in fails(mine, capsys, board="charuko:8x6:30mm")
 
 
-def test_videos(mine, without_report):
-    for name in ("a", "b"):
-        images = [cv2.imread(str(p)) for p in sorted((mine / name).iterdir())]
-        shutil.rmtree(mine / name)
-        video = cv2.VideoWriter(
-            str(mine / f"{name}.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 5, images[0].shape[1::-1]
-        )
-        video.set(cv2.VIDEOWRITER_PROP_QUALITY, 98)
-        for image in images:
-            video.write(image)
-        video.release()
-    run(mine)
-    assert float(Rig.load(mine / "out" / "rig.yaml")["b"].centre[0]) == pytest.approx(0.15, abs=5e-3)
-
-
 @pytest.mark.slow
 def test_photographs_of_four_cameras(tmp_path):
     """Through prints, lenses, noise, detector: ground truth within 3.5 deviations for some 50 parameters.

@@ -97,7 +97,7 @@ def test_a_job_is_rendered_killed_and_resumed(config, tmp_path, capfd):
     assert [row["scene"] for row in facts] == done(out)
     assert all(row["check"]["accepted"] and row["memory_mb"] > 50 for row in facts)
     scene = Rendered(out / "scenes/000001")
-    assert scene.accepted
+    assert scene.about["check"]["accepted"]
     assert scene.rig.names == ("mono", "colour")
     frame = scene.frame("colour")
     assert frame.rgb.shape == (3, 60, 80)

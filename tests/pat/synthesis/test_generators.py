@@ -30,7 +30,7 @@ def test_abstract_scenes_are_within_the_depths_and_around_the_cameras(seed):
     scene = abstract(seed, rig)
     assert 10 <= len(scene.objects) - 1 <= 20
     assert len({o.shape for o in scene.objects}) > 3
-    assert Scene.from_yaml(scene.to_yaml()) == scene == abstract(seed, rig) != abstract(seed + 1, rig)
+    assert scene == abstract(seed, rig) != abstract(seed + 1, rig)
     for camera in rig.cameras.values():
         seen = depths(scene, camera)
         assert seen.min() > 0.7 * 2
@@ -40,7 +40,7 @@ def test_abstract_scenes_are_within_the_depths_and_around_the_cameras(seed):
 
 def test_moving_scenes_move():
     scene = abstract(3, unlike_cameras(), moving=2.0)
-    moving = [o for o in scene.objects if not o.motion.still]
+    moving = [o for o in scene.objects if len(o.motion.keys) > 1]
     assert len(moving) == len(scene.objects) - 1
     assert {o.motion.keys[-1].time for o in moving} == {2.0}
 
