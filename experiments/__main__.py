@@ -89,7 +89,7 @@ class SystemsRun:
     """Folder for the results; by default out/systems/NAME."""
     weights: Weights = "mono-colour"
     max_memory: Memory = None
-    """Memory limit of fusing, such as 4GiB; a single frame is then fused in its own process, measured."""
+    """Memory limit of fusing, such as 4GiB."""
 
     def run(self) -> None:
         """Print the scores, and the expected ones where they are of the same settings."""

@@ -7,7 +7,6 @@ is to be high if it is near the true disparity.
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -34,7 +33,6 @@ from pat.matching.normalisation import ComparedViews, Comparison, Normalisation
 from pat.matching.positions import FINE
 from pat.media.colour import to_bytes
 from pat.networks.guided import GuidedPAT
-from pat.sensors import generator_for
 from pat.support.tensor_files import write_tensors
 from pat.synthesis.rigs import below
 
@@ -134,13 +132,9 @@ def losses(
 ) -> Iterator[Tensor]:
     """Of each step from one on: the cross-entropy of how near candidates are to the true disparity, of the
     statement that the best one is right, and how far it is off beyond or within what is stated."""
-    kinds = [some for some in samples if some]
-    for step in itertools.count(start):
-        g = generator_for(config.seed, "choice", step)
-        of = [kinds[i % len(kinds)] for i in range(config.batch)]
-        windows = [window(some[below(len(some), g)], config.side, g) for some in of]
+    for _, windows in config.windows(samples, "choice", start, window):
         inputs, options, truth, visible = (torch.cat(parts).to(config.device) for parts in zip(*windows))
-        with torch.autocast(config.device, torch.bfloat16, enabled=config.device != "cpu"):
+        with config.autocast():
             answer = pixel_shuffle(network(inputs).float().flatten(1, 2), FINE)
             scores, logit, width = answer.split([CANDIDATES, 1, 1], 1)
         apart = (options - truth).abs()

@@ -63,6 +63,10 @@ class Recipe:
             torch.manual_seed(self.seed)
             yield
 
+    def autocast(self) -> torch.autocast:
+        """Half precision where training is not on a CPU."""
+        return torch.autocast(self.device, torch.bfloat16, enabled=self.device != "cpu")
+
     def train(self, network: nn.Module, losses: Losses) -> None:
         """Train a network, or the rest of a run, and leave the averaged weights in it, on the CPU.
 

@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import os
-import subprocess
-import sys
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -18,7 +14,6 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from tifffile import imread
 from torch import Tensor
 
 from arraygeom import Rig
@@ -28,7 +23,6 @@ from experiments.names import refuse_unknown
 from pat.evaluation.baseline import classical_baseline
 from pat.evaluation.metrics import score
 from pat.evaluation.tables import markdown_table
-from pat.fusion.checks import LowConfidenceWarning
 from pat.fusion.frames import ImageFiles
 from pat.fusion.fuse import FuseSettings, fuse
 from pat.fusion.results import Frame, save_frame, view_of
@@ -36,12 +30,11 @@ from pat.fusion.sequence import SequenceFusion
 from pat.fusion.views import ViewFiles
 from pat.media.colour import linear_from_srgb, luminance, to_bytes, to_luma_chroma
 from pat.media.figures import colour_depth, save_panels
-from pat.media.images import read_image, write_image
+from pat.media.images import write_image
 from pat.media.raw import match_luminance
 from pat.media.video import write_video
 from pat.networks.protocol import FusionNetwork
 from pat.networks.weights import load_weights
-from pat.support.memory import peak_memory
 
 SceneKind = Literal["layered", "rendered"]
 NAMES = ("wide-narrow", "visible-nir", "exposures", "fast-slow")
@@ -187,14 +180,10 @@ def _still(job: SystemRun) -> tuple[list[str], Panels]:
     rig, recording, out = job.rig, job.recording, job.out
     alpha, ground_truth = job.system.alpha, recording.ground_truth[0]
     first = {name: paths[0] for name, paths in job.files.items()}
-    memory: list[str] = []
-    if job.max_memory is not None:
-        frame, memory = fused_apart(job, first)
-    files = ViewFiles(rig, first, alpha=alpha)
+    files, network = ViewFiles(rig, first, alpha=alpha), load_weights(job.weights)
     read, images = files.developed, dict(files)
-    if job.max_memory is None:
-        frame = fuse(load_weights(job.weights), read, images, alpha=alpha)
-        save_frame(frame, out, bits=16, view=view_of(read, alpha, bits=16))
+    frame = fuse(network, read, images, alpha=alpha, max_memory=job.max_memory)
+    save_frame(frame, out, bits=16, view=view_of(read, alpha, bits=16))
     baseline = classical_baseline(read, images, alpha)
     if len(images) == 2:
         baseline = match_luminance(baseline, images[alpha], read[alpha].sensor)
@@ -204,7 +193,7 @@ def _still(job: SystemRun) -> tuple[list[str], Panels]:
         merged_frame = merged(frame, rig, images, alpha)
         rows["fusion, exposures merged"] = merged_frame.image
         extra = _ranges(rig, recording, images, frame, merged_frame)
-        extra += _permuted(load_weights(job.weights), read, images, alpha, frame)
+        extra += _permuted(network, read, images, alpha, frame)
         write_image(out / "merged.tif", linear_from_srgb(merged_frame.image.clamp(min=0)), bits=32)
     white = 1.0 if not recording.light else float(ground_truth.max())
     panels = {f"{n}{' (alpha)' if n == alpha else ''}": images[n] for n in rig.names}
@@ -215,34 +204,7 @@ def _still(job: SystemRun) -> tuple[list[str], Panels]:
     panels |= {name: shown(image) for name, image in compared.items()}
     panels |= {"depth (red is near)": colour_depth(frame.depth), "confidence": frame.confidence[None]}
     scores = [*_table(rows, ground_truth, white), *_confidence_line(frame, ground_truth)]
-    return [*scores, *extra, *memory], panels
-
-
-def fused_apart(job: SystemRun, files: Mapping[str, Path]) -> tuple[Frame, list[str]]:
-    """A frame fused by `pat fuse` in a process of its own, and its memory and time, as lines of text."""
-    images = [text for name, path in files.items() for text in ("--image", f"{name}={path}")]
-    out, rig = job.out, job.out / "inputs" / "rig.yaml"
-    command = [sys.executable, "-m", "pat", "fuse", "--rig", str(rig), "--alpha", job.system.alpha, *images]
-    command += ["--out", str(out), "--bits", "16", "--weights", job.weights]
-    command += ["--max-memory", str(job.max_memory)]
-    begin, planned = time.monotonic(), ""
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    most = 0.0  # `wait4` would count what this process had resident when it started the other
-    for line in process.stderr or ():
-        most = max(most, peak_memory(process.pid) or 0.0)
-        planned = line.strip() if line.startswith("plan:") else planned
-        if line.strip():
-            job.say(line.rstrip())
-    _, status, used = os.wait4(process.pid, 0)
-    if os.waitstatus_to_exitcode(status) not in (0, LowConfidenceWarning.exit_status):
-        raise ValueError(f"fusing in a process of its own failed (wait status {status})")
-    took = f"{time.monotonic() - begin:.0f} s, {used.ru_utime + used.ru_stime:.0f} s of a core"
-    peak = f"allowed {job.max_memory}, at most {most / 2**30:.2f} GiB resident"
-    depth = torch.from_numpy(imread(out / "depth.tif")) if (out / "depth.tif").is_file() else None
-    image, confidence = read_image(out / "fused.png"), read_image(out / "confidence.png")[0]
-    depth = torch.full_like(confidence, torch.nan) if depth is None else depth
-    frame = Frame(image, depth, confidence, torch.full_like(depth, torch.nan))
-    return frame, ["", f"{planned}. Memory: {peak}. Time: {took}."]
+    return [*scores, *extra], panels
 
 
 def _sequence(job: SystemRun) -> tuple[list[str], Panels]:

@@ -10,17 +10,14 @@ import os
 import re
 import subprocess
 import sys
-import textwrap
 import tomllib
 from pathlib import Path
 
 import pytest
-import torch
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from arraygeom.extras import needs
-from pat.media.images import write_image
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("arraygeom", "pat", "calib")
@@ -300,16 +297,6 @@ def test_what_is_asked_for_is_pinned_exactly_and_in_range():
             assert only.operator == "=="
             assert "+" not in only.version, "a local version exists on one index only"
             assert asked.specifier.contains(only.version), f"{pin} is not in {asked}"
-
-
-def test_the_readme_example_runs(tmp_path, monkeypatch, capsys):
-    (fused,), pages = blocks("README.md", "python"), (ROOT / "docs" / "index.md").read_text()
-    (tmp_path / "rig.yaml").write_text(textwrap.dedent(re.search(r"```yaml\n(.*?) *```", pages, re.S)[1]))
-    for name, channels in (("a", 1), ("b", 3)):
-        write_image(tmp_path / f"{name}.png", torch.rand(channels, 400, 640))
-    monkeypatch.chdir(tmp_path)
-    exec(fused, {})
-    assert "[3, 400, 640]" in capsys.readouterr().out
 
 
 def test_documents_name_targets_and_files_that_exist():

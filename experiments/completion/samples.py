@@ -2,25 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+import itertools
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
-from torch import Tensor
+from torch import Generator, Tensor
 
 from experiments.evaluation.halves import of_half
 from experiments.fit import Recipe
 from pat.data.pairs import StereoPair, folder_pairs, middlebury_pairs
 from pat.networks.guided import GuidedPAT
 from pat.networks.weights import load_weights
+from pat.sensors import generator_for
 from pat.support.folders import files_below
 from pat.support.tensor_files import read_tensors, write_tensors
+from pat.synthesis.rigs import below
 
 from .pairs import mirrored, photo_pair, varied_pair
 from .shapes import shape_pair
 
+S, W = TypeVar("S"), TypeVar("W")
 Made = partial[StereoPair]
 """A pair that is made when it is called."""
 KINDS = ("pairs", "shapes", "photos")
@@ -72,6 +77,20 @@ class PairTraining(Recipe):
                 write_tensors(file, made)
             samples.append(read_tensors(file)[0])
         return samples
+
+    def windows(
+        self,
+        samples: Sequence[Sequence[S]],
+        purpose: str,
+        start: int,
+        window: Callable[[S, int, Generator], W],
+    ) -> Iterator[tuple[Generator, list[W]]]:
+        """Of each step from one on the randomness, and windows of samples, as many of each kind there is."""
+        kinds = [some for some in samples if some]
+        for step in itertools.count(start):
+            g = generator_for(self.seed, purpose, step)
+            of = (kinds[i % len(kinds)] for i in range(self.batch))
+            yield g, [window(some[below(len(some), g)], self.side, g) for some in of]
 
     def _photo_pairs(self) -> Iterator[Made]:
         files = self._photographs()

@@ -6,7 +6,6 @@ then it is trained on random windows of those. The weights are the fusion's with
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -25,7 +24,6 @@ from pat.media.colour import from_luma_chroma
 from pat.networks.completion import CANDIDATES, Completion, features
 from pat.networks.guided import GuidedPAT
 from pat.networks.weights import save_weights
-from pat.sensors import generator_for
 from pat.synthesis.rigs import below
 from pat.training.losses import image_loss
 
@@ -86,14 +84,11 @@ def losses(
     start: int,
 ) -> Iterator[Tensor]:
     """Of each step from one on: minus the mean PSNR of windows, as `image_loss`."""
-    kinds = [some for some in frames if some]
-    for step in itertools.count(start):
-        g = generator_for(config.seed, "completion", step)
-        parts = [window(kinds[i % len(kinds)], config.side, g) for i in range(config.batch)]
+    for g, parts in config.windows(frames, "completion", start, window):
         planes = varied(torch.stack(parts), g).to(config.device)
         facts, truth = torch.cat([planes[:, :2], planes[:, 4:]], 1), planes[:, 2:4]
         inputs = features(facts[:, :1], facts[:, 1:2], [facts[:, 2:]])
-        with torch.autocast(config.device, torch.bfloat16, enabled=config.device != "cpu"):
+        with config.autocast():
             answer = network.answer(inputs).float()
         added, shares = answer.split([2, CANDIDATES], 1)
         _, confidence, mixed, apart = facts.split([1, 1, 2, 2 * CANDIDATES], 1)
@@ -101,9 +96,8 @@ def losses(
         yield image_loss(*(from_luma_chroma(0 * confidence, c) for c in (mixed + change, truth)))
 
 
-def window(frames: Sequence[Tensor], side: int, g: Generator) -> Float[Tensor, "p n n"]:
-    """A random part of one of the frames; in three of ten cases at alpha's left, which no beta sees."""
-    frame = frames[below(len(frames), g)]
+def window(frame: Tensor, side: int, g: Generator) -> Float[Tensor, "p n n"]:
+    """A random part of a frame; in three of ten cases at alpha's left, which no beta sees."""
     y, x = (below(n - side + 1, g) for n in frame.shape[1:])
     x = 0 if below(10, g) < 3 else x
     return values(frame[:, y : y + side, x : x + side])

@@ -22,7 +22,6 @@ from pat.media.figures import save_panels
 from pat.networks.protocol import Comparing
 from pat.networks.weights import Network, load_weights
 from pat.support.tensor_files import write_tensors
-from pat.synthesis.photos import PhotoBank
 
 from . import certainty, conditions, fields, paper, sweeps
 from .halves import of_half
@@ -186,8 +185,6 @@ class OnScenes:
     weights: Weights = "pat-supervised"
     without: tuple[str, ...] = ()
     """Fields to leave out, such as dense, which takes most of the time."""
-    photos: tuple[Path, ...] = ()
-    """Folders of photographs; those that scikit-image ships if none is given."""
     scenes: int = 6
     """Number of scenes, of each rig."""
     out: Out = Path("out/ablate")
@@ -213,10 +210,6 @@ class OnScenes:
     def chosen(self, fields: Mapping[str, T]) -> dict[str, T]:
         """The fields that are not left out."""
         return {name: field for name, field in fields.items() if name not in self.without}
-
-    def bank(self) -> PhotoBank:
-        """The photographs."""
-        return PhotoBank.load(*self.photos) if self.photos else sample_photographs()
 
     def say_written(self) -> None:
         """Print the table."""
@@ -244,7 +237,7 @@ class Sweeps(OnScenes):
         chosen = self.chosen(sweeps.FIELDS)
         rigs = list(sweeps.points(self.sweeps or tuple(sweeps.SWEEPS), hw=self.hw))
         shown = progress("ablating")(rigs, len(rigs))
-        rows = sweeps.ablate(network, shown, chosen, scenes=self.scenes, photos=self.bank())
+        rows = sweeps.ablate(network, shown, chosen, scenes=self.scenes)
         write_report(rows, self.out)
         self.say_written()
 
@@ -259,7 +252,7 @@ class Fields(OnScenes):
     def run(self) -> None:
         """Write ablation.md, .csv, peaks.png (attention's maxima in three pictures); print the table."""
         network = self.comparing(fields.fields_of(1.0))
-        cases = list(fields.layered_cases(self.bank(), self.scenes))
+        cases = list(fields.layered_cases(sample_photographs(), self.scenes))
         if self.middlebury is not None:
             for linked in (True, False):
                 pairs = of_half(middlebury_pairs(self.middlebury), "report")

@@ -66,7 +66,7 @@ def losses(
         losses = []
         for denoiser, ideal in ((network.band, luminance(colours)), (network.colour, colours)):
             recorded, deviation = noisy(ideal, noise_levels(len(ideal), g), g)
-            with torch.autocast(config.device, torch.bfloat16, enabled=config.device != "cpu"):
+            with config.autocast():
                 image = denoiser(recorded.to(config.device), deviation.to(config.device))
             losses.append(image_loss(image, ideal.to(config.device)))
         yield torch.stack(losses).mean()

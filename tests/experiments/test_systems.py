@@ -1,7 +1,6 @@
 """The four arrays: the paper's rigs, recordings as cameras write files, fusion better than alpha."""
 
 import math
-import re
 
 import pytest
 import torch
@@ -135,21 +134,9 @@ def test_near_infrared_is_not_taken_for_a_response(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_system_is_fused_apart_under_a_cap(tiny, tmp_path):
-    said = []
-    here = run_system("wide-narrow", tmp_path, say=said.append)
-    assert said[0].startswith("rendering")
-    apart = run_system("wide-narrow", tmp_path, max_memory="2GiB")
-    assert psnr(apart)["fusion"] == pytest.approx(psnr(here)["fusion"], abs=0.02)
-    peak = re.search(r"at most ([0-9.]+) GiB resident", apart.table)
-    assert 0.2 < float(peak[1]) < 2
-    assert "plan: 1 piece" in apart.table
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["wide-narrow", "exposures", "fast-slow"])
 def test_every_system_runs(tiny, tmp_path, name):
-    assert "| fusion |" in run_system(name, tmp_path).table
+    assert "| fusion |" in run_system(name, tmp_path, max_memory="2GiB").table
 
 
 def test_the_usable_range_ends_at_white_and_in_the_noise():
