@@ -185,14 +185,11 @@ def followed(
 
 
 def _in_this_process(tasks: Iterable[Task], workers: Workers) -> Iterator[TaskOutcome]:
-    import torch
+    from arraygeom.threads import limited_to
 
     for task in tasks:
-        before = torch.get_num_threads()
-        try:
+        with limited_to(workers.threads):  # not to this generator's end: a failed job's traceback keeps it
             outcome = attempt(task, workers.threads)
-        finally:
-            torch.set_num_threads(before)  # not at this generator's end: a failed job's traceback keeps it
         yield outcome
 
 

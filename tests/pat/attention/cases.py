@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from arraygeom.segments import Positions, Segments
+from pat.attention import attend_with_statistics
 
 
 def random_case(seed: int, *, dtype=torch.float64) -> tuple[dict, dict]:
@@ -71,3 +72,29 @@ def relative(a: Tensor, b: Tensor) -> float:
     """The largest difference, relative to the largest number (or to 1, if that is smaller)."""
     a, b = a.detach().double(), b.detach().double()
     return float((a - b).abs().max() / b.abs().max().clamp(min=1.0))
+
+
+def differences(tensors: dict, options: dict, backend: str, *, seed: int) -> dict[str, float]:
+    """How far a backend's outputs are from the reference's, and the gradients by all tensors."""
+    found, expected = (
+        call(attend_with_statistics, tensors, options, backend=b) for b in (backend, "reference")
+    )
+    here, there = (gradients(out, tensors, seed=seed) for out in (found, expected))
+    by_output = {name: relative(getattr(found, name), getattr(expected, name)) for name in found._fields}
+    return by_output | {name: relative(here[name], there[name]) for name in tensors}
+
+
+def of_16_bits(tensors: dict, options: dict, dtype: torch.dtype, backend: str) -> dict[str, float]:
+    """How far outputs of features in 16 bits are from the reference's of the same numbers; types and
+    gradients are as they should be."""
+    images = ("query", "key", "value")
+    stored = {n: t.detach().to(dtype).requires_grad_() if n in images else t for n, t in tensors.items()}
+    exact = {n: t.detach().float().requires_grad_() for n, t in stored.items()}
+    found = call(attend_with_statistics, stored, options, backend=backend)
+    expected = call(attend_with_statistics, exact, options, backend="reference")
+    assert (found.value.dtype, found.position.dtype) == (dtype, torch.float32)
+    here, there = gradients(found, stored, seed=0), gradients(expected, exact, seed=0)
+    for name in tensors:
+        assert here[name].dtype == stored[name].dtype
+        assert relative(here[name], there[name]) < 4 * torch.finfo(dtype).eps, name
+    return {name: relative(getattr(found, name), getattr(expected, name)) for name in found._fields}

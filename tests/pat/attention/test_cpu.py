@@ -10,32 +10,17 @@ import torch
 from torch.autograd import gradcheck, gradgradcheck
 
 from arraygeom.segments import Positions, Segments
+from arraygeom.threads import limited_to
 from pat.attention import attend, attend_with_statistics, kernels
-from tests.pat.attention.cases import call, gradients, random_case, relative
+from tests.pat.attention.cases import call, differences, gradients, of_16_bits, random_case
 
 
-def differences(seed: int, dtype: torch.dtype) -> dict[str, float]:
-    tensors, options = random_case(seed, dtype=dtype)
-    found, expected = (
-        call(attend_with_statistics, tensors, options, backend=backend) for backend in ("cpu", "reference")
-    )
-    by_output = {name: relative(getattr(found, name), getattr(expected, name)) for name in found._fields}
-    there, here = gradients(expected, tensors, seed=seed), gradients(found, tensors, seed=seed)
-    return by_output | {name: relative(here[name], there[name]) for name in tensors}
-
-
+@pytest.mark.parametrize(("dtype", "most"), [(torch.float64, 1e-10), (torch.float32, 1e-5)])
 @pytest.mark.parametrize("seeds", [range(60), pytest.param(range(60, 500), marks=pytest.mark.slow)])
-def test_random_cases_in_float64(seeds):
+def test_random_cases(seeds, dtype, most):
     for seed in seeds:
-        worst = differences(seed, torch.float64)
-        assert max(worst.values()) < 1e-10, (seed, worst)
-
-
-@pytest.mark.parametrize("seeds", [range(30), pytest.param(range(30, 500), marks=pytest.mark.slow)])
-def test_random_cases_in_float32(seeds):
-    for seed in seeds:
-        worst = differences(seed, torch.float32)
-        assert max(worst.values()) < 1e-5, (seed, worst)
+        worst = differences(*random_case(seed, dtype=dtype), "cpu", seed=seed)
+        assert max(worst.values()) < most, (seed, worst)
 
 
 @pytest.mark.parametrize("interpolation", ["nearest", "bilinear"])
@@ -50,33 +35,14 @@ def test_more_samples_and_channels_than_are_processed_at_once(interpolation, d, 
     tensors |= {name: torch.rand(3, 37, 2, dtype=torch.float64) * 42 - 1.5 for name in ("start", "end")}
     tensors = {name: t.requires_grad_() for name, t in tensors.items()}
     options = {"samples": 120, "mask": torch.rand(3, 37) > 0.1, "interpolation": interpolation}
-    found, expected = (
-        call(attend_with_statistics, tensors, options, backend=backend) for backend in ("cpu", "reference")
-    )
-    assert all(relative(a, b) < 1e-10 for a, b in zip(found, expected))
-    here, there = gradients(found, tensors, seed=1), gradients(expected, tensors, seed=1)
-    assert all(relative(here[name], there[name]) < 1e-10 for name in tensors)
+    assert max(differences(tensors, options, "cpu", seed=1).values()) < 1e-10
 
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, pytest.param(torch.float16, marks=pytest.mark.slow)])
 def test_16_bit_inputs_are_accumulated_in_float32(dtype):
-    tensors, options = random_case(3, dtype=torch.float32)
-    stored = {
-        n: t.detach().to(dtype).requires_grad_() if n in ("query", "key", "value") else t
-        for n, t in tensors.items()
-    }
-    exact = {n: t.detach().float().requires_grad_() for n, t in stored.items()}
-    found = call(attend_with_statistics, stored, options, backend="cpu")
-    expected = call(attend_with_statistics, exact, options, backend="reference")
-    assert found.value.dtype == dtype
-    assert found.position.dtype == torch.float32
-    rounding = torch.finfo(dtype).eps
-    assert relative(found.value, expected.value) <= rounding / 2 * 1.01
-    assert relative(found.position, expected.position) < 1e-5
-    there, here = gradients(expected, exact, seed=0), gradients(found, stored, seed=0)
-    for name in tensors:
-        assert here[name].dtype == stored[name].dtype
-        assert relative(here[name], there[name]) < 4 * rounding, name
+    off = of_16_bits(*random_case(3, dtype=torch.float32), dtype, "cpu")
+    assert off["value"] <= torch.finfo(dtype).eps / 2 * 1.01
+    assert off["position"] < 1e-5
 
 
 def test_the_cache_of_compiled_code_watches_every_file_of_the_kernels():
@@ -97,28 +63,13 @@ def big_case(dtype=torch.float32):
 def test_any_number_of_threads_gives_the_same_bits(interpolation):
     inputs = big_case()
     valid = torch.rand(2, 60, 70) > 0.1
-    before = torch.get_num_threads()
     results = []
-    try:
-        for threads in (1, 2, 5, 2):
-            torch.set_num_threads(threads)
-            out = attend(
-                *inputs[:3],
-                Segments(*inputs[3:], valid),
-                samples=50,
-                interpolation=interpolation,
-                backend="cpu",
-            )
-            results.append(
-                (
-                    out,
-                    *torch.autograd.grad(
-                        out.square().sum(), inputs[: 3 if interpolation == "nearest" else 5]
-                    ),
-                )
-            )
-    finally:
-        torch.set_num_threads(before)
+    for threads in (1, 2, 5, 2):
+        with limited_to(threads):
+            segments, how = Segments(*inputs[3:], valid), {"interpolation": interpolation, "backend": "cpu"}
+            out = attend(*inputs[:3], segments, samples=50, **how)
+            wanted = inputs[: 3 if interpolation == "nearest" else 5]
+            results.append((out, *torch.autograd.grad(out.square().sum(), wanted)))
     for result in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(result, results[0]))
 

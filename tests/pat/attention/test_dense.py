@@ -1,6 +1,5 @@
 """All of beta by torch's own attention."""
 
-import pytest
 import torch
 
 from arraygeom import Dense
@@ -18,9 +17,3 @@ def test_dense_attention_is_that_of_every_position():
             attend(query, key, value, Dense(2), bias=given, backend=b) for b in ("auto", "reference")
         )
         torch.testing.assert_close(found, wanted, atol=1e-5, rtol=1e-5)
-
-
-def test_a_bias_of_another_shape_is_refused_in_a_line():
-    images = torch.ones(1, 2, 3, 4)
-    with pytest.raises(ValueError, match=r"bias \(5,\) does not broadcast to \(1, 3, 4, 12\)"):
-        attend(images, images, images, Dense(), bias=torch.zeros(5))

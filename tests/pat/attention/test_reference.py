@@ -59,19 +59,6 @@ def test_equals_a_loop_by_hand():
             assert out.peak[0, y, x].item() == pytest.approx(peak)
 
 
-@pytest.mark.parametrize("backend", ["reference", "cpu"])
-def test_a_row_of_samples_is_textbook_parallax_attention(backend):
-    torch.manual_seed(1)
-    q, key, value = (torch.randn(2, 8, 5, 9, dtype=torch.float64) for _ in range(3))
-    scores = torch.einsum("bdhi,bdhj->bhij", q, key)
-    expected = torch.einsum("bhij,bdhj->bdhi", scores.softmax(-1), value)
-    y, _ = torch.meshgrid(torch.arange(5.0).double(), torch.arange(9.0).double(), indexing="ij")
-    row = Segments(torch.stack([0 * y, y], -1), torch.stack([0 * y + 8, y], -1), y >= 0)
-    for interpolation in ("bilinear", "nearest"):
-        out = attend(q, key, value, row, interpolation=interpolation, backend=backend)
-        torch.testing.assert_close(out, expected, rtol=1e-12, atol=1e-12)
-
-
 def test_border_pixels_reach_half_a_pixel_out():
     key = value = torch.arange(3.0).view(1, 1, 1, 3) + 1
     x = torch.tensor([-0.502, -0.4995, 2.4995, 2.502])

@@ -25,13 +25,17 @@ def scene(sample):
     return ExplorerScene(sample.rig, sample.images)
 
 
+X = torch.tensor([[320.0, 200.0]], dtype=torch.float64)
+"""The pixel of `state`."""
+
+
 def state(**changes):
     return ExplorerState("mono", (320.0, 200.0), **changes)
 
 
 def test_the_segment_is_the_fields_own(scene, sample):
     report = inspect_pixel(scene, state()).betas["colour"]
-    field = Epipolar()(sample.rig.pair("mono", "colour"), torch.tensor([[320.0, 200.0]], dtype=torch.float64))
+    field = Epipolar()(sample.rig.pair("mono", "colour"), X)
     torch.testing.assert_close(report.ends, torch.cat([field.start, field.end]))
     torch.testing.assert_close(report.xy[[0, -1]], report.ends)
 
@@ -39,8 +43,8 @@ def test_the_segment_is_the_fields_own(scene, sample):
 def test_weights_are_those_of_attention(scene, sample):
     """The same windows as keys of `pat.attention`, one at each sample, give the same answer."""
     report = inspect_pixel(scene, state()).betas["colour"]
-    pair, x = sample.rig.pair("mono", "colour"), torch.tensor([[320.0, 200.0]], dtype=torch.float64)
-    scores = core.correlations(scene.guides["mono"], scene.guides["colour"], pair, x, report.xy)
+    pair = sample.rig.pair("mono", "colour")
+    scores = core.correlations(scene.guides["mono"], scene.guides["colour"], pair, X, report.xy)
     key, query = core.SHARPNESS * scores[None, None, None], torch.ones(1, 1, 1, 1, dtype=torch.float64)
     row = torch.stack([torch.arange(len(scores), dtype=torch.float64), torch.zeros(len(scores))], -1)
     look = core.Positions(row[None, None], report.valid[None, None])
@@ -51,7 +55,7 @@ def test_weights_are_those_of_attention(scene, sample):
 
 def test_windows_of_beta_are_of_its_scale(sample):
     """A step in alpha is one of 460 / 820 in beta, whichever way, and is turned as the cameras are."""
-    J = core.jacobian(sample.rig.pair("mono", "colour"), torch.tensor([[320.0, 200.0]], dtype=torch.float64))
+    J = core.jacobian(sample.rig.pair("mono", "colour"), X)
     assert float(J.det().sqrt()) == pytest.approx(460 / 820, rel=0.05)
     turn = math.degrees(torch.atan2(J[1, 0], J[0, 0]))
     assert turn == pytest.approx(math.degrees(math.asin(0.0349)), abs=0.3)
@@ -64,12 +68,8 @@ def test_the_windows_find_the_colour_and_the_depth(scene, sample):
         for y in range(50, 380, 90):
             report = inspect_pixel(scene, state().replace(x=(float(x), float(y))))
             ground_truth = sample.ground_truth[:, y, x].double()
-            errors.append(
-                [
-                    float((colour - ground_truth).abs().max())
-                    for colour in (report.colour, ground_truth.mean().expand(3))
-                ]
-            )
+            colours = report.colour, ground_truth.mean().expand(3)
+            errors.append([float((colour - ground_truth).abs().max()) for colour in colours])
     found, grey = torch.tensor(errors).median(0).values
     assert found < 0.5 * grey
 
@@ -79,9 +79,7 @@ def test_depths_are_those_of_the_samples(scene, sample):
     near, far = (float(d) for d in sample.rig.depth)
     assert float(report.depth[0]) == pytest.approx(near, rel=1e-6)
     assert float(report.depth[-1]) == pytest.approx(far, rel=1e-6)
-    again = depth_of(
-        sample.rig.pair("mono", "colour"), torch.tensor([[320.0, 200.0]]).double(), report.xy[5:6]
-    )
+    again = depth_of(sample.rig.pair("mono", "colour"), X, report.xy[5:6])
     assert float(report.depth[5]) == pytest.approx(float(again.depth))
 
 
@@ -93,12 +91,9 @@ def test_every_family_answers(scene, family):
 
 
 def test_near_and_far_are_the_fields(scene, sample):
-    pair, x = sample.rig.pair("mono", "colour"), torch.tensor([[320.0, 200.0]], dtype=torch.float64)
-    for changes, field in (
-        ({"near": 3.0}, Epipolar(near=3.0)),
-        ({"far": 5.0}, Epipolar(far=5.0)),
-    ):
-        found = field(pair, x)
+    pair = sample.rig.pair("mono", "colour")
+    for changes, field in (({"near": 3.0}, Epipolar(near=3.0)), ({"far": 5.0}, Epipolar(far=5.0))):
+        found = field(pair, X)
         ends = inspect_pixel(scene, state(**changes)).betas["colour"].ends
         torch.testing.assert_close(ends, torch.cat([found.start, found.end]))
 
@@ -107,7 +102,7 @@ def test_a_rotated_camera_moves_the_segment_as_the_rig_says(scene, sample):
     step = (0.0, math.radians(0.3), 0.0)
     turned = sample.rig.perturbed({"colour.rotation": torch.tensor(step, dtype=torch.float64)})
     report = inspect_pixel(scene.with_rig(turned), state())
-    found = Epipolar()(turned.pair("mono", "colour"), torch.tensor([[320.0, 200.0]], dtype=torch.float64))
+    found = Epipolar()(turned.pair("mono", "colour"), X)
     torch.testing.assert_close(report.betas["colour"].ends[0], found.start[0])
     moved = report.betas["colour"].ends - inspect_pixel(scene, state()).betas["colour"].ends
     assert moved.norm(dim=-1).tolist() == pytest.approx([460 * math.radians(0.3)] * 2, rel=0.15)
@@ -119,9 +114,7 @@ def test_lenses_are_followed(scene, sample):
     has_lens = ExplorerScene(sample.rig.with_camera("colour", camera), sample.images)
     report = inspect_pixel(has_lens, state()).betas["colour"]
     assert report.ends is None
-    found = Curved(256)(
-        has_lens.rig.pair("mono", "colour"), torch.tensor([[320.0, 200.0]], dtype=torch.float64)
-    )
+    found = Curved(256)(has_lens.rig.pair("mono", "colour"), X)
     torch.testing.assert_close(report.xy, found.xy[0])
 
 
@@ -134,17 +127,8 @@ def test_cameras_known_by_F_or_by_size_alone(sample):
         assert not report.problems
         assert report.betas["colour"].depth.isnan().all()
         assert math.isnan(report.depth)
-    problem = inspect_pixel(ExplorerScene(Rig(views), sample.images), state(family="epipolar")).problems[
-        "colour"
-    ]
-    assert "calibrat" in problem
-
-
-def test_what_cannot_be_is_said(scene, sample):
-    with pytest.raises(ValueError, match="near"):
-        inspect_pixel(scene, state(near=30.0))
-    with pytest.raises(ValueError, match=r"64x40.*640x400"):
-        ExplorerScene(sample.rig, {"mono": torch.zeros(1, 40, 64)})
+    report = inspect_pixel(ExplorerScene(Rig(views), sample.images), state(family="epipolar"))
+    assert "calibrat" in report.problems["colour"]
 
 
 def test_an_answer_for_images_of_megapixels_takes_milliseconds(sample):
@@ -164,10 +148,8 @@ def test_an_answer_for_images_of_megapixels_takes_milliseconds(sample):
     assert min(times) < 0.1
 
 
-def test_of_an_exact_rig_hardly_any_match_is_said_to_be_off_the_line():
-    sample, draw = load_sample(), torch.Generator().manual_seed(5)
-    scene, (h, w) = ExplorerScene(sample.rig, sample.images), sample.rig["mono"].hw
-    off = []
+def test_of_an_exact_rig_hardly_any_match_is_said_to_be_off_the_line(scene):
+    draw, (h, w), off = torch.Generator().manual_seed(5), scene.rig["mono"].hw, []
     for u, v in torch.rand(60, 2, generator=draw).tolist():
         x = (round(10 + u * (w - 20)), round(10 + v * (h - 20)))
         offset = inspect_pixel(scene, ExplorerState("mono", x)).betas["colour"].offset
@@ -176,18 +158,14 @@ def test_of_an_exact_rig_hardly_any_match_is_said_to_be_off_the_line():
     assert sum(distance > 1 for distance in off) < 0.2 * len(off)
 
 
-def test_a_moved_rig_puts_the_match_off_the_line_by_as_much_as_it_says():
-    sample = load_sample()
-    scene, state = ExplorerScene(sample.rig, sample.images), ExplorerState("mono", (334.0, 133.0))
+def test_a_moved_rig_puts_the_match_off_the_line_by_as_much_as_it_says(scene, sample):
+    state = ExplorerState("mono", (334.0, 133.0))
     here = inspect_pixel(scene, state).betas["colour"].offset
     assert here is not None
     assert here.distance < 0.3
     for angle in (0.003, -0.006):
-        moved = sample.rig.perturbed(
-            {"colour.rotation": torch.tensor([angle, 0.0, 0.0], dtype=torch.float64)}
-        )
-        report = inspect_pixel(scene.with_rig(moved), state)
-        off = report.betas["colour"].offset
+        moved = sample.rig.perturbed({"colour.rotation": torch.tensor([angle, 0, 0], dtype=torch.float64)})
+        off = inspect_pixel(scene.with_rig(moved), state).betas["colour"].offset
         assert off is not None
         x = torch.tensor([state.x], dtype=torch.float64)
         F = moved.pair("mono", "colour").fundamental
@@ -198,9 +176,8 @@ def test_a_moved_rig_puts_the_match_off_the_line_by_as_much_as_it_says():
     assert inspect_pixel(scene, state.replace(x=(560.0, 60.0))).betas["colour"].offset is None
 
 
-def test_a_networks_features_are_those_of_the_pair():
+def test_a_networks_features_are_those_of_the_pair(sample):
     """They were kept by camera alone, of another alpha's resolution, and all with the first beta's key."""
-    sample = load_sample()
     rig = sample.rig.with_camera("third", sample.rig["colour"])
     rig = rig.replace(cameras={name: rig[name] for name in ("mono", "colour", "third")})
     images = {name: interpolate(image[None], scale_factor=0.25)[0] for name, image in sample.images.items()}

@@ -11,13 +11,14 @@ import pytest
 import torch
 from torch.nn.functional import avg_pool2d
 
-from arraygeom import Camera, Distortion, Epipolar, Pose, ReceptiveField, Rig
+from arraygeom import Distortion, Epipolar, ReceptiveField
 from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.text import UNSCALED
 from pat.data.sample_array import load_sample
 from pat.fusion.steps import hw_at_alphas_resolution, of_size
 from pat.matching.inputs import Inputs
 from pat.networks.weights import load_weights
+from tests.arraygeom.rigs import parallel_rig
 from tests.browser import CHROMIUM, DRIVER, browser
 
 pytest.importorskip("anywidget", reason="the extra 'explore' is not installed")
@@ -29,26 +30,13 @@ ROOT = Path(__file__).parents[3]
 
 
 def small_rig(baseline=0.1, names=("a", "b")):
-    K = torch.tensor([[90.0, 0, 59.5], [0, 90.0, 39.5], [0, 0, 1]], dtype=torch.float64)
-    eye = torch.eye(3, dtype=torch.float64)
-    centres = [torch.tensor([i * baseline, 0, 0], dtype=torch.float64) for i in range(len(names))]
-    cameras = {
-        n: Camera(K=K, cam_from_world=Pose.from_centre(eye, c), hw=(80, 120)) for n, c in zip(names, centres)
-    }
-    return Rig(cameras, depth=(1.0, 8.0))
+    places = {name: (i * baseline,) for i, name in enumerate(names)}
+    return parallel_rig(90.0, (80, 120), places, (1.0, 8.0))
 
 
 def change(widget, **controls):
     widget.controls = {**widget.controls, **controls}
     return widget.answer
-
-
-def test_samples_are_those_of_the_field():
-    rig = small_rig()
-    view = explore(rig, x=(70, 30))
-    found = Epipolar()(rig.pair("a", "b"), torch.tensor([[70.0, 30.0]], dtype=torch.float64))
-    samples = torch.tensor(view.answer["betas"]["b"]["samples"]).double()
-    torch.testing.assert_close(samples[[0, -1]], torch.cat([found.start, found.end]), atol=0.01, rtol=0)
 
 
 def test_the_room_is_matched_at_its_depth():
@@ -63,8 +51,7 @@ def test_controls_move_the_samples():
     assert first[0] - wider[0] == pytest.approx(9.0, abs=0.02)  # f b / near = 90 * 0.1 / 1
     rotated = change(view, baseline=1.0, rotation=1.0)["betas"]["b"]["samples"][0]
     assert abs(rotated[0] - first[0]) > 1
-    moved = view.answer["rig"]
-    assert "rotation" in moved
+    assert "rotation" in view.answer["rig"]
 
 
 def test_depths_of_unknown_scale_are_not_metres():
@@ -157,18 +144,6 @@ def test_a_networks_weights_are_its_attention():
     torch.testing.assert_close((mean + 0.5) * colour.shape[1] / h - 0.5, position, atol=0.3, rtol=0)
 
 
-@pytest.mark.slow
-def test_an_answer_takes_under_50_ms_of_processor_time():
-    sample = load_sample()
-    view = explore(sample.rig, sample.images)
-    times = []
-    for x in range(100, 500, 40):
-        start = time.process_time()
-        change(view, x=[x, 200])
-        times.append(time.process_time() - start)
-    assert sorted(times)[len(times) // 2] < 0.05
-
-
 @pytest.fixture(scope="module")
 def driver():
     if not (CHROMIUM and DRIVER):
@@ -190,6 +165,14 @@ def until(driver, true, seconds=60):
         time.sleep(0.05)
 
 
+def open_saved(driver, view, folder, **how):
+    """What is shown of a view's saved page, in the browser."""
+    view.save(folder / "view.html", **how)
+    driver.get((folder / "view.html").as_uri())
+    until(driver, lambda told: len(told) == max(1, len(view.cameras)))
+    return captions(driver)
+
+
 def point(driver, camera, x, y, hw=(80, 120)):
     """Click a pixel of a camera's canvas."""
     canvas = driver.find_element("css selector", f"canvas[data-camera={camera}]")
@@ -197,6 +180,12 @@ def point(driver, camera, x, y, hw=(80, 120)):
     aside, down = (x + 0.5) / hw[1] * size["width"], (y + 0.5) / hw[0] * size["height"]
     offsets = round(aside - size["width"] / 2), round(down - size["height"] / 2)
     webdriver.ActionChains(driver).move_to_element_with_offset(canvas, *offsets).click().perform()
+
+
+def drag(driver, element, start, step):
+    """From a point of it, which is seen from its centre."""
+    held = webdriver.ActionChains(driver).move_to_element_with_offset(element, *start).click_and_hold()
+    held.move_by_offset(*step).release().perform()
 
 
 def slide(driver, name, value):
@@ -213,9 +202,7 @@ def test_the_saved_page_gives_the_numbers_of_the_kernel(driver, tmp_path):
     """Pixel, samples, match and depth by the page's own JavaScript, the rig moved, against Python's."""
     rig = small_rig(baseline=0.5)
     view = explore(rig)
-    view.save(tmp_path / "view.html")
-    driver.get((tmp_path / "view.html").as_uri())
-    until(driver, lambda told: len(told) == 2)
+    open_saved(driver, view, tmp_path)
     for name, value in (("rotation", 1.0), ("baseline", 1.2), ("focal", 1.1), ("near", 0.9)):
         slide(driver, name, value)
         change(view, **{name: value})
@@ -234,20 +221,15 @@ def test_the_saved_page_gives_the_numbers_of_the_kernel(driver, tmp_path):
 
 
 def test_the_saved_page_says_the_unit_of_depth(driver, tmp_path):
-    explore(small_rig().replace(name=UNSCALED)).save(tmp_path / "view.html")
-    driver.get((tmp_path / "view.html").as_uri())
-    until(driver, lambda told: len(told) == 2)
-    assert all(re.search(r"depth \S+ baselines", text) for text in captions(driver))
+    told = open_saved(driver, explore(small_rig().replace(name=UNSCALED)), tmp_path)
+    assert all(re.search(r"depth \S+ baselines", text) for text in told)
 
 
 def test_a_saved_page_of_lenses_has_a_grid_of_answers(driver, tmp_path):
     rig = small_rig()
     lens = Distortion("brown-conrady", torch.tensor([-0.1, 0, 0, 0], dtype=torch.float64))
     view = explore(rig.with_camera("b", rig["b"].replace(distortion=lens)))
-    view.save(tmp_path / "view.html", columns=4)
-    driver.get((tmp_path / "view.html").as_uri())
-    until(driver, lambda told: len(told) == 2)
-    before = captions(driver)
+    before = open_saved(driver, view, tmp_path, columns=4)
     point(driver, "a", 20, 15)
     until(driver, lambda told: told != before)
     assert captions(driver)[1].startswith("b: match (")
@@ -265,11 +247,8 @@ def test_a_saved_page_of_lenses_has_a_grid_of_answers(driver, tmp_path):
     ids=["words of the page", "marks of HTML", "one depth", "one row"],
 )
 def test_a_saved_page_answers_for_odd_names_depths_and_sizes(driver, tmp_path, rig):
-    explore(rig).save(tmp_path / "view.html")
-    driver.get((tmp_path / "view.html").as_uri())
-    until(driver, lambda told: len(told) == 2)
-    assert [told.partition(":")[0] for told in captions(driver)] == [f"{rig.names[0]} (alpha)", rig.names[1]]
-    before = captions(driver)
+    before = open_saved(driver, explore(rig), tmp_path)
+    assert [told.partition(":")[0] for told in before] == [f"{rig.names[0]} (alpha)", rig.names[1]]
     driver.find_element("css selector", ".pat").send_keys(Keys.ARROW_RIGHT)
     until(driver, lambda told: told[0] != before[0])
     assert "pixel (" in captions(driver)[0]
@@ -281,9 +260,7 @@ def test_an_image_saved_as_svg_fills_the_camera_and_code_is_copied_of_what_fails
     rig = small_rig()
     for name in rig.names:
         rig = rig.resize(name, (333, 1001))
-    explore(rig).save(tmp_path / "view.html")
-    driver.get((tmp_path / "view.html").as_uri())
-    until(driver, lambda told: len(told) == 2)
+    open_saved(driver, explore(rig), tmp_path)
     driver.execute_script("URL.createObjectURL = (blob) => { window.saved = blob; return '#'; }")
     driver.find_element("css selector", "[data-key=s]").click()
     saved = driver.execute_async_script("window.saved.text().then(arguments[0])")
@@ -291,8 +268,8 @@ def test_an_image_saved_as_svg_fills_the_camera_and_code_is_copied_of_what_fails
     slide(driver, "near", 9.0)
     slide(driver, "far", 1.0)
     until(driver, lambda told: "near" in told[0])
-    driver.find_element("css selector", "[data-key=c]").click()
     button = driver.find_element("css selector", "[data-key=c]")
+    button.click()
     end = time.monotonic() + 10
     while button.text == "copy code":
         assert time.monotonic() < end
@@ -300,8 +277,7 @@ def test_an_image_saved_as_svg_fills_the_camera_and_code_is_copied_of_what_fails
 
 
 def test_what_is_wrong_is_drawn_in_the_saved_page(driver, tmp_path):
-    explore(small_rig(names=("a",))).save(tmp_path / "one.html")
-    driver.get((tmp_path / "one.html").as_uri())
+    open_saved(driver, explore(small_rig(names=("a",))), tmp_path)
     until(driver, lambda told: "one camera" in told[0])
     yellow = """const canvas = document.querySelector('canvas');
         const { data } = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
@@ -312,20 +288,13 @@ def test_what_is_wrong_is_drawn_in_the_saved_page(driver, tmp_path):
 
 def test_a_beta_at_alphas_centre_is_drawn_and_dragged_as_one_seen_from_above(driver, tmp_path):
     """It was taken for alpha, which does not move."""
-    page = tmp_path / "page.html"
-    explore(small_rig(baseline=0.0)).save(page)
-    driver.get(page.as_uri())
-    until(driver, lambda told: len(told) == 2 and "match" in told[1])
+    open_saved(driver, explore(small_rig(baseline=0.0)), tmp_path)
+    until(driver, lambda told: "match" in told[1])
     top = driver.find_element("css selector", "canvas.top")
-    colours = driver.execute_script(
-        """const { data } = arguments[0].getContext('2d').getImageData(240, 270, 1, 1);
-        return [...data];""",
-        top,
-    )
+    script = "return [...arguments[0].getContext('2d').getImageData(240, 270, 1, 1).data]"
+    colours = driver.execute_script(script, top)
     samples = captions(driver)[1]
-    webdriver.ActionChains(driver).move_to_element_with_offset(top, 0, 45).click_and_hold().move_by_offset(
-        30, 0
-    ).release().perform()
+    drag(driver, top, (0, 45), (30, 0))
     until(driver, lambda told: told[1] != samples)
     assert colours[:3] == FIRST
 
@@ -358,10 +327,7 @@ def test_the_served_page_in_a_browser(driver, tmp_path):
         point(driver, "b", 30, 50)
         until(driver, lambda told: told[0] != before[0])
         before = captions(driver)
-        top = driver.find_element("css selector", "canvas.top")
-        webdriver.ActionChains(driver).move_to_element_with_offset(
-            top, 75, 45
-        ).click_and_hold().move_by_offset(0, -20).release().perform()
+        drag(driver, driver.find_element("css selector", "canvas.top"), (75, 45), (0, -20))
         until(driver, lambda told: told[1] != before[1])
         driver.set_script_timeout(60)
         milliseconds = driver.execute_async_script(TIMES)

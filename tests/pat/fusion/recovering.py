@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -28,6 +28,22 @@ def moved(rig: Rig, which: Sequence[str], by: Tensor) -> Rig:
     changes = [math.radians(1) * rotation, translation * lengths[0], steps["focal"] * lengths[1]]
     names = ("rotation", "translation", "focal")
     return rig.perturbed({f"colour.{name}": way for name, way in zip(names, changes)})
+
+
+def rotated(rig: Rig, angle: Tensor) -> Rig:
+    """The rig, colour rotated about its x axis, across the baseline."""
+    return rig.perturbed({"colour.rotation": angle * torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)})
+
+
+def rotation_left(error_of: Callable[[Tensor], Tensor]) -> float:
+    """Degrees that are left of 0.3 after ten steps downhill of an error, which is a function of the angle."""
+    angle = torch.tensor(math.radians(0.3), dtype=torch.float64, requires_grad=True)
+    optimiser = torch.optim.Rprop([angle], lr=math.radians(0.13), etas=(0.3, 1.01))
+    for _ in range(10):
+        optimiser.zero_grad()
+        error_of(angle).backward()
+        optimiser.step()
+    return math.degrees(angle.item())
 
 
 def residuals(network: FusionNetwork, rig: Rig, images: dict[str, Tensor]) -> Tensor:

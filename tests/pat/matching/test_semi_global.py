@@ -119,12 +119,8 @@ def test_threads_and_blocks_change_nothing(monkeypatch):
     alpha, beta, _ = plane_seen(pair, 2.0)
     call = alpha, beta, beta, sampled_at(pair, 1), sampled_at(pair, 2)
     whole = semi_global_matching(*call)
-    threads = torch.get_num_threads()
-    try:
-        torch.set_num_threads(1 if threads > 1 else 3)
+    with arraygeom.threads.limited_to(1 if torch.get_num_threads() > 1 else 3):
         again = semi_global_matching(*call)
-    finally:
-        torch.set_num_threads(threads)
     assert all(torch.equal(getattr(whole, part), getattr(again, part)) for part in PARTS)
     in_blocks_of(monkeypatch, block=16)
     pieces = semi_global_matching(*call)

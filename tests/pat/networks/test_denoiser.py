@@ -45,11 +45,8 @@ def denoised(part, electrons):
     ideal = luminance(ideal) if part == "band" else ideal
     level = NoiseLevel.of_electrons(electrons, 2)
     recorded = level.recorded(ideal, generator_for(0, part, electrons))
-    return (
-        ideal,
-        recorded,
-        getattr(load_denoiser(), part)(level.unbiased(recorded), level.deviation(recorded)),
-    )
+    ours = getattr(load_denoiser(), part)(level.unbiased(recorded), level.deviation(recorded))
+    return ideal, recorded, ours
 
 
 def test_the_shipped_network_is_small_and_described():

@@ -16,21 +16,13 @@ from pat.support import eight_bits
 
 @pytest.mark.parametrize("precision", ["bfloat16", "int8"])
 def test_a_precision_changes_the_image_little_and_something(precision):
-    if not (
-        torch.cpu._is_avx512_bf16_supported() if precision == "bfloat16" else torch.cpu._is_vnni_supported()
-    ):
+    of = "avx512_bf16" if precision == "bfloat16" else "vnni"
+    if not getattr(torch.cpu, f"_is_{of}_supported")():
         pytest.skip(f"this processor has no {precision}")
     sample = load_sample()
-    images = {name: sample.images[name] for name in sample.rig.names}
+    frame = {"alpha": "mono", "align": False, "response": "rec601"}
     exact, rounded = (
-        fuse(
-            load_weights("mono-colour", precision=p),
-            sample.rig,
-            images,
-            alpha="mono",
-            align=False,
-            response="rec601",
-        )
+        fuse(load_weights("mono-colour", precision=p), sample.rig, sample.images, **frame)
         for p in ("float32", precision)
     )
     apart = (exact.image - rounded.image).abs()

@@ -15,6 +15,7 @@ import pytest
 import torch
 from rich.console import Console
 
+from arraygeom.threads import limited_to
 from pat.support.jobs import JobError, Task, Workers, followed, run_tasks
 from tests.pat.fusion.test_batch import contents, material  # noqa: F401  (a fixture)
 from tests.pat.support.work import befallen, note
@@ -43,14 +44,10 @@ def test_errors_stop_or_are_skipped(tmp_path):
 
 
 def test_a_job_that_failed_leaves_torch_its_threads(tmp_path):
-    before = torch.get_num_threads()
-    try:
-        torch.set_num_threads(2)
+    with limited_to(2):
         with pytest.raises(JobError) as kept:
             run_tasks(tasks(tmp_path, "bad", "b"), workers=Workers(threads=1))
         assert torch.get_num_threads() == 2
-    finally:
-        torch.set_num_threads(before)
     assert "not good" in str(kept.value)  # until here its traceback is kept
 
 

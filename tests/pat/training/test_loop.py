@@ -2,7 +2,6 @@
 
 import json
 import os
-import resource
 import shutil
 import signal
 import socket
@@ -27,6 +26,7 @@ from pat.training.loop import rate_at, train
 from pat.training.losses import Objective, validation
 from pat.training.processes import Process
 from pat.training.samples import SampleSource, made_ahead, scenes
+from tests.processes import room_for
 
 from .runs import SMALL, losses, short_run
 
@@ -237,14 +237,9 @@ def test_no_room_for_a_checkpoint(folder, whole, monkeypatch):
     """The system refuses to write, as on a full disk; the older checkpoint stays, a run can go on from it."""
     config = replace(whole, out=folder / "full")
     stopped(config, 4, monkeypatch)
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     room = 2 * (whole.out / "best.safetensors").stat().st_size
-    resource.setrlimit(resource.RLIMIT_FSIZE, (room, limits[1]))
-    try:
-        with pytest.raises(OSError, match=r"step 6 .*step-00000003") as caught:
-            train(config)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    with room_for(room), pytest.raises(OSError, match=r"step 6 .*step-00000003") as caught:
+        train(config)
     assert "\n" not in str(caught.value)
     assert [p.name for p in (config.out / "checkpoints").iterdir()] == ["step-00000003.safetensors"]
     train(config)
