@@ -143,7 +143,8 @@ class Pair(Batched):
         if self.link is not None and self.link.H is not None:
             return self.link.H
         if self.calibrated and self.depth is not None:
-            return self.homography_at(middle_depth(*self.depth))
+            near, far = self.depth
+            return self.homography_at(2 / (1 / near + 1 / far))  # the middle of the disparities
         if self.calibrated:
             return self.homography_at(torch.tensor(torch.inf, dtype=torch.float64))
         return resize_matrix(self.alpha.hw, self.beta.hw)
@@ -185,11 +186,6 @@ class Pair(Batched):
 
 ROUNDED = 8
 """A baseline of so many units in the last place of the cameras' translations is none."""
-
-
-def middle_depth(near: Float[Tensor, "*b"], far: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-    """The depth whose inverse is midway between those of near and far: the middle of a disparity range."""
-    return 2 / (1 / near + 1 / far)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
