@@ -186,12 +186,7 @@ def _unflattened(held: Iterable[Any], layout: _Layout) -> Any:
 _NAMES = "_tensors"
 
 
-def collated(items: list[Batched], *, collate_fn_map: Any = None) -> Batched:
-    """What a DataLoader makes of the items of a batch: `stack`."""
-    return stack(items)
-
-
-default_collate_fn_map[Batched] = collated
+default_collate_fn_map[Batched] = lambda items, *, collate_fn_map=None: stack(items)
 
 
 def _fields(value: Any) -> list[dataclasses.Field[Any]]:

@@ -73,19 +73,13 @@ def warp(
     return Sampled(torch.where(valid[:, None], values, 0.0), valid)
 
 
-def plane_sweep(
-    pair: Pair,
-    image: Float[Tensor, "b c h w"],
-    depths: Float[Tensor, " d"],
-    *,
-    interpolation: Interpolation = "bilinear",
-) -> Sampled:
+def plane_sweep(pair: Pair, image: Float[Tensor, "b c h w"], depths: Float[Tensor, " d"]) -> Sampled:
     """Beta's image warped to alpha by planes z = depth, alpha's frame: values (B, C, D, Ha, Wa), validity.
 
     Of any cameras: through lenses too, where planes are no homographies. Depths are metres.
     """
     planes = depths[:, None, None, None].expand(-1, len(image), *pair.alpha.hw)
-    swept = [warp(pair, image, plane, interpolation=interpolation) for plane in planes]
+    swept = [warp(pair, image, plane) for plane in planes]
     return Sampled(torch.stack([s.values for s in swept], 2), torch.stack([s.valid for s in swept], 1))
 
 
@@ -99,13 +93,15 @@ def _in_beta(pair: Pair, depth: Tensor, x: Tensor | None = None) -> Projected:
     alpha, beta = pair.cameras
     depth = floating(depth)
     x = pixel_grid(alpha.hw, dtype=depth.dtype, device=depth.device) if x is None else x
-    rays, valid = alpha.rays(x.reshape(*[1] * (depth.ndim + 1 - x.ndim), *x.shape))
-    has_depth = depth.isfinite() & (depth > 0) & valid & (rays[..., 2] > 0)
-    scale = torch.where(has_depth, depth, 1.0) / torch.where(rays[..., 2] > 0, rays[..., 2], 1.0)
-    X = rays * scale[..., None]
+    x = x.reshape(*[1] * (depth.ndim + 1 - x.ndim), *x.shape)
+    rays, valid = alpha.rays(x)
+    ahead = rays[..., 2] > 0
+    rays = rays / torch.where(ahead, rays[..., 2], 1.0)[..., None]
+    has_depth = depth.isfinite() & (depth > 0) & valid & ahead
+    X = rays * torch.where(has_depth, depth, 1.0)[..., None]
     if not alpha.central:
-        start = alpha.ray_origins(x.reshape(*[1] * (depth.ndim + 1 - x.ndim), *x.shape))
-        X = X + start - rays * (start[..., 2] / torch.where(rays[..., 2] > 0, rays[..., 2], 1.0))[..., None]
+        start = alpha.ray_origins(x)
+        X = X + start - rays * start[..., 2:]
     projected = beta.project_local(pair.beta_from_alpha.apply(X))
     return projected._replace(valid=projected.valid & has_depth & beta.contains(projected.x))
 

@@ -40,9 +40,9 @@ class Pose(Batched):
             check_batches("R and t", self.R.shape[:-2], self.t.shape[:-1])
 
     @classmethod
-    def identity(cls, *, dtype: torch.dtype = torch.float64, device: torch.device | None = None) -> Pose:
+    def identity(cls, *, dtype: torch.dtype = torch.float64) -> Pose:
         """The transform that changes nothing."""
-        return cls(torch.eye(3, dtype=dtype, device=device), torch.zeros(3, dtype=dtype, device=device))
+        return cls(torch.eye(3, dtype=dtype), torch.zeros(3, dtype=dtype))
 
     @classmethod
     def from_centre(cls, R: Float[Tensor, "*b 3 3"], centre: Float[Tensor, "*b 3"]) -> Pose:

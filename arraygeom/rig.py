@@ -7,7 +7,6 @@ import difflib
 import fnmatch
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -22,7 +21,7 @@ from .epipolar import fundamental_matrix
 from .homography import plane_homography
 from .pixels import HW, product, resize_matrix, rot90_matrix, shift_matrix
 from .pose import Pose
-from .text import baseline_text, depth_text, length_unit, view_facts
+from .text import baseline_text, depth_text, length_unit
 from .tracing import traced
 
 if TYPE_CHECKING:
@@ -143,7 +142,8 @@ class Pair(Batched):
         if self.link is not None and self.link.H is not None:
             return self.link.H
         if self.calibrated and self.depth is not None:
-            return self.homography_at(middle_depth(*self.depth))
+            near, far = self.depth
+            return self.homography_at(2 / (1 / near + 1 / far))  # the middle of the disparities
         if self.calibrated:
             return self.homography_at(torch.tensor(torch.inf, dtype=torch.float64))
         return resize_matrix(self.alpha.hw, self.beta.hw)
@@ -185,11 +185,6 @@ class Pair(Batched):
 
 ROUNDED = 8
 """A baseline of so many units in the last place of the cameras' translations is none."""
-
-
-def middle_depth(near: Float[Tensor, "*b"], far: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-    """The depth whose inverse is midway between those of near and far: the middle of a disparity range."""
-    return 2 / (1 / near + 1 / far)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -416,19 +411,9 @@ class Rig(Batched):
 
     def _text(self) -> str:
         named = ", ".join(f"{name} {view._text()}" for name, view in self.cameras.items())
-        return "; ".join(filter(None, (named, *self._lengths())))
-
-    def _lengths(self) -> tuple[str, str]:
         unit = length_unit(self)
-        return baseline_text(self.cameras, unit), depth_text(self.depth, unit)
-
-    def _repr_html_(self) -> str:
-        head = ("camera", "size", "focal length", "lens", "response")
-        rows = [head, *((name, *view_facts(view)) for name, view in self.cameras.items())]
-        cells = ["".join(f"<td>{escape(cell)}</td>" for cell in row) for row in rows]
-        facts = (self.name, self._batch_text(), *self._lengths())
-        caption = escape("; ".join(filter(None, facts)))
-        return f"<table><caption>{caption}</caption>{''.join(f'<tr>{row}</tr>' for row in cells)}</table>"
+        facts = named, baseline_text(self.cameras, unit), depth_text(self.depth, unit)
+        return "; ".join(filter(None, facts))
 
     def _parameter_shapes(self) -> dict[str, Tensor]:
         """One tensor of the right shape, type and device for each parameter."""

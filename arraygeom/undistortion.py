@@ -23,8 +23,8 @@ AT_ONCE = 1 << 18
 """Pixels that are resampled at once."""
 
 
-def pinhole_view(camera: AnyLensView, *, widest: float = WIDEST) -> AnyLensView:
-    """The camera without its lens, large enough for all the old image shows up to `widest` radians off axis.
+def pinhole_view(camera: AnyLensView) -> AnyLensView:
+    """The camera without its lens, large enough for all the old image shows up to `WIDEST` off axis.
 
     Same position, orientation and K but for the principal point: pixels in the middle keep their size. Links
     follow by `rig.transformed(name, view.K @ camera.K^-1, view.hw)`. Raises ValueError for a batch of
@@ -35,7 +35,7 @@ def pinhole_view(camera: AnyLensView, *, widest: float = WIDEST) -> AnyLensView:
         raise ValueError("a pinhole view is made of one camera at a time: take one of the batch")
     with torch.no_grad():
         rays, valid = camera.rays(coarse_grid(camera.hw).to(camera.K))
-    near_axis = valid & (rays[..., 2] >= math.cos(widest) * rays.norm(dim=-1))
+    near_axis = valid & (rays[..., 2] >= math.cos(WIDEST) * rays.norm(dim=-1))
     if not near_axis.any():
         raise ValueError(
             "no pixel of the image is within its lens's range: check the distortion's coefficients"

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from arraygeom import Camera, Rig, pixel_grid, sample
+from arraygeom import Rig, pixel_grid, sample
 from pat.fusion.results import Frame
 from pat.media.colour import linear_from_srgb, luminance, srgb_from_linear
 from pat.media.raw import light_of
@@ -50,9 +50,7 @@ def merged(frame: Frame, rig: Rig, images: Mapping[str, Float[Tensor, "_ _ _"]],
 
 def _at_alpha(frame: Frame, rig: Rig, image: Tensor, alpha: str, name: str) -> Float[Tensor, "h w"]:
     """Linear light of a beta at alpha's pixels, by depth; NaN where it is not known or outside the image."""
-    a, b = rig[alpha], rig[name]
-    if not (isinstance(a, Camera) and isinstance(b, Camera)):
-        raise ValueError("merging exposures needs calibrated cameras: betas are sampled by depth")
+    a, b = rig.pair(alpha, name).cameras
     X = a.to(torch.float32).unproject(pixel_grid(a.hw), frame.depth)
     x, _, valid = b.to(torch.float32).project(X)
     sampled = sample(linear_from_srgb(image)[None], torch.where(valid[..., None], x, -1e3)[None])

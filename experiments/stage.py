@@ -53,9 +53,7 @@ class SystemScene(LayeredScenes):
 
     def camera(self, name: str) -> Camera:
         """A camera of the rig as a batch of one, in alpha's frame."""
-        camera, alpha = self.rig[name], self.rig[self.alpha]
-        if not (isinstance(camera, Camera) and isinstance(alpha, Camera)):
-            raise ValueError(f"'{name}' is not calibrated: a scene is rendered for calibrated cameras")
+        alpha, camera = self.rig.pair(self.alpha, name).cameras
         return stack([in_frame_of(alpha, camera).replace(distortion=None)])
 
     @torch.no_grad()

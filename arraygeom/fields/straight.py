@@ -15,7 +15,7 @@ from ..camera import Camera
 from ..checks import check_above, check_bounds
 from ..chunks import chunked
 from ..epipolar import Track, epipolar_lines, segments_between, track
-from ..homography import apply_homography, fit_homography, fit_similarity
+from ..homography import apply_homography, fit_homography
 from ..pixels import HW, coarse_grid, floating
 from ..rig import Depths, Link, Pair, depth_range
 from ..segments import Segments, clip_to_image
@@ -219,7 +219,7 @@ def require_pinholes(pair: Pair) -> tuple[Camera, Camera]:
     return alpha, beta
 
 
-def approximated(pair: Pair, kind: Literal["homography", "similarity"] = "homography") -> Pair:
+def approximated(pair: Pair) -> Pair:
     """The pair with its exact F and the H that fits best to the middles of its depth-bounded segments.
 
     Least squares in pixels of beta, over the segments that beta's image holds of every 16th alpha pixel:
@@ -238,8 +238,7 @@ def approximated(pair: Pair, kind: Literal["homography", "similarity"] = "homogr
         raise ValueError(
             "beta sees next to nothing of alpha's image between near and far: nothing to fit a map to"
         )
-    fit = fit_homography if kind == "homography" else fit_similarity
-    H = fit(x[valid], (0.5 * (segments.start + segments.end))[valid])
+    H = fit_homography(x[valid], (0.5 * (segments.start + segments.end))[valid])
     return replace(pair, link=Link(pair.fundamental, H))
 
 

@@ -204,9 +204,8 @@ def chroma_bound(task: MonoColourTask, rate: int) -> Float[Tensor, "3 h w"]:
 def evaluate_conditions(
     pairs: Sequence[StereoPair],
     network: FusionNetwork,
-    conditions: Iterable[str] = tuple(CONDITIONS),
+    conditions: Iterable[str],
     *,
-    max_disparity: float = PAPER_DISPARITY,
     progress: Callable[[Iterable[StereoPair], int], Iterable[StereoPair]] = lambda pairs, total: pairs,
 ) -> list[ConditionRow]:
     """Every method on every colour pair under every condition (`CONDITIONS`). Raises KeyError for others."""
@@ -220,7 +219,7 @@ def evaluate_conditions(
                 bound = StereoResult(chroma_bound(task, condition.rate))
                 rows.append(_row(pair.name, name, "bound of beta's resolution", bound, task, regions))
             for method, run in methods_of(network, condition.noise).items():
-                result = run(task.alpha, task.beta, max_disparity)
+                result = run(task.alpha, task.beta, PAPER_DISPARITY)
                 rows.append(_row(pair.name, name, method, result, task, regions))
     return rows
 

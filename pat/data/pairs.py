@@ -118,12 +118,12 @@ def middlebury_pairs(root: str | Path) -> Iterator[StereoPair]:
     return (_middlebury_pair(root, *scene) for scene in scenes)
 
 
-def folder_pairs(root: str | Path, *, max_disparity: float = PAPER_DISPARITY) -> Iterator[StereoPair]:
+def folder_pairs(root: str | Path) -> Iterator[StereoPair]:
     """Every (near-)rectified pair under `root`, names following one of `LEFT_AND_RIGHT`, such as KITTI's."""
     root = _folder(root)
     files = _some(_named(root), root)
     return (
-        StereoPair(_pair_name(root, left), read_image(left), read_image(right), max_disparity)
+        StereoPair(_pair_name(root, left), read_image(left), read_image(right), PAPER_DISPARITY)
         for left, right in files
     )
 

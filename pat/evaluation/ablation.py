@@ -290,8 +290,8 @@ def _case(
         notes["classical"] = str(error)
     for name, family in chosen.items():
         rig = family.assumed(case.rig, Generator().manual_seed(crc32(case.name.encode())))
-        notes[name] = unsupported(family.field(far), rig)
-        if notes[name]:
+        if isinstance(family.field(far), Dense) and (needed := dense_bytes(rig)) > DENSE_LIMIT:
+            notes[name] = f"does not fit: {needed / 2**30:.0f} GiB of positions"
             continue
         LOG.info("%s: %s", case.name, name)
         try:
@@ -323,14 +323,9 @@ def point_errors(case: AblationCase, depth: Float[Tensor, "h w"]) -> tuple[float
     return float(error.mean()), float((error <= 1).sum() / has_truth.sum())
 
 
-def unsupported(field: ReceptiveField | None, rig: Rig) -> str:
-    """Why a field cannot be used; empty if it can."""
-    pair = rig.pair(ALPHA, BETA)
-    if isinstance(field, Dense):
-        needed = math.prod(pair.alpha.hw) / 4 * math.prod(pair.beta.hw) * 8
-        if needed > DENSE_LIMIT:
-            return f"does not fit: {needed / 2**30:.0f} GiB of positions"
-    return ""
+def dense_bytes(rig: Rig) -> float:
+    """What explicit positions of the dense field take."""
+    return math.prod(rig[ALPHA].hw) / 4 * math.prod(rig[BETA].hw) * 8
 
 
 def markdown(rows: Sequence[AblationRow]) -> str:

@@ -39,6 +39,7 @@ class MonoColourTask(NamedTuple):
 def mono_colour_task(pair: StereoPair, rate: int) -> MonoColourTask:
     """Left as grey alpha (Rec. 601) and as ground truth in colour; right, reduced `rate` times, as beta.
 
+    A pixel of beta is the mean of `rate` x `rate` pixels of right, as a sensor with larger pixels sees it.
     Rows and columns beyond the last multiple of `rate` are cut from the bottom and the right. Raises
     ValueError for a grey pair, and for images of unequal sizes.
     """
@@ -51,14 +52,7 @@ def mono_colour_task(pair: StereoPair, rate: int) -> MonoColourTask:
         )
     ground_truth, right = (cut_to_multiple(image, rate) for image in (pair.left, pair.right))
     disparity = pair.disparity and Disparity(*(cut_to_multiple(plane, rate) for plane in pair.disparity))
-    return MonoColourTask(luminance(ground_truth), reduce_by(right, rate), ground_truth, disparity)
-
-
-def reduce_by(image: Float[Tensor, "c h w"], rate: int) -> Float[Tensor, "c hr wr"]:
-    """The mean of each `rate` x `rate` block, as a sensor with larger pixels sees it."""
-    if rate < 1 or any(side % rate for side in image.shape[1:]):
-        raise ValueError(f"cannot reduce {tuple(image.shape[1:])} by {rate}: give a divisor of both sides")
-    return avg_pool2d(image, rate)
+    return MonoColourTask(luminance(ground_truth), avg_pool2d(right, rate), ground_truth, disparity)
 
 
 def cut_to_multiple(image: Shaped[Tensor, "*c h w"], rate: int) -> Shaped[Tensor, "*c hc wc"]:

@@ -68,17 +68,19 @@ def evaluate_pairs(
 
     `max_disparity`, in alpha's pixels, is the same for all (the paper's: 120 / rate pixels of beta). With
     `images`, a folder, a strip for each pair and rate goes there: beta enlarged, each method, the ground
-    truth. Raises ValueError naming the method and the pair if a result differs in shape from the ground truth
-    or is not finite.
+    truth.
     """
     rows = []
     for pair in track(pairs, "evaluating", disable=not sys.stderr.isatty()):
         for rate in rates:
             task = mono_colour_task(pair, rate)
-            results = {n: _result(n, method, pair, task, max_disparity) for n, method in methods.items()}
+            results = {n: method(task.alpha, task.beta, max_disparity) for n, method in methods.items()}
             rows += [_row(pair.name, rate, name, result, task) for name, result in results.items()]
             if images:
-                shown = [enlarged(task.beta, hw_of(task.alpha)), *(r.image for r in results.values())]
+                shown = [
+                    enlarged(task.beta, hw_of(task.alpha)),
+                    *(r.image.clamp(0, 1) for r in results.values()),
+                ]
                 strip = torch.cat([*shown, task.ground_truth], -1)
                 write_image(images / f"{pair.name.replace('/', '-')}_x{rate}.png", strip)
     return rows
@@ -158,24 +160,11 @@ def structure_kept(rows: Sequence[StereoRow]) -> str:
     return f"{kept}; **below it**: {', '.join(lost)}." if lost else f"{kept}."
 
 
-def _result(
-    name: str, method: StereoMethod, pair: StereoPair, task: MonoColourTask, max_disparity: float
-) -> StereoResult:
-    result = method(task.alpha, task.beta, max_disparity)
-    image = result.image.detach().cpu()
-    if image.shape != task.ground_truth.shape:
-        wanted = tuple(task.ground_truth.shape)
-        raise ValueError(f"{name} on {pair.name}: gave {tuple(image.shape)}, wanted an image {wanted}")
-    if not image.isfinite().all():
-        raise ValueError(f"{name} on {pair.name}: gave NaN or infinite values")
-    return StereoResult(image.float().clamp(0, 1), result.disparity)
-
-
 def _row(pair: str, rate: int, method: str, result: StereoResult, task: MonoColourTask) -> StereoRow:
     errors: tuple[float | None, float | None] = (None, None)
     if result.disparity is not None and task.disparity is not None:
-        errors = disparity_errors(result.disparity.detach().cpu(), task.disparity)
-    return StereoRow(pair, rate, method, *score(result.image, task.ground_truth), *errors)
+        errors = disparity_errors(result.disparity, task.disparity)
+    return StereoRow(pair, rate, method, *score(result.image.clamp(0, 1), task.ground_truth), *errors)
 
 
 def disparity_errors(

@@ -12,9 +12,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from arraygeom.camera import Camera
 from arraygeom.pixels import pixel_grid
-from arraygeom.rig import Rig
+from arraygeom.rig import Pair, Rig
 from arraygeom.sampling import sample
 
 from .rendered import RenderedFrame, depth_between
@@ -51,10 +50,7 @@ def check_views(
     """
     views = {name: view_figures(frame) for name, frame in frames.items()}
     together = [(a, b) for a, b in permutations(frames, 2) if frames[a].time == frames[b].time]
-    pairs = {
-        f"{a} > {b}": pair_figures(_camera(rig, a), frames[a], _camera(rig, b), frames[b])
-        for a, b in together
-    }
+    pairs = {f"{a} > {b}": pair_figures(rig.pair(a, b), frames[a], frames[b]) for a, b in together}
     reasons = [r for name, figures in views.items() for r in _view_reasons(name, figures, limits)]
     reasons += [r for name, figures in pairs.items() for r in _pair_reasons(name, figures, limits)]
     for name in sorted({a for a, _ in together}):
@@ -92,7 +88,7 @@ def texture(rgb: Float[Tensor, "3 h w"], patch: int = 8) -> Float[Tensor, ""]:
     return (deviation > 0.02 * mean.clamp(min=0.01)).float().mean()
 
 
-def pair_figures(alpha: Camera, here: RenderedFrame, beta: Camera, there: RenderedFrame) -> dict[str, float]:
+def pair_figures(pair: Pair, here: RenderedFrame, there: RenderedFrame) -> dict[str, float]:
     """How well alpha's depth predicts beta's view, at up to 200,000 pixels.
 
     `inside` is the share of alpha's pixels whose points are on beta's image; of all, `visible` are seen
@@ -101,7 +97,7 @@ def pair_figures(alpha: Camera, here: RenderedFrame, beta: Camera, there: Render
     pixels. `colour` is the median difference of their colours, relative to their brightness, `shift` how many
     pixels one image is displaced against the other by all of these differences together.
     """
-    alpha, beta = alpha.to(dtype=torch.float64), beta.to(dtype=torch.float64)
+    alpha, beta = (camera.to(dtype=torch.float64) for camera in pair.cameras)
     x, depth, index = _chosen(here, 200_000)
     ahead = beta.project(alpha.unproject(x, depth))
     inside = ahead.valid & beta.contains(ahead.x.nan_to_num(-1e9))
@@ -150,13 +146,6 @@ def _compared(
     normal = A.T @ A + 1e-9 * torch.eye(2, dtype=A.dtype)
     shift = torch.linalg.solve(normal, A.T @ difference[:, keep].flatten())
     return (size / mine.mean(0).clamp(min=0.01)).median(), shift.norm()
-
-
-def _camera(rig: Rig, name: str) -> Camera:
-    camera = rig[name]
-    if not isinstance(camera, Camera):
-        raise ValueError(f"camera '{name}' is not calibrated: the check needs its K, R and t")
-    return camera
 
 
 def _view_reasons(name: str, figures: Mapping[str, float], limits: CheckLimits) -> Iterator[str]:

@@ -67,8 +67,6 @@ class LayeredScenes:
         seed: int = 0,
         device: torch.device | str = "cpu",
     ):
-        if not 1 <= layers[0] <= layers[1]:
-            raise ValueError(f"layers must be two numbers, at least 1 and in order, got {layers}")
         self.photos = photos.to(device)
         self.rigs = rigs
         self.hw = hw

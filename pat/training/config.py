@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, Union
+from typing import Literal
 
 import tyro
 
@@ -18,10 +18,7 @@ from pat.synthesis.rig_distribution import RigDistribution
 RECIPES = Path(__file__).parent / "recipes"
 RECTIFIED = RigDistribution(mode="rectified", parallax=(6.0, 110.0))
 GENERAL = RigDistribution(mode="general", parallax=(6.0, 90.0), focal_ratio=(0.8, 1.25))
-if TYPE_CHECKING:
-    NetworkConfig = GuidedPATConfig | PATConfig | BandwisePATConfig
-else:
-    NetworkConfig = Union[tuple(CONFIGS.values())]  # noqa: UP007
+NetworkConfig = PATConfig | GuidedPATConfig | BandwisePATConfig
 UNSEEN = ("out", "device", "save", "tensorboard", "cache")
 """Entries that may differ between a run and its continuation: samples and steps do not depend on them."""
 

@@ -52,29 +52,25 @@ def test_a_matrix_that_claims_a_size_takes_no_memory(tmp_path):
         read_rig(tmp_path / "a.yml", format="opencv")
 
 
-def struct_file(path: Path, *, compressed: bool) -> bytes:
+def matlab_pair() -> dict[str, object]:
+    """Two cameras as MATLAB's stereo parameters, and their relation."""
     camera = {
         "IntrinsicMatrix": np.array([[800.0, 0, 0], [0, 800, 0], [320, 200, 1]]),
         "ImageSize": [400.0, 640.0],
+        "RadialDistortion": np.array([0.1, 0.01]),
     }
-    camera["RadialDistortion"] = np.array([0.1, 0.01])
     pair = {"CameraParameters1": camera, "CameraParameters2": camera, "WorldUnits": "mm"}
-    pair |= {"RotationOfCamera2": np.eye(3), "TranslationOfCamera2": np.array([-100.0, 0, 0])}
-    others = {
-        "empty": np.zeros((0, 3)),
-        "cells": np.array([1, "b"], object),
-        "z": np.array([1 + 2j]),
-        "t": ["a", "bc"],
-    }
-    pytest.importorskip("scipy.io").savemat(path, {"s": pair, **others}, do_compression=compressed)
-    return path.read_bytes()
+    return pair | {"RotationOfCamera2": np.eye(3), "TranslationOfCamera2": np.array([-100.0, 0, 0])}
 
 
 @pytest.mark.parametrize("compressed", [False, True])
 def test_damaged_mat_files_are_read_or_refused(compressed, tmp_path):
     """Of these, scipy alone crashes the process on seed 50, among others."""
     path = tmp_path / "pair.mat"
-    whole = struct_file(path, compressed=compressed)
+    others = {"empty": np.zeros((0, 3)), "cells": np.array([1, "b"], object), "z": np.array([1 + 2j])}
+    variables = {"s": matlab_pair(), **others, "t": ["a", "bc"]}
+    pytest.importorskip("scipy.io").savemat(path, variables, do_compression=compressed)
+    whole = path.read_bytes()
     assert readable_variables(whole) == ["s", "empty", "cells", "z", "t"]
     assert Rig.load(path).names == ("camera1", "camera2")
     refused = 0

@@ -200,18 +200,6 @@ def test_fisheye_near_the_axis_in_float32():
     assert ((ray[:, :2] / ray[:, 2:] - X[:, :2]) / X[:, :2]).abs().max() < 2e-6
 
 
-def test_derivatives_on_the_axis_in_float32():
-    """On the axis the map is the identity to second order: Jacobian I, Hessian 0."""
-    for d in (brown().to(torch.float32), fisheye(FISHEYES[0]).to(torch.float32)):
-        zero = torch.zeros(2)
-        lens = Distortion(d.model, d.coefficients[:4])
-        for f in (lens.distort, lens.undistort):
-            J = torch.autograd.functional.jacobian(lambda x, f=f: f(x)[0], zero)
-            torch.testing.assert_close(J, torch.eye(2))
-    H = torch.autograd.functional.hessian(lambda x: lens.distort(x)[0].sum(), zero)
-    torch.testing.assert_close(H, torch.zeros(2, 2))
-
-
 @pytest.mark.parametrize("count", [0, 4, 5, 8, 12, 14])
 def test_derivatives_at_once_are_automatic_ones(count):
     """Behind the camera, on the axis and beyond the lens's range as well."""

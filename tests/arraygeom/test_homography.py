@@ -1,11 +1,8 @@
-import numpy as np
 import pytest
 import torch
 
+from arraygeom import rotation_from_vector
 from arraygeom.homography import apply_homography, fit_similarity, infinite_homography, plane_homography
-from tests.oracles import Oracle
-
-cv2 = Oracle("cv2")
 
 
 @pytest.fixture
@@ -22,12 +19,11 @@ def scene() -> dict[str, torch.Tensor]:
         .clone()
     )
     K[1, :, 0, 0] += 300 * rand(5)
-    rotations = np.stack([cv2.Rodrigues(0.3 * v.numpy())[0] for v in rand(5, 3)])
     normal = torch.tensor([0.0, 0, 1], dtype=torch.float64) + 0.4 * rand(5, 3)
     return {
         "K_alpha": K[0],
         "K_beta": K[1],
-        "R": torch.from_numpy(rotations),
+        "R": rotation_from_vector(0.3 * rand(5, 3)),
         "t": rand(5, 3),
         "normal": normal,
         "d": -3 + rand(5),

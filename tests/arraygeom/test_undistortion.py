@@ -16,7 +16,7 @@ from arraygeom import (
     resampled,
     rotation_from_vector,
 )
-from arraygeom.undistortion import pixels_between
+from arraygeom.undistortion import WIDEST, pixels_between
 from tests.oracles import Oracle
 
 cv2 = Oracle("cv2")
@@ -64,15 +64,15 @@ def test_there_and_back_is_the_image(model):
 
 def test_all_is_kept_up_to_the_widest_angle_and_the_middle_keeps_its_size():
     c = camera("kannala-brandt", focal=55.0)
-    view = pinhole_view(c, widest=math.radians(60))
+    view = pinhole_view(c)
     rays, valid = c.rays(torch.tensor([[0.0, 58.0], [159.0, 58.0], [81.0, 10.0], [81.0, 106.0]]).double())
     assert valid.all()
     angle = torch.atan2(rays[:, :2].norm(dim=-1), rays[:, 2])
-    assert angle[0] > math.radians(60) > angle[2]
+    assert angle[0] > WIDEST > angle[2]
     x = rays[2:, :2] / rays[2:, 2:] @ view.K[:2, :2].T + view.K[:2, 2]
     assert view.contains(x).all()
     assert torch.equal(view.K[:2, :2], c.K[:2, :2])
-    assert view.hw[1] < 2 * 55 * math.tan(math.radians(60)) + 3
+    assert view.hw[1] < 2 * 55 * math.tan(WIDEST) + 3
 
 
 def test_a_rotated_co_located_camera_sees_a_rotated_image():

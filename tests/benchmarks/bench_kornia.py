@@ -1,6 +1,6 @@
 """arraygeom beside kornia, for what both have: values, gradients, low precision, and the ratio of times.
 
-Run as `python -m tests.benchmarks.bench_kornia [table] [calls]`; it writes both, or one, into docs/kornia.md.
+Run as `python -m tests.benchmarks.bench_kornia`; it writes both into docs/kornia.md.
 
 The value's difference is the largest over all entries, float64, relative to the largest entry. The gradient's
 error is each library's own, of a random cotangent, against central differences of its own values; second
@@ -18,16 +18,15 @@ from collections.abc import Callable
 from functools import partial
 from statistics import median
 from types import FrameType
-from typing import Literal
 
 import kornia.geometry
 import torch
 import tyro
 from torch import Tensor
-from tyro.conf import Positional
 
 from arraygeom import Camera, Distortion, Pose, Rig, relative_pose
 from docs.update_readme import write_block
+from pat.evaluation.tables import markdown_table
 from pat.fusion.fuse import fuse
 from pat.networks.guided import GuidedPAT
 from tests.arraygeom.rigs import random_rig
@@ -90,28 +89,20 @@ def time_ratio(case: Parity) -> float:
 
 def table() -> str:
     """One row a case, as Markdown."""
-    lines = [
-        "| what | value, relative difference | gradient error, ours | kornia's | autocast, ours | kornia's "
-        "| float16, ours | kornia's | time, kornia / ours |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
-    large = cases(20_000)
+    rows, large = [], cases(20_000)
     for name, case in CASES.items():
         for f in case[:2]:
             second_order(f, case.at)
-        cells = [
-            name,
-            f"{value_difference(case):.0e}",
-            *(f"{gradient_error(f, case.at):.0e}" for f in case[:2]),
-            *(
-                low_precision(name, side, dtype)
-                for dtype in (torch.float32, torch.float16)
-                for side in (0, 1)
-            ),
-            f"{time_ratio(large[name]):.1f}",
-        ]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+        gradients = (f"{gradient_error(f, case.at):.0e}" for f in case[:2])
+        low = (low_precision(name, i, dtype) for dtype in (torch.float32, torch.float16) for i in (0, 1))
+        rows.append(
+            [name, f"{value_difference(case):.0e}", *gradients, *low, f"{time_ratio(large[name]):.1f}"]
+        )
+    columns = (
+        *("what", "value, relative difference", "gradient error, ours", "kornia's", "autocast, ours"),
+        *("kornia's", "float16, ours", "kornia's", "time, kornia / ours"),
+    )
+    return markdown_table(columns, rows, align="l")
 
 
 def kornia_calls(run: Callable[[], object]) -> set[str]:
@@ -170,12 +161,10 @@ def fused() -> None:
     fuse(GuidedPAT(), rig, images, alpha="alpha")
 
 
-def main(what: Positional[tuple[Literal["table", "calls"], ...]] = ("table", "calls")) -> None:
+def main() -> None:
     """Print the lists, and put them into docs/kornia.md."""
     torch.set_num_threads(1)
-    tables = {"table": table, "calls": counts}
-    for name in what:
-        made = tables[name]()
+    for name, made in {"table": table(), "calls": counts()}.items():
         print(made)
         write_block(DOCS / "kornia.md", name, made)
 

@@ -1,6 +1,6 @@
 """Lens models beside OpenCV, kornia, pycolmap: wrong answers, error, derivatives, vmap, time; docs/lenses.md.
 
-    python -m tests.benchmarks.bench_lenses [--lenses 1000] [--models NAME ...] [--write]
+    python -m tests.benchmarks.bench_lenses [--lenses 1000] [--write]
 
 1,000 random lenses of each model, 100 directions each, f = 1000 px, float64. The truth is the model's
 formula, written here in numpy, along the path from the axis to the direction: a lens is followed until its
@@ -15,7 +15,7 @@ NaN, infinity, or OpenCV's -1000000.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from statistics import median
 from typing import Any, NamedTuple
 
@@ -31,6 +31,7 @@ from arraygeom.kornia_models import to_kornia_model
 from arraygeom.lenses import PolynomialFisheye
 from arraygeom.lenses.model import LensModel
 from docs.update_readme import write_block
+from pat.evaluation.tables import markdown_table
 from tests.benchmarks.printed import DOCS, timed
 
 try:
@@ -40,7 +41,6 @@ except ImportError:
 
 Array = NDArray[np.float64]
 Answer = tuple[Array, NDArray[np.bool_]]
-PAGE = DOCS / "lenses.md"
 FOCAL, POINTS, STEPS, OFF = 1000.0, 100, 48, 0.1
 K = np.diag([FOCAL, FOCAL, 1.0])
 
@@ -390,22 +390,16 @@ def _kornia_maps(name: str, x: Tensor, c: Tensor) -> Tensor:
     return maps.undistort(params, Vector2(x)).data + maps.distort(params, Vector2(x)).data
 
 
-def _place(line: str) -> tuple[int, int]:
-    """Where a row goes: models and libraries in their order."""
-    model, library = (cell.strip() for cell in line.split("|")[1:3])
-    return list(FAMILIES).index(model), list(LIBRARIES).index(library)
-
-
 HEAD = (
     *("lens", "library", "project, wrong", "missed", "unproject, wrong", "missed", "largest other error, px"),
     *("second derivative", "vmap", "project, ms", "unproject, ms"),
 )
 
 
-def rows(names: Sequence[str], lenses: int) -> list[list[str]]:
+def rows(lenses: int) -> list[list[str]]:
     """One row a model and library."""
     made = []
-    for name in names:
+    for name in FAMILIES:
         points = drawn(name, lenses)
         for library, of in LIBRARIES.items():
             chosen = of(name)
@@ -416,17 +410,13 @@ def rows(names: Sequence[str], lenses: int) -> list[list[str]]:
     return made
 
 
-def main(lenses: int = 1000, models: tuple[str, ...] = tuple(FAMILIES), write: bool = False) -> None:
-    """Print the table, and put it into docs/lenses.md if asked; the rows of other models stay."""
+def main(lenses: int = 1000, write: bool = False) -> None:
+    """Print the table, and put it into docs/lenses.md if asked."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    made = [f"| {' | '.join(row)} |" for row in (HEAD, ["---"] * len(HEAD), *rows(models, lenses))]
+    made = markdown_table(HEAD, rows(lenses), align="l")
     if write:
-        others = set(FAMILIES) - set(models)
-        _, _, block = PAGE.read_text().partition("<!-- lenses:begin -->")
-        lines = block.partition("<!-- lenses:end -->")[0].splitlines()
-        kept = [line for line in lines if line[2:].split(" ")[0] in others]
-        write_block(PAGE, "lenses", "\n".join([*made[:2], *sorted([*made[2:], *kept], key=_place)]))
+        write_block(DOCS / "lenses.md", "lenses", made)
 
 
 if __name__ == "__main__":

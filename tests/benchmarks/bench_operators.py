@@ -41,6 +41,7 @@ from arraygeom import (
 )
 from arraygeom.lenses import FlatPort, RollingShutter
 from docs.update_readme import write_block
+from pat.evaluation.tables import markdown_table
 from tests.benchmarks.bench_kornia import gradient_error
 from tests.benchmarks.printed import DOCS, timed
 
@@ -270,13 +271,13 @@ def main(write: bool = False) -> None:
     """Print the table, and put it into docs/lenses.md if asked."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    lines = [HEAD, ["---"] * len(HEAD)]
+    lines = []
     for part in (triangulations, poses, images, adjustment):
         for row in part():
             print(" | ".join(row), flush=True)
             lines.append(row)
     if write:
-        write_block(DOCS / "lenses.md", "operators", "\n".join(f"| {' | '.join(line)} |" for line in lines))
+        write_block(DOCS / "lenses.md", "operators", markdown_table(HEAD, lines, align="l"))
 
 
 if __name__ == "__main__":

@@ -78,7 +78,6 @@ def test_every_method_is_scored_under_every_condition(tmp_path):
         [pair()],
         load_weights("mono-colour-small"),
         ["ideal", "rows off 1 px", "rows off 3 px"],
-        max_disparity=16.0,
     )
     ours = [row for row in rows if row.method == "fusion"]
     assert [row.condition for row in ours] == ["ideal", "rows off 1 px", "rows off 3 px"]

@@ -30,6 +30,7 @@ from pat.networks.guided import GuidedPAT
 from pat.networks.weights import load_weights, save_weights
 from pat.synthesis.photos import read_photographs
 from pat.training.checkpoints import collect, newest_checkpoint, restore, write_checkpoint
+from tests.arraygeom.test_damaged_files import matlab_pair
 
 from .mutations import mutated
 
@@ -137,13 +138,6 @@ def rig_seeds(folder: Path) -> Iterator[Seed]:
 def _matlab(folder: Path) -> Iterator[Seed]:
     from scipy.io import savemat
 
-    camera = {
-        "IntrinsicMatrix": np.array([[800.0, 0, 0], [0, 800, 0], [320, 200, 1]]),
-        "ImageSize": [400.0, 640.0],
-    }
-    camera["RadialDistortion"] = np.array([0.1, 0.01])
-    pair = {"CameraParameters1": camera, "CameraParameters2": camera, "WorldUnits": "mm"}
-    pair |= {"RotationOfCamera2": np.eye(3), "TranslationOfCamera2": np.array([-100.0, 0, 0])}
     folder.mkdir(parents=True, exist_ok=True)
     fisheye = {"MappingCoefficients": [300.0, -9e-4, 4e-7, -6e-10], "ImageSize": [480.0, 640.0]}
     fisheye |= {"DistortionCenter": [321.5, 239.25], "StretchMatrix": np.eye(2)}
@@ -154,7 +148,11 @@ def _matlab(folder: Path) -> Iterator[Seed]:
             f"cc_{side}": [320.5, 238],
             f"kc_{side}": [-0.2, 0.1, 0, 0, 0.01],
         }
-    for name, variables in (("pair", {"s": pair}), ("fisheye", {"s": fisheye}), ("bouguet", bouguet)):
+    for name, variables in (
+        ("pair", {"s": matlab_pair()}),
+        ("fisheye", {"s": fisheye}),
+        ("bouguet", bouguet),
+    ):
         savemat(folder / f"{name}.mat", variables)
         yield Seed("rig", f"{name} .mat", folder / f"{name}.mat")
 

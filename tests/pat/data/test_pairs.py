@@ -37,10 +37,10 @@ def test_a_folder_without_pairs_is_an_error_at_once(tmp_path, reader):
 def test_pairs_are_found_by_their_names(tmp_path, left, right, name):
     write(tmp_path / left, 0.0)
     write(tmp_path / right, 1.0)
-    (pair,) = folder_pairs(tmp_path, max_disparity=30.0)
+    (pair,) = folder_pairs(tmp_path)
     assert pair.name == name
     assert (float(pair.left.mean()), float(pair.right.mean())) == (0, 1)
-    assert (pair.max_disparity, pair.disparity) == (30, None)
+    assert (pair.max_disparity, pair.disparity) == (120, None)
 
 
 def test_middlebury_disparities_are_scaled_by_the_collection(tmp_path):

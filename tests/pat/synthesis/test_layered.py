@@ -168,8 +168,3 @@ def test_chroma_is_not_a_function_of_luminance(rich):
     chroma = image[2] - luminance
     middle = (luminance - 0.5).abs() < 0.03
     assert chroma[middle].std() > 0.8 * chroma.std() > 0.05
-
-
-def test_layers_are_checked(rich):
-    with pytest.raises(ValueError, match="layers"):
-        LayeredScenes(rich, RigDistribution(), hw=HW, layers=(3, 2))
