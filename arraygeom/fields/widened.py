@@ -68,7 +68,7 @@ class Widened:
     """Any field with `across` pixels to either side of it and `along` more pixels at either end.
 
     Uncertain calibration moves lines sideways: `across` alone. Motion between cameras that are not
-    synchronised moves points anywhere: `across` and `along`, or `for_motion`.
+    synchronised moves points anywhere: `across` and `along`.
 
     Segments made longer stay segments. Made wider they become positions: `samples` along, on rows at most one
     pixel apart, the rows following one another (the first `across` to the left of the way from start to end).
@@ -113,11 +113,6 @@ class Widened:
         if isinstance(locations, Segments):
             return Segments(locations.start - margin, locations.end - margin, locations.valid)
         return Positions(locations.xy - margin, locations.mask)
-
-    @classmethod
-    def for_motion(cls, field: ReceptiveField, pixels: float, **options: int) -> Widened:
-        """Tolerance to motion of up to `pixels` between the cameras' exposures."""
-        return cls(field, across=pixels, along=pixels, **options)
 
     @property
     def rows(self) -> int:

@@ -58,7 +58,7 @@ def test_bands_hold_points_moved_by_less_than_they_allow():
     pair = rig.pair("alpha", "beta")
     x = pixel_grid(pair.alpha.hw, dtype=torch.float64)[8:40:6, 8:56:6]
     segments = Epipolar()(pair, x)
-    band = Widened.for_motion(Epipolar(), 3.0, samples=64)(pair, x)
+    band = Widened(Epipolar(), 3.0, 3.0, samples=64)(pair, x)
     g = torch.Generator().manual_seed(0)
     moved = segments.at(torch.rand(x.shape[:-1], generator=g, dtype=torch.float64))
     moved = moved + 2 * torch.randn(moved.shape, generator=g, dtype=torch.float64).clamp(-1, 1)
@@ -69,7 +69,7 @@ def test_bands_hold_points_moved_by_less_than_they_allow():
 
 def test_points_widen_to_windows():
     pair = two_cameras().pair("alpha", "beta")
-    band = Widened.for_motion(Epipolar(), 2.0, samples=5)(pair, torch.tensor([[30.0, 20.0]]))
+    band = Widened(Epipolar(), 2.0, 2.0, samples=5)(pair, torch.tensor([[30.0, 20.0]]))
     torch.testing.assert_close(band.xy.reshape(5, 5, 2), pixel_grid((5, 5)) + torch.tensor([28.0, 18.0]))
 
 
