@@ -129,7 +129,7 @@ def check_batches(what: str, *shapes: tuple[int, ...]) -> None:
     """Raises ValueError unless batch axes broadcast."""
     try:
         broadcast_shapes(*shapes)
-    except RuntimeError:
+    except (RuntimeError, ValueError):
         listed = " and ".join(map(str, map(tuple, shapes)))
         raise ValueError(f"the batch axes of {what} are {listed}: give all the same, or none") from None
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Real
 from torch import Tensor
@@ -105,18 +106,9 @@ def broadcasts(batch: Sequence[int], points: Sequence[int]) -> bool:
 def broadcast_shapes(*shapes: Sequence[int]) -> torch.Size:
     """As `torch.broadcast_shapes`, whose first call in a process takes half a second to import sympy.
 
-    Raises RuntimeError for shapes that do not broadcast.
+    Raises RuntimeError (while torch follows) or ValueError for shapes that do not broadcast.
     """
-    if followed():
-        return torch.broadcast_shapes(*shapes)
-    sizes = [1] * max(map(len, shapes), default=0)
-    for shape in shapes:
-        for i, size in enumerate(reversed(shape), 1):
-            if sizes[-i] == 1:
-                sizes[-i] = size
-            elif size not in (1, sizes[-i]):
-                raise RuntimeError(f"shapes {', '.join(str(tuple(s)) for s in shapes)} do not broadcast")
-    return torch.Size(sizes)
+    return torch.broadcast_shapes(*shapes) if followed() else torch.Size(np.broadcast_shapes(*shapes))
 
 
 def map_homogeneous(M: Float[Tensor, "*b k 3"], x: Real[Tensor, "*n 2"]) -> Float[Tensor, "*m k"]:

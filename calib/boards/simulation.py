@@ -90,19 +90,17 @@ Rays = tuple[Float[Tensor, "n 3"], Bool[Tensor, " n"]]
 
 @torch.no_grad()
 def photograph(
-    camera: Camera, cam_from_board: Pose, board: Board, *, dpi: float | None = None, rays: Rays | None = None
+    camera: Camera, cam_from_board: Pose, board: Board, *, rays: Rays | None = None
 ) -> UInt8[np.ndarray, "h w"]:
     """The image of a printed board by a camera, through its lens: the mean of four samples per pixel.
 
-    The print is drawn at `dpi`, by default such that its pixels match the distance of the samples. `rays` are
-    `fine_rays(camera)`, if precomputed.
+    The print's pixels match the distance of the samples. `rays` are `fine_rays(camera)`, if precomputed.
     """
     directions, valid = rays or fine_rays(camera)
     R, t = cam_from_board.R, cam_from_board.t
     distance = (R[:, 2] @ t) / (directions @ R[:, 2])
     on_board = (directions * distance[:, None] - t) @ R
-    resolution = dpi or _resolution(camera, cam_from_board, board)
-    print_, per_metre, origin = printed(board, resolution)
+    print_, per_metre, origin = printed(board, _resolution(camera, cam_from_board, board))
     hw = 2 * camera.hw[0], 2 * camera.hw[1]
     on_print = (on_board[:, :2].numpy() * per_metre + origin).astype(np.float32).reshape(*hw, 2)
     on_print[~(valid & (distance > 0)).reshape(hw).numpy()] = -1

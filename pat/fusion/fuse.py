@@ -251,7 +251,8 @@ def ready_frame(
     `joined` takes co-located betas for one of several bands. Raises as `fuse`.
     """
     say = explain or (lambda line: None)
-    views, low_light = _seen(rig, images, alpha, settings)
+    views = Views.of(rig, images, alpha=alpha, depth=settings.depth, field=settings.field)
+    views, low_light = denoised_views(views, settings.noise)
     if network is None:
         weights = weights_for([len(views.images[name]) for name in views.betas])
         network = load_weights(weights)
@@ -339,7 +340,8 @@ def corrections_of(
     Arguments and errors are as of `fuse`.
     """
     settings = _given(FuseSettings, settings).changed(changes)
-    views, _ = _seen(rig, images, alpha, settings)
+    views = Views.of(rig, images, alpha=alpha, depth=settings.depth, field=settings.field)
+    views, _ = denoised_views(views, settings.noise)
     check_bands(views, network.bands)
     inputs, _ = prepared(network, views, steps_for(network, normalise=settings.match_levels))
     return find_corrections(network, inputs, settings.response, align=settings.align is not False)
@@ -357,9 +359,3 @@ def matches_by(matcher: Matcher, inputs: Inputs) -> Matches:
     matches = _given(Matches, matcher(inputs))
     matches.check(inputs)
     return matches
-
-
-def _seen(rig: Rig, images: Images, alpha: str, settings: FuseSettings) -> tuple[Views, LowLight]:
-    """The views of a frame, denoised, and what is known of their noise."""
-    views = Views.of(rig, images, alpha=alpha, depth=settings.depth, field=settings.field)
-    return denoised_views(views, settings.noise)

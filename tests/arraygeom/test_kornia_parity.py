@@ -168,7 +168,6 @@ def cases(points: int, dtype: torch.dtype = F64) -> dict[str, Parity]:
 
 
 X = scene_points(RIG, 40)
-X_ALPHA, X_BETA = ALPHA.project(X).x, BETA.project(X).x
 CASES = cases(40)
 
 

@@ -1,10 +1,7 @@
-import itertools
-
 import pytest
 import torch
 
 from arraygeom.pixels import (
-    broadcast_shapes,
     coarse_grid,
     map_homogeneous,
     pixel_grid,
@@ -23,18 +20,6 @@ def blob(hw: tuple[int, int], x: float, y: float, *, sigma: float = 2.0) -> torc
 def centroid(image: torch.Tensor) -> torch.Tensor:
     grid = pixel_grid(image.shape[-2:], dtype=image.dtype)
     return (image[0, 0, ..., None] * grid).sum((0, 1)) / image.sum()
-
-
-def test_shapes_are_broadcast_as_by_torch():
-    known = [(), (1,), (2,), (0,), (3, 1), (1, 0), (2, 3, 1), torch.Size((3, 2))]
-    for shapes in itertools.chain(*(itertools.product(known, repeat=count) for count in range(4))):
-        try:
-            wanted = torch.broadcast_shapes(*shapes)
-        except RuntimeError:
-            with pytest.raises(RuntimeError, match="do not broadcast"):
-                broadcast_shapes(*shapes)
-        else:
-            assert broadcast_shapes(*shapes) == wanted
 
 
 def test_maps_and_their_inverses():

@@ -101,8 +101,6 @@ def test_values_that_cannot_be_read_are_yaml_errors(value):
             f"depth: [1, 2]\ncameras: {{a: {CAMERA}}}\ndepth: [1, 20]\n",
             "'depth' occurs twice, in lines 1 and 3",
         ),
-        (f"cameras:\n  a: {CAMERA}\n  a: {CAMERA}\n", "'a' occurs twice, in lines 2 and 3"),
-        (f"cameras:\n  1: {CAMERA}\n  '1': {CAMERA}\n", "'1' occurs twice, in lines 2 and 3"),
         (
             f"cameras: {{a: {CAMERA}, b: {CAMERA}}}\nlinks:\n"
             + 2 * "  - {alpha: a, beta: b, F: [[0, 0, 0], [0, 0, 1], [0, -1, 0]]}\n",

@@ -178,7 +178,7 @@ def calibration_job(folder: Path) -> Job:
             (photos / name).mkdir(parents=True)
             for i in range(6):
                 pose = c.cam_from_world @ boards[i]
-                image = photograph(c, pose, parse_board(BOARD), dpi=60)
+                image = photograph(c, pose, parse_board(BOARD))
                 cv2.imwrite(str(photos / name / f"{i}.png"), image)
 
     def arguments(lens: str) -> Arguments:

@@ -1,9 +1,16 @@
 """A room as cameras of any model see it: for tests of what a camera of one's own goes through."""
 
+import warnings
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
-from arraygeom import Camera, Rig, pixel_grid
+from arraygeom import Camera, Pose, Rig, intrinsics, pixel_grid, rotation_from_vector
+from arraygeom.lenses import CameraModel
+from pat import fuse, load_weights
+from pat.evaluation.metrics import score
+from tests.arraygeom.rigs import number
 
 ROOM = 3.0
 """Half of the room's side, metres."""
@@ -57,3 +64,39 @@ def recorded(rig: Rig) -> tuple[dict[str, Tensor], Tensor]:
     truth = images[rig.names[0]]
     grey = (truth * truth.new_tensor([0.299, 0.587, 0.114])[:, None, None]).sum(0, keepdim=True)
     return {**images, rig.names[0]: grey}, truth
+
+
+def rig_of_two(model: CameraModel, focal: float, hw: tuple[int, int], *, around: bool, wide: bool) -> Rig:
+    """Two cameras in the room: beta beside alpha, or around the ball, as parallel rays need. `wide` ones see
+    more than half of the space: to its corners."""
+    R = rotation_from_vector(number(0.0, 0.12 if around else -0.01, 0.0))
+    t = number(0.0, 0.0, 2.5) - R @ number(0.0, 0.0, 2.5) if around else number(-0.25, 0.01, 0.0)
+    poses = Pose.identity(), Pose(R, t)
+    cameras = [Camera(K=intrinsics(focal, hw), cam_from_world=p, hw=hw, distortion=model) for p in poses]
+    return Rig(dict(zip(("alpha", "beta"), cameras)), depth=(1.3, 5.3 if wide else 3.2))
+
+
+class Fused(NamedTuple):
+    """What `rig_of_two` recorded; alpha's true depth; PSNR of alpha's own grey and of the image fused without
+    a warning; the median relative error of its depth."""
+
+    images: dict[str, Tensor]
+    truth: Tensor
+    depth: Tensor
+    alone: float
+    psnr: float
+    off: float
+
+
+def fused_in_the_room(rig: Rig, *, wide: bool) -> Fused:
+    """By the usual weights; of `wide` cameras depth is a distance."""
+    images, truth = recorded(rig)
+    X, distance = hit(rig["alpha"], pixel_grid(rig["alpha"].hw, dtype=torch.float64))
+    depth = distance if wide else X[..., 2]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        frame = fuse(load_weights("mono-colour"), rig, images, alpha="alpha")
+    shown = images["alpha"].expand(3, -1, -1), frame.image
+    alone, psnr = (score(image.clamp(0, 1), truth).psnr for image in shown)
+    off = float(((frame.depth - depth) / depth).abs().nanmedian())
+    return Fused(images, truth, depth, alone, psnr, off)

@@ -2,39 +2,33 @@
 
 import inspect
 import math
-import warnings
 
 import numpy as np
 import pytest
 import torch
 
 from arraygeom import (
-    Camera,
     Curved,
     Epipolar,
     EpipolarLine,
     HomographyDisplacement,
     Local,
     NearestVoxels,
-    Pose,
     Rig,
     default_field,
     depth_of,
-    intrinsics,
     pixel_grid,
-    rotation_from_vector,
     sampling_locations,
     triangulate,
 )
 from arraygeom.io import write_rig
 from experiments.evaluation.sweeps import ablate as ablate_rigs
-from pat import fuse, load_weights
+from pat import load_weights
 from pat.cli.main import main
 from pat.evaluation.ablation import AblationCase, FieldFamily, ablate, families
-from pat.evaluation.metrics import score
 from pat.explore.page import opened
 from tests.arraygeom.rigs import number
-from tests.pat.any_camera import hit, recorded
+from tests.pat.any_camera import fused_in_the_room, hit, rig_of_two
 from tests.pat.own_cameras import (
     WIDE,
     OwnEquidistant,
@@ -63,17 +57,8 @@ WHOLE = "equidistant", "polynomial", "sphere"
 
 
 def rig_of(name: str) -> Rig:
-    """Two of the cameras in the room: beta beside alpha, or around the ball, as parallel rays need."""
-    model, focal = SIX[name]
-    R = rotation_from_vector(number(0.0, 0.12 if name == "telecentric" else -0.01, 0.0))
-    t = (
-        number(0.0, 0.0, 2.5) - R @ number(0.0, 0.0, 2.5)
-        if name == "telecentric"
-        else number(-0.25, 0.01, 0.0)
-    )
-    poses = Pose.identity(), Pose(R, t)
-    cameras = [Camera(K=intrinsics(focal, HW), cam_from_world=p, hw=HW, distortion=model) for p in poses]
-    return Rig(dict(zip(("alpha", "beta"), cameras)), depth=(1.3, 5.3 if name in WHOLE else 3.2))
+    """Two of the cameras in the room."""
+    return rig_of_two(*SIX[name], HW, around=name == "telecentric", wide=name in WHOLE)
 
 
 def by_angle(X, radius):
@@ -202,25 +187,18 @@ def test_what_cannot_serve_says_what_is_missing(name, tmp_path):
 )
 def test_pictures(name, tmp_path):
     rig = rig_of(name)
-    images, truth = recorded(rig)
-    X, distance = hit(rig["alpha"], pixel_grid(HW, dtype=torch.float64))
-    wanted = distance if name in WHOLE else X[..., 2]
-    network = load_weights("mono-colour")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        frame = fuse(network, rig, images, alpha="alpha")
-    alone, fused = (
-        score(i.clamp(0, 1), truth).psnr for i in (images["alpha"].expand(3, -1, -1), frame.image)
-    )
-    error = float(((frame.depth - wanted) / wanted).abs().nanmedian())
-    print(f"{name}: {alone:.2f} dB alone, {fused:.2f} fused, depth off by {error:.1%}")
-    assert fused > alone + 4
-    assert error < 0.1
+    found = fused_in_the_room(rig, wide=name in WHOLE)
+    print(f"{name}: {found.alone:.2f} dB alone, {found.psnr:.2f} fused, depth off by {found.off:.1%}")
+    assert found.psnr > found.alone + 4
+    assert found.off < 0.1
 
     chosen = {"calibrated": families()["calibrated"], "epipolar": FieldFamily(lambda far: Epipolar())}
-    case = AblationCase(name, rig, images, truth, wanted)
+    case, network = (
+        AblationCase(name, rig, found.images, found.truth, found.depth),
+        load_weights("mono-colour"),
+    )
     rows = {row.family: row for row in ablate(network, [case], out=tmp_path, chosen=chosen)}
-    assert rows["calibrated"].psnr == pytest.approx(fused, abs=1e-3)
+    assert rows["calibrated"].psnr == pytest.approx(found.psnr, abs=1e-3)
     assert rows["calibrated"].within_one > 0.5
     assert "needs pinhole cameras" in rows["epipolar"].note
     assert "pinhole" in rows["classical"].note

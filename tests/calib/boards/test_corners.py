@@ -36,7 +36,7 @@ def rendered(text):
     board = parse_board(text)
     R = rotation_from_vector(torch.deg2rad(tensor(24.0, -28.0, 9.0)))
     pose = Pose(R, tensor(0.01, -0.005, 0.34) - R @ tensor(*board.points.mean(0)))
-    return board, pose, photograph(CAMERA, pose, board, dpi=240, rays=rays()).astype(float)
+    return board, pose, photograph(CAMERA, pose, board, rays=rays()).astype(float)
 
 
 def seen(text, *, noise=1.5):

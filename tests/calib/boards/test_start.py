@@ -145,7 +145,7 @@ def photos(tmp_path):
     (tmp_path / "photos").mkdir()
     boards, rig = one_board(0), drawn(start, 3)
     for name, c in rig.cameras.items():
-        image = photograph(c, c.cam_from_world @ boards[0], BOARD, dpi=60)
+        image = photograph(c, c.cam_from_world @ boards[0], BOARD)
         cv2.imwrite(str(tmp_path / "photos" / f"{name}.png"), image)
     return tmp_path
 

@@ -3,6 +3,7 @@
 import hashlib
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -95,13 +96,14 @@ def test_gradcheck_also_twice():
     def run(*values, backend="auto"):
         return tuple(call(attend_with_statistics, dict(zip(small, values)), options, backend=backend))
 
-    assert gradcheck(run, tuple(small.values()), fast_mode=True)
-    assert gradgradcheck(run, tuple(small.values()), fast_mode=True)
-    assert gradgradcheck(
-        lambda *values: call(attend, dict(zip(small, values)), options), tuple(small.values()), fast_mode=True
-    )
+    def alone(*values):
+        return call(attend, dict(zip(small, values)), options)
+
+    given = tuple(small.values())
+    assert gradcheck(run, given, fast_mode=True)
+    assert all(gradgradcheck(function, given, fast_mode=True) for function in (run, alone))
     with pytest.raises(RuntimeError, match="second-order"):
-        gradgradcheck(lambda *values: run(*values, backend="cpu"), tuple(small.values()), fast_mode=True)
+        gradgradcheck(partial(run, backend="cpu"), given, fast_mode=True)
 
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
@@ -115,16 +117,12 @@ def test_pixels_without_samples_give_and_pass_zeros(backend, interpolation):
     mask = torch.ones(3, 3, 2, dtype=torch.bool)
     mask[1, 1] = False
     mask[2, 2] = True
-    out = attend_with_statistics(
-        q, key, value, Positions(xy, mask), interpolation=interpolation, backend=backend
-    )
+    how = {"interpolation": interpolation, "backend": backend}
+    out = attend_with_statistics(q, key, value, Positions(xy, mask), **how)
     assert all(t.abs().max() == 0 for t in out)
-    grads = torch.autograd.grad(
-        [t for t in out if t.requires_grad],
-        (q, key, value, xy),
-        [torch.ones_like(t) for t in out if t.requires_grad],
-        materialize_grads=True,
-    )
+    outputs = [t for t in out if t.requires_grad]
+    ones = [torch.ones_like(t) for t in outputs]
+    grads = torch.autograd.grad(outputs, (q, key, value, xy), ones, materialize_grads=True)
     assert all(g.abs().max() == 0 for g in grads)
 
 

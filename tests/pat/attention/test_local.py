@@ -1,5 +1,7 @@
 """The backend for windows: equal to the reference, chosen where it serves, and refused where it does not."""
 
+from functools import partial
+
 import pytest
 import torch
 from torch.autograd import forward_ad
@@ -8,6 +10,9 @@ from arraygeom import Local, Pair, View, lazily
 from arraygeom.threads import limited_to
 from pat.attention import attend, attend_with_statistics, cpu
 from pat.attention.kernels import ROWS
+
+BOTH = "local", "reference"
+nearest = partial(attend, interpolation="nearest")
 
 
 def features(hw=(20, 30), dtype=torch.float32, batch=2):
@@ -20,38 +25,26 @@ def features(hw=(20, 30), dtype=torch.float32, batch=2):
 @pytest.mark.parametrize("hw", [(5, 9), (2 * ROWS + 3, 40)])
 def test_it_gives_what_the_others_give(hw, field, backend):
     query, key, value = features(hw)
-    wanted = attend(
-        query.double(), 5 * key.double(), value.double(), field, interpolation="nearest", backend=backend
-    )
-    found = attend(query, 5 * key, value, field, interpolation="nearest", backend="local")
+    wanted = nearest(query.double(), 5 * key.double(), value.double(), field, backend=backend)
+    found = nearest(query, 5 * key, value, field, backend="local")
     torch.testing.assert_close(found.double(), wanted, rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize("field", [Local(7, 3), Local(3), Local(1)], ids=str)
 def test_a_bias_counts_for_each_sample(field):
     given, bias = features(), 3 * torch.randn(field.size**2, generator=torch.Generator().manual_seed(1))
-    local, reference = (
-        attend(*given, field, bias=bias, interpolation="nearest", backend=backend)
-        for backend in ("local", "reference")
-    )
+    local, reference = (nearest(*given, field, bias=bias, backend=backend) for backend in BOTH)
     torch.testing.assert_close(local, reference, rtol=1e-5, atol=1e-5)
-    without = attend(*given, field, interpolation="nearest")
-    assert torch.allclose(local, without, atol=1e-5) == (field.size == 1)
+    assert torch.allclose(local, nearest(*given, field), atol=1e-5) == (field.size == 1)
 
 
 @pytest.mark.parametrize("left", [0, 1, 12])
 def test_a_bias_may_leave_samples_out(left):
     given, bias = features(), torch.full((25,), -torch.inf)
     bias[torch.randperm(25, generator=torch.Generator().manual_seed(1))[:left]] = 0.5
-    backends = "local", "reference"
-    of_both = (
-        [
-            attend(*given, Local(5), bias=bias, interpolation="nearest", backend=backend)
-            for backend in backends
-        ],
-        [windows_gradients(given, Local(5), backend, bias=bias) for backend in backends],
-    )
-    for found, wanted in of_both:
+    values = [nearest(*given, Local(5), bias=bias, backend=backend) for backend in BOTH]
+    slopes = [windows_gradients(given, Local(5), backend, bias=bias) for backend in BOTH]
+    for found, wanted in (values, slopes):
         torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-5)
 
 
@@ -59,10 +52,7 @@ def test_a_bias_may_leave_samples_out(left):
 def test_scores_without_a_number_do_what_they_do_in_the_reference(score):
     query, key, value = (t.abs() for t in features())
     key[:, :, :8, :8] = score
-    local, reference = (
-        attend(query, key, value, Local(3), interpolation="nearest", backend=backend)
-        for backend in ("local", "reference")
-    )
+    local, reference = (nearest(query, key, value, Local(3), backend=backend) for backend in BOTH)
     torch.testing.assert_close(local, reference, equal_nan=True)
     assert local[..., 2:5, 2:5].isnan().all() == (score != -torch.inf)
 
@@ -71,7 +61,7 @@ def test_threads_change_no_bit():
     given, found = features((70, 50)), []
     for n in (1, 2, 5):
         with limited_to(n):
-            values = attend(*given, Local(7, 3), interpolation="nearest", backend="local")
+            values = nearest(*given, Local(7, 3), backend="local")
             found.append((values, *windows_gradients(given, Local(7, 3), "local")))
     assert all(torch.equal(one, first) for outputs in found for one, first in zip(outputs, found[0]))
 
@@ -79,7 +69,7 @@ def test_threads_change_no_bit():
 def windows_gradients(given, field, backend, *, order=1, **options):
     """Gradients by query, key and value of a function of the values; or of these gradients' squares."""
     query, key, value = (t.clone().requires_grad_() for t in given)
-    out = attend(query, 2 * key, value, field, interpolation="nearest", backend=backend, **options)
+    out = nearest(query, 2 * key, value, field, backend=backend, **options)
     found = out.sin().sum()
     for _ in range(order):
         gradients = torch.autograd.grad(found, (query, key, value), create_graph=order == 2)
@@ -95,17 +85,15 @@ def test_its_gradients_are_the_references(field, order, backend):
     found = windows_gradients(given, field, backend, order=order)
     wanted = windows_gradients([t.double() for t in given], field, "reference", order=order)
     for one, other in zip(found, wanted):
-        torch.testing.assert_close(
-            one.double(), other, rtol=1e-4, atol=5e-5 * (1 + other.abs().amax().item())
-        )
+        most = 5e-5 * (1 + other.abs().amax().item())
+        torch.testing.assert_close(one.double(), other, rtol=1e-4, atol=most)
 
 
 def test_it_finds_the_gradients_that_are_wanted_only():
     query, key, value = features()
     for wanted in (query, key, value):
         wanted.requires_grad_()
-        out = attend(query, key, value, Local(3), interpolation="nearest", backend="local")
-        out.sum().backward()
+        nearest(query, key, value, Local(3), backend="local").sum().backward()
         assert [t.grad is not None for t in (query, key, value)] == [t is wanted for t in (query, key, value)]
         wanted.requires_grad_(False)
         wanted.grad = None
@@ -141,8 +129,8 @@ def test_forward_mode_is_the_references():
     with forward_ad.dual_level():
         given = query, forward_ad.make_dual(key, torch.ones_like(key)), value
         with pytest.raises(RuntimeError, match="derivatives"):
-            attend(*given, Local(3), interpolation="nearest", backend="local")
-        assert forward_ad.unpack_dual(attend(*given, Local(3), interpolation="nearest")).tangent is not None
+            nearest(*given, Local(3), backend="local")
+        assert forward_ad.unpack_dual(nearest(*given, Local(3))).tangent is not None
 
 
 def test_statistics_are_by_the_others():
@@ -156,6 +144,6 @@ def test_statistics_are_by_the_others():
 def test_it_is_chosen_where_it_serves(monkeypatch):
     given, called = features(), []
     monkeypatch.setattr(cpu, "forward_local", lambda *inputs: called.append(inputs) or inputs[2:])
-    attend(*given, Local(3), interpolation="nearest")
-    attend(*given, Local(3), interpolation="nearest", backend="cpu")
+    nearest(*given, Local(3))
+    nearest(*given, Local(3), backend="cpu")
     assert len(called) == 1

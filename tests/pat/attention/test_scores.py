@@ -48,9 +48,8 @@ def test_log_sum_and_mean_score_are_the_formula_in_value_and_gradient(interpolat
         found = function(one)
         torch.testing.assert_close(found[some], expected, rtol=1e-10, atol=1e-10)
         ours = torch.autograd.grad((found * cotangent)[some].sum(), [one.query, one.key])
-        theirs = torch.autograd.grad(
-            (expected * cotangent[some]).sum(), [one.query, one.key], retain_graph=True
-        )
+        loss = (expected * cotangent[some]).sum()
+        theirs = torch.autograd.grad(loss, [one.query, one.key], retain_graph=True)
         torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-9)
 
 
@@ -67,9 +66,8 @@ def test_the_peak_is_where_the_largest_score_is(dtype):
     best = torch.where(counts, scores, -torch.inf).argmax(-1)
     expected = xy.gather(-2, best[..., None, None].expand(*best.shape, 1, 2))[..., 0, :]
     some = counts.any(-1)
-    torch.testing.assert_close(
-        peak_position(one).movedim(1, -1)[some], expected[some].float(), rtol=0, atol=1e-3
-    )
+    found = peak_position(one).movedim(1, -1)
+    torch.testing.assert_close(found[some], expected[some].float(), rtol=0, atol=1e-3)
 
 
 def test_strided_is_every_other_pixel():

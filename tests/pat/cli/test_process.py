@@ -11,7 +11,6 @@ from threading import Barrier, Thread
 import pytest
 
 from pat.cli import options
-from pat.cli.demo import Demo
 from pat.cli.main import Pat, command_paths, main
 from pat.cli.options import FIELD_NAMES, WEIGHT_NAMES, field_named
 
@@ -140,21 +139,6 @@ def test_commands_that_do_not_exist(refusal):
     assert refusal("fues") == "pat: no command 'pat fues'; did you mean 'fuse'?"
     assert refusal("rig", "docter") == "pat: no command 'pat rig docter'; did you mean 'doctor'?"
     assert "known here: fuse, align" in refusal("--precision")
-
-
-@pytest.mark.parametrize(
-    ("error", "said"),
-    [
-        ("drawing needs matplotlib: pip install 'arraygeom-pat[plots]'", "matplotlib: pip install"),
-        ("No module named 'dask'", "No module named 'dask': pip install 'arraygeom-pat[all]'"),
-    ],
-)
-def test_a_package_that_is_not_installed_is_one_line(error, said, monkeypatch, refusal):
-    def fail(self):
-        raise ImportError(error)
-
-    monkeypatch.setattr(Demo, "run", fail)
-    assert said in refusal("demo")
 
 
 def test_a_closed_pipe_is_quiet():

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import torch
 
-from arraygeom import Camera, Pose, Rig, Sensor, intrinsics, pixel_grid, sample
+from arraygeom import Rig, Sensor, pixel_grid, sample
 from pat.media.colour import luminance
+from tests.arraygeom.rigs import parallel_rig
 
 HW, FOCAL, BASELINE = (96, 160), 160.0, 0.1
 FAR, NEAR = 4.0, 2.0
@@ -39,17 +40,9 @@ def seen(time: float, position: float) -> torch.Tensor:
 
 def rig(offset: float = 0.0) -> Rig:
     """Alpha, and beta whose first frame is `offset` seconds after alpha's."""
-    eye = torch.eye(3, dtype=torch.float64)
-    K = intrinsics(FOCAL, HW)
-    t = torch.tensor([-BASELINE, 0, 0], dtype=torch.float64)
     fast, slow = Sensor(response="mono", frame_rate=RATE), Sensor("rgb", frame_rate=SLOW, time_offset=offset)
-    return Rig(
-        {
-            "fast": Camera(K=K, cam_from_world=Pose.identity(), hw=HW, sensor=fast),
-            "slow": Camera(K=K, cam_from_world=Pose(eye, t), hw=HW, sensor=slow),
-        },
-        depth=(1.5, 6.0),
-    )
+    rig = parallel_rig(FOCAL, HW, {"fast": (), "slow": (BASELINE,)}, (1.5, 6.0), sensor=fast)
+    return rig.with_camera("slow", rig["slow"].replace(sensor=slow))
 
 
 def recording(count: int, offset: float = 0.0) -> tuple[dict[str, list[torch.Tensor]], list[torch.Tensor]]:

@@ -68,6 +68,12 @@ def array(lens: Distortion | None = None, turns: int = 0) -> tuple[Rig, dict[str
     return rig, images
 
 
+@pytest.fixture(scope="module")
+def found():
+    """The array, aligned."""
+    return align(*array(), alpha="mono", correct=False)
+
+
 @pytest.mark.parametrize("count", [1, 3])
 def test_fine_texture_and_short_segments_are_no_reason_for_doubt(count):
     """Matches are more distinct then than those that certainty was fitted to, and are right; it was 0.06."""
@@ -95,9 +101,8 @@ def test_positions_are_of_the_recorded_image(lens, turns, field):
     found = align(rig, images, alpha="mono", correct=False, field=field)
     view = found["nir"]
     y, x = np.mgrid[: HW[0], : HW[1]]
-    X = rig["mono"].unproject(
-        torch.from_numpy(np.stack([x, y], -1).astype(float)), torch.full(HW, DEPTH).double()
-    )
+    pixels = torch.from_numpy(np.stack([x, y], -1).astype(float))
+    X = rig["mono"].unproject(pixels, torch.full(HW, DEPTH).double())
     expected = rig["nir"].project(X).x.numpy()
     inner = (slice(12, -12), slice(30, -12))
     off = np.linalg.norm(view.positions - expected, axis=-1)[inner]
@@ -141,16 +146,12 @@ def test_values_are_samples_of_what_was_recorded(interpolation, kind):
     counts = np.rint(20000 + 20000 * images["nir"].numpy()).astype(np.uint16)
     for recorded in (counts, counts.astype(np.float32)):
         own = {"mono": images["mono"], "nir": recorded}
-        view = align(rig, images, alpha="mono", recorded=own, interpolation=interpolation, correct=False)[
-            "nir"
-        ]
+        found = align(rig, images, alpha="mono", recorded=own, interpolation=interpolation, correct=False)
+        view = found["nir"]
         assert view.values.dtype == recorded.dtype
         where = torch.from_numpy(np.nan_to_num(view.positions)).double()[None]
-        taken = (
-            sample(torch.from_numpy(recorded.astype(np.float64))[None], where, interpolation=kind)
-            .values[0]
-            .numpy()
-        )
+        values = torch.from_numpy(recorded.astype(np.float64))[None]
+        taken = sample(values, where, interpolation=kind).values[0].numpy()
         error = np.abs(view.values.astype(float) - taken)[:, view.valid]
         assert error.max() <= (0.5 if recorded.dtype == np.uint16 else 1e-6 * 40000)
         if interpolation == "nearest":
@@ -187,9 +188,8 @@ def test_the_greatest_integers_stay_so():
     assert int(taken[0, 0, 0]) == pytest.approx(np.iinfo(np.int64).max, rel=1e-12)
 
 
-def test_without_a_view_there_are_no_values_unless_filled():
-    rig, images = array()
-    view = align(rig, images, alpha="mono", correct=False)["nir"]
+def test_without_a_view_there_are_no_values_unless_filled(found):
+    view = found["nir"]
     beyond = view.visibility == OUTSIDE
     assert beyond.any()
     assert np.isnan(view.values[:, ~view.valid]).all()
@@ -197,7 +197,7 @@ def test_without_a_view_there_are_no_values_unless_filled():
     full = filled(np.where(view.valid, view.values, 0), view.valid, "propagate")
     assert np.isin(full, view.values[:, view.valid]).all()
     assert (full[:, view.valid] == view.values[:, view.valid]).all()
-    everything = align(rig, images, alpha="mono", correct=False, min_confidence=0.0)["nir"]
+    everything = align(*array(), alpha="mono", correct=False, min_confidence=0.0)["nir"]
     assert (everything.visibility[~beyond] == SEEN).all()
 
 
@@ -252,9 +252,7 @@ def test_types_that_differ_go_to_files_of_their_own(tmp_path):
     assert not (tmp_path / "aligned.tif").exists()
 
 
-def test_files_of_a_former_alignment_are_gone(tmp_path):
-    rig, images = array()
-    found = align(rig, images, alpha="mono", correct=False)
+def test_files_of_a_former_alignment_are_gone(found, tmp_path):
     save_aligned(found, tmp_path)
     (tmp_path / "index.html").write_text("its page")
     unknown = replace(found, depth=np.full_like(found.depth, np.nan))
@@ -262,23 +260,22 @@ def test_files_of_a_former_alignment_are_gone(tmp_path):
     assert {path.name for path in written} == {path.name for path in tmp_path.iterdir()}
 
 
-def test_a_camera_called_depth_has_no_file_of_its_own(tmp_path):
-    rig, images = array()
+def test_a_camera_called_depth_has_no_file_of_its_own(found, tmp_path):
+    usual, (rig, images) = shown_layers(found), array()
     rig = Rig({"mono": rig["mono"], "depth": rig["nir"]}, depth=rig.depth)
     images = {"mono": images["mono"], "depth": images["nir"]}
     found = align(rig, images, alpha="mono", correct=False)
     assert (tifffile.imread(save_aligned(found, tmp_path)[0]) == found.stack())[0].all()
-    layers, usual = shown_layers(found), shown_layers(align(*array(), alpha="mono", correct=False))
+    layers = shown_layers(found)
     assert torch.equal(layers["depth"], usual["nir"])
     assert torch.equal(layers["derived depth"], usual["depth"])
     with pytest.raises(ValueError, match=r"'depth' .*depth\.tif"):
         save_aligned(found, tmp_path, separate=True)
 
 
-def test_ndvi_needs_both_bands_and_both_views():
-    rig, images = array()
-    found = align(rig, images, alpha="mono", correct=False)
+def test_ndvi_needs_both_bands_and_both_views(found):
     assert ndvi(found) is None
+    rig, images = array()
     red = rig.with_camera("mono", rig["mono"].replace(sensor=Sensor(response=Band(660.0, 40.0))))
     found = align(red, images, alpha="mono", correct=False)
     index, (r, nir) = ndvi(found), (found.band(name) for name in ("mono", "nir"))
@@ -287,7 +284,7 @@ def test_ndvi_needs_both_bands_and_both_views():
     assert np.allclose(index[seen], ((nir - r) / (nir + r))[seen], atol=1e-6, equal_nan=True)
 
 
-def test_mistakes_are_named(tmp_path):
+def test_mistakes_are_named(found):
     rig, images = array()
     with pytest.raises(ValueError, match=r"'nir' .*1x4x4.*\(C, 96, 160\)"):
         align(rig, images, alpha="mono", recorded={**images, "nir": np.zeros((1, 4, 4))}, correct=False)
@@ -298,7 +295,7 @@ def test_mistakes_are_named(tmp_path):
         with pytest.raises(ValueError, match=said):  # before anything is matched
             align(rig, images, alpha="mono", recorded=recorded, matcher=lambda inputs: pytest.fail("matched"))
     with pytest.raises(KeyError, match="there are: mono, nir"):
-        align(rig, images, alpha="mono", correct=False).band("red")
+        found.band("red")
 
 
 def test_weights_without_matches_are_refused():
@@ -337,9 +334,8 @@ def test_ndvi_is_of_light_where_the_sensors_are_stated():
     facts = {"mono": (Band(660.0, 40.0), 100.0, 0.01, 2.0), "nir": (Band(840.0, 40.0), 300.0, 0.04, 1.0)}
     cameras, counts = {}, {}
     for name, (band, black, exposure, gain) in facts.items():
-        sensor = Sensor(
-            response=band, coding="linear", bits=16, black_level=black, exposure=exposure, gain=gain
-        )
+        recorded = {"coding": "linear", "bits": 16, "black_level": black}
+        sensor = Sensor(response=band, exposure=exposure, gain=gain, **recorded)
         cameras[name] = rig[name].replace(sensor=sensor)
         counts[name] = np.rint(black + images[name].numpy() * 1e6 * exposure * gain).astype(np.uint16)
     stated = rig.replace(cameras=cameras)

@@ -18,6 +18,7 @@ from pat.matching.inputs import Inputs
 from pat.networks.weights import load_weights
 from pat.sensors import NoiseLevel
 from tests.pat.commands import pat
+from tests.pat.fusion.test_results import frame_of
 
 
 def sample_of_bands(scales: dict[str, float]) -> tuple[Rig, dict[str, torch.Tensor]]:
@@ -71,9 +72,7 @@ def test_bands_keep_their_own_values_where_levels_are_matched():
 
 
 def test_bands_are_files_by_name_with_their_confidences(tmp_path):
-    frame = Frame(
-        torch.rand(3, 6, 8), torch.full((6, 8), torch.nan), *torch.rand(2, 6, 8), torch.rand(3, 6, 8).half()
-    )
+    frame = frame_of(3)._replace(by_band=torch.rand(3, 6, 8).half())
     written = save_frame(frame, tmp_path, bands=["red", "nir", "edge"])
     assert {path.name for path in written} == {"fused.png", "confidence.png"} | {
         f"{kind}_{name}.png" for kind in ("fused", "confidence") for name in ("red", "nir", "edge")
@@ -104,9 +103,8 @@ def test_one_band_that_matches_badly_is_no_wrong_rig():
 
 
 def test_plain_noise_names_the_option_that_it_needs():
-    image = torch.nn.functional.interpolate(torch.rand(1, 1, 16, 16), size=(200, 200), mode="bicubic").clamp(
-        0, 1
-    )
+    rough = torch.rand(1, 1, 16, 16)
+    image = torch.nn.functional.interpolate(rough, size=(200, 200), mode="bicubic").clamp(0, 1)
     noisy = NoiseLevel.of_electrons(60, 2).recorded(image, torch.Generator().manual_seed(0))
     assert noise_advice(Inputs(image, ())) == ""
     assert "try `--noise estimate`" in noise_advice(Inputs(noisy, ()))

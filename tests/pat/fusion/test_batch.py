@@ -51,11 +51,9 @@ def batch(material, out, **options) -> Batch:
     files = {name: find_images(material / name) for name in ("fast", "slow")}
     if not options.get("sequence"):
         files["slow"] = [files["slow"][0]] * len(files["fast"])
-    of_frames = {
-        entry.name: options.pop(entry.name) for entry in fields(FuseSettings) if entry.name in options
-    }
-    options = {"weights": str(material / "tiny.safetensors"), "files": files, **options}
-    options["settings"] = FuseSettings(**of_frames)
+    names = {entry.name for entry in fields(FuseSettings)} & set(options)
+    settings = FuseSettings(**{name: options.pop(name) for name in names})
+    options = {"weights": str(material / "tiny.safetensors"), "files": files, "settings": settings, **options}
     return Batch(**{"rig": Rig.load(material / "rig.yaml"), "alpha": "fast", "out": out, **options})
 
 
@@ -65,9 +63,8 @@ def contents(out: Path) -> dict[str, bytes]:
 
 def test_images_are_found_in_the_order_of_their_numbers(material, tmp_path):
     assert [p.name for p in find_images(material / "fast")] == [f"fast_{i}.png" for i in range(8, 15)]
-    assert [p.name for p in find_images(f"{material}/fast/*_1?.png")] == [
-        f"fast_{i}.png" for i in range(10, 15)
-    ]
+    found = [p.name for p in find_images(f"{material}/fast/*_1?.png")]
+    assert found == [f"fast_{i}.png" for i in range(10, 15)]
     with pytest.raises(FileNotFoundError, match="mono: "):
         find_images(tmp_path, name="mono")
 
@@ -150,9 +147,8 @@ def test_a_stopped_sequence_is_resumed_to_the_same_bits(material, tmp_path, monk
 
 
 def test_other_settings_are_not_mixed_in(material, tmp_path):
-    batch(
-        material, tmp_path / "out", files={n: find_images(material / n)[:1] for n in ("fast", "slow")}
-    ).run()
+    files = {name: find_images(material / name)[:1] for name in ("fast", "slow")}
+    batch(material, tmp_path / "out", files=files).run()
     with pytest.raises(ValueError, match=r"settings.yaml: "):
         batch(material, tmp_path / "out", match_levels=True).run(resume=True)
 
@@ -311,9 +307,8 @@ def test_one_command_at_a_time_writes_to_a_folder(material, tmp_path, monkeypatc
 
 def test_a_colour_file_of_a_raw_camera_is_refused_in_sequences_too(material, tmp_path):
     job = batch(material, tmp_path, sequence=True)
-    raw = job.rig.with_camera(
-        "slow", job.rig["slow"].replace(sensor=replace(job.rig["slow"].sensor, bayer="RGGB"))
-    )
+    slow = job.rig["slow"]
+    raw = job.rig.with_camera("slow", slow.replace(sensor=replace(slow.sensor, bayer="RGGB")))
     with pytest.raises(JobError, match=r"slow: .*slow_8.png: .*RGGB"):
         replace(job, rig=raw).run()
 
@@ -377,12 +372,8 @@ def test_noise_and_luminance_are_planned_and_among_the_settings(material, tmp_pa
     job = batch(material, tmp_path, noise=noise, keep_alpha=True)
     again = Batch.from_json(job.to_json())
     assert (again.settings.noise, again.settings.keep_alpha) == (noise, True)
-    other = (
-        batch(material, tmp_path),
-        batch(material, tmp_path, noise=noise),
-        batch(material, tmp_path, luminance="mix"),
-    )
-    assert len({job.dependencies, *(b.dependencies for b in other)}) == 4
+    others = [batch(material, tmp_path, **how) for how in ({}, {"noise": noise}, {"luminance": "mix"})]
+    assert len({job.dependencies, *(other.dependencies for other in others)}) == 4
 
 
 def test_settings_reach_the_fusion_of_frames_and_of_sequences(material, tmp_path, monkeypatch):

@@ -158,6 +158,9 @@ def test_views_name_what_is_wrong():
         ),
         (images | {"a": images["a"].half()}, "'a' is float16 of shape"),
         (images | {"a": images["a"][0]}, r"'a' is float32 of shape \(64, 96\): wanted float32 \(C, H, W\)"),
+        (images | {"b": images["b"].to("meta")}, "'b' is torch.strided on meta: give a dense tensor"),
+        (images | {"b": images["b"].to_sparse()}, "'b' is torch.sparse_coo on cpu: give a dense tensor"),
+        (images | {"b": images["b"].movedim(0, -1)}, r"of shape \(64, 96, 3\): wanted float32 \(C, H, W\)"),
     ):
         with pytest.raises(ValueError, match=message):
             Views.of(rig, wrong, alpha="a")

@@ -39,9 +39,8 @@ def test_a_frame_that_a_camera_lacks_shifts_none(prefix_a, prefix_b):
     """Of as many files each, they were fused one by one: 2 with 1, 3 with 2."""
     a = [f"{prefix_a}{i}" for i in (0, 2, 3, 4)]
     b = [f"{prefix_b}{i}" for i in (0, 1, 2, 4)]
-    with pytest.warns(
-        MissingFramesWarning, match=rf"'a' has none of {prefix_b}1; 'b' has none of {prefix_a}3: 3 of 5"
-    ):
+    said = rf"'a' has none of {prefix_b}1; 'b' has none of {prefix_a}3: 3 of 5"
+    with pytest.warns(MissingFramesWarning, match=said):
         found = stems(matched_frames(files(a=a, b=b)))
     assert found == {"a": [f"{prefix_a}{i}" for i in (0, 2, 4)], "b": [f"{prefix_b}{i}" for i in (0, 2, 4)]}
 

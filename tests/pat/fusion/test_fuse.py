@@ -29,6 +29,7 @@ from arraygeom import (
 )
 from arraygeom.chunks import Tile, tiles_of
 from arraygeom.fields import AroundDepth
+from arraygeom.threads import limited_to
 from calib.images.matches import match_points, seen_depths
 from pat.data.pairs import folder_pairs
 from pat.evaluation.metrics import score
@@ -77,6 +78,18 @@ def texture(channels: int, hw: tuple[int, int]) -> torch.Tensor:
     return torch.nn.functional.interpolate(rough, hw, mode="bicubic", align_corners=False)[0].clamp(0, 1)
 
 
+def scene(hw=(64, 96), beta_hw=(64, 96), **focal) -> tuple[Rig, dict[str, torch.Tensor]]:
+    """A rig, and images of its cameras."""
+    return rig_of(hw, beta_hw, **focal), {"mono": texture(1, hw), "colour": texture(3, beta_hw)}
+
+
+def in_tiles(patched, hw, side, halo):
+    """What is fused from here on is fused in these tiles."""
+    tiles = list(tiles_of(hw, side, halo))
+    patched.setattr(pat.fusion.tiles, "tiles_within", lambda *_: tiles)
+    return tiles
+
+
 @pytest.mark.parametrize(
     ("kind", "dtype", "bound"),
     [
@@ -88,20 +101,18 @@ def texture(channels: int, hw: tuple[int, int]) -> torch.Tensor:
 )
 def test_tiled_equals_whole(kind, dtype, bound, monkeypatch):
     """At every pixel, the tiles' borders included. The frame is wider than a tile with its halo."""
-    hw, beta_hw = (34, 1620), (30, 1110)
-    network, rig = network_of(kind).to(dtype), rig_of(hw, beta_hw)
-    images = {"mono": texture(1, hw).to(dtype), "colour": texture(3, beta_hw).to(dtype)}
+    hw, network = (34, 1620), network_of(kind).to(dtype)
+    rig, images = scene(hw, (30, 1110))
+    images = {name: image.to(dtype) for name, image in images.items()}
     whole = fuse(network, rig, images, alpha="mono")
-    tiles = list(tiles_of(hw, 160, network.halo))
-    assert any(t.outer[3] - t.outer[2] < hw[1] for t in tiles)
-    monkeypatch.setattr(pat.fusion.tiles, "tiles_within", lambda *_: tiles)
+    assert any(t.outer[3] - t.outer[2] < hw[1] for t in in_tiles(monkeypatch, hw, 160, network.halo))
     tiled = fuse(network, rig, images, alpha="mono")
     assert (tiled.image - whole.image).abs().max() < bound
     assert torch.equal(tiled.depth.isnan(), whole.depth.isnan())
     assert (tiled.confidence - whole.confidence).abs().max() < bound
     assert torch.allclose(1 / tiled.depth, 1 / whole.depth, atol=10 * bound, equal_nan=True)
     monkeypatch.setattr(type(network), "halo", 16)
-    monkeypatch.setattr(pat.fusion.tiles, "tiles_within", lambda *_: list(tiles_of(hw, 160, 16)))
+    in_tiles(monkeypatch, hw, 160, 16)
     assert (fuse(network, rig, images, alpha="mono").image - whole.image).abs().max() > bound
 
 
@@ -119,8 +130,7 @@ def test_matching_in_pieces_is_nearly_that_of_the_whole_and_tiles_do_not_matter(
     )
     off = (pieces.image - whole.image).abs().amax(0)
     assert (off > 0.005).float().mean() < 2.5e-3
-    hw = sample.rig["mono"].hw
-    monkeypatch.setattr(pat.fusion.tiles, "tiles_within", lambda *_: list(tiles_of(hw, 192, MAX_HALO)))
+    in_tiles(monkeypatch, sample.rig["mono"].hw, 192, MAX_HALO)
     tiled = fuse(network, sample.rig, images, alpha="mono")
     assert (tiled.image - pieces.image).abs().max() < 1e-5
     assert (tiled.confidence - pieces.confidence).abs().max() < 1e-5
@@ -140,11 +150,7 @@ def test_halos_are_wide_enough_for_the_weights(folder, precision, most, rms, sha
     whole = fuse(network, rig, images, alpha="left", field=field)
     h, w = rig["left"].hw
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(
-            pat.fusion.tiles,
-            "tiles_within",
-            lambda *_: list(tiles_of((h, w), (-(-h // 32) * 16, -(-w // 64) * 16), MAX_HALO)),
-        )
+        in_tiles(patched, (h, w), (-(-h // 32) * 16, -(-w // 64) * 16), MAX_HALO)
         tiled = fuse(network, rig, images, alpha="left", field=field)
     assert (tiled.image - whole.image).abs().max() < most
     assert (tiled.image - whole.image).square().mean().sqrt() < rms
@@ -211,7 +217,7 @@ def test_what_is_not_what_it_should_be_is_refused_in_a_line():
 
 
 def test_what_is_no_field_or_no_list_is_refused_in_a_line():
-    rig, images = rig_of((64, 96), (64, 96)), {"mono": texture(1, (64, 96)), "colour": texture(3, (64, 96))}
+    rig, images = scene()
 
     def ends(pair, x):
         return x, x
@@ -231,36 +237,23 @@ def test_what_is_no_field_or_no_list_is_refused_in_a_line():
         fuse("mono.png")
 
 
-@pytest.mark.parametrize(
-    ("image", "problem"),
-    [
-        (torch.zeros(3, 64, 96, device="meta"), "'colour' is torch.strided on meta: give a dense tensor"),
-        (torch.ones(3, 64, 96).to_sparse(), "'colour' is torch.sparse_coo on cpu: give a dense tensor"),
-        (torch.ones(64, 96, 3), r"float32 of shape \(64, 96, 3\): wanted float32 \(C, H, W\)"),
-    ],
-)
-def test_images_of_another_form_are_refused(image, problem):
-    images = {"mono": texture(1, (64, 96)), "colour": image}
-    with pytest.raises(ValueError, match=problem):
-        fuse(network_of("GuidedPAT"), rig_of((64, 96), (64, 96)), images, alpha="mono")
-
-
 def test_an_image_of_one_colour_is_named():
     """As with images alone: a black frame was a rig that does not fit."""
-    images = {"mono": texture(1, (64, 96)), "colour": torch.ones(3, 64, 96)}
+    rig, images = scene()
+    images["colour"] = torch.ones(3, 64, 96)
     with pytest.warns(UserWarning, match="'colour' is of one colour, with nothing to match: give another"):
-        fuse(network_of("GuidedPAT"), rig_of((64, 96), (64, 96)), images, alpha="mono")
+        fuse(network_of("GuidedPAT"), rig, images, alpha="mono")
 
 
 def test_a_network_elsewhere_is_refused():
     """It gave NaN, without a word."""
-    rig, images = rig_of((64, 96), (64, 96)), {"mono": texture(1, (64, 96)), "colour": texture(3, (64, 96))}
+    rig, images = scene()
     with pytest.raises(ValueError, match="'mono' is on cpu, the network on meta: give all on one device"):
         fuse(network_of("GuidedPAT").to("meta"), rig, images, alpha="mono")
 
 
 def test_precision_is_that_of_the_weights():
-    rig, images = rig_of((64, 96), (64, 96)), {"mono": texture(1, (64, 96)), "colour": texture(3, (64, 96))}
+    rig, images = scene()
     network, double = network_of("GuidedPAT"), {name: image.double() for name, image in images.items()}
     with pytest.raises(
         ValueError, match=r"float64, the network's weights are float32: .*network.to\(torch.float64\)"
@@ -274,16 +267,13 @@ def test_precision_is_that_of_the_weights():
 
 
 def test_images_are_asked_for_once_and_only_when_they_are_needed():
-    hw, beta_hw = (64, 96), (60, 80)
-    given = {"mono": texture(1, hw), "colour": texture(3, beta_hw)}
-    asked = []
+    (rig, given), network, asked = scene(beta_hw=(60, 80)), network_of("GuidedPAT"), []
 
     class Files(dict):
         def __getitem__(self, name):
             asked.append(name)
             return super().__getitem__(name)
 
-    network, rig = network_of("GuidedPAT"), rig_of(hw, beta_hw)
     found = fuse(network, rig, Files(given), alpha="mono")
     assert torch.equal(found.image, fuse(network, rig, given, alpha="mono").image)
     assert sorted(asked) == ["colour", "mono"]
@@ -321,8 +311,7 @@ def test_tiles_are_those_with_the_least_work():
 
 
 def test_the_plan_is_announced_before_the_work():
-    plans, rig = [], rig_of((50, 70), (40, 60))
-    images = {"mono": torch.rand(1, 50, 70), "colour": torch.rand(3, 40, 60)}
+    plans, (rig, images) = [], scene((50, 70), (40, 60))
     fuse(network_of("PAT"), rig, images, alpha="mono", announce=plans.append)
     assert str(plans[0]).startswith("1 piece, 0.4")
     assert plans[0].seconds is None
@@ -330,9 +319,8 @@ def test_the_plan_is_announced_before_the_work():
 
 def test_a_wide_beta_is_enlarged_only_where_alpha_sees():
     """Beta sees ten times alpha's field: what fusing gives is the same, and what is worked on is small."""
-    hw, wide = (64, 96), (300, 440)
-    rig, network = rig_of(hw, wide, focal=300.0, beta_focal=100.0), network_of("GuidedPAT")
-    images = {"mono": texture(1, hw), "colour": texture(3, wide)}
+    wide, network = (300, 440), network_of("GuidedPAT")
+    rig, images = scene(beta_hw=wide, beta_focal=100.0)
     views = pat.fusion.steps.equal_resolution(network, Views.of(rig, images, alpha="mono")).views
     assert math.prod(views.images["colour"].shape[1:]) < 0.6 * 9 * math.prod(wide)
     cut = fuse(network, rig, images, alpha="mono")
@@ -344,10 +332,8 @@ def test_a_wide_beta_is_enlarged_only_where_alpha_sees():
 
 
 def test_a_stopped_frame_goes_on_with_its_tiles(tmp_path, monkeypatch):
-    hw, beta_hw = (34, 300), (30, 210)
-    network, rig = network_of("PAT"), rig_of(hw, beta_hw)
-    images = {"mono": texture(1, hw), "colour": texture(3, beta_hw)}
-    monkeypatch.setattr(pat.fusion.tiles, "tiles_within", lambda *_: list(tiles_of(hw, 64, network.halo)))
+    (rig, images), network = scene((34, 300), (30, 210)), network_of("PAT")
+    in_tiles(monkeypatch, (34, 300), 64, network.halo)
     whole, made, fuse_tile = fuse(network, rig, images, alpha="mono"), [], pat.fusion.tiles.fuse_tile
 
     def counted(network, frame, state, tile):
@@ -373,10 +359,9 @@ def test_a_stopped_frame_goes_on_with_its_tiles(tmp_path, monkeypatch):
 
 def test_tiles_of_another_depth_map_are_not_taken(tmp_path, monkeypatch):
     """Every 64th pixel was compared."""
-    hw = (34, 130)
-    network, rig = network_of("GuidedPAT"), rig_of(hw, (30, 110))
-    images = {"mono": texture(1, hw), "colour": texture(3, (30, 110))}
-    monkeypatch.setattr(pat.fusion.tiles, "tiles_within", lambda *_: list(tiles_of(hw, 64, 16)))
+    hw, network = (34, 130), network_of("GuidedPAT")
+    rig, images = scene(hw, (30, 110))
+    in_tiles(monkeypatch, hw, 64, 16)
     depth, counts = torch.full(hw, 2.0), []
     for value in (2.0, 3.0):
         depth[5:20, 10:50] = value
@@ -388,10 +373,11 @@ def test_tiles_of_another_depth_map_are_not_taken(tmp_path, monkeypatch):
 
 def test_fields_of_cameras_that_are_not_there_and_other_bands_of_alpha_are_refused():
     """A misspelt name was ignored; two or four bands ended in an error of torch's."""
-    rig, images = rig_of((64, 96), (64, 96)), {"mono": texture(1, (64, 96)), "colour": texture(3, (64, 96))}
-    network = network_of("GuidedPAT")
+    (rig, images), network = scene(), network_of("GuidedPAT")
     with pytest.raises(ValueError, match="'color'"):
         fuse(network, rig, images, alpha="mono", field={"color": Epipolar()})
+    with pytest.raises(ValueError, match="no camera 'color'; did you mean 'colour'"):
+        fuse(network, rig, {**images, "color": images["colour"]}, alpha="mono")
     for bands in (2, 4):
         with pytest.raises(ValueError, match=f"alpha, 'mono', has {bands} bands"):
             fuse(network, rig, {**images, "mono": texture(bands, (64, 96))}, alpha="mono")
@@ -401,10 +387,9 @@ def test_fields_of_cameras_that_are_not_there_and_other_bands_of_alpha_are_refus
 
 def test_tiles_of_another_luminance_scale_or_precision_are_not_taken(tmp_path, monkeypatch):
     """A rig of other units has the same segments, and another depth."""
-    hw, beta_hw = (34, 130), (30, 110)
-    network, rig = network_of("GuidedPAT"), rig_of(hw, beta_hw)
-    images = {"mono": texture(1, hw), "colour": texture(3, beta_hw)}
-    monkeypatch.setattr(pat.fusion.tiles, "tiles_within", lambda *_: list(tiles_of(hw, 64, 16)))
+    hw, network = (34, 130), network_of("GuidedPAT")
+    rig, images = scene(hw, (30, 110))
+    in_tiles(monkeypatch, hw, 64, 16)
     larger = rig.replace(depth=tuple(2 * bound for bound in rig.depth))
     for name in rig.names:
         larger = larger.with_camera(
@@ -437,26 +422,16 @@ def test_colour_comes_from_where_the_field_says():
     side = (torch.arange(96) < 48).float().expand(1, *hw)
     ground_truth = torch.cat([side, 0 * side, 1 - side]) * (0.5 + 0.5 * torch.rand(1, *hw, generator=g))
     network = network_of("GuidedPAT")
-    upright = fuse(
-        network, rig, {"mono": ground_truth, "colour": ground_truth}, alpha="mono", depth=(5, 20)
-    ).image
-    turned = fuse(
-        network,
-        rig.rot90("colour", 1),
-        {"mono": ground_truth, "colour": ground_truth.rot90(1, (-2, -1))},
-        alpha="mono",
-        depth=(5, 20),
-    ).image
-    for image in (upright, turned):
+    for turns in (0, 1):
+        images = {"mono": ground_truth, "colour": ground_truth.rot90(turns, (-2, -1))}
+        image = fuse(network, rig.rot90("colour", turns), images, alpha="mono", depth=(5, 20)).image
         assert image[0, :, 10:40].mean() > image[2, :, 10:40].mean() + 0.1
         assert image[2, :, 56:86].mean() > image[0, :, 56:86].mean() + 0.1
 
 
 def test_light_that_alpha_measured_stays():
     """Where the rig says that alpha measured it; else the coded values' luminance is alpha's."""
-    rig = rig_of((48, 64), (48, 64))
-    images = {"mono": texture(1, (48, 64)), "colour": texture(3, (48, 64))}
-    network = load_weights("mono-colour")
+    (rig, images), network = scene((48, 64), (48, 64)), load_weights("mono-colour")
     plain = fuse(network, rig, images, alpha="mono").image
     rig = rig.with_camera("mono", rig["mono"].replace(sensor=Sensor(response=LIGHT)))
     light = fuse(network, rig, images, alpha="mono").image
@@ -476,26 +451,10 @@ def test_uncalibrated_rigs_fuse_without_depth():
     assert frame.depth.isnan().all()
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"colour": torch.rand(3, 40, 61)}, "'colour' is 61x40, the rig says 60x40"),
-        ({"color": torch.rand(3, 40, 60)}, "no camera 'color'; did you mean 'colour'"),
-        ({"mono": torch.full((1, 50, 70), torch.nan)}, "'mono' has NaN"),
-    ],
-)
-def test_mistakes_are_named(change, message):
-    rig = rig_of((50, 70), (40, 60))
-    images = {"mono": torch.rand(1, 50, 70), "colour": torch.rand(3, 40, 60)} | change
-    with pytest.raises(ValueError, match=message):
-        fuse(network_of("PAT"), rig, images, alpha="mono")
-
-
 @pytest.mark.parametrize("names", [("mono",), ("colour",), ("mono", "colour")])
 def test_cameras_of_several_types_are_fused(names):
     """K in float64 and the pose in float32, as a file's and an optimiser's."""
-    rig = rig_of((50, 70), (40, 60))
-    images = {"mono": texture(1, (50, 70)), "colour": texture(3, (40, 60))}
+    rig, images = scene((50, 70), (40, 60))
     wanted = fuse(network_of("GuidedPAT"), rig, images, alpha="mono").image
     for name in names:
         pose = rig[name].cam_from_world
@@ -505,16 +464,10 @@ def test_cameras_of_several_types_are_fused(names):
 
 
 def test_depth_and_confidence_are_the_same_bits_on_any_number_of_threads():
-    rig = rig_of((96, 128), (80, 120))
-    images = {"mono": texture(1, (96, 128)), "colour": texture(3, (80, 120))}
-    before = torch.get_num_threads()
-    try:
-        found = []
-        for threads in (1, 2, 3):
-            torch.set_num_threads(threads)
+    (rig, images), found = scene((96, 128), (80, 120)), []
+    for threads in (1, 2, 3):
+        with limited_to(threads):
             found.append(fuse(network_of("GuidedPAT"), rig, images, alpha="mono"))
-    finally:
-        torch.set_num_threads(before)
     for one in found[1:]:
         assert torch.equal(one.depth.nan_to_num(-1), found[0].depth.nan_to_num(-1))
         assert torch.equal(one.confidence, found[0].confidence)
@@ -522,16 +475,13 @@ def test_depth_and_confidence_are_the_same_bits_on_any_number_of_threads():
 
 
 def test_views_must_overlap():
-    rig = rig_of((50, 70), (40, 60))
+    rig, images = scene((50, 70), (40, 60))
     back = torch.diag(torch.tensor([-1.0, 1.0, -1.0], dtype=torch.float64))
     rig = rig.with_camera("colour", rig["colour"].replace(cam_from_world=Pose(back, torch.zeros(3).double())))
-    images = {"mono": torch.rand(1, 50, 70), "colour": torch.rand(3, 40, 60)}
     with pytest.raises(ValueError, match=r"'colour'.* 2 and 20 m"):
         fuse(network_of("PAT"), rig, images, alpha="mono", field=Epipolar())
     with pytest.raises(ValueError, match="0 < near <= far"):
         fuse(network_of("PAT"), rig, images, alpha="mono", depth=(20, 2))
-    with pytest.raises(ValueError, match="at least one beta"):
-        fuse(network_of("PAT"), rig, {"mono": images["mono"]}, alpha="mono")
 
 
 def has_lens(lens_of, rig, images):
@@ -544,19 +494,20 @@ def has_lens(lens_of, rig, images):
     return rig, images
 
 
+def less_of_alpha() -> tuple[Rig, dict[str, torch.Tensor], torch.Tensor]:
+    """The sample array with less of alpha: its rig, images and ground truth."""
+    sample = load_sample()
+    mono, ground_truth = (p[:, 80:320, 160:480] for p in (sample.images["mono"], sample.ground_truth))
+    return sample.rig.crop("mono", 80, 160, (240, 320)), {**sample.images, "mono": mono}, ground_truth
+
+
 LENSES = {"mono": [0.9, 0.0, 0.0, 0.0], "colour": [-0.6, 0.2, 0.005, 0.0]}
 
 
 @pytest.mark.parametrize("with_lens", [("colour",), ("mono", "colour")])
 def test_lenses_are_seen_through(with_lens):
     """The sample array behind lenses: the same colours at alpha's own, bent pixels, alpha's detail kept."""
-    sample = load_sample()
-    rig, images, network = (
-        sample.rig.crop("mono", 80, 160, (240, 320)),
-        dict(sample.images),
-        load_weights("mono-colour"),
-    )
-    images["mono"], ground_truth = (p[:, 80:320, 160:480] for p in (images["mono"], sample.ground_truth))
+    (rig, images, ground_truth), network = less_of_alpha(), load_weights("mono-colour")
     lensed, taken = has_lens({name: LENSES[name] for name in with_lens}, rig, images)
     clean = (fuse(network, rig, images, alpha="mono").image - ground_truth).square().mean()
     frame = fuse(network, lensed, taken, alpha="mono")
@@ -574,9 +525,7 @@ def test_lenses_are_seen_through(with_lens):
 
 def test_lenses_of_cameras_known_by_f_are_seen_through():
     """No pose and no focal length: F between straightened pixels, and lenses with a unit of their own."""
-    sample, network = load_sample(), load_weights("mono-colour")
-    rig, images = sample.rig.crop("mono", 80, 160, (240, 320)), dict(sample.images)
-    images["mono"], ground_truth = (p[:, 80:320, 160:480] for p in (images["mono"], sample.ground_truth))
+    (rig, images, ground_truth), network = less_of_alpha(), load_weights("mono-colour")
     lensed, taken = has_lens({"mono": LENSES["mono"], "colour": [-0.1, 0.01, 0.001, 0.0]}, rig, images)
     pair = rig.pair("mono", "colour")
     links = {("mono", "colour"): Link(pair.fundamental, pair.homography)}
@@ -596,15 +545,12 @@ def test_lenses_of_cameras_known_by_f_are_seen_through():
 
 
 def test_a_rotated_beta_is_brought_upright():
-    rig = rig_of((60, 80), (60, 80))
+    (rig, images), network = scene((60, 80), (60, 80)), network_of("GuidedPAT")
     for turns in range(4):
         assert quarter_turns(rig.rot90("colour", turns).pair("mono", "colour")) == -turns % 4
-    images = {"mono": texture(1, (60, 80)), "colour": texture(3, (60, 80))}
-    network = network_of("GuidedPAT")
     upright = fuse(network, rig, images, alpha="mono")
-    turned = fuse(
-        network, rig.rot90("colour", 3), images | {"colour": images["colour"].rot90(3, (1, 2))}, alpha="mono"
-    )
+    images["colour"] = images["colour"].rot90(3, (1, 2))
+    turned = fuse(network, rig.rot90("colour", 3), images, alpha="mono")
     assert (upright.image - turned.image).abs().max() < 1e-4
 
 
@@ -632,20 +578,19 @@ def test_real_lenses(shared_data):
 
 def test_an_image_that_is_not_needed_again_is_not_kept():
     """Alpha's own, whose padded copy the network has, where nothing is undone with it."""
-    hw, beta_hw = (40, 60), (40, 60)
-    images = {"mono": texture(1, hw), "colour": texture(3, beta_hw)}
-    views = Views.of(rig_of(hw, beta_hw), images, alpha="mono")
+    rig, images = scene((40, 60), (40, 60))
+    views = Views.of(rig, images, alpha="mono")
     kept = weakref.ref(images["mono"])
     network = network_of("GuidedPAT")
     inputs, undo = prepared(network, views, steps_for(network, normalise=False))
     del views, images
     assert undo
-    assert inputs.hw == hw
+    assert inputs.hw == (40, 60)
     assert kept() is None
 
 
 def test_several_betas_of_float64_are_fused():
-    rig, images = rig_of((64, 96), (64, 96)), {"mono": texture(1, (64, 96)), "colour": texture(3, (64, 96))}
+    rig, images = scene()
     beside = rig["colour"].replace(cam_from_world=Pose(rig["mono"].R, rig["colour"].t * -1))
     both = Rig({**rig.cameras, "other": beside}, depth=rig.depth)
     images = {name: image.double() for name, image in {**images, "other": images["colour"]}.items()}
@@ -655,8 +600,7 @@ def test_several_betas_of_float64_are_fused():
 @pytest.mark.parametrize("of", [fuse, corrections_of])
 def test_an_argument_that_is_none_is_named_with_what_there_is(of):
     """It was an argument of FuseSettings.__init__, which nobody had called."""
-    images = {name: torch.rand(1, 24, 32) for name in ("mono", "colour")}
-    with pytest.raises(
-        TypeError, match=r"^there is no argument or setting 'device': .*, luminance; on a GPU "
-    ):
-        of(PAT(PATConfig(dim=4)), rig_of((24, 32), (24, 32)), images, alpha="mono", device="cuda")
+    rig, images = scene((24, 32), (24, 32))
+    message = r"^there is no argument or setting 'device': .*, luminance; on a GPU "
+    with pytest.raises(TypeError, match=message):
+        of(network_of("PAT"), rig, images, alpha="mono", device="cuda")

@@ -168,9 +168,8 @@ def test_noise_stated_far_beyond_what_the_image_shows_is_said():
         warnings.simplefilter("error")
         denoised_views(Views.of(sample.rig, images, alpha=ALPHA), noise)
     wrong = {ALPHA: NoiseLevel.of_electrons(2)}
-    with pytest.warns(
-        UserWarning, match=f"noise of '{ALPHA}': a standard deviation of .* is stated, its image shows"
-    ):
+    said = f"noise of '{ALPHA}': a standard deviation of .* is stated, its image shows"
+    with pytest.warns(UserWarning, match=said):
         denoised_views(Views.of(sample.rig, sample.images, alpha=ALPHA), wrong)
 
 
@@ -192,17 +191,14 @@ def test_what_is_held_for_low_light_is_planned_for(network):
 def test_the_time_announced_has_the_correction_in_it(network, monkeypatch):
     sample, images, noise = in_low_light(200)
     monkeypatch.setattr(pat.fusion.tiles, "ESTIMATED", 0)
-    monkeypatch.setattr(
-        pat.fusion.low_light, "SETTINGS", replace(pat.fusion.low_light.SETTINGS, averaging=1e4)
-    )
+    slow = replace(pat.fusion.low_light.SETTINGS, averaging=1e4)
+    monkeypatch.setattr(pat.fusion.low_light, "SETTINGS", slow)
     plans, steps = [], []
     with steps_shown(steps.append):
         fuse(network, sample.rig, images, alpha=ALPHA, noise=noise, announce=plans.append)
     assert plans[0].seconds > 1e3
-    assert [s.split(" (")[0] for s in steps if "denoising" in s] == [
-        *(f"denoising {n}" for n in images),
-        "denoising the fused image",
-    ]
+    wanted = [f"denoising {name}" for name in (*images, "the fused image")]
+    assert [s.split(" (")[0] for s in steps if "denoising" in s] == wanted
 
 
 def test_betas_are_mixed_by_confidence():
@@ -221,20 +217,16 @@ def test_positions_of_parts_are_in_the_whole_betas(network, monkeypatch):
     ones = torch.ones(1, 2, 4, 5)
     output = FusionOutput(torch.zeros(1, 3, 4, 5), [ones], [ones[:, 0]], [0.5 * ones[:, 0]])
     monkeypatch.setattr(network, "forward", lambda inputs, matches=None: output)
-    field = FieldOnGrid.of(Rectified(3.0), Pair(View(hw=(4, 5)), View(hw=(4, 5))))
-    part = Beta(torch.zeros(1, 3, 4, 5), field, offset=(7, 2))
-    frame = FrameInputs(
-        Inputs(torch.zeros(1, 1, 4, 5), (part,)),
-        [Placement(Pair(View(hw=(4, 5)), View(hw=(4, 5))), lambda x: x)],
-        (4, 5),
-    )
+    pair = Pair(View(hw=(4, 5)), View(hw=(4, 5)))
+    part = Beta(torch.zeros(1, 3, 4, 5), FieldOnGrid.of(Rectified(3.0), pair), offset=(7, 2))
+    frame = FrameInputs(Inputs(torch.zeros(1, 1, 4, 5), (part,)), [Placement(pair, lambda x: x)], (4, 5))
     whole = (0, 4, 0, 5)
     monkeypatch.setattr(Inputs, "cut", lambda self, box: self)
     found = fuse_tile(network, frame, None, Tile(whole, whole)).matched
     assert found[0, :, 1, 1].tolist() == [8.0, 3.0, 0.5]
 
 
-def test_positions_are_those_of_the_matched_colours(network):
+def test_positions_are_those_of_the_matched_colours(network, monkeypatch):
     """Beta's own colours at the positions that are found resemble the fused image."""
     sample, images, noise = in_low_light(200)
     seen = {}
@@ -244,10 +236,8 @@ def test_positions_are_those_of_the_matched_colours(network):
         seen.update(image=image[None], beta=beta, confidence=confidence)
         return image
 
-    monkey = pytest.MonkeyPatch()
-    monkey.setattr("pat.fusion.low_light.colours_averaged", noted)
+    monkeypatch.setattr("pat.fusion.low_light.colours_averaged", noted)
     fuse(network, sample.rig, images, alpha=ALPHA, noise=noise)
-    monkey.undo()
     high = (seen["confidence"] > 0.8).expand_as(seen["image"])
     assert float((seen["beta"].denoised - seen["image"])[high].abs().mean()) < 0.04
 

@@ -23,9 +23,8 @@ def page(tmp_path_factory):
     depth[:, :40] = torch.nan
     frame = Frame(sample.ground_truth, depth, torch.linspace(0, 1, h)[:, None].expand(h, w), 0.1 / depth)
     baseline = classical_view(sample.rig, sample.images, "mono", longest=h)
-    facts = Facts(
-        ("weights: <mono> & more",), ("the rig may be wrong: check it",), 12.0, 2.0**30, classical=baseline
-    )
+    said = ["weights: <mono> & more"], ["the rig may be wrong: check it"]
+    facts = Facts(*said, 12.0, 2.0**30, classical=baseline)
     path = tmp_path_factory.mktemp("report") / "index.html"
     path.write_text(report_page(frame, sample.images, sample.rig, "mono", facts), encoding="utf-8")
     return path
@@ -48,9 +47,7 @@ def test_without_depth_poses_and_warnings_there_is_nothing_of_them(page):
     frame = Frame(torch.rand(3, 20, 30), torch.full((20, 30), torch.nan), *torch.rand(2, 20, 30))
     sample = load_sample()
     views = {name: sample.rig[name].resize((20, 30)) for name in sample.rig.names}
-    rig = Rig(views)
-    images = {name: torch.rand(1, 20, 30) for name in views}
-    text = report_page(frame, images, rig, "mono", Facts())
+    text = report_page(frame, dict.fromkeys(views, torch.rand(1, 20, 30)), Rig(views), "mono", Facts())
     assert 'data-overlay="depth"' not in text
     assert "<h2>Warnings" not in text
     assert text.count("<polyline") == 10
@@ -82,33 +79,24 @@ def test_slider_and_overlays_work_in_a_browser(page):
         driver.find_element("css selector", "#left option:nth-child(3)").click()
         assert run(shown.replace("SIDE", "left")) == ["classical"]
         clipped = run("return getComputedStyle(document.querySelector('.layer.left')).clipPath")
-        assert float(re.findall(r"[\d.]+(?=%)", clipped)[0]) == pytest.approx(
-            100 - float(boundary[:-1]), abs=0.01
-        )
+        left = 100 - float(boundary[:-1])
+        assert float(re.findall(r"[\d.]+(?=%)", clipped)[0]) == pytest.approx(left, abs=0.01)
         assert len(driver.get_screenshot_as_png()) > 20_000
         assert driver.get_log("browser") == []
 
 
 @pytest.mark.parametrize("lens", [None, [-0.12, 0.03, 0.0, 0.0]])
 def test_the_classical_layer_is_at_alphas_own_pixels(lens):
-    sample, rig = load_sample(), load_sample().rig
-    if lens is not None:
-        rig = rig.with_camera(
-            "mono",
-            rig["mono"].replace(
-                distortion=Distortion("brown-conrady", torch.tensor(lens, dtype=torch.float64))
-            ),
-        )
+    sample = load_sample()
+    lens = lens and Distortion("brown-conrady", torch.tensor(lens, dtype=torch.float64))
+    rig = sample.rig.with_camera("mono", sample.rig["mono"].replace(distortion=lens))
     found = classical_view(rig, sample.images, "mono", longest=320)
-    small = reduced(sample.ground_truth, 320)
+    small, grey = (reduced(image, 320) for image in (sample.ground_truth, sample.images["mono"]))
     assert found.shape == small.shape
     if lens is None:
-        assert (
-            score(found, small).psnr
-            > score(reduced(sample.images["mono"], 320).expand(3, -1, -1), small).psnr + 8
-        )
+        assert score(found, small).psnr > score(grey.expand(3, -1, -1), small).psnr + 8
     else:
-        assert float((found.mean(0) - reduced(sample.images["mono"], 320)[0]).abs().median()) < 0.05
+        assert float((found.mean(0) - grey[0]).abs().median()) < 0.05
 
 
 def test_there_is_no_classical_layer_of_cameras_known_by_lines_alone():

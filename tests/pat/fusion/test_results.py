@@ -29,11 +29,8 @@ def test_one_band_and_three_are_one_image(bands, tmp_path):
 def test_other_bands_are_written_one_by_one_and_their_mean(bands, tmp_path):
     frame = frame_of(bands)
     written = save_frame(frame, tmp_path, bits=16, name="7")
-    assert [p.name for p in written] == [
-        "7_fused.png",
-        *(f"7_fused_{i + 1}.png" for i in range(bands)),
-        "7_confidence.png",
-    ]
+    each = [f"7_fused_{i + 1}.png" for i in range(bands)]
+    assert [p.name for p in written] == ["7_fused.png", *each, "7_confidence.png"]
     assert torch.allclose(torch.cat([read_image(p) for p in written[1 : 1 + bands]]), frame.image, atol=1e-4)
     assert torch.allclose(read_image(written[0])[0], frame.image.mean(0), atol=1e-4)
 
@@ -62,9 +59,8 @@ def test_depth_in_16_bits_says_its_scale(tmp_path):
 def test_fused_images_say_that_they_are_srgb(tmp_path):
     save_frame(frame_of(3), tmp_path)
     with Image.open(tmp_path / "fused.png") as image:
-        assert "sRGB" in ImageCms.getProfileDescription(
-            ImageCms.ImageCmsProfile(BytesIO(image.info["icc_profile"]))
-        )
+        profile = ImageCms.ImageCmsProfile(BytesIO(image.info["icc_profile"]))
+    assert "sRGB" in ImageCms.getProfileDescription(profile)
     read_image(tmp_path / "fused.png")  # without a warning
 
 
@@ -79,9 +75,8 @@ def test_unknown_depth_is_nan_in_the_file_as_in_memory(tmp_path):
     depth = torch.tensor([[1.5, torch.nan, 3.0], [torch.nan, 2.0, 0.5]])
     frame = Frame(torch.rand(3, 2, 3), depth, *torch.rand(2, 2, 3))
     assert tmp_path / "depth.tif" in save_frame(frame, tmp_path)
-    torch.testing.assert_close(
-        torch.from_numpy(tifffile.imread(tmp_path / "depth.tif")), depth, equal_nan=True
-    )
+    found = torch.from_numpy(tifffile.imread(tmp_path / "depth.tif"))
+    torch.testing.assert_close(found, depth, equal_nan=True)
 
 
 def test_a_frame_that_wants_gradients_is_shown_and_saved(tmp_path):

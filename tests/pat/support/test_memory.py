@@ -33,8 +33,9 @@ def test_bytes_are_read():
     assert parse_bytes("4GiB") == 4 * 2**30
     assert parse_bytes("500 MB") == 5e8
     assert parse_bytes(7) == 7.0
-    with pytest.raises(ValueError, match="'4 gigs'"):
-        parse_bytes("4 gigs")
+    for wrong in ("4 gigs", "nan", "nanGiB", float("nan")):
+        with pytest.raises(ValueError, match=f"max_memory is '?{wrong}"):
+            parse_bytes(wrong)
 
 
 KEPT = """
@@ -75,9 +76,3 @@ def test_a_large_task_takes_what_is_planned_whatever_more_is_allowed(limit, want
     monkeypatch.setattr("pat.support.memory._keeps", True)
     assert planned(limit, 2.0, large=True) == wanted
     assert planned(limit, 2.0, large=False) == limit
-
-
-@pytest.mark.parametrize("amount", ["nan", "nanGiB", float("nan")])
-def test_a_limit_that_is_no_number_is_refused(amount):
-    with pytest.raises(ValueError, match="max_memory is"):
-        parse_bytes(amount)
