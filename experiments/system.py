@@ -34,7 +34,7 @@ from pat.media.images import write_image
 from pat.media.raw import match_luminance
 from pat.media.video import write_video
 from pat.networks.protocol import FusionNetwork
-from pat.networks.weights import load_weights
+from pat.networks.weights import Network, load_weights
 
 SceneKind = Literal["layered", "rendered"]
 NAMES = ("wide-narrow", "visible-nir", "exposures", "fast-slow")
@@ -121,24 +121,16 @@ def run_system(
     files = write_recording(recording, rig, out / "inputs")
     say("fusing")
     run = _sequence if len(recording.ground_truth) > 1 else _still
-    lines, panels = run(SystemRun(system, rig, files, recording, out, weights, max_memory, say))
+    lines, panels = run(rig, files, recording, out, load_weights(weights), max_memory)
     save_panels(panels, out / "figure.png", columns=4)
     table = "\n".join(lines) + "\n"
     write_text(out / "scores.md", table)
-    return SystemResult(table, sorted(p for p in out.iterdir() if p.is_file()))
+    return SystemResult(table, files_of(out))
 
 
-class SystemRun(NamedTuple):
-    """A recorded system, and how it is fused: folder, weights, memory limit, progress callback."""
-
-    system: ArraySystem
-    rig: Rig
-    files: Mapping[str, list[Path]]
-    recording: SystemRecording
-    out: Path
-    weights: str
-    max_memory: str | None
-    say: Callable[[str], None]
+def files_of(folder: Path) -> list[Path]:
+    """Those in a folder itself, in order."""
+    return sorted(path for path in folder.iterdir() if path.is_file())
 
 
 def _stage(system: ArraySystem, rig: Rig, scene: SceneKind) -> Any:
@@ -175,14 +167,19 @@ def write_recording(recording: SystemRecording, rig: Rig, out: Path) -> dict[str
 Panels = dict[str, Tensor]
 
 
-def _still(job: SystemRun) -> tuple[list[str], Panels]:
+def _still(
+    rig: Rig,
+    files: Mapping[str, list[Path]],
+    recording: SystemRecording,
+    out: Path,
+    network: Network,
+    max_memory: str | None,
+) -> tuple[list[str], Panels]:
     """One frame fused and compared: lines of the table, and panels of the figure."""
-    rig, recording, out = job.rig, job.recording, job.out
-    alpha, ground_truth = job.system.alpha, recording.ground_truth[0]
-    first = {name: paths[0] for name, paths in job.files.items()}
-    files, network = ViewFiles(rig, first, alpha=alpha), load_weights(job.weights)
-    read, images = files.developed, dict(files)
-    frame = fuse(network, read, images, alpha=alpha, max_memory=job.max_memory)
+    alpha, ground_truth = rig.names[0], recording.ground_truth[0]
+    views = ViewFiles(rig, {name: paths[0] for name, paths in files.items()}, alpha=alpha)
+    read, images = views.developed, dict(views)
+    frame = fuse(network, read, images, alpha=alpha, max_memory=max_memory)
     save_frame(frame, out, bits=16, view=view_of(read, alpha, bits=16))
     baseline = classical_baseline(read, images, alpha)
     if len(images) == 2:
@@ -207,12 +204,18 @@ def _still(job: SystemRun) -> tuple[list[str], Panels]:
     return [*scores, *extra], panels
 
 
-def _sequence(job: SystemRun) -> tuple[list[str], Panels]:
+def _sequence(
+    rig: Rig,
+    files: Mapping[str, list[Path]],
+    recording: SystemRecording,
+    out: Path,
+    network: Network,
+    max_memory: str | None,
+) -> tuple[list[str], Panels]:
     """All frames fused, with and without propagated colour, and compared."""
-    alpha, rig, out, ground_truth = job.system.alpha, job.rig, job.out, job.recording.ground_truth
-    frames = {name: ImageFiles(paths, rig, name, alpha=alpha) for name, paths in job.files.items()}
-    settings = FuseSettings(max_memory=job.max_memory)
-    fusion = SequenceFusion(load_weights(job.weights), rig, frames, alpha, settings=settings)
+    alpha, ground_truth = rig.names[0], recording.ground_truth
+    frames = {name: ImageFiles(paths, rig, name, alpha=alpha) for name, paths in files.items()}
+    fusion = SequenceFusion(network, rig, frames, alpha, settings=FuseSettings(max_memory=max_memory))
     colours, fused = fused_frames(fusion, len(ground_truth))
     by_themselves = [fusion.alone(i) for i in range(len(fused))]
     for i, frame in enumerate(fused):

@@ -35,6 +35,7 @@ from arraygeom import (
     pixel_grid,
     rotation_from_vector,
     sample,
+    stack,
 )
 from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.fields.straight import covering_displacement
@@ -52,7 +53,7 @@ from pat.sensors import generator_for
 from pat.synthesis.layered import LayeredScenes
 from pat.synthesis.photos import PhotoBank
 from pat.synthesis.rig_distribution import RigDistribution
-from pat.synthesis.rigs import RigBatch
+from pat.synthesis.rigs import RigBatch, in_frame_of
 
 SIZE: HW = (96, 128)
 NEAR, FAR = 2.0, 16.0
@@ -276,7 +277,7 @@ def made(rig: Rig, bank: PhotoBank, number: int) -> RecordedScene:
     g = generator_for(0, "sweep", number)
     pair = rig.pair(ALPHA, BETA)
     near, far = (torch.full((1,), float(d), dtype=torch.float64) for d in pair.depth_range)
-    cameras = [Camera(K=c.K[None], cam_from_world=Pose(c.R[None], c.t[None]), hw=c.hw) for c in pair.cameras]
+    cameras = [stack([in_frame_of(pair.cameras[0], camera)]) for camera in pair.cameras]
     batch = LayeredScenes(bank, RigDistribution(), hw=pair.alpha.hw).render(RigBatch(cameras, near, far), g)
     position, visible = seen_at(pair, *(depth[0].double() for depth in batch.depth))
     ground_truth, beta_image = (image[0] for image in batch.images)

@@ -10,7 +10,7 @@ from torch import Tensor
 from arraygeom import HomographyDisplacement
 from arraygeom.atomic import write_text
 from experiments.showcase import FAST, SCENE, SLOW, FastSlowArray, bright_gain, fast_and_slow_array
-from experiments.system import SystemResult, flicker, fused_frames
+from experiments.system import SystemResult, files_of, flicker, fused_frames
 from pat.cli.fuse import with_sensor
 from pat.evaluation.tables import markdown_table
 from pat.fusion.fuse import FuseSettings
@@ -47,10 +47,14 @@ def run_recorded(folder: Path, out: Path, *, weights: str, say: Callable[[str], 
     _, fused = fused_frames(job, len(FAST_FRAMES))
     say("fusing each frame alone, to compare")
     by_themselves = [job.alone(i) for i in range(len(FAST_FRAMES))]
-    table = _table(fused, by_themselves, frames[FAST])
-    written = _write(out, array, frames, fused, by_themselves)
+    methods = {"each frame alone": by_themselves, "colour propagated": fused}
+    flickers = {n: flicker([f.image for f in of_method], frames[FAST]) for n, of_method in methods.items()}
+    rows = [(name, f"{1000 * value:.2f}") for name, value in flickers.items()]
+    note = "Flicker is the mean change of chroma from frame to frame where nothing moves.\n"
+    table = f"{markdown_table(['', 'flicker x 1000'], rows)}\n{note}"
+    _write(out, array, frames, fused, by_themselves)
     write_text(out / "scores.md", table)
-    return SystemResult(table, [*written, out / "scores.md"])
+    return SystemResult(table, files_of(out))
 
 
 def recorded_frames(folder: Path) -> dict[str, list[Tensor]]:
@@ -61,25 +65,14 @@ def recorded_frames(folder: Path) -> dict[str, list[Tensor]]:
     return {n: [srgb_image(luminance_of(p) * gains.get(n, 1.0)) for p in images] for n, images in raw.items()}
 
 
-def _table(fused: list[Frame], by_themselves: list[Frame], greys: list[Tensor]) -> str:
-    frames = {"each frame alone": by_themselves, "colour propagated": fused}
-    rows = [
-        (n, f"{1000 * flicker([f.image for f in of_method], greys):.2f}") for n, of_method in frames.items()
-    ]
-    return (
-        f"{markdown_table(['', 'flicker x 1000'], rows)}\n"
-        "Flicker is the mean change of chroma from frame to frame where nothing moves.\n"
-    )
-
-
 def _write(
     out: Path,
     array: FastSlowArray,
     frames: dict[str, list[Tensor]],
     fused: list[Frame],
     by_themselves: list[Frame],
-) -> list[Path]:
-    """Frames, video, rig and figures; returns their paths."""
+) -> None:
+    """Frames, video, rig and figures."""
     for number, frame in zip(FAST_FRAMES, fused):
         save_frame(frame, out / "frames", name=str(number))
     write_video(out / "fused.mp4", [f.image for f in fused], rate=5)
@@ -92,4 +85,3 @@ def _write(
     save_panels(detail, out / "details.png", columns=4)
     whole = {"alpha, 144": frames[FAST][3], "fused, 144": fused[3].image}
     save_panels(whole, out / "figure.png", columns=2)
-    return [out / "fused.mp4", out / "rig.yaml", out / "details.png", out / "figure.png"]

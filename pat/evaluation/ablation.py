@@ -49,6 +49,7 @@ from arraygeom.fields.straight import covering_displacement
 from arraygeom.pixels import HW, coarse_grid
 from arraygeom.segments import clip_to_image
 
+from ..data.windows import scene_folders
 from ..fusion.fuse import fuse
 from ..fusion.steps import resolution_ratio
 from ..media.colour import luminance, srgb_image
@@ -56,10 +57,9 @@ from ..media.depth_maps import at_distance
 from ..media.figures import save_panels
 from ..networks.protocol import FusionNetwork
 from ..sensors import Clip, Noise, Quantise, record
-from ..support.folders import files_below
 from ..synthesis.layered import LayeredScenes
 from ..synthesis.photos import PhotoBank
-from ..synthesis.rendered import RENDER_FILE, Rendered, is_rendered
+from ..synthesis.rendered import Rendered
 from ..synthesis.rig_distribution import RigDistribution
 from .baseline import classical
 from .metrics import bootstrap_interval, score
@@ -207,18 +207,7 @@ def layered_cases(
 
 
 def rendered_cases(folder: Path, *, seed: int = 0) -> Iterator[AblationCase]:
-    """Every rendered scene under a folder: its first camera is alpha, its second beta.
-
-    Raises ValueError for a folder without rendered scenes, or with incomplete ones.
-    """
-    folders = sorted(
-        {path.parent for path in files_below(folder) if path.name in ("scene.yaml", RENDER_FILE)}
-    )
-    broken = [path for path in folders if not is_rendered(path)]
-    if not folders or broken:
-        incomplete = f"{broken[0]} is incomplete ({RENDER_FILE} is missing)" if broken else ""
-        what = incomplete or f"{folder} holds no rendered scene"
-        raise ValueError(f"{what}: render it with `pat render`")
+    """Rendered scenes of a folder (`scene_folders`): their first camera is alpha, their second beta."""
 
     def case(path: Path) -> AblationCase:
         scene, g = Rendered(path), Generator().manual_seed(seed)
@@ -226,9 +215,9 @@ def rendered_cases(folder: Path, *, seed: int = 0) -> Iterator[AblationCase]:
         frames = [scene.frame(name) for name in names]
         ground_truth, beta_image = (srgb_image(f.rgb) for f in frames)
         rig = Rig(dict(zip((ALPHA, BETA), (scene.rig[name] for name in names))))
-        return _recorded(str(path.relative_to(folder)), rig, ground_truth, beta_image, frames[0].depth, g)
+        return _recorded(path.name, rig, ground_truth, beta_image, frames[0].depth, g)
 
-    return map(case, folders)
+    return map(case, scene_folders(folder))
 
 
 def _recorded(

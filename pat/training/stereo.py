@@ -20,7 +20,7 @@ from torch import Generator, Tensor
 from arraygeom.camera import Camera, intrinsics
 from arraygeom.pixels import HW
 from arraygeom.pose import Pose
-from pat.data.pairs import MIDDLEBURY, PairFiles, pair_files
+from pat.data.pairs import PairFiles, pair_files
 from pat.data.windows import reduced
 from pat.media.images import read_image
 from pat.synthesis.layered import ArrayBatch
@@ -28,8 +28,8 @@ from pat.synthesis.rigs import below, one_of
 
 from .scenes import ACTIVE, Crops, active_items, chosen
 
-COUNTERPART = {"disp2.png": "disp6.png", "disp1.png": "disp5.png"}
-"""Files of the disparity of the right image, by those of the left."""
+DISPARITIES = ("disp2.png", "disp6.png"), ("disp1.png", "disp5.png")
+"""Files of the disparity of the left and of the right image."""
 REDUCED = 2
 """The largest reduction of a window: images found online are often less sharp than their pixels."""
 
@@ -131,13 +131,10 @@ class MeasuredPairs(PairCrops):
 
 def disparity_files(pair: PairFiles) -> tuple[Path, Path]:
     """Of the left and of the right image. Raises ValueError where one is missing."""
-    for layout in MIDDLEBURY.values():
-        files = [
-            pair.left.with_name(name)
-            for name in (layout.ground_truth, COUNTERPART.get(layout.ground_truth, "-"))
-        ]
-        if pair.left.name == layout.left and all(file.is_file() for file in files):
-            return files[0], files[1]
+    for names in DISPARITIES:
+        left, right = (pair.left.with_name(name) for name in names)
+        if left.is_file() and right.is_file():
+            return left, right
     raise ValueError(
         f"{pair.left.parent}: wanted the true disparity of both images beside them, disp1.png and disp5.png"
     )

@@ -9,7 +9,7 @@ import xml.etree.ElementTree as ElementTree
 import pytest
 import torch
 
-from arraygeom import Epipolar, pixel_grid, sample
+from arraygeom import Epipolar, Pose, pixel_grid, rotation_from_vector, sample
 from arraygeom.epipolar import epipolar_distance
 from experiments.__main__ import Experiments
 from experiments.evaluation.sweep_report import markdown, shipped_rows, write_report
@@ -45,6 +45,16 @@ def test_scenes_are_exact_for_every_rig(sweep, bank):
     assert scene.visible.float().mean() > 0.5
     assert off[scene.visible].mean() < 0.03
     assert off[scene.visible].mean() < 0.3 * off[~scene.visible].mean()
+
+
+def test_a_rig_may_stand_anywhere(bank):
+    """Scenes were before the world's origin, not before alpha."""
+    rig, turn = point("baseline", 12, hw=HW).rig, torch.tensor([0.2, 1.0, -0.1], dtype=torch.float64)
+    world = Pose(rotation_from_vector(turn), 3 * turn)
+    moved = {n: c.replace(cam_from_world=c.cam_from_world @ world) for n, c in rig.cameras.items()}
+    here, there = (made(r, bank, 0) for r in (rig, rig.replace(cameras=moved)))
+    torch.testing.assert_close(there.ground_truth, here.ground_truth, atol=1e-3, rtol=0)
+    assert (there.visible == here.visible).float().mean() > 0.99
 
 
 def test_calibrations_are_off_by_what_they_say():

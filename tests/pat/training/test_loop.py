@@ -3,12 +3,10 @@
 import json
 import os
 import shutil
-import signal
 import socket
 import subprocess
 import sys
 import threading
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -136,26 +134,6 @@ def command(*arguments, launcher=(), **environment):
         stderr=subprocess.STDOUT,
         text=True,
     )
-
-
-@pytest.mark.slow
-def test_killed_at_any_moment_and_started_again(folder, whole):
-    """kill -9 at moments that nobody chose, until a run gets through."""
-    config = replace(whole, out=folder / "killed")
-    save_config(config, folder / "killed.yaml")
-    for seconds in (0.5, 1.3, 2.1):
-        running = command(folder / "killed.yaml")
-        begun = config.out / "steps.csv"
-        while running.poll() is None and not begun.exists():
-            time.sleep(0.1)
-        time.sleep(seconds)
-        os.kill(running.pid, signal.SIGKILL)
-        running.communicate()
-        begun.unlink(missing_ok=True) if newest_checkpoint(config.out / "checkpoints") is None else None
-    running = command(folder / "killed.yaml")
-    assert running.wait() == 0, running.communicate()[0]
-    running.communicate()
-    assert losses(config.out) == losses(whole.out)
 
 
 def two_processes(config, file, monkeypatch):
