@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -96,10 +95,10 @@ def _transferred_piece(piece: Inputs, matches: Matches, sharing: Sequence[bool])
     of_each = [transferred_bands(alpha, *one) for one in zip(piece.betas, matches.betas)]
     shared = []
     if any(sharing):
-        counting = [(c, w, m.prior) for (c, w), m, counts in zip(of_each, matches.betas, sharing) if counts]
-        weights = [weight * math.exp(prior) for _, weight, prior in counting]
-        mixed = sum(w * colour for w, (colour, _, _) in zip(weights, counting)) / torch.stack(weights).sum(0)
-        shared = [diffused_from(mixed, alpha, torch.stack([weight for _, weight, _ in counting]).amax(0))]
+        colours, each = zip(*(one for one, counts in zip(of_each, sharing) if counts))
+        weights = torch.stack(each)
+        mixed = (weights * torch.stack(colours)).sum(0) / weights.sum(0)
+        shared = [diffused_from(mixed, alpha, weights.amax(0))]
     others = [one for one, counts in zip(of_each, sharing) if not counts]
     separate = [diffused_from(colour, alpha, weight) for colour, weight in others]
     return [*shared, *separate, *(colour for colour, _ in of_each)]

@@ -18,7 +18,7 @@ from .choice import Choice, chosen
 from .colour_transfer import transferred
 from .inputs import Inputs
 from .matches import BetaMatches, Matches, is_consistent
-from .multiview import agreed
+from .multiview import agreed, with_likeliest_colours
 from .normalisation import Comparison
 from .positions import FINE, at_matches, reduced
 from .semi_global import HalfSizeMatches, matched_at_half_size
@@ -45,12 +45,13 @@ def match(inputs: Inputs, choice: Choice | None = None) -> Matches:
     matches = in_each_beta(inputs)
     if inputs.can_agree:
         with torch.no_grad():
-            matches = agreed(inputs, with_certainty(chosen(inputs, matches, choice)))
+            matches = with_certainty(chosen(inputs, matches, choice))
+            matches = with_likeliest_colours(inputs, matches, with_certainty(agreed(inputs, matches)))
     if torch.is_grad_enabled():
         matches = following(inputs, matches)
     if not inputs.can_agree:
-        matches = chosen(inputs, matches, choice)
-    return transferred(inputs, with_certainty(matches))
+        matches = with_certainty(chosen(inputs, matches, choice))
+    return transferred(inputs, matches)
 
 
 def located(inputs: Inputs) -> Matches:

@@ -43,7 +43,6 @@ class BetaMatches:
     bands: (B, C, H, W), beta's bands minus alpha at the match, with the detail that alpha has and beta has
         not; None before they are transferred.
     diffused: (B, fills, C, H, W), the same diffused from pixels of high weight to the others.
-    prior: how much more, as a logit, its colours count than another beta's.
     chosen: (B, 1, H, W), of the disparities found there and around that of what alpha sees, which may be
         hidden in beta or fill in for what is; of several betas, what they agree on of those; None before one
         is chosen.
@@ -59,7 +58,6 @@ class BetaMatches:
     comparison: Comparison
     bands: Tensor | None = None
     diffused: Tensor | None = None
-    prior: float = 0.0
     chosen: Tensor | None = None
     stated: Tensor | None = None
     certainty: Tensor | None = None

@@ -3,8 +3,8 @@
 What one beta cannot see another can. Each beta is matched alone; of the inverse depths that they propose for
 a pixel, the one that most others support is taken, and where no match is consistent it is diffused. From it
 follow where the pixel is in every beta, and, by a depth buffer, which betas see it. For the depth of what
-alpha sees, but not for where its colours are from, what was chosen for each beta is proposed, and supports as
-far as it is certain.
+alpha sees what was chosen for each beta is proposed, and supports as far as it is certain; for where colours
+are from, what was found in each. Colours of betas that stand in for each other may be at their own matches.
 """
 
 from __future__ import annotations
@@ -30,8 +30,9 @@ from ..media.colour import to_bytes
 from ..support.settings import size, tuned
 from .filters import filled, numpy_of
 from .inputs import Beta, Inputs
+from .likeness import likeness
 from .matches import BetaMatches, Matches
-from .positions import FINE, Extent, enlarged
+from .positions import FINE, Extent, at_matches, enlarged
 from .semi_global import CONSISTENT, DISPARITY_FILL
 
 
@@ -52,12 +53,6 @@ class MultiviewSettings:
         "Nine bands and rendered arrays: by how much the share of pixels that agree has to rise "
         "for betas' depths to be brought together: above that of the depths as they are, and above "
         "that of a plane, which is what wrong matches and a flat background agree with",
-    )
-    parallax: float = tuned(
-        2.0,
-        "Twelve rendered arrays: the power of a beta's parallax by which the odds that its colour "
-        "is right fall: what it sees past depth's edges, "
-        "and how far a wrong depth displaces it, grow with parallax",
     )
 
 
@@ -178,13 +173,6 @@ class MatchedBeta:
         return torch.where(inside, row * columns + column, rows * columns)
 
 
-def _priors(inputs: Inputs) -> tuple[float, ...]:
-    """Of each beta, by its parallax: the length of its segments that is exceeded by a tenth."""
-    straight = [beta.field.straight[:, ::8, ::8] for beta in inputs.betas]
-    lengths = [float(torch.where(s.valid, s.length, 0.0).flatten().float().quantile(0.9)) for s in straight]
-    return tuple(SETTINGS.parallax * math.log((min(lengths) + 1) / (length + 1)) for length in lengths)
-
-
 class Agreement(NamedTuple):
     """What the matches of all betas agree on, at alpha's pixels.
 
@@ -230,7 +218,29 @@ def agreed(inputs: Inputs, matches: Matches) -> Matches:
     if all(one.chosen is not None for one in matches.betas):
         chosen = _of_all(inputs, views(matches.betas), of_betas)
         betas = (replace(one, chosen=other.disparity) for one, other in zip(betas, chosen))
-    return Matches(tuple(replace(one, prior=prior) for one, prior in zip(betas, _priors(inputs))))
+    return Matches(tuple(betas))
+
+
+@torch.no_grad()
+def with_likeliest_colours(inputs: Inputs, own: Matches, agreed: Matches) -> Matches:
+    """What betas agree on; but of betas that show all bands of the result, whose colours stand in for each
+    other's, `disparity`, where colours are from, is their own match unless beta is more like alpha there, and
+    `facts` are of their own."""
+    betas = list(agreed.betas)
+    for i, (one, found, same) in enumerate(zip(inputs.by_beta, own.betas, agreed.betas)):
+        if inputs.shows_all_bands(inputs.betas[i]):
+            betas[i] = replace(same, disparity=one.in_pieces(_likelier, found, same), facts=found.facts)
+    return Matches(tuple(betas))
+
+
+def _likelier(piece: Inputs, own: BetaMatches, agreed: BetaMatches) -> Float[Tensor, "b 1 h w"]:
+    """Of a piece with one beta, the disparity of each pixel at which beta is more like alpha."""
+    (beta,) = piece.betas
+    alpha, other, *_ = own.comparison.views(piece.alpha, beta.image)
+    mine, theirs = (
+        likeness(at_matches(other, beta.field.straight, one.disparity)[0] - alpha) for one in (own, agreed)
+    )
+    return torch.where(mine >= theirs, own.disparity, agreed.disparity)
 
 
 def _of_all(

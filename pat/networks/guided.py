@@ -46,7 +46,7 @@ class GuidedSettings:
         2.0,
         "Middlebury, tune half: added to confidence's logit where beta is as bright, when colour is blended",
     )
-    nowhere: float = size(-10.0, "The logit of the confidence where there is no valid segment")
+    nowhere: float = size(-30.0, "The logit of the confidence where there is no valid segment")
 
 
 SETTINGS = GuidedSettings()
@@ -64,7 +64,6 @@ class BetaEstimate(NamedTuple):
     position: (B, 2, H, W), the semi-global match in beta, pixels; beyond beta's edge where the segment is cut
         there.
     likeness: (B, 1, H, W), of alpha's brightness and that attended in beta, 0 to 1.
-    prior: how much more its colour counts than another beta's, as a logit.
     """
 
     attended: Tensor
@@ -76,7 +75,6 @@ class BetaEstimate(NamedTuple):
     choice: Tensor
     position: Tensor
     likeness: Tensor
-    prior: float = 0.0
 
     @property
     def confidence(self) -> Float[Tensor, "b h w"]:
@@ -228,9 +226,7 @@ class GuidedPAT(nn.Module):
         logit = torch.where(peak[:, None] > 0, logit, SETTINGS.nowhere)
         colour = torch.lerp(value - alpha, bands.to(value), exact.sigmoid())
         alike = likeness(facts[0])
-        return BetaEstimate(
-            attended, deviation, peak, colour, diffused, logit, choice, position, alike, matched.prior
-        )
+        return BetaEstimate(attended, deviation, peak, colour, diffused, logit, choice, position, alike)
 
     def _judged(self, encoded: Encoded, of_beta: BetaMatches, facts: Tensor, valid: Tensor) -> Tensor:
         """Logits (B, 3 + fills, H, W): of the confidence, of the choices, of taking the semi-global match."""
@@ -257,7 +253,8 @@ def output_of(image: Float[Tensor, "b c h w"], estimates: Sequence[BetaEstimate]
 
 
 def combined(estimates: Sequence[BetaEstimate]) -> BetaEstimate:
-    """The estimate of several betas of the same bands: what each shows, weighted by its odds of being right.
+    """The estimate of several betas of the same bands: what each shows, weighted by its odds of being right,
+    and by how probable the brightness is that it shows.
 
     Beside depth's edges one beta may show another surface and be as confident as the others: its brightness
     tells.
@@ -265,7 +262,8 @@ def combined(estimates: Sequence[BetaEstimate]) -> BetaEstimate:
     if len(estimates) == 1:
         return estimates[0]
     logits = torch.stack([e.logit for e in estimates])
-    weights = torch.stack([e.odds + e.prior for e in estimates]).softmax(0)
+    probable = [SETTINGS.alike * (e.likeness + SETTINGS.least_weight).log() for e in estimates]
+    weights = torch.stack([e.odds + p for e, p in zip(estimates, probable)]).softmax(0)
 
     def mean(parts: Sequence[Tensor]) -> Tensor:
         return sum(w * p for w, p in zip(weights, parts)) + torch.zeros_like(parts[0])

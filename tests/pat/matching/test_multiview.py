@@ -18,7 +18,7 @@ from pat.matching import multiview as several
 from pat.matching.match import in_each_beta, located, match
 from pat.matching.matches import Matches
 from pat.matching.multiview import NEAR as AGREES
-from pat.matching.multiview import MatchedBeta, agreed
+from pat.matching.multiview import MatchedBeta, agreed, with_likeliest_colours
 from pat.media.colour import luminance
 from pat.networks.guided import SETTINGS as GUIDED
 from pat.networks.guided import BetaEstimate, combined
@@ -94,27 +94,42 @@ def test_of_betas_of_equal_confidence_that_as_bright_as_alpha_counts_more(networ
         )
         for e, v in ((one, 1.0), (other, 0.0))
     )
-    odds = torch.tensor(GUIDED.alike).sigmoid()
+    dark_is_right = GUIDED.least_weight / (1 + GUIDED.least_weight)  # by its brightness
+    odds = torch.tensor(GUIDED.alike * (1 - math.log(dark_is_right))).sigmoid()
     torch.testing.assert_close(combined([bright, dark]).colour, odds.expand_as(one.colour))
     assert combined([dark, dark._replace(colour=bright.colour)]).colour.mean() == pytest.approx(0.5)
 
 
-def test_of_betas_alike_that_with_less_parallax_counts_more(network, scene):
-    """The odds fall with the square of the parallax; betas at the same distance count the same."""
+def test_colours_are_where_a_beta_is_most_like_alpha(network, scene):
+    """Of its own match and of that on which betas agree; of betas with some of the bands where all agree."""
     rig, images, _ = scene
-    wider = Rig({**rig.cameras, "far": camera(-0.5)}, depth=(NEAR, FAR))
-    views = Views.of(wider, images | {"far": seen_from(-0.5)}, alpha="mono")
-    left, right, distant = (found.prior for found in match(frame_inputs(network, views).inputs).betas)
-    assert left == pytest.approx(right, abs=0.05)
-    assert max(left, right) == 0
-    assert distant - left == pytest.approx(-2 * math.log(2), abs=0.25)
+    inputs = replace(frame_inputs(network, Views.of(rig, images, alpha="mono")).inputs, bands=3)
+    found = located(replace(inputs, betas=inputs.betas[:1]))
+    own, far = found.betas[0], found.betas[0].disparity + 7
+    wrong = torch.zeros(own.hw, dtype=torch.bool)
+    wrong[20:76, 90:130] = True
+    mixed = replace(own, disparity=torch.where(wrong, far, own.disparity))
+    agree = replace(own, disparity=torch.where(wrong, own.disparity, far), facts=own.facts + 0.1)
+    both = (Matches((one, one)) for one in (mixed, agree))
+    taken = with_likeliest_colours(inputs, *both).betas[0]
+    seen = own.facts.repeat_interleave(2, -1).repeat_interleave(2, -2)[0, 0] < 0.1
+    right = (taken.disparity - own.disparity)[0, 0].abs() < 0.01
+    assert right[seen].double().mean() > 0.85
+    torch.testing.assert_close(taken.facts, own.facts)
+    both = (Matches((one, one)) for one in (mixed, agree))
+    assert with_likeliest_colours(replace(inputs, bands=6), *both).betas[0] is agree
 
-    def estimate(value, prior):
-        one = torch.zeros(1, 1, 2, 2)
-        empty = one[:, 0]
-        return BetaEstimate(one, empty, empty, one + value, one[None], one, one, one, one, prior)
 
-    assert combined([estimate(1.0, 0.0), estimate(0.0, -2 * math.log(2))]).colour.mean() == pytest.approx(0.8)
+def test_of_betas_a_pixel_without_a_segment_never_counts(network):
+    """Not even where the other shows another brightness."""
+    one = torch.zeros(1, 1, 2, 2)
+    empty = one[:, 0]
+
+    def estimate(value, logit, likeness):
+        return BetaEstimate(one, empty, empty, one + value, one[None], one + logit, one, one, one + likeness)
+
+    dark, nowhere = estimate(1.0, -3.0, 0.0), estimate(0.0, GUIDED.nowhere, 1.0)
+    assert combined([dark, nowhere]).colour.min() > 0.99
 
 
 def test_the_order_of_the_betas_does_not_matter(network, scene):

@@ -63,7 +63,7 @@ def test_bands_of_several_betas_are_not_completed(shipped, monkeypatch):
     network = load_weights("mono-colour")
     monkeypatch.setattr(network, "_fills", lambda own, alpha, e: (e.colour,) * (CANDIDATES - 1))
     plane = drawn(1)
-    estimate = BetaEstimate(*[plane] * len(BetaEstimate._fields[:-1]))
+    estimate = BetaEstimate(*[plane] * len(BetaEstimate._fields))
     assert network.blended(Encoded(plane, plane), plane, [estimate] * 3, complete=True).shape == (
         1,
         3,
