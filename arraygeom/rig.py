@@ -7,6 +7,7 @@ import difflib
 import fnmatch
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -21,7 +22,7 @@ from .epipolar import fundamental_matrix
 from .homography import plane_homography
 from .pixels import HW, product, resize_matrix, rot90_matrix, shift_matrix
 from .pose import Pose
-from .text import baseline_text, depth_text, length_unit
+from .text import baseline_text, depth_text, length_unit, view_facts
 from .tracing import traced
 
 if TYPE_CHECKING:
@@ -411,9 +412,19 @@ class Rig(Batched):
 
     def _text(self) -> str:
         named = ", ".join(f"{name} {view._text()}" for name, view in self.cameras.items())
+        return "; ".join(filter(None, (named, *self._lengths())))
+
+    def _lengths(self) -> tuple[str, str]:
         unit = length_unit(self)
-        facts = named, baseline_text(self.cameras, unit), depth_text(self.depth, unit)
-        return "; ".join(filter(None, facts))
+        return baseline_text(self.cameras, unit), depth_text(self.depth, unit)
+
+    def _repr_html_(self) -> str:
+        head = ("camera", "size", "focal length", "lens", "response")
+        rows = [head, *((name, *view_facts(view)) for name, view in self.cameras.items())]
+        cells = ["".join(f"<td>{escape(cell)}</td>" for cell in row) for row in rows]
+        facts = (self.name, self._batch_text(), *self._lengths())
+        caption = escape("; ".join(filter(None, facts)))
+        return f"<table><caption>{caption}</caption>{''.join(f'<tr>{row}</tr>' for row in cells)}</table>"
 
     def _parameter_shapes(self) -> dict[str, Tensor]:
         """One tensor of the right shape, type and device for each parameter."""

@@ -225,6 +225,16 @@ def test_everything_has_a_short_text():
     assert "0 % valid" in repr(Positions(torch.zeros(2, 3, 2), torch.zeros(2, 3, dtype=torch.bool)))
 
 
+def test_notebooks_show_an_escaped_table():
+    camera = random_rig(1)["alpha"].replace(sensor=Sensor(response="<script>alert(1)</script>"))
+    html = Rig({"<b>": camera, "b": random_rig(1)["beta"]}, depth=(1, 2), name="a & b")._repr_html_()
+    assert "<script>" not in html
+    assert "<b>" not in html
+    assert "&lt;b&gt;" in html
+    assert "a &amp; b; baseline" in html
+    assert html.count("<tr>") == 3
+
+
 def test_a_pair_says_what_relates_it():
     pair = random_rig(1).pair("alpha", "beta")
     assert repr(pair).startswith("Pair: alpha 64x48 f=")
