@@ -15,6 +15,7 @@ from pat.fusion.inputs import frame_inputs
 from pat.fusion.views import Views
 from pat.matching import inputs as inputs_module
 from pat.matching import multiview as several
+from pat.matching.colour_transfer import transferred
 from pat.matching.match import in_each_beta, located, match
 from pat.matching.matches import Matches
 from pat.matching.multiview import NEAR as AGREES
@@ -114,10 +115,20 @@ def test_colours_are_where_a_beta_is_most_like_alpha(network, scene):
     taken = with_likeliest_colours(inputs, *both).betas[0]
     seen = own.facts.repeat_interleave(2, -1).repeat_interleave(2, -2)[0, 0] < 0.1
     right = (taken.disparity - own.disparity)[0, 0].abs() < 0.01
-    assert right[seen].double().mean() > 0.85
+    assert right[seen & wrong].double().mean() > 0.85
+    assert right[seen & ~wrong].double().mean() > 0.85
     torch.testing.assert_close(taken.facts, own.facts)
     both = (Matches((one, one)) for one in (mixed, agree))
     assert with_likeliest_colours(replace(inputs, bands=6), *both).betas[0] is agree
+
+
+def test_colour_that_betas_share_is_of_consistent_matches(network, scene):
+    rig, images, _ = scene
+    inputs = replace(frame_inputs(network, Views.of(rig, images, alpha="mono")).inputs, bands=3)
+    one, other = located(inputs).betas
+    given = Matches((one, replace(other, facts=torch.ones_like(other.facts))))
+    shared, alone = (transferred(replace(inputs, bands=n), given).betas[0].diffused for n in (3, 6))
+    assert (shared - alone).abs().mean() < 0.05 * alone.abs().mean()
 
 
 def test_of_betas_a_pixel_without_a_segment_never_counts(network):
