@@ -121,7 +121,7 @@ def run_system(
     files = write_recording(recording, rig, out / "inputs")
     say("fusing")
     run = _sequence if len(recording.ground_truth) > 1 else _still
-    lines, panels = run(rig, files, recording, out, load_weights(weights), max_memory)
+    lines, panels = run(Recorded(rig, files, recording, out, load_weights(weights), max_memory))
     save_panels(panels, out / "figure.png", columns=4)
     table = "\n".join(lines) + "\n"
     write_text(out / "scores.md", table)
@@ -167,15 +167,20 @@ def write_recording(recording: SystemRecording, rig: Rig, out: Path) -> dict[str
 Panels = dict[str, Tensor]
 
 
-def _still(
-    rig: Rig,
-    files: Mapping[str, list[Path]],
-    recording: SystemRecording,
-    out: Path,
-    network: Network,
-    max_memory: str | None,
-) -> tuple[list[str], Panels]:
+class Recorded(NamedTuple):
+    """A recorded system, its first camera alpha, and how it is fused."""
+
+    rig: Rig
+    files: Mapping[str, list[Path]]
+    recording: SystemRecording
+    out: Path
+    network: Network
+    max_memory: str | None
+
+
+def _still(recorded: Recorded) -> tuple[list[str], Panels]:
     """One frame fused and compared: lines of the table, and panels of the figure."""
+    rig, files, recording, out, network, max_memory = recorded
     alpha, ground_truth = rig.names[0], recording.ground_truth[0]
     views = ViewFiles(rig, {name: paths[0] for name, paths in files.items()}, alpha=alpha)
     read, images = views.developed, dict(views)
@@ -204,15 +209,9 @@ def _still(
     return [*scores, *extra], panels
 
 
-def _sequence(
-    rig: Rig,
-    files: Mapping[str, list[Path]],
-    recording: SystemRecording,
-    out: Path,
-    network: Network,
-    max_memory: str | None,
-) -> tuple[list[str], Panels]:
+def _sequence(recorded: Recorded) -> tuple[list[str], Panels]:
     """All frames fused, with and without propagated colour, and compared."""
+    rig, files, recording, out, network, max_memory = recorded
     alpha, ground_truth = rig.names[0], recording.ground_truth
     frames = {name: ImageFiles(paths, rig, name, alpha=alpha) for name, paths in files.items()}
     fusion = SequenceFusion(network, rig, frames, alpha, settings=FuseSettings(max_memory=max_memory))

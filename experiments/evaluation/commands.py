@@ -47,7 +47,7 @@ def with_truth(items: Sequence[T], half: str) -> Sequence[T]:
 
 
 @dataclass
-class Pairs(research.Evaluate):
+class Pairs(research.StereoSets):
     """Pairs of one half."""
 
     half: Half = "all"
@@ -68,7 +68,7 @@ class Pairs(research.Evaluate):
 
 
 @dataclass
-class Evaluate(Pairs):
+class Evaluate(Pairs, research.Evaluate):
     """As `pat evaluate`, by the paper's protocols, of one half of the pairs, with controls, without a rig.
 
     Example: python -m experiments evaluate --middlebury data/middlebury --half report --controls

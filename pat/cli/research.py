@@ -21,12 +21,8 @@ RenderedFolder = Annotated[Positional[Path], arg(metavar="FOLDER", help="Folder 
 
 
 @dataclass
-class Evaluate:
-    """Compare alpha alone, the classical baseline and the fusion on stereo pairs: PSNR, SSIM, images.
-
-    The left image made grey is alpha, the right one, reduced, is beta, the left one in colour is the ground
-    truth. Example: pat evaluate --kitti data/kitti --middlebury data/middlebury
-    """
+class StereoSets:
+    """Stereo pairs by data set, the network that fuses them, and where results go."""
 
     kitti: MaybePath = None
     """Folder of KITTI pairs: image_2 / image_3, or left.png / right.png."""
@@ -36,11 +32,33 @@ class Evaluate:
     """Folder of Flickr1024 pairs: 0001_L.png / 0001_R.png."""
     folder: MaybePath = None
     """Folder of other pairs, named in any of these ways."""
+    out: Out = Path("out/evaluate")
+    """Folder for what is written."""
+    weights: Weights = "mono-colour"
+
+    def sets(self) -> dict[str, Iterable[StereoPair]]:
+        """The pairs by data set, once all folders are open and what is written can be."""
+        from ..evaluation.stereo import DATA_SETS
+
+        folders = {name: getattr(self, name) for name in DATA_SETS if getattr(self, name) is not None}
+        if not folders:
+            raise ValueError(f"no images: give at least one of --{', --'.join(DATA_SETS)}")
+        writable(self.out, folder=True)
+        return {name: DATA_SETS[name](folder) for name, folder in folders.items()}
+
+
+@dataclass
+class Evaluate(StereoSets):
+    """Compare alpha alone, the classical baseline and the fusion on stereo pairs: PSNR, SSIM, images.
+
+    The left image made grey is alpha, the right one, reduced, is beta, the left one in colour is the ground
+    truth. Example: pat evaluate --kitti data/kitti --middlebury data/middlebury
+    """
+
     rates: tuple[int, ...] = (2, 4)
     """Factors by which beta is reduced."""
     out: Out = Path("out/evaluate")
     """Folder for scores.md, scores.csv and, for each data set, a strip of images a pair."""
-    weights: Weights = "mono-colour"
 
     def run(self) -> None:
         """Write and print the scores. Raises ValueError for no images, and for rates below 1."""
@@ -54,16 +72,10 @@ class Evaluate:
         self.write(rows, stereo.sets_markdown(rows))
 
     def sets(self) -> dict[str, Iterable[StereoPair]]:
-        """The pairs by data set, once all folders are open and what is written can be."""
-        from ..evaluation.stereo import DATA_SETS
-
-        folders = {name: getattr(self, name) for name in DATA_SETS if getattr(self, name) is not None}
-        if not folders:
-            raise ValueError(f"no images: give at least one of --{', --'.join(DATA_SETS)}")
+        """The same. Raises ValueError for rates below 1."""
         if not self.rates or min(self.rates) < 1:
             raise ValueError(f"--rates: {' '.join(map(str, self.rates))}: give whole numbers from 1 up")
-        writable(self.out, folder=True)
-        return {name: DATA_SETS[name](folder) for name, folder in folders.items()}
+        return super().sets()
 
     def write(self, rows: Mapping[str, Sequence[StereoRow]], text: str) -> None:
         """Write scores.md and scores.csv, and print the text."""

@@ -223,9 +223,9 @@ def agreed(inputs: Inputs, matches: Matches) -> Matches:
 
 @torch.no_grad()
 def with_likeliest_colours(inputs: Inputs, own: Matches, agreed: Matches) -> Matches:
-    """What betas agree on; but of betas that show all bands of the result, whose colours stand in for each
-    other's, `disparity`, where colours are from, is their own match unless beta is more like alpha there, and
-    `facts` are of their own."""
+    """What betas agree on. But of betas that show all bands of the result, whose colours stand in for each
+    other's, `disparity`, where colours are from, is their own match, or where all agree if beta is more like
+    alpha there; and `facts` are of their own matches."""
     betas = list(agreed.betas)
     for i, (one, found, same) in enumerate(zip(inputs.by_beta, own.betas, agreed.betas)):
         if inputs.shows_all_bands(inputs.betas[i]):

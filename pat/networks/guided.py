@@ -44,7 +44,8 @@ class GuidedSettings:
     least_weight: float = size(1e-3, "The least weight of a pixel in propagation")
     alike: float = tuned(
         2.0,
-        "Middlebury, tune half: added to confidence's logit where beta is as bright, when colour is blended",
+        "Middlebury, tune half: added to confidence's logit where beta is as bright, when colour is blended; "
+        "and the power of likeness by which each of several betas counts",
     )
     nowhere: float = size(-30.0, "The logit of the confidence where there is no valid segment")
 

@@ -1,7 +1,8 @@
 """Several colour betas about a mono alpha: rendered scenes of five cameras, fused with one, two, four betas.
 
     pat render arrays.yaml --scenes 4 --out arrays      # for each generator, with the rig that `--rig FILE`
-    writes python -m tests.benchmarks.bench_arrays arrays/* --out tests/benchmarks/RESULTS_arrays.md
+    # writes, seed 1, preset fast: abstract, photographs (of City100), experiments.scenes:still_life
+    python -m tests.benchmarks.bench_arrays arrays/* --out tests/benchmarks/RESULTS_arrays.md
 
 Alpha is the luma of what its camera sees, each beta is reduced 2x; the figure is PSNR (dB) against alpha's
 colours.
