@@ -57,7 +57,7 @@ class LowLightSettings:
         "noise that a demosaicing has smoothed shows as half or less",
     )
     found_bytes: float = size(12.0, "Of a position in a beta and its confidence")
-    averaging: float = size(0.25, "The time of averaging over that of denoising the views, about")
+    averaging: float = size(0.4, "The time of averaging over that of denoising the views, about")
 
 
 SETTINGS = LowLightSettings()
