@@ -92,7 +92,8 @@ def transferred(inputs: Inputs, matches: Matches) -> Matches:
 def _transferred_piece(piece: Inputs, matches: Matches, sharing: Sequence[bool]) -> list[Tensor]:
     """The diffused colour betas share, if any do, each other beta's, and each beta's bands minus alpha."""
     alpha = piece.alpha
-    of_each = [transferred_bands(alpha, *one) for one in zip(piece.betas, matches.betas)]
+    parts = zip(piece.betas, matches.betas)
+    of_each = [transferred_bands(alpha, *one, sees_luma=piece.sees_luma) for one in parts]
     shared = []
     if any(sharing):
         colours, each = zip(*(one for one, counts in zip(of_each, sharing) if counts))
@@ -104,12 +105,14 @@ def _transferred_piece(piece: Inputs, matches: Matches, sharing: Sequence[bool])
     return [*shared, *separate, *(colour for colour, _ in of_each)]
 
 
-def transferred_bands(alpha: Tensor, beta: Beta, matches: BetaMatches) -> tuple[Tensor, Tensor]:
+def transferred_bands(
+    alpha: Tensor, beta: Beta, matches: BetaMatches, *, sees_luma: bool
+) -> tuple[Tensor, Tensor]:
     """A beta's bands minus alpha at its matches (B, C, H, W), and their weight (B, 1, H, W), 0 to 1."""
     if matches.comparison.mix is not None:
         return _colours_of_bands(alpha, beta, matches, matches.comparison.mix)
     where = beta.field.straight, matches.disparity, matches.facts, matches.comparison.whole
-    return matched_colours(alpha, combined_bands(beta.image), beta.image, *where)
+    return matched_colours(alpha, combined_bands(beta.image), beta.image, *where, sees_luma=sees_luma)
 
 
 def matched_colours(
@@ -120,9 +123,11 @@ def matched_colours(
     disparity: Float[Tensor, "b 1 h w"],
     facts: Float[Tensor, "b 3 h2 w2"],
     normalisation: Normalisation,
+    *,
+    sees_luma: bool = True,
 ) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 1 h w"]]:
-    """Beta's bands minus alpha at the matches, colour as in alpha's light, with the detail that alpha has and
-    beta has not; their weight, 0 to 1."""
+    """Beta's bands minus alpha at the matches, colour as in alpha's light if that sees about the luma of
+    colours, with the detail that alpha has and beta has not; their weight, 0 to 1."""
     bands, planes = beta.shape[1], torch.cat([beta, guide, normalisation.normalised(guide)], 1)
     sampled, valid = at_matches(planes, segments, disparity)
     values, luma, brightness = sampled.split([bands, 1, 1], 1)
@@ -131,7 +136,8 @@ def matched_colours(
     soft = normalisation.softened(alpha)
     weight = match_weight(brightness - soft, consistent, valid)
     if bands > 1:
-        colour, bright = _scaled_to_alpha(values - luma, luma, alpha, weight)
+        power = SETTINGS.saturation if sees_luma else 0.0
+        colour, bright = _scaled_to_alpha(values - luma, luma, alpha, weight, power)
         noise = colour_noise(brightness - soft, soft, weight * consistent)
         if float(noise.amax()) > SETTINGS.least_noise:
             colour = _without_noise(colour, bright, noise)
@@ -160,19 +166,19 @@ def _colours_of_bands(
 
 
 def _scaled_to_alpha(
-    colour: Tensor, brightness: Tensor, alpha: Tensor, weight: Tensor
+    colour: Tensor, brightness: Tensor, alpha: Tensor, weight: Tensor, power: float
 ) -> tuple[Tensor, Tensor]:
     """Colour differences (B, C, H, W) and brightness of beta, larger where alpha is brighter around a pixel.
 
     What a lens or the light makes brighter keeps its saturation, a reflection does not: the power is in
-    between.
+    between; and 0 where alpha sees something else, as near infrared: there the ratio is of materials.
     """
     least, most = 1e-3, SETTINGS.most_brighter
     alpha_mean, beta_mean = (
         box_mean(image * weight, SETTINGS.surroundings) + least for image in (alpha, brightness)
     )
     ratio = (alpha_mean / beta_mean.clamp(min=least)).clamp(1 / most, most)
-    return colour * ratio**SETTINGS.saturation, brightness * ratio
+    return colour * ratio**power, brightness * ratio
 
 
 def match_weight(
