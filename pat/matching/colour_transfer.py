@@ -71,13 +71,13 @@ SETTINGS = ColourTransferSettings()
 class MatchStatistics(NamedTuple):
     """Of a frame's consistent matches: of each piece of a large frame they would differ, and borders show.
 
-    count: (B, 1, 1, 1), how many matches, and one.
+    matches: (B, 1, 1, 1), how many, and one.
     colour: (B, C, 1, 1), beta's bands minus alpha, in the mean.
     level: (3, B, 1, 1, 1), for brightness as alpha's: what is subtracted, the factor, what is added.
     explained, noise: (B, 1, 1, 1), as of `explained_share` and `colour_noise`.
     """
 
-    count: Tensor
+    matches: Tensor
     colour: Tensor
     level: Tensor
     explained: Tensor
@@ -116,7 +116,7 @@ class MatchStatistics(NamedTuple):
     @classmethod
     def mean(cls, pieces: Sequence[MatchStatistics]) -> MatchStatistics:
         """Those of a frame, by those of its pieces."""
-        counts = torch.stack([piece.count for piece in pieces])
+        counts = torch.stack([piece.matches for piece in pieces])
         share = counts / counts.sum(0)
         return cls(*(torch.stack([w * x for w, x in zip(share, each)]).sum(0) for each in zip(*pieces)))
 
@@ -158,7 +158,8 @@ def _transferred_piece(
     piece: Inputs, matches: Matches, sharing: Sequence[bool], statistics: Sequence[MatchStatistics] | None
 ) -> list[Tensor]:
     """The diffused colour betas share, if any do, each other beta's, and each beta's bands minus alpha."""
-    alpha, given = piece.alpha, statistics or [None] * len(piece.betas)
+    alpha = piece.alpha
+    given: Sequence[MatchStatistics | None] = statistics or [None] * len(piece.betas)
     of_each = [transferred_bands(alpha, *one)[:2] for one in zip(piece.betas, matches.betas, given)]
     shared = []
     if any(sharing):
