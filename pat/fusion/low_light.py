@@ -1,4 +1,4 @@
-"""Fusion of noisy views: denoised before they are matched, and their colours averaged once they are fused."""
+"""Fusion of noisy views: denoised before they are matched, joined with what betas recorded once fused."""
 
 from __future__ import annotations
 
@@ -21,9 +21,10 @@ from arraygeom.threads import convolutions_in_parallel
 from arraygeom.warned import warn
 
 from ..matching.radiometry import Response
-from ..networks.bm3d import without_noise
+from ..networks.bm3d import Observation, seen_by_another, without_noise
 from ..networks.weights import load_denoiser
-from ..sensors import NoiseLevel
+from ..sensors import NoiseLevel, generator_for
+from ..sensors.steps import normal
 from ..support.settings import physics, size, tuned
 from .non_local_means import averaged_with_alike
 from .results import Frame
@@ -111,13 +112,13 @@ class LowLight:
         *,
         keep_alpha: bool = False,
     ) -> Frame:
-        """A frame fused from the denoised views, its colours averaged with those that betas recorded.
+        """A frame fused from the denoised views, with what betas recorded: brightness and colours.
 
         `matched` is where its pixels are in each beta, x and y, and the confidence of that. `steps` were
         taken before it was fused, but for radiometry: values keep their scale; they are not undone yet.
         `response` says what brings betas to alpha's exposure.
         With `keep_alpha` the luma is alpha's as recorded. Betas that are not all RGB are denoised one by one
-        alone.
+        alone, and brightness is alpha's alone where no combination of beta's bands is what alpha sees.
         """
         if not self.noisy:
             return frame
@@ -125,7 +126,12 @@ class LowLight:
         alpha, image, views = self.views.alpha, frame.image, self.prepared(steps)
         alpha_view = views.pop(alpha)
         if all(view.recorded.shape[1] == 3 for view in views.values()):
-            image = colours_averaged(image, [exposed(view, response) for view in views.values()], matched)
+            betas = [exposed(view, response) for view in views.values()]
+            if alpha in self.noisy and response.explains and not keep_alpha:
+                grain = self._grain(steps)
+                seen = [brightness(view, grain[name][None], response) for name, view in zip(views, betas)]
+                image = image + brightness_change(alpha_view, seen, matched)
+            image = colours_averaged(image, betas, matched)
         if keep_alpha:
             image = image + self._stepped(self.given.images, steps)[alpha] - alpha_view.denoised[0]
         return frame._replace(image=image)
@@ -136,6 +142,16 @@ class LowLight:
         views = {**quiet, **self.noisy}
         parts = [self._stepped({name: view[i][0] for name, view in views.items()}, steps) for i in range(3)]
         return {name: NoisyView(*(images[name][None] for images in parts)) for name in parts[0]}
+
+    def _grain(self, steps: Sequence[FusionStep]) -> Mapping[str, Float[Tensor, "c h w"]]:
+        """White noise of unit deviation in each beta after the steps, of which some smooth it."""
+        middle, scale = 0.5, 0.1  # images are within 0..1
+        drawn = {
+            name: middle + scale * normal(image.shape, image, generator_for(0, name))
+            for name, image in self.given.images.items()
+            if name != self.given.alpha
+        }
+        return {name: (image - middle) / scale for name, image in self._stepped(drawn, steps).items()}
 
     def _stepped(self, images: Mapping[str, Tensor], steps: Sequence[FusionStep]) -> Mapping[str, Tensor]:
         views = self.views.replace(images)
@@ -237,6 +253,40 @@ def denoised(
         return in_tiles(partial(without_noise, network.colour), image, deviation).to(dtype)
     bands = zip(image.split(1, 1), deviation.split(1, 1))
     return torch.cat([in_tiles(partial(without_noise, network.band), *band) for band in bands], 1).to(dtype)
+
+
+class Brightness(NamedTuple):
+    """What alpha would have seen of a beta, its deviation, and grain of unit deviation: (1, 1, H, W)."""
+
+    recorded: Tensor
+    deviation: Tensor
+    grain: Tensor
+
+
+def brightness(view: NoisyView, grain: Float[Tensor, "1 3 h w"], response: Response) -> Brightness:
+    """Of an RGB beta at alpha's exposure, whose bands have noise of their own each."""
+    weights = response.weights.to(view.recorded)[:, None, None]
+    deviation = (weights * view.deviation).square().sum(1, keepdim=True).sqrt()
+    recorded, mixed = ((weights * image).sum(1, keepdim=True) for image in (view.recorded, grain))
+    return Brightness(recorded, deviation, mixed / weights.square().sum().sqrt())
+
+
+@torch.no_grad()
+def brightness_change(
+    alpha: NoisyView, betas: Sequence[Brightness], matched: Float[Tensor, "n 3 h w"]
+) -> Float[Tensor, "1 h w"]:
+    """What the betas' recordings change in alpha's denoised brightness, of one after another."""
+
+    def changed(estimate: Tensor, *planes: Tensor) -> Tensor:
+        first, deviation, *other = (plane[0] for plane in planes)
+        return seen_by_another(estimate[0], first, deviation, Observation(*other))[None]
+
+    estimate = alpha.denoised
+    for beta, found in zip(betas, matched):
+        positions, confidence = found[:2].movedim(0, -1), found[None, 2:].to(estimate)
+        there = (sample(plane, positions[None]).values for plane in beta)
+        estimate = estimate + in_tiles(changed, estimate, alpha.recorded, alpha.deviation, *there, confidence)
+    return (estimate - alpha.denoised)[0]
 
 
 @torch.no_grad()

@@ -2,18 +2,22 @@
 
 Blocks of 8 x 8 pixels are stacked with those most alike near them. A cosine transform of each and a Hadamard
 transform over the stack gather what they have in common in few coefficients, and noise spreads over all of
-them. Coefficients are weighted by how strong they are in an earlier estimate (Wiener's filter).
+them. Coefficients are weighted by how strong they are in an earlier estimate (Wiener's filter). What another
+camera recorded of the same points is added likewise (`seen_by_another`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import pad, unfold
 
 from arraygeom.chunks import spans
 from arraygeom.compiled import compiled
@@ -38,12 +42,16 @@ class BM3DSettings:
         "where an image is flat the noise makes blocks alike that lie apart, as is needed",
     )
     kept: float = tuned(0.5, "Middlebury, tune half: share of the network's brightness that is kept")
+    unlike: float = tuned(
+        0.05, "Middlebury, tune half: share of a coefficient's power by which another camera's match differs"
+    )
+    blocks: int = size(20_000, "About so many blocks say how another camera blurs")
 
 
 SETTINGS = BM3DSettings()
 SIDE, STEP, ALIKE, RADIUS, ROWS = SETTINGS.side, SETTINGS.step, SETTINGS.alike, SETTINGS.radius, SETTINGS.rows
 """For the compiled loops, which read no attributes."""
-AS_RECORDED, KEPT = SETTINGS.as_recorded, SETTINGS.kept
+AS_RECORDED, KEPT, UNLIKE = SETTINGS.as_recorded, SETTINGS.kept, SETTINGS.unlike
 CELLS = SIDE // STEP
 
 
@@ -94,32 +102,84 @@ def wiener_filtered(
     Blocks are alike where `guide` is. Beyond the edges images are mirrored. Computed in float32 on the CPU,
     on as many threads as torch may use; back on the image's device.
     """
-    h, w = image.shape[-2:]
+    return _of_groups(filter_groups, [image, expected, deviation.square()], guide, len(image))
+
+
+class Observation(NamedTuple):
+    """What another camera recorded at an image's pixels, of the same band: each (1, h, w).
+
+    `grain` is noise of unit deviation where that camera's is white, as it is when it gets there; `confidence`
+    is that of the positions.
+    """
+
+    recorded: Tensor
+    deviation: Tensor
+    grain: Tensor
+    confidence: Tensor
+
+
+def seen_by_another(
+    estimate: Float[Tensor, "1 h w"],
+    recorded: Float[Tensor, "1 h w"],
+    deviation: Float[Tensor, "1 h w"],
+    other: Observation,
+) -> Float[Tensor, "1 h w"]:
+    """What another camera's recording of the same points changes in an estimate without noise.
+
+    Kalman's update (1960) of each group's coefficients. The estimate's error is that of Wiener's filter for
+    what was `recorded` with noise of this deviation. The other camera blurs (by how much is found), and its
+    noise has a spectrum; the less its positions are certain, the less it counts.
+    """
+    taken = torch.lerp(estimate, other.recorded, other.confidence)
+    planes = [estimate, taken, deviation.square(), other.deviation.square(), other.confidence]
+    update = partial(update_groups, *_blur_and_spectrum(estimate, other))
+    return _of_groups(update, planes, torch.lerp(estimate, recorded, AS_RECORDED), 1)
+
+
+def _blur_and_spectrum(estimate: Float[Tensor, "1 h w"], other: Observation) -> tuple[np.ndarray, np.ndarray]:
+    """The share of each coefficient of a block that another camera shows, and the power of its grain."""
+    step = max(round((estimate.numel() / SETTINGS.blocks) ** 0.5), 1)
+    planes = torch.stack([estimate, *other[:1], *other[2:]]).float()
+    size = [max(SIDE - n, 0) for n in reversed(estimate.shape[-2:])]
+    planes = pad(planes, (0, size[0], 0, size[1]), mode="replicate")
+    blocks = unfold(planes, SIDE, stride=step).mT.unflatten(-1, (SIDE, SIDE))
+    cosines = torch.from_numpy(COSINES).to(blocks)
+    own, seen, grain = (cosines @ blocks[:3] @ cosines.T).flatten(2)
+    counts = blocks[3].mean((-2, -1)).square().clamp(min=1e-9)
+    share = (counts @ (own * seen)) / (counts @ own.square()).clamp(min=1e-9)
+    spectrum = (counts @ grain.square()) / counts.sum()
+    return share.clamp(0, 1).cpu().numpy(), spectrum.cpu().numpy()
+
+
+def _of_groups(
+    kernel: Callable[..., None], images: Sequence[Tensor], guide: Float[Tensor, "g h w"], bands: int
+) -> Float[Tensor, "bands h w"]:
+    """What a kernel makes of the groups of blocks that are alike in the guide, put together."""
+    h, w = guide.shape[-2:]
     margin = SIDE - STEP
     across, down = (-(-(size + margin) // STEP) for size in (w, h))
     first = RADIUS + margin
     padding = [(0, 0), (first, STEP * down + first - h), (first, STEP * across + first - w)]
-    planes = [
-        np.pad(x.detach().float().cpu().numpy(), padding, mode="symmetric")
-        for x in (image, expected, deviation.square(), guide)
-    ]
+    *planes, alike_in = (
+        np.pad(x.detach().float().cpu().numpy(), padding, mode="symmetric") for x in (*images, guide)
+    )
     high = STEP * (ROWS - 1) + SIDE + 2 * RADIUS
 
     def filtered(top: int, bottom: int) -> np.ndarray:
         alike = np.zeros((bottom - top, across, ALIKE, 2), np.int16)
-        find_alike(planes[3], top, alike)
-        sums = np.zeros((2, len(image), high, planes[0].shape[2]), np.float32)
-        filter_groups(*planes[:3], top, alike, COSINES, WINDOW, sums)
+        find_alike(alike_in, top, alike)
+        sums = np.zeros((2, bands, high, alike_in.shape[2]), np.float32)
+        kernel(*planes, top, alike, COSINES, WINDOW, sums)
         return sums
 
-    total = np.zeros((2, *planes[0].shape), np.float32)
-    bands: dict[int, np.ndarray] = {}
-    in_parallel([lambda span=span: bands.update({span[0]: filtered(*span)}) for span in spans(down, ROWS)])
-    for top in sorted(bands):
+    total = np.zeros((2, bands, *alike_in.shape[1:]), np.float32)
+    strips: dict[int, np.ndarray] = {}
+    in_parallel([lambda span=span: strips.update({span[0]: filtered(*span)}) for span in spans(down, ROWS)])
+    for top in sorted(strips):
         rows = total[:, :, STEP * top : STEP * top + high]
-        rows += bands.pop(top)[:, :, : rows.shape[2]]
+        rows += strips.pop(top)[:, :, : rows.shape[2]]
     inside = total[:, :, first : first + h, first : first + w]
-    return torch.from_numpy(inside[0] / inside[1]).to(image)
+    return torch.from_numpy(inside[0] / inside[1]).to(images[0])
 
 
 _PHASES = np.outer(np.arange(SIDE), 2 * np.arange(SIDE) + 1) * np.pi / (2 * SIDE)
@@ -202,6 +262,18 @@ def group_transform(blocks):
             blocks[i, n] *= np.float32(ALIKE**-0.5)
 
 
+@compiled(inline="always")
+def put_back(group, counts, y0, x0, alike, window, out):
+    """Add to `out` (2, rows, w) a group's blocks, which count so much each, and weights."""
+    for n in range(ALIKE):
+        y, x = y0 + alike[n, 0], x0 + alike[n, 1]
+        for i in range(SIDE):
+            for j in range(SIDE):
+                weight = counts * window[i, j]
+                out[0, y + i, x + j] += weight * group[SIDE * i + j, n]
+                out[1, y + i, x + j] += weight
+
+
 @compiled(nogil=True, cache=True, fastmath=True)
 def filter_groups(image, expected, variance, top, alike, cosines, window, out):
     """Add to `out` (2, c, rows, w), from its first row of blocks: filtered blocks, weighted, and weights."""
@@ -236,10 +308,45 @@ def filter_groups(image, expected, variance, top, alike, cosines, window, out):
                 group_transform(group)
                 block_transform(group, spare, back)
                 counts = 1 / ((noise + np.float32(1e-8)) * total)
+                put_back(group, counts, y0 - STEP * top, x0, alike[r, k], window, out[:, c])
+
+
+@compiled(nogil=True, cache=True, fastmath=True)
+def update_groups(
+    share, spectrum, estimate, taken, variance, other, confidence, top, alike, cosines, window, out
+):
+    """Add to `out` (2, 1, rows, w), from its first row of blocks: the weighted updates, and weights."""
+    rows, columns = alike.shape[:2]
+    group = np.empty((SIDE * SIDE, ALIKE), np.float32)
+    pilot = np.empty((SIDE * SIDE, ALIKE), np.float32)
+    spare = np.empty((SIDE * SIDE, ALIKE), np.float32)
+    back = cosines.T.copy()
+    for r in range(rows):
+        for k in range(columns):
+            y0, x0 = RADIUS + STEP * (top + r), RADIUS + STEP * k
+            noise, others, certain = np.float32(1e-12), np.float32(1e-12), np.float32(1e-6)
+            for n in range(ALIKE):
+                y, x = y0 + alike[r, k, n, 0], x0 + alike[r, k, n, 1]
+                noise += variance[0, y + SIDE // 2, x + SIDE // 2] / ALIKE
+                others += other[0, y + SIDE // 2, x + SIDE // 2] / ALIKE
+                certain += confidence[0, y + SIDE // 2, x + SIDE // 2] / ALIKE
+                for i in range(SIDE):
+                    for j in range(SIDE):
+                        group[SIDE * i + j, n] = taken[0, y + i, x + j]
+                        pilot[SIDE * i + j, n] = estimate[0, y + i, x + j]
+            block_transform(group, spare, cosines)
+            group_transform(group)
+            block_transform(pilot, spare, cosines)
+            group_transform(pilot)
+            total = np.float32(1)
+            for i in range(SIDE * SIDE):
                 for n in range(ALIKE):
-                    y, x = y0 + alike[r, k, n, 0] - STEP * top, x0 + alike[r, k, n, 1]
-                    for i in range(SIDE):
-                        for j in range(SIDE):
-                            weight = counts * window[i, j]
-                            out[0, c, y + i, x + j] += weight * group[SIDE * i + j, n]
-                            out[1, c, y + i, x + j] += weight
+                    power = pilot[i, n] * pilot[i, n]
+                    error = power * noise / (power + noise)
+                    unlike = (spectrum[i] * others + UNLIKE * power) / (certain * certain)
+                    gain = share[i] * error / (share[i] * share[i] * error + unlike + np.float32(1e-12))
+                    group[i, n] = gain * (group[i, n] - share[i] * pilot[i, n])
+                    total += gain * gain
+            group_transform(group)
+            block_transform(group, spare, back)
+            put_back(group, 1 / total, y0 - STEP * top, x0, alike[r, k], window, out[:, 0])

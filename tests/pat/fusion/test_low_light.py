@@ -14,12 +14,24 @@ from arraygeom.distortion import Distortion
 from arraygeom.fields.grid import FieldOnGrid
 from pat.evaluation.baseline import classical, non_local_means
 from pat.evaluation.metrics import score
+from pat.fusion.corrections import find_corrections
 from pat.fusion.fuse import fuse
 from pat.fusion.inputs import FrameInputs, Placement
-from pat.fusion.low_light import NoisyView, denoised, denoised_views, noise_levels, shown_noise, warped
+from pat.fusion.low_light import (
+    Brightness,
+    NoisyView,
+    brightness,
+    brightness_change,
+    denoised,
+    denoised_views,
+    noise_levels,
+    shown_noise,
+    warped,
+)
 from pat.fusion.tiles import Tile, fuse_tile
 from pat.fusion.views import Views
 from pat.matching.inputs import Beta, Inputs
+from pat.matching.radiometry import Response
 from pat.media.colour import luminance
 from pat.networks.protocol import FusionOutput
 from pat.networks.weights import load_weights
@@ -84,6 +96,62 @@ def test_averaged_colours_improve_on_denoising_alone(network, fused, monkeypatch
     monkeypatch.setattr("pat.fusion.low_light.averaged_with_alike", lambda image, *_: image)
     alone = fuse(network, sample.rig, images, alpha=ALPHA, noise=noise).image
     assert psnr(averaged, sample) > psnr(alone, sample) + 0.02
+
+
+@pytest.mark.parametrize(("electrons", "gain"), [(50, 0.05), (5000, 0.5)])
+def test_a_betas_light_improves_on_alphas_brightness(network, monkeypatch, electrons, gain):
+    """The more, the more of it there is: of so many electrons where alpha has 50."""
+    sample, images, noise = in_low_light(50)
+    noise[BETA] = NoiseLevel.of_electrons(electrons, 2)
+    images[BETA] = noise[BETA].recorded(sample.images[BETA][None], generator_for(0, BETA))[0]
+    joined = fuse(network, sample.rig, images, alpha=ALPHA, noise=noise).image
+    monkeypatch.setattr("pat.fusion.low_light.seen_by_another", lambda estimate, *_: 0 * estimate)
+    alone = fuse(network, sample.rig, images, alpha=ALPHA, noise=noise).image
+    seen, denoised, true = map(luminance, (joined, alone, sample.ground_truth))
+    assert float((seen - true).square().mean()) < 10 ** (-gain / 10) * float(
+        (denoised - true).square().mean()
+    )
+
+
+def test_each_beta_adds_what_it_saw():
+    """One after another, where its matches are certain; a beta that is shifted, at its matches."""
+    y, x = torch.meshgrid(torch.arange(40.0), torch.arange(60.0), indexing="ij")
+    clean = (0.5 + 0.03 * torch.sin(0.6 * x + 0.3 * y))[None, None]
+    estimate = 0.5 + 0.6 * (clean - 0.5)
+    alpha = NoisyView(estimate, estimate, torch.full_like(clean, 0.2))
+    grain = torch.randn(clean.shape, generator=generator_for(0))
+    betas = [Brightness(image, 0.01 + 0 * clean, grain) for image in (clean, clean.roll(5, -1))]
+    left, right = (torch.stack([x + move, y, c.to(x)]) for move, c in ((0, x < 30), (5, x >= 30)))
+    right[0].clamp_(max=59)
+    change = brightness_change(alpha, betas, torch.stack([left, right]))
+    before, after = ((image - clean).abs()[0, 0, 8:-8] for image in (estimate, estimate + change))
+    for part in (slice(8, 25), slice(35, 50)):
+        assert float(after[:, part].mean()) < 0.7 * float(before[:, part].mean())
+
+
+def test_brightness_is_of_what_alpha_sees():
+    """Its response; independent noise of the bands; grain of unit deviation."""
+    view = NoisyView(*(torch.rand(1, 3, 40, 50, generator=generator_for(0, i)) for i in range(3)))
+    grain = torch.randn(1, 3, 40, 50, generator=generator_for(1))
+    found = brightness(view, grain, Response(torch.tensor([0.6, 0.3, 0.1])))
+    red, green, blue = view.recorded[0]
+    torch.testing.assert_close(found.recorded[0, 0], 0.6 * red + 0.3 * green + 0.1 * blue)
+    bands = view.deviation[0] * torch.tensor([0.6, 0.3, 0.1])[:, None, None]
+    torch.testing.assert_close(found.deviation[0, 0], bands.square().sum(0).sqrt())
+    assert float(found.grain.std()) == pytest.approx(1, abs=0.05)
+
+
+def test_brightness_that_no_beta_explains_is_alphas_alone(network, monkeypatch):
+    sample, images, noise = in_low_light(200)
+    unlike = partial(find_corrections_explaining, 0.5)
+    monkeypatch.setattr("pat.fusion.fuse.find_corrections", unlike)
+    monkeypatch.setattr("pat.fusion.low_light.brightness_change", lambda *_: pytest.fail("was changed"))
+    fuse(network, sample.rig, images, alpha=ALPHA, noise=noise)
+
+
+def find_corrections_explaining(share, *args, **options):
+    found = find_corrections(*args, **options)
+    return replace(found, response=Response.rec601()._replace(explained=share))
 
 
 @pytest.mark.parametrize("given", [(ALPHA, BETA), (BETA,)])
