@@ -174,8 +174,8 @@ def test_a_band_that_no_combination_explains_leaves_rec601(monkeypatch):
 
 
 def test_materials_that_near_infrared_shows_otherwise_are_no_wrong_matches():
-    """Leaves are a quarter of this scene; the rest is as bright as in visible light. A robust fit leaves leaves
-    out."""
+    """Leaves are a quarter of this scene, which a robust fit leaves out; the rest is as bright as in visible
+    light."""
     g = torch.Generator().manual_seed(2)
     material = torch.randint(12, (4000,), generator=g)
     shadow = 0.4 + 0.6 * torch.rand(4000, generator=g)
