@@ -160,7 +160,8 @@ def _transferred_piece(
     """The diffused colour betas share, if any do, each other beta's, and each beta's bands minus alpha."""
     alpha = piece.alpha
     given: Sequence[MatchStatistics | None] = statistics or [None] * len(piece.betas)
-    of_each = [transferred_bands(alpha, *one)[:2] for one in zip(piece.betas, matches.betas, given)]
+    parts = zip(piece.betas, matches.betas, given)
+    of_each = [transferred_bands(alpha, *one, sees_luma=piece.sees_luma)[:2] for one in parts]
     shared = []
     if any(sharing):
         colours, each = zip(*(one for one, counts in zip(of_each, sharing) if counts))
@@ -173,14 +174,20 @@ def _transferred_piece(
 
 
 def transferred_bands(
-    alpha: Tensor, beta: Beta, matches: BetaMatches, statistics: MatchStatistics | None = None
+    alpha: Tensor,
+    beta: Beta,
+    matches: BetaMatches,
+    statistics: MatchStatistics | None = None,
+    *,
+    sees_luma: bool = True,
 ) -> tuple[Tensor, Tensor, MatchStatistics]:
     """A beta's bands minus alpha at its matches (B, C, H, W), their weight (B, 1, H, W), 0 to 1, and the
     statistics by which it is done: of these pixels, unless they are given."""
     if matches.comparison.mix is not None:
         return _colours_of_bands(alpha, beta, matches, matches.comparison.mix, statistics)
     where = beta.field.straight, matches.disparity, matches.facts, matches.comparison.whole
-    return matched_colours(alpha, combined_bands(beta.image), beta.image, *where, statistics)
+    there = alpha, combined_bands(beta.image), beta.image, *where, statistics
+    return matched_colours(*there, sees_luma=sees_luma)
 
 
 def matched_colours(
@@ -192,9 +199,12 @@ def matched_colours(
     facts: Float[Tensor, "b 3 h2 w2"],
     normalisation: Normalisation,
     statistics: MatchStatistics | None = None,
+    *,
+    sees_luma: bool = True,
 ) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 1 h w"], MatchStatistics]:
-    """Beta's bands minus alpha at the matches, colour as in alpha's light, with the detail that alpha has and
-    beta has not; their weight, 0 to 1; statistics, as of `transferred_bands`."""
+    """Beta's bands minus alpha at the matches, colour as in alpha's light if that sees about the luma of
+    colours, with the detail that alpha has and beta has not; their weight, 0 to 1; statistics, as of
+    `transferred_bands`."""
     bands, planes = beta.shape[1], torch.cat([beta, guide, normalisation.normalised(guide)], 1)
     sampled, valid = at_matches(planes, segments, disparity)
     values, luma, brightness = sampled.split([bands, 1, 1], 1)
@@ -203,7 +213,8 @@ def matched_colours(
     unlike = statistics.leveled(brightness) - soft
     weight = match_weight(unlike, consistent, valid)
     if bands > 1:
-        colour, bright = _scaled_to_alpha(values - luma, luma, alpha, weight)
+        power = SETTINGS.saturation if sees_luma else 0.0
+        colour, bright = _scaled_to_alpha(values - luma, luma, alpha, weight, power)
         if float(statistics.noise.amax()) > SETTINGS.least_noise:
             colour = _without_noise(colour, bright, statistics.noise)
         radii = [round(SETTINGS.detail_radius * max(1.0, blur)) for blur in normalisation.blurs[0]]
@@ -236,19 +247,19 @@ def _colours_of_bands(
 
 
 def _scaled_to_alpha(
-    colour: Tensor, brightness: Tensor, alpha: Tensor, weight: Tensor
+    colour: Tensor, brightness: Tensor, alpha: Tensor, weight: Tensor, power: float
 ) -> tuple[Tensor, Tensor]:
     """Colour differences (B, C, H, W) and brightness of beta, larger where alpha is brighter around a pixel.
 
     What a lens or the light makes brighter keeps its saturation, a reflection does not: the power is in
-    between.
+    between; and 0 where alpha sees something else, as near infrared: there the ratio is of materials.
     """
     least, most = 1e-3, SETTINGS.most_brighter
     alpha_mean, beta_mean = (
         box_mean(image * weight, SETTINGS.surroundings) + least for image in (alpha, brightness)
     )
     ratio = (alpha_mean / beta_mean.clamp(min=least)).clamp(1 / most, most)
-    return colour * ratio**SETTINGS.saturation, brightness * ratio
+    return colour * ratio**power, brightness * ratio
 
 
 def match_weight(

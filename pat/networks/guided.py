@@ -64,7 +64,8 @@ class BetaEstimate(NamedTuple):
         `diffused`.
     position: (B, 2, H, W), the semi-global match in beta, pixels; beyond beta's edge where the segment is cut
         there.
-    likeness: (B, 1, H, W), of alpha's brightness and that attended in beta, 0 to 1.
+    likeness: (B, 1, H, W), of alpha's brightness and that attended in beta, 0 to 1; 1 if alpha sees something
+        else.
     """
 
     attended: Tensor
@@ -165,6 +166,8 @@ class GuidedPAT(nn.Module):
             raise ValueError(f"the betas have {sum(bands)} bands in all, this network makes {wanted}")
         alpha, encoded = inputs.alpha, self.encoder(inputs.alpha)
         estimates = [self.estimate(encoded, alpha, *one) for one in zip(inputs.betas, matches.betas)]
+        if not inputs.sees_luma:  # then brightness says nothing of a match
+            estimates = [e._replace(likeness=torch.ones_like(e.likeness)) for e in estimates]
         used = estimates if parts else [combined([e for e, n in zip(estimates, bands) if n == wanted])]
         residual = self.blended(encoded, alpha, used, complete=inputs.sees_luma)
         if self.config.keep_luminance:

@@ -16,7 +16,7 @@ from pat.matching.likeness import UNLIKE
 from pat.matching.matches import BetaMatches, Matches
 from pat.matching.normalisation import Comparison, explained_share
 from pat.media.colour import luminance
-from tests.pat.matching.matched_scenes import beside, blurred, faint, semi_global_matching
+from tests.pat.matching.matched_scenes import beside, blurred, faint, matched, semi_global_matching
 
 
 def enlarged(image: torch.Tensor, times: int) -> torch.Tensor:
@@ -146,6 +146,21 @@ def test_colour_is_as_bright_as_alpha_where_betas_lens_is_dark():
         e[..., 64:].abs().mean() for e in chroma_errors(alpha, beta, ground_truth, in_place((64, 128)))
     )
     assert wrong < 0.6 * darker
+
+
+@pytest.mark.parametrize(("sees_luma", "kept"), [(True, 0.5**0.6), (False, 1.0)])
+def test_colour_is_as_strong_as_beta_shows_it_if_alpha_sees_something_else(sees_luma, kept):
+    """Near infrared is half as bright: so are the materials in it, not the light."""
+    scene = faint(3, contrast=0.12, blur=1.5)[..., :128]
+    beta = scene * torch.tensor([1.3, 1.0, 0.4]).view(1, 3, 1, 1)
+    alpha, guide = 0.5 * luminance(beta), luminance(beta)
+    segments, blocks = in_place((64, 128))
+    comparison = Comparison.of(alpha, guide)
+    disparity, facts = matched(alpha, guide, segments, blocks, comparison)
+    there = alpha, guide, beta, segments, disparity, facts, comparison.whole
+    bands, _, _ = warped.matched_colours(*there, sees_luma=sees_luma)
+    found, given = (image - luminance(image) for image in (bands, beta))
+    assert float((found * given).sum() / given.square().sum()) == pytest.approx(kept, abs=0.02)
 
 
 def test_detail_counts_as_far_as_brightness_explains_alpha():

@@ -1,5 +1,7 @@
 """GuidedPAT: colour is added and never luminance, betas in any split, gradients reach the geometry."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -129,6 +131,17 @@ def test_colour_counts_more_where_brightness_is_alike():
     assert (unlike.likeness[inside] < 0.01).all()
     same = unlike._replace(logit=alike.logit)
     assert ((alike.blending - same.blending)[inside] > 0.05).all()
+
+
+def test_brightness_tells_nothing_of_a_match_if_alpha_sees_something_else():
+    """As near infrared, nearly always of another brightness: colours of certain matches gave way to what was
+    filled in."""
+    torch.manual_seed(0)
+    network = GuidedPAT(SMALL)
+    alpha, beta = torch.full((1, 1, *HW), 0.9), torch.full((1, 3, *HW), 0.5)
+    inputs = replace(Inputs.of(alpha, [beta], [rectified()]), sees_luma=False)
+    (found,) = network.explain(inputs, matched_for(network, inputs))[1]
+    assert (found.likeness == 1).all()
 
 
 def test_features_are_as_exact_as_the_image_and_positions_more(monkeypatch):
