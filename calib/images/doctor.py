@@ -69,7 +69,8 @@ class Diagnosis:
     clearly better than a drift of the cameras does. equal: other kinds of mistake that explain them as well.
     before, after: statistics of the given rig and of the repaired one. tried: of all, best first. matches:
     number of points used. healthy: the given rig fits the images. certain: all explanations that are
-    as good as the one named are undone by the same rig.
+    as good as the one named are undone by the same rig. depth: bounds of the points' depth, as of
+    `depth_seen`, by the rig named, if that states no depth range.
     """
 
     named: Hypothesis
@@ -80,6 +81,7 @@ class Diagnosis:
     matches: int
     healthy: bool
     certain: bool
+    depth: tuple[float, float] | None = None
 
     @property
     def verdict(self) -> str:
@@ -107,7 +109,14 @@ class Diagnosis:
         lines = [self.verdict, f"as given: {self.before.as_text(unit)}"]
         if self.named.kind != "nothing":
             lines.append(f"repaired: {self.after.as_text(unit)}")
-        return "\n".join([*lines, f"from {self.matches} points seen in two images"])
+        lines.append(f"from {self.matches} points seen in two images")
+        if self.depth is not None:
+            near, far = (f"{bound:.3g}" for bound in self.depth)
+            lines.append(
+                f"the rig states no depth range; the points are {near} to {far} {unit} away, with a margin: "
+                f"add `depth: [{near}, {far}]` to its file, or give `--depth {near} {far}` where it is used"
+            )
+        return "\n".join(lines)
 
     def as_json(self) -> str:
         """The same as JSON, with the ten best explanations."""
@@ -119,6 +128,7 @@ class Diagnosis:
             "as_good": [{"mistake": h.kind, "words": h.words} for h in self.equal],
             "healthy": self.healthy,
             "matches": self.matches,
+            "depth": self.depth,
             "before": _rounded(self.before),
             "after": _rounded(self.after),
             "tried": tried,
@@ -176,6 +186,7 @@ def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnos
         matches=sum(len(matches.alpha) for matches in pairs.values()),
         healthy=healthy,
         certain=named is not given and all(_same_rig(named.rig, h.rig, pairs) for h in others),
+        depth=depth_seen(named.rig, pairs) if named.rig.depth is None else None,
     )
 
 

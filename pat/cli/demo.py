@@ -66,7 +66,8 @@ class Demo:
         table = table_of(columns)
         print(table, end="")
         write_text(self.out / "demo.md", f"```\n{table}```\n")
-        say(f"written: {', '.join(map(str, [*written, self.out / 'demo.png']))}")
+        written += [self.out / "demo.png", self.out / "demo.md"]
+        say(f"written: {', '.join(map(str, written))}")
 
 
 CORNER = (190, 300)

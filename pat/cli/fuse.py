@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from ..fusion.healing import Healed
     from ..fusion.report import Facts
     from ..fusion.results import Frame
+    from ..fusion.views import ViewFiles
 
 LOG = logging.getLogger(__name__)
 
@@ -144,6 +145,7 @@ class Fuse(Known):
         files = self._frames(files)
         self._choose_bits(files)
         views = ViewFiles(rig, {name: paths[0] for name, paths in files.items()}, alpha=alpha)
+        self._choose_weights(views)
         if self.sequence:
             return self._many(rig, files, alpha)
         with ThreadPoolExecutor(1) as beside:
@@ -156,6 +158,19 @@ class Fuse(Known):
             if several:
                 return self._many(rig, files, alpha)
             self._one(developed_rig(rig, files), views, alpha, views.files, healing=compared.result)
+
+    def _choose_weights(self, views: ViewFiles) -> None:
+        """The weights for any bands, unless asked otherwise, where no beta is meant to be in colour and they
+        do not have three bands in all."""
+        from ..networks.weights import weights_for
+
+        betas = [name for name in views if name != views.alpha]
+        if self.weights or any(views.rig[name].sensor.response == "rgb" for name in betas):
+            return
+        bands = [len(views[name]) for name in betas]
+        if 3 not in bands and sum(bands) != 3:
+            self.weights = weights_for(bands)
+            say(f"weights: {self.weights} (--weights NAME takes others)")
 
     def _without_rig(self) -> None:
         """Fuse images, folders or videos alone. Raises ValueError for options that need a rig."""

@@ -125,7 +125,10 @@ def find_corrections(
         inputs = corrections.applied(small.inputs, small.hw)
         parts = zip(small.inputs.betas, inputs.betas, located(inputs).betas)
         matches = [_of_beta(inputs.alpha, *of_beta, small.hw) for of_beta in parts]
-        response_now = _fitted(small, matches) if fits else corrections.response
+        response_now = corrections.response
+        if rgb:
+            found = _fitted(small, matches)
+            response_now = found if fits else response_now._replace(explained=found.explained)
         steps = [fit_misalignment(*m[1:]) if align else Misalignment() for m in matches]
         moves = zip(inputs.cameras, corrections.of_betas(inputs), steps)
         by_camera = {camera: before + step for names, before, step in moves for camera in names}

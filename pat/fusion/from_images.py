@@ -110,7 +110,7 @@ def array_from_images(
     if tagged is not None and focal:
         raise ValueError("focal: the images' tags state the focal lengths: leave it out")
     for name in files:
-        images[name] = _read(name, files[name], note)
+        images[name] = read_image(files[name], name=name)
     images = {name: _textured(f"{name}: {files.get(name, 'the image')}", images[name]) for name in sources}
     alpha = _chosen_alpha(images, alpha, note)
     if tagged is not None:
@@ -200,14 +200,16 @@ def frames_of_videos(
 
 
 def _tagged_rig(files: Mapping[str, Path], note: Say) -> Rig | None:
-    """The rig that the images' tags state, but for translations; None if not every image has such tags."""
+    """The rig that the images' tags state; None if not every image has such tags. Translations are found
+    later: none has to be stated."""
     if not states_cameras(list(files.values())):
         return None
     with warnings.catch_warnings(record=True, action="always") as caught:
         rig = rig_of_images(files)
     note(f"lenses and orientations of {', '.join(files)}: by the images' tags")
-    for warning in caught:
-        note(str(warning.message))
+    for text in (str(warning.message) for warning in caught):
+        if "RigTranslations" not in text:
+            note(text)
     return rig
 
 
@@ -397,16 +399,6 @@ def scaled(image: Float[Tensor, "c h w"], factor: float) -> Float[Tensor, "c h2 
     hw = [max(round(n * factor), 16) for n in image.shape[-2:]]
     reduced = interpolate(image[None], size=hw, mode="bicubic", antialias=True, align_corners=False)
     return reduced[0].clamp(0, 1)
-
-
-def _read(name: str, path: Path, note: Say) -> Float[Tensor, "c h w"]:
-    with warnings.catch_warnings(record=True, action="always") as caught:
-        image = read_image(path, name=name)
-    for warning in caught:
-        rotated = "orientation tag" in str(warning.message)
-        h, w = image.shape[-2:]
-        note(f"{name}: rotated as its EXIF orientation says, to {w}x{h}" if rotated else str(warning.message))
-    return image
 
 
 def _textured(label: str, image: Float[Tensor, "c h w"]) -> Float[Tensor, "_ h w"]:

@@ -30,6 +30,8 @@ QUALITY = 90
 """Of JPEG."""
 UNCONFIDENT = (230, 30, 120)
 """The colour that covers pixels without confidence."""
+LETTER, LINE = 8.0, 16.0
+"""Width of a letter and height of a line of the drawing's labels, in its units."""
 PAGE = Path(__file__).with_name("report.html")
 
 
@@ -134,19 +136,24 @@ def rig_drawing(rig: Rig, alpha: str) -> str:
     }
     points = np.concatenate([line for some in lines.values() for line in some])
     low, extent = points.min(0), float(np.ptp(points, axis=0).max()) or 1.0
-    drawn = []
+    drawn, labels = [], list[tuple[float, float, float]]()
     for i, name in enumerate(cameras):
         colour = COLOURS[i % len(COLOURS)]
         shown = [(line - low) / extent * 300 + 30 for line in lines[name]]
         for line in shown:
             text = " ".join(f"{x:.1f},{y:.1f}" for x, y in line)
             drawn.append(f'<polyline points="{text}" fill="none" stroke="{colour}" stroke-width="1.5"/>')
-        x, y = shown[0][0]
-        label = html.escape(name) + (" (alpha)" if name == alpha else "")
-        drawn.append(
-            f'<text x="{x:.1f}" y="{y + 18:.1f}" fill="{colour}" text-anchor="middle">{label}</text>'
-        )
+        label = name + (" (alpha)" if name == alpha else "")
+        (x, y), half = shown[0][0], LETTER * len(label) / 2
+        y += LINE
+        for left, right, above in sorted(labels, key=lambda place: place[2]):
+            if left < x + half and right > x - half and abs(above - y) < LINE:
+                y = above + LINE
+        labels.append((x - half, x + half, y))
+        text = html.escape(label)
+        drawn.append(f'<text x="{x:.1f}" y="{y:.1f}" fill="{colour}" text-anchor="middle">{text}</text>')
     wide, high = np.ptp(points, axis=0) / extent * 300 + 60
+    high = max(high, *(y + LINE / 2 for _, _, y in labels))
     return (
         f'<svg viewBox="0 0 {wide:.0f} {high:.0f}" role="img" aria-label="the rig from '
         f'above">{"".join(drawn)}</svg>'

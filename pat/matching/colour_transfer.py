@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -24,7 +25,7 @@ from .inputs import Beta, Inputs
 from .likeness import likeness
 from .matches import FILLS, BetaMatches, Matches, is_consistent
 from .normalisation import SETTINGS as NORMALISATION
-from .normalisation import Normalisation, combined_bands, explained_share, normalised
+from .normalisation import Normalisation, combined_bands, explained_share, moments
 from .positions import at_matches
 from .semi_global import DISPARITY_FILL
 from .spectral_mix import SpectralMix
@@ -67,6 +68,59 @@ class ColourTransferSettings:
 SETTINGS = ColourTransferSettings()
 
 
+class MatchStatistics(NamedTuple):
+    """Of a frame's consistent matches: of each piece of a large frame they would differ, and borders show.
+
+    matches: (B, 1, 1, 1), how many, and one.
+    colour: (B, C, 1, 1), beta's bands minus alpha, in the mean.
+    level: (3, B, 1, 1, 1), for brightness as alpha's: what is subtracted, the factor, what is added.
+    explained, noise: (B, 1, 1, 1), as of `explained_share` and `colour_noise`.
+    """
+
+    matches: Tensor
+    colour: Tensor
+    level: Tensor
+    explained: Tensor
+    noise: Tensor
+
+    @classmethod
+    def of(
+        cls,
+        alpha: Tensor,
+        soft: Tensor,
+        values: Tensor,
+        combined: Tensor,
+        brightness: Tensor,
+        valid: Tensor,
+        consistent: Tensor,
+    ) -> MatchStatistics:
+        """Those of alpha, which is as sharp as beta in `soft`, and of what beta shows at its matches: bands,
+        what they combine to, and its brightness."""
+        both = valid * consistent
+        count = both.sum((-2, -1), keepdim=True) + 1
+        colour = (both * (values - alpha)).sum((-2, -1), keepdim=True) / count
+        measured, wanted = moments(brightness, both), moments(alpha, both)
+        level = torch.stack([measured.mean, measured.gain(wanted, NORMALISATION.largest_gain), wanted.mean])
+        one = cls(count, colour, level, torch.zeros_like(count), torch.zeros_like(count))
+        if values.shape[1] == 1:
+            return one
+        unlike = one.leveled(brightness) - soft
+        noise = colour_noise(unlike, soft, match_weight(unlike, consistent, valid) * consistent)
+        return one._replace(explained=explained_share(combined, soft, both), noise=noise)
+
+    def leveled(self, brightness: Tensor) -> Tensor:
+        """Beta's brightness, where matches are consistent with alpha's mean and standard deviation."""
+        mean, factor, middle = self.level
+        return (brightness - mean) * factor + middle
+
+    @classmethod
+    def mean(cls, pieces: Sequence[MatchStatistics]) -> MatchStatistics:
+        """Those of a frame, by those of its pieces."""
+        counts = torch.stack([piece.matches for piece in pieces])
+        share = counts / counts.sum(0)
+        return cls(*(torch.stack([w * x for w, x in zip(share, each)]).sum(0) for each in zip(*pieces)))
+
+
 def transferred(inputs: Inputs, matches: Matches) -> Matches:
     """The matches with beta's bands at them; those of matches from elsewhere, too.
 
@@ -77,9 +131,10 @@ def transferred(inputs: Inputs, matches: Matches) -> Matches:
     matches.check(inputs)
     agree, large = inputs.can_agree, len(inputs.pieces) > 1
     sharing = [agree and inputs.shows_all_bands(beta) for beta in inputs.betas]
+    statistics = _statistics_of_frame(inputs, matches) if large else None
 
     def of(piece: Inputs, there: Matches) -> list[Tensor]:
-        parts = _transferred_piece(piece, there, sharing)
+        parts = _transferred_piece(piece, there, sharing, statistics)
         return [plane if plane.requires_grad or not large else plane.half() for plane in parts]
 
     parts = inputs.in_pieces(of, matches)
@@ -89,10 +144,24 @@ def transferred(inputs: Inputs, matches: Matches) -> Matches:
     return Matches(tuple(replace(m, bands=b, diffused=shared if s else next(diffused)) for m, b, s in made))
 
 
-def _transferred_piece(piece: Inputs, matches: Matches, sharing: Sequence[bool]) -> list[Tensor]:
+def _statistics_of_frame(inputs: Inputs, matches: Matches) -> list[MatchStatistics]:
+    """Those of each beta, over all pieces, in turn."""
+    pieces = ((inputs.cut(piece.outer), matches.cut(piece.outer)) for piece in inputs.pieces)
+    of_pieces = [
+        [transferred_bands(piece.alpha, *one)[2] for one in zip(piece.betas, there.betas)]
+        for piece, there in pieces
+    ]
+    return [MatchStatistics.mean(of_beta) for of_beta in zip(*of_pieces)]
+
+
+def _transferred_piece(
+    piece: Inputs, matches: Matches, sharing: Sequence[bool], statistics: Sequence[MatchStatistics] | None
+) -> list[Tensor]:
     """The diffused colour betas share, if any do, each other beta's, and each beta's bands minus alpha."""
     alpha = piece.alpha
-    of_each = [transferred_bands(alpha, *one) for one in zip(piece.betas, matches.betas)]
+    given: Sequence[MatchStatistics | None] = statistics or [None] * len(piece.betas)
+    parts = zip(piece.betas, matches.betas, given)
+    of_each = [transferred_bands(alpha, *one, sees_luma=piece.sees_luma)[:2] for one in parts]
     shared = []
     if any(sharing):
         colours, each = zip(*(one for one, counts in zip(of_each, sharing) if counts))
@@ -104,12 +173,21 @@ def _transferred_piece(piece: Inputs, matches: Matches, sharing: Sequence[bool])
     return [*shared, *separate, *(colour for colour, _ in of_each)]
 
 
-def transferred_bands(alpha: Tensor, beta: Beta, matches: BetaMatches) -> tuple[Tensor, Tensor]:
-    """A beta's bands minus alpha at its matches (B, C, H, W), and their weight (B, 1, H, W), 0 to 1."""
+def transferred_bands(
+    alpha: Tensor,
+    beta: Beta,
+    matches: BetaMatches,
+    statistics: MatchStatistics | None = None,
+    *,
+    sees_luma: bool = True,
+) -> tuple[Tensor, Tensor, MatchStatistics]:
+    """A beta's bands minus alpha at its matches (B, C, H, W), their weight (B, 1, H, W), 0 to 1, and the
+    statistics by which it is done: of these pixels, unless they are given."""
     if matches.comparison.mix is not None:
-        return _colours_of_bands(alpha, beta, matches, matches.comparison.mix)
+        return _colours_of_bands(alpha, beta, matches, matches.comparison.mix, statistics)
     where = beta.field.straight, matches.disparity, matches.facts, matches.comparison.whole
-    return matched_colours(alpha, combined_bands(beta.image), beta.image, *where)
+    there = alpha, combined_bands(beta.image), beta.image, *where, statistics
+    return matched_colours(*there, sees_luma=sees_luma)
 
 
 def matched_colours(
@@ -120,35 +198,39 @@ def matched_colours(
     disparity: Float[Tensor, "b 1 h w"],
     facts: Float[Tensor, "b 3 h2 w2"],
     normalisation: Normalisation,
-) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 1 h w"]]:
-    """Beta's bands minus alpha at the matches, colour as in alpha's light, with the detail that alpha has and
-    beta has not; their weight, 0 to 1."""
+    statistics: MatchStatistics | None = None,
+    *,
+    sees_luma: bool = True,
+) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 1 h w"], MatchStatistics]:
+    """Beta's bands minus alpha at the matches, colour as in alpha's light if that sees about the luma of
+    colours, with the detail that alpha has and beta has not; their weight, 0 to 1; statistics, as of
+    `transferred_bands`."""
     bands, planes = beta.shape[1], torch.cat([beta, guide, normalisation.normalised(guide)], 1)
     sampled, valid = at_matches(planes, segments, disparity)
     values, luma, brightness = sampled.split([bands, 1, 1], 1)
-    consistent = is_consistent(facts)
-    brightness = normalised(brightness, alpha, valid * consistent, largest_gain=NORMALISATION.largest_gain)
-    soft = normalisation.softened(alpha)
-    weight = match_weight(brightness - soft, consistent, valid)
+    consistent, soft = is_consistent(facts), normalisation.softened(alpha)
+    statistics = statistics or MatchStatistics.of(alpha, soft, values, luma, brightness, valid, consistent)
+    unlike = statistics.leveled(brightness) - soft
+    weight = match_weight(unlike, consistent, valid)
     if bands > 1:
-        colour, bright = _scaled_to_alpha(values - luma, luma, alpha, weight)
-        noise = colour_noise(brightness - soft, soft, weight * consistent)
-        if float(noise.amax()) > SETTINGS.least_noise:
-            colour = _without_noise(colour, bright, noise)
+        power = SETTINGS.saturation if sees_luma else 0.0
+        colour, bright = _scaled_to_alpha(values - luma, luma, alpha, weight, power)
+        if float(statistics.noise.amax()) > SETTINGS.least_noise:
+            colour = _without_noise(colour, bright, statistics.noise)
         radii = [round(SETTINGS.detail_radius * max(1.0, blur)) for blur in normalisation.blurs[0]]
         detailed = _each_detailed(colour, bright, alpha, radii)
-        matched = torch.lerp(colour, detailed, explained_share(luma, soft, valid * consistent)) + luma - alpha
+        matched = torch.lerp(colour, detailed, statistics.explained) + luma - alpha
     else:
         matched = _detailed(values, soft, alpha) - alpha
-    return matched, weight
+    return torch.where(valid, matched, statistics.colour), weight, statistics
 
 
 @torch.no_grad()
 def _colours_of_bands(
-    alpha: Tensor, beta: Beta, matches: BetaMatches, mix: SpectralMix
-) -> tuple[Tensor, Tensor]:
+    alpha: Tensor, beta: Beta, matches: BetaMatches, mix: SpectralMix, statistics: MatchStatistics | None
+) -> tuple[Tensor, Tensor, MatchStatistics]:
     """The bands minus alpha at matches that the mix has found, with the detail that alpha has and they have
-    not; their weight, 0 to 1."""
+    not; their weight, 0 to 1; the statistics."""
     values, valid = at_matches(beta.image, beta.field.straight, matches.disparity)
     brightness, soft = mix.of(values), matches.comparison.whole.softened(alpha)
     gain = mix.gain[:, None, None, None].to(alpha)
@@ -156,23 +238,28 @@ def _colours_of_bands(
     rises = mix.rises(values)
     slope = rises + local_slope(values - rises * brightness, brightness)
     colours = values + slope * SETTINGS.detail(beyond) - alpha
-    return colours, match_weight(brightness - soft, is_consistent(matches.facts), valid)
+    consistent = is_consistent(matches.facts)
+    statistics = statistics or MatchStatistics.of(
+        alpha, soft, values, brightness, brightness, valid, consistent
+    )
+    weight = match_weight(brightness - soft, consistent, valid)
+    return torch.where(valid, colours, statistics.colour), weight, statistics
 
 
 def _scaled_to_alpha(
-    colour: Tensor, brightness: Tensor, alpha: Tensor, weight: Tensor
+    colour: Tensor, brightness: Tensor, alpha: Tensor, weight: Tensor, power: float
 ) -> tuple[Tensor, Tensor]:
     """Colour differences (B, C, H, W) and brightness of beta, larger where alpha is brighter around a pixel.
 
     What a lens or the light makes brighter keeps its saturation, a reflection does not: the power is in
-    between.
+    between; and 0 where alpha sees something else, as near infrared: there the ratio is of materials.
     """
     least, most = 1e-3, SETTINGS.most_brighter
     alpha_mean, beta_mean = (
         box_mean(image * weight, SETTINGS.surroundings) + least for image in (alpha, brightness)
     )
     ratio = (alpha_mean / beta_mean.clamp(min=least)).clamp(1 / most, most)
-    return colour * ratio**SETTINGS.saturation, brightness * ratio
+    return colour * ratio**power, brightness * ratio
 
 
 def match_weight(

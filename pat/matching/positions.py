@@ -60,12 +60,15 @@ def at_matches(
     disparity: Float[Tensor, "b 1 _ _"],
     extent: Extent | None = None,
 ) -> tuple[Float[Tensor, "b c h w"], Bool[Tensor, "b 1 h w"]]:
-    """What beta shows at the matches, at its edge where these are beyond it, and where they are not."""
+    """What beta shows at the matches, at its edge where these are beyond it, and where they are not: those of
+    segments that are not valid are nowhere, and what is shown for them says nothing."""
     hw, middle = (beta.shape[-2], beta.shape[-1]), matches(segments, disparity, extent=extent).to(beta)
     position = middle.reshape(len(beta), -1, 2)
     inside = position.clamp(min=0).minimum(position.new_tensor([hw[1] - 1, hw[0] - 1]))
     values = sample(beta, inside, interpolation="bicubic").values
-    return values.reshape(*beta.shape[:2], *middle.shape[1:3]), on_image(middle, hw)[:, None]
+    return values.reshape(*beta.shape[:2], *middle.shape[1:3]), (segments.valid & on_image(middle, hw))[
+        :, None
+    ]
 
 
 def normals(segments: Segments) -> Float[Tensor, "*n 2"]:

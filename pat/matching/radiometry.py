@@ -65,7 +65,7 @@ class ResponseSettings:
     explained: float = tuned(
         0.8,
         "Share of alpha's variance that must be explained: of Middlebury's tune half at least .88 is, "
-        "of near infrared at most .74",
+        "of near infrared at most .73",
     )
 
 
@@ -278,7 +278,7 @@ class _Groups(NamedTuple):
 
     points: bands and `_shading_terms` of each point, (8, p); share: of its group's weight; group: which it is
     in. Of groups y: alpha; level: alpha as a smooth function of colour and place; terms: of `_shading_terms`;
-    counts: of points, wrong ones hardly; variance: of a group's points about what is smooth; spread: the
+    counts: of points, wrong ones too; variance: of a group's points about what is smooth; spread: the
     covariance of y's errors, which are light that differs and noise, as its Cholesky factor.
     """
 
@@ -306,18 +306,19 @@ class _Groups(NamedTuple):
 
         _, rest, weight = robust_least_squares(design, y, start, weigh, precision=ridge)
         group = _grouped(torch.cat([x, where.T]), SETTINGS.groups)
-        counts = torch.bincount(group, weight)
+        weights = torch.bincount(group, weight)
         planes = torch.cat([x, where.T, y[None], (y - rest).clamp(min=0.02)[None]])
-        means = torch.stack([torch.bincount(group, weight * plane) for plane in planes]) / counts
+        means = torch.stack([torch.bincount(group, weight * plane) for plane in planes]) / weights
         centres, level = means[:5].T / SETTINGS.near, means[6]
         brighter = (level / level.mean()).log()
         alike = torch.exp(-torch.cdist(centres, centres).square() / 2) + brighter[:, None] * brighter
         light = SETTINGS.light**2 * level[:, None] * level * alike
-        variance = torch.bincount(group, weight * rest.square()) / counts
+        variance = torch.bincount(group, weight * rest.square()) / weights
         noise = (variance + least**2) / SETTINGS.independent
         spread = torch.linalg.cholesky(light + torch.diag(noise))
         points, terms = torch.cat([x, _shading_terms(where)]), _shading_terms(means[3:5].T)
-        return cls(points, weight / counts[group], group, means[5], level, terms, counts, variance, spread)
+        counts, share = torch.bincount(group).to(y), weight / weights[group]
+        return cls(points, share, group, means[5], level, terms, counts, variance, spread)
 
     def explained_by(self, shading: Tensor, *, vignetted: bool) -> _Explanation:
         """The most probable of all kinds, without a gamma and with one, this shading taken out of beta; if
@@ -369,7 +370,8 @@ class _Groups(NamedTuple):
         return model, white.mT @ white
 
     def _explained_by(self, model: Float[Tensor, " n"]) -> float:
-        """The share of alpha's variance that a model of the groups explains."""
+        """The share of alpha's variance that a model of the groups explains. Wrong matches among a group's
+        points hardly count, but a group of none but unlikely ones is a material that alpha sees otherwise."""
         unlike = self.y - self.counts @ self.y / self.counts.sum()
         parts = (self.counts @ (residual.square() + self.variance) for residual in (self.y - model, unlike))
         left, whole = map(float, parts)

@@ -213,7 +213,7 @@ def _applied(header: ImageHeader, orientation: str, label: str) -> int:
     h, w = header.upright
     warn(
         f"{label}: orientation tag {header.orientation} is applied, which makes it {w}x{h}; "
-        "remove the tag if the calibration is of the pixels as stored"
+        "remove the tag if a calibration is of the pixels as stored"
     )
     return header.orientation
 

@@ -26,7 +26,7 @@ from ..matching.colour_transfer import FILLS
 from ..matching.inputs import Beta, Inputs
 from ..matching.likeness import likeness
 from ..matching.matches import BetaMatches, Matches
-from ..matching.positions import FINE, Extent, matches
+from ..matching.positions import FINE, Extent, at_matches, matches
 from ..media.colour import luminance
 from ..support.blocks import ResidualBlock, UNet, channels_last, conv, enlarge, stacked
 from ..support.settings import size, tuned
@@ -64,7 +64,8 @@ class BetaEstimate(NamedTuple):
         `diffused`.
     position: (B, 2, H, W), the semi-global match in beta, pixels; beyond beta's edge where the segment is cut
         there.
-    likeness: (B, 1, H, W), of alpha's brightness and that attended in beta, 0 to 1.
+    likeness: (B, 1, H, W), of alpha's brightness and that attended in beta, 0 to 1; 1 if alpha sees something
+        else.
     """
 
     attended: Tensor
@@ -165,8 +166,12 @@ class GuidedPAT(nn.Module):
             raise ValueError(f"the betas have {sum(bands)} bands in all, this network makes {wanted}")
         alpha, encoded = inputs.alpha, self.encoder(inputs.alpha)
         estimates = [self.estimate(encoded, alpha, *one) for one in zip(inputs.betas, matches.betas)]
+        if not inputs.sees_luma:  # then brightness says nothing of a match
+            estimates = [e._replace(likeness=torch.ones_like(e.likeness)) for e in estimates]
         used = estimates if parts else [combined([e for e, n in zip(estimates, bands) if n == wanted])]
         residual = self.blended(encoded, alpha, used, complete=inputs.sees_luma)
+        if not inputs.sees_luma:
+            residual = where_certain(residual, inputs, matches)
         if self.config.keep_luminance:
             residual = residual - inputs.luminance * luminance(residual)
         output = output_of(alpha + residual, estimates)
@@ -240,6 +245,25 @@ class GuidedPAT(nn.Module):
     def _key(self, features: Encoded) -> Tensor:
         """What queries and keys are at full size."""
         return pixel_shuffle(self.fine_key(features.half), 2)
+
+
+def where_certain(
+    residual: Float[Tensor, "b c h w"], inputs: Inputs, matches: Matches
+) -> Float[Tensor, "b c h w"]:
+    """Bands minus alpha; those that betas with all of them show at the positions chosen, as far as these are
+    certain and, up to a pixel, off the matches: those are often wrong if alpha sees something else."""
+    weights, shown = [], []
+    for beta, matched in zip(inputs.betas, matches.betas, strict=True):
+        if beta.image.shape[1] == residual.shape[1] and matched.certainty is not None:
+            values, valid = at_matches(beta.image, beta.field.straight, matched.surface)
+            apart = (matched.surface - matched.disparity).abs().clamp(max=1)
+            weights.append(enlarge(matched.certainty[:, :1]).to(residual) * valid * apart)
+            shown.append(values - inputs.alpha)
+    if not shown:
+        return residual
+    weight = torch.stack(weights)
+    mean = (weight * torch.stack(shown)).sum(0) / (weight.sum(0) + SETTINGS.least_weight)
+    return torch.lerp(residual, mean, weight.amax(0))
 
 
 def _joined(bands: Sequence[Tensor]) -> Tensor:

@@ -307,3 +307,16 @@ def test_only_a_distortion_may_have_the_wrong_sign():
     assert named == [
         f"distortion of {who} with the wrong sign (the inverse map)" for who in ("all cameras", f"'{second}'")
     ]
+
+
+def test_a_rig_without_a_depth_range_is_told_one():
+    """That fusion then searches: it holds all points."""
+    rig = unlike_pair()
+    points = seen_points(rig)
+    assert "states no depth" not in diagnose_matches(rig, sizes(rig), points).as_text()
+    found = diagnose_matches(rig.replace(depth=None), sizes(rig), points)
+    near, far = (float(bound) for bound in rig.depth)
+    assert found.depth is not None
+    assert 0.8 * near < found.depth[0] < found.depth[1] < 1.3 * far
+    assert f"--depth {found.depth[0]:.3g} {found.depth[1]:.3g}" in found.as_text()
+    assert json.loads(found.as_json())["depth"] == list(found.depth)

@@ -1,6 +1,7 @@
 """`pat align`: its files and options on a wall with a post before it, and what is refused, one line each."""
 
 import shutil
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -10,6 +11,7 @@ import torch
 from PIL import Image
 
 from arraygeom import Rig
+from pat.fusion.from_images import _tagged_rig, camera_names
 from pat.media.profiles import srgb_profile
 from tests.arraygeom.test_xmp import FISHEYE, PERSPECTIVE, image_of
 from tests.pat.cli.test_known import FAR, NEAR, ON_POST, H, W, folder  # noqa: F401
@@ -159,6 +161,13 @@ def capture(tmp_path):
 def test_captures_that_do_not_go_together(capture, tmp_path, refusal, options, message):
     assert message in refusal("align", *capture(**options), "-o", tmp_path / "out")
     assert not (tmp_path / "out" / "aligned.tif").exists()
+
+
+def test_translations_that_will_be_found_are_not_asked_for(capture):
+    said = []
+    _tagged_rig(camera_names([Path(file) for file in capture()]), said.append)
+    assert any("by the images' tags" in line for line in said)
+    assert not any("RigTranslations" in line for line in said)
 
 
 @pytest.mark.parametrize(

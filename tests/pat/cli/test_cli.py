@@ -90,13 +90,14 @@ def test_demo_beats_alpha_and_every_classical_fusion_of_the_photograph(tmp_path,
     main(["demo", "--out", str(tmp_path)])
     truth = load_motorcycle().ground_truth
     fused = score(read_image(tmp_path / "fused.png"), truth)
-    table = capsys.readouterr().out
+    table, said = capsys.readouterr()
     rows = {line[:34].strip(): line[34:].split()[:3:2] for line in table.splitlines()[1:]}
     assert float(rows["fusion"][0]) == pytest.approx(fused.psnr, abs=0.05)
     others = [numbers for name, numbers in rows.items() if name != "fusion"]
     assert len(others) == 5
     assert all(float(psnr) < fused.psnr and float(ssim) < fused.ssim for psnr, ssim in others)
-    assert (tmp_path / "demo.png").is_file()
+    listed = said.replace("\n", "").rpartition("written: ")[2].split(", ")
+    assert set(listed) == {str(path) for path in tmp_path.iterdir()}
 
 
 @pytest.mark.parametrize(
@@ -480,13 +481,15 @@ def test_one_image_for_two_cameras_is_refused(small, refusal):
 
 def test_bands_are_listed_with_their_files(small, capsys):
     rig = Rig.load(small / "rig.yaml")
-    cameras = {"mono": rig["mono"], "nir": rig["colour"], "red": rig["colour"]}
+    band = rig["colour"].replace(sensor=Sensor())
+    cameras = {"mono": rig["mono"], "nir": band, "red": band}
     Rig(cameras, depth=rig.depth).save(small / "rig.yaml")
     for name, band in zip(("red", "nir"), read_image(small / "colour.png")):
         write_image(small / f"{name}.png", band[None] * (0.5 if name == "nir" else 1))
-    given = f"{images(small, *cameras)} --alpha mono --weights mono-spectral --no-report"
+    given = f"{images(small, *cameras)} --alpha mono --no-report"
     pat(f"fuse {small / 'rig.yaml'} {given} -o {small / 'out'}")
     said = " ".join(capsys.readouterr().err.split())
+    assert "weights: mono-spectral (--weights NAME takes others)" in said
     assert "bands at alpha's view: fused_nir.png, fused_red.png; fused.png is their mean" in said
     for name, other in (("nir", "red"), ("red", "nir")):
         files = f"out/fused_{name}.png", f"{name}.png", f"{other}.png"

@@ -147,6 +147,15 @@ def test_betas_without_names_are_corrected_too(middle, network):
         assert len(given.applied(unnamed.inputs, unnamed.hw).betas) == 1
 
 
+@pytest.mark.parametrize("response", ["fit", "rec601", (0.2, 0.4, 0.4)])
+def test_whether_alpha_sees_luma_is_found_whatever_response_is_stated(middle, network, response):
+    sample, images, _ = middle
+    for alpha, alike in ((images[ALPHA], True), (1 - images[ALPHA], False)):
+        views = Views.of(sample.rig, images | {ALPHA: alpha}, alpha=ALPHA)
+        frame, _ = prepared(network, views, [])
+        assert find_corrections(network, frame, response, align=True).response.explains == alike
+
+
 def test_a_sequence_finds_corrections_once(middle, network, monkeypatch):
     from pat.fusion import sequence
 

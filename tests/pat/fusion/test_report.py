@@ -1,11 +1,12 @@
 """The page of a fused frame: complete in itself, and in a real browser."""
 
 import re
+from itertools import combinations
 
 import pytest
 import torch
 
-from arraygeom import Distortion, Rig, View
+from arraygeom import Distortion, Pose, Rig, View
 from pat.data.sample_array import SAMPLE, load_sample
 from pat.evaluation.baseline import classical_view
 from pat.evaluation.metrics import score
@@ -52,6 +53,33 @@ def test_without_depth_poses_and_warnings_there_is_nothing_of_them(page):
     assert "<h2>Warnings" not in text
     assert text.count("<polyline") == 10
     assert rig_drawing(Rig.load(SAMPLE / "rig.yaml"), "mono").count("(alpha)") == 1
+
+
+def test_labels_of_cameras_above_one_another_are_apart():
+    """As of three rows of cameras, of which those of a column are at one point seen from above."""
+    camera = load_sample().rig["mono"]
+    places = [torch.tensor([0.04 * (i % 3), 0.04 * (i // 3), 0]).double() for i in range(9)]
+    poses = {f"Cam-{i}": Pose(torch.eye(3).double(), t) for i, t in enumerate(places)}
+    rig = Rig({name: camera.replace(cam_from_world=pose) for name, pose in poses.items()})
+    drawing = rig_drawing(rig, "Cam-4")
+    labels = [(float(x), float(y)) for x, y in re.findall(r'<text x="([\d.]+)" y="([\d.]+)"', drawing)]
+    assert len(labels) == 9
+    assert all(abs(x - u) > 60 or abs(y - v) > 15 for (x, y), (u, v) in combinations(labels, 2))
+    assert max(y for _, y in labels) < float(re.search(r'viewBox="0 0 \d+ (\d+)', drawing)[1])
+
+
+@pytest.mark.skipif(not (CHROMIUM and DRIVER), reason="no browser is installed: apt-get install chromium")
+def test_a_long_path_does_not_widen_the_page(page, tmp_path):
+    pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
+    path = tmp_path / "long.html"
+    path.write_text(page.read_text().replace("the rig may be wrong", "/folder" * 20), encoding="utf-8")
+    for width in (1200, 500):
+        with browser(f"{width},900") as driver:
+            driver.get(path.as_uri())
+            items = "[...document.querySelectorAll('li')].map(x => x.scrollWidth - x.clientWidth)"
+            page_width = "document.documentElement.scrollWidth - innerWidth"
+            beyond = driver.execute_script(f"return [{page_width}, ...{items}]")
+            assert max(beyond) <= 0
 
 
 @pytest.mark.skipif(not (CHROMIUM and DRIVER), reason="no browser is installed: apt-get install chromium")

@@ -61,6 +61,6 @@ def semi_global_matching(
     """Matches of one beta, whose brightness is `guide`, and its colours by them, as `match` has."""
     comparison = comparison or Comparison.of(alpha, guide)
     disparity, facts = matched(alpha, guide, segments, blocks, comparison)
-    colours, weight = matched_colours(alpha, guide, beta, segments, disparity, facts, comparison.whole)
+    colours, weight, _ = matched_colours(alpha, guide, beta, segments, disparity, facts, comparison.whole)
     diffused = diffused_from(colours, alpha, weight)
     return BetaMatches(disparity, facts, comparison, colours, diffused)

@@ -1,16 +1,22 @@
 """Beta's bands at alpha's view: detail, brightness, weight, and what is diffused."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from arraygeom import Segments, pixel_grid
+from arraygeom.fields.grid import FieldOnGrid
 from pat.matching import colour_transfer as warped
-from pat.matching.colour_transfer import _diffused, colour_noise, match_weight
+from pat.matching import inputs as inputs_module
+from pat.matching.colour_transfer import _diffused, colour_noise, match_weight, transferred
+from pat.matching.inputs import Inputs, InputsSettings
 from pat.matching.likeness import UNLIKE
-from pat.matching.normalisation import explained_share
+from pat.matching.matches import BetaMatches, Matches
+from pat.matching.normalisation import Comparison, explained_share
 from pat.media.colour import luminance
-from tests.pat.matching.matched_scenes import beside, blurred, faint, semi_global_matching
+from tests.pat.matching.matched_scenes import beside, blurred, faint, matched, semi_global_matching
 
 
 def enlarged(image: torch.Tensor, times: int) -> torch.Tensor:
@@ -142,6 +148,21 @@ def test_colour_is_as_bright_as_alpha_where_betas_lens_is_dark():
     assert wrong < 0.6 * darker
 
 
+@pytest.mark.parametrize(("sees_luma", "kept"), [(True, 0.5**0.6), (False, 1.0)])
+def test_colour_is_as_strong_as_beta_shows_it_if_alpha_sees_something_else(sees_luma, kept):
+    """Near infrared is half as bright: so are the materials in it, not the light."""
+    scene = faint(3, contrast=0.12, blur=1.5)[..., :128]
+    beta = scene * torch.tensor([1.3, 1.0, 0.4]).view(1, 3, 1, 1)
+    alpha, guide = 0.5 * luminance(beta), luminance(beta)
+    segments, blocks = in_place((64, 128))
+    comparison = Comparison.of(alpha, guide)
+    disparity, facts = matched(alpha, guide, segments, blocks, comparison)
+    there = alpha, guide, beta, segments, disparity, facts, comparison.whole
+    bands, _, _ = warped.matched_colours(*there, sees_luma=sees_luma)
+    found, given = (image - luminance(image) for image in (bands, beta))
+    assert float((found * given).sum() / given.square().sum()) == pytest.approx(kept, abs=0.02)
+
+
 def test_detail_counts_as_far_as_brightness_explains_alpha():
     """Of an alpha that sees something else none is taken, of its like nearly all, of a negative none."""
     g = torch.Generator().manual_seed(4)
@@ -192,3 +213,34 @@ def test_texture_and_lost_detail_are_no_noise():
     ]
     assert found[1] == pytest.approx(4 * found[0], rel=0.3)
     assert colour_noise(alpha, alpha, 0 * ones).tolist() == [[[[0.0]]]]
+
+
+@pytest.mark.parametrize("tint", [(0.8,), (1.2, 1.0, 0.6)])
+def test_pieces_show_no_border_even_far_from_what_beta_sees(tint, monkeypatch):
+    """Beta sees none of the lower three quarters, nor anything of one piece, and has corners unlike the rest;
+    noise and contrast are on one side alone."""
+    h, w = 256, 384
+    g = torch.Generator().manual_seed(3)
+    alpha = 0.4 + 0.02 * torch.rand(1, 1, h, w, generator=g)
+    alpha[..., w // 2 :] += 0.3 * enlarged(torch.rand(1, 1, h // 8, w // 16, generator=g), 8)
+    beta = alpha * torch.tensor(tint).view(1, -1, 1, 1)
+    beta[..., w // 2 :] += 0.02 * torch.randn(beta[..., w // 2 :].shape, generator=g)
+    beta[..., :4, :] = torch.linspace(0, 1, w)
+    beta = torch.cat([beta[..., :4, :], beta], -2)[..., :h, :]
+
+    def evaluate(x: torch.Tensor) -> Segments:
+        valid = x[..., 1] < h // 4
+        there = torch.where(valid[..., None], x + x.new_tensor([0.0, 4.0]), 0.0)
+        return Segments(there, there, valid)
+
+    field = FieldOnGrid.evaluated(evaluate, (h, w), 1)
+    inputs = replace(Inputs.of(alpha, [beta], [field]), multiple=16)
+    facts = torch.zeros(1, 3, h // 2, w // 2)
+    matches = Matches((BetaMatches(torch.zeros_like(alpha), facts, Comparison.of(alpha, beta)),))
+    (whole,) = transferred(inputs, matches).betas
+    monkeypatch.setattr(inputs_module, "SETTINGS", InputsSettings(halo=64, at_once=40_000))
+    assert len({piece.outer[0] for piece in inputs.pieces}) > 1 < len({p.outer[2] for p in inputs.pieces})
+    (pieces,) = transferred(inputs, matches).betas
+    for one, other in zip(whole.colours, pieces.colours):
+        assert (one - other).abs().max() < 0.1
+    assert float(whole.colours[0][..., h // 2 :, :].std((-2, -1)).max()) < 1e-6

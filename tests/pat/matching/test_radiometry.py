@@ -173,6 +173,20 @@ def test_a_band_that_no_combination_explains_leaves_rec601(monkeypatch):
     assert not fit(x, alpha).is_rec601
 
 
+def test_materials_that_near_infrared_shows_otherwise_are_no_wrong_matches():
+    """Leaves are a quarter of this scene, which a robust fit leaves out; the rest is as bright as in visible
+    light."""
+    g = torch.Generator().manual_seed(2)
+    material = torch.randint(12, (4000,), generator=g)
+    shadow = 0.4 + 0.6 * torch.rand(4000, generator=g)
+    colours = 0.1 + 0.5 * torch.rand(3, 12, generator=g)
+    x = colours[:, material] * shadow
+    leaves = material < 3
+    alpha = torch.where(leaves, 0.7 * shadow, luminance(x[:, None])[0, 0])
+    assert not fit(x, alpha).explains
+    assert fit(x[:, ~leaves], alpha[~leaves]).explains
+
+
 def test_a_gamma_needs_a_range_of_brightness():
     """Dark surfaces whose light varies: a gamma explains them better, as anything would."""
     g = torch.Generator().manual_seed(1)

@@ -1,5 +1,7 @@
 """GuidedPAT: colour is added and never luminance, betas in any split, gradients reach the geometry."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -8,6 +10,8 @@ from arraygeom.fields.grid import FieldOnGrid
 from pat.data.sample_array import load_sample
 from pat.fusion.fuse import fuse
 from pat.matching.inputs import Inputs
+from pat.matching.matches import Matches
+from pat.matching.positions import at_matches
 from pat.media.colour import luminance
 from pat.networks import guided, recall
 from pat.networks.configs import GuidedPATConfig
@@ -129,6 +133,33 @@ def test_colour_counts_more_where_brightness_is_alike():
     assert (unlike.likeness[inside] < 0.01).all()
     same = unlike._replace(logit=alike.logit)
     assert ((alike.blending - same.blending)[inside] > 0.05).all()
+
+
+def test_brightness_tells_nothing_of_a_match_if_alpha_sees_something_else():
+    """As near infrared, nearly always of another brightness: colours of certain matches gave way to what was
+    filled in."""
+    torch.manual_seed(0)
+    network = GuidedPAT(SMALL)
+    alpha, beta = torch.full((1, 1, *HW), 0.9), torch.full((1, 3, *HW), 0.5)
+    inputs = replace(Inputs.of(alpha, [beta], [rectified()]), sees_luma=False)
+    (found,) = network.explain(inputs, matched_for(network, inputs))[1]
+    assert (found.likeness == 1).all()
+
+
+def test_certain_colours_are_those_at_the_chosen_position_if_alpha_sees_something_else():
+    torch.manual_seed(0)
+    network = GuidedPAT(SMALL)
+    inputs = Inputs.of(torch.rand(1, 1, *HW), [torch.rand(1, 3, *HW)], [rectified()])
+    (matched,) = matched_for(network, inputs).betas
+    sure = torch.ones(1, 2, HW[0] // 2, HW[1] // 2)
+    elsewhere = {"chosen": torch.full((1, 1, *HW), 4.0), "disparity": torch.full((1, 1, *HW), 7.0)}
+    matches = Matches((replace(matched, **elsewhere, certainty=sure),))
+    there, valid = at_matches(inputs.betas[0].image, inputs.betas[0].field.straight, matches.betas[0].surface)
+    assert valid[..., 16:].all()
+    for sees_luma in (True, False):
+        image = network.explain(replace(inputs, sees_luma=sees_luma), matches)[0].image.detach()
+        off = (image - luminance(image) - (there - luminance(there)))[..., 16:].abs().max()
+        assert (float(off) > 0.01) == sees_luma
 
 
 def test_features_are_as_exact_as_the_image_and_positions_more(monkeypatch):
