@@ -1,12 +1,14 @@
 """Colour put right by what betas recorded: iterative back-projection (Irani and Peleg 1991), one step.
 
 A beta of fewer pixels records means over several of alpha's. Of the fused image it would have recorded,
-too: what its image has more, within small neighbourhoods, is detail that the image lacks.
+too: what its image has more, within small neighbourhoods, is detail that the image lacks; and beta's noise,
+the more likely the less detail alpha shows there.
 """
 
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import torch
 from jaxtyping import Float
@@ -43,7 +45,7 @@ def back_projected(
         first += count
         if min(beta.enlargement) > 1 and (in_turn or count == image.shape[1]):
             position = matches(beta.field.straight, of_beta.disparity).movedim(-1, 1)
-            lacks = missing(image[:, shown], position.to(image), confidence[:, None], beta)
+            lacks = missing(image[:, shown], inputs.alpha, position.to(image), confidence[:, None], beta)
             lacks = (1 - 1 / math.sqrt(math.prod(beta.enlargement))) * lacks
             if of_beta.comparison.mix is not None and not keeps_luminance:
                 alpha = of_beta.comparison.mix.of(image[:, shown])
@@ -56,11 +58,13 @@ def back_projected(
 
 def missing(
     image: Float[Tensor, "b c h w"],
+    alpha: Float[Tensor, "b 1 h w"],
     position: Float[Tensor, "b 2 h w"],
     confidence: Float[Tensor, "b 1 h w"],
     beta: Beta,
 ) -> Float[Tensor, "b c h w"]:
-    """What `beta` shows more than it would record of an image, where its pixels are matched, by confidence.
+    """What `beta` shows more than it would record of an image, where its pixels are matched, by confidence,
+    and by the share of alpha's variance there in both.
 
     `position` is in pixels of the beta's image, which is enlarged from fewer.
     """
@@ -71,14 +75,23 @@ def missing(
     begin = position.new_tensor(beta.offset) - first * scale
     width, height = ((begin + position.new_tensor(hw[::-1])) / scale).ceil().int().tolist()
     corner = (position + begin[:, None, None]).movedim(1, -1)
-    recorded, share = _recorded(image, corner, confidence, scale, (height, width))
+    recorded, share = _recorded(torch.cat([image, alpha], 1), corner, confidence, scale, (height, width))
+    recorded, grey = recorded[:, :-1], recorded[:, -1:]
     shown = _before_enlargement(beta.image, begin, scale, (height, width))
     covered = (share / scale.prod()).clamp(max=1)
     rest = (shown - recorded) * (share > 0)
-    side = 2 * RADIUS + 1
-    mean = avg_pool2d(torch.cat([rest * covered, covered], 1), side, 1, RADIUS)
-    rest = (rest - mean[:, :-1] / mean[:, -1:].clamp(min=1e-6)) * covered
+    around = partial(_around, weight=covered)
+    rest, detail = rest - around(rest), grey - around(grey)
+    power, own = around(rest.square()), around(detail.square())
+    rest = rest * own / (own + power).clamp(min=1e-12) * covered
     return _at(rest, (corner + 0.5) / scale - 0.5) * confidence
+
+
+def _around(x: Float[Tensor, "b c h w"], weight: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b c h w"]:
+    """The mean of the neighbourhood of each pixel."""
+    side = 2 * RADIUS + 1
+    mean = avg_pool2d(torch.cat([x * weight, weight], 1), side, 1, RADIUS)
+    return mean[:, :-1] / mean[:, -1:].clamp(min=1e-6)
 
 
 def _recorded(
