@@ -263,6 +263,27 @@ def group_transform(blocks):
 
 
 @compiled(inline="always")
+def read_group(plane, y0, x0, alike, matrix, spare, group):
+    """Fill a group with the blocks of a plane, transformed."""
+    for n in range(ALIKE):
+        y, x = y0 + alike[n, 0], x0 + alike[n, 1]
+        for i in range(SIDE):
+            for j in range(SIDE):
+                group[SIDE * i + j, n] = plane[y + i, x + j]
+    block_transform(group, spare, matrix)
+    group_transform(group)
+
+
+@compiled(inline="always")
+def mean_of_group(plane, y0, x0, alike):
+    """That of a plane in the middles of a group's blocks."""
+    mean = np.float32(1e-12)
+    for n in range(ALIKE):
+        mean += plane[y0 + alike[n, 0] + SIDE // 2, x0 + alike[n, 1] + SIDE // 2] / ALIKE
+    return mean
+
+
+@compiled(inline="always")
 def put_back(group, counts, y0, x0, alike, window, out):
     """Add to `out` (2, rows, w) a group's blocks, which count so much each, and weights."""
     for n in range(ALIKE):
@@ -286,18 +307,9 @@ def filter_groups(image, expected, variance, top, alike, cosines, window, out):
         for k in range(columns):
             y0, x0 = RADIUS + STEP * (top + r), RADIUS + STEP * k
             for c in range(len(image)):
-                noise = np.float32(1e-12)
-                for n in range(ALIKE):
-                    y, x = y0 + alike[r, k, n, 0], x0 + alike[r, k, n, 1]
-                    noise += variance[c, y + SIDE // 2, x + SIDE // 2] / ALIKE
-                    for i in range(SIDE):
-                        for j in range(SIDE):
-                            group[SIDE * i + j, n] = image[c, y + i, x + j]
-                            pilot[SIDE * i + j, n] = expected[c, y + i, x + j]
-                block_transform(group, spare, cosines)
-                group_transform(group)
-                block_transform(pilot, spare, cosines)
-                group_transform(pilot)
+                noise = mean_of_group(variance[c], y0, x0, alike[r, k])
+                read_group(image[c], y0, x0, alike[r, k], cosines, spare, group)
+                read_group(expected[c], y0, x0, alike[r, k], cosines, spare, pilot)
                 total = np.float32(1)
                 for i in range(SIDE * SIDE):
                     for n in range(ALIKE):
@@ -324,20 +336,11 @@ def update_groups(
     for r in range(rows):
         for k in range(columns):
             y0, x0 = RADIUS + STEP * (top + r), RADIUS + STEP * k
-            noise, others, certain = np.float32(1e-12), np.float32(1e-12), np.float32(1e-6)
-            for n in range(ALIKE):
-                y, x = y0 + alike[r, k, n, 0], x0 + alike[r, k, n, 1]
-                noise += variance[0, y + SIDE // 2, x + SIDE // 2] / ALIKE
-                others += other[0, y + SIDE // 2, x + SIDE // 2] / ALIKE
-                certain += confidence[0, y + SIDE // 2, x + SIDE // 2] / ALIKE
-                for i in range(SIDE):
-                    for j in range(SIDE):
-                        group[SIDE * i + j, n] = taken[0, y + i, x + j]
-                        pilot[SIDE * i + j, n] = estimate[0, y + i, x + j]
-            block_transform(group, spare, cosines)
-            group_transform(group)
-            block_transform(pilot, spare, cosines)
-            group_transform(pilot)
+            noise = mean_of_group(variance[0], y0, x0, alike[r, k])
+            others = mean_of_group(other[0], y0, x0, alike[r, k])
+            certain = mean_of_group(confidence[0], y0, x0, alike[r, k]) + np.float32(1e-6)
+            read_group(taken[0], y0, x0, alike[r, k], cosines, spare, group)
+            read_group(estimate[0], y0, x0, alike[r, k], cosines, spare, pilot)
             total = np.float32(1)
             for i in range(SIDE * SIDE):
                 for n in range(ALIKE):

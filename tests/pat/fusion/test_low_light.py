@@ -141,12 +141,14 @@ def test_brightness_is_of_what_alpha_sees():
     assert float(found.grain.std()) == pytest.approx(1, abs=0.05)
 
 
-def test_brightness_that_no_beta_explains_is_alphas_alone(network, monkeypatch):
+@pytest.mark.parametrize("share", [0.5, 1.0])
+def test_brightness_that_no_beta_explains_is_alphas_alone(network, monkeypatch, share):
     sample, images, noise = in_low_light(200)
-    unlike = partial(find_corrections_explaining, 0.5)
-    monkeypatch.setattr("pat.fusion.fuse.find_corrections", unlike)
-    monkeypatch.setattr("pat.fusion.low_light.brightness_change", lambda *_: pytest.fail("was changed"))
+    monkeypatch.setattr("pat.fusion.fuse.find_corrections", partial(find_corrections_explaining, share))
+    asked = []
+    monkeypatch.setattr("pat.fusion.low_light.brightness_change", lambda alpha, *_: asked.append(alpha) or 0)
     fuse(network, sample.rig, images, alpha=ALPHA, noise=noise)
+    assert len(asked) == (share == 1.0)
 
 
 def find_corrections_explaining(share, *args, **options):
