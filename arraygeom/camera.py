@@ -28,9 +28,9 @@ from .pixels import (
     within,
 )
 from .pose import Pose
-from .sensor import Sensor
-from .text import view_facts
-from .tracing import traced
+from .runtime.text import range_text
+from .runtime.tracing import traced
+from .sensor import Sensor, response_text
 
 if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
@@ -362,3 +362,11 @@ def _two(value: Any, name: str) -> tuple[Any, Any]:
             f"{name} is one number or two, in pixels; got {len(pair)}: make one K a camera and stack them"
         )
     return tuple(v.reshape(()) if isinstance(v, Tensor) else v for v in pair)  # type: ignore[return-value]
+
+
+def view_facts(view: Any) -> tuple[str, str, str, str]:
+    """Size, focal length (pixels; if calibrated), lens model and response of a view."""
+    lens, focal = getattr(view, "distortion", None), ""
+    if hasattr(view, "cam_from_world"):
+        focal = "f=" + range_text(view.K.detach()[..., :2, :2].det().abs().sqrt(), ".4g")
+    return f"{view.hw[1]}x{view.hw[0]}", focal, lens.model if lens else "", response_text(view.sensor)

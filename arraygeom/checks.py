@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from .pixels import broadcast_shapes
-from .tracing import followed
+from .runtime.tracing import followed
 
 T = TypeVar("T")
 

@@ -41,7 +41,7 @@ from .lenses.common import WIDEST, finite_points, on_plane, once, unit
 from .lenses.fisheye import fisheye_limit, fisheye_project, fisheye_unproject
 from .lenses.model import LensModel
 from .pixels import to_homogeneous
-from .tracing import traced
+from .runtime.tracing import traced
 
 BROWN_CONRADY = "brown-conrady"
 KANNALA_BRANDT = "kannala-brandt"

@@ -16,8 +16,8 @@ from torch import Tensor
 from .homography import infinite_homography
 from .pixels import HW, floating, map_homogeneous, product, to_homogeneous
 from .pose import Pose, cross_matrix, in_float64, matvec
+from .runtime.tracing import traced
 from .segments import FLAT, Segments
-from .tracing import traced
 
 
 def essential_matrix(beta_from_alpha: Pose) -> Float[Tensor, "*b 3 3"]:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from .pixels import map_homogeneous, product, to_homogeneous
 from .robust import LocalModel, levenberg_marquardt
-from .tracing import needs_numbers, traced
+from .runtime.tracing import needs_numbers, traced
 
 
 class TransformedPoints(NamedTuple):

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
-from .tracing import followed
+from .runtime.tracing import followed
 
 HW = tuple[int, int]
 

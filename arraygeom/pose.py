@@ -14,8 +14,8 @@ from torch import Tensor
 from .batching import Batched
 from .checks import check_batches, check_numbers, check_rotation, checking, derived
 from .pixels import broadcast_shapes, broadcasts, floating, product
-from .text import angle, range_text
-from .tracing import traced
+from .runtime.text import angle, range_text
+from .runtime.tracing import traced
 
 if TYPE_CHECKING:
     from kornia.geometry.liegroup import Se3

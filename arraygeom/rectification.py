@@ -14,7 +14,7 @@ from .homography import infinite_homography
 from .pixels import HW, product
 from .pose import Pose, cross_matrix, matvec, rotation_from_vector, rotation_vector
 from .rig import Pair
-from .tracing import needs_numbers
+from .runtime.tracing import needs_numbers
 
 
 class Rectification(NamedTuple):

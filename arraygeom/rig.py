@@ -16,14 +16,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .batching import Batched, map_tensors
-from .camera import Camera, LensView, View
+from .camera import Camera, LensView, View, view_facts
 from .checks import check_numbers, check_origin, checking, derived
 from .epipolar import fundamental_matrix
 from .homography import plane_homography
 from .pixels import HW, product, resize_matrix, rot90_matrix, shift_matrix
 from .pose import Pose
-from .text import baseline_text, depth_text, length_unit, view_facts
-from .tracing import traced
+from .runtime.text import baseline_text, depth_text, length_unit
+from .runtime.tracing import traced
 
 if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera

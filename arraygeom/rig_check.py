@@ -12,7 +12,7 @@ from torch import Tensor
 from .camera import Camera, LensView, View
 from .checks import derived
 from .pixels import HW, coarse_grid, map_homogeneous
-from .text import length_unit
+from .runtime.text import length_unit
 
 if TYPE_CHECKING:
     from .rig import Pair, Rig

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from .tracing import followed, traced
+from .runtime.tracing import followed, traced
 
 
 def first_root(coefficients: Tensor) -> Tensor:

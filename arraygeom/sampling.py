@@ -11,8 +11,8 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from .pixels import HW, floating, within
-from .threads import in_parallel
-from .tracing import followed
+from .runtime.threads import in_parallel
+from .runtime.tracing import followed
 
 Interpolation = Literal["bilinear", "nearest", "bicubic"]
 

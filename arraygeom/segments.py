@@ -16,8 +16,8 @@ from torch import Tensor
 
 from .batching import Batched
 from .pixels import HW, pixel_grid
-from .text import share_text
-from .tracing import followed
+from .runtime.text import share_text
+from .runtime.tracing import followed
 
 
 @dataclass(frozen=True, eq=False, repr=False)

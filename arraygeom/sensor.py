@@ -79,3 +79,13 @@ class Sensor:
 
 
 torch.serialization.add_safe_globals([Band, Curve, Sensor])
+
+
+def response_text(sensor: Sensor) -> str:
+    """The spectral response in a word or two, if one is stated."""
+    response = sensor.response
+    if isinstance(response, Band):
+        return f"{response.centre:g}+-{response.width / 2:g} nm"
+    if isinstance(response, Curve):
+        return f"{min(response.wavelength):g}-{max(response.wavelength):g} nm"
+    return response or ""

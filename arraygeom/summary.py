@@ -13,8 +13,8 @@ from .camera import Camera
 from .fields import Curved, Epipolar, sampling_locations
 from .pixels import coarse_grid, pixel_grid
 from .rig import Pair, Rig
+from .runtime.text import angle
 from .segments import Segments
-from .text import angle
 
 
 class CameraSummary(NamedTuple):

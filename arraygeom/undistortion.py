@@ -11,11 +11,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from .camera import AnyLensView, Camera, LensView, View
-from .chunks import chunked
 from .pixels import HW, coarse_grid, map_homogeneous, pixel_coordinates, product
 from .rig import Rig
+from .runtime.chunks import chunked
+from .runtime.tracing import needs_numbers
 from .sampling import Interpolation, Sampled, sample
-from .tracing import needs_numbers
 
 WIDEST = math.radians(62)
 """How far off axis a pinhole view reaches: there it stretches outwards 4.5 times as much as in the middle."""

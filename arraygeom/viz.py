@@ -18,14 +18,14 @@ from torch import Tensor
 
 from .camera import Camera
 from .epipolar import epipolar_distance, epipolar_lines
-from .extras import needs
 from .fields import ReceptiveField, recorded_field
 from .fields.protocol import sampling_locations
 from .fields.widened import direction
 from .pixels import HW
 from .rig import Pair, Rig
+from .runtime.extras import needs
+from .runtime.text import length_unit
 from .segments import Segments
-from .text import length_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from arraygeom import Dense, Epipolar, EpipolarLine, HomographyDisplacement, Local, NearestVoxels, Rectified
 from arraygeom.viz import draw_fields, draw_rig, draw_sampling_locations, show_image
-from pat.data.sample_array import ALPHA, BETA, SampleArray, load_sample
+from pat.app.sample_array import ALPHA, BETA, SampleArray, load_sample
 from pat.media.figures import save_figure
 
 OUT = Path(__file__).parent / "drawings"

@@ -70,7 +70,7 @@ def shown(output: dict[str, Any]) -> str:
 
 def commands() -> str:
     """Every command with what its --help says."""
-    from pat.cli.main import command_paths
+    from pat.app.cli.main import command_paths
 
     return "\n".join(
         f"## pat {' '.join(path)}\n\n```text\n{help_of(path)}\n```\n" for path in command_paths()
@@ -79,7 +79,7 @@ def commands() -> str:
 
 def help_of(path: tuple[str, ...]) -> str:
     """What `pat PATH --help` prints, without colours."""
-    from pat.cli.main import main
+    from pat.app.cli.main import main
 
     os.environ |= {"COLUMNS": "110", "NO_COLOR": "1", "TERM": "dumb"}
     printed = io.StringIO()

@@ -9,7 +9,7 @@ import tyro
 from torch.nn.functional import interpolate
 from tyro.conf import UseAppendAction
 
-from arraygeom.atomic import write_text
+from arraygeom.runtime.atomic import write_text
 from pat.media.images import read_image, write_image
 
 

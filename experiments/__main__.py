@@ -9,9 +9,9 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from tyro.conf import Positional, arg
 
-from pat.cli.main import main
-from pat.cli.options import MaybeOut, MaybePath, Memory, Out, Weights, progress, say, working, writable
-from pat.data.windows import scene_folders
+from pat.app.cli.main import main
+from pat.app.cli.options import MaybeOut, MaybePath, Memory, Out, Weights, progress, say, working, writable
+from pat.lab.data.windows import scene_folders
 from pat.sensors import seed_for
 from pat.support.schema import read_yaml
 

@@ -25,8 +25,8 @@ from skimage.data import stereo_motorcycle
 from torch import Tensor
 
 from arraygeom import Camera, Pose, Rig, apply_homography, intrinsics, sample
-from arraygeom.atomic import write_text
 from arraygeom.pixels import pixel_grid
+from arraygeom.runtime.atomic import write_text
 from arraygeom.undistortion import pixels_between, recorded_pixels
 from calib.boards.detect import collect_folder
 from calib.boards.poses import StartDeviations
@@ -37,15 +37,15 @@ from calib.images.matches import seen_depths
 from calib.images.refinement import EXTRA_FREE, FREE, refine
 from experiments.evaluation.halves import of_half
 from experiments.names import refuse_unknown
-from pat.data.pairs import PAPER_DISPARITY, Disparity, StereoPair, middlebury_pairs
-from pat.evaluation.protocols import rectified_rig
-from pat.evaluation.tables import markdown_table
+from pat.app.aligned_page import shown_layers
+from pat.app.from_images import array_from_images, camera_names
 from pat.fusion.align import LEAST_CONFIDENCE, SEEN, Aligned, align, resampled_values
 from pat.fusion.aligned_files import RecordedFiles
-from pat.fusion.aligned_page import shown_layers
-from pat.fusion.from_images import array_from_images, camera_names
 from pat.fusion.steps import without_lenses
 from pat.fusion.views import ViewFiles
+from pat.lab.data.pairs import PAPER_DISPARITY, Disparity, StereoPair, middlebury_pairs
+from pat.lab.evaluation.protocols import rectified_rig
+from pat.lab.evaluation.tables import markdown_table
 from pat.media.figures import save_panels
 
 HALF_PIXEL = 0.5

@@ -23,7 +23,8 @@ from arraygeom import Segments, pixel_grid
 from experiments.completion.capture import fused_at_random
 from experiments.completion.samples import KINDS, PairTraining
 from experiments.fit import command, recipe_text
-from pat.data.pairs import Disparity, StereoPair
+from pat.lab.data.pairs import Disparity, StereoPair
+from pat.lab.synthesis.rigs import below
 from pat.matching.certainty import SETTINGS, typical_facts
 from pat.matching.choice import CANDIDATES, Choice, candidates, features
 from pat.matching.inputs import Inputs
@@ -34,7 +35,6 @@ from pat.matching.positions import FINE
 from pat.media.colour import to_bytes
 from pat.networks.guided import GuidedPAT
 from pat.support.tensor_files import write_tensors
-from pat.synthesis.rigs import below
 
 NEAR = 0.8
 """A candidate so many pixels from the true disparity scores half."""

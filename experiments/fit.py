@@ -19,10 +19,10 @@ from torch import Tensor, nn
 from torch.optim import Adam
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from arraygeom.atomic import write_text
+from arraygeom.runtime.atomic import write_text
+from pat.lab.training.checkpoints import collect, newest_checkpoint, restore, write_checkpoint
 from pat.support.locks import folder_lock
 from pat.support.schema import from_document, read_yaml, to_document
-from pat.training.checkpoints import collect, newest_checkpoint, restore, write_checkpoint
 
 Losses = Callable[[int], Iterator[Tensor]]
 """The loss of each step from a given one on, computed when it is asked for."""

@@ -19,12 +19,12 @@ import tyro
 from experiments.evaluation.commands import finished
 from experiments.evaluation.conditions import CONDITIONS
 from experiments.evaluation.halves import of_half
-from pat.data.pairs import StereoPair, middlebury_pairs
-from pat.evaluation.metrics import score
-from pat.evaluation.protocols import rectified_fusion
-from pat.evaluation.tables import markdown_table
+from pat.lab.data.pairs import StereoPair, middlebury_pairs
+from pat.lab.evaluation.protocols import rectified_fusion
+from pat.lab.evaluation.tables import markdown_table
 from pat.networks.weights import SHIPPED, Network, load_weights
 from pat.support.eight_bits import measured, names, round_to_eight_bits
+from pat.support.metrics import score
 from pat.support.tensor_files import read_tensors, write_tensors
 
 RESULTS = Path("tests/benchmarks/RESULTS_int8.md")

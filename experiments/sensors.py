@@ -34,12 +34,12 @@ from arraygeom.pixels import pixel_grid
 from arraygeom.rig import Rig
 from arraygeom.sampling import sample
 from arraygeom.sensor import Band, Curve, Sensor
-from pat.data.windows import read_view, scene_rig
+from pat.lab.data.windows import read_view, scene_rig
+from pat.lab.synthesis.rendered import Rendered
 from pat.media.colour import REC601, linear_from_srgb, srgb_from_linear
 from pat.media.images import write_image
 from pat.sensors import BoxBlur, Clip, GaussianBlur, Jitter, Noise, Quantise, Resample, Step, generator_for
 from pat.support.schema import from_document, near
-from pat.synthesis.rendered import Rendered
 
 CHANNELS = ((600.0, 35.0), (540.0, 35.0), (460.0, 35.0), (850.0, 60.0))
 """Assumed responses of the channels R, G, B and NIR of an ideal image: Gaussians, centre and sigma in nm."""

@@ -16,22 +16,29 @@ from jaxtyping import Float
 from torch import Tensor
 
 from arraygeom import HomographyDisplacement, Rig, View, apply_homography, pixel_grid, sample, shift_origin
-from arraygeom.atomic import write_text
+from arraygeom.runtime.atomic import write_text
 from calib.images.matches import FittedLink, fit_link, line_distance, match_points, near_lines, seen_depths
 from experiments.evaluation.halves import of_half
-from pat.evaluation.baseline import classical
-from pat.evaluation.metrics import score
-from pat.evaluation.protocols import BASELINES, rectified_fusion
-from pat.evaluation.stereo import DATA_SETS, StereoRow, evaluate_sets, markdown, sets_markdown, structure_kept
-from pat.evaluation.tables import markdown_table
+from pat.fusion.classical import classical
 from pat.fusion.fuse import fuse
 from pat.fusion.steps import resolution_ratio
+from pat.lab.evaluation.protocols import BASELINES, rectified_fusion
+from pat.lab.evaluation.stereo import (
+    DATA_SETS,
+    StereoRow,
+    evaluate_sets,
+    markdown,
+    sets_markdown,
+    structure_kept,
+)
+from pat.lab.evaluation.tables import markdown_table
 from pat.matching.normalisation import normalised
 from pat.media.colour import luminance_of, srgb_image
 from pat.media.figures import colour_depth, save_panels
 from pat.media.images import read_image
 from pat.networks.protocol import FusionNetwork
 from pat.networks.weights import load_weights
+from pat.support.metrics import score
 
 PAIRS = ("kitti", "middlebury", "flickr1024")
 SYNTIM = "Serfaty"

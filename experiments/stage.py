@@ -12,16 +12,16 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 
 from arraygeom import Camera, Pose, Rig, stack
-from arraygeom.chunks import Box, assembled, tiles_of
 from arraygeom.pose import matvec
+from arraygeom.runtime.chunks import Box, assembled, tiles_of
 from experiments.scenes import SCENES
-from pat.evaluation.ablation import sample_photographs
+from pat.lab.evaluation.ablation import sample_photographs
+from pat.lab.synthesis.blender import RenderSettings, render
+from pat.lab.synthesis.layered import LayeredScenes
+from pat.lab.synthesis.layers import Layers, draw_layers
+from pat.lab.synthesis.rig_distribution import RigDistribution
+from pat.lab.synthesis.rigs import RigBatch, in_frame_of
 from pat.media.colour import srgb_from_linear
-from pat.synthesis.blender import RenderSettings, render
-from pat.synthesis.layered import LayeredScenes
-from pat.synthesis.layers import Layers, draw_layers
-from pat.synthesis.rig_distribution import RigDistribution
-from pat.synthesis.rigs import RigBatch, in_frame_of
 
 RenderedView = tuple[Float[Tensor, "1 3 h w"], Float[Tensor, "h w"]]
 

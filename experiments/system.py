@@ -17,17 +17,16 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from arraygeom import Rig
-from arraygeom.atomic import write_text
+from arraygeom.runtime.atomic import write_text
 from experiments.hdr import merged, missed, tone_curve, usable_range
 from experiments.names import refuse_unknown
-from pat.evaluation.baseline import classical_baseline
-from pat.evaluation.metrics import score
-from pat.evaluation.tables import markdown_table
+from pat.fusion.classical import classical_baseline
 from pat.fusion.frames import ImageFiles
 from pat.fusion.fuse import FuseSettings, fuse
 from pat.fusion.results import Frame, save_frame, view_of
 from pat.fusion.sequence import SequenceFusion
 from pat.fusion.views import ViewFiles
+from pat.lab.evaluation.tables import markdown_table
 from pat.media.colour import linear_from_srgb, luminance, to_bytes, to_luma_chroma
 from pat.media.figures import colour_depth, save_panels
 from pat.media.images import write_image
@@ -35,6 +34,7 @@ from pat.media.raw import match_luminance
 from pat.media.video import write_video
 from pat.networks.protocol import FusionNetwork
 from pat.networks.weights import Network, load_weights
+from pat.support.metrics import score
 
 SceneKind = Literal["layered", "rendered"]
 NAMES = ("wide-narrow", "visible-nir", "exposures", "fast-slow")

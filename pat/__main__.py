@@ -15,7 +15,7 @@ def main() -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     gc.set_threshold(70_000, 20)
     try:
-        from .cli.main import main as command
+        from .app.cli.main import main as command
         from .support.memory import keep_freed
 
         keep_freed()

@@ -60,7 +60,7 @@ def refusal(capsys):
     """What `pat`, or another group of commands, says as it refuses its arguments: the last line, and one."""
 
     def said(*arguments: object, **group: object) -> str:
-        from pat.cli.main import main
+        from pat.app.cli.main import main
 
         with pytest.raises(SystemExit) as stop:
             main([str(argument) for argument in arguments], **group)

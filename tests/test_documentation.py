@@ -15,7 +15,7 @@ from arraygeom import Camera, Pose, Rig, intrinsics
 from arraygeom.io import opencv, write_rig
 from docs.hooks import on_page_markdown
 from experiments.__main__ import Experiments
-from pat.cli.main import command_paths
+from pat.app.cli.main import command_paths
 from pat.media.images import write_image
 
 ROOT = Path(__file__).parents[1]

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from pat.data.sample_array import load_sample
+from pat.app.sample_array import load_sample
 
 nbformat = pytest.importorskip("nbformat")
 ROOT = Path(__file__).parents[1]
@@ -76,7 +76,7 @@ def test_outputs_are_kept_and_none_is_an_error(path):
 @pytest.mark.slow
 def test_the_explorer_is_shown_by_a_cell(tmp_path):
     pytest.importorskip("anywidget")
-    imports = "from pat.data.sample_array import load_sample\nfrom pat.explore import explore\n"
+    imports = "from pat.app.sample_array import load_sample\nfrom pat.app.explore import explore\n"
     source = f"{imports}explore(*load_sample()[:2])"
     cells = [nbformat.v4.new_code_cell(source)]
     fresh = run().execute(nbformat.v4.new_notebook(cells=cells), tmp_path)

@@ -16,10 +16,10 @@ import importlib, pkgutil
 import arraygeom, calib, pat
 for package in (arraygeom, calib, pat):
     for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
-        if not module.name.startswith(("pat.synthesis.blender", "pat.attention.gpu")):
+        if not module.name.startswith(("pat.lab.synthesis.blender", "pat.attention.gpu")):
             importlib.import_module(module.name)
 """
-FUSE = "from pat.cli.main import main; main(sys.argv[1:])"
+FUSE = "from pat.app.cli.main import main; main(sys.argv[1:])"
 
 
 def run(code, *words):
@@ -33,7 +33,7 @@ def test_every_module_is_imported_without_what_only_posix_has():
 
 
 def test_images_are_fused_without_what_only_posix_has(tmp_path):
-    sample = ROOT / "pat/data/sample"
+    sample = ROOT / "pat/app/sample"
     images = [word for name in ("mono", "colour") for word in ("--image", f"{name}={sample / name}.png")]
     run(FUSE, "fuse", "--rig", sample / "rig.yaml", "--alpha", "mono", *images, "--out", tmp_path / "out")
     assert (tmp_path / "out" / "fused.png").is_file()

@@ -17,7 +17,7 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from arraygeom.extras import needs
+from arraygeom.runtime.extras import needs
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("arraygeom", "pat", "calib")
@@ -202,7 +202,7 @@ def test_importing_arraygeom_and_fusion_is_light():
         return set(done.stdout.split())
 
     assert not loaded("arraygeom") & {"kornia", "cv2", "scipy", "matplotlib"}
-    of_batches = loaded("pat.fusion.batch")
+    of_batches = loaded("pat.app.batch")
     assert "pat.fusion.fuse" in of_batches
     assert not of_batches & {"matplotlib", "av", "anywidget", "bpy"}
 

@@ -8,7 +8,7 @@ import pytest
 from arraygeom import Rig
 from arraygeom.io import RigFileWarning
 from pat import fuse
-from pat.data.sample_array import ALPHA, load_sample
+from pat.app.sample_array import ALPHA, load_sample
 from pat.networks.weights import load_weights
 from tests.arraygeom.test_io import FIXTURES
 

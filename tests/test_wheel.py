@@ -24,7 +24,9 @@ def test_the_demo_runs_from_the_wheel(tmp_path):
     call(*pip, "install", "--no-deps", "--target", str(tmp_path / "installed"), str(wheel), cwd=tmp_path)
     empty = tmp_path / "empty"
     empty.mkdir()
-    script = "import pat; print(pat.__file__); from pat.cli.main import main; main(['demo', '--out', 'here'])"
+    script = (
+        "import pat; print(pat.__file__); from pat.app.cli.main import main; main(['demo', '--out', 'here'])"
+    )
     printed = call(sys.executable, "-c", script, cwd=empty, PYTHONPATH=str(tmp_path / "installed"))
     assert str(tmp_path / "installed") in printed.splitlines()[0]
     assert "fusion" in printed

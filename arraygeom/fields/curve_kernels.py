@@ -9,8 +9,8 @@ import math
 
 import numpy as np
 
-from ..compiled import compiled
 from ..epipolar import FRONT
+from ..runtime.compiled import compiled
 from ..segments import FLAT
 
 PINHOLE, BROWN, FISHEYE = 0, 1, 2

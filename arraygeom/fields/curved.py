@@ -16,14 +16,14 @@ from torch import Tensor
 
 from ..camera import Camera, LensView, View
 from ..checks import check_above, check_bounds, check_field
-from ..chunks import spans
 from ..distortion import Distortion
 from ..epipolar import FRONT, Track, beside, clipped
 from ..pixels import HW, floating, map_homogeneous, product
 from ..rig import Pair
+from ..runtime.chunks import spans
+from ..runtime.threads import in_parallel
+from ..runtime.tracing import traced
 from ..segments import Positions, Segments, fractions_on_image, sample_fractions
-from ..threads import in_parallel
-from ..tracing import traced
 from ..undistortion import pinhole_view
 from .protocol import PIECE, ReceptiveField, answered, compilable
 from .straight import Epipolar

@@ -7,10 +7,10 @@ from typing import Any, Literal
 
 from ..checks import check_field
 from ..epipolar import FRONT
-from ..extras import imported
 from ..pixels import coarse_grid
 from ..rig import Pair
-from ..tracing import traced
+from ..runtime.extras import imported
+from ..runtime.tracing import traced
 from .curved import Curved, ThroughLenses
 from .explicit import Dense, Local, NearestVoxels
 from .protocol import ReceptiveField

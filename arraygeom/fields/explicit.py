@@ -11,14 +11,14 @@ from jaxtyping import Real
 from torch import Tensor
 
 from ..checks import check_above
-from ..chunks import chunked, spans
 from ..epipolar import epipolar_lines
 from ..homography import apply_homography
 from ..pixels import HW, floating, pixel_grid, within
 from ..rig import Pair
+from ..runtime.chunks import chunked, spans
+from ..runtime.threads import in_parallel
+from ..runtime.tracing import traced
 from ..segments import Positions
-from ..threads import in_parallel
-from ..tracing import traced
 from .protocol import PIECE, compilable
 from .straight import require_straight
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..compiled import compiled
+from ..runtime.compiled import compiled
 
 BUCKETS = 128
 """Buckets into which distances are sorted first."""

@@ -8,11 +8,11 @@ import torch
 from jaxtyping import Float, Real
 from torch import Tensor
 
-from ..chunks import chunked
 from ..epipolar import Depth
 from ..homography import TransformedPoints, apply_homography
 from ..pixels import floating
 from ..rig import Pair
+from ..runtime.chunks import chunked
 from .curved import Curved, RayCurve
 from .default import natural_bounds
 

@@ -13,13 +13,13 @@ from torch import Tensor
 from ..batching import tensors_of
 from ..camera import Camera
 from ..checks import check_above, check_bounds
-from ..chunks import chunked
 from ..epipolar import Track, epipolar_lines, segments_between, track
 from ..homography import apply_homography, fit_homography
 from ..pixels import HW, coarse_grid, floating
 from ..rig import Depths, Link, Pair, depth_range
+from ..runtime.chunks import chunked
+from ..runtime.tracing import followed, needs_numbers
 from ..segments import Segments, clip_to_image
-from ..tracing import followed, needs_numbers
 from .protocol import CHUNK, all_pixels, segments_by_rows
 
 

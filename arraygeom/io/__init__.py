@@ -14,13 +14,13 @@ from typing import Any
 
 import torch
 
-from ..atomic import sweep, write_text, write_together
 from ..camera import Camera, LensView
 from ..pixels import HW
 from ..rig import Rig
 from ..rig_check import unit_oddity
+from ..runtime.atomic import sweep, write_text, write_together
+from ..runtime.warned import warn
 from ..sensor import Sensor
-from ..warned import warn
 from . import kitti
 from .export import at_origin, calibrated
 from .source import RigFileError, RigFileWarning, RigSource, UnknownRigFormat, decoded

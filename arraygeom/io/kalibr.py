@@ -19,7 +19,7 @@ from ..lenses.central import DOUBLE_SPHERE, EXTENDED_UNIFIED, FOV, UNIFIED
 from ..lenses.model import LensModel
 from ..pose import Pose
 from ..rig import Rig
-from ..safe_yaml import dump_yaml
+from ..runtime.safe_yaml import dump_yaml
 from ..sensor import Sensor
 from .export import at_origin, brown_conrady, calibrated, focal_and_centre, pose_rows
 from .source import Entry, RigSource

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from io import BytesIO
 from typing import Any, NamedTuple
 
-from ..extras import needs
+from ..runtime.extras import needs
 from .source import RigSource
 
 LARGEST = 2**26

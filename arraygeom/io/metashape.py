@@ -17,7 +17,7 @@ from ..distortion import Distortion
 from ..lenses.central import THIN_PRISM_FISHEYE
 from ..pose import Pose
 from ..rig import Rig
-from ..safe_yaml import LARGEST_TEXT
+from ..runtime.safe_yaml import LARGEST_TEXT
 from .source import RigSource
 
 LENS_NUMBERS = ("k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")

@@ -54,9 +54,9 @@ from ..lenses.model import CAMERA_MODELS, CameraModel, LensModel, check_model
 from ..pixels import HW, shift_matrix
 from ..pose import Pose, rotation_from_vector
 from ..rig import Link, Rig
-from ..safe_yaml import SafeDumper
+from ..runtime.safe_yaml import SafeDumper
+from ..runtime.text import short
 from ..sensor import Band, Curve, Sensor
-from ..text import short
 from .source import Entry, RigSource
 
 T = TypeVar("T")

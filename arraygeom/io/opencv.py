@@ -17,11 +17,11 @@ from torch import Tensor
 
 from ..camera import Camera
 from ..distortion import KANNALA_BRANDT
-from ..extras import needs
 from ..pixels import HW
 from ..pose import Pose
 from ..rig import Rig
-from ..safe_yaml import DEEPEST, LARGEST_TEXT
+from ..runtime.extras import needs
+from ..runtime.safe_yaml import DEEPEST, LARGEST_TEXT
 from .export import brown_conrady, calibrated, focal_and_centre
 from .source import Entry, RigSource, pose_of
 

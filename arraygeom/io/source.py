@@ -20,9 +20,9 @@ from ..distortion import BROWN_CONRADY, COEFFICIENT_COUNTS, KANNALA_BRANDT, Dist
 from ..pixels import HW, shift_matrix
 from ..pose import Pose, rotation_error, rotation_from_vector
 from ..rig import Rig
-from ..safe_yaml import load_json, load_yaml, yaml_problem
-from ..text import short
-from ..warned import warn
+from ..runtime.safe_yaml import load_json, load_yaml, yaml_problem
+from ..runtime.text import short
+from ..runtime.warned import warn
 
 # Of a rotation vector, in radians; it may go round a few times.
 LARGEST_ANGLE = 1e3

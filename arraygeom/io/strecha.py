@@ -12,7 +12,7 @@ from pathlib import Path
 from ..camera import Camera
 from ..pose import Pose
 from ..rig import Rig
-from ..text import short
+from ..runtime.text import short
 from .source import RigSource
 
 

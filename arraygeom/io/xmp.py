@@ -27,12 +27,12 @@ from torch import Tensor
 
 from ..camera import Camera
 from ..distortion import Distortion
-from ..extras import needs
 from ..lenses import PolynomialFisheye
 from ..lenses.model import LensModel
 from ..pixels import HW
 from ..pose import Pose, rotation_from_vector
 from ..rig import Rig
+from ..runtime.extras import needs
 from ..sensor import Band, Sensor
 from .source import RigSource
 

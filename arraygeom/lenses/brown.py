@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..pixels import broadcast_shapes, product, to_homogeneous
 from ..roots import first_root, invert_increasing, keeps_orientation, newton_step, solve_in_plane
-from ..tracing import traced
+from ..runtime.tracing import traced
 from .common import BEYOND, MARGIN, POLE, SOLVED, TINY, WIDEST, norm, once, polynomial_product
 
 

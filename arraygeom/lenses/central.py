@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ..roots import first_root, invert_increasing
-from ..tracing import traced
+from ..runtime.tracing import traced
 from .brown import brown_distort, brown_undistort
 from .common import MARGIN, TINY, WIDEST, angle_over_radius, cosine_and_sinc, unit
 

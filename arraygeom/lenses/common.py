@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ..pixels import floating
-from ..tracing import followed
+from ..runtime.tracing import followed
 
 # The range of validity ends this fraction (of the squared radius) inside the turn, where the inverse is still
 # good to 1e-6 px in float64.

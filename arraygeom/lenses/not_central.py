@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ..checks import checking
 from ..pixels import to_homogeneous
-from ..tracing import followed
+from ..runtime.tracing import followed
 from .common import cosine_and_sinc, finite_points, on_plane, unit
 from .model import CameraModel, LensModel, beside_points
 

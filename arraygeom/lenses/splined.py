@@ -12,7 +12,7 @@ from torch import Tensor
 from ..checks import checking
 from ..pixels import broadcast_shapes
 from ..roots import keeps_orientation, newton_step, solve_in_plane
-from ..tracing import traced
+from ..runtime.tracing import traced
 from .common import SOLVED, finite_points, norm
 from .model import CameraModel, beside_points
 

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image, ImageOps
 
-from arraygeom.image_bytes import decodable
+from arraygeom.runtime.image_bytes import decodable
 
 Grey = UInt8[np.ndarray, "h w"]
 

@@ -20,7 +20,7 @@ from matplotlib.tri import Triangulation
 
 from arraygeom import Camera, Rig
 from arraygeom.distortion import term
-from arraygeom.text import angle
+from arraygeom.runtime.text import angle
 from arraygeom.viz import COLOURS, draw_rig, show_image
 
 from .adequacy import CELLS, Coverage, coverages

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from arraygeom import Rig
-from arraygeom.threads import torch_in_one_thread
+from arraygeom.runtime.threads import torch_in_one_thread
 
 from .board import Board
 from .bundle import Solved

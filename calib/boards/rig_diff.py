@@ -21,7 +21,7 @@ from scipy.special import chdtrc
 
 from arraygeom import Camera, Pose, Rig, triangulate
 from arraygeom.pose import cross_matrix
-from arraygeom.text import length_unit
+from arraygeom.runtime.text import length_unit
 
 from .bundle import camera_jacobian
 from .uncertainty import RigCovariance, beta_covariance, grid_points, worst_deviation

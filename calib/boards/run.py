@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 
 from arraygeom import Rig
-from arraygeom.atomic import sweep, write_text, write_together
 from arraygeom.rig import depth_range
+from arraygeom.runtime.atomic import sweep, write_text, write_together
 
 from .adequacy import coverage_advice, coverages, next_views, point_counts
 from .board import Board

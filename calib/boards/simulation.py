@@ -18,7 +18,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from torch import Tensor
 
 from arraygeom import Camera, Pose, Rig, pixel_grid, rotation_from_vector, stack
-from arraygeom.atomic import write_atomically
+from arraygeom.runtime.atomic import write_atomically
 from arraygeom.viz import calibrated
 
 from .board import Board

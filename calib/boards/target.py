@@ -32,8 +32,8 @@ import yaml
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-from arraygeom.atomic import write_atomically
-from arraygeom.safe_yaml import load_yaml
+from arraygeom.runtime.atomic import write_atomically
+from arraygeom.runtime.safe_yaml import load_yaml
 
 from .board import (
     AprilGrid,

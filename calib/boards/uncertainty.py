@@ -18,11 +18,11 @@ import torch
 from jaxtyping import Bool, Float
 
 from arraygeom import Camera, Pose, Rig
-from arraygeom.atomic import write_text
 from arraygeom.io.native import read_text, write
 from arraygeom.io.source import float64_of
 from arraygeom.pixels import HW
-from arraygeom.safe_yaml import load_json
+from arraygeom.runtime.atomic import write_text
+from arraygeom.runtime.safe_yaml import load_json
 from arraygeom.sensor import Sensor
 
 from .board import Board

@@ -16,8 +16,8 @@ from torch.nn.functional import normalize
 from arraygeom import Camera, Rig
 from arraygeom.pixels import HW, coarse_grid
 from arraygeom.pose import rotation_vector
-from arraygeom.text import length_unit
-from arraygeom.threads import torch_in_one_thread
+from arraygeom.runtime.text import length_unit
+from arraygeom.runtime.threads import torch_in_one_thread
 
 from .depth_change import relative_change
 from .evidence import SCALES, DriftEvidence, FitStatistics, fit_statistics, observations

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from arraygeom import Camera, Link, Pose, Rig, View, intrinsics, rotation_from_vector
 from arraygeom.pixels import HW
-from arraygeom.threads import torch_in_one_thread
+from arraygeom.runtime.threads import torch_in_one_thread
 
 from .depth_change import share_outside
 from .least_squares import cost, most_probable, noise_scale, posterior_covariance, shifts_left_out

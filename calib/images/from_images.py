@@ -14,8 +14,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from arraygeom import Rig, View, intrinsics
-from arraygeom.progress import part, stage
-from arraygeom.threads import torch_in_one_thread
+from arraygeom.runtime.progress import part, stage
+from arraygeom.runtime.threads import torch_in_one_thread
 
 from .lenses import describe_lenses
 from .matches import (

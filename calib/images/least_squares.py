@@ -16,8 +16,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from arraygeom.progress import log_step
 from arraygeom.robust import LocalModel, cauchy, levenberg_marquardt, normal_deviation, normal_equations
+from arraygeom.runtime.progress import log_step
 
 from .residuals import PARTS
 

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from arraygeom import Link, Pair, Rig, apply_homography, epipolar_distance, epipolar_lines, triangulate
-from arraygeom.chunks import chunked
 from arraygeom.pixels import shift_matrix
-from arraygeom.progress import log_step
+from arraygeom.runtime.chunks import chunked
+from arraygeom.runtime.progress import log_step
 
 from .patch_matching import refine_points
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from arraygeom import Camera, LensView, Link, Rig, intrinsics, rotation_from_vector
 from arraygeom.distortion import typical_coefficients
-from arraygeom.text import length_unit
+from arraygeom.runtime.text import length_unit
 
 SIGMA = {"rotation": math.radians(0.5), "translation": 0.01, "focal": 0.01, "centre": 5.0, "distortion": 0.02}
 """Default standard deviations: radians, a share of the longest baseline, a share of the focal length, pixels

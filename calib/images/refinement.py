@@ -26,8 +26,8 @@ from scipy.linalg import qr
 from torch import Tensor
 
 from arraygeom import Camera, Rig
-from arraygeom.progress import log_step, part, stage
-from arraygeom.threads import torch_in_one_thread
+from arraygeom.runtime.progress import log_step, part, stage
+from arraygeom.runtime.threads import torch_in_one_thread
 
 from .depth_change import NEGLIGIBLE, DepthChange, depth_modes, log_depths, relative_change, share_outside
 from .least_squares import (

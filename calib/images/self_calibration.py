@@ -21,8 +21,8 @@ from torch import Tensor
 from arraygeom import Camera, LensView, Link, Pair, Pose, Rig, View, intrinsics, rotation_from_vector
 from arraygeom.pixels import HW, map_homogeneous
 from arraygeom.robust import cauchy, least_squares, normal_deviation, robust_least_squares
-from arraygeom.text import UNSCALED, angle
-from arraygeom.threads import torch_in_one_thread
+from arraygeom.runtime.text import UNSCALED, angle
+from arraygeom.runtime.threads import torch_in_one_thread
 
 from .lenses import with_lens_of
 from .matches import (

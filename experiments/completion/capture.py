@@ -14,8 +14,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pat.data.pairs import StereoPair
-from pat.evaluation.protocols import mono_colour_task, rectified_fusion
+from pat.lab.data.pairs import StereoPair
+from pat.lab.evaluation.protocols import mono_colour_task, rectified_fusion
 from pat.media.colour import to_luma_chroma
 from pat.networks.completion import CANDIDATES, Completion, differences
 from pat.networks.guided import GuidedPAT

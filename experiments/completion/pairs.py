@@ -19,7 +19,7 @@ from skimage.segmentation import felzenszwalb
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from pat.data.pairs import Disparity, StereoPair
+from pat.lab.data.pairs import Disparity, StereoPair
 from pat.media.images import read_image
 
 Image = NDArray[np.float32]

@@ -14,13 +14,13 @@ from torch import Generator, Tensor
 
 from experiments.evaluation.halves import of_half
 from experiments.fit import Recipe
-from pat.data.pairs import StereoPair, folder_pairs, middlebury_pairs
+from pat.lab.data.pairs import StereoPair, folder_pairs, middlebury_pairs
+from pat.lab.synthesis.rigs import below
 from pat.networks.guided import GuidedPAT
 from pat.networks.weights import load_weights
 from pat.sensors import generator_for
 from pat.support.folders import files_below
 from pat.support.tensor_files import read_tensors, write_tensors
-from pat.synthesis.rigs import below
 
 from .pairs import mirrored, photo_pair, varied_pair
 from .shapes import shape_pair

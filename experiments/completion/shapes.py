@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from pat.data.pairs import Disparity, StereoPair
+from pat.lab.data.pairs import Disparity, StereoPair
 
 from .pairs import HW, MARGIN, MOST, Image, recoloured, window_of
 

@@ -18,14 +18,14 @@ from torch import Generator, Tensor
 
 from experiments.evaluation.certainty import unseeing
 from experiments.fit import command, recipe_text
-from pat.data.pairs import StereoPair
+from pat.lab.data.pairs import StereoPair
+from pat.lab.synthesis.rigs import below
+from pat.lab.training.losses import image_loss
 from pat.matching.match import match
 from pat.media.colour import from_luma_chroma
 from pat.networks.completion import CANDIDATES, Completion, features
 from pat.networks.guided import GuidedPAT
 from pat.networks.weights import save_weights
-from pat.synthesis.rigs import below
-from pat.training.losses import image_loss
 
 from .capture import captured, levels, values
 from .samples import KINDS, PairTraining

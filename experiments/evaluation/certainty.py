@@ -18,9 +18,9 @@ from jaxtyping import Bool, Float
 from torch import Generator, Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
-from pat.data.pairs import PAPER_DISPARITY, StereoPair
-from pat.evaluation.protocols import hw_of, rectified_fusion
-from pat.evaluation.tables import grouped, markdown_table
+from pat.lab.data.pairs import PAPER_DISPARITY, StereoPair
+from pat.lab.evaluation.protocols import hw_of, rectified_fusion
+from pat.lab.evaluation.tables import grouped, markdown_table
 from pat.matching.certainty import SETTINGS, CertaintyNetwork, measured, typical_facts
 from pat.matching.choice import Choice
 from pat.matching.inputs import Inputs

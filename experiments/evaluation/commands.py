@@ -9,14 +9,14 @@ from typing import Annotated, Literal, TypeVar
 
 from tyro.conf import arg
 
-from arraygeom.atomic import write_text
+from arraygeom.runtime.atomic import write_text
 from experiments.names import refuse_unknown
-from pat.cli import research
-from pat.cli.options import MaybePath, Out, Weights, progress, say, writable
-from pat.data.pairs import StereoPair, middlebury_pairs
-from pat.evaluation import protocols, stereo
-from pat.evaluation.ablation import sample_photographs
-from pat.evaluation.tables import write_csv
+from pat.app.cli.options import MaybePath, Out, Weights, progress, say, writable
+from pat.lab import commands as research
+from pat.lab.data.pairs import StereoPair, middlebury_pairs
+from pat.lab.evaluation import protocols, stereo
+from pat.lab.evaluation.ablation import sample_photographs
+from pat.lab.evaluation.tables import write_csv
 from pat.matching.certainty import fitted_network
 from pat.media.figures import save_panels
 from pat.networks.protocol import Comparing

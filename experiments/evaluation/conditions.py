@@ -22,10 +22,10 @@ from torch.nn.functional import interpolate
 from arraygeom import Rectified
 from arraygeom.sampling import sample
 from arraygeom.viz import new_figure
-from pat.data.pairs import PAPER_DISPARITY, Disparity, StereoPair
-from pat.evaluation.baseline import classical_fusion, denoised_knowing, raw_disparity
-from pat.evaluation.metrics import bootstrap_interval, score
-from pat.evaluation.protocols import (
+from pat.fusion.classical import classical_fusion, denoised_knowing, raw_disparity
+from pat.fusion.fuse import corrections_of
+from pat.lab.data.pairs import PAPER_DISPARITY, Disparity, StereoPair
+from pat.lab.evaluation.protocols import (
     MonoColourTask,
     StereoMethod,
     StereoResult,
@@ -35,13 +35,13 @@ from pat.evaluation.protocols import (
     rectified_fusion,
     rectified_rig,
 )
-from pat.evaluation.stereo import disparity_errors
-from pat.evaluation.tables import grouped, markdown_table
-from pat.fusion.fuse import corrections_of
+from pat.lab.evaluation.stereo import disparity_errors
+from pat.lab.evaluation.tables import grouped, markdown_table
 from pat.media.colour import from_luma_chroma, luminance, to_bytes, to_luma_chroma
 from pat.media.figures import save_figure
 from pat.networks.protocol import FusionNetwork
 from pat.sensors.noise_level import NoiseLevel
+from pat.support.metrics import bootstrap_interval, score
 
 LEFT_CROP = 64
 """Columns at the left that stereo super-resolution leaves out of its scores."""

@@ -35,13 +35,13 @@ from arraygeom import (
 )
 from arraygeom.fields.straight import covering_displacement
 from experiments.peaks import with_peak
-from pat.data.pairs import PAPER_DISPARITY, Disparity, StereoPair
-from pat.evaluation.metrics import score
-from pat.evaluation.protocols import enlarged, hw_of, mono_colour_task, rectified_rig
-from pat.evaluation.tables import grouped, markdown_table
+from pat.lab.data.pairs import PAPER_DISPARITY, Disparity, StereoPair
+from pat.lab.evaluation.protocols import enlarged, hw_of, mono_colour_task, rectified_rig
+from pat.lab.evaluation.tables import grouped, markdown_table
+from pat.lab.synthesis.photos import PhotoBank
 from pat.media.figures import colour_depth
 from pat.networks.protocol import Comparing
-from pat.synthesis.photos import PhotoBank
+from pat.support.metrics import score
 
 from .sweeps import ALPHA, BETA, RecordedScene, fused, made, rig_of
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from arraygeom.safe_yaml import load_yaml
-from pat.data.pairs import StereoPair
+from arraygeom.runtime.safe_yaml import load_yaml
+from pat.lab.data.pairs import StereoPair
 
 
 def of_half(pairs: Iterable[StereoPair], half: str) -> Iterator[StereoPair]:

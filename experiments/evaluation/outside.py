@@ -14,14 +14,14 @@ from torch.nn.functional import interpolate
 
 from arraygeom import ReceptiveField
 from arraygeom.fields import AroundDepth
-from pat.data.pairs import PAPER_DISPARITY, Disparity, StereoPair
-from pat.evaluation.baseline import checked_disparity
-from pat.evaluation.metrics import score
-from pat.evaluation.protocols import MonoColourTask, enlarged, hw_of, mono_colour_task, rectified_fusion
-from pat.evaluation.stereo import disparity_errors
-from pat.evaluation.tables import grouped, markdown_table
+from pat.fusion.classical import checked_disparity
+from pat.lab.data.pairs import PAPER_DISPARITY, Disparity, StereoPair
+from pat.lab.evaluation.protocols import MonoColourTask, enlarged, hw_of, mono_colour_task, rectified_fusion
+from pat.lab.evaluation.stereo import disparity_errors
+from pat.lab.evaluation.tables import grouped, markdown_table
 from pat.media.colour import luminance, to_bytes
 from pat.networks.protocol import FusionNetwork
+from pat.support.metrics import score
 
 PRIOR = 0.05
 """Share by which the depths of the prior are off at most."""

@@ -15,19 +15,19 @@ from jaxtyping import Float
 from torch import Tensor
 
 from arraygeom import Pair, Positions, ReceptiveField, Rectified, Segments
-from pat.data.pairs import Disparity, StereoPair
-from pat.data.sample_array import BETA, SAMPLE
-from pat.evaluation.protocols import (
+from pat.app.from_images import found_rig
+from pat.app.sample_array import BETA, SAMPLE
+from pat.fusion.fuse import fuse
+from pat.fusion.steps import of_size
+from pat.lab.data.pairs import Disparity, StereoPair
+from pat.lab.evaluation.protocols import (
     StereoMethod,
     StereoResult,
     cut_to_multiple,
     hw_of,
     rectified_fusion,
 )
-from pat.evaluation.stereo import StereoRow
-from pat.fusion.from_images import found_rig
-from pat.fusion.fuse import fuse
-from pat.fusion.steps import of_size
+from pat.lab.evaluation.stereo import StereoRow
 from pat.media.images import read_image
 from pat.networks.protocol import FusionNetwork
 from pat.networks.weights import Network

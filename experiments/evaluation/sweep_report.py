@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from arraygeom.atomic import write_text
+from arraygeom.runtime.atomic import write_text
 from arraygeom.viz import new_figure
-from pat.evaluation.metrics import bootstrap_interval
-from pat.evaluation.tables import grouped, markdown_table
+from pat.lab.evaluation.tables import grouped, markdown_table
 from pat.media.figures import save_figure
+from pat.support.metrics import bootstrap_interval
 
 from .sweeps import SWEEPS, Row
 

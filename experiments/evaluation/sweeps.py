@@ -42,18 +42,18 @@ from arraygeom.fields.straight import covering_displacement
 from arraygeom.pixels import HW
 from experiments.names import refuse_unknown
 from pat.attention.scores import peak_position
-from pat.evaluation.ablation import ALPHA, BETA, recorded, sample_photographs, turned
-from pat.evaluation.metrics import score
-from pat.evaluation.rectified import rectified
 from pat.fusion.steps import resolution_ratio
+from pat.lab.evaluation.ablation import ALPHA, BETA, recorded, sample_photographs, turned
+from pat.lab.evaluation.rectified import rectified
+from pat.lab.synthesis.layered import LayeredScenes
+from pat.lab.synthesis.photos import PhotoBank
+from pat.lab.synthesis.rig_distribution import RigDistribution
+from pat.lab.synthesis.rigs import RigBatch, in_frame_of
 from pat.matching.inputs import Inputs
 from pat.media.colour import luminance
 from pat.networks.protocol import Comparing
 from pat.sensors import generator_for
-from pat.synthesis.layered import LayeredScenes
-from pat.synthesis.photos import PhotoBank
-from pat.synthesis.rig_distribution import RigDistribution
-from pat.synthesis.rigs import RigBatch, in_frame_of
+from pat.support.metrics import score
 
 SIZE: HW = (96, 128)
 NEAR, FAR = 2.0, 16.0
@@ -265,7 +265,7 @@ def two(rig: Rig) -> Rig:
             model = camera.distortion.model
             raise ValueError(
                 f"these scenes are made for pinholes and '{name}' has a lens ({model}): "
-                "give scenes of your own to pat.evaluation.ablation.ablate"
+                "give scenes of your own to pat.lab.evaluation.ablation.ablate"
             )
     return Rig(
         dict(zip((ALPHA, BETA), cameras)), depth=tuple(float(d) for d in rig.pair(first, second).depth_range)

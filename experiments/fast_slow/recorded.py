@@ -8,14 +8,14 @@ from pathlib import Path
 from torch import Tensor
 
 from arraygeom import HomographyDisplacement
-from arraygeom.atomic import write_text
+from arraygeom.runtime.atomic import write_text
 from experiments.showcase import FAST, SCENE, SLOW, FastSlowArray, bright_gain, fast_and_slow_array
 from experiments.system import SystemResult, files_of, flicker, fused_frames
-from pat.cli.fuse import with_sensor
-from pat.evaluation.tables import markdown_table
+from pat.app.cli.fuse import with_sensor
 from pat.fusion.fuse import FuseSettings
 from pat.fusion.results import Frame, save_frame
 from pat.fusion.sequence import SequenceFusion
+from pat.lab.evaluation.tables import markdown_table
 from pat.media.colour import luminance_of, srgb_image
 from pat.media.figures import save_panels
 from pat.media.images import read_image

@@ -16,13 +16,13 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 
 from experiments.fit import Recipe, command, recipe_text
+from pat.lab.synthesis.photos import PhotoBank
+from pat.lab.synthesis.rigs import below
+from pat.lab.training.losses import image_loss
 from pat.media.colour import luminance
 from pat.networks.denoiser import LowLightNetwork
 from pat.networks.weights import load_denoiser, save_weights
 from pat.sensors import NoiseLevel, generator_for
-from pat.synthesis.photos import PhotoBank
-from pat.synthesis.rigs import below
-from pat.training.losses import image_loss
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from pat.synthesis.scene import Scene
+from pat.lab.synthesis.scene import Scene
 
 from .landscape import landscape
 from .still_life import still_life

@@ -11,8 +11,8 @@ from dataclasses import replace
 from numpy.random import Generator
 
 from arraygeom.rig import Rig
-from pat.synthesis.furnish import seeded
-from pat.synthesis.scene import (
+from pat.lab.synthesis.furnish import seeded
+from pat.lab.synthesis.scene import (
     Light,
     Material,
     Object,

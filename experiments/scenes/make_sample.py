@@ -1,4 +1,4 @@
-"""Makes the sample array in pat/data/sample: `python -m experiments.scenes.make_sample`; needs Blender."""
+"""Makes the sample array in pat/app/sample: `python -m experiments.scenes.make_sample`; needs Blender."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import tyro
 
 from arraygeom import Camera, Pose, Rig, Sensor, intrinsics, rotation_from_vector
 from arraygeom.rig import depth_range
-from pat.data.sample_array import ALPHA, BETA, SAMPLE
+from pat.app.sample_array import ALPHA, BETA, SAMPLE
+from pat.lab.synthesis.blender import RenderSettings, render
 from pat.media.colour import luminance, srgb_from_linear
 from pat.media.images import write_image
 from pat.sensors import Clip, Noise, Quantise, record
-from pat.synthesis.blender import RenderSettings, render
 
 from .still_life import still_life
 

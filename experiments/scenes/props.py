@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 from arraygeom.camera import Camera
 from arraygeom.pose import Pose
 from arraygeom.rig import Rig
-from pat.synthesis.furnish import DEPTHS, vec
-from pat.synthesis.scene import Key, Light, Material, Motion, Object, Paint, Scene, Texture, Vec3, World
+from pat.lab.synthesis.furnish import DEPTHS, vec
+from pat.lab.synthesis.scene import Key, Light, Material, Motion, Object, Paint, Scene, Texture, Vec3, World
 
 Profile = Sequence[tuple[float, float]]
 """Radius and height of an object of revolution, metres, from its top."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from pat.synthesis.scene import Material, Object, Paint, Texture, Vec3
+from pat.lab.synthesis.scene import Material, Object, Paint, Texture, Vec3
 
 from .props import ball, box, lathed, moved, paint, plain, profile, wood
 

@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from arraygeom.camera import Camera
 from arraygeom.rig import Rig
-from pat.synthesis.furnish import seeded, vec
-from pat.synthesis.scene import Key, Light, Material, Motion, Object, Paint, Scene, Texture, Vec3, World
+from pat.lab.synthesis.furnish import seeded, vec
+from pat.lab.synthesis.scene import Key, Light, Material, Motion, Object, Paint, Scene, Texture, Vec3, World
 
 from .props import arranged, ball, box, first_camera, lathed, moved, on_path, paint, plain, profile
 from .room import BRASS, FLOOR, OAK, SHELF, WALNUT, furniture

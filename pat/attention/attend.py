@@ -26,12 +26,12 @@ from torch.nn.functional import scaled_dot_product_attention
 from torch.utils.checkpoint import checkpoint
 
 from arraygeom.camera import View
-from arraygeom.chunks import chunked
 from arraygeom.fields import Dense, Local, lazily
 from arraygeom.pixels import pixel_coordinates
 from arraygeom.rig import Pair
+from arraygeom.runtime.chunks import chunked
+from arraygeom.runtime.tracing import needs_numbers, transformations
 from arraygeom.segments import Positions, Segments
-from arraygeom.tracing import needs_numbers, transformations
 from pat.attention import reference, torch_op
 from pat.attention.reference import Attended, AttentionInputs, SamplePositions, accumulated
 

@@ -17,9 +17,9 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from arraygeom.fields import Local
+from arraygeom.runtime.threads import in_parallel, threads
 from arraygeom.sampling import SLACK
 from arraygeom.segments import sample_fractions
-from arraygeom.threads import in_parallel, threads
 from pat.attention import kernels
 from pat.attention.reference import AttentionInputs, accumulated, channels_last
 

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from arraygeom.chunks import chunked
+from arraygeom.runtime.chunks import chunked
 from arraygeom.sampling import on_image
 from arraygeom.segments import sample_fractions
 

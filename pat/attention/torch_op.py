@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from arraygeom.fields import Local
-from arraygeom.tracing import followed
+from arraygeom.runtime.tracing import followed
 from pat.attention import reference
 from pat.attention.reference import Attended, AttentionInputs, SamplePositions
 

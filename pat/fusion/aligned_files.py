@@ -12,7 +12,7 @@ import tifffile
 import torch
 from numpy.typing import NDArray
 
-from arraygeom.atomic import write_together
+from arraygeom.runtime.atomic import write_together
 
 from ..media.images import read_recorded, write_image
 from ..media.raw import demosaiced, recorded_bands

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 import torch
 
-from arraygeom.warned import warn
+from arraygeom.runtime.warned import warn
 
 from ..matching.inputs import Inputs
 from ..networks.protocol import FusionNetwork

@@ -11,10 +11,10 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from arraygeom import Segments, depth_from_track, pixel_grid
-from arraygeom.chunks import ROWS, Tile, assembled, tiles_of
 from arraygeom.epipolar import Depth, Track
 from arraygeom.pixels import HW
-from arraygeom.threads import in_order
+from arraygeom.runtime.chunks import ROWS, Tile, assembled, tiles_of
+from arraygeom.runtime.threads import in_order
 
 from ..matching.inputs import Beta, Inputs
 from ..matching.matches import Matches

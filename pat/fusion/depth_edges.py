@@ -16,8 +16,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from arraygeom.chunks import chunked, spans
-from arraygeom.threads import in_parallel
+from arraygeom.runtime.chunks import chunked, spans
+from arraygeom.runtime.threads import in_parallel
 
 from ..matching.filters import numpy_of
 from ..support.settings import size, tuned

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from arraygeom.chunks import chunked
+from arraygeom.runtime.chunks import chunked
 
 from ..matching.filters import nearest_known, numpy_of
 from ..matching.positions import FINE

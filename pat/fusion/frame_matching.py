@@ -11,7 +11,7 @@ from itertools import pairwise, takewhile
 from pathlib import Path
 from statistics import median
 
-from arraygeom.warned import warn
+from arraygeom.runtime.warned import warn
 
 LEAST_WHOLE = 0.5
 """Of all frames, those that every camera has: of fewer, names agree by chance, as those of a sequence may."""

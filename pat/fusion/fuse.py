@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from arraygeom import ReceptiveField, Rig
-from arraygeom.chunks import Tile
-from arraygeom.threads import torch_in_one_thread
-from arraygeom.tracing import transformations
-from arraygeom.warned import warn
+from arraygeom.runtime.chunks import Tile
+from arraygeom.runtime.threads import torch_in_one_thread
+from arraygeom.runtime.tracing import transformations
+from arraygeom.runtime.warned import warn
 
 from ..matching.inputs import Inputs
 from ..matching.match import Matcher, match
@@ -126,7 +126,7 @@ def fuse(
     """Fuse one frame at camera `alpha`'s view: `fuse(network, rig, images, alpha=...)`, or `fuse(images)`.
 
     Images alone are files, or files or tensors by camera; their rig and the weights are found as by `pat
-    fuse` (`pat.fusion.from_images.array_from_images`, which also gives them), and depths are multiples of the
+    fuse` (`pat.app.from_images.array_from_images`, which also gives them), and depths are multiples of the
     baseline. Frames too large for the memory allowed are fused in tiles of alpha, each with the part of every
     beta that its segments touch, and a halo: equal to the whole to 1e-4. Distorted images are first resampled
     to pinhole views (`pat.fusion.steps.undistort`), rotated betas made upright, and betas resized to alpha's
@@ -318,7 +318,7 @@ def _with_rig(
             'fuse takes a network, a rig, images and alpha=NAME, such as `load_weights("mono-colour")`, '
             "`Rig.load(FILE)` and {NAME: read_image(FILE)}; or images alone, to find the rig"
         )
-    from .from_images import array_from_images
+    from ..app.from_images import array_from_images
 
     array = array_from_images(network, alpha=alpha, say=explain or (lambda line: None))
     return load_weights(array.weights), array.rig, array.images, array.alpha, array.match_levels

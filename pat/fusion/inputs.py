@@ -17,7 +17,7 @@ from arraygeom.fields import AroundDepth, AroundMatches, default_field, pinhole_
 from arraygeom.fields.grid import BLOCK, FieldOnGrid
 from arraygeom.fields.ray_depth import ray_depth
 from arraygeom.pixels import HW
-from arraygeom.text import length_unit
+from arraygeom.runtime.text import length_unit
 
 from ..matching.inputs import Beta, Inputs
 from ..matching.normalisation import combined_bands

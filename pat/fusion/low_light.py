@@ -15,10 +15,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from arraygeom import sample
-from arraygeom.chunks import chunked
 from arraygeom.pixels import HW
-from arraygeom.threads import convolutions_in_parallel
-from arraygeom.warned import warn
+from arraygeom.runtime.chunks import chunked
+from arraygeom.runtime.threads import convolutions_in_parallel
+from arraygeom.runtime.warned import warn
 
 from ..matching.radiometry import Response
 from ..networks.bm3d import Observation, seen_by_another, without_noise

@@ -15,8 +15,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from arraygeom.chunks import chunked
 from arraygeom.robust import least_squares
+from arraygeom.runtime.chunks import chunked
 
 from ..matching.colour_transfer import SETTINGS, local_slope
 from ..matching.normalisation import Normalisation

@@ -14,9 +14,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from arraygeom.chunks import spans
-from arraygeom.compiled import compiled
-from arraygeom.threads import in_parallel
+from arraygeom.runtime.chunks import spans
+from arraygeom.runtime.compiled import compiled
+from arraygeom.runtime.threads import in_parallel
 
 from ..media.colour import from_luma_chroma, luminance
 from ..support.settings import size, tuned

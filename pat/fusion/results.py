@@ -19,9 +19,9 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from arraygeom import Camera, Rig
-from arraygeom.atomic import write_together
-from arraygeom.chunks import chunked
-from arraygeom.threads import in_parallel
+from arraygeom.runtime.atomic import write_together
+from arraygeom.runtime.chunks import chunked
+from arraygeom.runtime.threads import in_parallel
 
 from ..media.colour import linear_from_srgb
 from ..media.depth_maps import write_points

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor, nn
 
 from arraygeom import pixel_grid
-from arraygeom.chunks import Box, Tile, area, assembled, sides_by_work, tiles_of, whole
-from arraygeom.threads import convolutions_in_parallel
+from arraygeom.runtime.chunks import Box, Tile, area, assembled, sides_by_work, tiles_of, whole
+from arraygeom.runtime.threads import convolutions_in_parallel
 
 from ..matching.inputs import Inputs
 from ..matching.matches import Matches

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from arraygeom import Rig
-from arraygeom.warned import warn
+from arraygeom.runtime.warned import warn
 
 
 class KeyFrame(NamedTuple):

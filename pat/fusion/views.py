@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from arraygeom import Curved, Epipolar, Moved, Pair, ReceptiveField, Rig, Sensor, ThroughLenses, Widened
 from arraygeom.batching import tensors_of
 from arraygeom.pixels import HW
-from arraygeom.warned import warn
+from arraygeom.runtime.warned import warn
 
 from ..media.colour import luminance_of as grey
 from ..media.images import Images, read_image

@@ -21,7 +21,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import max_pool2d
 
-from arraygeom.chunks import ROWS, Tile, assembled, tiles_of
+from arraygeom.runtime.chunks import ROWS, Tile, assembled, tiles_of
 
 from ..support.settings import size
 from ..support.tensor_files import with_weights

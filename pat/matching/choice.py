@@ -23,8 +23,8 @@ from torch import Tensor, nn
 from torch.nn.functional import pad, pixel_shuffle
 
 from arraygeom import Segments
-from arraygeom.chunks import spans
-from arraygeom.threads import convolutions_in_parallel, in_parallel
+from arraygeom.runtime.chunks import spans
+from arraygeom.runtime.threads import convolutions_in_parallel, in_parallel
 
 from ..support.blocks import UNet
 from ..support.settings import size

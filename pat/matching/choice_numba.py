@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from arraygeom.compiled import compiled
+from arraygeom.runtime.compiled import compiled
 
 COLUMNS = 32
 """Columns whose numbers are written at a time: they stay in a core's first cache."""

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from arraygeom import Segments
-from arraygeom.chunks import chunked
-from arraygeom.threads import in_parallel
+from arraygeom.runtime.chunks import chunked
+from arraygeom.runtime.threads import in_parallel
 
 from ..media.colour import to_bytes
 from ..support.settings import size, tuned

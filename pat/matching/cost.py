@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from arraygeom.compiled import compiled
+from arraygeom.runtime.compiled import compiled
 
 from ..support.settings import physics, tuned
 

@@ -12,10 +12,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from arraygeom import Positions, Segments
-from arraygeom.chunks import Box, Tile, assembled, sides_by_work, tiles_of, whole
 from arraygeom.epipolar import Track
 from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.pixels import HW
+from arraygeom.runtime.chunks import Box, Tile, assembled, sides_by_work, tiles_of, whole
 
 from ..support.settings import size
 

@@ -9,8 +9,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from arraygeom import Segments
-from arraygeom.chunks import Box, slices
 from arraygeom.pixels import HW
+from arraygeom.runtime.chunks import Box, slices
 from arraygeom.sampling import on_image
 
 from .inputs import Inputs

@@ -23,8 +23,8 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from arraygeom import Segments, depth_from_track, pixel_grid
-from arraygeom.chunks import Tile, assembled, slices, spans
 from arraygeom.epipolar import FRONT, Track
+from arraygeom.runtime.chunks import Tile, assembled, slices, spans
 
 from ..media.colour import to_bytes
 from ..support.settings import size, tuned

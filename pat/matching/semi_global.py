@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from arraygeom import Segments
-from arraygeom.chunks import Box, Tile, area, slices, tiles_of
+from arraygeom.runtime.chunks import Box, Tile, area, slices, tiles_of
+from arraygeom.runtime.threads import in_parallel
 from arraygeom.sampling import SLACK
-from arraygeom.threads import in_parallel
 
 from ..support.memory import how_many_fit
 from ..support.settings import size, tuned

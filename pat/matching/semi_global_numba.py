@@ -14,7 +14,7 @@ from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 
-from arraygeom.compiled import compiled, renew_with
+from arraygeom.runtime.compiled import compiled, renew_with
 from pat.attention.kernels import SOURCES
 from pat.attention.kernels.emit import LANES, NARROW, Vector, instruction
 from pat.attention.kernels.layout import pointers

@@ -20,11 +20,11 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from arraygeom import Positions, Segments, sample
-from arraygeom.chunks import slices, spans, tiles_of
 from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.fields.widened import direction
 from arraygeom.pixels import HW, pixel_grid
-from arraygeom.warned import warn
+from arraygeom.runtime.chunks import slices, spans, tiles_of
+from arraygeom.runtime.warned import warn
 
 from . import semi_global_numba as kernels
 from .cost import planes_of

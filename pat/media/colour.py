@@ -8,7 +8,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from arraygeom.chunks import chunked
+from arraygeom.runtime.chunks import chunked
 
 REC601 = (0.299, 0.587, 0.114)
 """Weights of red, green and blue in luma, on sRGB-encoded values (ITU-R BT.601)."""

@@ -14,7 +14,7 @@ from PIL import Image
 from torch import Tensor
 
 from arraygeom import Camera, pixel_grid, world_rays
-from arraygeom.atomic import write_atomically
+from arraygeom.runtime.atomic import write_atomically
 
 from .colour import to_bytes
 from .headers import HW

@@ -14,8 +14,8 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from arraygeom.atomic import write_atomically
-from arraygeom.chunks import chunked
+from arraygeom.runtime.atomic import write_atomically
+from arraygeom.runtime.chunks import chunked
 
 from .colour import to_bytes
 

@@ -15,7 +15,7 @@ from PIL.BmpImagePlugin import BmpImageFile
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.WebPImagePlugin import WebPImageFile
 
-from arraygeom.image_bytes import DAMAGED, PNG, TIFF, first_tiff_page, png_chunks
+from arraygeom.runtime.image_bytes import DAMAGED, PNG, TIFF, first_tiff_page, png_chunks
 
 HW = tuple[int, int]
 

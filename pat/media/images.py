@@ -19,9 +19,9 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from arraygeom.atomic import write_atomically
-from arraygeom.chunks import ROWS, spans
-from arraygeom.image_bytes import (
+from arraygeom.runtime.atomic import write_atomically
+from arraygeom.runtime.chunks import ROWS, spans
+from arraygeom.runtime.image_bytes import (
     MINISBLACK,
     MINISWHITE,
     PNG,
@@ -33,7 +33,7 @@ from arraygeom.image_bytes import (
     has_further_images,
     tiff_colours,
 )
-from arraygeom.warned import warn
+from arraygeom.runtime.warned import warn
 
 from .headers import HW, ImageHeader, image_header
 from .profiles import in_srgb, with_srgb_profile

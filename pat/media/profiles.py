@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageCms
 
-from arraygeom.warned import warn
+from arraygeom.runtime.warned import warn
 
 _JPEG_PART = 65_000
 """Bytes of a profile in one segment of a JPEG file, at most."""

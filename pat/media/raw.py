@@ -17,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from arraygeom import Rig, Sensor
-from arraygeom.chunks import chunked
+from arraygeom.runtime.chunks import chunked
 
 from .colour import linear_from_srgb, luminance, srgb_from_linear
 

@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from arraygeom.atomic import write_atomically
-from arraygeom.extras import needs
+from arraygeom.runtime.atomic import write_atomically
+from arraygeom.runtime.extras import needs
 
 from .colour import to_bytes
 

@@ -19,9 +19,9 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad, unfold
 
-from arraygeom.chunks import spans
-from arraygeom.compiled import compiled
-from arraygeom.threads import in_parallel
+from arraygeom.runtime.chunks import spans
+from arraygeom.runtime.compiled import compiled
+from arraygeom.runtime.threads import in_parallel
 
 from ..support.settings import size, tuned
 from .denoiser import opponent, opponent_deviation, rgb_of_opponent

@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 from torch import Tensor
 
-from arraygeom.chunks import Box, slices
+from arraygeom.runtime.chunks import Box, slices
 
 from ..attention.scores import Compared
 from ..matching.inputs import Inputs

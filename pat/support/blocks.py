@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn.functional import pixel_unshuffle
 from torch.utils._pytree import tree_map
 
-from arraygeom.chunks import chunked
+from arraygeom.runtime.chunks import chunked
 
 from .eight_bits import Conv2d, plain
 from .unshuffle_numba import unshuffle

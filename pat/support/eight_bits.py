@@ -19,9 +19,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from arraygeom.chunks import spans
 from arraygeom.fields.protocol import compilable
-from arraygeom.threads import STRIPS, WORTH_STRIPS, in_parallel, threads
+from arraygeom.runtime.chunks import spans
+from arraygeom.runtime.threads import STRIPS, WORTH_STRIPS, in_parallel, threads
 
 from . import eight_bits_numba as kernels
 from .settings import size, tuned

@@ -33,8 +33,8 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from arraygeom.extras import needs
-from arraygeom.warned import warn
+from arraygeom.runtime.extras import needs
+from arraygeom.runtime.warned import warn
 
 from .folders import error_text
 from .steps import about, steps_shown
@@ -185,7 +185,7 @@ def followed(
 
 
 def _in_this_process(tasks: Iterable[Task], workers: Workers) -> Iterator[TaskOutcome]:
-    from arraygeom.threads import limited_to
+    from arraygeom.runtime.threads import limited_to
 
     for task in tasks:
         with limited_to(workers.threads):  # not to this generator's end: a failed job's traceback keeps it

@@ -54,7 +54,7 @@ def parse_yaml(text: str | bytes, name: str) -> Any:
     """The content of a YAML text, UTF-8. Raises ValueError naming `name` and the line if it is not YAML."""
     import yaml
 
-    from arraygeom.safe_yaml import load_yaml, yaml_problem
+    from arraygeom.runtime.safe_yaml import load_yaml, yaml_problem
 
     try:
         return load_yaml(text if isinstance(text, str) else text.decode("utf-8"))
@@ -98,7 +98,7 @@ def _read(kind: Any, value: Any, entry: str) -> Any:
 
 
 def _short(value: object) -> str:
-    from arraygeom.text import short  # imports torch, which the help of a command does without
+    from arraygeom.runtime.text import short  # imports torch, which the help of a command does without
 
     return short(value)
 

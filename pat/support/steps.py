@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from threading import get_ident
 
-from arraygeom.progress import progress
+from arraygeom.runtime.progress import progress
 
 PACKAGES = ("arraygeom", "calib", "pat")
 EARLIEST = 0.1

@@ -12,7 +12,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from arraygeom.atomic import write_atomically
+from arraygeom.runtime.atomic import write_atomically
 
 Network = TypeVar("Network", bound=nn.Module)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from arraygeom.compiled import compiled
+from arraygeom.runtime.compiled import compiled
 
 COLUMNS = 32
 """Columns whose channels are interleaved at a time: they stay in a core's first cache."""

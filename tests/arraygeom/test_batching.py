@@ -26,7 +26,7 @@ from arraygeom import (
 from arraygeom.batching import tensors_of
 from arraygeom.checks import check_hw
 from arraygeom.rectification import rectify
-from arraygeom.text import UNSCALED
+from arraygeom.runtime.text import UNSCALED
 from tests.arraygeom.rigs import parallel_rig, random_rig
 
 F64 = torch.float64

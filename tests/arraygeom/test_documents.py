@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import arraygeom
-from arraygeom.compiled import can_compile
+from arraygeom.runtime.compiled import can_compile
 
 PAGE = Path(arraygeom.__file__).parent / "conventions.md"
 MODULES = [

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from arraygeom import Curved, Distortion, NearestVoxels, Pair, pixel_grid
-from arraygeom.compiled import can_compile
+from arraygeom.runtime.compiled import can_compile
 from tests.arraygeom.rigs import pairs, random_rig
 from tests.arraygeom.test_curved import fisheye_rig
 

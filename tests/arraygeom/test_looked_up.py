@@ -33,7 +33,7 @@ def test_pieces_are_what_all_at_once_is(given, interpolation, monkeypatch):
 
 
 def test_in_inference_mode_pieces_are_looked_up_on_all_threads(given, monkeypatch):
-    monkeypatch.setattr("arraygeom.threads.threads", lambda: 2)
+    monkeypatch.setattr("arraygeom.runtime.threads.threads", lambda: 2)
     with torch.inference_mode():
         found = sample(*given)
     assert torch.equal(found.values, sample(*given).values)

@@ -22,8 +22,8 @@ from arraygeom import (
 )
 from arraygeom.lenses import RollingShutter
 from arraygeom.pose import rotation_error
+from arraygeom.runtime.text import UNSCALED
 from arraygeom.summary import summarise_pairs
-from arraygeom.text import UNSCALED
 from tests.arraygeom.rigs import known_by_f, random_rig, scene_points, two_cameras
 
 EVERYTHING = ("rotation", "translation", "focal", "centre")

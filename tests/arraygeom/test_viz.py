@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from arraygeom import Distortion, Epipolar, Local, Rig, Segments, Widened, sampling_locations, viz
-from arraygeom.text import UNSCALED
+from arraygeom.runtime.text import UNSCALED
 from tests.arraygeom.rigs import known_by_f, random_rig, scene_points, two_cameras
 
 pytest.importorskip("matplotlib", reason="drawings need matplotlib")

@@ -19,11 +19,11 @@ from tyro.conf import Positional
 
 from arraygeom import Rig
 from pat import fuse, load_weights
-from pat.data.windows import read_view, reduced, scene_folders, scene_rig
-from pat.evaluation.metrics import score
-from pat.evaluation.tables import markdown_header, markdown_row
+from pat.lab.data.windows import read_view, reduced, scene_folders, scene_rig
+from pat.lab.evaluation.tables import markdown_header, markdown_row
 from pat.media.colour import luminance, srgb_image
 from pat.networks.protocol import FusionNetwork
+from pat.support.metrics import score
 from tests.arraygeom.rigs import parallel_rig
 from tests.benchmarks.printed import print_tables
 

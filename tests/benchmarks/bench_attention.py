@@ -28,10 +28,10 @@ import tyro
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from arraygeom.atomic import write_text
+from arraygeom.runtime.atomic import write_text
 from arraygeom.segments import Segments
 from pat.attention import attend
-from pat.evaluation.tables import markdown_header, markdown_row
+from pat.lab.evaluation.tables import markdown_header, markdown_row
 from pat.support.memory import peak_memory
 
 RESULTS = Path(__file__).with_name("RESULTS.md")

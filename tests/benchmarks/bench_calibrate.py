@@ -24,7 +24,7 @@ from calib.boards.rig import Calibration, calibrate
 from calib.boards.solve import adjust, calibrate_single
 from calib.boards.target import parse_board
 from calib.boards.validation import epipolar_errors
-from pat.evaluation.tables import markdown_header, markdown_row
+from pat.lab.evaluation.tables import markdown_header, markdown_row
 from tests.benchmarks.printed import DATA, print_tables
 from tests.calib.board_scenes import errors_of, pose_errors
 from tests.calib.rendered import BOARD

@@ -27,7 +27,7 @@ from calib.images.depth_change import observed_depths
 from calib.images.hypotheses import swap
 from calib.images.matches import match_cameras
 from calib.images.refinement import refine_matches
-from pat.evaluation.tables import markdown_row
+from pat.lab.evaluation.tables import markdown_row
 from tests.benchmarks.printed import DATA, head, print_tables, reproducible
 from tests.calib.real import RealPair, bumblebee, syntim
 from tests.calib.simulated import simulated_matches, simulated_rig

@@ -26,13 +26,13 @@ import tyro
 from selenium import webdriver
 from selenium.common.exceptions import WebDriverException
 
-from pat.data.sample_array import load_sample
-from pat.evaluation.tables import markdown_header, markdown_row
+from pat.app.sample_array import load_sample
+from pat.lab.evaluation.tables import markdown_header, markdown_row
 from tests.benchmarks.bench_job import PAT, ROOT
 from tests.benchmarks.printed import print_tables
 from tests.browser import browser
 
-SAMPLE = ROOT / "pat" / "data" / "sample"
+SAMPLE = ROOT / "pat" / "app" / "sample"
 NETWORKS = "windows", "pat-supervised"
 MOVED = """
 const [points, done] = arguments, canvas = document.querySelector('canvas[data-camera=mono]');
@@ -50,8 +50,8 @@ const frame = () => new Promise(requestAnimationFrame);
   done(times);
 })()"""
 """Moves over alpha and waits until its caption has changed; the first is not counted."""
-NOTEBOOK = """from pat.data.sample_array import load_sample
-from pat.explore import explore
+NOTEBOOK = """from pat.app.sample_array import load_sample
+from pat.app.explore import explore
 sample = load_sample()
 explore(sample.rig, sample.images, network=None if "{0}" == "windows" else "{0}")"""
 
@@ -91,7 +91,7 @@ def measured(driver: Any, points: int) -> Iterator[tuple[str, str, list[float]]]
     """Where it runs, by what it weighs, and the times."""
     with tempfile.TemporaryDirectory() as name:
         folder, sample = Path(name), load_sample()
-        from pat.explore import explore
+        from pat.app.explore import explore
 
         explore(sample.rig, sample.images).save(folder / "saved.html")
         driver.get((folder / "saved.html").as_uri())

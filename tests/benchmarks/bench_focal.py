@@ -22,8 +22,8 @@ from arraygeom.io import read_rig
 from calib.images.focal_length import fit_focal_length
 from calib.images.from_images import rig_from_images
 from calib.images.self_calibration import FOCAL_SHARE
-from pat.evaluation.tables import markdown_header, markdown_row
-from pat.fusion.from_images import MATCHED, resized_rig, scaled
+from pat.app.from_images import MATCHED, resized_rig, scaled
+from pat.lab.evaluation.tables import markdown_header, markdown_row
 from tests.benchmarks.printed import DATA, print_tables, reproducible
 from tests.calib.real import RealPair, ball, bumblebee, hilti, kitti, lund, middlebury, named, syntim
 

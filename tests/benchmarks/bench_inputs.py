@@ -19,8 +19,8 @@ import cv2
 import tyro
 
 from experiments.peaks import with_peak
-from pat.cli.main import main as pat
-from pat.evaluation.tables import markdown_row
+from pat.app.cli.main import main as pat
+from pat.lab.evaluation.tables import markdown_row
 
 from .input_kinds import Kind, kinds
 from .printed import DATA, head

@@ -26,8 +26,8 @@ from torch import Tensor
 
 from arraygeom import Camera, Distortion, Pose, Rig, relative_pose
 from docs.update_readme import write_block
-from pat.evaluation.tables import markdown_table
 from pat.fusion.fuse import fuse
+from pat.lab.evaluation.tables import markdown_table
 from pat.networks.guided import GuidedPAT
 from tests.arraygeom.rigs import random_rig
 from tests.arraygeom.test_kornia_parity import CASES, Parity, cases

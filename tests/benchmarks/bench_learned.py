@@ -28,24 +28,24 @@ from torch import Generator, Tensor
 from arraygeom import Camera, Pose, Rig, intrinsics, pixel_grid, rotation_from_vector
 from experiments.evaluation.certainty import Reliability
 from experiments.evaluation.halves import of_half
-from pat.data.pairs import middlebury_pairs
-from pat.evaluation.ablation import recorded
-from pat.evaluation.metrics import score
-from pat.evaluation.protocols import mono_colour_task, rectified_rig
-from pat.evaluation.tables import markdown_header, markdown_row
 from pat.fusion.fuse import fuse
 from pat.fusion.results import Frame
 from pat.fusion.steps import hw_at_alphas_resolution
+from pat.lab.data.pairs import middlebury_pairs
+from pat.lab.evaluation.ablation import recorded
+from pat.lab.evaluation.protocols import mono_colour_task, rectified_rig
+from pat.lab.evaluation.tables import markdown_header, markdown_row
+from pat.lab.synthesis.layered import LayeredScenes
+from pat.lab.synthesis.photos import PhotoBank
+from pat.lab.synthesis.rig_distribution import RigDistribution
+from pat.lab.synthesis.rigs import RigBatch, log_uniform, uniform
 from pat.matching.colour_transfer import transferred
 from pat.matching.inputs import Inputs
 from pat.matching.match import located
 from pat.matching.matches import Matches
 from pat.media.colour import luminance
 from pat.networks.weights import load_weights
-from pat.synthesis.layered import LayeredScenes
-from pat.synthesis.photos import PhotoBank
-from pat.synthesis.rig_distribution import RigDistribution
-from pat.synthesis.rigs import RigBatch, log_uniform, uniform
+from pat.support.metrics import score
 from tests.benchmarks.printed import DATA, print_tables, reproducible
 
 HW = 240, 320

@@ -31,7 +31,7 @@ from arraygeom.kornia_models import to_kornia_model
 from arraygeom.lenses import PolynomialFisheye
 from arraygeom.lenses.model import LensModel
 from docs.update_readme import write_block
-from pat.evaluation.tables import markdown_table
+from pat.lab.evaluation.tables import markdown_table
 from tests.benchmarks.printed import DOCS, timed
 
 try:

@@ -31,7 +31,7 @@ from calib.images.doctor import Diagnosis, diagnose_matches
 from calib.images.hypotheses import TRANSPOSE, on_cameras, on_pixels, rotated_view, swap
 from calib.images.matches import match_cameras, seen_depths
 from calib.images.residuals import median_off
-from pat.evaluation.tables import markdown_header, markdown_row
+from pat.lab.evaluation.tables import markdown_header, markdown_row
 from tests.benchmarks.bench_drift import drifted, error
 from tests.benchmarks.printed import DATA, print_tables, reproducible
 from tests.calib.real import every_pair

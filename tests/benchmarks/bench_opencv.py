@@ -32,7 +32,7 @@ from calib.boards.photos import FrameKey
 from calib.boards.rig import calibrate
 from calib.boards.target import parse_board
 from calib.boards.validation import FOLDS, epipolar_errors
-from pat.evaluation.tables import markdown_row
+from pat.lab.evaluation.tables import markdown_row
 from tests.benchmarks.printed import DATA, head, print_tables, reproducible
 from tests.calib.rendered import BOARD
 from tests.calib.tracks import CALISCOPE_BOARD, caliscope_views

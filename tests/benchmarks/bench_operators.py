@@ -41,7 +41,7 @@ from arraygeom import (
 )
 from arraygeom.lenses import FlatPort, RollingShutter
 from docs.update_readme import write_block
-from pat.evaluation.tables import markdown_table
+from pat.lab.evaluation.tables import markdown_table
 from tests.benchmarks.bench_kornia import gradient_error
 from tests.benchmarks.printed import DOCS, timed
 

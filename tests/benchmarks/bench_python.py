@@ -18,13 +18,13 @@ from statistics import median
 
 import tyro
 
-from pat.evaluation.tables import markdown_row, markdown_table
+from pat.lab.evaluation.tables import markdown_row, markdown_table
 
 FRAME = """
 import time, warnings
 import torch
 from pat import fuse, load_weights
-from pat.data.sample_array import load_sample
+from pat.app.sample_array import load_sample
 warnings.simplefilter("ignore")
 sample, network = load_sample(), load_weights("mono-colour")
 rig, images = sample.rig, {{}}

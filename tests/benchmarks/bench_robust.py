@@ -20,7 +20,7 @@ from rich.progress import track
 from arraygeom import Rig
 from calib.boards.detect import BoardViews, Detection
 from calib.boards.rig import Calibration, calibrate
-from pat.evaluation.tables import markdown_row
+from pat.lab.evaluation.tables import markdown_row
 from tests.benchmarks.printed import head, print_tables, reproducible
 from tests.calib.board_scenes import BOARD, board_poses, errors_of, four_cameras, see
 

@@ -20,7 +20,7 @@ from calib.boards.detect import collect_folder
 from calib.boards.rig import Calibration, calibrate
 from calib.boards.solve import readjusted
 from calib.boards.target import parse_board
-from pat.evaluation.tables import markdown_row
+from pat.lab.evaluation.tables import markdown_row
 from tests.benchmarks.printed import DATA, head, print_tables, reproducible
 
 

@@ -19,20 +19,20 @@ import tyro
 from torch import Generator, Tensor
 
 from arraygeom import Rig
-from pat.evaluation.ablation import recorded
-from pat.evaluation.baseline import classical, classical_baseline
-from pat.evaluation.metrics import score
-from pat.evaluation.tables import markdown_header, markdown_row
+from pat.fusion.classical import classical, classical_baseline
 from pat.fusion.fuse import fuse
+from pat.lab.evaluation.ablation import recorded
+from pat.lab.evaluation.tables import markdown_header, markdown_row
+from pat.lab.synthesis.layered import LayeredScenes
+from pat.lab.synthesis.photos import PhotoBank
+from pat.lab.synthesis.rig_distribution import RigDistribution
+from pat.lab.training.config import TrainConfig
+from pat.lab.training.lenses import Spectra
+from pat.lab.training.samples import photographs
 from pat.media.colour import luminance
 from pat.networks.protocol import FusionNetwork
 from pat.networks.weights import load_weights
-from pat.synthesis.layered import LayeredScenes
-from pat.synthesis.photos import PhotoBank
-from pat.synthesis.rig_distribution import RigDistribution
-from pat.training.config import TrainConfig
-from pat.training.lenses import Spectra
-from pat.training.samples import photographs
+from pat.support.metrics import score
 
 HW = (240, 320)
 RIGS = RigDistribution(mode="rectified", parallax=(10.0, 60.0), resolutions=(0.5,))

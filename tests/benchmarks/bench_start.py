@@ -23,7 +23,7 @@ from calib.boards.uncertainty import baseline_deviation, rig_covariance
 from calib.images.matches import PointMatches, match_cameras
 from calib.images.residuals import line_distances
 from experiments.alignment import nine_band_calibration
-from pat.evaluation.tables import markdown_row
+from pat.lab.evaluation.tables import markdown_row
 from pat.media.images import read_image
 from tests.benchmarks.printed import DATA, head, print_tables, reproducible
 

@@ -16,11 +16,11 @@ import torch
 import tyro
 
 from arraygeom.fields import named_field
-from pat.evaluation.ablation import sample_photographs
+from pat.lab.evaluation.ablation import sample_photographs
+from pat.lab.training.config import TrainConfig, load_config
+from pat.lab.training.losses import Objective
+from pat.lab.training.samples import Sample, SampleSource, source_of
 from pat.networks.weights import Network, new_network, set_precision
-from pat.training.config import TrainConfig, load_config
-from pat.training.losses import Objective
-from pat.training.samples import Sample, SampleSource, source_of
 from tests.benchmarks.printed import spread, timed
 
 

@@ -31,10 +31,10 @@ from tyro.conf import Positional
 from experiments.evaluation.conditions import regions_of
 from experiments.evaluation.halves import of_half
 from pat import load_weights
-from pat.data.pairs import PAPER_DISPARITY, StereoPair, middlebury_pairs
-from pat.evaluation.baseline import classical_fusion
-from pat.evaluation.protocols import MonoColourTask, mono_colour_task, rectified_fusion
-from pat.evaluation.tables import markdown_header, markdown_row
+from pat.fusion.classical import classical_fusion
+from pat.lab.data.pairs import PAPER_DISPARITY, StereoPair, middlebury_pairs
+from pat.lab.evaluation.protocols import MonoColourTask, mono_colour_task, rectified_fusion
+from pat.lab.evaluation.tables import markdown_header, markdown_row
 from pat.matching.colour_transfer import FILLS
 from pat.media.colour import to_luma_chroma
 from pat.networks.guided import BetaEstimate, Encoded, GuidedPAT

@@ -9,8 +9,8 @@ import torch
 import tyro
 from torch.utils.flop_counter import FlopCounterMode
 
-from pat.evaluation.protocols import rectified_fusion
-from pat.evaluation.tables import markdown_row
+from pat.lab.evaluation.protocols import rectified_fusion
+from pat.lab.evaluation.tables import markdown_row
 from pat.networks.weights import SHIPPED, load_weights
 from tests.benchmarks.printed import head, spread, timed
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 STAGES = {
-    "read": ["pat.media.images.read_image", "pat.cli.options.load_rig"],
+    "read": ["pat.media.images.read_image", "pat.app.cli.options.load_rig"],
     "views": ["pat.fusion.fuse.prepared"],
     "field": ["arraygeom.fields.grid.FieldOnGrid.of"],
     "plan": ["pat.fusion.fuse.plan_frame"],
@@ -29,7 +29,7 @@ STAGES = {
     "completion": ["pat.networks.completion.Completion.forward"],
     "back-projection": ["pat.fusion.tiles.back_projected"],
     "depth": ["pat.fusion.tiles.measured_depth", "pat.fusion.fuse.background_filled"],
-    "write": ["pat.fusion.results.save_frame", "pat.fusion.report.report_page"],
+    "write": ["pat.fusion.results.save_frame", "pat.app.report.report_page"],
 }
 """What is counted as each part, without the parts within it."""
 
@@ -43,7 +43,7 @@ def scene(folder: Path, width: int, height: int, betas: int, k1: float = 0.0) ->
     import torch
 
     from arraygeom import Distortion, Rig, resampled
-    from pat.data.sample_array import ALPHA, BETA, SAMPLE
+    from pat.app.sample_array import ALPHA, BETA, SAMPLE
 
     rig = Rig.load(SAMPLE / "rig.yaml")
     folder.mkdir(parents=True, exist_ok=True)
@@ -70,7 +70,7 @@ def scene(folder: Path, width: int, height: int, betas: int, k1: float = 0.0) ->
 def classical(folder: Path, out: Path) -> None:
     """The classical baseline with the first beta."""
     from arraygeom import Rig
-    from pat.evaluation.baseline import classical as baseline
+    from pat.fusion.classical import classical as baseline
     from pat.media.colour import luminance_of
     from pat.media.images import read_image, write_image
 
@@ -167,7 +167,7 @@ def stages(arguments: list[str]) -> None:
             given = vars(owner)[attribute]
             wrapped = clock.around(part, getattr(owner, attribute))
             setattr(owner, attribute, staticmethod(wrapped) if isinstance(given, classmethod) else wrapped)
-    from pat.cli.main import main
+    from pat.app.cli.main import main
 
     clock.to("rest")
     try:

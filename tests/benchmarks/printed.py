@@ -10,8 +10,8 @@ from statistics import median
 import cv2
 import torch
 
-from arraygeom.atomic import write_text
-from pat.evaluation.tables import markdown_header
+from arraygeom.runtime.atomic import write_text
+from pat.lab.evaluation.tables import markdown_header
 
 DATA = Path("../shared/data")
 DOCS = Path(__file__).parents[2] / "docs"

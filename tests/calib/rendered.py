@@ -20,7 +20,7 @@ import torch
 from arraygeom import Camera, Pose, Rig, rotation_from_vector
 from arraygeom.sensor import Sensor
 from tests.calib.board_scenes import camera, tensor
-from tests.pat.synthesis.boards import Sheet, board_scene
+from tests.pat.lab.synthesis.boards import Sheet, board_scene
 
 SHEET = Sheet(squares=(12, 9), square=0.06, marker=0.045, margin=0.03)
 BOARD = "charuco:12x9:60mm:45mm:5x5_250"
@@ -83,9 +83,9 @@ def _pose(view: Camera, random: np.random.Generator) -> Pose:
 
 def photograph(out: Path, *, count: int = POSES, samples: int = 8) -> None:
     """The images, `out/<camera>/<frame>.png` (8 bits), and `out/true.yaml`."""
+    from pat.lab.synthesis.blender import RenderSettings, render
     from pat.media.colour import REC709, luminance, srgb_image
     from pat.media.images import write_image
-    from pat.synthesis.blender import RenderSettings, render
 
     cameras = rig()
     slow = {name: c.replace(sensor=Sensor(frame_rate=1.0)) for name, c in cameras.cameras.items()}

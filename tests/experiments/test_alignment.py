@@ -15,8 +15,8 @@ from experiments.alignment import (
     ecc_homography,
     local_offsets,
 )
-from pat.data.pairs import Disparity
-from pat.evaluation.protocols import rectified_rig
+from pat.lab.data.pairs import Disparity
+from pat.lab.evaluation.protocols import rectified_rig
 
 HW = (120, 200)
 

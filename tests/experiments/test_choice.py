@@ -16,7 +16,7 @@ from experiments.completion.pairs import HW, photo_pair, varied_pair
 from experiments.completion.shapes import seen_from_right, shape_pair
 from experiments.evaluation.certainty import unseeing
 from experiments.fit import command
-from pat.data.pairs import Disparity, StereoPair
+from pat.lab.data.pairs import Disparity, StereoPair
 from pat.matching.choice import CANDIDATES, FACTS, Choice
 from pat.support.tensor_files import with_weights, write_tensors
 

@@ -12,7 +12,7 @@ from experiments.evaluation.conditions import (
     evaluate_conditions,
 )
 from experiments.evaluation.halves import of_half
-from pat.data.pairs import Disparity, StereoPair
+from pat.lab.data.pairs import Disparity, StereoPair
 from pat.media.colour import luminance
 from pat.networks.weights import load_weights
 

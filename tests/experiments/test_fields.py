@@ -19,8 +19,8 @@ from experiments.evaluation.fields import (
 )
 from experiments.evaluation.sweeps import ALPHA, BETA, fused
 from pat.attention.scores import peak_position
-from pat.data.pairs import Disparity, StereoPair
-from pat.evaluation.ablation import sample_photographs
+from pat.lab.data.pairs import Disparity, StereoPair
+from pat.lab.evaluation.ablation import sample_photographs
 from pat.matching.inputs import Inputs
 from pat.networks.configs import PATConfig
 from pat.networks.paper import PAT

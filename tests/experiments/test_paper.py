@@ -8,12 +8,12 @@ from torch.nn.functional import interpolate, pad
 
 from arraygeom import pixel_grid
 from experiments.evaluation.paper import AuthorsRows, controls, falls, halved
-from pat.data import StereoPair, middlebury_pairs
-from pat.data.pairs import Disparity
-from pat.evaluation.protocols import rectified_fusion, rectified_rig
-from pat.evaluation.stereo import StereoRow, evaluate_pairs
+from pat.lab.data import StereoPair, middlebury_pairs
+from pat.lab.data.pairs import Disparity
+from pat.lab.evaluation.protocols import rectified_fusion, rectified_rig
+from pat.lab.evaluation.stereo import StereoRow, evaluate_pairs
 from pat.networks.weights import load_weights
-from tests.pat.evaluation.test_stereo import Matcher, pairs
+from tests.pat.lab.evaluation.test_stereo import Matcher, pairs
 
 
 def test_authors_rows_are_those_of_their_loader():

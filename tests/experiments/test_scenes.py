@@ -5,8 +5,8 @@ import torch
 
 from arraygeom import Camera, Rig, intrinsics
 from experiments.scenes import SCENES
-from tests.pat.synthesis.scenes import posed
-from tests.pat.synthesis.test_generators import depths
+from tests.pat.lab.synthesis.scenes import posed
+from tests.pat.lab.synthesis.test_generators import depths
 
 ENDS = ("armchair seat", "rug", "window panes", "chair seat")
 

@@ -22,14 +22,14 @@ from experiments.sensors import (
     record_array,
 )
 from pat import fuse, load_weights
-from pat.cli.main import main
-from pat.data.windows import read_view
-from pat.farm.backends import LayeredSettings
+from pat.app.cli.main import main
+from pat.lab.data.windows import read_view
+from pat.lab.farm.backends import LayeredSettings
+from pat.lab.synthesis.check import CheckLimits
+from pat.lab.synthesis.rendered import Rendered, save_frame
 from pat.media.colour import luminance, srgb_from_linear
 from pat.media.images import read_image
 from pat.sensors import BoxBlur, Clip, GaussianBlur, Noise, Quantise, Resample, record
-from pat.synthesis.check import CheckLimits
-from pat.synthesis.rendered import Rendered, save_frame
 from tests.arraygeom.rigs import parallel_rig
 
 

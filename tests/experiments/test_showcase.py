@@ -21,7 +21,7 @@ from arraygeom import (
 from arraygeom import rotation_from_vector as rotation
 from experiments.__main__ import Experiments
 from experiments.showcase import SLOW, SYNTIM, published_matrices, showcase
-from pat.cli.main import Pat, main
+from pat.app.cli.main import Pat, main
 from pat.media.images import read_image, write_image
 from pat.networks.configs import GuidedPATConfig
 from pat.networks.guided import GuidedPAT

@@ -24,8 +24,8 @@ from experiments.evaluation.sweeps import (
     point,
     seen_at,
 )
-from pat.cli.main import main
-from pat.evaluation.ablation import sample_photographs
+from pat.app.cli.main import main
+from pat.lab.evaluation.ablation import sample_photographs
 
 HW = (48, 64)
 

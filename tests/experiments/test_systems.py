@@ -12,7 +12,7 @@ from experiments.__main__ import Experiments
 from experiments.hdr import merged, usable_range
 from experiments.sensors import Mosaic
 from experiments.stage import SystemScene
-from pat.cli.main import main
+from pat.app.cli.main import main
 from pat.fusion.results import Frame
 from pat.fusion.steps import resolution_ratio
 from pat.fusion.views import ViewFiles

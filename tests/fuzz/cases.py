@@ -22,14 +22,14 @@ from torch import nn
 from arraygeom import Distortion, Rig
 from arraygeom.io import read_rig, write_rig
 from calib.boards.uncertainty import RigCovariance
-from pat.cli.main import main
+from pat.app.cli.main import main
+from pat.lab.synthesis.photos import read_photographs
+from pat.lab.training.checkpoints import collect, newest_checkpoint, restore, write_checkpoint
 from pat.media.images import read_image, write_image
 from pat.media.video import Video, read_video
 from pat.networks.configs import GuidedPATConfig
 from pat.networks.guided import GuidedPAT
 from pat.networks.weights import load_weights, save_weights
-from pat.synthesis.photos import read_photographs
-from pat.training.checkpoints import collect, newest_checkpoint, restore, write_checkpoint
 from tests.arraygeom.test_damaged_files import matlab_pair
 
 from .mutations import mutated

@@ -17,12 +17,12 @@ import torch
 from arraygeom import Rig
 from arraygeom.io import RigFileError
 from calib.boards.uncertainty import RigCovariance
+from pat.lab.synthesis.photos import read_photographs
+from pat.lab.training import checkpoints
+from pat.lab.training.checkpoints import FORMAT, collect, newest_checkpoint, restore, write_checkpoint
 from pat.networks.weights import load_weights, save_weights
 from pat.support.memory import keep_freed
 from pat.support.tensor_files import write_tensors
-from pat.synthesis.photos import read_photographs
-from pat.training import checkpoints
-from pat.training.checkpoints import FORMAT, collect, newest_checkpoint, restore, write_checkpoint
 from tests.fuzz import cases, sandbox
 from tests.fuzz.run import faults_of
 

@@ -17,15 +17,15 @@ from safetensors import safe_open
 from arraygeom.io import read_rig
 from calib.boards.simulation import photograph
 from calib.boards.target import parse_board
+from pat.lab.training.checkpoints import newest_checkpoint, read_checkpoint
+from pat.lab.training.config import save_config
 from pat.media.images import write_image
 from pat.networks.guided import GuidedPAT
 from pat.networks.weights import save_weights
-from pat.training.checkpoints import newest_checkpoint, read_checkpoint
-from pat.training.config import save_config
 from tests.calib.board_scenes import board_poses, camera
 from tests.kills.killing import Job, files_of, mixed
 from tests.pat.fusion import moving
-from tests.pat.training.runs import SMALL, short_run
+from tests.pat.lab.training.runs import SMALL, short_run
 
 FIXTURES = Path(__file__).parents[1] / "arraygeom" / "fixtures"
 FRAMES = 6

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import psutil
 
-from pat.cli.main import main
+from pat.app.cli.main import main
 from tests.kills.long_writes import sitecustomize
 from tests.processes import ROOT, dask_cluster, forked
 

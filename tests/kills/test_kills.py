@@ -5,8 +5,8 @@ from contextlib import contextmanager
 
 import pytest
 
-import arraygeom.atomic
 import arraygeom.io
+import arraygeom.runtime.atomic
 from tests.kills.jobs import conversion_job
 from tests.kills.killing import killed, mixed, reference
 
@@ -34,7 +34,7 @@ def test_files_written_in_place_are_seen(conversion, monkeypatch):
     @contextmanager
     def in_place(path):
         yield path
-        arraygeom.atomic.flush(path)
+        arraygeom.runtime.atomic.flush(path)
 
     @contextmanager
     def one_by_one(folder, *, last):
@@ -43,7 +43,7 @@ def test_files_written_in_place_are_seen(conversion, monkeypatch):
     monkeypatch.setattr(arraygeom.io, "write_together", one_by_one)
     mixed_files = killed(*conversion, way="write", kills=3)
     assert any("of another making" in fault for fault in mixed_files.faults)
-    monkeypatch.setattr(arraygeom.atomic, "write_atomically", in_place)
+    monkeypatch.setattr(arraygeom.runtime.atomic, "write_atomically", in_place)
     torn_files = killed(*conversion, way="write", kills=2)
     assert any("torn" in fault for fault in torn_files.faults)
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from arraygeom import Camera, Pose, Rig, intrinsics, pixel_grid, rotation_from_vector
 from arraygeom.lenses import CameraModel
 from pat import fuse, load_weights
-from pat.evaluation.metrics import score
+from pat.support.metrics import score
 from tests.arraygeom.rigs import number
 
 ROOM = 3.0

@@ -3,7 +3,7 @@
 
 def pat(line: str, *more: object) -> None:
     """Run `pat` with the words of a line, and with `more` of them, which may have spaces."""
-    from pat.cli.main import main
+    from pat.app.cli.main import main
 
     main([*line.split(), *map(str, more)])
 

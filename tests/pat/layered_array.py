@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from pat.data.sample_array import ALPHA, BETA, SampleArray
-from pat.data.sample_array import load_sample as load
+from pat.app.sample_array import ALPHA, BETA, SampleArray
+from pat.app.sample_array import load_sample as load
 
 __all__ = ["ALPHA", "BETA", "load_sample", "middle_of_sample"]
 

@@ -24,9 +24,9 @@ from arraygeom import (
 from arraygeom.io import write_rig
 from experiments.evaluation.sweeps import ablate as ablate_rigs
 from pat import load_weights
-from pat.cli.main import main
-from pat.evaluation.ablation import AblationCase, FieldFamily, ablate, families
-from pat.explore.page import opened
+from pat.app.cli.main import main
+from pat.app.explore.page import opened
+from pat.lab.evaluation.ablation import AblationCase, FieldFamily, ablate, families
 from tests.arraygeom.rigs import number
 from tests.pat.any_camera import fused_in_the_room, hit, rig_of_two
 from tests.pat.own_cameras import (

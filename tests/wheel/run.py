@@ -25,8 +25,8 @@ EXPLORE = """
 from pathlib import Path
 import pat
 from arraygeom import Rig
-from pat.explore import ExplorerScene, opened
-folder = Path(pat.__file__).parent / "data" / "sample"
+from pat.app.explore import ExplorerScene, opened
+folder = Path(pat.__file__).parent / "app" / "sample"
 images = {name: pat.read_image(folder / f"{name}.png") for name in ("mono", "colour")}
 opened(Rig.load(folder / "rig.yaml"), images).save("explorer.html")
 """

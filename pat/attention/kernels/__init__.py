@@ -12,7 +12,7 @@ Images come channels-last and flat, in float64 or float32.
 
 from pathlib import Path
 
-from arraygeom.compiled import renew_with
+from arraygeom.runtime.compiled import renew_with
 
 from .backward import backward
 from .channels import scatter

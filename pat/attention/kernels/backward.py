@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from arraygeom.compiled import compiled
+from arraygeom.runtime.compiled import compiled
 
 from .channels import block_products, block_sums, copy, fill
 from .emit import LANES

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from llvmlite.binding import get_host_cpu_features
 
-from arraygeom.compiled import compiled
+from arraygeom.runtime.compiled import compiled
 
 from .emit import LANES, NARROW
 from .layout import BLOCK, from_pixel, of, pointers

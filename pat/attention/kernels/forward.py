@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from arraygeom.compiled import compiled
+from arraygeom.runtime.compiled import compiled
 
 from .channels import block_products, block_sums, copy, fill
 from .emit import LANES

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import types
 
-from arraygeom.compiled import compiled
+from arraygeom.runtime.compiled import compiled
 
 from .emit import LANES, instruction
 from .vectors import from_index

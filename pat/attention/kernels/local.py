@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from arraygeom.compiled import compiled
+from arraygeom.runtime.compiled import compiled
 
 from .emit import LANES
 from .layout import of, pointers

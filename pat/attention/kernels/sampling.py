@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from arraygeom.compiled import compiled
+from arraygeom.runtime.compiled import compiled
 
 from .channels import fill
 from .emit import LANES

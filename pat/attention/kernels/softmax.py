@@ -9,7 +9,7 @@ import numpy as np
 from numba import types
 from numba.extending import overload
 
-from arraygeom.compiled import compiled
+from arraygeom.runtime.compiled import compiled
 
 from .channels import fill
 from .emit import LANES

@@ -10,13 +10,13 @@ import pytest
 import torch
 
 from arraygeom import Pose, Rig, View, rotation_from_vector
-from arraygeom.text import UNSCALED
+from arraygeom.runtime.text import UNSCALED
 from calib.boards.bundle import changed, parameter_names
 from calib.boards.rig_diff import _projections, draw_difference, rig_difference
 from calib.boards.solve import adjust
 from calib.boards.uncertainty import rig_covariance
-from pat.cli.main import main
-from pat.data.sample_array import SAMPLE
+from pat.app.cli.main import main
+from pat.app.sample_array import SAMPLE
 from tests.calib.board_scenes import board_poses, four_cameras, scene_of, see
 
 DEPTH = (1.0, 4.0)

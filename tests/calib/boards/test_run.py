@@ -13,7 +13,7 @@ from calib.boards.rig import calibrate
 from calib.boards.simulation import simulate_photos
 from calib.boards.solve import calibrate_single
 from calib.boards.target import parse_board
-from pat.cli.main import main
+from pat.app.cli.main import main
 from tests.calib.board_scenes import camera, errors_of, four_cameras, pose_errors
 
 BOARD = "charuco:9x7:60mm"

@@ -17,7 +17,7 @@ from calib.boards.simulation import photograph
 from calib.images.matches import match_cameras
 from calib.images.residuals import line_distances
 from experiments.alignment import nine_band_calibration
-from pat.cli.main import main
+from pat.app.cli.main import main
 from pat.media.images import read_image
 from tests.benchmarks.bench_start import GRID, neighbours
 from tests.calib.board_scenes import BOARD, board_poses, camera, errors_of, see, tensor

@@ -10,13 +10,13 @@ import torch
 
 from arraygeom import Distortion, Link, Pose, Rig, View, triangulate
 from arraygeom.lenses import PolynomialFisheye
-from arraygeom.text import UNSCALED
+from arraygeom.runtime.text import UNSCALED
 from calib.images.doctor import diagnose, diagnose_matches
 from calib.images.hypotheses import TRANSPOSE, hypotheses, on_cameras, swap
 from calib.images.least_squares import most_probable
 from calib.images.parameters import UNCERTAIN, apply_change, free_parameters
 from calib.images.residuals import sampson_of_pairs
-from pat.cli.main import main
+from pat.app.cli.main import main
 from pat.media.images import write_image
 from tests.benchmarks.bench_drift import drifted
 from tests.benchmarks.bench_names import OPENGL, negated, reordered, shifted, turned

@@ -7,7 +7,7 @@ from arraygeom import Rig
 from calib.images.from_images import rig_from_images
 from calib.images.matches import PointMatches
 from calib.images.residuals import line_distances
-from pat.cli.main import main
+from pat.app.cli.main import main
 from pat.media.images import write_image
 from tests.calib.scenes import rectified_images, rectified_pair, seen_points, texture
 

@@ -25,8 +25,8 @@ from calib.images.photometric import PhotometricImage, photometric_errors
 from calib.images.refinement import Refinement, refine_matches
 from calib.images.residuals import line_distances
 from experiments.showcase import FAST, FAST_FRAME, SCENE, SLOW_FRAME, published_matrices
+from pat.app.cli.main import main
 from pat.attention import attend_with_statistics
-from pat.cli.main import main
 from pat.media.images import read_image
 from tests.calib.scenes import rectified_images, rectified_pair, seen_points, vector
 

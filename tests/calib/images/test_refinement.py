@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from arraygeom import Camera, Distortion, Link, Rig, View
-from arraygeom.text import UNSCALED
+from arraygeom.runtime.text import UNSCALED
 from calib.images.depth_change import DepthChange, relative_change
 from calib.images.hypotheses import swap
 from calib.images.matches import PointMatches, image_sizes, match_cameras
@@ -15,8 +15,8 @@ from calib.images.parameters import apply_change, free_parameters
 from calib.images.photometric import PhotometricImage, photometric_errors
 from calib.images.refinement import RefinementProblem, jacobian, polish, refine, refine_matches, solve
 from calib.images.residuals import epipolar_residuals, median_off, sampson_of_pairs
+from pat.app.cli.main import main
 from pat.attention import attend_with_statistics
-from pat.cli.main import main
 from pat.media.images import write_image
 from tests.benchmarks.bench_drift import DRIFTS, drifted, with_lens_mistake
 from tests.benchmarks.bench_drift import error as depth_error

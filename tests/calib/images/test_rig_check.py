@@ -13,7 +13,7 @@ from calib.images import rig_check
 from calib.images.depth_change import share_outside
 from calib.images.matches import PointMatches, match_cameras
 from calib.images.rig_check import find_misfit, misfit_warning
-from pat.cli.main import main
+from pat.app.cli.main import main
 from pat.media.images import write_image
 from tests.calib.scenes import rectified_images, rectified_pair, texture, vector
 

@@ -10,8 +10,8 @@ import pytest
 import torch
 from torch.autograd import gradcheck, gradgradcheck
 
+from arraygeom.runtime.threads import limited_to
 from arraygeom.segments import Positions, Segments
-from arraygeom.threads import limited_to
 from pat.attention import attend, attend_with_statistics, kernels
 from tests.pat.attention.cases import call, differences, gradients, of_16_bits, random_case
 
@@ -173,7 +173,7 @@ def test_processes_that_compile_at_once_do_not_take_each_others_code(tmp_path):
     """Two processes read the same empty index, then each saves code of its own types."""
     from numba.core.caching import IndexDataCacheFile
 
-    from arraygeom.compiled import separate_cache
+    from arraygeom.runtime.compiled import separate_cache
 
     class Entry:
         def __init__(self):

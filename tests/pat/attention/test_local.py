@@ -7,7 +7,7 @@ import torch
 from torch.autograd import forward_ad
 
 from arraygeom import Local, Pair, View, lazily
-from arraygeom.threads import limited_to
+from arraygeom.runtime.threads import limited_to
 from pat.attention import attend, attend_with_statistics, cpu
 from pat.attention.kernels import ROWS
 

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from arraygeom import Rig
-from pat.data.sample_array import load_sample
+from pat.app.from_images import _ordered_betas, show_colour
+from pat.app.sample_array import load_sample
 from pat.fusion.checks import LowConfidenceWarning, noise_advice, warn_of_confidence
-from pat.fusion.from_images import _ordered_betas, show_colour
 from pat.fusion.fuse import fuse
 from pat.fusion.inputs import FrameInputs
 from pat.fusion.results import Frame, band_names, save_frame

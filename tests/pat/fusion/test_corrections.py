@@ -6,7 +6,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from pat.evaluation.metrics import score
 from pat.fusion.corrections import Corrections, find_corrections
 from pat.fusion.fuse import corrections_of, fuse
 from pat.fusion.inputs import prepared
@@ -16,6 +15,7 @@ from pat.matching.epipolar_offset import Misalignment, fit_misalignment
 from pat.matching.radiometry import Response
 from pat.media.colour import luminance
 from pat.networks.weights import load_weights
+from pat.support.metrics import score
 from tests.pat.layered_array import ALPHA, BETA, load_sample, middle_of_sample
 
 

@@ -9,7 +9,7 @@ import torch
 import pat.fusion.tiles
 import pat.fusion.views
 from arraygeom import Distortion, Epipolar, Sensor
-from arraygeom.chunks import tiles_of
+from arraygeom.runtime.chunks import tiles_of
 from pat.fusion.frames import ImageFiles
 from pat.fusion.fuse import fuse
 from pat.fusion.sequence import fuse_sequence

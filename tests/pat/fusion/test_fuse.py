@@ -27,17 +27,16 @@ from arraygeom import (
     resampled,
     rotation_from_vector,
 )
-from arraygeom.chunks import Tile, tiles_of
 from arraygeom.fields import AroundDepth
-from arraygeom.threads import limited_to
+from arraygeom.runtime.chunks import Tile, tiles_of
+from arraygeom.runtime.threads import limited_to
 from calib.images.matches import match_points, seen_depths
-from pat.data.pairs import folder_pairs
-from pat.evaluation.metrics import score
 from pat.fusion.fuse import corrections_of, fuse
 from pat.fusion.inputs import FrameInputs, prepared
 from pat.fusion.steps import quarter_turns, resolution_ratio, steps_for, without_lenses
 from pat.fusion.tiles import MAX_HALO, SLACK, tiles_within, working_memory
 from pat.fusion.views import Views
+from pat.lab.data.pairs import folder_pairs
 from pat.matching.inputs import Inputs, InputsSettings
 from pat.media.colour import linear_from_srgb, luminance
 from pat.media.images import read_image
@@ -47,6 +46,7 @@ from pat.networks.configs import BandwisePATConfig, GuidedPATConfig, PATConfig
 from pat.networks.guided import GuidedPAT
 from pat.networks.paper import PAT
 from pat.networks.weights import load_weights, set_precision
+from pat.support.metrics import score
 from tests.pat.layered_array import load_sample
 
 
@@ -160,7 +160,7 @@ def test_halos_are_wide_enough_for_the_weights(folder, precision, most, rms, sha
 WRONG = """
 import torch
 from pat import fuse, load_weights
-from pat.data.sample_array import SAMPLE, load_sample
+from pat.app.sample_array import SAMPLE, load_sample
 from pat.media.images import write_image
 
 sample, network = load_sample(), load_weights("mono-colour")

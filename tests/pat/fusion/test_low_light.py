@@ -12,8 +12,7 @@ import pat.fusion.tiles
 from arraygeom import Pair, Rectified, Rig, View
 from arraygeom.distortion import Distortion
 from arraygeom.fields.grid import FieldOnGrid
-from pat.evaluation.baseline import classical, non_local_means
-from pat.evaluation.metrics import score
+from pat.fusion.classical import classical, non_local_means
 from pat.fusion.corrections import find_corrections
 from pat.fusion.fuse import fuse
 from pat.fusion.inputs import FrameInputs, Placement
@@ -36,6 +35,7 @@ from pat.media.colour import luminance
 from pat.networks.protocol import FusionOutput
 from pat.networks.weights import load_weights
 from pat.sensors import NoiseLevel, generator_for
+from pat.support.metrics import score
 from pat.support.steps import steps_shown
 from tests.pat.layered_array import ALPHA, BETA, load_sample, middle_of_sample
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from pat.data.sample_array import load_sample
+from pat.app.sample_array import load_sample
 from pat.fusion.fuse import fuse
 from pat.fusion.luminance import with_own_colours
 from pat.fusion.results import Frame

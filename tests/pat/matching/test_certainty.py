@@ -7,7 +7,7 @@ import torch
 from skimage.data import stereo_motorcycle
 
 from experiments.evaluation.certainty import Reliability
-from pat.data.sample_array import load_motorcycle, load_sample
+from pat.app.sample_array import load_motorcycle, load_sample
 from pat.fusion.fuse import fuse
 from pat.fusion.results import Frame
 from pat.matching import certainty, choice

@@ -11,9 +11,9 @@ from torch.nn.functional import grid_sample
 from arraygeom import Rectified, Segments, pixel_grid
 from arraygeom.fields.default import default_field
 from arraygeom.fields.grid import FieldOnGrid
-from pat.data.sample_array import load_motorcycle
-from pat.evaluation.protocols import rectified_rig
+from pat.app.sample_array import load_motorcycle
 from pat.fusion.fuse import fuse
+from pat.lab.evaluation.protocols import rectified_rig
 from pat.matching import choice
 from pat.matching import inputs as parts
 from pat.matching.certainty import typical_facts

@@ -7,9 +7,8 @@ import pytest
 import torch
 
 from arraygeom import Camera, Pose, Rig, Segments, intrinsics, pixel_grid
-from arraygeom.chunks import tiles_of
 from arraygeom.fields import pinhole_track
-from pat.evaluation.metrics import score
+from arraygeom.runtime.chunks import tiles_of
 from pat.fusion.fuse import fuse
 from pat.fusion.inputs import frame_inputs
 from pat.fusion.views import Views
@@ -24,6 +23,7 @@ from pat.media.colour import luminance
 from pat.networks.guided import SETTINGS as GUIDED
 from pat.networks.guided import BetaEstimate, combined
 from pat.networks.weights import load_weights
+from pat.support.metrics import score
 
 H, W = 96, 192
 NEAR, FAR = 2.0, 8.0

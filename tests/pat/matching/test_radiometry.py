@@ -5,12 +5,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from pat.evaluation.metrics import score
 from pat.fusion.fuse import fuse
 from pat.matching import radiometry
 from pat.matching.radiometry import KINDS, SETTINGS, Response, fit, stated_response
 from pat.media.colour import REC601, luminance
 from pat.networks.weights import load_weights
+from pat.support.metrics import score
 from tests.pat.layered_array import ALPHA, BETA, load_sample
 
 WEIGHTS = (0.2, 0.4, 0.4)

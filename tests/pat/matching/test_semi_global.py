@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-import arraygeom.threads
+import arraygeom.runtime.threads
 import pat.matching.semi_global
 import pat.matching.subpixel
 from arraygeom import (
@@ -119,7 +119,7 @@ def test_threads_and_blocks_change_nothing(monkeypatch):
     alpha, beta, _ = plane_seen(pair, 2.0)
     call = alpha, beta, beta, sampled_at(pair, 1), sampled_at(pair, 2)
     whole = semi_global_matching(*call)
-    with arraygeom.threads.limited_to(1 if torch.get_num_threads() > 1 else 3):
+    with arraygeom.runtime.threads.limited_to(1 if torch.get_num_threads() > 1 else 3):
         again = semi_global_matching(*call)
     assert all(torch.equal(getattr(whole, part), getattr(again, part)) for part in PARTS)
     in_blocks_of(monkeypatch, block=16)
@@ -145,7 +145,7 @@ def test_no_more_blocks_at_once_than_memory_holds(monkeypatch, limit, at_once):
     views = Comparison.of(alpha, beta).half_views(alpha, beta)
     monkeypatch.setattr(pat.matching.semi_global, "_block", block)
     in_blocks_of(monkeypatch, block=8, long_block=8)
-    monkeypatch.setattr(arraygeom.threads, "threads", lambda: 4)
+    monkeypatch.setattr(arraygeom.runtime.threads, "threads", lambda: 4)
     with limited(limit):
         matched_at_half_size(views, sampled_at(pair, 2))
     assert max(most) in at_once
@@ -160,7 +160,7 @@ def test_blocks_know_what_others_claim(monkeypatch, threads):
     given = Comparison.of(alpha, beta).half_views(alpha, beta), sampled_at(pair, 2)
     whole = matched_at_half_size(*given)
     in_blocks_of(monkeypatch, block=12, long_block=20, margin=1000)
-    monkeypatch.setattr(arraygeom.threads, "threads", lambda: threads)
+    monkeypatch.setattr(arraygeom.runtime.threads, "threads", lambda: threads)
     blocks = matched_at_half_size(*given)
     assert (whole.facts[:, 0] > pat.matching.semi_global.CONSISTENT).any()
     for one, other in zip(whole, blocks):

@@ -16,7 +16,7 @@ import tifffile
 import torch
 from PIL import Image, ImageOps
 
-from arraygeom.atomic import sweep, write_atomically, write_together
+from arraygeom.runtime.atomic import sweep, write_atomically, write_together
 from pat.media.colour import from_luma_chroma, luminance, to_luma_chroma
 from pat.media.headers import image_header
 from pat.media.images import decoded_photograph, read_image, read_recorded, write_image

@@ -7,7 +7,7 @@ from scipy.fft import dctn, idctn
 from scipy.linalg import hadamard
 from torch.nn.functional import avg_pool2d, pad
 
-from arraygeom.threads import limited_to
+from arraygeom.runtime.threads import limited_to
 from pat.networks.bm3d import (
     ALIKE,
     RADIUS,

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from pat.evaluation.baseline import non_local_means
+from pat.fusion.classical import non_local_means
 from pat.media.colour import luminance
 from pat.networks.denoiser import DenoiserConfig, LowLightNetwork
 from pat.networks.weights import DENOISER, SHIPPED, load_denoiser, load_weights, save_weights

@@ -7,7 +7,7 @@ import torch
 
 from arraygeom import Camera, Epipolar, Pair, Pose, Rectified, Segments, View, intrinsics
 from arraygeom.fields.grid import FieldOnGrid
-from pat.data.sample_array import load_sample
+from pat.app.sample_array import load_sample
 from pat.fusion.fuse import fuse
 from pat.matching.inputs import Inputs
 from pat.matching.matches import Matches

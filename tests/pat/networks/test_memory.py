@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from arraygeom.chunks import Tile
+from arraygeom.runtime.chunks import Tile
 from pat.fusion.inputs import frame_inputs
 from pat.fusion.tiles import fuse_tile, working_memory
 from pat.fusion.views import Views

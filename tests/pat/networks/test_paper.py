@@ -7,10 +7,10 @@ from arraygeom import Pair, Rectified, Rig, View, sampling_locations
 from arraygeom.fields.grid import FieldOnGrid
 from pat import fuse, load_weights
 from pat.attention import attend
-from pat.evaluation.metrics import score
 from pat.matching.inputs import Inputs
 from pat.networks.configs import PATConfig
 from pat.networks.paper import PAT
+from pat.support.metrics import score
 from tests.pat.layered_array import middle_of_sample
 
 

@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from pat import fuse
-from pat.data.sample_array import load_sample
-from pat.evaluation.metrics import score
+from pat.app.sample_array import load_sample
 from pat.networks.weights import load_weights, set_precision
 from pat.support import eight_bits
+from pat.support.metrics import score
 
 
 @pytest.mark.parametrize("precision", ["bfloat16", "int8"])

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from arraygeom.threads import limited_to, torch_in_one_thread
+from arraygeom.runtime.threads import limited_to, torch_in_one_thread
 from pat.networks.weights import misfit
 from pat.support.eight_bits import Conv2d, available, measured, packed, round_to_eight_bits
 

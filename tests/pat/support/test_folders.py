@@ -5,10 +5,10 @@ import os
 import pytest
 import torch
 
-from pat.data import folder_pairs
+from pat.lab.data import folder_pairs
+from pat.lab.synthesis.photos import read_photographs
 from pat.media.images import write_image
 from pat.support.folders import files_below
-from pat.synthesis.photos import read_photographs
 
 
 def test_links_are_followed_but_not_in_circles(tmp_path):

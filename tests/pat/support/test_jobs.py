@@ -15,9 +15,9 @@ import pytest
 import torch
 from rich.console import Console
 
-from arraygeom.threads import limited_to
+from arraygeom.runtime.threads import limited_to
 from pat.support.jobs import JobError, Task, Workers, followed, run_tasks
-from tests.pat.fusion.test_batch import contents, material  # noqa: F401  (a fixture)
+from tests.pat.app.test_batch import contents, material  # noqa: F401  (a fixture)
 from tests.pat.support.work import befallen, note
 
 
@@ -128,7 +128,7 @@ def test_a_killed_command_is_resumed_to_the_same_bits(material, tmp_path):  # no
         os.link(material / "slow" / f"slow_{8 + i % 2}.png", tmp_path / "slow" / f"s{i}.png")
     images = [a for name in ("fast", "slow") for a in ("--image", f"{name}={tmp_path / name}")]
     given = ["--rig", material / "rig.yaml", "--weights", material / "tiny.safetensors", "--alpha", "fast"]
-    run = "import sys; from pat.cli.main import main\nif __name__ == '__main__': main(sys.argv[1:])"
+    run = "import sys; from pat.app.cli.main import main\nif __name__ == '__main__': main(sys.argv[1:])"
     (tmp_path / "run.py").write_text(run)
 
     def command(out: str, *more: str) -> subprocess.Popen:

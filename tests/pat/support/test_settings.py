@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from pat.cli.research import Settings
+from pat.lab.commands import Settings
 from pat.matching.semi_global import HALF_SIZE
 from pat.matching.subpixel import FULL_SIZE
 from pat.support.settings import all_settings, listed, physics, size, tuned

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from arraygeom.progress import log_step, part, progress, stage
+from arraygeom.runtime.progress import log_step, part, progress, stage
 from calib.images.from_images import rig_from_images
 from pat.media.images import read_image
 from pat.support import steps

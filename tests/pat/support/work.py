@@ -5,7 +5,7 @@ import signal
 import time
 from pathlib import Path
 
-from arraygeom.atomic import write_text
+from arraygeom.runtime.atomic import write_text
 from pat.support.jobs import JobError
 
 

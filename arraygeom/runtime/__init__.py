@@ -1,0 +1,1 @@
+"""Support that is not geometry: threads, compiled kernels, atomic files, progress, warnings, messages."""

@@ -1,0 +1,70 @@
+"""Short texts for messages: lengths, ranges, shares, depth bounds."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+UNSCALED = "found from images: lengths are multiples of the baseline, not metres"
+"""The name of a rig of unknown scale."""
+
+
+def length_unit(rig: Any) -> str:
+    """What lengths of a rig are in: "m", or "baselines" of one of unknown scale."""
+    return "baselines" if rig.name == UNSCALED else "m"
+
+
+def baseline_text(cameras: Mapping[str, Any], unit: str = "m") -> str:
+    """Distances between the cameras whose poses are known; metres in a unit that suits them."""
+    centres = [c.centre.detach() for c in cameras.values() if hasattr(c, "cam_from_world")]
+    pairs = [(a - b).norm(dim=-1) for i, a in enumerate(centres) for b in centres[:i]]
+    if not pairs:
+        return ""
+    lengths = torch.cat([d.reshape(-1) for d in torch.broadcast_tensors(*pairs)])
+    named = "baselines" if len(pairs) > 1 else "baseline"
+    if unit != "m":
+        return f"{named} {range_text(lengths, '.3g')}"
+    scale, unit = next((s, u) for limit, s, u in UNITS if float(lengths.max()) < limit)
+    return f"{named} {range_text(lengths * scale, '.3g')} {unit}"
+
+
+UNITS = ((0.01, 1e3, "mm"), (1.0, 1e2, "cm"), (float("inf"), 1.0, "m"))
+"""Below which length (metres) another unit reads better, its factor and name."""
+
+
+def depth_text(depth: tuple[Tensor, Tensor] | None, unit: str = "m") -> str:
+    """The depth range: "2-5 m"."""
+    if depth is None:
+        return ""
+    near, far = float(depth[0].detach().min()), float(depth[1].detach().max())
+    return f"{near:.3g} {unit} to infinity" if far == float("inf") else f"{near:.3g}-{far:.3g} {unit}"
+
+
+def angle(R: Tensor) -> Tensor:
+    """The angle (*b) of a rotation (*b, 3, 3), radians; exact for small ones too."""
+    R = R.detach()
+    skew = torch.stack(
+        [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], -1
+    )
+    return torch.atan2(0.5 * skew.norm(dim=-1), 0.5 * (R.diagonal(dim1=-2, dim2=-1).sum(-1) - 1))
+
+
+def range_text(values: Tensor, form: str) -> str:
+    """The least and the largest value, as one where they read alike."""
+    low, high = (format(float(v), form) for v in (values.min(), values.max()))
+    return low if low == high else f"{low}-{high}"
+
+
+def share_text(mask: Tensor) -> str:
+    """How much of a mask is true."""
+    return f"{100 * float(mask.float().mean()):.0f} %" if mask.numel() else "none"
+
+
+def short(value: object) -> str:
+    """A value in a message: numbers with four digits, no more than its first 60 characters, in ASCII."""
+    text = re.sub(r"-?\d+\.\d{4,}(?:e[-+]\d+)?", lambda number: f"{float(number[0]):.4g}", ascii(value))
+    return text if len(text) <= 60 else f"{text[:57]}..."

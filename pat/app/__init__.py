@@ -1,0 +1,1 @@
+"""The application: commands, explorer, pages, batches, and fusing without a rig."""

@@ -1,0 +1,375 @@
+"""Many frames, and sequences, from folders to a folder: `pat fuse` with more than one image a camera.
+
+Every frame is a task of its own that leaves its image last; `settings.yaml` beside the images says what they
+were made with, and a job is resumed with the same settings only; `inputs.json` says from which images, and
+frames whose images have changed are made again. One command at a time writes to a folder. The colours of a
+sequence's key frames wait in `.keys` until all frames are there.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import re
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any
+
+import yaml
+from rich.console import Console
+from torch import Tensor
+
+from arraygeom import Rig, ThroughLenses, Widened
+from arraygeom.fields import FIELDS
+from arraygeom.io.native import read_text as rig_of_text
+from arraygeom.io.native import write as rig_text
+from arraygeom.runtime.atomic import sweep, write_text
+from arraygeom.runtime.safe_yaml import dump_yaml, load_yaml
+
+from ..fusion.checks import confidence_checked
+from ..fusion.frames import ImageFiles
+from ..fusion.fuse import FuseSettings, fuse
+from ..fusion.results import Frame, ImageFormat, band_names, save_frame, view_of
+from ..fusion.sequence import KeyColour, SequenceFusion, readable
+from ..fusion.timeline import KeyFrame
+from ..fusion.views import ViewFiles
+from ..media.images import read_image
+from ..media.raw import developed_rig
+from ..media.suffixes import IMAGE_SUFFIXES, VIDEO_SUFFIXES
+from ..media.video import check_video, write_video
+from ..networks.weights import Precision, find_weights, load_weights
+from ..sensors import NoiseLevel
+from ..support.jobs import HERE, JobReport, OnError, Task, Workers, run_tasks
+from ..support.locks import folder_lock
+from ..support.memory import limited
+from ..support.schema import entries_of
+from ..support.tensor_files import read_tensors, write_tensors
+
+INPUTS = "inputs.json"
+SETTINGS, KEYS, PLAN = "settings.yaml", ".keys", "plan.json"
+
+PLAN_FORMAT = "pat-batch 1"
+_network = lru_cache(maxsize=2)(load_weights)
+FIELD_CLASSES = {kind.__name__: kind for kind in (*FIELDS.values(), ThroughLenses, Widened)}
+
+
+@dataclass(frozen=True)
+class Batch:
+    """What is to be fused and how: `files` by camera, the frames in order; `out`, the folder of the results.
+
+    Options are as of `save_frame`. A `sequence` is fused as `fuse_sequence` does, else the first
+    frame with the first of every other camera, the second with the second and so on (`frame_matching` finds
+    which these are).
+    """
+
+    rig: Rig
+    files: Mapping[str, Sequence[Path]]
+    alpha: str
+    out: Path
+    weights: str = "mono-colour"
+    sequence: bool = False
+    speed: float | None = None
+    settings: FuseSettings = FuseSettings()  # noqa: RUF009
+    bits: int = 8
+    kind: ImageFormat = "png"
+    alone: bool = False
+    """Of a sequence: fuse each frame by itself, without warping colour; for comparison."""
+    precision: Precision = "float32"
+    """Of the network's convolutions, as of `load_weights`."""
+    strict: bool = False
+    """A frame of unfit confidence (`LowConfidenceWarning`) fails."""
+
+    def __post_init__(self) -> None:
+        for name in self.files:
+            self.rig.require(name)
+        if self.alpha not in self.files:
+            raise ValueError(f"no image of alpha, '{self.alpha}'")
+        if not self.sequence and len({len(files) for files in self.files.values()}) > 1:
+            counts = ", ".join(f"{len(files)} of '{name}'" for name, files in self.files.items())
+            raise ValueError(
+                f"frames need as many images of each camera, got {counts}; or is it a --sequence?"
+            )
+
+    @cached_property
+    def names(self) -> list[str]:
+        """What alpha's files are called, without suffix; numbers if two are called the same."""
+        names = [file.stem for file in self.files[self.alpha]]
+        return names if len(set(names)) == len(names) else [f"{i:06d}" for i in range(len(names))]
+
+    @property
+    def dependencies(self) -> str:
+        """What the results depend on, as text."""
+        digest = hashlib.sha256(find_weights(self.weights).read_bytes()).hexdigest()
+        entries = json.loads(self.to_json())
+        files = entries.pop("files")
+        for name in ("format", "out", "strict"):
+            del entries[name]
+        del entries["settings"]["max_memory"]
+        entries["weights"] = f"{self.weights} (SHA-256 {digest[:16]})"
+        if self.sequence:
+            entries["frames"] = {name: len(paths) for name, paths in files.items()}
+        return dump_yaml(entries)
+
+    @property
+    def inputs(self) -> dict[str, str]:
+        """A digest of names, sizes and times of the images each frame is made from: all, in a sequence."""
+        stamps = {name: [_stamp(file) for file in files] for name, files in self.files.items()}
+        if self.sequence:
+            return dict.fromkeys(self.names, _digest(stamps))
+        frames = ({n: indices[i] for n, indices in stamps.items()} for i in range(len(self.names)))
+        return dict(zip(self.names, map(_digest, frames)))
+
+    def fused_file(self, i: int) -> Path:
+        """The file of a fused frame."""
+        return self.out / f"{self.names[i]}_fused.{self.kind}"
+
+    def run(
+        self,
+        *,
+        workers: Workers = HERE,
+        resume: bool = False,
+        on_error: OnError = "stop",
+        video: float | None = None,
+        console: Console | None = None,
+    ) -> JobReport:
+        """Fuse all frames. With `video`, its frames a second, fused.mp4 is written when all are there.
+
+        Raises JobError if a frame fails and the job is to stop, ValueError to resume with other settings, and
+        for a folder that another command is writing to, or that cannot be written to.
+        """
+        if video is not None:
+            check_video(video)
+        plan, many = self.out / KEYS / PLAN, range(len(self.names))
+        how: dict[str, Any] = {"workers": workers, "resume": resume, "on_error": on_error, "console": console}
+        with folder_lock(self.out):
+            self._begin(resume)
+            if self.sequence:
+                self.fusion.timeline.warn_of_ends()
+            if self.sequence and not self.alone:
+                missing = [i for i in many if not (resume and self.fused_file(i).exists())]
+                keys = [(k, f"key frame {self.names[k.alpha]}") for k in self.fusion.keys_of(missing)]
+                first = [Task(self._key_file(k), fuse_key, (plan, k), about) for k, about in keys]
+                run_tasks(first, title="key frames", **how)
+            tasks = [Task(self.fused_file(i), fuse_one, (plan, i)) for i in many]
+            report = run_tasks(tasks, title="frames", **how)
+            if video is not None and (report.made or report.kept):
+                made = [p for i in many if (p := self.fused_file(i)).exists()]
+                write_video(self.out / "fused.mp4", (read_image(p) for p in made), rate=video)
+            if not report.failed:
+                shutil.rmtree(self.out / KEYS)
+            return report
+
+    def _begin(self, resume: bool) -> None:
+        """Write the settings and what frames are made from; or, to resume, compare them with those before.
+
+        Frames whose images are not those of before are removed.
+        """
+        text, file = self.dependencies, self.out / SETTINGS
+        changed = _differing(text, file.read_text(encoding="utf-8")) if resume and file.is_file() else []
+        if changed:
+            raise ValueError(
+                f"{file}: the frames there were made with other settings ({', '.join(changed)}): "
+                "give the same ones, or another --out"
+            )
+        now, before = self.inputs, entries_of(self.out / INPUTS) if resume else {}
+        other = [i for i, name in enumerate(self.names) if before.get(name) != now[name]]
+        if not resume or (self.sequence and other):
+            shutil.rmtree(self.out / KEYS, ignore_errors=True)
+        for i in other:
+            self.fused_file(i).unlink(missing_ok=True)
+        for folder in (self.out, self.out / KEYS):
+            sweep(folder)
+        write_text(file, text)
+        write_text(self.out / INPUTS, json.dumps(now, indent=1))
+        write_text(self.out / KEYS / PLAN, self.to_json())
+
+    def to_json(self) -> str:
+        """The batch as text for processes that fuse its frames. Raises ValueError for one's own field."""
+        entries = {entry.name: getattr(self, entry.name) for entry in dataclasses.fields(self)}
+        return json.dumps({"format": PLAN_FORMAT, **entries}, default=_plain)
+
+    @classmethod
+    def from_json(cls, text: str, source: str = PLAN) -> Batch:
+        """The batch of `to_json`'s text. Raises ValueError naming `source`."""
+        try:
+            entries = json.loads(text, object_hook=_made)
+            if entries.pop("format") != PLAN_FORMAT:
+                raise ValueError("another version's")
+            entries["rig"] = rig_of_text(entries["rig"], source)
+            entries["files"] = {n: [Path(file) for file in files] for n, files in entries["files"].items()}
+            entries["out"] = Path(entries["out"])
+            settings = entries["settings"]
+            settings |= {n: tuple(v) for n, v in settings.items() if isinstance(v, list)}
+            return cls(**{**entries, "settings": FuseSettings(**settings)})
+        except (AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
+            raise ValueError(f"{source}: not a plan of this program ({error}): start the job again") from None
+
+    @cached_property
+    def fusion(self) -> SequenceFusion:
+        """The sequence, with the images that its frames have in common."""
+        frames = {n: ImageFiles(files, self.rig, n, alpha=self.alpha) for n, files in self.files.items()}
+        rig, network = developed_rig(self.rig, self.files), _network(self.weights, precision=self.precision)
+        return SequenceFusion(network, rig, frames, self.alpha, self.speed, self.settings)
+
+    def _key_file(self, key: KeyFrame) -> Path:
+        return self.out / KEYS / f"{key.alpha:08d}.safetensors"
+
+    def _fetch(self, key: KeyFrame) -> KeyColour | None:
+        file = self._key_file(key)
+        try:
+            return KeyColour(**read_tensors(file)[0]) if file.exists() else None
+        except ValueError as error:
+            image = self.files[self.alpha][key.alpha]
+            raise ValueError(f"{image}: its colour, {error}: fuse again without --resume") from None
+
+    def fuse_key(self, key: KeyFrame) -> None:
+        """Write the colour of a key frame."""
+        with confidence_checked(strict=self.strict):
+            colour = self.fusion.colour(key)
+        write_tensors(self._key_file(key), colour._asdict())
+
+    def fuse_one(self, i: int) -> None:
+        """Write a frame."""
+        with limited(self.settings.limit):
+            with confidence_checked(strict=self.strict):
+                frame = self._frame(i)
+            view = view_of(self.rig, self.alpha, bits=self.bits, bands=len(frame.image))
+            bands = band_names(frame, self._betas) or self._propagated_bands(frame)
+            save_frame(
+                frame, self.out, bits=self.bits, kind=self.kind, view=view, name=self.names[i], bands=bands
+            )
+
+    @property
+    def _betas(self) -> list[str]:
+        return [name for name in self.rig.betas(self.alpha) if name in self.files]
+
+    def _propagated_bands(self, frame: Frame) -> list[str]:
+        """As `band_names`, of a frame of several bands that does not say whose confidence is whose."""
+        if not self.sequence or not 1 < len(frame.image) == len(self._betas):
+            return []
+        frames = [self.fusion.frames[name] for name in self._betas]
+        images = [next(readable(of_one.__getitem__, range(len(of_one))), frame.image) for of_one in frames]
+        return self._betas if all(len(image) == 1 for image in images) else []
+
+    def _frame(self, i: int) -> Frame:
+        if not self.sequence:
+            images = ViewFiles(self.rig, {n: files[i] for n, files in self.files.items()}, alpha=self.alpha)
+            network = _network(self.weights, precision=self.precision)
+            return fuse(network, images.developed, images, alpha=self.alpha, settings=self.settings)
+        fusion = self.fusion
+        return fusion.alone(i) if self.alone else fusion.frame(i, fusion.timeline.key_frames(), self._fetch)
+
+
+def _plain(value: object) -> object:
+    """What is in a plan as JSON has it. Raises ValueError for fields of other families than arraygeom's."""
+    if isinstance(value, Rig):
+        return rig_text(value)
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, Tensor):
+        return float(value)
+    if isinstance(value, FuseSettings | NoiseLevel):
+        return vars(value)
+    kind = type(value).__name__
+    if FIELD_CLASSES.get(kind) is not type(value):
+        supported = ", ".join(FIELD_CLASSES)
+        raise ValueError(
+            f"a batch's field is written to a file, which {value!r} cannot be: give one of {supported}"
+        )
+    return {"kind": kind, **vars(value)}
+
+
+def _made(entries: dict[str, Any]) -> Any:
+    """The field or noise level that a part of a plan is of; other entries as they are."""
+    if entries.keys() == vars(NoiseLevel()).keys():
+        return NoiseLevel(**entries)
+    kind = entries.get("kind")
+    if isinstance(kind, str) and kind in FIELD_CLASSES:
+        return FIELD_CLASSES[kind](**{name: value for name, value in entries.items() if name != "kind"})
+    return entries
+
+
+def fuse_key(plan: Path, key: KeyFrame) -> None:
+    """The task of a key frame."""
+    _planned(plan, plan.stat().st_mtime_ns).fuse_key(key)
+
+
+def fuse_one(plan: Path, i: int) -> None:
+    """The task of a frame."""
+    _planned(plan, plan.stat().st_mtime_ns).fuse_one(i)
+
+
+def _differing(now: str, before: str) -> list[str]:
+    """Names of the settings (YAML) that are not as before."""
+    try:
+        stated, former = load_yaml(now), load_yaml(before)
+    except yaml.YAMLError:
+        return ["unreadable"]
+    if not isinstance(former, dict):
+        return ["unreadable"]
+    names = [name for name, value in stated.items() if former.get(name) != value]
+    if names == ["settings"] and isinstance(former.get("settings"), dict):
+        names = [n for n, value in stated["settings"].items() if former["settings"].get(n) != value]
+    return names
+
+
+def _stamp(file: Path) -> str:
+    try:
+        facts = file.stat()
+    except OSError:
+        return f"{file.name}: missing"
+    return f"{file.name}: {facts.st_size} bytes of {facts.st_mtime_ns}"
+
+
+def _digest(document: object) -> str:
+    return hashlib.sha256(json.dumps(document).encode()).hexdigest()[:32]
+
+
+@lru_cache(maxsize=2)
+def _planned(plan: Path, time: int) -> Batch:
+    return Batch.from_json(plan.read_text(encoding="utf-8", errors="replace"), str(plan))
+
+
+def find_images(text: str | Path, *, name: str = "") -> list[Path]:
+    """The images of a folder, a pattern such as "a/mono_*.png", or one file; numbers in names count as such.
+
+    Raises FileNotFoundError if there is none, ValueError for a video, and for two of one name.
+    """
+    path = Path(text)
+    label = f"{name}: " if name else ""
+    if path.suffix.lower() in VIDEO_SUFFIXES:
+        raise ValueError(
+            f"{label}{path}: is a video, which only `pat fuse` without a rig reads: save its frames"
+        )
+    if path.is_dir():
+        files = _images_in(path)
+    elif path.exists():
+        files = [path]
+    else:
+        files = [p for p in path.parent.glob(path.name) if p.is_file()]
+    files = sorted((p for p in files if p == path or not p.name.startswith(".")), key=_natural)
+    if not files:
+        below = [str(p) for p in sorted(path.iterdir()) if _images_in(p)] if path.is_dir() else []
+        advice = f"give a folder of images, such as {below[0]}" if below else "check the path"
+        raise FileNotFoundError(f"{label}{path}: no image there: {advice}")
+    frames: dict[str, Path] = {}
+    for file in files:
+        if (other := frames.setdefault(file.stem, file)) != file:
+            pattern = file.with_name(f"*{file.suffix}")
+            raise ValueError(
+                f"{label}{other} and {file.name} are one frame: give a pattern, such as '{pattern}'"
+            )
+    return files
+
+
+def _images_in(folder: Path) -> list[Path]:
+    files = folder.iterdir() if folder.is_dir() else ()
+    return [path for path in files if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()]
+
+
+def _natural(path: Path) -> list[tuple[int, str]]:
+    return [(int(token), "") if token.isdecimal() else (-1, token) for token in re.split(r"(\d+)", path.name)]

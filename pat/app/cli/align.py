@@ -1,0 +1,186 @@
+"""`pat align`: images of an array in, every camera's own values at one camera's pixels out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+from . import options
+from .fuse import files_by_camera, named_images
+from .known import Known
+from .options import FIRST, Out, say
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from arraygeom import Rig
+
+    from ...fusion.align import Aligned
+
+
+@dataclass
+class Align(Known):
+    """Align an array's images: every camera's own values at the pixels of one, with masks; no fused image.
+
+    Without a rig: pat align IMG_0000_*.TIF
+    With one: pat align rig.yaml --alpha mono --image mono=a.png --image nir=b.tif --depth 2 20 --out out/
+
+    Values keep their recorded type and bits. Without a rig it is found from the tags of the images, or from
+    the images, and written to found_rig.yaml beside the result. With folders, or quoted patterns, frames are
+    aligned one by one, matched by names or by the numbers or times in them.
+    """
+
+    spellings: ClassVar[Mapping[str, str]] = {"--rig": FIRST, "--to": "--alpha"}
+
+    out: Out = Path("out")
+    """Folder for aligned.tif (all bands, with names and wavelengths), NAME_visibility.png (255 seen, 128
+    occluded, 0 beyond the edge), NAME_confidence.png, NAME_positions.npy, depth.tif, visibility.txt and
+    index.html."""
+    interpolation: Literal["nearest", "bilinear", "cubic"] = "bilinear"
+    """Between recorded values; nearest keeps them."""
+    confidence: float = 0.5
+    """Confidence, 0 to 1, from which a camera counts as seeing a point: lower keeps more, more mistakes."""
+    fill: Literal["none", "propagate"] = "none"
+    """Pixels a camera does not see: none leaves them without a value, propagate takes the nearest seen."""
+    separate: bool = False
+    """Write a file of each camera, NAME.tif, instead of one of all bands."""
+    positions: Literal["npy", "tif", "none"] = "npy"
+    """Format of the sub-pixel positions of alpha's pixels in each camera's image (x, y)."""
+    correct: bool = True
+    """Find how far the other cameras lie off their search segments, and put that right."""
+
+    def run(self) -> None:
+        """Align one frame or several, with the rig that is given or one that is found."""
+        image, with_rig = named_images(self.given, self.image, "align")
+        options.writable(self.out, folder=True)
+        self.settings()
+        with self.judged():
+            for frame in self._frames_with_rig(image) if with_rig else self._frames_without():
+                self._align(frame)
+
+    def _frames_with_rig(self, image: tuple[str, ...]) -> Iterator[_Frame]:
+        """The frames of the rig that is given, which the first one is checked against."""
+        from ...fusion.frame_matching import matched_frames
+        from ...fusion.views import ViewFiles
+        from ..healing import checked_rig
+
+        rig = options.load_rig_or_say_no_image(self.given[0], self.depth)
+        alpha, files = files_by_camera(rig, self.alpha, self.given, image)
+        files = matched_frames(files)
+        for i, one in enumerate(options.by_frame(files)):
+            views = ViewFiles(rig, one, alpha=alpha)
+            if i == 0:
+                checked_rig(views, heal=False)
+            yield _Frame(views.developed, rig, views, one, alpha, name=_name_of(files, alpha, one))
+
+    def _frames_without(self) -> Iterator[_Frame]:
+        """The frames of the rig that is found from the first one."""
+        from ...fusion.frame_matching import matched_frames
+        from ...fusion.views import ViewFiles
+        from ..batch import find_images
+        from ..from_images import camera_names
+
+        if self.depth:
+            raise ValueError("--depth: needs a rig: give one with --rig RIG")
+        files = matched_frames({name: find_images(path) for name, path in camera_names(self.given).items()})
+        array = self.found_array(files)
+        files = {name: files[name] for name in array.rig.names}
+        for i, one in enumerate(options.by_frame(files)):
+            images = ViewFiles(array.recorded, one, alpha=array.alpha) if i else array.images
+            name = _name_of(files, array.alpha, one)
+            yield _Frame(
+                array.rig, array.recorded, images, one, array.alpha, array.notes, name, rig_found=True
+            )
+
+    def _align(self, frame: _Frame) -> None:
+        """Align a frame, and write and say what comes of it."""
+        from ...fusion.aligned_files import save_aligned
+        from ...fusion.results import FOUND_RIG
+        from ...support.locks import folder_lock
+
+        begin = time.monotonic()
+        options.say_when_compiling()
+        with folder_lock(self.out):
+            if frame.name:
+                self.refuse_several()
+            aligned = self._aligned(frame)
+            written = save_aligned(
+                aligned,
+                self.out,
+                separate=self.separate,
+                positions=self.positions,
+                name=frame.name,
+                keep=frame.files.values(),
+            )
+            if frame.rig_found:
+                frame.recorded.save(self.out / FOUND_RIG)
+                written.append(self.out / FOUND_RIG)
+            if self.report and not frame.name:
+                self._write_page(aligned, frame, time.monotonic() - begin)
+                written.append(self.out / "index.html")
+        prefix = f"{frame.name}_" if frame.name else ""
+        print((self.out / f"{prefix}visibility.txt").read_text(), end="")
+        say(f"written to {self.out}: {', '.join(path.name for path in written)}")
+
+    def _aligned(self, frame: _Frame) -> Aligned:
+        """The frame aligned, with the plan and a bar on the terminal."""
+        from ...fusion.align import align
+        from ...fusion.aligned_files import RecordedFiles
+        from ...networks.weights import load_weights
+
+        settings = self.settings()
+        rig, field = self.with_known(frame.rig, frame.alpha, frame.files, options.field_named(self.field))
+        with options.working_by_plan(f"aligning {frame.name}".strip()) as announce:
+            return align(
+                rig,
+                frame.images,
+                alpha=frame.alpha,
+                recorded=RecordedFiles(frame.recorded, frame.files),
+                network=None if self.weights is None else load_weights(self.weights),
+                field=field,
+                interpolation=self.interpolation,
+                min_confidence=self.confidence,
+                fill=self.fill,
+                max_memory=settings.max_memory,
+                match_levels=settings.match_levels,
+                response=settings.response,
+                correct=self.correct,
+                noise=settings.noise,
+                explain=lambda line: self.note(f"{frame.name}: {line}" if frame.name else line),
+                announce=None if frame.name else announce,
+            )
+
+    def _write_page(self, aligned: Aligned, frame: _Frame, seconds: float) -> None:
+        """Write index.html."""
+        from arraygeom.runtime.atomic import write_text
+
+        from ..aligned_page import aligned_page
+        from ..report import Facts
+
+        texts = [str(message) for message in options.WARNED]
+        weights = () if self.weights is None else (f"weights: {self.weights}",)
+        facts = Facts((*weights, *self._notes, *frame.notes), texts, seconds)
+        write_text(self.out / "index.html", aligned_page(aligned, frame.recorded, facts))
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """One frame to align: the rig of its developed images, that of its files, and those; `rig_found` says
+    that the rig was found from the images. The name goes in front of the files'; empty for a single frame."""
+
+    rig: Rig
+    recorded: Rig
+    images: Mapping[str, Tensor]
+    files: Mapping[str, Path]
+    alpha: str
+    notes: tuple[str, ...] = ()
+    name: str = ""
+    rig_found: bool = False
+
+
+def _name_of(files: Mapping[str, Sequence[Path]], alpha: str, one: Mapping[str, Path]) -> str:
+    """The name of a frame among several: that of alpha's file."""
+    return one[alpha].stem if len(files[alpha]) > 1 else ""

@@ -1,0 +1,115 @@
+"""`pat demo` and `pat warm-up`: what ships with the package, fused."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from . import options
+from .fuse import fuse_with_progress
+from .options import Out, Weights, say
+
+
+@dataclass
+class Demo:
+    """Fuse a photograph and the sample array: image, depth, confidence of the photograph, a figure, a table.
+
+    The photograph is scikit-image's motorcycle: its left image as a mono camera's, its right one, reduced, as
+    a colour camera's. Both arrays are recorded as real cameras do (another response, a darker exposure, 300
+    electrons at white), the rendered one as ideal cameras too; beside the fusion stands what is done without
+    learning.
+    """
+
+    out: Out = Path("out/demo")
+    """Folder for the results."""
+    weights: Weights = "mono-colour"
+
+    def run(self) -> None:
+        """Fuse both arrays, and write and print what each method scores."""
+        from arraygeom.runtime.atomic import write_text
+
+        from ...fusion.results import save_frame
+        from ...networks.weights import load_weights
+        from ...support.metrics import score
+        from ..demo import as_real_cameras, classical_methods, save_demo_figure
+        from ..sample_array import ALPHA, load_motorcycle, load_sample
+
+        options.writable(self.out, folder=True)
+        network = load_weights(self.weights)
+        sample = load_sample()
+        arrays = {
+            "photograph": as_real_cameras(load_motorcycle()),
+            "rendered": as_real_cameras(sample),
+            "rendered, ideal": (sample, None),
+        }
+        columns: dict[str, dict[str, str]] = {}
+        for name, (array, noise) in arrays.items():
+            say(f"{name}: classical fusion")
+            methods = {
+                "alpha alone": array.images[ALPHA].expand(3, -1, -1),
+                **classical_methods(network, array, noise),
+            }
+            say(f"{name}: fusion with the weights '{self.weights}'")
+            frame = fuse_with_progress(self.weights, array.rig, array.images, alpha=ALPHA, noise=noise)
+            methods["fusion"] = frame.image.clamp(0, 1)
+            scores = {method: score(image, array.ground_truth) for method, image in methods.items()}
+            columns[name] = {method: f"{psnr:.2f} / {ssim:.3f}" for method, (psnr, ssim) in scores.items()}
+            if name == "photograph":
+                written = save_frame(frame, self.out)
+                panels = {
+                    "mono camera": array.images[ALPHA],
+                    "classical, denoised and corrected": methods["classical, denoised and corrected"],
+                    "fusion": methods["fusion"],
+                }
+                save_demo_figure(panels, CORNER, self.out / "demo.png")
+        table = table_of(columns)
+        print(table, end="")
+        write_text(self.out / "demo.md", f"```\n{table}```\n")
+        written += [self.out / "demo.png", self.out / "demo.md"]
+        say(f"written: {', '.join(map(str, written))}")
+
+
+CORNER = (190, 300)
+"""Row and column of the window of the photograph that the figure shows enlarged."""
+
+
+def table_of(columns: dict[str, dict[str, str]]) -> str:
+    """PSNR in dB and SSIM by recording and method, in columns; a dash where a method has no use."""
+    methods = list(next(iter(columns.values())))
+    wide = max(map(len, methods)) + 2
+    lines = [" " * wide + "".join(f"{name:>18s}" for name in columns)]
+    for method in methods:
+        scores = "".join(f"{scores_of.get(method, '-'):>18s}" for scores_of in columns.values())
+        lines.append(f"{method:{wide}s}{scores}")
+    return "\n".join([*lines, ""])
+
+
+@dataclass
+class WarmUp:
+    """Compile the kernels `pat fuse` uses, once for this machine, so that no later command waits for it."""
+
+    def run(self) -> None:
+        """Compile the kernels by fusing the sample array once: with noise, and as two betas with lenses."""
+        import torch
+
+        from arraygeom import Distortion
+        from arraygeom.runtime.compiled import cache_folder
+
+        from ...attention.kernels import forward
+        from ...fusion.fuse import fuse
+        from ...networks.weights import load_weights
+        from ...sensors import NoiseLevel
+        from ..sample_array import ALPHA, load_sample
+
+        options.say_when_compiling()
+        sample, begin = load_sample(), time.monotonic()
+        lens = Distortion("brown-conrady", torch.full((4,), -1e-3).double())
+        colour = sample.rig["colour"].replace(distortion=lens)
+        rig = sample.rig.with_camera("colour", colour).with_camera("second", colour)
+        images = {**sample.images, "second": sample.images["colour"]}
+        noise = dict.fromkeys(images, NoiseLevel.of_electrons(300))
+        fuse(load_weights("mono-colour"), rig, images, alpha=ALPHA, noise=noise)
+        folder = cache_folder(forward)
+        kept = "" if folder is None else f", kept in {folder}"
+        say(f"kernels are ready: {time.monotonic() - begin:.0f} s{kept}")

@@ -1,0 +1,528 @@
+"""`pat show`, `pat explore` and `pat rig ...`: rig files drawn, inspected, converted, checked and refined."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+
+from tyro.conf import Positional, arg
+
+from . import options
+from .known import MatchesFile
+from .options import (
+    FIRST,
+    LAST,
+    Depth,
+    FieldName,
+    Images,
+    MaybeOut,
+    Numbers,
+    Out,
+    RigFile,
+    load_rig,
+    optional,
+    say,
+)
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from arraygeom import Rig
+    from arraygeom.summary import CameraSummary, PairSummary
+    from calib.images.matches import Pairs
+    from calib.images.refined import Refinement
+
+
+@dataclass
+class Show:
+    """Draw a rig, search segments of some alpha pixels, and how far matched points lie from their lines."""
+
+    rig: RigFile
+    alpha: Annotated[str | None, optional("NAME")] = None
+    """The camera whose pixels are chosen; by default the first."""
+    image: Images = ()
+    """Images to draw on, if wanted; with two or more, points are matched in them."""
+    out: Out = Path("out/show")
+    """Folder for rig.png (cameras in space; if calibrated), fields.png (search segments of some pixels) and,
+    with images, matches.png (patches around points matched in the images, and how far they lie from their
+    lines)."""
+
+    def run(self) -> None:
+        """Write the drawings, and warn of a rig that does not fit the images."""
+        from arraygeom import Camera
+        from arraygeom.viz import draw_fields, draw_matches, draw_rig
+
+        from ...media.figures import save_figure
+
+        options.writable(self.out, folder=True)
+        rig = load_rig(self.rig)
+        alpha = rig.require(self.alpha or rig.names[0])
+        images = options.read_images(rig, self.image)
+        warn_of_misfit(rig, images)
+        written = []
+        if any(isinstance(camera, Camera) for camera in rig.cameras.values()):
+            written.append(save_figure(draw_rig(rig, alpha=alpha), self.out / "rig.png"))
+        if len(rig.names) > 1:
+            fields = draw_fields(rig, alpha, _twelve_pixels(rig[alpha].hw), images=images)
+            written.append(save_figure(fields, self.out / "fields.png"))
+        with options.working("matching points of the images"):
+            points = matched_points(rig, alpha, images)
+        if points:
+            written.append(save_figure(draw_matches(rig, alpha, points, images), self.out / "matches.png"))
+        say(f"written: {', '.join(map(str, written))}")
+
+
+def warn_of_misfit(rig: Rig, images: Mapping[str, Tensor]) -> None:
+    """Say so on standard error if a rig fits its images badly."""
+    from calib.images.rig_check import misfit_warning
+
+    if (warning := misfit_warning(rig, images)) is not None:
+        say(f"pat: {warning}", style="yellow")
+
+
+def matched_points(rig: Rig, alpha: str, images: Mapping[str, Tensor]) -> dict[str, tuple[Tensor, Tensor]]:
+    """Points of alpha and each beta that shows enough of the same and the rig relates to alpha, by beta."""
+    from calib.images.matches import match_cameras
+    from calib.images.residuals import related
+
+    points: dict[str, tuple[Tensor, Tensor]] = {}
+    for name in rig.betas(alpha) if alpha in images else ():
+        if name in images:
+            with suppress(ValueError):
+                pair = related(rig, match_cameras({alpha: images[alpha], name: images[name]}))
+                points[name] = pair[alpha, name].alpha, pair[alpha, name].beta
+    return points
+
+
+def given_matches(path: Path | None, texts: Sequence[str], images: Mapping[str, Tensor]) -> Pairs | None:
+    """The matches of a file between the cameras' images of `--image NAME=FILE`; None without a file."""
+    if path is None:
+        return None
+    from arraygeom.io.point_matches import read_matches
+    from calib.images.matches import PointMatches
+
+    files = options.files_by_name(texts)
+    sizes = {name: (image.shape[1], image.shape[2]) for name, image in images.items()}
+    return {names: PointMatches(*points) for names, points in read_matches(path, files, sizes).items()}
+
+
+def _twelve_pixels(hw: tuple[int, int]) -> Tensor:
+    """Pixels (12, 2) spread over an image."""
+    from arraygeom import pixel_grid
+
+    grid = (pixel_grid((3, 4)) + 0.5) / pixel_grid((3, 4)).new_tensor([4, 3])
+    return (grid * grid.new_tensor([hw[1], hw[0]])).floor().reshape(-1, 2)
+
+
+@dataclass
+class Explore:
+    """Explore receptive fields in the browser: point at a pixel of alpha, see its segments, move the rig.
+
+    Example: pat explore rig.yaml --image mono=a.png --image colour=b.png
+    """
+
+    rig: RigFile
+    image: Images = ()
+    """An image of each camera, once each; without any a checkered room is shown."""
+    alpha: Annotated[str | None, optional("NAME")] = None
+    """The camera to point in; by default the first with an image."""
+    field: FieldName = "auto"
+    weights: Annotated[str | None, arg(metavar="NAME|FILE", help_behavior_hint="")] = None
+    """A network of the paper whose attention to show, as pat-supervised; else correlations of windows."""
+    save: Annotated[Path | None, optional("FILE.html")] = None
+    """Write a page of one file that needs no server, and end."""
+    port: int = 0
+    """Port on localhost; 0 takes a free one."""
+    browser: bool = True
+    """Open the browser."""
+
+    def run(self) -> None:
+        """Serve the explorer, or save its page. Raises ValueError for what it cannot show."""
+        from ..explore import opened, serve
+
+        if self.save is not None:
+            options.writable(self.save, option="--save")
+        rig = load_rig(self.rig)
+        images = options.read_images(rig, self.image) if self.image else None
+        if images:
+            warn_of_misfit(rig, images)
+        options.field_named(self.field)
+        explorer = opened(rig, images, alpha=self.alpha, network=self.weights, field=self.field)
+        if explorer.error:
+            raise ValueError(explorer.error)
+        if self.save is None:
+            serve(explorer, port=self.port, browser=self.browser)
+        else:
+            explorer.save(self.save)
+            say(f"written: {self.save}")
+
+
+MOST_CAMERAS = 12
+"""Of which `pat rig info` describes every pair."""
+
+
+@dataclass
+class Info:
+    """Print fields of view, baselines, pixel footprints, and how long segments are for every pair."""
+
+    rig: RigFile
+    depth: Depth = None
+    """Near and far bounds in metres, instead of the rig's."""
+    alpha: Annotated[str | None, optional("NAME")] = None
+    """Only pairs with this alpha, the 50 nearest; by default all, and of over 12 cameras the first's."""
+    json: bool = False
+    """Print JSON instead of tables."""
+
+    def run(self) -> None:
+        """Print what is odd about the rig, and a line for each camera and each pair."""
+        from arraygeom.io import ANY_SCALE, recognise
+        from arraygeom.runtime.text import length_unit
+        from arraygeom.summary import summarise_cameras, summarise_pairs
+
+        rig = load_rig(self.rig, self.depth)
+        if rig.name:
+            say(rig.name)
+        warn_of_oddities(rig)
+        unit = length_unit(rig)
+        if (kind := recognise(self.rig)) in ANY_SCALE:
+            unit = "units"
+            say(f"lengths are in units of the file: {kind} files state none, and seldom are in metres")
+        alpha = None if self.alpha is None else rig.require(self.alpha)
+        if alpha is None and len(rig.names) > MOST_CAMERAS:
+            alpha, count = rig.names[0], len(rig.names)
+            say(f"pairs with alpha '{alpha}' and its nearest cameras, of {count}: --alpha NAME for others")
+        cameras, pairs = summarise_cameras(rig), summarise_pairs(rig, alpha)
+        if self.json:
+            document = {"cameras": [c._asdict() for c in cameras], "pairs": [p._asdict() for p in pairs]}
+            return options.print_json(document)
+        print_tables(cameras, pairs, unit)
+
+
+def warn_of_oddities(rig: Rig) -> None:
+    """Say on standard error what is odd about a rig, but for what reading its file has warned of."""
+    from arraygeom.rig_check import unit_oddity
+
+    warned = unit_oddity(rig)
+    for oddity in rig.check():
+        if warned is None or not oddity.endswith(warned):
+            say(f"pat: {oddity}", style="yellow")
+
+
+def print_tables(cameras: Sequence[CameraSummary], pairs: Sequence[PairSummary], unit: str) -> None:
+    """A table of cameras and, if there are any, one of pairs; lengths in metres or another unit."""
+    from rich.console import Console
+    from rich.table import Table
+
+    fine, baseline = ("mm", "baseline m") if unit == "m" else (f"{unit}/1000", "baseline")
+    footprint = f"{fine} a pixel, near - far"
+    of_cameras = Table("camera", "pixels", "focal px", "view deg", footprint, box=None)
+    for c in cameras:
+        further = _two(c.focal), _two(c.field_of_view, " x "), _two(c.footprint, " - ")
+        of_cameras.add_row(c.name, f"{c.wh[0]}x{c.wh[1]}", *further)
+    lengths = "segment px, median - longest", f"depth step {unit}, near - far"
+    of_pairs = Table("alpha > beta", baseline, "rotation deg", "seen", *lengths, box=None)
+    for p in pairs:
+        share = "" if p.seen is None else f"{p.seen:.0%}"
+        further = share, _two(p.length, " - "), _two(p.depth_step, " - ")
+        of_pairs.add_row(f"{p.alpha} > {p.beta}", f"{p.baseline:.4g}", f"{p.rotation:.2f}", *further)
+    for table in (of_cameras, of_pairs)[: 1 + bool(pairs)]:
+        Console().print(table)
+
+
+def _two(values: tuple[float, float] | None, between: str = ", ") -> str:
+    return "" if values is None else between.join(f"{v:.4g}" for v in values)
+
+
+@dataclass
+class Convert:
+    """Convert a rig file from one format to another."""
+
+    spellings: ClassVar[Mapping[str, str]] = {"--rig": FIRST, "--out": LAST, "-o": LAST}
+
+    source: Annotated[Positional[Path], arg(metavar="RIG")]
+    """Rig file, or folder where the format is one; also: --rig RIG."""
+    target: Annotated[Positional[Path], arg(metavar="OUT")]
+    """File or folder to write; also: --out OUT."""
+    read_as: Annotated[str | None, optional("FORMAT")] = None
+    """Format of the source; by default recognised."""
+    size: Annotated[tuple[int, int] | None, optional("W H")] = None
+    """Of the images, pixels: for files that state none, or several."""
+    write_as: Annotated[str, arg(metavar="FORMAT")] = "native"
+    """Format of the target."""
+
+    def run(self) -> None:
+        """Write the rig. Raises ValueError for a size the file contradicts, and what OUT cannot hold."""
+        from arraygeom.io import read_rig, write_rig
+
+        hw = None if self.size is None else (self.size[1], self.size[0])
+        if hw is not None and min(hw) < 1:
+            raise ValueError("--size: wanted width and height in pixels")
+        rig = read_rig(self.source, format=self.read_as, hw=hw)
+        for name in rig.names if hw is not None else ():
+            if (stated := rig[name].hw) != hw:
+                h, w = stated
+                raise ValueError(f"--size: the file states {w}x{h} for '{name}': leave it out")
+        write_rig(rig, self.target, format=self.write_as)
+        say(f"written: {self.target} ({len(rig.names)} cameras)")
+
+
+@dataclass
+class Doctor:
+    """Find the usual mistakes in a rig, by features matched between one image of each camera.
+
+    Half-pixel and one-pixel shifts, R transposed, pose inverted, the centre given as t, OpenGL axes, order of
+    quaternions, radians taken for degrees, units, cameras swapped, images resized, cropped, rotated or
+    mirrored without the rig, x and y exchanged, distortion ignored, applied twice or with the wrong sign.
+    Example: pat rig doctor rig.yaml --image mono=a.png --image colour=b.png --out better.yaml
+    """
+
+    spellings: ClassVar[Mapping[str, str]] = {"--fix": "--out"}
+
+    rig: RigFile
+    image: Images
+    """An image of each of two or more cameras."""
+    matches: MatchesFile = None
+    out: MaybeOut = None
+    """Rig file to write if a mistake is found: the repaired rig. Also: --fix. A former file is kept as
+    NAME.old. Exit status 4, and nothing is written, if several mistakes with different repairs explain the
+    images as well."""
+    json: bool = False
+    """Print JSON instead of text."""
+
+    def run(self) -> None:
+        """Print the diagnosis, and write the repaired rig; exit status 4 if several repairs do as well."""
+        from arraygeom.runtime.atomic import write_atomically
+        from calib.images.doctor import diagnose
+
+        if self.out is not None:
+            options.writable(self.out)
+        rig = load_rig(self.rig)
+        with options.working("matching features and trying mistakes"):
+            images = options.read_images(rig, self.image, sized=False)
+            diagnosis = diagnose(rig, images, given_matches(self.matches, self.image, images))
+        if self.json:
+            options.print_json(json.loads(diagnosis.as_json()))
+        else:
+            print(diagnosis.as_text())
+        if self.out is None:
+            return
+        if diagnosis.named.kind == "nothing":
+            return say("no rig written: no mistake was found")
+        if not diagnosis.certain:
+            say("no rig written: several mistakes explain these images as well: correct the rig file by hand")
+            raise SystemExit(REFUSED)
+        kept = ""
+        if self.out.exists():
+            former = self.out.with_name(f"{self.out.name}.old")
+            with write_atomically(former) as temporary:
+                temporary.write_bytes(self.out.read_bytes())
+            kept = f"; the former file: {former}"
+        diagnosis.named.rig.save(self.out)
+        say(f"written: {self.out} ({diagnosis.named.words}: undone{kept})")
+
+
+REFUSED = 4
+"""The exit status of a refinement that is refused though the rig does not fit."""
+NEARER = 4.0
+"""How many times nearer to their lines points come then."""
+
+
+@dataclass
+class Refine:
+    """Refine a rig by ordinary images of its cameras: matched points first, then the fusion's own error.
+
+    No rig is written unless held-out points come nearer to their epipolar lines, the changes agree with their
+    standard deviations, and depth does not become less certain. What happens to depth is printed and written
+    into the file. Example: pat rig refine rig.yaml --image mono=a.png --image colour=b.png --out better.yaml
+    """
+
+    rig: RigFile
+    image: Images
+    """Once for each camera and frame: the first files of all cameras are one frame, and so on."""
+    out: Out
+    """Rig file to write."""
+    matches: MatchesFile = None
+    free: tuple[str, ...] = ("rotation", "centre")
+    """Free parameters: rotation, translation, focal, centre (principal_point), distortion; or
+    CAMERA.rotation. By default, focal and translation too if that brings held-out points nearer."""
+    sigma: Annotated[tuple[str, ...], arg(metavar="KIND=NUMBER")] = ()
+    """Standard deviation of a parameter before refinement: degrees, pixels; translation, focal relative."""
+    photometric: bool = True
+    """Also minimise the fusion's own error, after that of the points."""
+    force: bool = False
+    """Write the refined rig in spite of objections."""
+
+    def run(self) -> None:
+        """Print what changes, and write the rig; exit status 4 if it is refused though it does not fit."""
+        from arraygeom.io.native import write
+        from arraygeom.runtime.atomic import write_text
+        from calib.images.refinement import refine
+
+        from ...attention import attend_with_statistics
+
+        options.writable(self.out)
+        rig = load_rig(self.rig)
+        deviations = options.numbers_by_name(self.sigma, "--sigma")
+        options.say_when_compiling()
+        frames = options.read_frames(rig, self.image)
+        if self.matches is not None and len(frames) > 1:
+            raise ValueError(
+                f"--matches needs a single frame, and {len(frames)} are given: give one image of each camera"
+            )
+        matches = given_matches(self.matches, self.image, frames[0])
+        with options.working("matching features and refining"):
+            refined = refine(
+                rig,
+                frames,
+                matches=None if matches is None else [matches],
+                free=[kind for text in self.free for kind in text.split(",")],
+                sigma={kind: math.radians(s) if kind == "rotation" else s for kind, s in deviations.items()},
+                attend=attend_with_statistics if self.photometric else None,
+                force=self.force,
+            )
+        print(refined.as_text())
+        if not refined.accepted:
+            return self._refused(refined)
+        notes = "".join(f"# {line}\n" for line in ["pat rig refine:", *refined.as_text().splitlines()])
+        write_text(self.out, write(refined.rig) + notes)
+        say(f"written: {self.out}")
+
+    def _refused(self, refined: Refinement) -> None:
+        """Say why no rig is written, and what to do; ends the command if points come far nearer."""
+        force = ": --force writes it all the same" if refined.objections else ""
+        if not refined.held_out[1].median < refined.held_out[0].median / NEARER:
+            return say(f"no rig written{force}")
+        first = {text.partition("=")[0]: text.partition("=")[2] for text in self.image[::-1]}
+        say(
+            "no rig written, though points come far nearer to their lines: --force writes it all the "
+            f"same; or fuse without a rig: `pat fuse {' '.join(first.values())}`",
+            style="yellow",
+        )
+        sys.exit(REFUSED)
+
+
+@dataclass
+class RigFromImages:
+    """Make a rig from images alone: fundamental matrices and rough homographies, good enough to fuse with.
+
+    Example: pat rig start --image mono=a.png --image colour=b.png --focal mono=800 --out rig.yaml
+    """
+
+    image: Images
+    """An image of each camera, once each."""
+    out: Out
+    """Rig file to write."""
+    focal: Numbers = ()
+    """Rough focal lengths in pixels, if known; used where they help."""
+    matches: MatchesFile = None
+
+    def run(self) -> None:
+        """Write the rig and print its statistics. Raises ValueError for images with too little in common."""
+        from calib.images.from_images import rig_from_images
+
+        from ...media.images import read_image
+
+        options.writable(self.out)
+        images = {n: read_image(path, name=n) for n, path in options.files_by_name(self.image).items()}
+        focal = options.numbers_by_name(self.focal, "--focal")
+        with options.working("matching features and fitting lines"):
+            matches = given_matches(self.matches, self.image, images)
+            result = rig_from_images(images, focal=focal, matches=matches)
+        print(result.as_text())
+        result.rig.save(self.out)
+        say(f"written: {self.out}")
+
+
+@dataclass
+class RigDiff:
+    """Say whether a rig has moved: two calibrations of it compared by the pixels and depths that they say.
+
+    A motion of the whole rig is no difference. What is more than both calibrations' errors follows from the
+    covariance files that `pat calibrate` writes beside its rigs.
+    Example: pat rig diff may.yaml october.yaml --out diff.png
+    """
+
+    first: Annotated[Positional[Path], arg(metavar="A")]
+    """Rig file."""
+    second: Annotated[Positional[Path], arg(metavar="B")]
+    """Rig file of the same cameras."""
+    depth: Depth = None
+    """Near and far bounds in metres between which rigs are compared, instead of the first one's."""
+    image: Images = ()
+    """An image of each camera: which rig fits them better, by points matched in them."""
+    matches: MatchesFile = None
+    out: MaybeOut = None
+    """Picture to write: how far pixels and depths differ, over the images."""
+
+    def run(self) -> None:
+        """Print the comparison and the verdict. Raises ValueError for rigs of other cameras."""
+        from calib.boards.rig_diff import draw_difference, rig_difference
+        from calib.boards.uncertainty import RigCovariance
+
+        from ...media.figures import figure_file, save_figure
+
+        if self.out is not None:
+            figure_file(options.writable(self.out))
+        if self.matches is not None and not self.image:
+            raise ValueError("--matches needs --image: give the images of the cameras, NAME=FILE for each")
+        a, b = load_rig(self.first), load_rig(self.second)
+        depth = self.depth or (a.depth or b.depth)
+        if depth is None:
+            raise ValueError(
+                "--depth: neither rig states the depths it is used between: give NEAR FAR, metres"
+            )
+        near, far = (float(bound) for bound in depth)
+        beside = [path.with_suffix(".covariance.json") for path in (self.first, self.second)]
+        covariances = [
+            RigCovariance.load(path, rig) if path.is_file() else None for path, rig in zip(beside, (a, b))
+        ]
+        difference = rig_difference(a, b, covariances=(covariances[0], covariances[1]), depth=(near, far))
+        for path, covariance in zip(beside, covariances):
+            if covariance is None and any(covariances):
+                options.warn(f"{path}: not there: that rig counts as calibrated as well as the other")
+        if not any(covariances):
+            options.warn("no covariance file beside the rigs: calibrate with `pat calibrate`")
+        print(difference.as_text())
+        if self.image:
+            print(self._on_images(a, b))
+        if self.out is not None:
+            save_figure(draw_difference(difference), self.out)
+            say(f"written: {self.out}")
+
+    def _on_images(self, a: Rig, b: Rig) -> str:
+        """Which rig's lines points that are matched in the images are nearer to."""
+        from calib.images.matches import match_cameras
+        from calib.images.residuals import line_distances, nearer
+
+        images = options.read_images(a, self.image)
+        with options.working("matching points of the images"):
+            pairs = given_matches(self.matches, self.image, images) or match_cameras(images)
+        of_a, of_b = line_distances(a, pairs), line_distances(b, pairs)
+        medians = f"{of_a.abs().median():.2f} px from A's lines and {of_b.abs().median():.2f} px from B's"
+        text = f"on the images: {len(of_a)} points, {medians}"
+        closer = float((of_a.abs() < of_b.abs()).float().mean())
+        if nearer(of_b, of_a):
+            return f"{text}: A fits better, at {closer:.0%} of them"
+        if nearer(of_a, of_b):
+            return f"{text}: B fits better, at {1 - closer:.0%} of them"
+        return f"{text}: neither fits significantly better"
+
+
+class RigCommands:
+    """Inspect, convert, draw, check, refine and compare rig files."""
+
+    commands: ClassVar[Mapping[str, Any]] = {
+        "info": Info,
+        "convert": Convert,
+        "show": Show,
+        "doctor": Doctor,
+        "refine": Refine,
+        "start": RigFromImages,
+        "diff": RigDiff,
+    }

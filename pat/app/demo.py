@@ -1,0 +1,67 @@
+"""What `pat demo` fuses: a rendered scene and a photograph, ideal and as cameras record them; its figure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from torch import Generator, Tensor
+
+from ..fusion.classical import classical, denoised_knowing
+from ..fusion.fuse import corrections_of
+from ..media.colour import luminance
+from ..media.figures import save_panels
+from ..networks.protocol import FusionNetwork
+from ..sensors.noise_level import NoiseLevel
+from .sample_array import ALPHA, BETA, SampleArray
+
+RESPONSE = (0.2, 0.4, 0.4)
+"""Weights of red, green and blue in the real mono camera, whose luminance is not Rec. 601's."""
+EXPOSURE = 0.6
+"""Values of the real colour camera over those of the mono camera."""
+NOISE = NoiseLevel.of_electrons(300, 2.0)
+"""Of both real cameras."""
+CROP = 4
+"""Enlargement of the figure's lower row."""
+
+
+def as_real_cameras(array: SampleArray) -> tuple[SampleArray, dict[str, NoiseLevel]]:
+    """The same array with cameras of another response and exposure, in low light, and the noise of each."""
+    generator = Generator().manual_seed(0)
+    ideal = {ALPHA: luminance(array.ground_truth, RESPONSE), BETA: EXPOSURE * array.images[BETA]}
+    images = {name: NOISE.recorded(image[None], generator)[0] for name, image in ideal.items()}
+    return array._replace(images=images), dict.fromkeys(images, NOISE)
+
+
+def classical_methods(
+    network: FusionNetwork, array: SampleArray, noise: Mapping[str, NoiseLevel] | None
+) -> dict[str, Tensor]:
+    """The classical fusion: plain; with alpha's response corrected; denoised first; and both.
+
+    The response is what our fusion finds in the denoised images; these are by non-local means that know the
+    noise. Plain alone where the cameras are ideal.
+    """
+    rig, images, _ = array
+    methods = {"classical": classical(rig, images, ALPHA, BETA)}
+    if noise is None:
+        return methods
+    denoised = {name: denoised_knowing(image, noise[name]) for name, image in images.items()}
+    response = corrections_of(network, rig, denoised, alpha=ALPHA, align=False).response
+
+    def corrected(given: Mapping[str, Tensor]) -> Tensor:
+        scaled = {ALPHA: response.of_alpha(given[ALPHA]), BETA: response.of_beta(given[BETA])}
+        return response.undone(classical(rig, scaled, ALPHA, BETA)).clamp(0, 1)
+
+    methods["classical, corrected"] = corrected(images)
+    methods["classical, denoised"] = classical(rig, denoised, ALPHA, BETA)
+    methods["classical, denoised and corrected"] = corrected(denoised)
+    return methods
+
+
+def save_demo_figure(panels: Mapping[str, Tensor], corner: tuple[int, int], path: Path) -> None:
+    """Images of one size, three in a row, below each a window with a given corner (row, column), enlarged."""
+    h, w = next(iter(panels.values())).shape[-2:]
+    top, left = corner
+    window = (..., slice(top, top + h // CROP), slice(left, left + w // CROP))
+    enlarged = {f"{name}, {CROP} x": image[window] for name, image in panels.items()}
+    save_panels({**panels, **enlarged}, path, columns=3)

@@ -1,0 +1,216 @@
+"""The explorer without a browser: what it starts from, what it answers, and itself as a page of one file."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from arraygeom import Camera, ReceptiveField, Rig, pixel_grid
+from arraygeom.runtime.atomic import write_text
+
+from ...networks.paper import PAT
+from .answers import DEFAULTS, Controls, answer, choices, shown_cameras, slider_ranges
+from .pixel import WINDOWS, ExplorerScene, shipped_attention
+
+MODULE, PINHOLE = (Path(__file__).with_name(name) for name in ("widget.js", "pinhole.js"))
+GRID = 24
+"""Columns of alpha's pixels whose answers are in a saved page, where the page cannot compute them."""
+
+
+@dataclass
+class Explorer:
+    """A scene, alpha's name and where the controls start; or the error that is shown instead."""
+
+    scene: ExplorerScene | None
+    alpha: str
+    controls: Controls
+    error: str = ""
+
+    def answer(self, controls: Controls) -> dict[str, Any]:
+        """What is drawn for a state of the controls."""
+        if self.scene is None:
+            return {"error": self.error}
+        try:
+            return answer(self.scene, self.alpha, controls)
+        except (ValueError, TypeError, AttributeError, LookupError, ArithmeticError) as error:
+            return {"error": str(error)}
+
+    def values(self) -> dict[str, Any]:
+        """What the widget starts from."""
+        scene = self.scene
+        return {
+            "cameras": [] if scene is None else shown_cameras(scene, self.alpha),
+            "ranges": [] if scene is None else slider_ranges(scene.rig),
+            "choices": [] if scene is None else choices(scene, self.controls),
+            "controls": self.controls,
+            "defaults": DEFAULTS,
+            "answer": self.answer(self.controls),
+        }
+
+    def save(self, path: str | Path, columns: int = GRID) -> None:
+        """Write a page of one file that needs neither a kernel nor a network.
+
+        For calibrated pinholes it computes any pixel and the rig's sliders itself, for the field and weights
+        that are chosen by default; for others it has the answers for a grid of `columns` of alpha's pixels,
+        and no sliders.
+        """
+        values = {**self.values(), "choices": []}
+        if self.scene is not None and is_pinhole(self.scene.rig) and self.usual:
+            values["ranges"] = [entry for entry in values["ranges"] if entry[0] != "lens"]
+            asks = f"asksPinholes({json.dumps(geometry(self.scene.rig, self.alpha))})"
+        else:
+            values["ranges"] = []
+            asks = f"asksGrid({json.dumps(self.grid(columns))})"
+        write_text(path, page(values, asks))
+
+    @property
+    def usual(self) -> bool:
+        """Whether field, weights and lens are those that a page can compute."""
+        return all(self.controls[name] == DEFAULTS[name] for name in ("field", "second", "weights", "lens"))
+
+    def grid(self, columns: int) -> dict[str, Any]:
+        """Answers for a grid of alpha's pixels by "column,row", and the grid's size."""
+        if self.scene is None:
+            return {"columns": 1, "rows": 1, "answers": {"0,0": {"error": self.error}}}
+        h, w = self.scene.rig[self.alpha].hw
+        rows = max(1, round(columns * h / w))
+        xs, ys = ([(i + 0.5) * side / n - 0.5 for i in range(n)] for side, n in ((w, columns), (h, rows)))
+        answers = {
+            f"{i},{j}": self.answer({**self.controls, "x": [x, y], "clicked": None})
+            for i, x in enumerate(xs)
+            for j, y in enumerate(ys)
+        }
+        return {"columns": columns, "rows": rows, "answers": answers}
+
+
+def is_pinhole(rig: Rig) -> bool:
+    """Whether all cameras are calibrated pinholes and no pair is known otherwise."""
+    pinholes = all(isinstance(c, Camera) and c.distortion is None for c in rig.cameras.values())
+    return pinholes and not rig.links and rig.depth is not None
+
+
+def geometry(rig: Rig, alpha: str) -> dict[str, Any]:
+    """The cameras in numbers, for the page's own computation."""
+    cameras = {
+        name: {k: getattr(camera, k).tolist() for k in ("K", "R", "centre")} | {"hw": list(camera.hw)}
+        for name, camera in rig.cameras.items()
+        if isinstance(camera, Camera)
+    }
+    assert rig.depth is not None
+    near, far = (min(float(d), 1e9) for d in rig.depth)
+    return {"alpha": alpha, "cameras": cameras, "near": near, "far": far}
+
+
+def page(values: Mapping[str, Any], asks: str) -> str:
+    """The page of the widget, whose questions are answered by `asks`, an expression of pinhole.js."""
+    scripts = MODULE.read_text().replace("export default { render };", "") + PINHOLE.read_text()
+    # Nothing in a text may end the script, or be taken for a part of the page.
+    data, asks = (text.replace("<", "\\u003c") for text in (json.dumps(values), asks))
+    parts = {"MODULES": scripts, "DATA": data, "ASKS": asks}
+    return re.sub("|".join(parts), lambda match: parts[match[0]], PAGE)
+
+
+PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>Receptive fields</title>
+<style>body { margin: 0; background: light-dark(#f6f7f9, #14171a); color-scheme: light dark }
+body > .pat { min-height: 100vh; box-sizing: border-box }</style>
+<body><script type="module">
+MODULES
+const values = DATA;
+render({ el: document.body, model: modelOf(values, ASKS) });
+</script></body></html>
+"""
+
+
+def opened(
+    rig: Rig,
+    images: Mapping[str, Float[Tensor, "_ _ _"]] | None = None,
+    *,
+    alpha: str | None = None,
+    x: tuple[float, float] | None = None,
+    network: PAT | str | None = None,
+    fields: Mapping[str, ReceptiveField] | None = None,
+    **controls: Any,
+) -> Explorer:
+    """The explorer of a rig: arguments as of `explore`. What is wrong with them is its `error`."""
+    if unknown := controls.keys() - DEFAULTS.keys():
+        raise TypeError(f"explore has no argument {', '.join(sorted(unknown))}: {', '.join(DEFAULTS)}")
+    networks = {} if network is None or isinstance(network, str) else {"network": network}
+    weights = WINDOWS if network is None else network if isinstance(network, str) else "network"
+    try:
+        if isinstance(network, str):
+            shipped_attention(network)  # refuses others
+        images, alpha = checked(rig, images, alpha)
+        scene = ExplorerScene(rig, images, fields or {}, networks)
+    except (ValueError, TypeError, FileNotFoundError) as error:
+        return Explorer(None, "", {**DEFAULTS, "x": [0, 0]}, str(error))
+    h, w = rig[alpha].hw
+    controls = {**DEFAULTS, "weights": weights, **controls, "x": list(x or (w // 2, h // 2))}
+    return Explorer(scene, alpha, controls)
+
+
+def checked(
+    rig: Rig, images: Mapping[str, Tensor] | None, alpha: str | None
+) -> tuple[Mapping[str, Tensor], str]:
+    """The images and alpha's name. Raises ValueError for what cannot be shown."""
+    if len(rig.names) < 2:
+        raise ValueError("the rig has one camera: a receptive field needs two cameras or more")
+    alpha = rig.require(alpha or next((n for n in rig.names if not images or n in images), rig.names[0]))
+    images = images or checkered_room(rig, alpha)
+    for name in images:
+        rig.require(name)
+    if alpha not in images or len(images) < 2:
+        raise ValueError(f"give images of alpha, '{alpha}', and of at least one beta")
+    return images, alpha
+
+
+SQUARES = 2
+"""Squares from the middle of the room to a wall."""
+NARROWEST = 1e-3
+"""Least tangent of half the room's angle of view: a row of pixels on the axis has none."""
+DEEPEST = 20.0
+"""Depth of the back wall in nearest depths where the rig's farthest is beyond it."""
+
+
+def checkered_room(rig: Rig, alpha: str) -> dict[str, Float[Tensor, "1 h w"]]:
+    """Every camera's image (1, h, w) of a box, its back wall far, its side walls seen by alpha from near on.
+
+    Squares differ in brightness, so that each has one match. Raises ValueError for a rig without poses or
+    depth range.
+    """
+    cameras = {name: view for name, view in rig.to(torch.float64).cameras.items() if isinstance(view, Camera)}
+    if len(cameras) < len(rig.cameras) or rig.depth is None:
+        raise ValueError("a synthetic room needs a calibrated rig with a depth range: give images")
+    near, far = (float(d) for d in rig.depth)
+    view = cameras[alpha]
+    rays, valid = view.rays(pixel_grid(view.hw, dtype=torch.float64))
+    rays = torch.where(valid[..., None], rays, 0.0)
+    side = near * rays[..., :2].abs().amax((0, 1)).clamp(min=NARROWEST)
+    half = torch.cat([side, side.new_tensor([min(far, DEEPEST * near)])])
+    return {name: room_image(camera, view, half) for name, camera in cameras.items()}
+
+
+def room_image(camera: Camera, alpha: Camera, half: Float[Tensor, "3"]) -> Float[Tensor, "1 h w"]:
+    """The room's image; `half` is half the room's size in alpha's axes, metres, with alpha in its middle."""
+    rays, valid = camera.rays(pixel_grid(camera.hw, dtype=torch.float64))
+    R = alpha.R @ camera.R.T
+    start = alpha.R @ (camera.centre - alpha.centre)
+    directions = rays @ R.T
+    distance = (half * directions.sign() - start) / directions
+    hit, wall = torch.where(distance > 0, distance, torch.inf).min(-1)
+    points = start + hit[..., None] * directions
+    square = torch.floor(points / half.min() * SQUARES)
+    square = square.scatter(-1, wall[..., None], 0.0)
+    brightness = torch.frac(torch.sin(square @ HASH + wall) * 43758.5453).abs()  # the usual hash of shaders
+    return torch.where(valid & hit.isfinite(), 0.1 + 0.8 * brightness, 0.0).float()[None]
+
+
+HASH = torch.tensor([12.9898, 78.233, 37.719], dtype=torch.float64)
+"""Numbers without a common period, those of the hash."""

@@ -1,0 +1,412 @@
+"""The explorer's computation: one alpha pixel and a state of the controls in, everything that is drawn out.
+
+Only one pixel is computed, so that an answer takes milliseconds whatever the images' size; no widget is used
+here. The weights are those of C3 attention: of a network, or with the simplest features, luminance in a
+window around each point, of mean zero and length one, so that scores are normalised correlations. Windows of
+beta are warped by the rough homography, so that cameras of other focal lengths and orientations compare the
+same patch.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from arraygeom import (
+    Curved,
+    Dense,
+    HomographyDisplacement,
+    Local,
+    NearestVoxels,
+    Pair,
+    Positions,
+    ReceptiveField,
+    Rectified,
+    Rig,
+    Segments,
+    depth_of,
+    pixel_grid,
+    sample,
+)
+from arraygeom.fields import covering_displacement
+from arraygeom.fields.default import FIELDS, LINE_SHARE, named_field, recorded_field
+from arraygeom.fields.protocol import sampling_locations
+from arraygeom.fields.ray_depth import ray_depth, rough_transfer
+from arraygeom.pixels import HW
+
+from ...fusion.steps import hw_at_alphas_resolution, of_size
+from ...fusion.views import checked_image
+from ...media.colour import luminance
+from ...networks.paper import PAT, QueryAndKey
+from ...networks.weights import load_weights
+
+WINDOWS = "windows"
+"""Weights by the correlation of windows."""
+
+
+@dataclass(frozen=True)
+class ExplorerState:
+    """Values of the controls.
+
+    `x` is alpha's pixel. `near` and `far` (metres) replace the rig's; None keeps them. `weights` are by
+    windows, or by a network of that name.
+    """
+
+    alpha: str
+    x: tuple[float, float]
+    family: str = "auto"
+    near: float | None = None
+    far: float | None = None
+    weights: str = WINDOWS
+
+    def replace(self, **changes: object) -> ExplorerState:
+        """A copy with some values changed."""
+        return dataclasses.replace(self, **changes)  # type: ignore[arg-type]
+
+
+class MatchOffset(NamedTuple):
+    """Where the images match best near the best sample, on the line or beside it, and how well.
+
+    position: in beta's pixels. distance: from the line, pixels. correlation: of the windows there, -1 to 1.
+    """
+
+    position: Float[Tensor, "2"]
+    distance: float
+    correlation: float
+
+
+class BetaReport(NamedTuple):
+    """Sampling locations in one beta for the pixel, and the match.
+
+    xy: samples in beta's pixels; `valid` marks those in the image. ends: start and end where the field is a
+    segment. weight: of each sample, 1 in all. depth: of each sample in metres, NaN where there is none.
+    value: beta's image, weighted. peak: the largest weight. offset: how far the images' own match lies from
+    the line, None without a segment or a clear match.
+    """
+
+    xy: Float[Tensor, "l 2"]
+    valid: Bool[Tensor, " l"]
+    ends: Float[Tensor, "2 2"] | None
+    weight: Float[Tensor, " l"]
+    depth: Float[Tensor, " l"]
+    value: Float[Tensor, " c"]
+    peak: float
+    offset: MatchOffset | None = None
+
+
+class PixelReport(NamedTuple):
+    """A report or a problem for each beta, and the fused colour and depth of the pixel."""
+
+    betas: dict[str, BetaReport]
+    problems: dict[str, str]
+    colour: Float[Tensor, " c"]
+    depth: float
+
+
+@dataclass(frozen=True)
+class ExplorerScene:
+    """A rig and its images (C, H, W); fields of one's own and networks by name.
+
+    The luminances that windows compare are computed once, and so are a network's features when it is first
+    asked.
+    """
+
+    rig: Rig
+    images: Mapping[str, Tensor]
+    fields: Mapping[str, ReceptiveField] = field(default_factory=dict)
+    networks: Mapping[str, PAT] = field(default_factory=dict)
+    guides: dict[str, Tensor] = field(default_factory=dict)
+    features: dict[tuple[str, str, str | None], tuple[HW, QueryAndKey]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name in [name for name in self.images if name not in self.guides]:
+            image = checked_image(self.rig, self.images, name)
+            grey = luminance(image) if image.shape[0] == 3 else image.mean(0, keepdim=True)
+            self.guides[name] = grey[None]
+
+    def with_rig(self, rig: Rig) -> ExplorerScene:
+        """The same images with a rig that was moved."""
+        return dataclasses.replace(self, rig=rig)
+
+    def query(self, network: str, alpha: str) -> Tensor:
+        """What a network's attention compares of alpha."""
+        return self._features((network, alpha, None), self.images[alpha], self.rig[alpha].hw).query
+
+    def key(self, network: str, alpha: str, beta: str, pair: Pair) -> Tensor:
+        """What it compares of a beta, at alpha's resolution if the network wants that."""
+        hw = hw_at_alphas_resolution(pair) if self._network(network).equal_resolution else pair.beta.hw
+        return self._features((network, alpha, beta), self.images[beta], hw).key
+
+    def _network(self, name: str) -> PAT:
+        return self.networks[name] if name in self.networks else shipped_attention(name)
+
+    def _features(self, which: tuple[str, str, str | None], image: Tensor, hw: HW) -> QueryAndKey:
+        """Features of an image at a size, of alpha or of a beta; computed again when another is asked for."""
+        if which not in self.features or self.features[which][0] != hw:
+            network, alpha, beta = which
+            asked = self._network(network)
+            betas = [name for name in self.rig.betas(alpha) if name in self.images]
+            number = min(betas.index(beta), asked.betas - 1) if beta else 0
+            with torch.no_grad():
+                self.features[which] = hw, asked.query_and_key(of_size(image, hw)[None], number)
+        return self.features[which][1]
+
+
+@cache
+def shipped_attention(name: str) -> PAT:
+    """Weights of the paper's network. Raises ValueError for others."""
+    network = load_weights(name)
+    if not isinstance(network, PAT):
+        raise ValueError(f"weights '{name}' are not of the paper's network: its attention alone can be shown")
+    return network
+
+
+DENSE = 2048
+"""Positions of the dense field, roughly."""
+SIZED: dict[str, Callable[[Pair, Tensor], ReceptiveField]] = {
+    "homography": lambda pair, x: HomographyDisplacement(displacement(pair, x)),
+    "rectified": lambda pair, x: Rectified(displacement(pair, x), alpha_is="either"),
+    "nearest": lambda pair, x: NearestVoxels(window=max(1, round(displacement(pair, x)))),
+    "local": lambda pair, x: Local(9),
+    "dense": lambda pair, x: Dense(stride=max(1, math.ceil(math.sqrt(math.prod(pair.beta.hw) / DENSE)))),
+    "curved": lambda pair, x: Curved(256),
+}
+"""Families whose extent is that of the depth range at a pixel, or follows from the images' size."""
+FAMILIES = ("auto", *FIELDS)
+"""Names of the fields: `auto` is the default, which `pat fuse` uses. A state takes MODULE:OBJECT, too."""
+
+
+def chosen_field(pair: Pair, family: str, x: Float[Tensor, "1 2"]) -> ReceptiveField:
+    """The field of a family at a pixel."""
+    if family in SIZED:
+        return SIZED[family](pair, x)
+    return recorded_field(pair) if family == "auto" else named_field(family)
+
+
+def displacement(pair: Pair, x: Float[Tensor, "1 2"]) -> float:
+    """What covers the depth range at this pixel, else a share of beta's longer side."""
+    if pair.link is None and pair.calibrated and pair.depth is not None:
+        return max(1.0, float(covering_displacement(pair, x)))
+    return LINE_SHARE * max(pair.beta.hw)
+
+
+def with_depths(rig: Rig, state: ExplorerState) -> Rig:
+    """The rig with the state's depths. Raises ValueError if near is beyond far."""
+    if state.near is None and state.far is None:
+        return rig
+    if rig.depth is None and (state.near is None or state.far is None):
+        raise ValueError("the rig has no depth range: give near and far, both")
+    near, far = rig.depth or (None, None)
+    near, far = (old if new is None else new for old, new in ((near, state.near), (far, state.far)))
+    return rig.replace(depth=(near, far))
+
+
+def inspect_pixel(scene: ExplorerScene, state: ExplorerState) -> PixelReport:
+    """The report on the state's pixel in every beta that has an image.
+
+    Raises ValueError for a rig that the state makes impossible. Errors that concern one beta go to
+    `problems`.
+    """
+    rig = with_depths(scene.rig, state)
+    betas: dict[str, BetaReport] = {}
+    problems: dict[str, str] = {}
+    for name in rig.betas(state.alpha):
+        if name not in scene.images:
+            problems[name] = "no image given"
+            continue
+        try:
+            betas[name] = beta_report(scene, rig.pair(state.alpha, name), name, state)
+        except (ValueError, FileNotFoundError) as error:
+            problems[name] = str(error)
+        except Exception as error:  # of a field of one's own
+            problems[name] = f"the field '{state.family}' failed: {type(error).__name__}: {error}"
+    return PixelReport(betas, problems, fused_colour(scene, betas, state), joint_depth(betas))
+
+
+def pixel_of(state: ExplorerState) -> Float[Tensor, "1 2"]:
+    """The state's pixel, in float64."""
+    return torch.tensor([state.x], dtype=torch.float64)
+
+
+def beta_report(scene: ExplorerScene, pair: Pair, name: str, state: ExplorerState) -> BetaReport:
+    """A pixel's samples in one beta, their weights, depths. Raises ValueError if the field does not fit."""
+    x = pixel_of(state)
+    field = scene.fields.get(state.family) or chosen_field(pair, state.family, x)
+    locations = sampling_locations(field, pair, x)
+    if isinstance(locations, Segments):  # about one sample a pixel of beta
+        longest = float(torch.where(locations.valid, locations.length, 0.0).max())
+        samples = locations.positions(math.ceil(longest) + 1)
+    else:
+        samples = locations
+    xy, valid = samples.xy[0], samples.mask[0]
+    if state.weights == WINDOWS:
+        scores = SHARPNESS * correlations(scene.guides[state.alpha], scene.guides[name], pair, x, xy)
+    else:
+        query = sampled(scene.query(state.weights, state.alpha), x)
+        key = scene.key(state.weights, state.alpha, name, pair)
+        larger = xy.new_tensor([key.shape[-1] / pair.beta.hw[1], key.shape[-2] / pair.beta.hw[0]])
+        scores = (query.T @ sampled(key, (xy + 0.5) * larger - 0.5))[0]
+    weight = softmax(scores, valid)
+    value = sampled(scene.images[name][None], xy) @ weight
+    depth, ends = depths(pair, x, xy, valid), ends_of(locations)
+    offset = match_offset((scene.guides[state.alpha], scene.guides[name]), pair, x, (xy, weight), ends)
+    return BetaReport(xy, valid, ends, weight, depth, value, float(weight.max()), offset)
+
+
+ACROSS, STEP = 8, 0.25
+"""How far from the line the images' own match is sought, and to which step, pixels."""
+MOST_SAMPLES = 96
+"""Samples on the line, around that of the largest weight, from which it is sought."""
+CLEAR = 0.8
+"""Least correlation of a clear match."""
+BETTER = 0.03
+"""By how much a match beside the line must correlate better than the best one on it."""
+
+
+def match_offset(
+    guides: tuple[Tensor, Tensor],
+    pair: Pair,
+    x: Float[Tensor, "1 2"],
+    samples: tuple[Float[Tensor, "l 2"], Float[Tensor, " l"]],
+    ends: Float[Tensor, "2 2"] | None,
+) -> MatchOffset | None:
+    """The images' own match near the segment, by the correlation of windows around both pixels.
+
+    Unlike the samples it may lie beside the line, and does if the rig is off. None where nothing matches
+    clearly.
+    """
+    xy, weight = samples
+    if ends is None or not bool((weight > 0).any()) or float((ends[1] - ends[0]).norm()) < 1e-6:
+        return None
+    along = torch.nn.functional.normalize(ends[1] - ends[0], dim=0)
+    across = torch.stack([-along[1], along[0]])
+    first = max(int(weight.argmax()) - MOST_SAMPLES // 2, 0)
+    line = xy[first : first + MOST_SAMPLES]
+    fine = torch.arange(-1, 1 + STEP / 2, STEP).to(xy)[:, None]
+
+    def best(points: Float[Tensor, "*n 2"]) -> tuple[Tensor, float]:
+        points = points.reshape(-1, 2)
+        scores = correlations(*guides, pair, x, points)
+        return points[scores.argmax()], float(scores.max())
+
+    on_line, line_score = best(best(line)[0] + fine * along)
+    beside = best(line[:, None] + torch.arange(-ACROSS, ACROSS + 1).to(xy)[:, None] * across)[0]
+    beside, beside_score = best(beside + fine[:, None] * across + fine * along)
+    distance = abs(float((beside - ends[0]) @ across))
+    if max(line_score, beside_score) < CLEAR:
+        return None
+    if beside_score < line_score + BETTER:
+        return MatchOffset(on_line, 0.0, line_score)
+    # at the edge it would be better beyond
+    return MatchOffset(beside, distance, beside_score) if distance < ACROSS else None
+
+
+def ends_of(locations: Segments | Positions) -> Float[Tensor, "2 2"] | None:
+    """Start and end of the first pixel's segment, if it is one."""
+    if not isinstance(locations, Segments) or not bool(locations.valid[0]):
+        return None
+    return torch.stack([locations.start[0], locations.end[0]])
+
+
+SHARPNESS = 30.0
+"""What correlations are multiplied with to be scores."""
+RADIUS = 5
+"""Windows of 11 x 11 pixels are compared."""
+
+
+def correlations(
+    alpha: Float[Tensor, "1 1 h w"],
+    beta: Float[Tensor, "1 1 hb wb"],
+    pair: Pair,
+    x: Float[Tensor, "1 2"],
+    xy: Float[Tensor, "l 2"],
+) -> Float[Tensor, " l"]:
+    """Normalised correlations (-1 to 1) of alpha's window at x with beta's at each of xy."""
+    steps = (pixel_grid((2 * RADIUS + 1, 2 * RADIUS + 1), dtype=x.dtype) - RADIUS).reshape(-1, 2)
+    transformed = steps @ jacobian(pair, x).T
+    alpha_features = window_features(alpha, x, steps)
+    return (window_features(beta, xy, transformed) @ alpha_features.T)[:, 0]
+
+
+def jacobian(pair: Pair, x: Float[Tensor, "1 2"]) -> Float[Tensor, "2 2"]:
+    """The Jacobian at x of the rough transfer to beta; the identity where there is none."""
+    half = x.new_tensor([[0.5, 0.0], [0.0, 0.5]])
+    ends = torch.cat([x, x + half, x - half])
+    transformed, valid = rough_transfer(pair, ends)
+    return (transformed[1:3] - transformed[3:5]).T if bool(valid.all()) else torch.eye(2, dtype=x.dtype)
+
+
+def window_features(
+    guide: Float[Tensor, "1 1 h w"], x: Float[Tensor, "l 2"], steps: Float[Tensor, "k 2"]
+) -> Float[Tensor, "l k"]:
+    """The window's values around each point, mean 0 and length 1; 0 where it is flat."""
+    values = sampled(guide, x[:, None] + steps, extended=True)[0]
+    values = values - values.mean(-1, keepdim=True)
+    length = values.norm(dim=-1, keepdim=True)
+    return torch.where(length > FLAT, values / torch.where(length > FLAT, length, 1.0), 0.0)
+
+
+FLAT = 1e-4
+"""A window with less contrast than this has no features."""
+
+
+def softmax(scores: Float[Tensor, " l"], valid: Bool[Tensor, " l"]) -> Float[Tensor, " l"]:
+    """Over the valid samples; all zero without any."""
+    if not bool(valid.any()):
+        return torch.zeros_like(scores)
+    return torch.where(valid, scores, -torch.inf).softmax(0)
+
+
+def depths(
+    pair: Pair, x: Float[Tensor, "1 2"], xy: Float[Tensor, "l 2"], valid: Bool[Tensor, " l"]
+) -> Float[Tensor, " l"]:
+    """The depth in alpha of each sample, NaN where it has none or the pair is not calibrated."""
+    if pair.link is not None or not pair.calibrated:
+        return torch.full_like(xy[:, 0], torch.nan)
+    pinholes = pair.alpha.has_pinhole_view and pair.beta.has_pinhole_view
+    depth = (depth_of if pinholes else ray_depth)(pair, x.expand(len(xy), 2), xy)
+    return torch.where(depth.valid & valid, depth.depth, torch.nan)
+
+
+def joint_depth(betas: Mapping[str, BetaReport]) -> float:
+    """The inverse of the mean inverse depth by all weights, metres; NaN if no sample has a depth."""
+    inverse, total = 0.0, 0.0
+    for beta in betas.values():
+        has_depth = beta.depth.isfinite()
+        inverse += beta.peak * float((beta.weight[has_depth] / beta.depth[has_depth]).sum())
+        total += beta.peak * float(beta.weight[has_depth].sum())
+    return total / inverse if inverse > 0 else math.nan
+
+
+def sampled(
+    image: Float[Tensor, "1 c h w"], x: Float[Tensor, "*l 2"], extended: bool = False
+) -> Float[Tensor, " c *l"]:
+    """The image's values at positions, in their precision; the image is not copied."""
+    return sample(image, x[None].to(image), extended=extended).values[0].to(x)
+
+
+def fused_colour(
+    scene: ExplorerScene, betas: Mapping[str, BetaReport], state: ExplorerState
+) -> Float[Tensor, " c"]:
+    """Alpha's luminance with the colour differences of the betas in colour, each weighted by its peak."""
+    alpha_value = sampled(scene.guides[state.alpha], pixel_of(state))[:, 0]
+    coloured = [s for s in betas.values() if len(s.value) == 3 and s.peak > 0]
+    if not coloured:
+        return alpha_value
+    weights = sum(s.peak for s in coloured)
+    differences = [s.value - luminance(s.value[:, None, None]).reshape(1) for s in coloured]
+    return alpha_value + sum((s.peak / weights) * difference for s, difference in zip(coloured, differences))
+
+
+def image_pixel(x: float, y: float, hw: HW) -> tuple[float, float]:
+    """The centre of the pixel nearest to a point."""
+    h, w = hw
+    return float(min(max(round(x), 0), w - 1)), float(min(max(round(y), 0), h - 1))

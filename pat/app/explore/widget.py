@@ -1,0 +1,75 @@
+"""The explorer in one line of a notebook, without a server or a network."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from jaxtyping import Float
+from torch import Tensor
+
+from arraygeom import ReceptiveField, Rig
+from arraygeom.runtime.extras import needs
+
+from ...networks.paper import PAT
+from .page import GRID, MODULE, Explorer, opened
+
+with needs("explore", "the explorer in a notebook"):
+    import anywidget
+    import traitlets
+
+
+class FieldWidget(anywidget.AnyWidget):
+    """Alpha and betas side by side; `controls` come from the browser, `answer` goes to it."""
+
+    _esm = MODULE
+    cameras: Any = traitlets.List().tag(sync=True)
+    ranges: Any = traitlets.List().tag(sync=True)
+    choices: Any = traitlets.List().tag(sync=True)
+    defaults = traitlets.Dict().tag(sync=True)
+    controls = traitlets.Dict().tag(sync=True)
+    answer = traitlets.Dict().tag(sync=True)
+
+    def __init__(self, explorer: Explorer) -> None:
+        self.explorer = explorer
+        super().__init__(**explorer.values())
+        self.observe(self._respond, "controls")
+
+    def __repr__(self) -> str:
+        return "the explorer, which a kernel answers: run this cell"
+
+    def save(self, path: str | Path, columns: int = GRID) -> None:
+        """Write a page of one file that needs no kernel; see `Explorer.save`."""
+        self.explorer.controls = self.controls
+        self.explorer.save(path, columns)
+
+    def _respond(self, change: Any) -> None:
+        self.answer = self.explorer.answer(change.new)
+
+
+def explore(
+    rig: Rig,
+    images: Mapping[str, Float[Tensor, "_ _ _"]] | None = None,
+    *,
+    alpha: str | None = None,
+    x: tuple[float, float] | None = None,
+    network: PAT | str | None = None,
+    fields: Mapping[str, ReceptiveField] | None = None,
+    **controls: Any,
+) -> FieldWidget:
+    """The receptive fields of a rig in a cell of a notebook: point at a pixel of alpha, and move the rig.
+
+    Args:
+        images: (C, H, W) by camera name; without any a checkered room is shown.
+        alpha: its name, by default the first camera with an image; x: its pixel, by default the middle.
+        network: whose attention is shown: a network of the paper, or weights such as "pat-supervised";
+            without one, correlations of windows.
+        fields: fields of one's own by name, which can then be chosen.
+        controls: where the controls start: `field` and `second` (names of fields), `weights`, `near` and
+            `far` (metres), `baseline` and `focal` (factors), `rotation` (degrees), `lens` (added to k1),
+            `moved` (metres).
+
+    What is wrong with the input is said in the widget. Raises TypeError for an unknown argument.
+    """
+    return FieldWidget(opened(rig, images, alpha=alpha, x=x, network=network, fields=fields, **controls))

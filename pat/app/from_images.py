@@ -1,0 +1,462 @@
+"""Images without a rig: which is alpha, what the betas give, and the rig, all from the images."""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import re
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from arraygeom import Link, Rig, Sensor
+from arraygeom.io.xmp import named_by_band, rig_of_images, states_cameras
+from arraygeom.runtime.progress import log_step, part, stage
+from arraygeom.runtime.text import UNSCALED
+from arraygeom.undistortion import pixels_between
+from calib.images.focal_length import common_focal_length
+from calib.images.from_images import UncalibratedRig, rig_from_images
+from calib.images.known_intrinsics import centres_found
+from calib.images.lenses import describe_lenses
+from calib.images.self_calibration import RefinedPair, joined, refined_by_depth, self_calibrated
+
+from ..fusion.fuse import ImageSources, fuse
+from ..fusion.results import Frame
+from ..fusion.steps import without_lenses
+from ..fusion.views import is_in_colour, range_of, read_view
+from ..media.headers import focal_length
+from ..media.images import read_image, write_image
+from ..media.raw import developed_rig
+from ..media.video import read_video
+from ..networks.weights import Network, load_weights, weights_for
+
+LOG = logging.getLogger(__name__)
+
+MATCHED = 1600
+"""Images are reduced to this many pixels along their longer side to match features."""
+COARSE = 640
+"""And to this many of alpha for the first, coarse fusion."""
+LINES = 0.45
+"""The share of the time to find a rig that epipolar lines take; the rest is calibration."""
+EVEN = 0.004
+"""The standard deviation below which an image is of one colour: a count of 8 bits."""
+WAVELENGTHS = {"edge": 720, "red": 620, "green": 540, "blue": 460}
+"""Nanometres; a red edge is no red."""
+COLOURS = ((570, 700), (500, 580), (400, 500))
+"""Nanometres between which three bands are shown as red, green and blue."""
+LONGEST_VISIBLE = 760
+"""Nanometres; bands beyond are not put in order."""
+
+Images = Mapping[str, Float[Tensor, "_ h w"]]
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class ImageArray:
+    """What images of an array say of it: the rig, which camera is alpha, with which weights to fuse, and how.
+
+    rig: of the images as they were developed. recorded: of the files, with their sensors' coding and black
+        level.
+    images: alpha's and those of the betas that are fused. notes: what was found, a line each.
+    """
+
+    rig: Rig
+    recorded: Rig
+    images: dict[str, Tensor]
+    alpha: str
+    weights: str
+    match_levels: bool
+    notes: tuple[str, ...]
+
+
+def array_from_images(
+    sources: ImageSources,
+    *,
+    alpha: str | None = None,
+    weights: str | None = None,
+    focal: Mapping[str, float] | None = None,
+    say: Say = lambda line: None,
+) -> ImageArray:
+    """The array of one image a camera. `say` is called with each line of what is found, as it is found.
+
+    `focal`: focal lengths in pixels by camera, instead of those in the files' tags. Raises ValueError, one
+    line: fewer than two images, an image of one colour, images that do not show the same things, a focal
+    length of no camera.
+    """
+    sources, focal = _by_camera(sources), focal or {}
+    files = {name: Path(path) for name, path in sources.items() if isinstance(path, str | Path)}
+    images: dict[str, Any] = {name: image for name, image in sources.items() if name not in files}
+    for name, image in images.items():
+        range_of(name, image)
+    for name, length in focal.items():
+        if name not in sources or not 0 < length < math.inf:
+            raise ValueError(
+                f"focal {name}={length:g}: no camera of {', '.join(sources)}, or not positive: mend it"
+            )
+    notes: list[str] = []
+
+    def note(line: str) -> None:
+        notes.append(line)
+        say(line)
+
+    tagged = None if images else _tagged_rig(files, note)
+    if tagged is not None and focal:
+        raise ValueError("focal: the images' tags state the focal lengths: leave it out")
+    for name in files:
+        images[name] = read_image(files[name], name=name)
+    images = {name: _textured(f"{name}: {files.get(name, 'the image')}", images[name]) for name in sources}
+    alpha = _chosen_alpha(images, alpha, note)
+    if tagged is not None:
+        images = {name: read_view(tagged, name, files[name], like=tagged[alpha].sensor) for name in images}
+    names = _ordered_betas(images, alpha, note)
+    images = {name: images[name] for name in (alpha, *names)}
+    if tagged is None:
+        lengths = _focal_lengths(images, files, focal, note)
+        network = load_weights(weights or _weights_of(images, alpha))
+        rig, names = found_rig(images, alpha, lengths, network, note)
+        sensors = {name: Sensor({1: "mono", 3: "rgb"}.get(len(images[name]))) for name in names}
+        recorded = rig = _with_sensors(rig, sensors)
+    else:
+        rig, names = _translated_rig(tagged, images, alpha, note)
+        recorded = _with_sensors(rig, {name: tagged[name].sensor for name in names})
+    images = {name: images[name] for name in names}
+    weights = weights or _weights_of(images, alpha)
+    several = len(names) > 2 and all(len(images[name]) == 1 for name in names[1:])
+    if several:
+        note("radiometry: each band is brought to alpha's mean and contrast, as for a grey world")
+    return ImageArray(rig, recorded, images, alpha, weights, several, tuple(notes))
+
+
+def _with_sensors(rig: Rig, sensors: Mapping[str, Sensor]) -> Rig:
+    return rig.replace(cameras={name: rig[name].replace(sensor=sensor) for name, sensor in sensors.items()})
+
+
+def _by_camera(sources: ImageSources) -> Mapping[str, str | Path | Tensor]:
+    """Files or tensors by camera. Raises ValueError for fewer than two, TypeError for one without a name."""
+    if isinstance(sources, str | Path):
+        raise ValueError(f"an array has two images or more, got {sources}: give a list of them")
+    if not isinstance(sources, Mapping):
+        for source in sources:
+            if not isinstance(source, str | Path):
+                got = type(source).__name__
+                raise TypeError(
+                    f"an image is a {got} without a name: give files, or {{NAME: tensor}} by camera"
+                )
+        sources = camera_names([Path(path) for path in sources])
+    if len(sources) < 2:
+        raise ValueError(f"an array has two images or more, got {len(sources)}")
+    return sources
+
+
+def _focal_lengths(
+    images: Images, files: Mapping[str, Path], given: Mapping[str, float], note: Say
+) -> dict[str, float]:
+    """Those given, else those in the files' tags, pixels; of images without either none."""
+    by_tags = {n: focal_length(files[n], (x.shape[-2], x.shape[-1])) for n, x in images.items() if n in files}
+    lengths = {n: length for n, length in {**by_tags, **given}.items() if length and n in images}
+    for name, length in lengths.items():
+        note(f"{name}: focal length {length:.0f} pixels, {'as given' if name in given else 'by EXIF'}")
+    return lengths
+
+
+def camera_names(paths: Sequence[Path]) -> dict[str, Path]:
+    """Names of cameras for their files: the bands' that their tags state, the files' own without suffix, or
+    the folders', or numbers."""
+    if states_cameras(paths):
+        return named_by_band(paths)
+    for names in ([p.stem for p in paths], [p.resolve().parent.name for p in paths]):
+        plain = [re.sub(r"[^\w.-]+", "_", name).strip("_") for name in names]
+        if len(set(plain)) == len(plain) and all(plain):
+            return dict(zip(plain, paths))
+    return {f"camera{i}": path for i, path in enumerate(paths, 1)}
+
+
+def frames_of_videos(
+    videos: Mapping[str, Path], folder: Path
+) -> tuple[dict[str, list[Path]], dict[str, float]]:
+    """The frames of videos as image files in a folder, and the frames a second, by camera.
+
+    Files have their video's time: a job that is resumed knows by it that they are the same.
+    """
+    files: dict[str, list[Path]] = {}
+    rates: dict[str, float] = {}
+    for name, path in videos.items():
+        frames, rates[name] = read_video(path)
+        files[name] = []
+        for i, image in enumerate(frames):
+            files[name].append(folder / name / f"{i:06d}.png")
+            write_image(files[name][-1], image)
+            os.utime(files[name][-1], ns=(path.stat().st_mtime_ns,) * 2)
+        if not files[name]:
+            raise ValueError(f"{path}: a video without frames")
+    return files, rates
+
+
+def _tagged_rig(files: Mapping[str, Path], note: Say) -> Rig | None:
+    """The rig that the images' tags state; None if not every image has such tags. Translations are found
+    later: none has to be stated."""
+    if not states_cameras(list(files.values())):
+        return None
+    with warnings.catch_warnings(record=True, action="always") as caught:
+        rig = rig_of_images(files)
+    note(f"lenses and orientations of {', '.join(files)}: by the images' tags")
+    for text in (str(warning.message) for warning in caught):
+        if "RigTranslations" not in text:
+            note(text)
+    return rig
+
+
+@stage()
+def _translated_rig(tagged: Rig, images: Images, alpha: str, note: Say) -> tuple[Rig, list[str]]:
+    """The rig of tags with translations and depths by the images, the cameras that match; alpha first."""
+    straight, pinhole = without_lenses(Rig({name: tagged[name] for name in images}), images)
+    shown = {name: pixels_between(tagged[name], straight[name])[1][None].float() for name in images}
+    lengths = {name: float(straight[name].K[0, 0]) for name in images}
+    finest = lengths[alpha] * min(MATCHED / max(images[alpha].shape[-2:]), 1.0)
+    factors = {name: min(finest / length, 1.0) for name, length in lengths.items()}
+    reduced = {name: scaled(image, factors[name]) for name, image in pinhole.items()}
+    masks = {name: scaled(mask, factors[name])[0] > 0.99 for name, mask in shown.items()}
+    translated, facts = centres_found(resized_rig(straight, reduced), reduced, masks, alpha=alpha)
+    for name, (points, distance) in facts.items():
+        note(f"{name}: {points} points, {distance:.2f} px from their lines, intrinsics kept")
+    for name in images.keys() - {*translated.names}:
+        note(f"{name}: left out, too little in common with the others")
+    note(f"depths are multiples of the baseline {alpha} to {translated.betas(alpha)[0]}")
+    rig, names = developed_rig(tagged, images), [alpha, *translated.betas(alpha)]
+    cameras = {name: rig[name].replace(cam_from_world=translated[name].cam_from_world) for name in names}
+    return Rig(cameras, depth=translated.depth, name=UNSCALED), names
+
+
+@stage()
+def found_rig(
+    images: Images, alpha: str, focal: Mapping[str, float], network: Network, note: Say
+) -> tuple[Rig, list[str]]:
+    """The rig of the cameras of images, and which of them it relates to alpha; alpha comes first in both.
+
+    Calibrated, up to a scale, where points matched between alpha and a beta have parallax; else known by F
+    alone.
+    """
+    factors = {name: min(MATCHED / max(image.shape[-2:]), 1.0) for name, image in images.items()}
+    reduced = {name: scaled(image, factors[name]) for name, image in images.items()}
+    lengths = {name: length * factors[name] for name, length in focal.items()}
+    with part(0, LINES):
+        uncalibrated = rig_from_images(reduced, focal=lengths, alpha=alpha)
+    betas = [name for name in images if (alpha, name) in uncalibrated.rig.links]
+    if not betas:
+        raise ValueError(
+            f"no image shows enough of what '{alpha}' shows: choose another alpha with --alpha NAME"
+        )
+    for name in images.keys() - {alpha, *betas}:
+        note(f"{name}: left out, too little in common with {alpha}")
+    observed = {} if lengths.keys() & {alpha, *betas} else _observed_focal_lengths(uncalibrated, alpha, betas)
+    for name, (length, deviation) in observed.items():
+        note(
+            f"{name}: focal length {length / factors[name]:.0f} pixels +- {deviation:.0%}, by matched points"
+        )
+    lengths |= {name: length for name, (length, _) in observed.items()}
+    rig = _calibrated(uncalibrated, reduced, alpha, betas, lengths, network, note)
+    return resized_rig(rig, images), [alpha, *betas]
+
+
+def _observed_focal_lengths(
+    uncalibrated: UncalibratedRig, alpha: str, betas: Sequence[str]
+) -> dict[str, tuple[float, float]]:
+    """Of alpha and the betas of its size, pixels, and its relative deviation: that which the points of a pair
+    determine best; of none where no pair does."""
+    fits = []
+    for name in betas:
+        LOG.info("looking for the focal length of %s and %s", alpha, name)
+        views = {n: uncalibrated.rig[n] for n in (alpha, name)}
+        fits.append(
+            common_focal_length(views, uncalibrated.rig.links[alpha, name], uncalibrated.matches[alpha, name])
+        )
+    best = min((fit for fit in fits if fit is not None), key=lambda fit: fit.deviation, default=None)
+    if best is None:
+        return {}
+    alike = [name for name in (alpha, *betas) if uncalibrated.rig[name].hw == uncalibrated.rig[alpha].hw]
+    return dict.fromkeys(alike, (best.length, best.deviation))
+
+
+def _calibrated(
+    uncalibrated: UncalibratedRig,
+    images: Images,
+    alpha: str,
+    betas: Sequence[str],
+    focal: Mapping[str, float],
+    network: Network,
+    note: Say,
+) -> Rig:
+    """The rig of alpha and these betas: calibrated, each pair refined by what a coarse fusion of it matches.
+
+    A pair whose lines no poses fit as well as F alone keeps F's, with the nearest poses for rough depths; one
+    without parallax has F alone. Each is said in a line.
+    """
+    pairs: dict[str, RefinedPair] = {}
+    depths: dict[str, Frame] = {}
+    links: dict[tuple[str, str], Link] = {}
+    for i, name in enumerate(betas):
+        log_step(LOG, LINES + (1 - LINES) * i / len(betas), "calibrating %s and %s", alpha, name)
+        pair = _calibrated_pair(uncalibrated, alpha, name, focal, note)
+        if pair is None or not pair.exact:
+            links[alpha, name] = uncalibrated.rig.links[alpha, name]
+        if pair is None:
+            continue
+        pairs[name] = pair
+        if pair.exact or len(betas) > 1:
+            pairs[name], depths[name] = _refined(pair, images, network, links)
+        if pairs[name] is not pair:
+            points, distance = pairs[name].points, pairs[name].distance
+            note(f"{alpha} > {name}: {points} points, {distance:.2f} px from their lines")
+    if any(getattr(view, "distortion", None) is not None for view in uncalibrated.rig.cameras.values()):
+        note(describe_lenses(uncalibrated.rig))
+    names = {alpha, *betas}
+    if not pairs:
+        cameras = {name: view for name, view in uncalibrated.rig.cameras.items() if name in names}
+        links = {pair: link for pair, link in uncalibrated.rig.links.items() if names >= {*pair}}
+        return uncalibrated.rig.replace(cameras=cameras, links=links)
+    first = next(iter(pairs))
+    assumed = [name for name in (alpha, *pairs) if name not in focal]
+    of = f" {alpha} to {first}" if len(betas) > 1 else ""
+    rough = f"; focal lengths assumed of {', '.join(assumed)}: depths are only proportional"
+    note(f"depths are multiples of the baseline{of}{rough if assumed else ''}")
+    scales = {name: _relative_scale(depths[first], depths[name]) if name in depths else 1.0 for name in pairs}
+    rig = joined(pairs, scales)
+    for name in betas:
+        if name not in pairs:
+            rig = rig.with_camera(name, uncalibrated.rig[name])
+    return rig.replace(cameras={name: rig[name] for name in (alpha, *betas)}, links=links)
+
+
+def _calibrated_pair(
+    uncalibrated: UncalibratedRig, alpha: str, name: str, focal: Mapping[str, float], note: Say
+) -> RefinedPair | None:
+    """Alpha and one beta with poses by their points; None without parallax. What was found is said."""
+    views = {n: uncalibrated.rig[n] for n in (alpha, name)}
+    link, matches = uncalibrated.rig.links[alpha, name], uncalibrated.matches[alpha, name]
+    pair = self_calibrated(views, link, matches, focal=focal)
+    if pair is None or not pair.exact:
+        lines = uncalibrated.as_text().splitlines()
+        note(next(line for line in lines if line.startswith(f"{alpha} > {name}")))
+    if pair is None:
+        note(
+            f"no depth by {name}: "
+            f"its points show no parallax, beside {alpha} it is too near, or its scene too far or flat"
+        )
+        return None
+    exact = f"{pair.points} points, {pair.distance:.2f} px from their lines; refining"
+    rough = f"lines by F; depths are rough, by poses whose lines are {pair.distance:.2f} px off"
+    note(f"{alpha} > {name}: {exact if pair.exact else rough}")
+    return pair
+
+
+def _refined(
+    pair: RefinedPair, images: Images, network: Network, links: Mapping[tuple[str, str], Link]
+) -> tuple[RefinedPair, Frame]:
+    """The pair refined by a fusion's matches at reduced size, unless it has one of these links; and that."""
+    alpha, beta = pair.rig.names
+    factor = min(COARSE / max(images[alpha].shape[-2:]), 1.0)
+    small = {name: scaled(images[name], factor) for name in (alpha, beta)}
+    bands = len(small[beta])
+    link = links.get((alpha, beta))
+    rig = resized_rig(pair.rig if link is None else pair.rig.replace(links={(alpha, beta): link}), small)
+    with warnings.catch_warnings(action="ignore"):
+        network = network if network.bands in (None, bands) else load_weights(weights_for([bands]))
+        LOG.info("coarse fusion of %s and %s", alpha, beta)
+        frame = fuse(network, rig, small, alpha=alpha, align=False, response="rec601")
+    if link is not None:
+        return pair, frame
+    refined = refined_by_depth(pair._replace(rig=rig), small, frame.depth, frame.confidence)
+    if refined.rig is rig:
+        return pair, frame
+    return refined._replace(rig=resized_rig(refined.rig, images), distance=refined.distance / factor), frame
+
+
+def _relative_scale(first: Frame, other: Frame) -> float:
+    """The factor that brings another pair's depths to those of the first."""
+    sure = (first.confidence > 0.5) & (other.confidence > 0.5)
+    both = sure & first.depth.isfinite() & other.depth.isfinite()
+    return float((first.depth[both] / other.depth[both]).median()) if both.any() else 1.0
+
+
+def resized_rig(rig: Rig, images: Images) -> Rig:
+    """The rig whose cameras are of the images' sizes."""
+    for name in rig.names:
+        rig = rig.resize(name, (int(images[name].shape[-2]), int(images[name].shape[-1])))
+    return rig
+
+
+def scaled(image: Float[Tensor, "c h w"], factor: float) -> Float[Tensor, "c h2 w2"]:
+    """The image reduced by this factor; of 1 or more, as it is."""
+    if factor >= 1:
+        return image
+    hw = [max(round(n * factor), 16) for n in image.shape[-2:]]
+    reduced = interpolate(image[None], size=hw, mode="bicubic", antialias=True, align_corners=False)
+    return reduced[0].clamp(0, 1)
+
+
+def _textured(label: str, image: Float[Tensor, "c h w"]) -> Float[Tensor, "_ h w"]:
+    """The image, one band of it where all are equal. Raises ValueError for an image of one colour."""
+    if float(image.flatten(1).std(-1, correction=0).amax()) < EVEN:
+        raise ValueError(f"{label}: is of one colour, with nothing to match: give another image")
+    return image[:1] if len(image) == 3 and not is_in_colour(image) else image
+
+
+def _chosen_alpha(images: Images, alpha: str | None, note: Say) -> str:
+    """Alpha: as asked, or the largest grey image, or the largest of all."""
+    if alpha is not None:
+        if alpha not in images:
+            raise ValueError(f"--alpha: no camera '{alpha}'; the images' names are {', '.join(images)}")
+        return alpha
+    grey = [name for name, image in images.items() if len(image) == 1]
+    chosen = max(grey or images, key=lambda name: math.prod(images[name].shape[-2:]))
+    h, w = images[chosen].shape[-2:]
+    why = "the largest grey image" if grey else "the largest image"
+    if len(grey) == 1:
+        why = "the only grey image"
+    elif sum(images[name].shape[-2:] == (h, w) for name in grey or images) > 1:
+        why = "the first of images of one size"
+    note(
+        f"alpha, whose view and detail the result has: {chosen} ({w}x{h}, {why}; --alpha NAME takes another)"
+    )
+    return chosen
+
+
+def _ordered_betas(images: Images, alpha: str, note: Say) -> list[str]:
+    """The betas in the order of their bands: as given where one is in colour, else from red to blue."""
+    betas = [name for name in images if name != alpha]
+    if any(len(images[name]) == 3 for name in betas):
+        return betas
+    waves = {name: _wavelength(name) for name in betas}
+    if all(waves.values()):
+        betas = sorted(betas, key=lambda name: -waves[name])
+    shown = ", shown as red, green, blue by their names" if show_colour(betas, [1] * len(betas)) else ""
+    note(f"bands: {', '.join(betas)}, each at alpha's view{shown}")
+    return betas
+
+
+def _weights_of(images: Images, alpha: str) -> str:
+    """The name of the shipped weights for alpha and the betas of these images."""
+    names = [name for name in images if name != alpha]
+    bands = [len(images[name]) for name in names]
+    return "mono-colour" if 3 in bands or show_colour(names, bands) else "mono-spectral"
+
+
+def show_colour(names: Sequence[str], bands: Sequence[int]) -> bool:
+    """Whether cameras of a band each record, by their names, red, green and blue, in this order."""
+    shown = [low <= _wavelength(name) <= high for name, (low, high) in zip(names, COLOURS)]
+    return set(bands) == {1} and len(names) == 3 and all(shown)
+
+
+def _wavelength(name: str) -> float:
+    """Nanometres by a camera's name, such as cam_550nm or green; 0 if it does not say."""
+    if number := re.search(r"(?<!\d)([3-9]\d\d)(?:\s*nm)?(?!\d)", name):
+        return float(number[1]) if float(number[1]) <= LONGEST_VISIBLE else 0.0
+    words = re.split(r"[^a-z]+", name.lower())
+    return next((float(w) for colour, w in WAVELENGTHS.items() if colour in words), 0.0)

@@ -1,0 +1,103 @@
+"""A rig its images contradict: said, and healed for them if they determine it far better than the file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from torch import Tensor
+
+from arraygeom import Rig
+from arraygeom.runtime.warned import warn
+from calib.images.depth_change import share_outside
+from calib.images.matches import Pairs, match_cameras
+from calib.images.refinement import refine_matches
+from calib.images.residuals import own_distance, related
+from calib.images.rig_check import OUTSIDE, find_misfit
+from calib.images.self_calibration import depth_bounds
+
+from ..fusion.checks import LowConfidenceWarning
+from ..fusion.views import ViewFiles
+from ..support.settings import size
+from .from_images import MATCHED, resized_rig, scaled
+
+
+@dataclass(frozen=True)
+class HealingSettings:
+    """Of a frame that heals its own rig."""
+
+    nearer: float = size(4.0, "How many times nearer to their lines held-out points must come")
+    of_own: float = size(
+        2.0, "How many times as far from them as from those of an F of their own they may be then"
+    )
+    slack: float = size(0.25, "And so many pixels of the matched images more")
+
+
+SETTINGS = HealingSettings()
+
+
+class Healed(NamedTuple):
+    """The rig of image files as these have it, and what was changed, in a line."""
+
+    rig: Rig
+    text: str
+
+
+def checked_rig(views: ViewFiles, *, heal: bool) -> Healed | None:
+    """The rig healed by its images, if they say clearly more; else None, and a warning if it fits them badly.
+
+    By a `LowConfidenceWarning` if it is wrong: mistaken by the doctor's verdict, or points are where nothing
+    is seen.
+    """
+    try:
+        images = dict(views)
+        misfit = find_misfit(views.developed, images)
+    except (ValueError, OSError):  # of a file or an image: the fusion says so
+        return None
+    if misfit is None:
+        return None
+    wrong = misfit.mistaken or misfit.outside > OUTSIDE
+    if heal and not misfit.outside > OUTSIDE and (healed := healed_rig(views.rig, images, views.alpha)):
+        return healed._replace(text=f"{healed.text}; {misfit.text}") if misfit.mistaken else healed
+    warn(misfit.text, LowConfidenceWarning if wrong else UserWarning)
+    return None
+
+
+def healed_rig(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> Healed | None:
+    """The rig refined by points matched between alpha and the betas, whatever its deviations; None unless
+    held-out points then lie about as near to their lines as to those of an F of their own, and far nearer
+    than before."""
+    small = {name: scaled(image, min(MATCHED / max(image.shape[-2:]), 1.0)) for name, image in images.items()}
+    reduced = resized_rig(rig.replace(cameras={name: rig[name] for name in (alpha, *small)}), small)
+    try:
+        pairs = related(reduced, match_cameras(small, alpha=alpha))
+        refined = refine_matches(reduced, [pairs], force=True)
+    except ValueError:  # too few points, nothing to refine
+        return None
+    before, after = (statistics.median for statistics in refined.held_out)
+    best = SETTINGS.of_own * own_distance(reduced, pairs) + SETTINGS.slack
+    far = after > best or after * SETTINGS.nearer > before
+    if not refined.accepted or far or share_outside(refined.rig, pairs) > OUTSIDE:
+        return None
+    cameras = dict(rig.cameras)
+    for name in small:
+        cameras[name] = refined.rig.resize(name, rig[name].hw)[name].replace(sensor=rig[name].sensor)
+    text = (
+        f"the rig is healed by these images: points lay {before:.1f} px from their lines, {after:.2f} px now"
+    )
+    if refined.depth is not None:
+        text += f"; depth changes by {refined.depth.change:.0%} (median), and is rough"
+    healed = rig.replace(cameras=cameras, depth=_depth_range(refined.rig, pairs))
+    return Healed(healed, f"{text} (--no-align leaves the rig as it is)")
+
+
+def _depth_range(rig: Rig, pairs: Pairs) -> tuple[float, float] | None:
+    """The rig's depth range, extended to that of the matched points: a rotation that images correct moves all
+    depths along the segments."""
+    every = [depth_bounds(Rig({n: rig[n] for n in names}), matches) for names, matches in pairs.items()]
+    ranges = [bounds for bounds in every if bounds is not None]
+    if rig.depth is None or not ranges:
+        return rig.depth
+    recorded = [float(bound) for bound in rig.depth]
+    return min(recorded[0], *(near for near, _ in ranges)), max(recorded[1], *(far for _, far in ranges))

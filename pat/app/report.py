@@ -1,0 +1,196 @@
+"""A page that shows a fused frame: one HTML file with everything in it."""
+
+from __future__ import annotations
+
+import base64
+import html
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from arraygeom import Camera, Rig
+from arraygeom.runtime.threads import in_parallel
+from arraygeom.viz import COLOURS, frustum, frustum_size
+
+from ..fusion.results import Frame, picture_of
+from ..media.colour import to_bytes
+from ..media.figures import colour_depth, reduced
+from ..support.memory import how_many_fit
+
+LONGEST = 1600
+"""Images in the page have at most this many pixels along their longer side."""
+QUALITY = 90
+"""Of JPEG."""
+UNCONFIDENT = (230, 30, 120)
+"""The colour that covers pixels without confidence."""
+LETTER, LINE = 8.0, 16.0
+"""Width of a letter and height of a line of the drawing's labels, in its units."""
+PAGE = Path(__file__).with_name("report.html")
+
+
+class Facts(NamedTuple):
+    """What the page says beside the images.
+
+    notes: what was found or normalised. warnings: with what to do. seconds, memory (bytes): of the fusion, if
+    known.
+    unit: of depths. classical: the classical baseline at alpha's view, a layer to compare with.
+    """
+
+    notes: Sequence[str] = ()
+    warnings: Sequence[str] = ()
+    seconds: float | None = None
+    memory: float | None = None
+    unit: str = "m"
+    classical: Float[Tensor, "_ _ _"] | None = None
+
+
+def report_page(
+    frame: Frame, images: Mapping[str, Float[Tensor, "_ _ _"]], rig: Rig, alpha: str, facts: Facts
+) -> str:
+    """The page: images under a slider, overlays, the rig, figures; it needs no other file and no network.
+
+    `images` are alpha's and the betas'.
+    """
+    layers = {f"alpha: {alpha}": images[alpha]}
+    layers |= {f"beta: {name}": images[name] for name in rig.betas(alpha) if name in images}
+    if facts.classical is not None:
+        layers["classical"] = facts.classical
+    layers["fused"] = frame.image
+    overlays: dict[str, Callable[[], str]] = {"confidence": lambda: shares_layer(frame.confidence)}
+    depths, extent, legend = frame.depth[frame.depth.isfinite()], "", ""
+    if len(depths):
+        overlays["depth"] = lambda: data_url(colour_depth(frame.depth))
+        (near, far), unit = (f"{d:.3g}" for d in np.percentile(depths.cpu().numpy(), (1, 99))), facts.unit
+        extent = f"{near} to {far} {unit}, for 98% of the pixels"
+        legend = f"depth: near, {near} {unit} <i></i> far, {far} {unit}; unknown is black"
+        legend = f'<p class="legend" hidden>{legend}</p>'
+    tasks: list[Callable[[], str]] = [
+        *(partial(data_url, picture_of(layer)) for layer in layers.values()),
+        *overlays.values(),
+    ]
+    urls = dict(zip((*layers, *overlays), in_parallel(tasks, most=how_many_fit(100 * LONGEST**2))))
+    return filled_page(
+        f"{' + '.join(name for name in rig.names if name in images)}, fused",
+        frame.depth.shape,
+        {name: urls[name] for name in layers},
+        {name: urls[name] for name in overlays},
+        _figures(frame, extent, facts),
+        facts,
+        RIG=rig_drawing(rig, alpha),
+        LEGEND=legend,
+    )
+
+
+def filled_page(
+    title: str,
+    hw: Sequence[int],
+    layers: Mapping[str, str],
+    overlays: Mapping[str, str],
+    figures: Mapping[str, str],
+    facts: Facts,
+    **parts: str,
+) -> str:
+    """The page with layers to compare and overlays to switch, URLs by name, and its further parts as HTML."""
+    h, w = hw
+    parts = {"LEGEND": "", **parts, "TITLE": html.escape(title), "RATIO": f"{w} / {h}"}
+    rows = [f"<tr><th>{html.escape(key)}<td>{html.escape(value)}" for key, value in figures.items()]
+    parts["FACTS"] = "\n".join(rows)
+    parts["NOTES"] = _listed("What was found", facts.notes, kind="notes")
+    parts["WARNINGS"] = _listed("Warnings", facts.warnings, kind="warnings")
+    named = {name: html.escape(name) for name in (*layers, *overlays)}
+    parts["LAYERS"] = "\n".join(
+        f'<img class="layer" data-name="{named[name]}" alt="{named[name]}" src="{url}">'
+        for name, url in layers.items()
+    )
+    parts["OVERLAYS"] = "\n".join(
+        f'<img class="overlay" id="{named[name]}" alt="{named[name]}" src="{url}" hidden>'
+        for name, url in overlays.items()
+    )
+    said = {**named, "confidence": "confidence (covered where it is low)"}
+    parts["SWITCHES"] = "\n".join(
+        f'<label><input type="checkbox" data-overlay="{named[name]}"> {said[name]}</label>'
+        for name in overlays
+    )
+    page = PAGE.read_text(encoding="utf-8")
+    for name, text in parts.items():
+        page = page.replace(f"{{{{{name}}}}}", text)
+    return page
+
+
+def rig_drawing(rig: Rig, alpha: str) -> str:
+    """The calibrated cameras from above as an inline SVG: x to the right, z upwards; empty without any."""
+    cameras = {name: camera for name, camera in rig.cameras.items() if isinstance(camera, Camera)}
+    if not cameras:
+        return ""
+    size = frustum_size(cameras)
+    lines = {
+        name: [line[:, [0, 2]] * (1, -1) for line in frustum(camera, size)]
+        for name, camera in cameras.items()
+    }
+    points = np.concatenate([line for some in lines.values() for line in some])
+    low, extent = points.min(0), float(np.ptp(points, axis=0).max()) or 1.0
+    drawn, labels = [], list[tuple[float, float, float]]()
+    for i, name in enumerate(cameras):
+        colour = COLOURS[i % len(COLOURS)]
+        shown = [(line - low) / extent * 300 + 30 for line in lines[name]]
+        for line in shown:
+            text = " ".join(f"{x:.1f},{y:.1f}" for x, y in line)
+            drawn.append(f'<polyline points="{text}" fill="none" stroke="{colour}" stroke-width="1.5"/>')
+        label = name + (" (alpha)" if name == alpha else "")
+        (x, y), half = shown[0][0], LETTER * len(label) / 2
+        y += LINE
+        for left, right, above in sorted(labels, key=lambda place: place[2]):
+            if left < x + half and right > x - half and abs(above - y) < LINE:
+                y = above + LINE
+        labels.append((x - half, x + half, y))
+        text = html.escape(label)
+        drawn.append(f'<text x="{x:.1f}" y="{y:.1f}" fill="{colour}" text-anchor="middle">{text}</text>')
+    wide, high = np.ptp(points, axis=0) / extent * 300 + 60
+    high = max(high, *(y + LINE / 2 for _, _, y in labels))
+    return (
+        f'<svg viewBox="0 0 {wide:.0f} {high:.0f}" role="img" aria-label="the rig from '
+        f'above">{"".join(drawn)}</svg>'
+        "<p>The cameras from above, each with the field of view that it has.</p>"
+    )
+
+
+def _figures(frame: Frame, extent: str, facts: Facts) -> dict[str, str]:
+    h, w = frame.depth.shape
+    figures = {"size": f"{w} x {h} pixels", "mean confidence": f"{float(frame.confidence.mean()):.2f}"}
+    figures["confidence above 0.5"] = f"{float((frame.confidence > 0.5).float().mean()):.0%} of the pixels"
+    if extent:
+        figures["depth"] = extent
+    if facts.seconds is not None:
+        figures["time"] = f"{facts.seconds:.0f} s"
+    if facts.memory is not None:
+        figures["memory"] = f"{facts.memory / 2**30:.1f} GiB at most"
+    return figures
+
+
+def data_url(image: Float[Tensor, "c h w"]) -> str:
+    """The URL of an image as JPEG, grey or in colour, of at most `LONGEST` pixels."""
+    pixels = to_bytes(reduced(image, LONGEST).detach().cpu().expand(3, -1, -1).flip(0)).transpose(1, 2, 0)
+    _, content = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    return f"data:image/jpeg;base64,{base64.b64encode(content.tobytes()).decode()}"
+
+
+def shares_layer(confidence: Float[Tensor, "h w"]) -> str:
+    """The URL of a PNG that covers pixels the more, the less their confidence."""
+    cover = 1 - reduced(confidence[None].detach().cpu(), LONGEST)
+    colour = torch.tensor(UNCONFIDENT[::-1])[:, None, None] / 255
+    layers = torch.cat([colour.expand(3, *cover.shape[1:]), 0.85 * cover])
+    _, content = cv2.imencode(".png", to_bytes(layers).transpose(1, 2, 0))
+    return f"data:image/png;base64,{base64.b64encode(content.tobytes()).decode()}"
+
+
+def _listed(title: str, lines: Iterable[str], *, kind: str) -> str:
+    """A section of the page with a list; empty without lines."""
+    items = "".join(f"<li>{html.escape(line)}" for line in lines)
+    return f'<section class="{kind}"><h2>{title}</h2><ul>{items}</ul></section>' if items else ""

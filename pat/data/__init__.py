@@ -1,6 +1,0 @@
-"""Pairs and arrays on disk."""
-
-from pat.data.pairs import PAPER_DISPARITY, Disparity, StereoPair, folder_pairs, middlebury_pairs
-from pat.data.windows import scene_folders
-
-__all__ = ["PAPER_DISPARITY", "Disparity", "StereoPair", "folder_pairs", "middlebury_pairs", "scene_folders"]

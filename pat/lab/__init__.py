@@ -1,0 +1,1 @@
+"""The researcher's room: synthesis, data, training, evaluation, the farm and their commands."""

@@ -1,0 +1,284 @@
+"""Commands for the development of networks: evaluate, ablate, data, render, train, settings."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+from tyro.conf import Fixed, Positional, arg
+
+from ..app.cli import options
+from ..app.cli.options import FieldName, MaybePath, Out, Weights, optional, say, writable
+
+if TYPE_CHECKING:
+    from .data.pairs import StereoPair
+    from .evaluation.stereo import StereoRow
+
+RenderedFolder = Annotated[Positional[Path], arg(metavar="FOLDER", help="Folder written by `pat render`.")]
+
+
+@dataclass
+class StereoSets:
+    """Stereo pairs by data set, the network that fuses them, and where results go."""
+
+    kitti: MaybePath = None
+    """Folder of KITTI pairs: image_2 / image_3, or left.png / right.png."""
+    middlebury: MaybePath = None
+    """Folder of Middlebury's 2001 to 2006 collections."""
+    flickr1024: MaybePath = None
+    """Folder of Flickr1024 pairs: 0001_L.png / 0001_R.png."""
+    folder: MaybePath = None
+    """Folder of other pairs, named in any of these ways."""
+    out: Out = Path("out/evaluate")
+    """Folder for what is written."""
+    weights: Weights = "mono-colour"
+
+    def sets(self) -> dict[str, Iterable[StereoPair]]:
+        """The pairs by data set, once all folders are open and what is written can be."""
+        from .evaluation.stereo import DATA_SETS
+
+        folders = {name: getattr(self, name) for name in DATA_SETS if getattr(self, name) is not None}
+        if not folders:
+            raise ValueError(f"no images: give at least one of --{', --'.join(DATA_SETS)}")
+        writable(self.out, folder=True)
+        return {name: DATA_SETS[name](folder) for name, folder in folders.items()}
+
+
+@dataclass
+class Evaluate(StereoSets):
+    """Compare alpha alone, the classical baseline and the fusion on stereo pairs: PSNR, SSIM, images.
+
+    The left image made grey is alpha, the right one, reduced, is beta, the left one in colour is the ground
+    truth. Example: pat evaluate --kitti data/kitti --middlebury data/middlebury
+    """
+
+    rates: tuple[int, ...] = (2, 4)
+    """Factors by which beta is reduced."""
+    out: Out = Path("out/evaluate")
+    """Folder for scores.md, scores.csv and, for each data set, a strip of images a pair."""
+
+    def run(self) -> None:
+        """Write and print the scores. Raises ValueError for no images, and for rates below 1."""
+        from ..networks.weights import load_weights
+        from .evaluation import protocols, stereo
+
+        sets = self.sets()
+        network = load_weights(self.weights)
+        methods = {**protocols.BASELINES, "fusion": protocols.rectified_fusion(network)}
+        rows = stereo.evaluate_sets(sets, methods, self.rates, out=self.out)
+        self.write(rows, stereo.sets_markdown(rows))
+
+    def sets(self) -> dict[str, Iterable[StereoPair]]:
+        """The same. Raises ValueError for rates below 1."""
+        if not self.rates or min(self.rates) < 1:
+            raise ValueError(f"--rates: {' '.join(map(str, self.rates))}: give whole numbers from 1 up")
+        return super().sets()
+
+    def write(self, rows: Mapping[str, Sequence[StereoRow]], text: str) -> None:
+        """Write scores.md and scores.csv, and print the text."""
+        from arraygeom.runtime.atomic import write_text
+
+        from .evaluation.stereo import StereoRow
+        from .evaluation.tables import write_csv
+
+        write_text(self.out / "scores.md", text)
+        all_rows = [(name, *row) for name, of_method in rows.items() for row in of_method]
+        write_csv(self.out / "scores.csv", ("set", *StereoRow._fields), all_rows)
+        print(text, end="")
+        say(f"written: {self.out / 'scores.md'}, {self.out / 'scores.csv'}, images in {self.out}")
+
+
+@dataclass
+class Ablate:
+    """What calibration is worth: families of receptive fields compared by one network.
+
+    On layered scenes with exact positions, of unrectified rigs with focal lengths 1 to 3 times beta's; or on
+    scenes of your own rig. Example: pat ablate --rendered scenes --weights runs/mine/best.safetensors
+    """
+
+    weights: Weights = "pat-supervised"
+    photos: tuple[Path, ...] = ()
+    """Folders of photographs; those that scikit-image ships if none is given."""
+    rendered: MaybePath = None
+    """Folder of scenes written by `pat render`: their first camera is alpha, their second beta."""
+    scenes: int = 6
+    """Number of scenes."""
+    hw: Annotated[tuple[int, int], arg(metavar="H W")] = (240, 320)
+    """Height and width of both images. The family `dense` compares each pixel with each: it takes longer than
+    all others together, and is left out where that does not fit into 2 GiB, as at 240 x 320."""
+    seed: int = 0
+    """Of the scenes."""
+    field: FieldName = "auto"
+    out: Out = Path("out/ablate")
+    """Folder for ablation.md, ablation.csv and ablation.png."""
+
+    def run(self) -> None:
+        """Write and print the table. Raises ValueError for less than one scene."""
+        from ..networks.weights import load_weights
+        from .evaluation.ablation import FieldFamily, ablate, families, layered_cases, rendered_cases
+
+        if self.scenes < 1:
+            raise ValueError(f"--scenes: {self.scenes}: give at least 1")
+        layered = [
+            name for name in ("photos", "scenes", "hw") if getattr(self, name) != getattr(Ablate, name)
+        ]
+        if self.rendered is not None and layered:
+            raise ValueError(f"--{', --'.join(layered)}: of layered scenes: leave out with --rendered")
+        writable(self.out, folder=True)
+        network = load_weights(self.weights)
+        if self.rendered is not None:
+            cases = rendered_cases(self.rendered, seed=self.seed)
+        else:
+            cases = layered_cases(self.scenes, photos=self.photos, hw=self.hw, seed=self.seed)
+        chosen, given_field = families(), options.field_named(self.field)
+        if given_field is not None:
+            chosen[self.field] = FieldFamily(lambda disparity: given_field)
+        ablate(network, cases, out=self.out, chosen=chosen)
+        print((self.out / "ablation.md").read_text(encoding="utf-8"), end="")
+        say(f"written: {self.out / 'ablation.md'}, and its figures and numbers beside it")
+
+
+@dataclass
+class DataInfo:
+    """Summarise a folder of rendered scenes: sizes, time and memory they took, refused seeds."""
+
+    folder: RenderedFolder
+
+    def run(self) -> None:
+        """Print the summary. Raises ValueError for a folder that `pat render` did not write."""
+        from .farm.job import summarise
+
+        print(summarise(self.folder))
+
+
+class Data:
+    """Inspect rendered scenes."""
+
+    commands: ClassVar[Mapping[str, Any]] = {"info": DataInfo}
+
+
+@dataclass
+class Render:
+    """Render many scenes of a rig for training: workers, retries, resuming, clusters.
+
+    Example: pat render config.yaml --scenes 900 --out data/ --workers 2. The same command again renders what
+    is missing. The file has at least `rig: rig.yaml`; see `pat.lab.farm.job.RenderConfig`.
+    """
+
+    config: Annotated[Positional[Path], arg(metavar="CONFIG")]
+    """What to render (YAML): rig, seed, backend and its settings."""
+    scenes: int
+    """Number of scenes there should be in the end."""
+    out: Out
+    """Folder of the scenes."""
+    workers: int = 1
+    """Processes on this machine."""
+    shard: Annotated[str, arg(metavar="I/N")] = "1/1"
+    """Only every N-th scene from the I-th on, for batch systems."""
+    scheduler: Annotated[str | None, optional("ADDRESS")] = None
+    """Address of a Dask scheduler whose workers render the scenes, such as tcp://host:8786."""
+
+    def run(self) -> None:
+        """Render what is missing; exit status 1 if the job is not complete then."""
+        from .farm.job import RenderConfig, Shard, render
+
+        report = render(
+            RenderConfig.load(self.config),
+            scenes=self.scenes,
+            out=self.out,
+            workers=self.workers,
+            shard=Shard.parse(self.shard),
+            scheduler=self.scheduler,
+            console=options.console(),
+        )
+        say(f"{self.out}: {report}" + ": the same command tries these again" * bool(report.failed))
+        if report.failed:
+            sys.exit(1)
+
+
+@dataclass
+class Train:
+    """Train weights by a recipe, on scenes made from photographs during training.
+
+    Example: pat train mono-colour-small --photos ~/images --out runs/mine --minutes 60
+    """
+
+    spellings: ClassVar[Mapping[str, str]] = {"-o": "--out"}
+
+    recipe: Positional[str] = "mono-colour"
+    """A recipe of the package, or a YAML file."""
+    config: Fixed[Any] = None
+
+    @classmethod
+    def parse(cls, arguments: list[str]) -> Train:
+        """The command from its arguments; its options are those of the recipe."""
+        from .training.config import command_line
+
+        return cls(config=command_line(arguments))
+
+    def run(self) -> None:
+        """Train, or continue a run that stopped. Raises ValueError for a recipe that its data do not suit."""
+        from .training.loop import train
+
+        say(f"written: {train(self.config)}")
+
+
+@dataclass
+class Settings:
+    """List the numbers that matching, fusion and networks were given: value, kind, and where each is from.
+
+    Kinds: *physics* follows from what is measured, *size* says how much is done at a time, *tuned* was
+    chosen. Example: pat settings --kind tuned
+    """
+
+    kind: Literal["physics", "size", "tuned", "all"] = "all"
+    """Those of one kind alone."""
+
+    rooms: ClassVar[tuple[str, ...]] = ("pat.matching", "pat.fusion", "pat.networks")
+
+    def run(self) -> None:
+        """Print a line for each."""
+        from ..support.settings import all_settings
+
+        entries = [s for s in all_settings(*self.rooms) if self.kind in ("all", s.kind)]
+        for entry in entries:
+            name = f"{entry.algorithm.removesuffix('Settings')}.{entry.name}"
+            print(f"{entry.kind:8}{name} = {entry.value}  {entry.why}")
+        print(f"{sum(s.numbers for s in entries)} numbers under {len(entries)} names")
+
+
+@dataclass
+class Import:
+    """Convert a checkpoint of the paper's authors (best.pth.tar) to a weights file for `--weights`.
+
+    The file is read as tensors and numbers; nothing in it is run.
+    Example: pat weights import log_2inputs/x4/best.pth.tar --out pat-authors.safetensors
+    """
+
+    checkpoint: Annotated[Positional[Path], arg(metavar="FILE", help="Checkpoint, for any number of inputs.")]
+    out: Out = Path("pat-authors.safetensors")
+    """Weights file to write."""
+
+    def run(self) -> None:
+        """Write the weights. Raises FileNotFoundError or ValueError for a file that is no such checkpoint."""
+        from ..networks.authors import read_authors
+        from ..networks.paper import PAT
+        from ..networks.weights import save_weights
+
+        writable(self.out)
+        read = read_authors(self.checkpoint)
+        network = PAT(read.config)
+        network.load_state_dict(read.state)
+        save_weights(network, self.out, facts=read.facts)
+        betas, c = read.config.betas, read.config
+        what = f"{betas} beta{'s' * (betas > 1)}, images of {c.in_channels} channels, enlarged {c.scale}x"
+        say(f"written: {self.out} (PAT for {what})")
+
+
+class WeightsCommands:
+    """Convert weights of other programs."""
+
+    commands: ClassVar[Mapping[str, Any]] = {"import": Import}

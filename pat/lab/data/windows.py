@@ -1,0 +1,126 @@
+"""Rendered scenes on disk, their views, and windows cut from them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+from zipfile import BadZipFile
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from arraygeom.camera import Camera
+from arraygeom.pixels import HW, map_homogeneous, pixel_grid, resize_matrix
+from arraygeom.rig import Rig
+from arraygeom.sampling import sample
+from arraygeom.undistortion import pinhole_view, resampled
+from pat.lab.synthesis.rendered import RENDER_FILE, Rendered, is_rendered
+
+AGAIN = "remove it and run 'pat render' again"
+
+
+def scene_folders(root: str | Path) -> list[Path]:
+    """The complete scenes in a folder of a job, of scenes, or a scene itself, in order of their names.
+
+    Raises FileNotFoundError for no such folder, ValueError where there is no scene, or an incomplete one.
+    """
+    root = Path(root)
+    if not root.is_dir():
+        raise FileNotFoundError(f"{root}: no such folder: check the path")
+    if is_rendered(root):
+        return [root]
+    inside = root / "scenes" if (root / "scenes").is_dir() else root
+    folders = sorted(f for f in inside.iterdir() if f.is_dir() and not f.name.startswith("."))
+    if not any(is_rendered(f) for f in folders):
+        make = f"make some with 'pat render CONFIG --scenes N --out {root}'"
+        raise ValueError(f"{root}: holds no rendered scene: {make}")
+    if broken := next((f for f in folders if not is_rendered(f)), None):
+        raise ValueError(f"{broken}: is not a whole scene (no {RENDER_FILE}): {AGAIN}")
+    return folders
+
+
+@contextmanager
+def reading(folder: Path) -> Iterator[None]:
+    """Errors of what is read name the folder and what to do."""
+    try:
+        yield
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile, TypeError) as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise ValueError(f"{folder}: cannot be read ({reason}): {AGAIN}") from None
+
+
+def scene_rig(folder: Path) -> Rig:
+    """The cameras of a scene. Raises ValueError if they cannot be read, or are not calibrated."""
+    with reading(folder):
+        return Rendered(folder).rig
+
+
+class RenderedView(NamedTuple):
+    """An image in linear light, its pixels' depth (metres; NaN where the camera sees nothing), its camera."""
+
+    rgb: Float[Tensor, "3 h w"]
+    depth: Float[Tensor, "h w"]
+    camera: Camera
+
+
+def read_view(folder: Path, name: str) -> RenderedView:
+    """A camera's first frame, as rendered. Raises ValueError, naming the folder, for one of no use."""
+    with reading(folder):
+        frame, camera = Rendered(folder).frame(name), Rendered(folder).rig[name]
+    if not isinstance(camera, Camera):
+        raise ValueError(f"{folder}: camera '{name}' is not calibrated")
+    hw = (frame.depth.shape[-2], frame.depth.shape[-1])
+    if hw != camera.hw or frame.rgb.shape[1:] != frame.depth.shape:
+        text = f"the image of '{name}' is {hw[1]}x{hw[0]}, its rig says {camera.hw[1]}x{camera.hw[0]}"
+        raise ValueError(f"{folder}: {text}: {AGAIN}")
+    return RenderedView(frame.rgb, frame.depth, camera.to(torch.float64))
+
+
+def pinhole_of(camera: Camera) -> Camera:
+    """The camera itself, or its pinhole view if it has a lens model."""
+    return camera if camera.distortion is None else pinhole_view(camera)
+
+
+def undistorted(view: RenderedView) -> RenderedView:
+    """The view resampled to its pinhole camera, if it has a lens model."""
+    if view.camera.distortion is None:
+        return view
+    pinhole = pinhole_of(view.camera)
+    rgb = resampled(view.rgb, view.camera, pinhole, extended=True).values[0].clamp(min=0)
+    depth = resampled(view.depth[None], view.camera, pinhole, interpolation="nearest")
+    return RenderedView(rgb, torch.where(depth.valid[0], depth.values[0, 0], torch.nan), pinhole)
+
+
+def window(view: RenderedView, top: int, left: int, size: HW, hw: HW) -> RenderedView:
+    """A window of a view, reduced (or enlarged) to `hw`. Beyond the image its edge repeats, without depth."""
+    rows, columns = (torch.arange(n) + start for n, start in zip(size, (top, left)))
+    h, w = view.camera.hw
+    inside = ((rows >= 0) & (rows < h))[:, None] & (columns >= 0) & (columns < w)
+    rows, columns = rows.clamp(0, h - 1)[:, None], columns.clamp(0, w - 1)
+    rgb = reduced(view.rgb[:, rows, columns][None], hw)[0]
+    depth = reduced_depth(torch.where(inside, view.depth[rows, columns], torch.nan)[None], hw)[0]
+    return RenderedView(rgb, depth, view.camera.crop(top, left, size).resize(hw))
+
+
+def reduced(rgb: Float[Tensor, "n c h w"], hw: HW) -> Float[Tensor, "n c h2 w2"]:
+    """Cubic (a = -0.5, antialiased) reduction of linear light, which stays above zero."""
+    if rgb.shape[-2:] == hw:
+        return rgb
+    return interpolate(rgb, hw, mode="bicubic", align_corners=False, antialias=True).clamp(min=0)
+
+
+def reduced_depth(depth: Float[Tensor, "n h w"], hw: HW) -> Float[Tensor, "n h2 w2"]:
+    """Depth at the new pixels' centres: inverse depth interpolated on even surfaces, the nearest at edges."""
+    old = (depth.shape[-2], depth.shape[-1])
+    if old == hw:
+        return depth
+    back = resize_matrix(hw, old)
+    x = map_homogeneous(back[:2], pixel_grid(hw, dtype=torch.float64)).to(depth)[None]
+    between = 1 / sample(1 / depth[:, None], x).values[:, 0]
+    nearest = sample(depth[:, None], x, interpolation="nearest").values[:, 0]
+    even = (between / nearest - 1).abs() < 0.01
+    return torch.where(even, between, nearest)

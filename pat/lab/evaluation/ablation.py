@@ -1,0 +1,407 @@
+"""What calibration is worth: one checkpoint, every family of receptive fields, on the same scenes.
+
+The paper's figure of calibrated against rectified as a tool. Scenes are layered photographs seen by
+unrectified rigs, alpha with a focal length 1 to 3 times beta's, rendered here; or rendered folders of one's
+own.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+from zlib import crc32
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from rich.progress import track
+from torch import Generator, Tensor
+from torch.nn.functional import avg_pool2d
+
+from arraygeom import (
+    Camera,
+    Curved,
+    Dense,
+    Epipolar,
+    HomographyDisplacement,
+    Local,
+    NearestVoxels,
+    Pair,
+    Pose,
+    ReceptiveField,
+    Rectified,
+    Rig,
+    Segments,
+    apply_homography,
+    pixel_grid,
+    rotation_from_vector,
+)
+from arraygeom.fields.default import natural_bounds
+from arraygeom.fields.straight import covering_displacement
+from arraygeom.pixels import HW, coarse_grid
+from arraygeom.runtime.atomic import write_text
+from arraygeom.segments import clip_to_image
+
+from ...fusion.classical import classical
+from ...fusion.fuse import fuse
+from ...fusion.steps import resolution_ratio
+from ...media.colour import luminance, srgb_image
+from ...media.depth_maps import at_distance
+from ...media.figures import save_panels
+from ...networks.protocol import FusionNetwork
+from ...sensors import Clip, Noise, Quantise, record
+from ...support.metrics import bootstrap_interval, score
+from ..data.windows import scene_folders
+from ..synthesis.layered import LayeredScenes
+from ..synthesis.photos import PhotoBank
+from ..synthesis.rendered import Rendered
+from ..synthesis.rig_distribution import RigDistribution
+from .rectified import rectified
+from .tables import grouped, markdown_table, write_csv
+
+LOG = logging.getLogger(__name__)
+
+ALPHA, BETA = "alpha", "beta"
+RIGS = RigDistribution(
+    mode="general",
+    parallax=(8.0, 60.0),
+    focal_ratio=(1 / 3, 1.0),
+    resolutions=(1.0,),
+    rotation=3.0,
+    decentring=0.05,
+)
+"""Rigs of the layered scenes: beta's focal length is 1/3 to 1 of alpha's, in images of equal sizes."""
+DENSE_LIMIT = 2**31
+"""Bytes that explicit positions may take; the dense field of larger images is omitted."""
+RATIOS = (1.0, 1.5, 2.0)
+"""Where groups of focal ratios begin in the table; those below are one more."""
+CROP = 96
+"""Side of the crops in the figure, pixels."""
+SHOWN = 4
+"""Cases in the figure."""
+
+
+class AblationCase(NamedTuple):
+    """One scene: the rig, the recorded images, alpha's view in true colour, and its depth in metres."""
+
+    name: str
+    rig: Rig
+    images: dict[str, Tensor]
+    ground_truth: Tensor
+    depth: Tensor
+
+    @property
+    def ratio(self) -> float:
+        """Alpha's focal length over beta's."""
+        alpha, beta = self.rig.pair(ALPHA, BETA).cameras
+        return float(alpha.K[0, 0] / beta.K[0, 0])
+
+
+@dataclass(frozen=True)
+class FieldFamily:
+    """A receptive field, given the largest displacement from H x, and the rig that it is computed from.
+
+    If `warped`, both images are rectified by that rig before, and the result is warped back.
+    """
+
+    field: Callable[[float], ReceptiveField | None]
+    assumed: Callable[[Rig, Generator], Rig] = lambda rig, g: rig
+    warped: bool = False
+
+    def fuse(self, network: FusionNetwork, rig: Rig, case: AblationCase, far: float) -> tuple[Tensor, Tensor]:
+        """Alpha's view fused (3, H, W), its depth. Raises ValueError for a rig that cannot be rectified."""
+        if not self.warped:
+            frame = fuse(network, rig, case.images, alpha=ALPHA, field=self.field(far))
+            return frame.image, frame.depth
+        level = rectified(rig, case.images)
+        frame = fuse(network, level.rig, level.images, alpha=ALPHA, field=self.field(far))
+        return level.back(frame.image), level.depth_back(frame.depth)
+
+
+class AblationRow(NamedTuple):
+    """One family on one scene: scores of the image, error in beta of points at the depth found (pixels).
+
+    `within_one` is the share of pixels whose point is within one pixel of its true position in beta. `note`
+    says why there are no figures, where there are none.
+    """
+
+    scene: str
+    ratio: float
+    family: str
+    psnr: float = math.nan
+    ssim: float = math.nan
+    end_point_error: float = math.nan
+    within_one: float = math.nan
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class HorizontalDisplacement:
+    """The rectified assumption at its best: H known, so position and scale; only lines are taken as rows.
+
+    The segment is +-`disparity` pixels along x around H x.
+    """
+
+    disparity: float
+
+    def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> Segments:
+        """Horizontal segments of beta around H x."""
+        centre, finite = apply_homography(pair.homography, x)
+        step = centre.new_tensor([self.disparity, 0.0])
+        segments = clip_to_image(centre + step, centre - step, pair.beta.hw)
+        return Segments(segments.start, segments.end, segments.valid & finite)
+
+
+def families() -> dict[str, FieldFamily]:
+    """Every family by name, `calibrated` first."""
+    exact = {
+        "calibrated": FieldFamily(lambda disparity: None),  # the default
+        "rectified, warped": FieldFamily(lambda disparity: Epipolar(), warped=True),
+        "rectified assumption": FieldFamily(lambda disparity: Rectified(2 * disparity, alpha_is="either")),
+        "rows around H x": FieldFamily(HorizontalDisplacement),
+        "homography + displacement": FieldFamily(HomographyDisplacement),
+        "nearest voxels": FieldFamily(lambda disparity: NearestVoxels()),
+        "local 5x5": FieldFamily(lambda disparity: Local()),
+        "dense": FieldFamily(lambda disparity: Dense()),
+    }
+    wrong = {f"rotated by {a:g} deg": partial(_rotated, a) for a in (0.1, 0.3, 1.0)}
+    wrong |= {f"centre off by {p:g} px": partial(_decentred, p) for p in (1, 3, 10)}
+    return exact | {name: FieldFamily(lambda disparity: Epipolar(), rig) for name, rig in wrong.items()}
+
+
+def disparity(network: FusionNetwork, pair: Pair) -> float:
+    """The largest displacement of a point from H x, pixels of beta as the network gets it."""
+    if pair.has_lens:
+        segments = Curved(bounds=natural_bounds(pair))(
+            pair, coarse_grid(pair.alpha.hw).reshape(-1, 2).double()
+        )
+        reached = (segments.xy - segments.xy[:, :1]).norm(dim=-1)[segments.mask & segments.mask[:, :1]]
+        return float(reached.amax()) if len(reached) else 1.0
+    scale = resolution_ratio(pair)
+    resized = network.equal_resolution and not 0.8 < scale < 1.25
+    return max(float(covering_displacement(pair)) / (scale if resized else 1.0), 1.0)
+
+
+def layered_cases(
+    count: int,
+    *,
+    photos: Sequence[Path] = (),
+    hw: HW = (240, 320),
+    seed: int = 0,
+) -> Iterator[AblationCase]:
+    """Scenes of layered photographs (scikit-image's, if none are given), recorded with some noise."""
+    bank = PhotoBank.load(*photos) if photos else sample_photographs()
+    scenes, g = LayeredScenes(bank, RIGS, hw=hw, seed=seed), Generator().manual_seed(seed)
+    for number in range(count):
+        made = scenes.sample(1, g)
+        ground_truth, beta_image = (image[0] for image in made.images)
+        cameras = {name: camera[0].to(torch.float64) for name, camera in zip((ALPHA, BETA), made.cameras)}
+        yield _recorded(f"scene {number}", Rig(cameras), ground_truth, beta_image, made.depth[0][0], g)
+
+
+def rendered_cases(folder: Path, *, seed: int = 0) -> Iterator[AblationCase]:
+    """Rendered scenes of a folder (`scene_folders`): their first camera is alpha, their second beta."""
+
+    def case(path: Path) -> AblationCase:
+        scene, g = Rendered(path), Generator().manual_seed(seed)
+        names = scene.rig.names[:2]
+        frames = [scene.frame(name) for name in names]
+        ground_truth, beta_image = (srgb_image(f.rgb) for f in frames)
+        rig = Rig(dict(zip((ALPHA, BETA), (scene.rig[name] for name in names))))
+        return _recorded(path.name, rig, ground_truth, beta_image, frames[0].depth, g)
+
+    return map(case, scene_folders(folder))
+
+
+def _recorded(
+    name: str, rig: Rig, ground_truth: Tensor, beta_image: Tensor, depth: Tensor, g: Generator
+) -> AblationCase:
+    """The case of two ideal images: some noise, a depth range a little wider than the scene's."""
+    finite = depth[depth.isfinite()]
+    images = recorded({ALPHA: luminance(ground_truth), BETA: beta_image}, g)
+    rig = rig.replace(depth=(float(finite.min()) / 1.1, float(finite.max()) * 1.1))
+    return AblationCase(name, rig, images, ground_truth, depth)
+
+
+def recorded(ideal: Mapping[str, Tensor], g: Generator) -> dict[str, Tensor]:
+    """Ideal images (C, H, W) as good cameras record them: some noise, 8 bits."""
+    steps = [Noise(8000, 3), Clip(), Quantise(8)]
+    return {name: record(image[None], steps, g)[0] for name, image in ideal.items()}
+
+
+def sample_photographs(*, count: int = 12, seed: int = 0) -> PhotoBank:
+    """The photographs that scikit-image ships, and `count` patterns drawn by the seed.
+
+    They are free to use (astronaut: NASA; chelsea, coffee and rocket: CC0).
+    """
+    from skimage import io
+    from skimage.data import data_dir
+
+    from ..synthesis.patterns import patterns
+
+    names = ("astronaut.png", "chelsea.png", "coffee.png", "rocket.jpg")
+    images = [io.imread(Path(data_dir) / name)[..., :3] for name in names]
+    return PhotoBank(images + patterns(np.random.default_rng(seed), count), photos=len(images))
+
+
+def ablate(
+    network: FusionNetwork, cases: Iterable[AblationCase], chosen: Mapping[str, FieldFamily], *, out: Path
+) -> list[AblationRow]:
+    """Every chosen family on every case; ablation.md, .csv and .png (crops of some cases) go to `out`."""
+    rows: list[AblationRow] = []
+    panels: dict[str, Tensor] = {}
+    for i, case in enumerate(track(cases, "ablating", disable=not sys.stderr.isatty())):
+        result, images = _case(network, case, chosen)
+        rows += result
+        panels |= crops(case, images, result) if i < SHOWN else {}
+    write_text(out / "ablation.md", markdown(rows))
+    write_csv(out / "ablation.csv", AblationRow._fields, rows)
+    save_panels(panels, out / "ablation.png", columns=6)
+    return rows
+
+
+def _case(
+    network: FusionNetwork, case: AblationCase, chosen: Mapping[str, FieldFamily]
+) -> tuple[list[AblationRow], dict[str, Tensor]]:
+    """Rows of a case, and the images of the families that the network supports."""
+    images = {"alpha alone": case.images[ALPHA].expand(3, -1, -1)}
+    notes, errors, far = {}, {}, disparity(network, case.rig.pair(ALPHA, BETA))
+    try:
+        images["classical"] = classical(case.rig, case.images, ALPHA, BETA)
+    except ValueError as error:
+        notes["classical"] = str(error)
+    for name, family in chosen.items():
+        rig = family.assumed(case.rig, Generator().manual_seed(crc32(case.name.encode())))
+        if isinstance(family.field(far), Dense) and (needed := dense_bytes(rig)) > DENSE_LIMIT:
+            notes[name] = f"does not fit: {needed / 2**30:.0f} GiB of positions"
+            continue
+        LOG.info("%s: %s", case.name, name)
+        try:
+            image, depth = family.fuse(network, rig, case, far)
+        except ValueError as error:
+            notes[name] = str(error).partition(":")[0]
+            continue
+        images[name], errors[name] = image.clamp(0, 1), point_errors(case, depth)
+    names, none = ["alpha alone", "classical", *chosen], (math.nan, math.nan)
+    scores = {name: score(image, case.ground_truth) for name, image in images.items()}
+    figures = {name: (*scores.get(name, none), *errors.get(name, none)) for name in names}
+    return [AblationRow(case.name, case.ratio, n, *figures[n], notes.get(n, "")) for n in names], images
+
+
+def point_errors(case: AblationCase, depth: Float[Tensor, "h w"]) -> tuple[float, float]:
+    """Mean error in beta (pixels) of points at `depth` where known; the share of all within a pixel.
+
+    Whether beta sees the point or not: the reference is the projection at the true depth.
+    """
+    alpha, beta = case.rig.pair(ALPHA, BETA).cameras
+    x = pixel_grid(alpha.hw, dtype=torch.float64).reshape(-1, 2)
+    unproject = at_distance if natural_bounds(case.rig.pair(ALPHA, BETA)) == "distance" else Camera.unproject
+    ours, theirs = (beta.project(unproject(alpha, x, d.reshape(-1).double())) for d in (depth, case.depth))
+    has_truth = theirs.valid & theirs.x.isfinite().all(-1)
+    compared = has_truth & ours.valid & ours.x.isfinite().all(-1)
+    if not compared.any():
+        return math.nan, math.nan
+    error = (ours.x - theirs.x).norm(dim=-1)[compared]
+    return float(error.mean()), float((error <= 1).sum() / has_truth.sum())
+
+
+def dense_bytes(rig: Rig) -> float:
+    """What explicit positions of the dense field take."""
+    return math.prod(rig[ALPHA].hw) / 4 * math.prod(rig[BETA].hw) * 8
+
+
+def markdown(rows: Sequence[AblationRow]) -> str:
+    """One line a family: mean PSNR, its 95% bootstrap interval, SSIM, dB to calibrated, by focal ratio."""
+    between = [f"ratio {low:g} to {high:g}" for low, high in pairwise(RATIOS)]
+    bins = [f"ratio below {RATIOS[0]:g}", *between, f"ratio from {RATIOS[-1]:g}"]
+    columns = ["family", "PSNR", "SSIM", "against calibrated", *bins, "off, px", "within 1 px", ""]
+    lines = [[name, *_cells(own, rows)] for name, own in grouped(rows, "family").items()]
+    scenes = len({row.scene for row in rows})
+    interval = ", behind it a 95% interval" if scenes > 1 else ""
+    note = (
+        f"{_scenes(scenes)}; the focal ratio is alpha's focal length over beta's. PSNR in dB{interval}.\n"
+        "Rectified, warped: both images are rectified by the calibration, and the result is "
+        "warped back. The\nrectified assumption takes lines of the images as they are for rows, and both "
+        "images for the same field of\nview; 'rows around H x' is given position and scale, and takes only "
+        "the lines for rows. Off: mean error in\nbeta of points at the depth found.\n\n"
+    )
+    return note + markdown_table(columns, lines, align="l" + "r" * (len(columns) - 2) + "l")
+
+
+def _cells(rows: Sequence[AblationRow], every: Sequence[AblationRow]) -> list[str]:
+    """One family's line of the table: its own rows, and all rows for the reference."""
+    served = [row for row in rows if not math.isnan(row.psnr)]
+    if not served:
+        return [""] * (len(RATIOS) + 6) + [rows[0].note]
+    reference = {row.scene: row.psnr for row in every if row.family == "calibrated"}
+    gains = [row.psnr - reference.get(row.scene, math.nan) for row in served]
+    off, near = zip(*((row.end_point_error, row.within_one) for row in served))
+    gain, error, within = map(_mean, (gains, off, near))
+    psnr, ssim = [row.psnr for row in served], [row.ssim for row in served]
+    interval = " ({:.2f} to {:.2f})".format(*bootstrap_interval(psnr)) if len(psnr) > 1 else ""
+    groups = [[r.psnr for r in served if a <= r.ratio < b] for a, b in pairwise((0, *RATIOS, math.inf))]
+    means = [f"{np.mean(g):.2f}" if g else "" for g in groups]
+    note = "" if len(served) == len(rows) else f"{_scenes(len(rows) - len(served))} omitted"
+    depth = ["", ""] if math.isnan(error) else [f"{error:.2f}", f"{within:.1%}"]
+    gained = "" if math.isnan(gain) else f"{gain:+.2f}"
+    image = [f"{np.mean(psnr):.2f}{interval}", f"{np.mean(ssim):.4f}", gained]
+    return [*image, *means, *depth, note]
+
+
+def _scenes(count: int) -> str:
+    return f"{count} scene{'s' * (count != 1)}"
+
+
+def _mean(values: Sequence[float]) -> float:
+    """Of those that are known; NaN if none is."""
+    numbers = [value for value in values if not math.isnan(value)]
+    return float(np.mean(numbers)) if numbers else math.nan
+
+
+def crops(case: AblationCase, images: Mapping[str, Tensor], rows: Sequence[AblationRow]) -> dict[str, Tensor]:
+    """Crops by title of what was fused, where calibrated and rectified differ most; PSNR is the whole's."""
+    window = (slice(None), *_most_different(images, case.ground_truth))
+    panels = {f"{case.name}: ground truth\nfocal ratio {case.ratio:.1f}": case.ground_truth[window]}
+    for row in rows:
+        if row.family in images:
+            panels[f"{case.name}: {row.family}\n{row.psnr:.1f} dB"] = images[row.family][window]
+    return panels
+
+
+def _most_different(images: Mapping[str, Tensor], ground_truth: Tensor) -> tuple[slice, slice]:
+    """The square in which the rectified assumption is worse than calibrated by most."""
+    h, w = ground_truth.shape[1:]
+    side = min(CROP, h, w)
+    names = [n for n in ("rectified assumption", "calibrated") if n in images]
+    errors = [(images[n] - ground_truth).square().mean(0) for n in names]
+    worse = errors[0] - errors[1] if len(errors) == 2 else ground_truth[0] * 0
+    lost = avg_pool2d(worse[None, None], side, stride=1)[0, 0]
+    top, left = divmod(int(lost.argmax()), lost.shape[1])
+    return slice(top, top + side), slice(left, left + side)
+
+
+def _rotated(degrees: float, rig: Rig, g: Generator) -> Rig:
+    """Beta rotated about a random axis."""
+    axis = torch.randn(3, generator=g, dtype=torch.float64)
+    return turned(rig, axis / axis.norm() * math.radians(degrees))
+
+
+def turned(rig: Rig, rotation: Float[Tensor, "3"]) -> Rig:
+    """Beta turned about its centre, by a rotation vector in its own axes."""
+    beta = rig.pair(ALPHA, BETA).cameras[1]
+    turn = Pose(rotation_from_vector(rotation), torch.zeros(3).double())
+    return rig.with_camera(BETA, beta.replace(cam_from_world=turn @ beta.cam_from_world))
+
+
+def _decentred(pixels: float, rig: Rig, g: Generator) -> Rig:
+    """Beta's principal point shifted in a random direction."""
+    angle = 2 * math.pi * float(torch.rand((), generator=g))
+    shift = torch.tensor([pixels * math.cos(angle), pixels * math.sin(angle)], dtype=torch.float64)
+    return rig.perturbed({f"{BETA}.centre": shift})

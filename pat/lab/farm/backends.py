@@ -1,0 +1,170 @@
+"""Renderers of one scene from one seed: layered photographs, or Blender."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+
+from arraygeom.batching import stack
+from arraygeom.camera import Camera
+from arraygeom.pixels import HW
+from arraygeom.rig import Rig
+from pat.lab.synthesis.blender import compat
+from pat.lab.synthesis.blender.lens import lens_for
+from pat.lab.synthesis.blender.settings import PRESETS, RenderSettings
+from pat.lab.synthesis.blender.task import fitted, render_here, shots
+from pat.lab.synthesis.check import CheckLimits, check_views
+from pat.lab.synthesis.generators import generator_named
+from pat.lab.synthesis.layered import LayeredScenes
+from pat.lab.synthesis.patterns import patterns
+from pat.lab.synthesis.photos import PhotoBank
+from pat.lab.synthesis.rendered import RENDER_FILE, RenderedFrame, frame_file, save_frame
+from pat.lab.synthesis.rig_distribution import RigDistribution
+from pat.lab.synthesis.rigs import RigBatch, in_frame_of
+from pat.media.colour import linear_from_srgb
+from pat.support.schema import from_document
+
+FARTHEST = 50.0
+"""Layered scenes of rigs that see to infinity end at this many times the near bound."""
+
+
+Renderer = Callable[[int, Path], None]
+"""Renders and checks the scene of a seed into a folder, made here. Raises ValueError."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LayeredSettings:
+    """Layered scenes: the first camera of the rig is alpha.
+
+    `photos` are folders of images (none: patterns alone), reduced to `edge` pixels; `layers` bounds the
+    number of planes; `oversampling` samples a pixel along each axis.
+    """
+
+    photos: tuple[Path, ...] = ()
+    edge: int = 512
+    layers: tuple[int, int] = (5, 12)
+    oversampling: int = 2
+
+    def __post_init__(self) -> None:
+        for name, least in (("edge", 32), ("oversampling", 1)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
+        if not 1 <= self.layers[0] <= self.layers[1]:
+            raise ValueError(f"layers must be two numbers, at least 1 and in order, got {self.layers}")
+
+    def images(self, rig: Rig) -> list[HW]:
+        """The sizes of the images of a scene. Raises ValueError for a rig that cannot be rendered."""
+        return [camera.hw for camera in rig_from_alpha(rig).cameras]
+
+    def renderer(self, rig: Rig, limits: CheckLimits) -> Renderer:
+        """A renderer that is ready."""
+        rig_batch = rig_from_alpha(rig)
+        if self.photos:
+            bank = PhotoBank.load(*self.photos, max_edge=self.edge)
+        else:
+            bank = PhotoBank(patterns(np.random.default_rng(0), 60))
+        scenes = LayeredScenes(bank, RigDistribution(), hw=rig_batch.cameras[0].hw, layers=self.layers)
+
+        def render(seed: int, out: Path) -> None:
+            started = time.monotonic()
+            generator = torch.Generator().manual_seed(seed)
+            batch = scenes.render(rig_batch, generator, oversampling=self.oversampling)
+            frames = {
+                name: RenderedFrame(time=0.0, rgb=linear_from_srgb(image)[0], depth=depth[0], index=index[0])
+                for name, image, depth, index in zip(rig.names, batch.images, batch.depth, batch.index)
+            }
+            files = {name: frame_file(rig, name) for name in rig.names}
+            out.mkdir(parents=True)
+            rig.save(out / "rig.yaml")
+            for name, frame in frames.items():
+                save_frame(out / files[name], frame)
+            about = {
+                "settings": {"backend": "layered"},
+                "versions": {"pat": version("arraygeom-pat"), "torch": torch.__version__},
+                "seconds": round(time.monotonic() - started, 3),
+                "frames": {name: [{"file": file, "time": 0.0}] for name, file in files.items()},
+                "check": check_views(rig, frames, limits),
+            }
+            (out / RENDER_FILE).write_text(json.dumps(about, indent=1), encoding="utf-8")
+
+        return render
+
+
+@dataclass(frozen=True, kw_only=True)
+class BlenderSettings:
+    """Blender's scenes: a generator, a preset, and settings that differ from the preset's.
+
+    The generator is "abstract", "photographs" (with `photos`, a folder of images), or "module:function".
+    """
+
+    generator: str = "abstract"
+    photos: Path | None = None
+    preset: Literal["fast", "paper"] = "fast"
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if (self.generator == "photographs") != (self.photos is not None):
+            raise ValueError("the generator 'photographs' needs a folder `photos`, no other one takes it")
+        if ":" not in self.generator:
+            generator_named(self.generator)
+        self.render_settings()
+
+    def render_settings(self) -> RenderSettings:
+        """All settings; one thread by default, because a farm has a worker a core."""
+        settings = {**PRESETS[self.preset], "threads": 1, **self.settings}
+        return from_document(RenderSettings, settings, "settings")
+
+    def images(self, rig: Rig) -> list[HW]:
+        """The sizes of the images of a scene, one for each exposure.
+
+        Raises ValueError for a rig that cannot be rendered, and a generator that cannot be imported.
+        """
+        generator_named(self.generator)
+        for name, camera in rig.cameras.items():
+            lens_for(camera, name)
+        settings = self.render_settings()
+        rig = fitted(rig, settings)
+        return [rig[shot.camera].hw for shot in shots(rig, settings)]
+
+    def renderer(self, rig: Rig, limits: CheckLimits) -> Renderer:
+        """A renderer that is ready; this process imports bpy. Raises ValueError without Blender."""
+        compat.load()
+        generator, settings = generator_named(self.generator), replace(self.render_settings(), limits=limits)
+        further = {} if self.photos is None else {"folder": self.photos}
+
+        def render(seed: int, out: Path) -> None:
+            scene = generator(seed, rig, moving=settings.duration, **further)
+            render_here(scene, rig, out, settings=settings)
+
+        return render
+
+
+def rig_from_alpha(rig: Rig) -> RigBatch:
+    """The rig as a batch of one, the first camera being the world's frame.
+
+    Raises ValueError for cameras that are not calibrated or have a lens, and for a rig without a depth range.
+    """
+    for name, camera in rig.cameras.items():
+        if not isinstance(camera, Camera):
+            raise ValueError(f"camera '{name}' is not calibrated: rendering needs its K, R and t")
+        if camera.distortion is not None:
+            raise ValueError(
+                f"camera '{name}' has a lens model, layered scenes have none: use Blender, or omit it"
+            )
+    if rig.depth is None:
+        raise ValueError("the rig has no depth range: add `depth: [near, far]` in metres to its file")
+    near, far = (float(d) for d in rig.depth)
+    far = min(far, FARTHEST * near)
+    cameras = [c.to(torch.float64) for c in rig.cameras.values() if isinstance(c, Camera)]
+    relative = [stack([in_frame_of(cameras[0], c)]) for c in cameras]
+    return RigBatch(
+        relative, torch.tensor([near], dtype=torch.float64), torch.tensor([far], dtype=torch.float64)
+    )

@@ -1,0 +1,163 @@
+"""One scene, rendered in this process."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import closing, contextmanager
+from importlib.metadata import version
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, NamedTuple
+from uuid import uuid4
+
+import numpy as np
+import torch
+
+from arraygeom.rig import Rig
+
+from ....support.schema import to_document
+from ..check import check_views
+from ..rendered import RENDER_FILE, Rendered, RenderedFrame, frame_file, save_frame
+from ..scene import Scene
+from ..shapes import inside
+from . import compat
+from .lens import Lens, lens_for
+from .settings import RenderSettings
+from .studio import NOTHING, Studio
+
+_RATE = 30.0
+_SHARED_MEMORY = Path("/dev/shm")
+_SCRATCH = "pat-render-"
+
+
+class Shot(NamedTuple):
+    """One frame to render: camera, number, and time in seconds."""
+
+    camera: str
+    number: int
+    time: float
+
+
+def render(scene: Scene, rig: Rig, out: Path, *, settings: RenderSettings) -> Rendered:
+    """`render_here` in a process of its own, so that this one does not import bpy."""
+    with ProcessPoolExecutor(1, get_context("spawn")) as process:
+        return process.submit(render_here, scene, rig.to("cpu"), out, settings=settings).result()
+
+
+def render_here(scene: Scene, rig: Rig, out: Path, *, settings: RenderSettings) -> Rendered:
+    """Render a scene into the folder `out`, atomically, in this process, which imports bpy.
+
+    Raises ValueError for what cannot be rendered (one line: skew, a camera inside an object, a missing
+    library).
+    """
+    out = Path(out)
+    if out.exists():
+        raise ValueError(f"{out} exists: give a new folder, or remove it first")
+    rig, started = fitted(rig, settings), time.monotonic()
+    lenses = {name: lens_for(camera, name) for name, camera in rig.cameras.items()}
+    planned = shots(rig, settings)
+    refuse_inside(scene, rig, planned)
+    with _staged(out) as folder, _scratch() as scratch, closing(Studio(scene, settings, scratch)) as studio:
+        files: dict[str, list[dict[str, Any]]] = {name: [] for name in rig.names}
+        first: dict[str, RenderedFrame] = {}
+        for shot in planned:
+            frame = take(studio, lenses[shot.camera], shot)
+            file = frame_file(rig, shot.camera, shot.number)
+            save_frame(folder / file, frame)
+            files[shot.camera].append({"file": file, "time": shot.time})
+            first.setdefault(shot.camera, frame)
+        rig.save(folder / "rig.yaml")
+        scene.save(folder / "scene.yaml")
+        about = {
+            "settings": to_document(settings),
+            "versions": {"blender": studio.bpy.app.version_string, "pat": version("arraygeom-pat")},
+            "seconds": round(time.monotonic() - started, 3),
+            "frames": files,
+            "check": check_views(rig, first, settings.limits),
+        }
+        (folder / RENDER_FILE).write_text(json.dumps(about, indent=1), encoding="utf-8")
+    return Rendered(out)
+
+
+def fitted(rig: Rig, settings: RenderSettings) -> Rig:
+    """The rig at the size that is rendered."""
+    if settings.width is None:
+        return rig
+    scale = settings.width / max(camera.hw[1] for camera in rig.cameras.values())
+    for name, camera in rig.cameras.items():
+        h, w = (max(round(n * scale), 4) for n in camera.hw)
+        rig = rig if (h, w) == camera.hw else rig.resize(name, (h, w))
+    return rig
+
+
+def shots(rig: Rig, settings: RenderSettings) -> list[Shot]:
+    """All frames in order: each camera from its time offset on, at its frame rate, for the duration."""
+    planned = []
+    for name, camera in rig.cameras.items():
+        rate = camera.sensor.frame_rate or _RATE
+        count = max(1, int(np.ceil(settings.duration * rate - 1e-9)))
+        planned += [Shot(name, k, camera.sensor.time_offset + k / rate) for k in range(count)]
+    return planned
+
+
+def refuse_inside(scene: Scene, rig: Rig, planned: list[Shot]) -> None:
+    """Raises ValueError if a camera is inside an object when it takes a frame."""
+    for shot in planned:
+        centre = rig[shot.camera].centre.detach().cpu().double().numpy()
+        for item in scene.objects:
+            if inside(item, centre, shot.time):
+                where = f"inside the object '{item.name}' at {shot.time:g} s"
+                raise ValueError(f"camera '{shot.camera}' is {where}: move one of them")
+
+
+def take(studio: Studio, lens: Lens, shot: Shot) -> RenderedFrame:
+    """One frame. Raises ValueError if the camera sees nothing."""
+    rendered = studio.channels(lens.pinhole, shot.time, "rgb")
+    index = rendered[compat.index_name(rendered)].round().int()
+    depth = torch.where(rendered["Depth.Z"] < NOTHING, rendered["Depth.Z"], torch.inf)
+    if not (index > 0).any():
+        raise ValueError(f"camera '{shot.camera}' sees nothing at {shot.time:g} s: rotate it or move it")
+    nir = None
+    if studio.settings.infrared:
+        nir = lens.resampled(studio.channels(lens.pinhole, shot.time, "nir")["Combined.R"][None])
+    return RenderedFrame(
+        time=shot.time,
+        rgb=lens.resampled(torch.stack([rendered[f"Combined.{letter}"] for letter in "RGB"])),
+        depth=lens.depth(depth, index),
+        index=lens.nearest(index[None].float())[0].int(),
+        nir=nir,
+    )
+
+
+@contextmanager
+def _staged(out: Path) -> Iterator[Path]:
+    """A folder beside `out` that is renamed to it when complete."""
+    out.parent.mkdir(parents=True, exist_ok=True)
+    folder = out.with_name(f".{out.name}-{uuid4().hex[:8]}.part")
+    folder.mkdir()
+    try:
+        yield folder
+        folder.rename(out)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextmanager
+def _scratch() -> Iterator[Path]:
+    """A temporary folder, in memory if possible, for the files that Blender writes.
+
+    Its name holds the process number: those of processes that were killed are removed.
+    """
+    where = _SHARED_MEMORY if os.access(_SHARED_MEMORY, os.W_OK) else None
+    for left in _SHARED_MEMORY.glob(f"{_SCRATCH}*") if where else ():
+        owner = left.name.removeprefix(_SCRATCH).partition("-")[0]
+        if owner.isdecimal() and not Path(f"/proc/{owner}").exists():
+            shutil.rmtree(left, ignore_errors=True)
+    with tempfile.TemporaryDirectory(dir=where, prefix=f"{_SCRATCH}{os.getpid()}-") as folder:
+        yield Path(folder)

@@ -1,0 +1,195 @@
+"""A bank of photographs in memory, sampled per pixel at the right level of detail.
+
+Textures repeat by mirroring, so that planes may be of any size. Each is stored with its pyramid of
+2x area averages as packed bytes (R + 256 G + 65536 B in one int32): one gather fetches one texel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from zipfile import BadZipFile
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from arraygeom.runtime.atomic import write_atomically
+
+from ...media.images import decoded_photograph
+from ...media.suffixes import PHOTO_SUFFIXES
+from ...support.folders import files_below
+from .patterns import patterns, recoloured
+
+LEVELS = 6
+_MULTIPLE = 2 ** (LEVELS - 1)
+
+
+class PhotoBank:
+    """Textures of any sizes with their pyramids, on one device.
+
+    Each side is cropped to a multiple of 32, so that every level is an exact 2x area average of the one
+    below. `len(bank)` textures; `photos` of them, the first, are photographs and the others patterns made
+    from a seed.
+    """
+
+    def __init__(self, images: Iterable[np.ndarray], *, photos: int | None = None):
+        levels = [_pyramid(_cropped(p)) for p in images]
+        if not levels:
+            raise ValueError("a PhotoBank needs at least one image")
+        sizes = [[(p.shape[1], p.shape[0]) for p in pyramid] for pyramid in levels]
+        counts = np.array([[w * h for w, h in pyramid] for pyramid in sizes])
+        starts = np.concatenate([[0], counts.ravel().cumsum()[:-1]]).reshape(counts.shape)
+        self.photos = len(levels) if photos is None else photos
+        self.texels = torch.from_numpy(np.concatenate([_packed(p) for pyramid in levels for p in pyramid]))
+        self.starts = torch.from_numpy(starts).int()
+        self.wh = torch.tensor(sizes, dtype=torch.int32)
+
+    @classmethod
+    def load(
+        cls,
+        *folders: str | Path,
+        max_edge: int = 1024,
+        cache: str | Path | None = None,
+        seed: int = 0,
+        choose: Callable[[int], bool] = lambda i: True,
+    ) -> PhotoBank:
+        """All images under the folders, colour or grey, reduced to `max_edge` pixels, and patterns beside.
+
+        `cache` names an .npz file that is written on the first call and read
+        on later ones; it is not checked against the folders. `choose` selects images by number, to hold
+        some out. Raises ValueError where no image is found or chosen, and for a file that is no cache.
+        """
+        if cache and Path(cache).exists():
+            images = _cached(Path(cache))
+        else:
+            images = read_photographs(folders, max_edge)
+            if cache:
+                with write_atomically(cache) as temporary, temporary.open("wb") as file:
+                    np.savez(file, *images)
+        chosen = [p for i, p in enumerate(images) if choose(i)]
+        if not chosen:
+            raise ValueError(
+                f"{len(images)} photographs are too few to learn from some and to hold others out: give more"
+            )
+        rng = np.random.default_rng(seed)
+        extra = patterns(rng, 48) + recoloured(chosen, rng, 48)
+        return cls(chosen + extra, photos=len(chosen))
+
+    def __len__(self) -> int:
+        return len(self.wh)
+
+    def to(self, device: torch.device | str) -> PhotoBank:
+        """The same bank on a device."""
+        moved = object.__new__(PhotoBank)
+        moved.photos = self.photos
+        moved.texels, moved.starts, moved.wh = (x.to(device) for x in (self.texels, self.starts, self.wh))
+        return moved
+
+    def lookup(
+        self, texture: Int[Tensor, " n"], xy: Float[Tensor, "n 2"], level: Float[Tensor, " n"]
+    ) -> Float[Tensor, "3 n"]:
+        """Colours 0..1 at the textures' pixels (x, y) (first centre (0, 0)), trilinear in position and level.
+
+        `level` is log2 of the distance between samples in pixels of the full texture: at 0 the full image is
+        read, at 1 its 2x reduction, whose pixel (0, 0) lies at (0.5, 0.5) of the full one.
+        """
+        level = level.clamp(0, LEVELS - 1)
+        fine = level.floor().clamp(max=LEVELS - 2)
+        weight = level - fine
+        index = texture.long() * LEVELS + fine.long()
+        scale = torch.exp2(-fine)
+        half_pixel = xy.mT + 0.5
+        low = self._bilinear(index, half_pixel * scale - 0.5)
+        high = self._bilinear(index + 1, half_pixel * (0.5 * scale) - 0.5)
+        return torch.lerp(low, high, weight)
+
+    def window(
+        self, texture: int, level: int, xy: tuple[int, int], side: int
+    ) -> Float[Tensor, "3 side side"]:
+        """A square of a texture at one level, its first pixel at (x, y), repeated by mirroring."""
+        w, h = self.wh[texture, level].tolist()
+        x, y = (_mirrored(start + torch.arange(side), torch.tensor(n)) for start, n in zip(xy, (w, h)))
+        return self._fetch(int(self.starts[texture, level]) + w * y[:, None] + x)
+
+    def _bilinear(self, index: Tensor, xy: Tensor) -> Tensor:
+        """Colours at positions (2, n) of the level with flat index."""
+        start = self.starts.view(-1)[index]
+        w, h = self.wh.view(-1, 2)[index].unbind(-1)
+        corner = xy.floor()
+        fx, fy = xy - corner
+        x0, y0 = corner.int()
+        columns = _mirrored(x0, w), _mirrored(x0 + 1, w)
+        rows = start + w * _mirrored(y0, h), start + w * _mirrored(y0 + 1, h)
+        top, bottom = (torch.lerp(self._fetch(r + columns[0]), self._fetch(r + columns[1]), fx) for r in rows)
+        return torch.lerp(top, bottom, fy)
+
+    def _fetch(self, index: Tensor) -> Tensor:
+        packed = self.texels[index]
+        channels = torch.stack([packed & 255, (packed >> 8) & 255, packed >> 16])
+        return channels.float().mul_(1 / 255)
+
+
+def _mirrored(i: Tensor, n: Tensor) -> Tensor:
+    """Indices folded into 0 .. n - 1 by reflecting at the edges: ... 1 0 | 0 1 ... n-1 | n-1 ..."""
+    period = 2 * n
+    i = i - period * torch.div(i.float(), period.float()).floor().int()
+    i = torch.where(i < n, i, period - 1 - i)
+    return torch.minimum(i.clamp_(min=0), n - 1)
+
+
+def _cached(file: Path) -> list[np.ndarray]:
+    """The images of a cache. Raises ValueError, which names the file, for a damaged or another one."""
+    try:
+        with np.load(file) as archive:
+            return list(archive.values())
+    except (BadZipFile, AttributeError, EOFError, OSError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"{file}: not a cache of photographs ({error}): remove it, or name another"
+        ) from None
+
+
+def read_photographs(folders: tuple[str | Path, ...], max_edge: int) -> list[np.ndarray]:
+    """RGB bytes of all images under the folders, reduced to `max_edge` pixels. Raises ValueError for none."""
+    paths = sorted(p for folder in folders for p in files_below(folder) if p.suffix.lower() in PHOTO_SUFFIXES)
+    images = [_reduced(p, max_edge) for p in map(_decoded, paths) if p is not None]
+    if not images:
+        raise ValueError(f"no image found under {', '.join(map(str, folders)) or 'no folder'}")
+    return images
+
+
+def _decoded(path: Path) -> np.ndarray | None:
+    """RGB bytes, or None for a file that is no image, or one too small or too large to be a texture."""
+    image = decoded_photograph(path, cv2.IMREAD_COLOR, least=_MULTIPLE)
+    if image is None or min(image.shape[:2]) < _MULTIPLE:
+        return None
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def _reduced(image: np.ndarray, max_edge: int) -> np.ndarray:
+    h, w = image.shape[:2]
+    s = max_edge / max(h, w)
+    if s >= 1:
+        return image
+    size = (max(round(w * s), _MULTIPLE), max(round(h * s), _MULTIPLE))
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+
+
+def _cropped(image: np.ndarray) -> np.ndarray:
+    h, w = (n // _MULTIPLE * _MULTIPLE for n in image.shape[:2])
+    return image[:h, :w]
+
+
+def _pyramid(image: np.ndarray) -> list[np.ndarray]:
+    exact = [image.astype(np.float32)]
+    for _ in range(LEVELS - 1):
+        h, w = exact[-1].shape[:2]
+        exact.append(exact[-1].reshape(h // 2, 2, w // 2, 2, 3).mean((1, 3)))
+    return [(p + 0.5).astype(np.uint8) for p in exact]
+
+
+def _packed(image: np.ndarray) -> np.ndarray:
+    r, g, b = np.moveaxis(image.reshape(-1, 3).astype(np.int32), -1, 0)
+    return r | g << 8 | b << 16

@@ -1,0 +1,255 @@
+"""Training recipes: one typed dataclass, read from YAML, with command-line overrides."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from pat.lab.synthesis.rig_distribution import RigDistribution
+from pat.networks.configs import CONFIGS, BandwisePATConfig, GuidedPATConfig, PATConfig
+from pat.support.schema import from_document, near, parse_yaml, to_document
+
+RECIPES = Path(__file__).parent / "recipes"
+RECTIFIED = RigDistribution(mode="rectified", parallax=(6.0, 110.0))
+GENERAL = RigDistribution(mode="general", parallax=(6.0, 90.0), focal_ratio=(0.8, 1.25))
+NetworkConfig = PATConfig | GuidedPATConfig | BandwisePATConfig
+UNSEEN = ("out", "device", "save", "tensorboard", "cache")
+"""Entries that may differ between a run and its continuation: samples and steps do not depend on them."""
+
+
+@dataclass(frozen=True)
+class RecordingConfig:
+    """Degradations of each camera's images."""
+
+    gain: float = 0.3
+    """Probability of another gain, gamma and white balance."""
+    blur: float = 0.25
+    """Probability of Gaussian blur."""
+    noise: float = 0.6
+    """Probability of shot and read noise."""
+    paper: float = 0.3
+    """Probability of one of the paper's four degradations on top, for one beta."""
+    miscalibrated: float = 0.0
+    """Error of the poses that fields are computed from: root mean square displacement of points, pixels."""
+    lens: float = 0.0
+    """Probability of lens distortion (|k1| up to 0.3), the image undistorted before fusion."""
+    spectral: float = 0.0
+    """Probability of random bands, one to four if one beta has them all, instead of red, green and blue."""
+    ideal: bool = False
+    """The ground truth is the scene itself; else it has alpha's luminance as recorded, noise included."""
+
+    def __post_init__(self) -> None:
+        for name in ("gain", "blur", "noise", "paper", "lens", "spectral"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name} is a probability, 0 to 1, got {getattr(self, name):g}")
+        if not 0 <= self.miscalibrated < math.inf:
+            raise ValueError(f"miscalibrated must be 0 or more pixels, got {self.miscalibrated:g}")
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """A recipe. A step sees `groups` times `batch` scenes; there are `steps` steps, or what `minutes` allow.
+
+    Raises ValueError for inconsistent values.
+    """
+
+    photos: tuple[Path, ...] = ()
+    """Folders of photographs: the textures of layered scenes."""
+    out: Path = Path("runs/mono-colour")
+    """Folder for weights, checkpoints, figures and images."""
+    start: Path | None = None
+    """File of weights to start from."""
+    network: NetworkConfig = dataclasses.field(default_factory=GuidedPATConfig)
+    steps: int = 4000
+    """Steps of the whole run."""
+    minutes: float = float("inf")
+    """Time limit of the whole run, minutes."""
+    batch: int = 4
+    """Scenes in a batch."""
+    groups: int = 1
+    """Batches a step, distributed over processes."""
+    hw: tuple[int, int] = (96, 192)
+    """Height and width of alpha in the scenes."""
+    loss: Literal["psnr", "psnr-ssim", "mse"] = "psnr-ssim"
+    """On the image: minus the mean PSNR, with or without SSIM, or the mean squared error."""
+    attention: float = 0.0
+    """Weight of the cross-entropy of PAT's attention to the true position, beside the loss on the image."""
+    rate: float = 8e-4
+    """Learning rate of Adam."""
+    momenta: tuple[float, float] = (0.9, 0.99)
+    """Decay rates of Adam's two averages."""
+    schedule: Literal["cosine", "halving"] = "cosine"
+    """The rate falls along half a cosine, or is halved every 30/80 of the way."""
+    warmup: int = 100
+    """Steps of linear warm-up of the rate."""
+    clip: float = 1.0
+    """Norm that gradients are clipped to; inf for none."""
+    reuse: float = 2.0
+    """How many times a batch of scenes is recorded on average, each time differently."""
+    average: int = 300
+    """Time constant, in steps, of the weight average that is validated and saved."""
+    validate: int = 250
+    """Steps between validations, which save the weights if they are the best so far."""
+    save: int = 250
+    """Steps between checkpoints."""
+    filtered: float = 0.15
+    """Share of the batches with three betas, one a band."""
+    rectified: float = 0.5
+    """Share of the batches with rigs of `rectified_rigs`, the others being of `general_rigs`."""
+    rectified_rigs: RigDistribution = RECTIFIED
+    general_rigs: RigDistribution = GENERAL
+    rendered: float = 0.0
+    """Share of the batches made of rendered scenes instead of layered ones."""
+    rendered_from: tuple[Path, ...] = ()
+    """Folders of rendered scenes, output of `pat render`."""
+    pairs: float = 0.0
+    """Share of the batches made of stereo pairs."""
+    pairs_from: tuple[Path, ...] = ()
+    """Folders of rectified stereo pairs in colour."""
+    measured: float = 0.0
+    """Share of the batches made of stereo pairs with true disparity."""
+    measured_from: tuple[Path, ...] = ()
+    """Folders of Middlebury's stereo pairs, with the true disparity of both images."""
+    recording: RecordingConfig = RecordingConfig()
+    field: str = "epipolar"
+    """The receptive field, by name, or MODULE:OBJECT for your own."""
+    held_out: int = 12
+    """One photograph in so many is for validation only."""
+    seed: int = 0
+    """Random seed."""
+    cache: Path | None = None
+    """File (.npz) that caches the photographs."""
+    device: str = "auto"
+    """Torch device, such as cuda or cpu; auto takes a GPU if there is one."""
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """Precision of convolutions; attention and geometry are in float32."""
+    compile: bool = False
+    """Compile convolutions by torch.compile."""
+    tensorboard: bool = False
+    """Log figures and images for TensorBoard too."""
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "batch", "groups", "average", "validate", "save", "held_out"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        for name in ("attention", "warmup", "seed"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} must be 0 or more, got {getattr(self, name):g}")
+        if not all(0 <= momentum < 1 for momentum in self.momenta):
+            raise ValueError(f"momenta must be from 0 to below 1, got {self.momenta}")
+        for name in ("minutes", "rate", "reuse", "clip"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be more than 0, got {getattr(self, name):g}")
+        if min(self.hw) < 16 or any(side % 16 for side in self.hw):
+            raise ValueError(f"hw must be multiples of 16, got {self.hw[0]} x {self.hw[1]}")
+        self._check_sources()
+
+    def _check_sources(self) -> None:
+        for name in ("filtered", "rectified", "rendered", "pairs", "measured"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name} is a share of the batches, 0 to 1, got {getattr(self, name):g}")
+        for name in ("rendered", "pairs", "measured"):
+            share, folders = getattr(self, name), getattr(self, f"{name}_from")
+            if bool(share) != bool(folders):
+                given = "there is no folder" if share else f"{folders[0]} is given"
+                raise ValueError(
+                    f"{name} is {share:g} and {given}: give both `{name}` and `{name}_from`, or neither"
+                )
+        total = self.rendered + self.pairs + self.measured
+        if total > 1:
+            raise ValueError(f"rendered, pairs and measured are shares of the batches, {total:g} in all")
+
+
+def recipes() -> tuple[str, ...]:
+    """Names of the recipes in the package."""
+    return tuple(sorted(p.stem for p in RECIPES.glob("*.yaml")))
+
+
+def load_config(name: str | Path) -> TrainConfig:
+    """A recipe of the package by name, or a YAML file.
+
+    Raises FileNotFoundError for neither, ValueError naming the entry for what a recipe cannot be.
+    """
+    path = next((p for p in (RECIPES / f"{name}.yaml", Path(name)) if p.is_file()), None)
+    if path is None:
+        raise FileNotFoundError(
+            f"no recipe '{name}' (it is a file or a name of the package){near(name, recipes())}"
+        )
+    return parse_config(path.read_text(encoding="utf-8"), str(path))
+
+
+def parse_config(text: str, name: str = "config") -> TrainConfig:
+    """A recipe from YAML text. Raises ValueError naming the entry."""
+    values = parse_yaml(text, name)
+    try:
+        if not values:
+            raise ValueError(
+                f"the recipe is empty: write entries (name: value), or take {', '.join(recipes())}"
+            )
+        if not isinstance(values, Mapping):
+            raise ValueError(f"wanted entries (name: value), got {values!r}")
+        config = from_document(TrainConfig, {k: v for k, v in values.items() if k != "network"})
+        if "network" not in values:
+            return config
+        network = values["network"]
+        if not isinstance(network, Mapping):
+            raise ValueError(f"network: wanted entries such as kind: GuidedPAT, got {network!r}")
+        kind = network.get("kind", "GuidedPAT")
+        if kind not in CONFIGS:
+            raise ValueError(f"network.kind: no network '{kind}'{near(kind, CONFIGS)}")
+        entries = {k: v for k, v in network.items() if k != "kind"}
+        return replace(config, network=from_document(CONFIGS[kind], entries, "network"))
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from None
+
+
+def config_text(config: TrainConfig) -> str:
+    """The recipe as YAML, every value written out; `parse_config` reads it back."""
+    from arraygeom.runtime.safe_yaml import dump_yaml
+
+    plain = to_document(config, defaults=True)
+    kind = next(name for name, made_of in CONFIGS.items() if type(config.network) is made_of)
+    values = plain | {"network": {"kind": kind} | plain["network"]}
+    return dump_yaml(values, default_flow_style=None, width=118)
+
+
+def save_config(config: TrainConfig, path: Path) -> None:
+    """Write `config_text` atomically."""
+    from arraygeom.runtime.atomic import write_text
+
+    text = config_text(config)
+    write_text(path, text)
+
+
+def command_line(arguments: list[str]) -> TrainConfig:
+    """`[RECIPE] [--name value ...]`: a recipe by name or file, and overrides of its values."""
+    base = TrainConfig()
+    if arguments and not arguments[0].startswith("-"):
+        base, arguments = load_config(arguments[0]), arguments[1:]
+    return tyro.cli(
+        TrainConfig,
+        prog="pat train [RECIPE]",
+        description=(
+            "Train weights on scenes made from photographs while training. RECIPE is a YAML file or one of "
+            f"{', '.join(recipes())}; the options below change it. The same command again continues a run "
+            "that stopped. On N processors: torchrun --nproc_per_node N -m pat train RECIPE --groups N"
+        ),
+        default=base,
+        args=arguments,
+        config=(tyro.conf.AvoidSubcommands, tyro.conf.DisallowNone),
+    )
+
+
+def difference(config: TrainConfig, other: TrainConfig) -> str | None:
+    """The first entry, as "name: a, b", that makes two recipes different runs; None if none does."""
+    for entry in dataclasses.fields(TrainConfig):
+        ours, theirs = getattr(config, entry.name), getattr(other, entry.name)
+        if entry.name not in UNSEEN and ours != theirs:
+            return f"{entry.name}: {ours}, {theirs}"
+    return None

@@ -1,0 +1,353 @@
+"""Samples made in training: layered scenes from photographs, seen by random rigs, recorded by random cameras.
+
+A share of them may come from rendered scenes, and from stereo pairs.
+
+The samples of a step are a pure function of the seed and the number of the step, so that a run continues
+where it stopped, and processes share a step without communication.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import random
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from itertools import islice
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Generator, Tensor
+from torch.nn.functional import interpolate
+
+from arraygeom import Camera, Epipolar, Pair, Pose, ReceptiveField, pixel_grid, rotation_from_vector, sample
+from arraygeom.fields import named_field, pinhole_track
+from arraygeom.fields.grid import FieldOnGrid
+from arraygeom.pixels import HW
+from arraygeom.sampling import Sampled
+from pat.lab.synthesis.layered import ArrayBatch, LayeredScenes
+from pat.lab.synthesis.photos import PhotoBank
+from pat.lab.synthesis.rigs import below
+from pat.matching.inputs import Inputs
+from pat.matching.matches import Matches
+from pat.media.colour import luminance
+from pat.networks.protocol import FusionNetwork, matched_for
+from pat.sensors import Clip, GaussianBlur, Jitter, Noise, Quantise, Step, augment, paper_cases, record
+
+from .config import RecordingConfig, TrainConfig
+from .lenses import LOST, MOST, Spectra, through_lenses
+from .scenes import Crops, RenderedCrops
+from .stereo import MeasuredPairs, PairCrops
+
+CACHED = 48
+"""Groups of scenes cached to be recorded again."""
+FEW = 8
+"""With fewer cached than this, a new one is always made."""
+SCENE, RECORDING = 0, 1
+"""Purpose of a random generator, beside the seed and a number."""
+
+
+class Sample(NamedTuple):
+    """A network's input, the ground truth, and, if known, the true position of each pixel in each beta."""
+
+    alpha: Tensor
+    betas: list[Tensor]
+    fields: list[FieldOnGrid]
+    ground_truth: Tensor
+    position: list[Tensor]
+    visible: list[Tensor]
+    matches: Matches | None = None
+    """Those of the betas, if they are known and the network uses some."""
+
+    @property
+    def inputs(self) -> Inputs:
+        """What a network is given."""
+        return Inputs.of(self.alpha, self.betas, self.fields)
+
+
+class Planned(NamedTuple):
+    """The scenes that a step records: their number, and the kind of their rigs."""
+
+    scenes: int
+    kind: str
+    betas: int
+    dropped: int | None
+    """The number of the scenes to drop from the cache."""
+
+
+def plan(config: TrainConfig, seed: int) -> Iterator[Planned]:
+    """What each step of a recipe records, from step 0: new scenes, or some of the last `CACHED` again."""
+    draw = random.Random(seed)
+    shares = {name: getattr(config, name) for name in ("rendered", "pairs", "measured")}
+    layered = max(1 - sum(shares.values()), 0.0)
+    cached: list[Planned] = []
+    for number in range(2**62):
+        new = len(cached) < FEW or draw.random() < 1 / config.reuse
+        if new:
+            kind = "layered"
+            if layered < 1:  # drawn only where there is a choice: what ships was trained on these sequences
+                kind = draw.choices([*shares, kind], [*shares.values(), layered])[0]
+            if kind == "layered":
+                kind = "rectified" if draw.random() < config.rectified else "general"
+            betas = 3 if draw.random() < config.filtered else 1
+            dropped = cached.pop() if len(cached) > CACHED else None
+            cached.insert(0, Planned(number, kind, betas, None))
+            yield cached[0]._replace(dropped=dropped.scenes if dropped else None)
+        else:
+            yield cached[int(draw.random() * len(cached))]
+
+
+@dataclass
+class SampleSource:
+    """Samples by the number of the step: called with a count it gives the first group of that many steps.
+
+    Scenes are of `layered`, by the kind of their rigs and the number of betas, or of `folders`, by their
+    kind.
+    """
+
+    config: TrainConfig
+    layered: Mapping[tuple[str, int], LayeredScenes]
+    folders: Mapping[str, Crops]
+    seed: int
+    field: ReceptiveField
+    cache: dict[tuple[int, int], ArrayBatch] = dataclasses.field(default_factory=dict)
+
+    def __call__(self, count: int) -> Iterator[Sample]:
+        """The first group of the first `count` steps."""
+        return (group[0] for group in islice(self.steps([0]), count))
+
+    def steps(self, groups: list[int], *, start: int = 0) -> Iterator[list[Sample]]:
+        """The samples of these groups, step by step, from step `start` on."""
+        for step, planned in enumerate(plan(self.config, self.seed)):
+            for key in [key for key in self.cache if key[0] == planned.dropped]:
+                del self.cache[key]
+            if step >= start:
+                yield [self.sample(planned, step, group) for group in groups]
+
+    def sample(self, planned: Planned, step: int, group: int) -> Sample:
+        """One group of one step."""
+        if (planned.scenes, group) not in self.cache:
+            g = _generator(self.seed, SCENE, planned.scenes, group)
+            self.cache[planned.scenes, group] = self._made(planned, g)
+        g = _generator(self.seed, RECORDING, step, group)
+        scenes = self.cache[planned.scenes, group]
+        return degraded(scenes, g, field=self.field, recording=self.config.recording)
+
+    def _made(self, planned: Planned, g: Generator) -> ArrayBatch:
+        if planned.kind in self.folders:
+            crops = self.folders[planned.kind]
+            return crops.sample(self.config.batch, g, number=planned.scenes, betas=planned.betas)
+        return self.layered[planned.kind, planned.betas].sample(self.config.batch, g)
+
+
+def made_ahead(samples: Iterator[list[Sample]], network: FusionNetwork) -> Iterator[list[Sample]]:
+    """Samples with matches: those of the next step are made, and matched, while a step is computed.
+
+    They do not depend on the network's weights, so that results are the same.
+    """
+
+    def following() -> list[Sample]:
+        return [group._replace(matches=matched_for(network, group.inputs)) for group in next(samples)]
+
+    with ThreadPoolExecutor(1) as beside:
+        coming = beside.submit(following)
+        while True:
+            given = coming.result()
+            coming = beside.submit(following)
+            yield given
+
+
+def scenes(config: TrainConfig, *, device: str = "cpu") -> tuple[SampleSource, SampleSource]:
+    """Sources of samples to learn from and to validate on, from different photographs, scenes and pairs."""
+    field, n = named_field(config.field), config.held_out
+    layered = config.rendered + config.pairs + config.measured < 1
+    bank, unseen = photographs(config) if layered else (None, None)
+
+    def source(photos: PhotoBank | None, seed: int, choose: Callable[[int], bool]) -> SampleSource:
+        return source_of(config, photos, seed, field, device, crops(config, seed, device, choose))
+
+    learn = source(bank, config.seed + 1, lambda i: i % n != 0)
+    return learn, source(unseen, config.seed + 2, lambda i: i % n == 0)
+
+
+def source_of(
+    config: TrainConfig,
+    photos: PhotoBank | None,
+    seed: int,
+    field: ReceptiveField,
+    device: str = "cpu",
+    folders: Mapping[str, Crops] = {},
+) -> SampleSource:
+    """A recipe's samples. `photos` may be None where all batches come from `folders`, by kind of scenes."""
+    kinds = {"rectified": config.rectified_rigs, "general": config.general_rigs}
+    layered = {
+        (kind, betas): LayeredScenes(
+            photos, replace(rigs, betas=betas), hw=config.hw, seed=seed, device=device
+        )
+        for kind, rigs in kinds.items()
+        for betas in (1, 3)
+        if photos is not None
+    }
+    return SampleSource(config, layered, folders, seed, field)
+
+
+def crops(config: TrainConfig, seed: int, device: str, choose: Callable[[int], bool]) -> dict[str, Crops]:
+    """Windows of rendered scenes and of pairs, by kind; of each the items chosen by their number."""
+    general, rectified = config.general_rigs.resolutions, config.rectified_rigs.resolutions
+    sources: dict[str, tuple[type[Crops], tuple[Path, ...], tuple[float, ...]]] = {
+        "rendered": (RenderedCrops, config.rendered_from, general),
+        "pairs": (PairCrops, config.pairs_from, rectified),
+        "measured": (MeasuredPairs, config.measured_from, rectified),
+    }
+    return {
+        name: kind(folders, hw=config.hw, resolutions=resolutions, seed=seed, device=device, choose=choose)
+        for name, (kind, folders, resolutions) in sources.items()
+        if folders
+    }
+
+
+def photographs(config: TrainConfig) -> tuple[PhotoBank, PhotoBank]:
+    """Photographs to learn from, and every `held_out`-th for validation.
+
+    Raises ValueError where there are none, or too few to hold some out.
+    """
+    if not config.photos and not (config.cache and config.cache.exists()):
+        raise ValueError("no photographs: give `photos` one or more folders with images")
+    n = config.held_out
+
+    def bank(choose: Callable[[int], bool]) -> PhotoBank:
+        return PhotoBank.load(*config.photos, cache=config.cache, seed=config.seed, choose=choose)
+
+    return bank(lambda i: i % n != 0), bank(lambda i: i % n == 0)
+
+
+def degraded(
+    scene: ArrayBatch,
+    g: Generator,
+    *,
+    field: ReceptiveField = Epipolar(),  # noqa: B008
+    recording: RecordingConfig = RecordingConfig(),  # noqa: B008
+) -> Sample:
+    """Recorded images of a scene: alpha grey, betas in colour (or one band), at alpha's resolution."""
+    images, two_views = _banded(scene, g, recording.spectral), len(scene.images) == 2
+    ideal, grey, cameras = images[0], luminance(scene.images[0]), scene.cameras
+    alpha = recorded(grey, cameras[0], g, recording).values
+    betas, on_grid, position, visible = [], [], [], []
+    for i, image in enumerate(images[1:], 1):
+        band = image if two_views else image[:, i - 1 : i]
+        beta = recorded(band, cameras[i], g, recording, lost=LOST)
+        betas.append(enlarged(beta.values, scene.cameras[0].hw))
+        if two_views and _chance(recording.paper, g):
+            alpha, betas[0], _ = augment(alpha, betas[0], paper_cases(), g)
+        pair = pair_of(scene, i, g)
+        on_grid.append(FieldOnGrid.of(field, perturbed(pair, recording.miscalibrated, g)))
+        if scene.depth:
+            transferred = transfer(pair, scene.depth[0], scene.depth[i].masked_fill(~beta.valid, torch.nan))
+            position.append(transferred[0])
+            visible.append(transferred[1])
+    ground_truth = ideal if recording.ideal else ideal + (alpha - grey)
+    return Sample(alpha, betas, on_grid, ground_truth, position, visible)
+
+
+def _banded(scene: ArrayBatch, g: Generator, spectral: float) -> list[Tensor]:
+    """The scene's images, with this probability in other bands than red, green and blue."""
+    if spectral == 0 or not _chance(spectral, g):
+        return scene.images
+    count = 1 + below(MOST, g) if len(scene.images) == 2 else len(scene.images) - 1
+    spectra = Spectra.drawn(len(scene.images[0]), count, g)
+    return [spectra.of(image) for image in scene.images]
+
+
+def recorded(
+    image: Tensor, camera: Camera, g: Generator, recording: RecordingConfig, *, lost: float = 0.0
+) -> Sampled:
+    """The recorded image, perhaps distorted by a lens and undistorted; up to `lost` missing on each side."""
+
+    def record_here(image: Tensor) -> Tensor:
+        return record(image, steps(g, recording), g)
+
+    b, _, h, w = image.shape
+    if recording.lens and _chance(recording.lens, g):
+        return through_lenses(image, camera, record_here, g, lost=lost)
+    return Sampled(record_here(image), image.new_ones(b, h, w, dtype=torch.bool))
+
+
+def steps(g: Generator, recording: RecordingConfig) -> list[Step]:
+    """Gain, blur and noise of one camera; each with its own probability."""
+    steps: list[Step] = []
+    if _chance(recording.gain, g):
+        steps.append(Jitter(0.04, 0.04, 0.01))
+    if _chance(recording.blur, g):
+        steps.append(GaussianBlur(0.3 + float(torch.rand((), generator=g))))
+    if _chance(recording.noise, g):
+        steps.append(Noise(10 ** (3 + 1.5 * float(torch.rand((), generator=g))), 4.0))
+    return [*steps, Clip(), Quantise(8)]
+
+
+def pair_of(scene: ArrayBatch, beta: int, g: Generator) -> Pair:
+    """The batch of pairs (alpha, beta), beta at alpha's resolution, bounds looser than the scenes' own."""
+    near, far = scene.depth_range.double().unbind(-1)
+    loose = torch.rand(2, len(near), generator=g, dtype=torch.float64).to(near.device)
+    depth = near / (1 + 0.6 * loose[0]), torch.where(loose[1] < 0.5, torch.inf, far * (1 + 2 * loose[1]))
+    cameras = [c.to(torch.float64) for c in scene.cameras]
+    return Pair(cameras[0], cameras[beta].resize(scene.cameras[0].hw), depth)
+
+
+def perturbed(pair: Pair, pixels: float, g: Generator) -> Pair:
+    """The pairs, betas rotated at random, points moving by about `pixels`, root mean square, on each axis."""
+    if pixels == 0:
+        return pair
+    alpha, beta = pair.cameras
+    drawn = torch.randn(len(beta.K), 3, generator=g, dtype=torch.float64).to(beta.K)
+    rotation = rotation_from_vector(drawn * pixels / beta.K[:, :1, 0])
+    moved: Camera = beta.replace(
+        cam_from_world=Pose(rotation, torch.zeros_like(beta.t)) @ beta.cam_from_world
+    )
+    return Pair(alpha, moved, pair.depth)
+
+
+def transfer(pair: Pair, depth: Tensor, beta_depth: Tensor) -> tuple[Tensor, Tensor]:
+    """Positions of alpha's pixels in beta (B, h, w, 2); whether beta sees the same surface there (B, h, w).
+
+    Pixels without depth (NaN) are not visible, and at (0, 0).
+    """
+    hw = pair.alpha.hw
+    track = pinhole_track(pair, pixel_grid(hw, device=depth.device).reshape(1, -1, 2))
+    z = depth.reshape(len(depth), -1)
+    x = track.at(1 / z)
+    expected = (track.a[..., 2] + track.b[..., 2] / z) * z
+    native = beta_depth[:, None].reciprocal()
+    scale = x.new_tensor([beta_depth.shape[-1] / pair.beta.hw[1], beta_depth.shape[-2] / pair.beta.hw[0]])
+    sampled = sample(native, (x + 0.5) * scale - 0.5, interpolation="nearest")
+    visible = sampled.valid & ((sampled.values[:, 0] * expected - 1).abs() < 0.02)
+    return x.nan_to_num(0.0).reshape(-1, *hw, 2), visible.reshape(-1, *hw)
+
+
+def alone(sample: Sample, i: int) -> Sample:
+    """The i-th of a group of samples."""
+
+    def one(parts: Sequence[Tensor]) -> list[Tensor]:
+        return [tensor if len(tensor) == 1 else tensor[i : i + 1] for tensor in parts]
+
+    alpha, ground_truth = one([sample.alpha, sample.ground_truth])
+    on_grid = [f.of_one(i) for f in sample.fields]
+    return Sample(alpha, one(sample.betas), on_grid, ground_truth, one(sample.position), one(sample.visible))
+
+
+def enlarged(image: Float[Tensor, "b c hb wb"], hw: HW) -> Float[Tensor, "b c h w"]:
+    """An image enlarged to another one's size (bicubic)."""
+    if image.shape[-2:] == hw:
+        return image
+    return interpolate(image, size=hw, mode="bicubic", align_corners=False).clamp(0, 1)
+
+
+def _chance(p: float, g: Generator) -> bool:
+    return bool(torch.rand((), generator=g) < p)
+
+
+def _generator(*numbers: int) -> Generator:
+    """A generator of its own for each sequence of numbers."""
+    return Generator().manual_seed(int(np.random.SeedSequence(numbers).generate_state(1)[0]))

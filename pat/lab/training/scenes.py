@@ -1,0 +1,225 @@
+"""Rendered scenes as training samples: a random window of any camera as alpha, of any others as betas.
+
+Folders hold the output of `pat render`. Scenes may differ in their rigs and image sizes; images of cameras
+with a lens model are undistorted as `pat fuse` does it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import TypeVar
+
+import torch
+from jaxtyping import Float
+from torch import Generator, Tensor
+
+from arraygeom.batching import stack
+from arraygeom.camera import Camera
+from arraygeom.pixels import HW, pixel_grid
+from arraygeom.rig import Rig
+from pat.lab.data.windows import (
+    RenderedView,
+    pinhole_of,
+    read_view,
+    scene_folders,
+    scene_rig,
+    undistorted,
+    window,
+)
+from pat.lab.synthesis.layered import ArrayBatch
+from pat.lab.synthesis.rigs import below, in_frame_of, one_of, scaled
+from pat.media.colour import srgb_image
+from pat.sensors import generator_for
+
+T = TypeVar("T")
+ACTIVE = 8
+"""Scenes, or pairs, that samples are drawn from at a time; their images stay in memory."""
+GROUPS_PER_EXCHANGE = 8
+"""After so many groups of samples one of the active items is exchanged."""
+REDUCED = 4
+"""The largest reduction of a window."""
+SKY = 1e6
+"""Distance from the camera, in metres, assigned to what is infinitely far: its parallax is negligible."""
+DECENTRED = 0.1
+"""Largest random shift of a beta's window, as a fraction of its size."""
+
+
+class Crops:
+    """Random windows of what is in folders; `hw` is alpha's size in the samples.
+
+    `resolutions` are those of betas, as in `RigDistribution`; `choose` selects items by their number.
+    """
+
+    def __init__(
+        self,
+        roots: Sequence[Path],
+        *,
+        hw: HW,
+        resolutions: tuple[float, ...] = (1.0,),
+        seed: int = 0,
+        device: str = "cpu",
+        choose: Callable[[int], bool] = lambda i: True,
+    ):
+        self.hw, self.resolutions, self.seed, self.device = hw, resolutions, seed, device
+        self._find(roots, choose)
+
+    def _find(self, roots: Sequence[Path], choose: Callable[[int], bool]) -> None:
+        """List the items, and refuse what cannot be used."""
+        raise NotImplementedError
+
+    def sample(self, batch: int, generator: Generator, *, number: int, betas: int = 1) -> ArrayBatch:
+        """Windows of group `number`, of the items active then."""
+        raise NotImplementedError
+
+    def beta_sizes(self, betas: int, generator: Generator) -> list[HW]:
+        """Sizes of betas, drawn."""
+        return [scaled(self.hw, one_of(self.resolutions, generator)) for _ in range(betas)]
+
+
+class RenderedCrops(Crops):
+    """Random windows of the rendered scenes in folders.
+
+    Raises ValueError for a folder without scenes or with an incomplete one, for a scene of one camera, and
+    for one of which no image is as large as `hw`; when it is read, for one whose images cannot be read.
+    """
+
+    def _find(self, roots: Sequence[Path], choose: Callable[[int], bool]) -> None:
+        folders = [folder for root in roots for folder in scene_folders(root)]
+        self.folders = chosen(folders, choose, f"rendered scenes of {', '.join(map(str, roots))}")
+        rigs = [scene_rig(folder) for folder in self.folders]
+        self.names = [rig.names for rig in rigs]
+        self.alphas = [large_enough(folder, rig, self.hw) for folder, rig in zip(self.folders, rigs)]
+        self._view = lru_cache(3 * ACTIVE)(
+            lambda scene, name: undistorted(read_view(self.folders[scene], name))
+        )
+
+    def sample(self, batch: int, generator: Generator, *, number: int, betas: int = 1) -> ArrayBatch:
+        """Windows of group `number`, of the scenes active then.
+
+        If a scene has fewer other cameras than betas are wanted, several betas are of the same camera.
+        """
+        scenes = active_items(number, len(self.folders), self.seed)
+        sizes = self.beta_sizes(betas, generator)
+        with torch.no_grad():
+            drawn = [self._windows(one_of(scenes, generator), sizes, generator) for _ in range(batch)]
+        return batched(drawn, self.device)
+
+    def _windows(self, scene: int, sizes: list[HW], g: Generator) -> list[RenderedView]:
+        """Alpha's window and one of each beta."""
+        name = one_of(self.alphas[scene], g)
+        names = [n for n in self.names[scene] if n != name]
+        order = [names[i] for i in torch.randperm(len(names), generator=g).tolist()]
+        whole = self._view(scene, name)
+        times = 1 + below(min(REDUCED, *(a // b for a, b in zip(whole.camera.hw, self.hw))), g)
+        size = self.hw[0] * times, self.hw[1] * times
+        top, left = [below(a - b + 1, g) for a, b in zip(whole.camera.hw, size)]
+        alpha = finite_window(whole, top, left, size, self.hw)
+        betas = [self._view(scene, order[i % len(order)]) for i in range(len(sizes))]
+        return [alpha, *(beside(alpha, beta, small, self.hw, g) for beta, small in zip(betas, sizes))]
+
+
+def active_items(number: int, count: int, seed: int) -> list[int]:
+    """Which of `count` items group `number` of samples is drawn from: a function of these numbers alone.
+
+    >>> active_items(0, 3, seed=0) == active_items(100, 3, seed=0) == [0, 1, 2]
+    True
+    """
+    if count <= ACTIVE:
+        return list(range(count))
+    first = number // GROUPS_PER_EXCHANGE
+    return [_order(count, seed, i // count)[i % count] for i in range(first, first + ACTIVE)]
+
+
+@lru_cache(8)
+def _order(count: int, seed: int, epoch: int) -> list[int]:
+    return torch.randperm(count, generator=generator_for(seed, "order", epoch)).tolist()
+
+
+def chosen(every: list[T], choose: Callable[[int], bool], what: str) -> list[T]:
+    """Those chosen by their number. Raises ValueError if none is."""
+    items = [item for i, item in enumerate(every) if choose(i)]
+    if not items:
+        raise ValueError(
+            f"{what}: {len(every)} are too few to learn from some and to hold others out: give more"
+        )
+    return items
+
+
+def large_enough(folder: Path, rig: Rig, hw: HW) -> list[str]:
+    """The cameras of a scene that can be alpha. Raises ValueError if none can, or there is no other."""
+    sizes = {name: pinhole_of(c).hw for name, c in rig.cameras.items() if isinstance(c, Camera)}
+    count = len(rig.names)
+    if len(sizes) < max(count, 2):
+        raise ValueError(
+            f"{folder}: has {len(sizes)} calibrated cameras of {count}: all must be, two at least"
+        )
+    names = [name for name, size in sizes.items() if size[0] >= hw[0] and size[1] >= hw[1]]
+    if not names:
+        listed = ", ".join(f"{name} {w}x{h}" for name, (h, w) in sizes.items())
+        raise ValueError(
+            f"{folder}: no image is as large as the samples, {hw[1]}x{hw[0]} ({listed}): lower `hw`"
+        )
+    return names
+
+
+def beside(alpha: RenderedView, beta: RenderedView, size: HW, hw: HW, g: Generator) -> RenderedView:
+    """A window of beta with alpha's angle of view, about where alpha's centre projects at a random depth."""
+    ratio = pixels_per_radian(beta.camera) / pixels_per_radian(alpha.camera)
+    wanted = (max(round(hw[0] * ratio), 1), max(round(hw[1] * ratio), 1))
+    middle = torch.tensor([(hw[1] - 1) / 2, (hw[0] - 1) / 2], dtype=torch.float64)
+    near, far = (float(d) for d in bounds(alpha.depth[None])[0])
+    share = float(torch.rand((), generator=g))
+    depth = middle.new_tensor(1 / (share / near + (1 - share) / far))
+    projected = beta.camera.project(alpha.camera.unproject(middle, depth))
+    shift = DECENTRED * (2 * torch.rand(2, generator=g, dtype=torch.float64) - 1)
+    centre = (
+        projected.x
+        if bool(projected.valid)
+        else middle.new_tensor([beta.camera.hw[1] / 2, beta.camera.hw[0] / 2])
+    )
+    x, y = (centre + shift * middle.new_tensor([wanted[1], wanted[0]])).tolist()
+    top, left = (_inside(c - n / 2, n, whole) for c, n, whole in zip((y, x), wanted, beta.camera.hw))
+    return finite_window(beta, top, left, wanted, size)
+
+
+def _inside(start: float, length: int, whole: int) -> int:
+    """Where a window starts, shifted into the image, or centred on it where it is larger."""
+    low, high = sorted((0, whole - length))
+    return round(min(max(start, low), high))
+
+
+def pixels_per_radian(camera: Camera) -> float:
+    """The angular resolution in the middle of the image."""
+    return float(camera.K[:2, :2].det().abs().sqrt())
+
+
+def finite_window(view: RenderedView, top: int, left: int, size: HW, hw: HW) -> RenderedView:
+    """A `window` whose infinite depths are replaced by those of a distance `SKY`."""
+    cut = window(view, top, left, size, hw)
+    rays, _ = cut.camera.rays(pixel_grid(hw, dtype=torch.float64))
+    return cut._replace(
+        depth=torch.where(cut.depth.isposinf(), (SKY / rays.norm(dim=-1)).to(cut.depth), cut.depth)
+    )
+
+
+def bounds(depth: Float[Tensor, "b h w"]) -> Float[Tensor, "b 2"]:
+    """The nearest and the farthest depth; `SKY` where nothing is seen."""
+    unseen = depth.isnan()
+    near = torch.where(unseen, SKY, depth).flatten(1).amin(1)
+    return torch.stack([near, torch.maximum(near, torch.where(unseen, 0.0, depth).flatten(1).amax(1))], -1)
+
+
+def batched(drawn: Sequence[Sequence[RenderedView]], device: str) -> ArrayBatch:
+    """Samples of views of the same sizes, each with alpha first, as one batch."""
+    views = list(zip(*drawn))
+    images = [srgb_image(torch.stack([v.rgb for v in same])).to(device) for same in views]
+    depth = [torch.stack([v.depth for v in same]).to(device) for same in views]
+    cameras = [
+        stack([in_frame_of(alpha.camera, v.camera) for alpha, v in zip(views[0], same)]).to(
+            device, torch.float32
+        )
+        for same in views
+    ]
+    return ArrayBatch(images, depth, cameras, bounds(depth[0]))

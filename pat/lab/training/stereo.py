@@ -1,0 +1,186 @@
+"""Stereo pairs as training samples: a random window of an image as alpha and truth, of the other as beta.
+
+Where their depth is not known, the loss is on the image alone. Their cameras are assumed: rectified, a metre
+apart, with the pair's range of disparities.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from PIL import Image, UnidentifiedImageError
+from torch import Generator, Tensor
+
+from arraygeom.camera import Camera, intrinsics
+from arraygeom.pixels import HW
+from arraygeom.pose import Pose
+from pat.lab.data.pairs import PairFiles, pair_files
+from pat.lab.data.windows import reduced
+from pat.lab.synthesis.layered import ArrayBatch
+from pat.lab.synthesis.rigs import below, one_of
+from pat.media.images import read_image
+
+from .scenes import ACTIVE, Crops, active_items, chosen
+
+DISPARITIES = ("disp2.png", "disp6.png"), ("disp1.png", "disp5.png")
+"""Files of the disparity of the left and of the right image."""
+REDUCED = 2
+"""The largest reduction of a window: images found online are often less sharp than their pixels."""
+
+
+class Pictures(NamedTuple):
+    """Two images (3, H, W), the largest disparity, pixels; and their disparities (H, W), 0 if not known."""
+
+    left: Tensor
+    right: Tensor
+    largest: float
+    disparities: tuple[Tensor, ...] = ()
+
+
+class PairCrops(Crops):
+    """Random windows of the rectified stereo pairs in folders.
+
+    Raises ValueError for a folder without pairs, for a pair whose images differ in size, are not in colour or
+    are smaller than `hw`; when it is read, for an image that cannot be read.
+    """
+
+    def _find(self, roots: Sequence[Path], choose: Callable[[int], bool]) -> None:
+        pairs = [pair for root in roots for pair in pair_files(root)]
+        self.pairs = chosen(pairs, choose, f"stereo pairs of {', '.join(map(str, roots))}")
+        for pair in self.pairs:
+            self.check(pair)
+        self._pictures = lru_cache(ACTIVE)(lambda i: self.read(self.pairs[i]))
+
+    def check(self, pair: PairFiles) -> None:
+        """Raise ValueError unless both images are in colour, of one size, and at least `hw`."""
+        left, right = _header(pair.left), _header(pair.right)
+        if left != right:
+            raise ValueError(
+                f"{pair.left} is {_described(left)} and {pair.right.name} "
+                f"{_described(right)}: pairs must be alike"
+            )
+        if left[2] == 1:
+            raise ValueError(f"{pair.left} is grey: pairs to train on must be in colour")
+        h, w = self.hw
+        if left[0] < h or left[1] < w:
+            raise ValueError(
+                f"{pair.left} is {_described(left)}, smaller than the samples, {w}x{h}: lower `hw`"
+            )
+
+    def read(self, pair: PairFiles) -> Pictures:
+        """The images of a pair."""
+        return Pictures(read_image(pair.left), read_image(pair.right), pair.max_disparity)
+
+    def sample(self, batch: int, generator: Generator, *, number: int, betas: int = 1) -> ArrayBatch:
+        """Windows of group `number`, of the pairs active then. Several betas are of the same camera.
+
+        `depth` is NaN where it is not known, and there is none without disparities.
+        """
+        active = active_items(number, len(self.pairs), self.seed)
+        sizes = self.beta_sizes(betas, generator)
+        drawn = [self._window(one_of(active, generator), generator) for _ in range(batch)]
+        images, disparities, sides, largest = zip(*drawn)
+        alpha, beta = (torch.stack(same) for same in zip(*images))
+        side, nearest = (torch.tensor(numbers, dtype=torch.float64) for numbers in (sides, largest))
+        shown = [alpha, *(reduced(beta, size).clamp(max=1) for size in sizes)]
+        cameras = assumed_cameras(shown, side, nearest, self.device)
+        if not disparities[0]:
+            return cameras
+        near, far = (depth_of(torch.stack(same), self.hw[1]) for same in zip(*disparities))
+        depth = [near, *(coarser(far, size) for size in sizes)]
+        return replace(cameras, depth=[d.to(self.device) for d in depth])
+
+    def _window(self, i: int, g: Generator) -> tuple[list[Tensor], list[Tensor], float, float]:
+        """Alpha and beta, their disparities, 1 where alpha is left, -1 where right, the largest disparity."""
+        pictures, (h, w) = self._pictures(i), self.hw
+        whole = pictures.left.shape[1:]
+        times = 1 + below(min(REDUCED, whole[0] // h, whole[1] // w), g)
+        top, left = (below(n - times * m + 1, g) for n, m in zip(whole, self.hw))
+        window = slice(top, top + times * h), slice(left, left + times * w)
+        cut = [p[None, :, *window] for p in (pictures.left, pictures.right)]
+        images = [reduced(p, self.hw)[0].clamp(max=1) for p in cut]
+        disparities = [d[window][::times, ::times] / times for d in pictures.disparities]
+        if below(2, g):
+            return images, disparities, 1.0, pictures.largest / times
+        return images[::-1], disparities[::-1], -1.0, pictures.largest / times
+
+
+class MeasuredPairs(PairCrops):
+    """Random windows of Middlebury's pairs in folders, of the collections of 2003, 2005 and 2006.
+
+    Raises ValueError as `PairCrops`, and for a pair without the disparity of both images.
+    """
+
+    def check(self, pair: PairFiles) -> None:
+        """Raise ValueError for a pair that cannot be used."""
+        super().check(pair)
+        disparity_files(pair)
+
+    def read(self, pair: PairFiles) -> Pictures:
+        """The images and disparities of a pair."""
+        left, right = (read_image(path)[0] * 255 for path in disparity_files(pair))
+        scale = 255 / pair.max_disparity
+        return super().read(pair)._replace(disparities=(left / scale, right / scale))
+
+
+def disparity_files(pair: PairFiles) -> tuple[Path, Path]:
+    """Of the left and of the right image. Raises ValueError where one is missing."""
+    for names in DISPARITIES:
+        left, right = (pair.left.with_name(name) for name in names)
+        if left.is_file() and right.is_file():
+            return left, right
+    raise ValueError(
+        f"{pair.left.parent}: wanted the true disparity of both images beside them, disp1.png and disp5.png"
+    )
+
+
+def depth_of(disparity: Float[Tensor, "b h w"], width: int) -> Float[Tensor, "b h w"]:
+    """Of the cameras of `assumed_cameras`, in metres; NaN where the disparity is 0."""
+    return torch.where(disparity > 0, width / disparity, torch.nan)
+
+
+def coarser(depth: Float[Tensor, "b h w"], hw: HW) -> Float[Tensor, "b hs ws"]:
+    """The depth at about the centres of larger pixels, never a mean across an edge."""
+    h, w = depth.shape[-2:]
+    rows, columns = (((torch.arange(n) + 0.5) * whole / n).long() for n, whole in zip(hw, (h, w)))
+    return depth[:, rows][:, :, columns]
+
+
+def assumed_cameras(
+    images: list[Tensor], side: Float[Tensor, " b"], disparity: Float[Tensor, " b"], device: str
+) -> ArrayBatch:
+    """The images, alpha first, cameras a metre apart that put the nearest points `disparity` pixels apart."""
+    batch, _, h, w = images[0].shape
+    K = intrinsics(float(w), (h, w)).expand(batch, 3, 3)
+    t = torch.zeros(batch, 3, dtype=torch.float64)
+    alpha = Camera(
+        K=K, cam_from_world=Pose(torch.eye(3, dtype=torch.float64).expand(batch, 3, 3), t), hw=(h, w)
+    )
+    beta = alpha.replace(cam_from_world=Pose(alpha.R, torch.stack([-side, t[:, 1], t[:, 2]], -1)))
+    betas = [beta.resize((p.shape[-2], p.shape[-1])) for p in images[1:]]
+    cameras = [camera.to(device, torch.float32) for camera in (alpha, *betas)]
+    near = w / disparity
+    bounds = torch.stack([near, torch.full_like(near, torch.inf)], -1).to(device, torch.float32)
+    return ArrayBatch([p.to(device) for p in images], [], cameras, bounds)
+
+
+def _header(file: Path) -> tuple[int, int, int]:
+    """Height, width and channels (1 or 3) of an image, without reading it whole."""
+    try:
+        with Image.open(file) as image:
+            return image.height, image.width, 1 if image.mode[0] in "1LIF" else 3
+    except (OSError, UnidentifiedImageError):
+        raise ValueError(
+            f"{file}: not an image that can be read: give a whole PNG, TIFF or JPEG file"
+        ) from None
+
+
+def _described(header: tuple[int, int, int]) -> str:
+    h, w, channels = header
+    return f"{w}x{h} {'grey' if channels == 1 else 'in colour'}"

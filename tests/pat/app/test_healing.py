@@ -1,0 +1,91 @@
+"""A rig that is only roughly right is healed by its images, and the healed one written beside."""
+
+import pytest
+import torch
+from torch.nn.functional import avg_pool2d
+
+from arraygeom import Pose, Rig, Sensor, rotation_from_vector
+from pat.app.healing import checked_rig
+from pat.app.sample_array import load_sample
+from pat.fusion.views import ViewFiles
+from pat.media.images import read_image, write_image
+from pat.support.metrics import score
+from tests.pat.commands import images, pat
+
+
+@pytest.fixture(scope="module")
+def material(tmp_path_factory):
+    """The sample array at half its size, a rig as with a ruler, both in files, and the ground truth."""
+    folder, sample = tmp_path_factory.mktemp("healing"), load_sample()
+    rig = sample.rig.resize("mono", (200, 320)).resize("colour", (180, 280))
+    for name, image in sample.images.items():
+        write_image(folder / f"{name}.png", avg_pool2d(image, 2))
+    camera = rig["colour"]
+    tilted = rotation_from_vector(torch.tensor([0.04, 0.0, 0.03], dtype=torch.float64)) @ camera.R
+    rough = camera.replace(
+        cam_from_world=Pose(tilted, camera.t), K=camera.K * camera.K.new_tensor([[1.03], [1.03], [1]])
+    )
+    rig.save(folder / "right.yaml")
+    rig.with_camera("colour", rough).save(folder / "rough.yaml")
+    return folder, avg_pool2d(sample.ground_truth, 2)
+
+
+def fused(folder, rig, out):
+    files = images(folder, "mono", "colour")
+    how = "--weights mono-colour-small --no-report"
+    pat(f"fuse {folder / rig} --alpha mono {files} {how} -o {folder / out}")
+    return read_image(folder / out / "fused.png")
+
+
+def test_a_frame_heals_its_own_rig_and_says_so(material, capsys):
+    """A rig measured with a ruler gave a ghosted image of low confidence."""
+    folder, ground_truth = material
+    before = (folder / "rough.yaml").read_text()
+    right, healed = (fused(folder, f"{name}.yaml", name) for name in ("right", "rough"))
+    said = " ".join(capsys.readouterr().err.split())
+    assert "the rig is healed by these images: points lay" in said
+    assert score(healed, ground_truth).psnr > score(right, ground_truth).psnr - 0.5
+    assert (folder / "rough.yaml").read_text() == before
+    written = Rig.load(folder / "rough" / "healed_rig.yaml")
+    assert written.names == ("mono", "colour")
+    assert not (folder / "right" / "healed_rig.yaml").exists()
+
+
+def test_a_rig_of_the_same_name_as_the_healed_one_is_kept(material, capsys):
+    folder, _ = material
+    given = folder / "same" / "healed_rig.yaml"
+    given.parent.mkdir()
+    given.write_text((folder / "rough.yaml").read_text())
+    before = given.read_text()
+    fused(folder, "same/healed_rig.yaml", "same")
+    assert given.read_text() == before
+    assert "the healed rig is not written" in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_healed_rig_is_of_the_files_as_they_were_recorded(material):
+    """It was of the developed images: of many frames and by the next command, raw ones were not developed."""
+    folder, _ = material
+    rig = Rig.load(folder / "rough.yaml")
+    rig = rig.with_camera("colour", rig["colour"].replace(sensor=Sensor("rgb", bits=8, black_level=2.0)))
+    files = {name: folder / f"{name}.png" for name in rig.names}
+    healed = checked_rig(ViewFiles(rig, files, alpha="mono"), heal=True)
+    assert {name: healed.rig[name].sensor for name in files} == {name: rig[name].sensor for name in files}
+
+
+def test_a_right_rig_is_left_as_it_is(material):
+    folder, _ = material
+    views = ViewFiles(
+        Rig.load(folder / "right.yaml"), {n: folder / f"{n}.png" for n in ("mono", "colour")}, alpha="mono"
+    )
+    assert checked_rig(views, heal=True) is None
+
+
+def test_a_refusal_of_refine_has_a_status_of_its_own_and_says_what_to_do(material, capsys):
+    folder, _ = material
+    files = images(folder, "mono", "colour")
+    with pytest.raises(SystemExit) as stop:
+        pat(f"rig refine {folder / 'rough.yaml'} {files} --no-photometric -o {folder / 'x.yaml'}")
+    assert stop.value.code == 4
+    said = " ".join(capsys.readouterr().err.split())
+    assert f"or fuse without a rig: `pat fuse {folder / 'colour.png'} {folder / 'mono.png'}`" in said
+    assert not (folder / "x.yaml").exists()

@@ -1,0 +1,71 @@
+"""Every way in which rendering can be refused is one line, and no crash of Blender reaches the caller."""
+
+import importlib
+import sys
+
+import pytest
+import torch
+
+from arraygeom.camera import Camera, intrinsics
+from arraygeom.rig import Rig
+from pat.lab.synthesis.blender import RenderSettings, compat, render, render_here, task
+from pat.lab.synthesis.blender.settings import PRESETS
+from tests.pat.lab.synthesis.scenes import posed, room_scene, unlike_cameras
+
+RIG = unlike_cameras()
+SETTINGS = RenderSettings(samples=1)
+
+
+def without(monkeypatch, error: Exception) -> None:
+    def fail(name):
+        raise error
+
+    monkeypatch.setattr(importlib, "import_module", fail)
+
+
+def test_skew_is_refused_before_blender_starts(tmp_path):
+    skewed = RIG["oblong"].replace(K=RIG["oblong"].K + torch.tensor([[0, 0.5, 0], [0, 0, 0], [0, 0, 0]]))
+    with pytest.raises(ValueError, match=r"'oblong' .*skew"):
+        render_here(room_scene(), RIG.with_camera("oblong", skewed), tmp_path / "x", settings=SETTINGS)
+    assert "bpy" not in sys.modules
+
+
+def test_errors_of_a_process_of_its_own_come_back_as_they_are(tmp_path):
+    (tmp_path / "x").mkdir()
+    with pytest.raises(ValueError, match="exists: give a new folder"):
+        render(room_scene(), RIG, tmp_path / "x", settings=SETTINGS)
+
+
+def test_a_camera_inside_an_object_is_refused():
+    moved = RIG["shifted"].replace(cam_from_world=posed((0, 0, 0), (-0.7, -0.3, 4.1)))
+    rig = RIG.with_camera("shifted", moved)
+    with pytest.raises(ValueError, match=r"'shifted' .*'sphere' .*0 s"):
+        task.refuse_inside(room_scene(), rig, task.shots(rig, SETTINGS))
+
+
+def test_another_version_of_python_is_refused(monkeypatch):
+    without(monkeypatch, ModuleNotFoundError("No module named 'bpy'", name="bpy"))
+    monkeypatch.setattr(sys, "version_info", (3, 12, 1))
+    with pytest.raises(ValueError, match=r"3.11 .*3.13 .*3.12$"):
+        compat.load()
+    monkeypatch.setattr(sys, "version_info", (3, 11, 2))
+    with pytest.raises(ValueError, match=r"pip install 'arraygeom-pat\[synthesis\]'$"):
+        compat.load()
+
+
+def test_missing_libraries_are_named_with_the_packages_that_bring_them(monkeypatch):
+    without(
+        monkeypatch, ImportError("libX11.so.6: cannot open shared object file: No such file or directory")
+    )
+    with pytest.raises(ValueError, match=r"libX11.so.6.* apt-get install -y libx11-6 .* libgl1$"):
+        compat.load()
+
+
+def test_presets_fit_the_rig_to_their_width():
+    camera = Camera(K=intrinsics(600.0, (768, 1024)), cam_from_world=posed(), hw=(768, 1024))
+    rig = Rig({"a": camera, "b": camera.resize((300, 400))})
+    for name, hw in (("fast", (384, 512)), ("paper", (1536, 2048))):
+        fitted = task.fitted(rig, RenderSettings(**PRESETS[name]))
+        assert fitted["a"].hw == hw
+        torch.testing.assert_close(fitted["a"].K, camera.resize(hw).K)
+    assert task.fitted(rig, RenderSettings()) is rig

@@ -1,0 +1,127 @@
+"""Recipes: from YAML and back, over the command line, and what is wrong with one."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import yaml
+
+from pat.lab.training.config import (
+    TrainConfig,
+    command_line,
+    config_text,
+    difference,
+    load_config,
+    parse_config,
+    recipes,
+    save_config,
+)
+from pat.networks.configs import GuidedPATConfig, PATConfig
+
+
+def test_written_and_read_back(tmp_path):
+    config = TrainConfig(
+        photos=(Path("a"), Path("b")), network=PATConfig(dim=8), minutes=3.5, cache=Path("c.npz")
+    )
+    save_config(config, tmp_path / "c.yaml")
+    assert load_config(tmp_path / "c.yaml") == config
+    assert parse_config(config_text(TrainConfig())) == TrainConfig()
+    assert yaml.safe_load(config_text(config))["network"]["kind"] == "PAT"
+
+
+@pytest.mark.parametrize("name", recipes())
+def test_recipes_of_the_package(name):
+    config = load_config(name)
+    assert config.out == Path("runs") / name
+    assert parse_config(config_text(config)) == config
+
+
+def test_the_papers_recipes_are_the_papers():
+    two, four = load_config("paper-2"), load_config("paper-4")
+    assert (two.network, four.network) == (PATConfig(), PATConfig(betas=3, in_channels=1))
+    assert two.steps * two.batch == four.steps * four.batch == 80 * 800 * 49
+    assert (two.rate, two.schedule, two.loss, two.hw) == (2e-4, "halving", "mse", (32, 96))
+    assert two.recording.paper == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("batchs: 4", "c: batchs: unknown key; did you mean 'batch'?"),
+        ("recording: {gian: 1}", "c: recording.gian: unknown key; did you mean 'gain'?"),
+        ("network: {kind: PAT, dimm: 8}", "c: network.dimm: unknown key; did you mean 'dim'?"),
+        (
+            "network: {kind: Pat}",
+            "c: network.kind: no network 'Pat'; known here: PAT, GuidedPAT, BandwisePAT",
+        ),
+        ("network: 3", "c: network: wanted entries such as kind: GuidedPAT, got 3"),
+        ("batch: four", "c: batch: is 'four'; wanted a whole number"),
+        ("batch: 4.5", "c: batch: is 4.5; wanted a whole number"),
+        ("batch: true", "c: batch: is True; wanted a whole number"),
+        ("rate: fast", "c: rate: is 'fast'; wanted a number"),
+        ("hw: [96]", "c: hw: has 1 entries; wanted 2"),
+        ("hw: [96, 100]", "c: hw must be multiples of 16, got 96 x 100"),
+        ("schedule: cosin", "c: schedule: is 'cosin'; did you mean 'cosine'?"),
+        ("compile: 1", "c: compile: is 1; wanted true or false"),
+        ("steps: 0", "c: steps must be at least 1, got 0"),
+        ("minutes: -1", "c: minutes must be more than 0, got -1"),
+        ("filtered: 2", "c: filtered is a share of the batches, 0 to 1, got 2"),
+        ("rectified: -.5", "c: rectified is a share of the batches, 0 to 1, got -0.5"),
+        ("recording: {noise: 60}", "c: recording: noise is a probability, 0 to 1, got 60"),
+        ("recording: {miscalibrated: .nan}", "c: recording"),
+        ("seed: -1", "c: seed must be 0 or more, got -1"),
+        ("warmup: -5", "c: warmup must be 0 or more, got -5"),
+        ("momenta: [0.9, 1.5]", "c: momenta must be from 0 to below 1"),
+        ("general_rigs: {near: [0, 2]}", "c: general_rigs: near must be two positive numbers in order"),
+        ("general_rigs: {resolutions: []}", "c: general_rigs: betas must be at least 1 and resolutions"),
+        ("rendered: 1.5", "c: rendered is a share of the batches, 0 to 1, got 1.5"),
+        ("rendered: 0.5", "c: rendered is 0.5 and there is no folder: give both `rendered` and"),
+        ("pairs_from: a", "c: pairs is 0 and a is given: give both `pairs` and `pairs_from`"),
+        ("measured: 0.5", "c: measured is 0.5 and there is no folder: give both `measured` and"),
+        ("measured_from: [a]", "give both `measured` and `measured_from`"),
+        ("{rendered: 0.7, rendered_from: a, pairs: 0.7, pairs_from: [b]}", "of the batches, 1.4 in all"),
+        ("{measured: 0.6, measured_from: [a], pairs: 0.6, pairs_from: [b]}", "of the batches, 1.2 in all"),
+        ("attention: -1", "c: attention must be 0 or more"),
+        ("# to do", "c: the recipe is empty: write entries (name: value), or take mono-colour, "),
+        ("[1, 2]", "c: wanted entries (name: value), got [1, 2]"),
+        ("a: [", "c: not valid YAML at line 2"),
+    ],
+)
+def test_what_is_wrong_is_named_in_one_line(text, message):
+    with pytest.raises(ValueError) as caught:
+        parse_config(text, "c")
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_numbers_as_people_write_them():
+    config = parse_config("{rate: 8e-4, minutes: inf, steps: 1e5, photos: ~/images, start: null}")
+    assert (config.rate, config.minutes, config.steps) == (8e-4, float("inf"), 100_000)
+    assert config.photos == (Path.home() / "images",)
+
+
+def test_the_command_line_goes_over_the_recipe(tmp_path):
+    save_config(TrainConfig(batch=6, network=GuidedPATConfig(taps=9)), tmp_path / "c.yaml")
+    config = command_line(
+        [
+            str(tmp_path / "c.yaml"),
+            "--rate",
+            "1e-3",
+            "--network.window",
+            "3",
+            "--general-rigs.focal-ratio",
+            "1",
+            "3",
+        ]
+    )
+    assert (config.batch, config.rate, config.network.taps, config.network.window) == (6, 1e-3, 9, 3.0)
+    assert config.general_rigs.focal_ratio == (1, 3)
+    assert command_line(["paper-4", "--network.dim", "8"]).network == PATConfig(betas=3, in_channels=1, dim=8)
+    with pytest.raises(FileNotFoundError, match=r"no recipe 'paper-3' .*; did you mean 'paper-4'\?"):
+        command_line(["paper-3"])
+
+
+def test_what_makes_another_run():
+    config = TrainConfig()
+    assert difference(config, replace(config, out=Path("x"), save=3, tensorboard=True)) is None
+    assert difference(config, replace(config, seed=1)) == "seed: 0, 1"
