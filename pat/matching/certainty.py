@@ -77,7 +77,7 @@ def with_certainty(matches: Matches) -> Matches:
 def _certainty(matches: BetaMatches) -> Float[Tensor, "b 2 h2 w2"]:
     """Confidence, and half of the interval of disparity, by the fitted network, in pieces."""
     typical, (h, w) = typical_facts(matches), matches.disparity.shape[-2:]
-    bare = replace(matches, bands=None, diffused=None, certainty=None)
+    bare = replace(matches, colours=None, certainty=None)
     network = deepcopy(fitted_network()).to(matches.facts)  # another thread may need it in another precision
 
     def of(tile: Tile) -> Tensor:

@@ -111,7 +111,7 @@ def _chosen(inputs: Inputs, matches: BetaMatches, network: Choice) -> BetaMatche
             del answer
         return made
 
-    disparity, stated = inputs.in_pieces(of, replace(matches, bands=None, diffused=None, certainty=None))
+    disparity, stated = inputs.in_pieces(of, replace(matches, colours=None, certainty=None))
     return replace(matches, chosen=None if inputs.betas[0].around else disparity, stated=stated)
 
 

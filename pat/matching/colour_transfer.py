@@ -13,17 +13,17 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from arraygeom import Segments
 from arraygeom.runtime.chunks import chunked
 from arraygeom.runtime.threads import in_parallel
 
 from ..media.colour import to_bytes
 from ..support.settings import size, tuned
 from . import semi_global_numba as kernels
+from .examples import by_examples
 from .filters import LocalMoments, box_mean, numpy_of, smoothed
 from .inputs import Beta, Inputs
 from .likeness import likeness
-from .matches import FILLS, BetaMatches, Matches, is_consistent
+from .matches import BetaMatches, Colours, Matches, is_consistent
 from .normalisation import SETTINGS as NORMALISATION
 from .normalisation import Normalisation, combined_bands, explained_share, moments
 from .positions import at_matches
@@ -35,7 +35,9 @@ from .spectral_mix import SpectralMix
 class ColourTransferSettings:
     """Brightness is 0 to 1. Middlebury and SYNTIM are the pairs of their tune halves."""
 
-    inconsistent: float = tuned(0.25, "Middlebury: weight of an inconsistent match, before the likeness")
+    alike: float = tuned(
+        2.0, "Middlebury, tune half: added to the logit of a match's confidence where brightness agrees"
+    )
     fill: float = tuned(
         100.0, "Middlebury, tune half: strength of colour's diffusion, which stops where disparity's does"
     )
@@ -66,6 +68,8 @@ class ColourTransferSettings:
 
 
 SETTINGS = ColourTransferSettings()
+LEAST = 1e-3
+"""Size: the least weight of a pixel in a fill."""
 
 
 class MatchStatistics(NamedTuple):
@@ -105,7 +109,7 @@ class MatchStatistics(NamedTuple):
         if values.shape[1] == 1:
             return one
         unlike = one.leveled(brightness) - soft
-        noise = colour_noise(unlike, soft, match_weight(unlike, consistent, valid) * consistent)
+        noise = colour_noise(unlike, soft, both * likeness(unlike))
         return one._replace(explained=explained_share(combined, soft, both), noise=noise)
 
     def leveled(self, brightness: Tensor) -> Tensor:
@@ -122,11 +126,11 @@ class MatchStatistics(NamedTuple):
 
 
 def transferred(inputs: Inputs, matches: Matches) -> Matches:
-    """The matches with beta's bands at them; those of matches from elsewhere, too.
+    """The matches with `colours`: beta's bands at them, also for matches from elsewhere.
 
-    Of betas that agree on depth, those that have all of the result's bands share the colour that is diffused;
-    any other has its own. With gradients if images or fields have some and gradients are recorded. Raises
-    ValueError for matches of another size or number of betas.
+    Of betas that agree on depth, those that have all of the result's bands share their fills; any other has
+    its own. With gradients if images or fields have some and gradients are recorded. Raises ValueError for
+    matches of another size or number of betas.
     """
     matches.check(inputs)
     agree, large = inputs.can_agree, len(inputs.pieces) > 1
@@ -138,17 +142,20 @@ def transferred(inputs: Inputs, matches: Matches) -> Matches:
         return [plane if plane.requires_grad or not large else plane.half() for plane in parts]
 
     parts = inputs.in_pieces(of, matches)
-    bands, diffused = parts[-len(sharing) :], iter(parts[: -len(sharing)])
-    shared = next(diffused) if any(sharing) else None
-    made = zip(matches.betas, bands, sharing)
-    return Matches(tuple(replace(m, bands=b, diffused=shared if s else next(diffused)) for m, b, s in made))
+    fills, planes = parts[: -3 * len(sharing)], iter(parts[-3 * len(sharing) :])
+    own = iter(fills[1:] if any(sharing) else fills)
+    made = []
+    for match, shares in zip(matches.betas, sharing):
+        carried = next(planes), next(planes), next(planes)
+        made.append(replace(match, colours=Colours(*carried, fills[0] if shares else next(own))))
+    return Matches(tuple(made))
 
 
 def _statistics_of_frame(inputs: Inputs, matches: Matches) -> list[MatchStatistics]:
     """Those of each beta, over all pieces, in turn."""
     pieces = ((inputs.cut(piece.outer), matches.cut(piece.outer)) for piece in inputs.pieces)
     of_pieces = [
-        [transferred_bands(piece.alpha, *one)[2] for one in zip(piece.betas, there.betas)]
+        [transferred_bands(piece.alpha, *one)[-1] for one in zip(piece.betas, there.betas)]
         for piece, there in pieces
     ]
     return [MatchStatistics.mean(of_beta) for of_beta in zip(*of_pieces)]
@@ -157,20 +164,20 @@ def _statistics_of_frame(inputs: Inputs, matches: Matches) -> list[MatchStatisti
 def _transferred_piece(
     piece: Inputs, matches: Matches, sharing: Sequence[bool], statistics: Sequence[MatchStatistics] | None
 ) -> list[Tensor]:
-    """The diffused colour betas share, if any do, each other beta's, and each beta's bands minus alpha."""
+    """The fills that betas share, if any do, each other beta's, and of each beta the first three `Colours`."""
     alpha = piece.alpha
     given: Sequence[MatchStatistics | None] = statistics or [None] * len(piece.betas)
     parts = zip(piece.betas, matches.betas, given)
-    of_each = [transferred_bands(alpha, *one, sees_luma=piece.sees_luma)[:2] for one in parts]
-    shared = []
+    of_each = [transferred_bands(alpha, *one, sees_luma=piece.sees_luma)[:3] for one in parts]
+    fills = []
     if any(sharing):
-        colours, each = zip(*(one for one, counts in zip(of_each, sharing) if counts))
+        colours, each, _ = zip(*(one for one, counts in zip(of_each, sharing) if counts))
         weights = torch.stack(each)
-        mixed = (weights * torch.stack(colours)).sum(0) / weights.sum(0)
-        shared = [diffused_from(mixed, alpha, weights.amax(0))]
-    others = [one for one, counts in zip(of_each, sharing) if not counts]
-    separate = [diffused_from(colour, alpha, weight) for colour, weight in others]
-    return [*shared, *separate, *(colour for colour, _ in of_each)]
+        mixed = ((weights + LEAST) * torch.stack(colours)).sum(0) / (weights + LEAST).sum(0)
+        fills = [filled_from(mixed, alpha, weights.amax(0))]
+    alone = (one for one, counts in zip(of_each, sharing) if not counts)
+    fills += [filled_from(colour, alpha, weight) for colour, weight, _ in alone]
+    return [*fills, *(plane for one in of_each for plane in one)]
 
 
 def transferred_bands(
@@ -180,38 +187,34 @@ def transferred_bands(
     statistics: MatchStatistics | None = None,
     *,
     sees_luma: bool = True,
-) -> tuple[Tensor, Tensor, MatchStatistics]:
-    """A beta's bands minus alpha at its matches (B, C, H, W), their weight (B, 1, H, W), 0 to 1, and the
-    statistics by which it is done: of these pixels, unless they are given."""
+) -> tuple[Tensor, Tensor, Tensor, MatchStatistics]:
+    """The first three `Colours` of a beta, and the statistics by which they are made: of these pixels, unless
+    they are given."""
     if matches.comparison.mix is not None:
         return _colours_of_bands(alpha, beta, matches, matches.comparison.mix, statistics)
-    where = beta.field.straight, matches.disparity, matches.facts, matches.comparison.whole
-    there = alpha, combined_bands(beta.image), beta.image, *where, statistics
-    return matched_colours(*there, sees_luma=sees_luma)
+    return matched_colours(alpha, beta, matches, statistics, sees_luma=sees_luma)
 
 
 def matched_colours(
     alpha: Float[Tensor, "b 1 h w"],
-    guide: Float[Tensor, "b 1 hb wb"],
-    beta: Float[Tensor, "b c hb wb"],
-    segments: Segments,
-    disparity: Float[Tensor, "b 1 h w"],
-    facts: Float[Tensor, "b 3 h2 w2"],
-    normalisation: Normalisation,
+    beta: Beta,
+    matches: BetaMatches,
     statistics: MatchStatistics | None = None,
     *,
     sees_luma: bool = True,
-) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 1 h w"], MatchStatistics]:
+) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 1 h w"], Float[Tensor, "b 1 h w"], MatchStatistics]:
     """Beta's bands minus alpha at the matches, colour as in alpha's light if that sees about the luma of
-    colours, with the detail that alpha has and beta has not; their weight, 0 to 1; statistics, as of
+    colours, with the detail that alpha has and beta has not; weight, likeness and statistics, as of
     `transferred_bands`."""
-    bands, planes = beta.shape[1], torch.cat([beta, guide, normalisation.normalised(guide)], 1)
-    sampled, valid = at_matches(planes, segments, disparity)
+    guide, normalisation = combined_bands(beta.image), matches.comparison.whole
+    bands, planes = beta.image.shape[1], torch.cat([beta.image, guide, normalisation.normalised(guide)], 1)
+    sampled, valid = at_matches(planes, beta.field.straight, matches.disparity)
     values, luma, brightness = sampled.split([bands, 1, 1], 1)
-    consistent, soft = is_consistent(facts), normalisation.softened(alpha)
+    consistent, soft = is_consistent(matches.facts), normalisation.softened(alpha)
     statistics = statistics or MatchStatistics.of(alpha, soft, values, luma, brightness, valid, consistent)
     unlike = statistics.leveled(brightness) - soft
-    weight = match_weight(unlike, consistent, valid)
+    alike = likeness(unlike) if sees_luma else torch.ones_like(unlike)
+    weight = match_weight(alike, matches.confidence, valid)
     if bands > 1:
         power = SETTINGS.saturation if sees_luma else 0.0
         colour, bright = _scaled_to_alpha(values - luma, luma, alpha, weight, power)
@@ -222,15 +225,15 @@ def matched_colours(
         matched = torch.lerp(colour, detailed, statistics.explained) + luma - alpha
     else:
         matched = _detailed(values, soft, alpha) - alpha
-    return torch.where(valid, matched, statistics.colour), weight, statistics
+    return torch.where(valid, matched, statistics.colour), weight, alike, statistics
 
 
 @torch.no_grad()
 def _colours_of_bands(
     alpha: Tensor, beta: Beta, matches: BetaMatches, mix: SpectralMix, statistics: MatchStatistics | None
-) -> tuple[Tensor, Tensor, MatchStatistics]:
+) -> tuple[Tensor, Tensor, Tensor, MatchStatistics]:
     """The bands minus alpha at matches that the mix has found, with the detail that alpha has and they have
-    not; their weight, 0 to 1; the statistics."""
+    not; weight, likeness and statistics, as of `transferred_bands`."""
     values, valid = at_matches(beta.image, beta.field.straight, matches.disparity)
     brightness, soft = mix.of(values), matches.comparison.whole.softened(alpha)
     gain = mix.gain[:, None, None, None].to(alpha)
@@ -242,8 +245,9 @@ def _colours_of_bands(
     statistics = statistics or MatchStatistics.of(
         alpha, soft, values, brightness, brightness, valid, consistent
     )
-    weight = match_weight(brightness - soft, consistent, valid)
-    return torch.where(valid, colours, statistics.colour), weight, statistics
+    alike = likeness(brightness - soft)
+    weight = match_weight(alike, matches.confidence, valid)
+    return torch.where(valid, colours, statistics.colour), weight, alike, statistics
 
 
 def _scaled_to_alpha(
@@ -263,19 +267,22 @@ def _scaled_to_alpha(
 
 
 def match_weight(
-    unlike: Float[Tensor, "b 1 h w"], consistent: Tensor, valid: Tensor
+    alike: Float[Tensor, "b 1 h w"], confidence: Float[Tensor, "b 1 h w"], valid: Tensor
 ) -> Float[Tensor, "b 1 h w"]:
-    """The weight of a match whose brightness differs from alpha's by `unlike`; always more than 0."""
-    least = SETTINGS.inconsistent
-    return (least + (1 - least) * consistent) * valid * likeness(unlike) + 1e-4
+    """The probability that the match shows the point that alpha sees, 0 to 1, from the match's confidence and
+    the photometric likeness."""
+    odds = confidence.clamp(LEAST, 1 - LEAST).logit() + SETTINGS.alike * alike
+    return odds.sigmoid() * valid
 
 
-def diffused_from(
-    matched: Float[Tensor, "b c h w"], alpha: Float[Tensor, "b 1 h w"], weight: Float[Tensor, "b 1 h w"]
+def filled_from(
+    colour: Float[Tensor, "b c h w"], alpha: Float[Tensor, "b 1 h w"], weight: Float[Tensor, "b 1 h w"]
 ) -> Float[Tensor, "b fills c h w"]:
-    """Bands diffused by weight over what is connected in alpha, in each of the `FILLS` ways."""
-    planes = zip(numpy_of(matched), numpy_of(alpha[:, 0]), numpy_of(weight[:, 0]), to_bytes(alpha[:, 0]))
-    return torch.from_numpy(np.stack([_diffused(*one) for one in planes])).to(alpha)
+    """Candidate colours of pixels that beta does not see: diffused along the regression on brightness over
+    what is connected in alpha, and by example."""
+    planes = zip(numpy_of(colour), numpy_of(alpha[:, 0]), numpy_of(weight[:, 0]), to_bytes(alpha[:, 0]))
+    fills = [np.stack([_diffused(c, a, w + LEAST, guide), by_examples(c, a, w)]) for c, a, w, guide in planes]
+    return torch.from_numpy(np.stack(fills)).to(alpha)
 
 
 @torch.no_grad()
@@ -337,22 +344,19 @@ def local_slope(
 
 
 def _diffused(
-    colour: NDArray,
-    brightness: NDArray,
-    weight: NDArray,
-    guide: NDArray[np.uint8],
-    how: tuple[float, float] = (SETTINGS.fill, DISPARITY_FILL[1]),
+    colour: NDArray, brightness: NDArray, weight: NDArray, guide: NDArray[np.uint8]
 ) -> NDArray[np.float32]:
-    """Colour (c, h, w) over what is connected in the guide, (fills, c, h, w): by its weighted regression on
-    brightness (h, w), and as it is.
+    """Colour (c, h, w) by its weighted regression on brightness (h, w) over what is connected in the guide.
 
     The moments of the guided filter (He et al. 2013), diffused instead of averaged over a window: what no
     beta sees has colour that varies with brightness as it does nearby.
     """
-    totals = smoothed([weight * p for p in (1, brightness, brightness**2, *colour)], guide, how)
+    how = SETTINGS.fill, DISPARITY_FILL[1]
+    sums = [weight, *(weight * p for p in (brightness, brightness**2, *colour))]
+    total, first, second, *of_bands = smoothed(sums, guide, how)
     products = smoothed([weight * brightness * p for p in colour], guide, how)
-    out = np.empty((FILLS, *colour.shape), np.float32)
-    planes = zip(totals[3:], products, *out)
-    regression = partial(kernels.regression, brightness, *totals[:3])
-    in_parallel([partial(regression, c, p, SETTINGS.floor, *o) for c, p, *o in planes])
-    return out
+    mean = first / total
+    variance = np.maximum(second / total - mean * mean, 0) + SETTINGS.floor
+    beyond = np.clip(brightness - mean, -SETTINGS.most_detail, SETTINGS.most_detail)
+    bands = [band / total for band in of_bands]
+    return np.stack([b + (p / total - b * mean) / variance * beyond for b, p in zip(bands, products)])

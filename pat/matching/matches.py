@@ -1,12 +1,13 @@
-"""What matching has found: of each beta where alpha's pixels are in it, and its bands there."""
+"""Results of matching: where alpha's pixels are in each beta, and the bands of the beta there."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from arraygeom import Segments
 from arraygeom.pixels import HW
@@ -25,82 +26,113 @@ def is_consistent(facts: Float[Tensor, "b 3 h2 w2"]) -> Float[Tensor, "b 1 h w"]
 
 
 FILLS = 2
-"""Size: ways in which colour is diffused, along its regression on brightness, and as it is."""
-CHANNELS = {"disparity": 1, "chosen": 1, "facts": 3, "stated": 2, "certainty": 2, "bands": 0, "diffused": 0}
-"""Of each plane of `BetaMatches`; 0: as many as beta has bands."""
+"""Size: fills of each beta, along the regression on brightness, and by example."""
+CHANNELS = {"disparity": 1, "chosen": 1, "facts": 3, "stated": 2, "certainty": 2}
+"""Channels of each plane of `BetaMatches`."""
 AT_HALF_SIZE = ("facts", "stated", "certainty")
+
+
+class Colours(NamedTuple):
+    """Bands of one beta carried to alpha's view, each minus alpha.
+
+    bands: (B, C, H, W), at the match, with the detail that alpha has and beta has not.
+    weight: (B, 1, H, W), the probability that `bands` are of the point that alpha sees, 0 to 1.
+    likeness: (B, 1, H, W), photometric similarity of alpha and beta at the match, 0 to 1; 1 where alpha does
+        not see luma.
+    fills: (B, FILLS, C, H, W), candidates for pixels that beta does not see.
+    """
+
+    bands: Tensor
+    weight: Tensor
+    likeness: Tensor
+    fills: Tensor
+
+    def cut(self, box: Box, shared: dict[int, Tensor]) -> Colours:
+        """The part at alpha's (top, bottom, left, right); fills that several betas share are shared there,
+        too, by `shared`, keyed by the whole."""
+        index = (..., *slices(box))
+        fills = shared.setdefault(id(self.fills), self.fills[index])
+        return Colours(*(plane[index] for plane in self[:3]), fills)
 
 
 @dataclass(frozen=True)
 class BetaMatches:
-    """The matches of alpha's H x W pixels in one beta.
+    """Matches of alpha's H x W pixels in one beta.
 
-    disparity: (B, 1, H, W), how far along its segment, from the end, the match is, pixels of beta; where no
-        match is consistent, diffused from where one is.
-    facts: (B, 3, H / 2, W / 2), how far matching back from beta disagrees, by how much the match is better
-        than others, and its cost; each 0 to 1.
-    comparison: what of beta was compared with alpha.
-    bands: (B, C, H, W), beta's bands minus alpha at the match, with the detail that alpha has and beta has
-        not; None before they are transferred.
-    diffused: (B, fills, C, H, W), the same diffused from pixels of high weight to the others.
-    chosen: (B, 1, H, W), of the disparities found there and around that of what alpha sees, which may be
-        hidden in beta or fill in for what is; of several betas, what they agree on of those; None before one
-        is chosen.
-    stated: (B, 2, H / 2, W / 2), what the choice says of it: the logit of that it is right, and the logarithm
-        of how far it may be off, pixels; None before one is chosen.
+    disparity: (B, 1, H, W), the distance of the match from the end of its segment, pixels of beta; where no
+        match passes the left-right check, diffused from where one does.
+    facts: (B, 3, H / 2, W / 2), the left-right error, the margin over other candidates, and the cost; each 0
+        to 1.
+    comparison: the images that were compared.
+    chosen: (B, 1, H, W), the disparity of the surface that alpha sees, which may be occluded in beta; of
+        several betas, the one on which they agree; None before it is chosen.
+    stated: (B, 2, H / 2, W / 2), the choice network's logit that its disparity is right, and the logarithm
+        of its error, pixels; None before one is chosen.
     certainty: (B, 2, H / 2, W / 2), the probability that beta sees the point and the match is within a pixel
-        of it, and the half-width, in pixels of beta, of the interval around the match in which the true
-        position is in 9 of 10 cases; None where it is not known.
+        of it, and the half-width, in pixels of beta, of the interval around the match that holds the true
+        position in 9 of 10 cases; None where it is not known.
+    colours: beta's bands at the matches; None before they are carried over.
     """
 
     disparity: Tensor
     facts: Tensor
     comparison: Comparison
-    bands: Tensor | None = None
-    diffused: Tensor | None = None
     chosen: Tensor | None = None
     stated: Tensor | None = None
     certainty: Tensor | None = None
+    colours: Colours | None = None
 
     @property
     def hw(self) -> HW:
-        """Size of the alpha that they are of."""
+        """Height and width of alpha, pixels."""
         return self.disparity.shape[-2], self.disparity.shape[-1]
 
     @property
     def surface(self) -> Float[Tensor, "b 1 h w"]:
-        """The disparity of what alpha sees, as far as it is known: the one that was chosen."""
+        """The disparity of the surface that alpha sees, as far as it is known: the chosen one."""
         return self.disparity if self.chosen is None else self.chosen
 
     @property
-    def colours(self) -> tuple[Tensor, Tensor]:
-        """`bands` and `diffused`. Raises ValueError before they are transferred."""
-        if self.bands is None or self.diffused is None:
-            raise ValueError(
-                "these matches have no colours: give them those of their images by `transferred`"
-            )
-        return self.bands, self.diffused
+    def confidence(self) -> Float[Tensor, "b 1 h w"]:
+        """The probability that beta sees the point and the match is right, 0 to 1: from `certainty`, else
+        whether the match passes the left-right check."""
+        if self.certainty is None:
+            return is_consistent(self.facts)
+        return interpolate(self.certainty[:, :1].float(), scale_factor=FINE, mode="bilinear").to(self.facts)
+
+    @property
+    def carried(self) -> Colours:
+        """The colours. Raises ValueError before they are carried over."""
+        if self.colours is None:
+            raise ValueError("these matches have no colours: give them their images' by `transferred`")
+        return self.colours
 
     def positions(self, segments: Segments, hw: HW) -> tuple[Float[Tensor, "b h w 2"], Bool[Tensor, "b h w"]]:
-        """Matches in a beta of this size (x, y), by segments of alpha's pixels; whether they are on it."""
+        """Match positions (x, y) in a beta of this size, by the segments of alpha's pixels, and whether each
+        lies on it."""
         where = matches(segments, self.surface, beyond_edge=True)
         return where, segments.valid & on_image(where, hw)
 
     def check(self, inputs: Inputs) -> None:
-        """Raises ValueError unless its planes are tensors of finite floats, as of inputs of one beta."""
+        """Raise ValueError unless all planes are finite floats of the shapes that inputs of one beta need."""
         (batch, _, *hw), bands = inputs.alpha.shape, inputs.betas[0].image.shape[1]
-        for name, channels in CHANNELS.items():
-            plane = getattr(self, name)
+        planes = {name: getattr(self, name) for name in CHANNELS}
+        shapes = {
+            name: (batch, channels, *(n // FINE if name in AT_HALF_SIZE else n for n in hw))
+            for name, channels in CHANNELS.items()
+        }
+        if self.colours is not None:
+            planes |= self.colours._asdict()
+            shapes |= {"bands": (batch, bands, *hw), "weight": (batch, 1, *hw), "likeness": (batch, 1, *hw)}
+            shapes |= {"fills": (batch, FILLS, bands, *hw)}
+        for name, plane in planes.items():
             if plane is None and name not in ("disparity", "facts"):
                 continue
-            fills = (FILLS,) if name == "diffused" else ()
-            sides = (n // FINE for n in hw) if name in AT_HALF_SIZE else hw
-            shape = (batch, *fills, channels or bands, *sides)
-            if not isinstance(plane, Tensor) or not plane.is_floating_point() or plane.shape != shape:
+            if not isinstance(plane, Tensor) or not plane.is_floating_point() or plane.shape != shapes[name]:
                 tensor = isinstance(plane, Tensor)
                 got = f"{plane.dtype} {tuple(plane.shape)}" if tensor else type(plane).__name__
                 got = got.removeprefix("torch.")
-                raise ValueError(f"these matches' {name} is {got}: wanted a tensor of floats {shape}")
+                raise ValueError(f"these matches' {name} is {got}: wanted a tensor of floats {shapes[name]}")
             if not bool(plane.isfinite().all()):
                 raise ValueError(f"these matches' {name} is NaN or infinite: give any, with little certainty")
         if self.certainty is not None and not bool((self.certainty[:, 0] - 0.5).abs().max() <= 0.5):
@@ -111,13 +143,15 @@ class BetaMatches:
                 f"these matches' disparity and facts are {both}: give one type, that of the images"
             )
 
-    def cut(self, box: Box) -> BetaMatches:
+    def cut(self, box: Box, shared: dict[int, Tensor] | None = None) -> BetaMatches:
         """The part at alpha's (top, bottom, left, right), all even."""
         whole, half = slices(box), slices([n // FINE for n in box])
-        planes = {name: plane for name, plane in vars(self).items() if isinstance(plane, Tensor)}
-        sizes = {name: whole if plane.shape[-1] == self.hw[1] else half for name, plane in planes.items()}
-        cut: dict[str, Any] = {name: plane[(..., *sizes[name])] for name, plane in planes.items()}
-        return replace(self, **cut)
+        planes = {name: getattr(self, name) for name in CHANNELS if getattr(self, name) is not None}
+        cut: dict[str, Any] = {
+            name: plane[(..., *(half if name in AT_HALF_SIZE else whole))] for name, plane in planes.items()
+        }
+        colours = self.colours and self.colours.cut(box, {} if shared is None else shared)
+        return replace(self, **cut, colours=colours)
 
 
 @dataclass(frozen=True)
@@ -133,18 +167,17 @@ class Matches:
 
     @property
     def nbytes(self) -> int:
-        """Memory held, of a large frame: colours as float16, those that betas share counted once."""
-        colours = {id(colour): colour.numel() for beta in self.betas for colour in beta.colours}
+        """Memory held, of a large frame: colours as float16, fills that betas share counted once."""
+        colours = [beta.colours for beta in self.betas if beta.colours is not None]
+        fills = {id(one.fills): one.fills.numel() for one in colours}
+        own = sum(plane.numel() for one in colours for plane in one[:3])
         planes = [2 * beta.disparity.nbytes + beta.facts.nbytes * 7 // 3 for beta in self.betas]
-        return 2 * sum(colours.values()) + sum(planes)
+        return 2 * (own + sum(fills.values())) + sum(planes)
 
     def cut(self, box: Box) -> Matches:
-        """Of a part of alpha. Colour that several betas share, they share there too."""
-        shared: dict[int, Tensor | None] = {}
-        parts = [(id(beta.diffused), beta.cut(box)) for beta in self.betas]
-        for key, cropped in parts:
-            shared.setdefault(key, cropped.diffused)
-        return Matches(tuple(replace(cropped, diffused=shared[key]) for key, cropped in parts))
+        """The part at alpha's (top, bottom, left, right). Fills that several betas share stay shared."""
+        shared: dict[int, Tensor] = {}
+        return Matches(tuple(beta.cut(box, shared) for beta in self.betas))
 
     def check(self, inputs: Inputs) -> None:
         """Raises ValueError unless they are of so many betas, and `BetaMatches.check` has no objection."""

@@ -28,8 +28,6 @@ EDGE = np.float32(4 / 255)
 """Difference of alpha's neighbours that halves the larger penalty."""
 FARTHEST = np.float32(8)
 """A difference of labels in the left-right check counts as at most this."""
-MOST_BEYOND = np.float32(0.3)
-"""Brightness this far from the mean of what is around counts as no farther in a regression."""
 ONE = np.float32(1.0)
 HALF = np.float32(0.5)
 PARTS = 16
@@ -353,21 +351,6 @@ def _between(total, best, last):
 
 
 @compiled(nogil=True, cache=True)
-def regression(brightness, total, first, second, colour, product, floor, along, mean_colour):
-    """A band of `colour_transfer.diffused_from`, from smoothed sums of weights (total), and of weights times
-    brightness, its square, the band (colour), and brightness times the band (product)."""
-    height, width = brightness.shape
-    for y in range(height):
-        for x in range(width):
-            share = ONE / total[y, x]
-            mean, middle = first[y, x] * share, colour[y, x] * share
-            variance = max(second[y, x] * share - mean * mean, np.float32(0))
-            slope = (product[y, x] * share - middle * mean) / (variance + floor)
-            beyond = min(max(brightness[y, x] - mean, -MOST_BEYOND), MOST_BEYOND)
-            along[y, x], mean_colour[y, x] = middle + slope * beyond, middle
-
-
-@compiled(nogil=True, cache=True)
 def costs_at(alpha, beta, places, out):
     """Cost of alpha's pixel and beta's at each of its places, pixels of beta counted row by row (-1: none):
     out (h, w, 1, lanes), of which those after the last place have no label. `alpha` and `beta` are flat
@@ -383,5 +366,5 @@ def costs_at(alpha, beta, places, out):
                 costs[label] = cost if target >= 0 else NOWHERE
 
 
-for _entry in (costs, aggregate, winners, regression, costs_at):
+for _entry in (costs, aggregate, winners, costs_at):
     renew_with(_entry, [Path(__file__), Path(__file__).with_name("cost.py"), *SOURCES])

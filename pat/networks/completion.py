@@ -16,14 +16,14 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import pixel_shuffle
 
-from ..matching.colour_transfer import FILLS
+from ..matching.matches import FILLS
 from ..media.colour import from_luma_chroma, to_luma_chroma
 from ..support.blocks import UNet, stacked
 from ..support.settings import tuned
 
-CANDIDATES = 3 + FILLS
-"""Size: matched, propagated, diffused in each way, by example."""
-BLOCKS = 2
+CANDIDATES = 2 + FILLS
+"""Size: matched, diffused, by nearest examples, by attention."""
+BLOCKS = 1
 """Size: residual blocks at each scale."""
 
 

@@ -37,40 +37,16 @@ class PATConfig:
 
 @dataclass(frozen=True)
 class GuidedPATConfig:
-    """Widths of the features at 1/2, 1/4, 1/8 and 1/16 of the size, of the keys, and of the judgement.
+    """Bands of the image (None: all of the betas'), and the widths of the U-Net that weighs candidates.
 
-    Attention reaches `window` pixels to either side of the match, with `taps` samples. Colour is propagated
-    within alpha in one round for each of `propagation_steps`, the spacing of 7 x 7 pixels at 1/4.
     `keep_luminance` lets the network add colour to alpha, never luminance. `completion` has widths at 1/2,
-    1/4 and 1/8, of what completes colours in the end; none without such a part.
+    1/4 and 1/8 of the size; empty without a U-Net, when nothing is trained.
     """
 
-    widths: tuple[int, int, int, int] = (16, 32, 40, 48)
-    fine_dim: int = 8
-    window: float = 3.0
-    taps: int = 13
-    judge_dim: int = 16
-    confidence_dim: int = 24
-    propagation_dim: int = 8
-    propagation_steps: tuple[int, ...] = (1, 3, 8)
-    bands: int = 3
+    bands: int | None = 3
     keep_luminance: bool = True
     completion: tuple[int, ...] = ()
 
 
-@dataclass(frozen=True)
-class BandwisePATConfig(GuidedPATConfig):
-    """GuidedPAT's, for one band, which need not have alpha's luminance."""
-
-    bands: int = 1
-    keep_luminance: bool = False
-
-    def __post_init__(self) -> None:
-        if self.bands != 1 or self.keep_luminance:
-            raise ValueError(
-                "BandwisePAT fuses one band at a time: leave bands at 1 and keep_luminance at false"
-            )
-
-
-CONFIGS = {"PAT": PATConfig, "GuidedPAT": GuidedPATConfig, "BandwisePAT": BandwisePATConfig}
+CONFIGS = {"PAT": PATConfig, "GuidedPAT": GuidedPATConfig}
 """By the name of the network."""

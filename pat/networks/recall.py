@@ -38,9 +38,6 @@ class RecallSettings:
     slope: float = tuned(0.1, "Middlebury, tune half: the same of slopes there")
     distance: float = tuned(10.0, "Middlebury, tune half: pixels at which the weight falls to 1 / e")
     certainty: int = tuned(3, "Middlebury, tune half: power of confidence, squared, that pixels count by")
-    share: float = tuned(
-        0.5, "Middlebury, tune half: of what no beta sees, by example; of what is doubtful, smoothed"
-    )
     least_weight: float = size(1e-3, "The least weight of a pixel")
     side: int = size(17, "A pixel looks at so many in each row and column")
     spacing: int = size(6, "The distance of these, twice as much in a window of twice the size around that")
@@ -59,19 +56,12 @@ def by_example(
     return fitted(recalled(alpha, colour, confidence), alpha, colour, confidence)
 
 
-def with_examples(
-    unseen: Float[Tensor, "b c h w"], recalled: Float[Tensor, "b c h w"], confidence: Float[Tensor, "b c h w"]
-) -> Float[Tensor, "b c h w"]:
-    """Colour for where no beta sees the point, in part by example, the less certain a pixel is the more."""
-    return torch.lerp(unseen, recalled, SETTINGS.share * (1 - confidence))
-
-
 def with_less_noise(
     alpha: Float[Tensor, "b 1 h w"], colour: Float[Tensor, "b c h w"], confidence: Float[Tensor, "b c h w"]
 ) -> Float[Tensor, "b c h w"]:
     """Colour, in part the mean of what is alike in alpha, the less certain a pixel is the more."""
     smooth = smoothed_within(alpha, colour, SETTINGS.last, confidence)
-    return torch.lerp(colour, smooth, SETTINGS.share * (1 - confidence))
+    return torch.lerp(smooth, colour, confidence)
 
 
 def recalled(

@@ -17,7 +17,6 @@ from ..support import eight_bits
 from ..support.blocks import in_bfloat16
 from ..support.schema import from_document
 from ..support.tensor_files import DAMAGED, not_whole, undamaged, write_tensors
-from .bandwise import BandwisePAT
 from .configs import CONFIGS
 from .denoiser import DenoiserConfig, LowLightNetwork
 from .guided import GuidedPAT
@@ -26,7 +25,7 @@ from .paper import PAT, AttentionEngine
 SHIPPED = Path(__file__).parent / "shipped"
 DENOISER = Path(__file__).parent / "denoisers" / "low-light.safetensors"
 FORMAT = "pat-weights 1"
-Network = PAT | GuidedPAT | BandwisePAT
+Network = PAT | GuidedPAT
 NETWORKS: Mapping[str, tuple[Any, Any]] = {
     network.__name__: (network, CONFIGS[network.__name__]) for network in get_args(Network)
 }
@@ -104,8 +103,7 @@ def set_precision(network: nn.Module, precision: Precision, *, compiled: bool = 
     """
     if precision == "int8":
         eight_bits.round_to_eight_bits(network)
-    inner = network.single if isinstance(network, BandwisePAT) else network
-    for module in inner.children():
+    for module in network.children():
         if isinstance(module, (AttentionEngine, nn.ModuleList)):
             continue
         if precision == "bfloat16":
