@@ -36,7 +36,7 @@ class CompletionTraining(PairTraining):
     """A recipe; as many windows are of each kind of pairs that there are."""
 
     out: Path = Path("runs/completion")
-    widths: tuple[int, int, int] = (64, 96, 128)
+    widths: tuple[int, int, int] = (24, 36, 48)
     """Channels at 1/2, 1/4 and 1/8 of the size."""
     choices: tuple[Path, ...] = ()
     """Files of choices between disparities trained without some pairs (`--without`): of a pair, what the one

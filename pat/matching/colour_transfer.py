@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -14,18 +13,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from arraygeom.runtime.chunks import chunked
-from arraygeom.runtime.threads import in_parallel
 
 from ..media.colour import to_bytes
 from ..support.settings import size, tuned
-from . import semi_global_numba as kernels
 from .examples import by_examples
 from .filters import LocalMoments, box_mean, numpy_of, smoothed
 from .inputs import Beta, Inputs
 from .likeness import likeness
 from .matches import BetaMatches, Colours, Matches, is_consistent
 from .normalisation import SETTINGS as NORMALISATION
-from .normalisation import Normalisation, combined_bands, explained_share, moments
+from .normalisation import combined_bands, explained_share, moments
 from .positions import at_matches
 from .semi_global import DISPARITY_FILL
 from .spectral_mix import SpectralMix
@@ -164,7 +161,7 @@ def _statistics_of_frame(inputs: Inputs, matches: Matches) -> list[MatchStatisti
 def _transferred_piece(
     piece: Inputs, matches: Matches, sharing: Sequence[bool], statistics: Sequence[MatchStatistics] | None
 ) -> list[Tensor]:
-    """The fills that betas share, if any do, each other beta's, and of each beta the first three `Colours`."""
+    """The fills that betas share, if any do, each other beta's, and the first three `Colours` of each beta."""
     alpha = piece.alpha
     given: Sequence[MatchStatistics | None] = statistics or [None] * len(piece.betas)
     parts = zip(piece.betas, matches.betas, given)

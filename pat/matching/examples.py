@@ -1,4 +1,4 @@
-"""Colour of pixels that no beta sees, by example: from seen pixels most alike in brightness, texture and place.
+"""Colour of unseen pixels by example: that of the seen pixels most alike in brightness, texture and place.
 
 Nearest neighbours among alpha's own seen pixels (Welsh et al. 2002 colour a grey image so, by another one).
 """
@@ -45,9 +45,9 @@ def by_examples(
 ) -> Float[NDArray, "c h w"]:
     """Colour with the pixels of low weight replaced by the mean of their nearest seen pixels.
 
-    `weight` (0 to 1) is the probability that a pixel's colour is its own. Every second pixel in each direction
-    is looked up; between them the mean is interpolated. Where fewer pixels are seen than a mean takes, colour
-    is returned as it is.
+    `weight` (0 to 1) is the probability that a pixel's colour is its own. Every second pixel in each
+    direction is looked up, and the mean is interpolated between them. Where fewer pixels are seen than a mean
+    takes, colour is returned as it is.
     """
     seen = weight > SETTINGS.seen
     sources = np.zeros_like(seen)

@@ -52,7 +52,7 @@ class Colours(NamedTuple):
         too, by `shared`, keyed by the whole."""
         index = (..., *slices(box))
         fills = shared.setdefault(id(self.fills), self.fills[index])
-        return Colours(*(plane[index] for plane in self[:3]), fills)
+        return Colours(self.bands[index], self.weight[index], self.likeness[index], fills)
 
 
 @dataclass(frozen=True)

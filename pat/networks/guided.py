@@ -121,7 +121,8 @@ class GuidedPAT(nn.Module):
 
 def _as_alpha(carried: Colours, alpha: Tensor) -> Colours:
     """Colours in the type of alpha; a large frame's are kept in half precision."""
-    return Colours(*(plane.to(alpha) for plane in carried[:3]), carried.fills)
+    bands, weight, likeness = (plane.to(alpha) for plane in carried[:3])
+    return Colours(bands, weight, likeness, carried.fills)
 
 
 def _joined(bands: Sequence[Tensor]) -> Tensor:

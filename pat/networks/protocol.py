@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
+from typing import Literal, NamedTuple, Protocol, runtime_checkable
 
 from torch import Tensor
 
@@ -74,15 +74,6 @@ class FusionNetwork(Protocol):
 
     def __call__(self, inputs: Inputs, matches: Matches | None = None) -> FusionOutput:
         """Fuse. Raises ValueError without matches if it uses them."""
-        ...
-
-
-@runtime_checkable
-class Explaining(Protocol):
-    """A network that says of each beta what it took it for, which training supervises."""
-
-    def explain(self, inputs: Inputs, matches: Any) -> tuple[FusionOutput, list[Any]]:
-        """Fuse, and the estimate of each beta."""
         ...
 
 

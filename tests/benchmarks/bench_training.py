@@ -69,7 +69,7 @@ def prepared(config: TrainConfig, *, half: bool, compiled: bool) -> Network:
     return network
 
 
-def main(repeats: int = 3, names: tuple[str, ...] = ("mono-colour", "mono-colour-small", "paper-2")) -> None:
+def main(repeats: int = 3, names: tuple[str, ...] = ("mono-colour", "mono-colour", "paper-2")) -> None:
     """Measure and print the networks of recipes."""
     torch.set_num_threads(1)
     for name in names:

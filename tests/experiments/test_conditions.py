@@ -76,7 +76,7 @@ def test_fewer_electrons_are_noisier():
 def test_every_method_is_scored_under_every_condition(tmp_path):
     rows = evaluate_conditions(
         [pair()],
-        load_weights("mono-colour-small"),
+        load_weights("mono-colour"),
         ["ideal", "rows off 1 px", "rows off 3 px"],
     )
     ours = [row for row in rows if row.method == "fusion"]
@@ -116,4 +116,4 @@ def test_gains_are_of_the_same_pairs():
 
 def test_an_unknown_condition_is_refused():
     with pytest.raises(KeyError):
-        evaluate_conditions([pair()], load_weights("mono-colour-small"), ["fog"])
+        evaluate_conditions([pair()], load_weights("mono-colour"), ["fog"])

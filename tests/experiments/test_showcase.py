@@ -244,7 +244,7 @@ def test_the_tables_commands_say_what_is_wrong(arguments, complaint, data, tmp_p
 
 def test_the_papers_figures_are_beside_ours(data, tmp_path, capsys):
     given = ["--kitti", str(data / "kitti"), "--rates", "2", "--controls", "--out", str(tmp_path)]
-    main(["evaluate", *given, "--weights", "mono-colour-small"], group=Experiments)
+    main(["evaluate", *given, "--weights", "mono-colour"], group=Experiments)
     printed = capsys.readouterr().out
     assert printed == (tmp_path / "scores.md").read_text()
     assert "| shuffled fields | the paper, printed, on its own data |" in printed

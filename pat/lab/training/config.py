@@ -12,13 +12,13 @@ from typing import Literal
 import tyro
 
 from pat.lab.synthesis.rig_distribution import RigDistribution
-from pat.networks.configs import CONFIGS, BandwisePATConfig, GuidedPATConfig, PATConfig
+from pat.networks.configs import CONFIGS, GuidedPATConfig, PATConfig
 from pat.support.schema import from_document, near, parse_yaml, to_document
 
 RECIPES = Path(__file__).parent / "recipes"
 RECTIFIED = RigDistribution(mode="rectified", parallax=(6.0, 110.0))
 GENERAL = RigDistribution(mode="general", parallax=(6.0, 90.0), focal_ratio=(0.8, 1.25))
-NetworkConfig = PATConfig | GuidedPATConfig | BandwisePATConfig
+NetworkConfig = PATConfig | GuidedPATConfig
 UNSEEN = ("out", "device", "save", "tensorboard", "cache")
 """Entries that may differ between a run and its continuation: samples and steps do not depend on them."""
 

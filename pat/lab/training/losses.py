@@ -7,18 +7,10 @@ from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import avg_pool2d, binary_cross_entropy_with_logits, mse_loss
+from torch.nn.functional import avg_pool2d, mse_loss
 
 from pat.attention.scores import Compared, peak_position
-from pat.networks.guided import BetaEstimate
-from pat.networks.protocol import (
-    Comparing,
-    Explaining,
-    FusionNetwork,
-    FusionOutput,
-    fused_at_once,
-    matched_for,
-)
+from pat.networks.protocol import Comparing, FusionNetwork, FusionOutput, fused_at_once
 from pat.networks.weights import Network
 
 from .attention_loss import attention_loss
@@ -74,27 +66,15 @@ class Objective(nn.Module):
             fused, compared = self.network.compare(sample.inputs)
             where = attention_loss(compared, sample.position, sample.visible)
             return self.image_loss(fused.image, sample.ground_truth) + self.attention * where
-        fused, estimates = explained(self.network, sample)
-        loss = self.image_loss(fused.image, sample.ground_truth)
-        return loss + match_loss(estimates, sample) if estimates else loss
+        fused = fused_sample(self.network, sample)
+        return self.image_loss(fused.image, sample.ground_truth)
 
 
-def explained(network: FusionNetwork, sample: Sample) -> tuple[FusionOutput, list[BetaEstimate]]:
-    """The network's output, and its match in each beta if it reports it."""
-    if not isinstance(network, Explaining):
-        return network(sample.inputs), []
-    return network.explain(sample.inputs, sample.matches or matched_for(network, sample.inputs))
-
-
-def match_loss(estimates: list[BetaEstimate], sample: Sample) -> Tensor:
-    """Error of position where beta sees the point, pixels, and of confidence; 0 without ground truth."""
-    total = sample.ground_truth.new_zeros(())
-    for match, ground_truth, visible in zip(estimates, sample.position, sample.visible):
-        off = (match.attended - ground_truth.movedim(-1, 1)).abs().sum(1)
-        total = total + 0.02 * (off.clamp(max=6.0) * visible).sum() / visible.sum().clamp(min=1)
-        good = (visible & (off.detach() < 1.5)).to(off)
-        total = total + 0.05 * binary_cross_entropy_with_logits(match.logit[:, 0], good)
-    return total / len(estimates)
+def fused_sample(network: FusionNetwork, sample: Sample) -> FusionOutput:
+    """The network's output for a group of samples, by their matches where they have some."""
+    if sample.matches is not None:
+        return network(sample.inputs, sample.matches)
+    return fused_at_once(network, sample.inputs)
 
 
 @torch.no_grad()

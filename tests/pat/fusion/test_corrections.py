@@ -26,7 +26,7 @@ def sample():
 
 @pytest.fixture(scope="module")
 def network():
-    return load_weights("mono-colour-small")
+    return load_weights("mono-colour")
 
 
 def as_expected(sample):

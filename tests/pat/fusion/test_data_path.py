@@ -5,6 +5,7 @@ from collections import Counter
 import numpy as np
 import pytest
 import torch
+from pat.networks.bandwise import BandwisePAT
 
 import pat.fusion.tiles
 import pat.fusion.views
@@ -16,7 +17,6 @@ from pat.fusion.sequence import fuse_sequence
 from pat.fusion.tiles import MAX_HALO
 from pat.fusion.views import ViewFiles, Views
 from pat.media.images import write_image
-from pat.networks.bandwise import BandwisePAT
 from pat.networks.configs import BandwisePATConfig, GuidedPATConfig
 from pat.networks.guided import GuidedPAT
 from tests.arraygeom.rigs import parallel_rig

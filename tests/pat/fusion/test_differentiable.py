@@ -75,7 +75,7 @@ def test_depths_follow_a_camera_that_moves_along_the_segments(cropped, kind, axi
 def test_gradients_reach_rig_images_and_weights(cropped, luminance, recwarn):
     """Torch warns once a process of numbers taken out of tensors with gradients, here always."""
     rig, images, _ = cropped
-    network = load_weights("mono-colour-small").requires_grad_(True)
+    network = load_weights("mono-colour").requires_grad_(True)
     angle = torch.zeros((), dtype=torch.float64, requires_grad=True)
     images = {name: image.clone().requires_grad_() for name, image in images.items()}
     options = {"align": False, "luminance": luminance, "differentiable": True}
@@ -94,13 +94,13 @@ def test_without_differentiable_everything_is_detached(cropped):
     rig, images, _ = cropped
     angle = torch.zeros((), dtype=torch.float64, requires_grad=True)
     images = images | {"colour": images["colour"].clone().requires_grad_()}
-    frame = fuse(load_weights("mono-colour-small"), rotated(rig, angle), images, alpha="mono")
+    frame = fuse(load_weights("mono-colour"), rotated(rig, angle), images, alpha="mono")
     assert [part.requires_grad for part in frame[:3]] == [False, False, False]
 
 
 def test_a_differentiable_fusion_is_of_the_whole_frame(cropped, tmp_path):
     rig, images, _ = cropped
-    network = load_weights("mono-colour-small")
+    network = load_weights("mono-colour")
     for more, message in (
         ({"max_memory": "2GiB"}, "max_memory and store"),
         ({"store": tmp_path}, "max_memory and store"),
@@ -112,7 +112,7 @@ def test_a_differentiable_fusion_is_of_the_whole_frame(cropped, tmp_path):
 
 def test_a_transformation_of_torch_func_is_refused(cropped):
     rig, images, _ = cropped
-    network = load_weights("mono-colour-small")
+    network = load_weights("mono-colour")
 
     def depth(angle: torch.Tensor) -> torch.Tensor:
         turned = rotated(rig, angle)

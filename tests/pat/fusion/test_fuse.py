@@ -7,6 +7,7 @@ import weakref
 
 import pytest
 import torch
+from pat.networks.bandwise import BandwisePAT
 
 import pat.fusion.steps
 import pat.fusion.tiles
@@ -41,7 +42,6 @@ from pat.matching.inputs import Inputs, InputsSettings
 from pat.media.colour import linear_from_srgb, luminance
 from pat.media.images import read_image
 from pat.media.raw import LIGHT
-from pat.networks.bandwise import BandwisePAT
 from pat.networks.configs import BandwisePATConfig, GuidedPATConfig, PATConfig
 from pat.networks.guided import GuidedPAT
 from pat.networks.paper import PAT
@@ -117,7 +117,7 @@ def test_tiled_equals_whole(kind, dtype, bound, monkeypatch):
 
 
 def test_matching_in_pieces_is_nearly_that_of_the_whole_and_tiles_do_not_matter(monkeypatch):
-    sample, network = load_sample(), load_weights("mono-colour-small")
+    sample, network = load_sample(), load_weights("mono-colour")
     images = {name: sample.images[name] for name in sample.rig.names}
     whole = fuse(network, sample.rig, images, alpha="mono")
     monkeypatch.setattr(pat.matching.inputs, "SETTINGS", InputsSettings(halo=128, at_once=150_000))

@@ -42,7 +42,7 @@ from tests.pat.layered_array import ALPHA, BETA, load_sample, middle_of_sample
 
 @pytest.fixture(scope="module")
 def network():
-    return load_weights("mono-colour-small")
+    return load_weights("mono-colour")
 
 
 def in_low_light(electrons, of=middle_of_sample):

@@ -23,7 +23,7 @@ def images(sample):
 
 @pytest.fixture(scope="module")
 def fused(sample, images):
-    network = load_weights("mono-colour-small")
+    network = load_weights("mono-colour")
 
     def frame(kept):
         return fuse(network, sample.rig, images, alpha=ALPHA, response="rec601", align=False, luminance=kept)
@@ -47,7 +47,7 @@ def test_betas_luminance_has_alphas_detail(sample, fused, monkeypatch):
 
     monkeypatch.setattr(module, "with_alpha_detail", lambda frame, alpha: frame)
     images = dict(sample.images) | {ALPHA: luminance(sample.ground_truth)}
-    network = load_weights("mono-colour-small")
+    network = load_weights("mono-colour")
     options = {"alpha": ALPHA, "response": "rec601", "align": False, "luminance": "beta"}
     plain = fuse(network, sample.rig, images, **options)
     monkeypatch.undo()
@@ -67,7 +67,7 @@ def test_betas_luminance_has_alphas_detail(sample, fused, monkeypatch):
     ("weights", "options", "message"),
     [
         ("mono-spectral", {"luminance": "beta"}, "needs weights for RGB betas"),
-        ("mono-colour-small", {"luminance": "mix", "noise": "estimate"}, "leave one of them out"),
+        ("mono-colour", {"luminance": "mix", "noise": "estimate"}, "leave one of them out"),
     ],
 )
 def test_what_cannot_be_is_refused(sample, weights, options, message):

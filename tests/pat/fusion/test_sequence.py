@@ -288,7 +288,7 @@ def test_a_noisy_sequence_is_denoised(fused):
     """One level for all frames, stated or estimated; alpha's values stay where that is asked for."""
     frames, ground_truth, _, _ = fused
     level = NoiseLevel.of_electrons(60, 2)
-    recorded, network, rig = noisy(frames, level), load_weights("mono-colour-small"), moving.rig(0.003)
+    recorded, network, rig = noisy(frames, level), load_weights("mono-colour"), moving.rig(0.003)
     fusion = partial(fuse_sequence, network, rig, recorded, alpha="fast")
     plain = psnr(fusion(), ground_truth)
     stated = dict.fromkeys(recorded, level)

@@ -77,7 +77,7 @@ def kept():
         return found[-1][1]
 
     images = {name: sample.images[name] for name in ("mono", "colour")}
-    frame = fuse(load_weights("mono-colour-small"), sample.rig, images, alpha="mono", matcher=matcher)
+    frame = fuse(load_weights("mono-colour"), sample.rig, images, alpha="mono", matcher=matcher)
     return (*found[-1], frame, sample)
 
 
@@ -112,7 +112,7 @@ def test_confidence_is_the_matches_whatever_the_network(kept):
 def motorcycle():
     """The frame of a real pair, and its true depth, NaN where that is not known."""
     array = load_motorcycle()
-    frame = fuse(load_weights("mono-colour-small"), array.rig, array.images, alpha="mono")
+    frame = fuse(load_weights("mono-colour"), array.rig, array.images, alpha="mono")
     disparity = torch.from_numpy(stereo_motorcycle()[2][:, :740].copy())
     pair = array.rig.pair("mono", "colour")
     baseline = float(pair.beta_from_alpha.t.norm())

@@ -91,7 +91,7 @@ def motorcycle():
         found.append((inputs, Matches((located_in_one(inputs),))))
         return match(inputs)
 
-    fuse(load_weights("mono-colour-small"), array.rig, array.images, alpha="mono", matcher=matcher)
+    fuse(load_weights("mono-colour"), array.rig, array.images, alpha="mono", matcher=matcher)
     return found[0]
 
 
@@ -122,7 +122,7 @@ def test_depth_is_of_what_was_chosen_and_colour_of_the_match():
         return Matches((replace(found, chosen=found.chosen + 4),))
 
     one, other = (
-        fuse(load_weights("mono-colour-small"), array.rig, array.images, alpha="mono", matcher=matcher)
+        fuse(load_weights("mono-colour"), array.rig, array.images, alpha="mono", matcher=matcher)
         for matcher in (match, farther)
     )
     pixel = 1 / (994.978 * 0.193001)

@@ -28,7 +28,7 @@ DEPTH, BASELINE = 4.0, 0.25
 
 @pytest.fixture(scope="module")
 def network():
-    return load_weights("mono-colour-small")
+    return load_weights("mono-colour")
 
 
 @pytest.fixture(scope="module")

@@ -31,7 +31,7 @@ NEAR, FAR = 2.0, 8.0
 
 @pytest.fixture(scope="module")
 def network():
-    return load_weights("mono-colour-small")
+    return load_weights("mono-colour")
 
 
 def smooth_texture(seed, hw):

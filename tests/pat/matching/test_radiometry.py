@@ -202,7 +202,7 @@ def test_a_gamma_needs_a_range_of_brightness():
 
 def test_fusion_of_another_response():
     """Taken for Rec. 601, this alpha's colours are several dB off; with its response stated they are not."""
-    sample, network = load_sample(), load_weights("mono-colour-small")
+    sample, network = load_sample(), load_weights("mono-colour")
     images = {ALPHA: combined(sample.ground_truth), BETA: sample.images[BETA]}
 
     def psnr(response, given=images):

@@ -2,13 +2,13 @@
 
 import pytest
 import torch
+from pat.networks.bandwise import BandwisePAT
 
 from arraygeom import Pair, Rectified, Rig, View
 from arraygeom.fields.grid import FieldOnGrid
 from pat.fusion.fuse import fuse
 from pat.fusion.steps import co_located
 from pat.matching.inputs import Inputs
-from pat.networks.bandwise import BandwisePAT
 from pat.networks.configs import BandwisePATConfig
 from pat.networks.protocol import fused_at_once
 from tests.arraygeom.rigs import parallel_rig

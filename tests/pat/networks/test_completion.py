@@ -85,7 +85,7 @@ def test_colours_are_completed_if_alpha_sees_luma(alike):
 
 
 def test_a_network_may_be_without(shipped):
-    assert load_weights("mono-colour-small").completion is None
+    assert load_weights("mono-colour").completion is None
     assert GuidedPAT().working_bytes(10**6, [10**6]) < load_weights("mono-colour").working_bytes(
         10**6, [10**6]
     )

@@ -63,4 +63,4 @@ def test_written_and_read_back(tmp_path):
     with pytest.raises(ValueError, match="not weights of this package"):
         load_weights(tmp_path / "w.safetensors")
     with pytest.raises(ValueError, match="not weights of this package"):
-        load_denoiser(SHIPPED / "mono-colour-small.safetensors")
+        load_denoiser(SHIPPED / "mono-colour.safetensors")

@@ -33,7 +33,7 @@ def test_a_precision_changes_the_image_little_and_something(precision):
 
 
 def test_a_copy_of_a_network_in_bfloat16_computes_with_its_own_weights():
-    network = load_weights("mono-colour-small")
+    network = load_weights("mono-colour")
     set_precision(network, "bfloat16")
     other = copy.deepcopy(network)
     for parameter in other.encoder.parameters():
@@ -47,12 +47,12 @@ def test_a_copy_of_a_network_in_bfloat16_computes_with_its_own_weights():
 
 def test_a_precision_that_there_is_not_is_refused():
     with pytest.raises(ValueError, match=r"precision is 'float16'.*float32"):
-        unwrap(load_weights)("mono-colour-small", precision="float16")
+        unwrap(load_weights)("mono-colour", precision="float16")
 
 
 def test_weights_without_ranges_and_processors_without_8_bits_refuse_them(monkeypatch):
     with pytest.raises(ValueError, match="state no ranges" if torch.cpu._is_vnni_supported() else "float32"):
-        load_weights("mono-colour-small", precision="int8")
+        load_weights("mono-colour", precision="int8")
     monkeypatch.setattr(eight_bits, "available", lambda: False)
     with pytest.raises(ValueError, match=r"8-bit integers.*float32"):
         load_weights("mono-colour", precision="int8")

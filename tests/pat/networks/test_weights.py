@@ -7,9 +7,9 @@ import resource
 import numpy as np
 import pytest
 import torch
+from pat.networks.bandwise import BandwisePAT
 from safetensors.torch import save_file
 
-from pat.networks.bandwise import BandwisePAT
 from pat.networks.configs import BandwisePATConfig, GuidedPATConfig, PATConfig
 from pat.networks.guided import GuidedPAT
 from pat.networks.paper import PAT

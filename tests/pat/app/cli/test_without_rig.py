@@ -107,7 +107,7 @@ def test_the_rig_that_is_written_is_of_the_files_as_they_were_recorded(folder, t
         "colour", rig["colour"].replace(sensor=Sensor(coding="linear", bits=16, black_level=64.0))
     )
     given = {name: read_image(folder / f"{name}.png") for name in rig.names}
-    found = ImageArray(rig, raw, given, "mono", "mono-colour-small", False, ())
+    found = ImageArray(rig, raw, given, "mono", "mono-colour", False, ())
     monkeypatch.setattr("pat.app.from_images.array_from_images", lambda *a, **k: found)
     pat(f"fuse {folder / 'mono.png'} {folder / 'colour.png'} --no-report -o {tmp_path}")
     assert Rig.load(tmp_path / "found_rig.yaml")["colour"].sensor == raw["colour"].sensor
