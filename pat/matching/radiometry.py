@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from operator import attrgetter, itemgetter
+from operator import itemgetter
 from typing import Literal, NamedTuple
 
 import torch
@@ -62,6 +62,13 @@ class ResponseSettings:
         (0.08, 0.04, 0.02), "By how much the logarithms of further ones differ from that of the best, in turn"
     )
     steps: int = size(2, "How often vignetting is taken out and looked for again")
+    blocks: int = size(6, "Parts of beta's width and of its height over which evidence must agree")
+    holds: tuple[float, float] = tuned(
+        (0.25, 1.8),
+        "Middlebury, tune half, and plain scenes: least share by which another response lowers the squared "
+        "error, and that over its standard error across blocks",
+    )
+    clipped: float = size(0.1, "Errors of brightness count as no larger: wrong matches")
     explained: float = tuned(
         0.8,
         "Share of alpha's variance that must be explained: of Middlebury's tune half at least .88 is, "
@@ -187,15 +194,60 @@ def fit(
     unclipped = (y > 0.02) & (y < 0.98) & (x > 0.01).all(0) & (x < 0.98).all(0)
     if int(unclipped.sum()) < fewest:
         return Response.rec601()
-    groups = _Groups.of(x[:, unclipped], y[unclipped], place[unclipped])
-    shading = y.new_zeros(len(groups.terms))
-    fits = [groups.explained_by(shading, vignetted=False)]
+    points = _Points(x[:, unclipped], y[unclipped], place[unclipped])
+    groups = _Groups.of(*points)
+    none = y.new_zeros(len(groups.terms))
+    response = rec601 = Response.rec601()
+    exposed, weighed = (groups.explained_by(none, kinds, vignetted=False).response for kinds in (LUMA, KINDS))
+    if points.hold(exposed, rec601):
+        response = exposed
+    # Weights as recorded need no exposure that luma would: they are held against luma as recorded.
+    before = rec601 if weighed.gain == weighed.gamma == 1 else response
+    kinds = LUMA
+    if weighed.weights.tolist() != list(REC601) and points.hold(weighed, before):
+        response, kinds = weighed, OTHERS
+    explained = max(exposed.explained, weighed.explained)
     if where is not None:
-        for _ in range(SETTINGS.steps):
-            shading = shading + groups.explained_by(shading, vignetted=True).further
-        fits.append(groups.explained_by(shading, vignetted=True))
-    response = max(fits, key=attrgetter("evidence")).response
-    return response if response.explains else Response.rec601()._replace(explained=response.explained)
+        shaded = groups.shaded(kinds)
+        explained = max(explained, shaded.explained)
+        if points.hold(shaded, response):
+            response = shaded
+    response = response if explained >= SETTINGS.explained else rec601
+    return response._replace(explained=explained)
+
+
+class _Points(NamedTuple):
+    """Points that match: bands of beta, alpha, and place in beta, in its width and height from its middle."""
+
+    bands: Float[Tensor, "3 n"]
+    alpha: Float[Tensor, " n"]
+    place: Float[Tensor, "n 2"]
+
+    def hold(self, response: Response, simpler: Response) -> bool:
+        """Whether a response explains alpha clearly better than a simpler one, and all over the image.
+
+        Things of few hues, and shading that differs between the cameras, make wrong weights fit somewhat
+        better in some places: the gain must be large, and many times its standard error over blocks.
+        """
+        errors = [self._squared_errors(one) for one in (simpler, response)]
+        block = ((self.place + 0.5) * SETTINGS.blocks).long().clamp(0, SETTINGS.blocks - 1)
+        block = block[:, 1] * SETTINGS.blocks + block[:, 0]
+        count = torch.bincount(block).to(self.alpha)
+        enough = count >= SETTINGS.points_of_group
+        if int(enough.sum()) < 2:
+            return False
+        gains = torch.bincount(block, errors[0] - errors[1])[enough] / count[enough]
+        share = count[enough].sqrt() / count[enough].sqrt().sum()
+        mean = share @ gains
+        deviation = (share.square() @ (gains - mean).square()).sqrt()
+        least, times = SETTINGS.holds
+        return bool((mean >= least * errors[0].mean()) & (mean >= times * deviation) & (mean > 0))
+
+    def _squared_errors(self, response: Response) -> Float[Tensor, " n"]:
+        shades = self.bands.new_tensor(response.shading) @ _shading_terms(self.place) if response.shading else 0.0
+        even = self.bands * torch.as_tensor(shades).exp()
+        error = self.alpha - response.weights @ (response.gain * even**response.gamma)
+        return error.abs().clamp(max=SETTINGS.clipped).square()
 
 
 def _shading_terms(where: Float[Tensor, "n 2"]) -> Float[Tensor, "5 n"]:
@@ -263,6 +315,8 @@ KINDS = tuple(
 )
 """Luma, a sensor without filters, or any other; beta exposed as alpha, or otherwise. The first of each is
 as usual."""
+LUMA = tuple(kind for kind in KINDS if kind.weights == REC601)
+OTHERS = tuple(kind for kind in KINDS if kind.weights != REC601)
 
 
 class _Explanation(NamedTuple):
@@ -320,15 +374,22 @@ class _Groups(NamedTuple):
         counts, share = torch.bincount(group).to(y), weight / weights[group]
         return cls(points, share, group, means[5], level, terms, counts, variance, spread)
 
-    def explained_by(self, shading: Tensor, *, vignetted: bool) -> _Explanation:
-        """The most probable of all kinds, without a gamma and with one, this shading taken out of beta; if
-        vignetted, with what is left of it."""
+    def shaded(self, kinds: Sequence[_Kind]) -> Response:
+        """The most probable response of these kinds with vignetting."""
+        shading = self.y.new_zeros(len(self.terms))
+        for _ in range(SETTINGS.steps):
+            shading = shading + self.explained_by(shading, kinds, vignetted=True).further
+        return self.explained_by(shading, kinds, vignetted=True).response
+
+    def explained_by(self, shading: Tensor, kinds: Sequence[_Kind], *, vignetted: bool) -> _Explanation:
+        """The most probable response of these kinds, without a gamma and with one, this shading taken out of
+        beta; if vignetted, with the shading that is left."""
         gammas = self.y.new_tensor(SETTINGS.gammas)
         _, gram = self._modelled(gammas, shading, vignetted)
         drawn = -shading if vignetted else shading[:0]
         rare = math.log(SETTINGS.rare if vignetted else 1 - SETTINGS.rare)
         fits = []
-        for kind in KINDS:
+        for kind in kinds:
             evidence = kind.evidence(gram, drawn)[0] + kind.prior(gammas) + rare
             for some in (gammas == 1, gammas != 1)[: 1 + kind.gain]:
                 best = gammas[some][evidence[some].argmax()]
