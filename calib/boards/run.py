@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from arraygeom import Rig
-from arraygeom.rig import depth_range
+from arraygeom.pair import depth_range
 from arraygeom.runtime.atomic import write_text
 from arraygeom.runtime.together import refuse_others, sweep, write_together
 
@@ -68,6 +68,7 @@ def calibrate_photos(
     if depth is not None:
         depth_range(*depth)
     written = [out.with_suffix(".html"), out.with_suffix(".covariance.json"), out]
+    sweep(out.parent, out.name)
     refuse_others(out.parent, [path.name for path in written[:2]], group=out.name)
     target = parse_boards([board] if isinstance(board, str) else board)
     nominal = None if start is None else Rig.load(start)
@@ -90,7 +91,6 @@ def calibrate_photos(
         calibration, title=title, notes=notes, detected=collected.views, photos=collected.photos
     )
     covariance = rig_covariance(calibration.fit)
-    sweep(out.parent, out.name)
     with write_together(out.parent, group=out.name, last=out.name, given=[out.name]) as folder:
         write_text(folder / written[0].name, report)
         if covariance is not None:

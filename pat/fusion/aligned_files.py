@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from arraygeom.runtime.atomic import write_text
 from arraygeom.runtime.file_names import file_names
-from arraygeom.runtime.together import write_together
+from arraygeom.runtime.together import refuse_others, write_together
 
 from ..media.images import read_recorded, write_image
 from ..media.raw import demosaiced, recorded_bands
@@ -76,8 +76,8 @@ def save_aligned(
     Raises ValueError for two files of one name, and rather than write over a file of `keep`, such as the
     images; FileExistsError for files in the way that no run wrote.
     """
-    files = _files(aligned, separate, positions)
     prefix = f"{name}_" if name else ""
+    files = _files(aligned, separate, positions)
     files = [(f"{prefix}{file}", *how) for file, *how in files]
     files += [(file, write_text, text) for file, text in (pages or {}).items()]
     kept, count = {path.resolve() for path in keep}, Counter(file.casefold() for file, *_ in files)
@@ -90,6 +90,15 @@ def save_aligned(
         for file, write, *parts in files:
             write(folder / file, *parts)
     return [out / file for file in sorted(file for file, *_ in files)]
+
+
+def refuse_to_replace(out: Path, cameras: Iterable[str], *, separate: bool, name: str = "") -> None:
+    """Raise FileExistsError if an alignment would replace files in `out` that no run wrote."""
+    kinds = "_visibility.png", "_confidence.png", "_positions.npy", "_positions.tif", *[".tif"] * separate
+    own = [f"{called}{kind}" for called in file_names(cameras).values() for kind in kinds]
+    prefix = f"{name}_" if name else ""
+    names = [f"{prefix}{file}" for file in ("aligned.tif", "depth.tif", "visibility.txt", *own)]
+    refuse_others(out, [*names, *["index.html"] * (not name)], group=f"{prefix}aligned")
 
 
 def _files(aligned: Aligned, separate: bool, positions: PositionFormat) -> list[tuple[Any, ...]]:

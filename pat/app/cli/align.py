@@ -98,9 +98,9 @@ class Align(Known):
     def _align(self, frame: _Frame) -> None:
         """Align a frame, and write and say what comes of it."""
         from arraygeom.io.native import write
-        from arraygeom.runtime.together import write_listed
+        from arraygeom.runtime.together import sweep, write_listed
 
-        from ...fusion.aligned_files import save_aligned
+        from ...fusion.aligned_files import refuse_to_replace, save_aligned
         from ...fusion.results import FOUND_RIG
         from ...support.locks import folder_lock
 
@@ -109,6 +109,8 @@ class Align(Known):
         with folder_lock(self.out):
             if frame.name:
                 self.refuse_several()
+            sweep(self.out)
+            refuse_to_replace(self.out, frame.recorded.names, separate=self.separate, name=frame.name)
             aligned = self._aligned(frame)
             shown = self.report and not frame.name
             page = self._page(aligned, frame, time.monotonic() - begin) if shown else None
