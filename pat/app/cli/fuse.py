@@ -345,7 +345,7 @@ class Fuse(Known):
             frame, gain = self._exposed(frame)
             if image_array is None and not frame.depth.isfinite().any():
                 self.note("no depth: the rig knows its cameras by F alone, or the images match nowhere")
-            found = None if image_array is None else image_array.recorded
+            found = None if image_array is None else image_array.lasting
             written = self._saved(frame, rig, alpha, files, along=along, rig=found)
             shutil.rmtree(store, ignore_errors=True)
             if self.report:
