@@ -57,10 +57,10 @@ class Explanation(NamedTuple):
                 f"{self.noise:.2f} px (one plane, cameras at one place, or all too far): it is taken; open: "
                 "lines and depth"
             )
-        left = "scale" if focal_lengths else "scale, and the proportions of depth while focal lengths are"
+        bas_relief = "" if focal_lengths else ", and the proportions of depth without focal lengths"
         return (
             f"{self.beyond} of {self.points} points move along lines beyond one homography: lines are taken; "
-            f"open: {left}" + ("" if focal_lengths else " assumed")
+            f"open: scale{bas_relief}"
         )
 
 
