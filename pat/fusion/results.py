@@ -23,6 +23,7 @@ from arraygeom.io.native import write as rig_text
 from arraygeom.runtime.atomic import alone, write_text
 from arraygeom.runtime.chunks import chunked
 from arraygeom.runtime.file_names import file_names
+from arraygeom.runtime.text import ASSUMED
 from arraygeom.runtime.threads import in_parallel
 from arraygeom.runtime.together import LISTS, refuse_others, write_listed, write_together
 
@@ -98,11 +99,12 @@ def save_frame(
     `view`, the rig of alpha alone goes to view.yaml and says so; with `rig`, that of all cameras to
     found_rig.yaml; with `points`, the camera of alpha, the pixels of known depth, which is `along` its axis
     or rays (`measured_along`), go to points.ply. With a `name` the files are name_fused.png and so on.
-    Without any known depth there are no depth files. With `bands`, the names of bands that cameras record one
-    by one, each goes to fused_NAME.png and confidence_NAME.png too (NAME by `file_names`); bands without
-    names that are not one or three go to fused_1.png and so on. Of other numbers than one and three fused.png
-    is the mean. `pages` are further text files. All are swapped in together, the image last, and those of a
-    former frame of this name are gone (`write_together`, which keeps `about`). Returns what was written.
+    Without any known depth there are no depth files, and no bounds of it by a view whose focal lengths are
+    assumed. With `bands`, the names of bands that cameras record one by one, each goes to fused_NAME.png and
+    confidence_NAME.png too (NAME by `file_names`); bands without names that are not one or three go to
+    fused_1.png and so on. Of other numbers than one and three fused.png is the mean. `pages` are further text
+    files. All are swapped in together, the image last, and those of a former frame of this name are gone
+    (`write_together`, which keeps `about`). Returns what was written.
 
     Raises FileExistsError for files in the way that no fusion wrote.
     """
@@ -115,7 +117,9 @@ def save_frame(
         confidence = partial(write_image, folder / f"{prefix}confidence.png", frame.confidence[None])
         tasks: list[Callable[[], object]] = [confidence]
         if frame.depth.isfinite().any():
-            for suffix, depth in zip(("", "_nearest", "_farthest"), (frame.depth, *frame.depth_interval)):
+            known = view is None or view.name != ASSUMED
+            bounds = zip(("_nearest", "_farthest"), frame.depth_interval) if known else ()
+            for suffix, depth in (("", frame.depth), *bounds):
                 path = folder / f"{prefix}depth{suffix}.tif"
                 tasks.append(partial(write_image, path, depth[None], bits=32, unknown=True))
             near = float(view.depth[0]) if view is not None and view.depth else None
