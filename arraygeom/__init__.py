@@ -3,6 +3,10 @@
 Cameras, rigs, two-view geometry and receptive fields as tensor operations; see conventions.md.
 """
 
+from collections.abc import Callable
+from importlib import import_module
+from typing import Any
+
 from .batching import stack
 from .camera import Camera, LensView, Projected, View, intrinsics
 from .checks import unchecked
@@ -46,17 +50,30 @@ from .homography import (
     plane_homography,
 )
 from .multiview import ConsistentDepth, WorldRays, consistent_depth, plane_sweep, warp, world_rays
+from .pair import Link, Pair
 from .pixels import pixel_grid, resize_matrix
 from .pose import Pose, rotation_from_vector
 from .rectification import Rectification, rectify
 from .relative_pose import TwoViewPose, poses_from_essential, relative_pose
 from .reprojection import Bundle, bundle_adjusted, reprojection_residuals
-from .rig import Link, Pair, Rig
+from .rig import SERVICES, Rig
 from .sampling import sample, to_grid
 from .segments import Positions, Segments
 from .sensor import Band, Curve, Sensor
 from .triangulation import Triangulated, depth_of, triangulate
 from .undistortion import pinhole_view, resampled
+
+
+def _when_called(module: str, name: str) -> Callable[..., Any]:
+    """A function whose module is imported when it is called: the formats of rig files take a while."""
+    return lambda *args: getattr(import_module(f"{__name__}.{module}"), name)(*args)
+
+
+SERVICES.update(
+    load=_when_called("io", "read_rig"),
+    save=_when_called("io", "write_rig"),
+    check=_when_called("rig_check", "oddities"),
+)
 
 __all__ = [
     "Band",
@@ -133,3 +150,7 @@ __all__ = [
     "warp",
     "world_rays",
 ]
+
+
+def __dir__() -> list[str]:
+    return __all__

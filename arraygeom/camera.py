@@ -13,6 +13,7 @@ from torch import Tensor
 from .batching import Batched
 from .checks import check_batches, check_hw, check_K, checking
 from .distortion import Distortion
+from .kornia_models import from_kornia_model, to_kornia_model
 from .lenses.common import on_plane
 from .lenses.model import LensModel, check_model
 from .pixels import (
@@ -290,10 +291,8 @@ class Camera(LensView):
         """
         from kornia.geometry.camera import PinholeCamera
 
-        from .kornia_models import to_kornia_model
-
         if self.distortion is not None and not self.distortion.harmless:
-            return to_kornia_model(self)
+            return to_kornia_model(self.K, self.hw, self.distortion)
         R, t, K = self.R.reshape(-1, 3, 3), self.t.reshape(-1, 3), self.K.reshape(-1, 3, 3)
         row = K.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(K), 1, 4)
         intrinsics = torch.cat([torch.cat([K, K.new_zeros(len(K), 3, 1)], -1), row], -2)
@@ -313,10 +312,12 @@ class Camera(LensView):
         from kornia.geometry.camera import PinholeCamera
         from kornia.sensors.camera import CameraModel
 
-        from .kornia_models import from_kornia_model
-
         if isinstance(camera, CameraModel):
-            return from_kornia_model(camera, cam_from_world)
+            K, hw, lens = from_kornia_model(camera)
+            if cam_from_world is None:
+                here = Pose.identity().to(K)
+                cam_from_world = Pose(here.R.expand_as(K), here.t.expand(K.shape[:-1]))
+            return cls(K=K, cam_from_world=cam_from_world, hw=hw, distortion=lens)
         if not isinstance(camera, PinholeCamera):
             kind = type(camera).__name__
             raise TypeError(f"a {kind} is none of kornia's PinholeCamera and CameraModel: make one of these")

@@ -1,19 +1,18 @@
-"""Cameras with lenses from and to kornia's camera models (`kornia.sensors.camera`), which have no pose."""
+"""Intrinsics and lenses from and to kornia's camera models (`kornia.sensors.camera`), which have no pose."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from .camera import Camera, LensView
 from .distortion import BROWN_CONRADY, KANNALA_BRANDT, Distortion
 from .lenses import Orthographic
 from .lenses.model import LensModel
-from .pixels import broadcast_shapes
-from .pose import Pose
+from .pixels import HW, broadcast_shapes
 
 if TYPE_CHECKING:
     from kornia.sensors.camera import CameraModel
@@ -22,12 +21,11 @@ BROWN_TERMS = 8
 """Kornia's models have k1 k2 p1 p2 k3 k4 k5 k6."""
 
 
-def to_kornia_model(camera: LensView) -> CameraModel:
-    """Kornia's camera model with the same intrinsics and lens. Raises ValueError where kornia has none."""
+def to_kornia_model(K: Float[Tensor, "*b 3 3"], hw: HW, lens: LensModel | None) -> CameraModel:
+    """Kornia's camera model with these intrinsics and lens. Raises ValueError where kornia has none."""
     from kornia.image import ImageSize
     from kornia.sensors.camera import CameraModel, CameraModelType
 
-    K, lens = camera.K, camera.distortion
     if bool((K[..., 0, 1] != 0).any() | (K[..., 1, 0] != 0).any()):
         raise ValueError("kornia's camera models have fx, fy, cx and cy, and this K is skewed or rotated")
     numbers = K.new_zeros(0)
@@ -47,7 +45,7 @@ def to_kornia_model(camera: LensView) -> CameraModel:
     focal_and_centre = torch.stack([K[..., 0, 0], K[..., 1, 1], K[..., 0, 2], K[..., 1, 2]], -1)
     batch = broadcast_shapes(K.shape[:-2], numbers.shape[:-1])
     params = torch.cat([tensor.expand(*batch, -1) for tensor in (focal_and_centre, numbers.to(K))], -1)
-    return CameraModel(ImageSize(*camera.hw), kind, params.flatten(0, -2) if params.ndim > 2 else params)
+    return CameraModel(ImageSize(*hw), kind, params.flatten(0, -2) if params.ndim > 2 else params)
 
 
 def _eight(lens: LensModel) -> Tensor:
@@ -59,12 +57,12 @@ def _eight(lens: LensModel) -> Tensor:
     return pad(c[..., :BROWN_TERMS], (0, max(0, BROWN_TERMS - c.shape[-1])))
 
 
-def from_kornia_model(model: CameraModel, cam_from_world: Pose | None = None) -> Camera:
-    """The camera of a kornia camera model, one or a batch, at a pose (the world's origin by default)."""
+def from_kornia_model(model: CameraModel) -> tuple[Float[Tensor, "*b 3 3"], HW, LensModel | None]:
+    """K, the image's (height, width) and the lens of a kornia camera model, one or a batch."""
     from kornia.sensors.camera.distortion_model import BrownConradyTransform, KannalaBrandtK3Transform
     from kornia.sensors.camera.projection_model import OrthographicProjection
 
-    K, numbers = model.matrix(), model.params[..., 4:]
+    numbers = model.params[..., 4:]
     lens: LensModel | None = None
     if isinstance(model.projection, OrthographicProjection):
         lens = Orthographic()
@@ -72,9 +70,4 @@ def from_kornia_model(model: CameraModel, cam_from_world: Pose | None = None) ->
         lens = Distortion(BROWN_CONRADY, numbers)
     elif isinstance(model.distortion, KannalaBrandtK3Transform):
         lens = Distortion(KANNALA_BRANDT, numbers)
-    if cam_from_world is None:
-        here = Pose.identity().to(K)
-        cam_from_world = Pose(here.R.expand_as(K), here.t.expand(K.shape[:-1]))
-    return Camera(
-        K=K, cam_from_world=cam_from_world, hw=(int(model.height), int(model.width)), distortion=lens
-    )
+    return model.matrix(), (int(model.height), int(model.width)), lens

@@ -11,9 +11,10 @@ from torch import Tensor
 
 from .camera import Camera, Projected
 from .epipolar import beside
+from .pair import Pair
 from .pixels import HW, floating, pixel_grid
 from .pose import Pose
-from .rig import Pair, Rig
+from .rig import Rig
 from .sampling import Interpolation, Sampled, sample
 
 

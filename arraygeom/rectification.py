@@ -11,9 +11,9 @@ from torch import Tensor
 
 from .camera import Camera, intrinsics
 from .homography import infinite_homography
+from .pair import Pair
 from .pixels import HW, product
 from .pose import Pose, cross_matrix, matvec, rotation_from_vector, rotation_vector
-from .rig import Pair
 from .runtime.tracing import needs_numbers
 
 

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from itertools import combinations, pairwise
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from .camera import Camera, LensView, View
 from .checks import derived
+from .fields.default import recorded_field
+from .pair import Pair
 from .pixels import HW, coarse_grid, map_homogeneous
+from .rig import Rig
 from .runtime.text import length_unit
-
-if TYPE_CHECKING:
-    from .rig import Pair, Rig
 
 SMALLEST_BASELINE, LARGEST_BASELINE = 1e-4, 50.0
 """A baseline outside these bounds, in metres, is more likely a mistaken unit than a camera array."""
@@ -156,8 +155,6 @@ def _reduced(hw: HW) -> HW:
 
 def _overlap(pair: Pair) -> bool:
     """Whether the segment of any pixel of a grid reaches beta's image."""
-    from .fields.default import recorded_field
-
     locations = recorded_field(pair)(pair, _grid(pair.alpha).to(pair.cameras[0].K))
     return bool((locations.valid if hasattr(locations, "valid") else locations.mask).any())
 

@@ -11,8 +11,9 @@ from torch import Tensor
 
 from .camera import Camera
 from .fields import Curved, Epipolar, sampling_locations
+from .pair import Pair
 from .pixels import coarse_grid, pixel_grid
-from .rig import Pair, Rig
+from .rig import Rig
 from .runtime.text import angle
 from .segments import Segments
 

@@ -13,10 +13,10 @@ from .camera import Camera
 from .epipolar import Depth, beside, depth_from_track, track
 from .lenses.common import on_plane
 from .multiview import world_rays
+from .pair import Pair
 from .pixels import floating, product
 from .pose import matvec
 from .reprojection import projection_slopes
-from .rig import Pair
 
 
 class Triangulated(NamedTuple):

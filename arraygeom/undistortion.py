@@ -12,7 +12,6 @@ from torch import Tensor
 
 from .camera import AnyLensView, Camera, LensView, View
 from .pixels import HW, coarse_grid, map_homogeneous, pixel_coordinates, product
-from .rig import Rig
 from .runtime.chunks import chunked
 from .runtime.tracing import needs_numbers
 from .sampling import Interpolation, Sampled, sample
@@ -102,15 +101,6 @@ def _between(recorded: LensView, now: View) -> Float[Tensor, "3 3"]:
             "which pixels were recorded views without K do not say: give them one (`with_pixels`)"
         )
     return product(recorded.K.double(), torch.linalg.inv(now.K.double()))
-
-
-def with_pixels(rig: Rig) -> Rig:
-    """The rig whose views all have a K, the identity if not calibrated: it follows all changes of pixels."""
-    for name, view in rig.cameras.items():
-        if not isinstance(view, LensView):
-            eye = torch.eye(3, dtype=torch.float64)
-            rig = rig.with_camera(name, LensView(hw=view.hw, sensor=view.sensor, K=eye))
-    return rig
 
 
 def resampled(

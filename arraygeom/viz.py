@@ -21,8 +21,9 @@ from .epipolar import epipolar_distance, epipolar_lines
 from .fields import ReceptiveField, recorded_field
 from .fields.protocol import sampling_locations
 from .fields.widened import direction
+from .pair import Pair
 from .pixels import HW
-from .rig import Pair, Rig
+from .rig import Rig
 from .runtime.extras import needs
 from .runtime.text import length_unit
 from .segments import Segments

@@ -13,8 +13,8 @@ from torch import Tensor
 from ..camera import LensView, View
 from ..checks import check_above, check_field
 from ..epipolar import beside, segments_between
+from ..pair import Pair
 from ..pixels import HW, floating
-from ..rig import Pair
 from ..segments import Segments
 from ..undistortion import recorded_pixels, straight_pixels
 from .default import straight_field

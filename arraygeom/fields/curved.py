@@ -18,8 +18,8 @@ from ..camera import Camera, LensView, View
 from ..checks import check_above, check_bounds, check_field
 from ..distortion import Distortion
 from ..epipolar import FRONT, Track, beside, clipped
+from ..pair import Pair
 from ..pixels import HW, floating, map_homogeneous, product
-from ..rig import Pair
 from ..runtime.chunks import spans
 from ..runtime.threads import in_parallel
 from ..runtime.tracing import traced

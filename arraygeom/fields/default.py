@@ -7,8 +7,8 @@ from typing import Any, Literal
 
 from ..checks import check_field
 from ..epipolar import FRONT
+from ..pair import Pair
 from ..pixels import coarse_grid
-from ..rig import Pair
 from ..runtime.extras import imported
 from ..runtime.tracing import traced
 from .curved import Curved, ThroughLenses

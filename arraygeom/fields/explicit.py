@@ -13,8 +13,8 @@ from torch import Tensor
 from ..checks import check_above
 from ..epipolar import epipolar_lines
 from ..homography import apply_homography
+from ..pair import Pair
 from ..pixels import HW, floating, pixel_grid, within
-from ..rig import Pair
 from ..runtime.chunks import chunked, spans
 from ..runtime.threads import in_parallel
 from ..runtime.tracing import traced

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from ..pair import Pair
 from ..pixels import HW, pixel_coordinates, pixel_grid
-from ..rig import Pair
 from ..runtime.chunks import Box, chunked
 from ..segments import Positions, Segments, clip_to_image
 from .protocol import ReceptiveField, SamplingLocations, device_of, lazily

@@ -12,8 +12,8 @@ from torch import Tensor
 from ..batching import tensors_of
 from ..camera import Camera
 from ..checks import check_field, check_pixels
+from ..pair import Pair
 from ..pixels import floating, pixel_grid
-from ..rig import Pair
 from ..runtime.chunks import chunked
 from ..runtime.compiled import can_compile
 from ..runtime.tracing import followed

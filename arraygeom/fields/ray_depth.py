@@ -10,8 +10,8 @@ from torch import Tensor
 
 from ..epipolar import Depth
 from ..homography import TransformedPoints, apply_homography
+from ..pair import Pair
 from ..pixels import floating
-from ..rig import Pair
 from ..runtime.chunks import chunked
 from .curved import Curved, RayCurve
 from .default import natural_bounds

@@ -15,8 +15,8 @@ from ..camera import Camera
 from ..checks import check_above, check_bounds
 from ..epipolar import Track, epipolar_lines, segments_between, track
 from ..homography import apply_homography, fit_homography
+from ..pair import Depths, Link, Pair, depth_range
 from ..pixels import HW, coarse_grid, floating
-from ..rig import Depths, Link, Pair, depth_range
 from ..runtime.chunks import chunked
 from ..runtime.tracing import followed, needs_numbers
 from ..segments import Segments, clip_to_image

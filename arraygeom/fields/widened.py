@@ -10,8 +10,8 @@ from jaxtyping import Float, Real
 from torch import Tensor
 
 from ..checks import check_above, check_field
+from ..pair import Pair
 from ..pixels import HW, floating, shift_matrix
-from ..rig import Pair
 from ..sampling import sample
 from ..segments import Positions, Segments, clip_to_image
 from .curved import Curved, ThroughLenses

@@ -51,9 +51,10 @@ from torch import Tensor
 from ..camera import Camera, LensView, View, intrinsics
 from ..distortion import COEFFICIENT_COUNTS, Distortion
 from ..lenses.model import CAMERA_MODELS, CameraModel, LensModel, check_model
+from ..pair import Link
 from ..pixels import HW, shift_matrix
 from ..pose import Pose, rotation_from_vector
-from ..rig import Link, Rig
+from ..rig import Rig
 from ..runtime.safe_yaml import SafeDumper
 from ..runtime.text import short
 from ..sensor import Band, Curve, Sensor

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from arraygeom import Rig
-from arraygeom.rig import depth_range
+from arraygeom.pair import depth_range
 from arraygeom.runtime.atomic import sweep, write_text, write_together
 
 from .adequacy import coverage_advice, coverages, next_views, point_counts

@@ -10,7 +10,7 @@ import torch
 import tyro
 
 from arraygeom import Camera, Pose, Rig, Sensor, intrinsics, rotation_from_vector
-from arraygeom.rig import depth_range
+from arraygeom.pair import depth_range
 from pat.app.sample_array import ALPHA, BETA, SAMPLE
 from pat.lab.synthesis.blender import RenderSettings, render
 from pat.media.colour import luminance, srgb_from_linear

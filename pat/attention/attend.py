@@ -27,8 +27,8 @@ from torch.utils.checkpoint import checkpoint
 
 from arraygeom.camera import View
 from arraygeom.fields import Dense, Local, lazily
+from arraygeom.pair import Pair
 from arraygeom.pixels import pixel_coordinates
-from arraygeom.rig import Pair
 from arraygeom.runtime.chunks import chunked
 from arraygeom.runtime.tracing import needs_numbers, transformations
 from arraygeom.segments import Positions, Segments

@@ -19,10 +19,11 @@ from numpy.typing import DTypeLike, NDArray
 from torch import Tensor
 
 from arraygeom import Band, LensView, ReceptiveField, Rig, Segments, View, pixel_grid, sample
+from arraygeom.rig import with_pixels
 from arraygeom.runtime.chunks import chunked
 from arraygeom.runtime.threads import torch_in_one_thread
 from arraygeom.sampling import Interpolation, on_image
-from arraygeom.undistortion import pixels_between, recorded_pixels, resampled, with_pixels
+from arraygeom.undistortion import pixels_between, recorded_pixels, resampled
 
 from ..matching.match import Matcher, match
 from ..matching.matches import BetaMatches

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from .configs import PATConfig
+from .paper import PAT
 
 PREFIX = "module."
 
@@ -51,6 +52,14 @@ def read_authors(path: str | Path) -> Authors:
         raise ValueError(f"{path}: not a checkpoint of the authors' PAT: {error}") from None
 
 
+def load_authors(path: str | Path) -> PAT:
+    """The network of an authors' checkpoint (best.pth.tar), ready to use. Raises as `read_authors`."""
+    read = read_authors(path)
+    network = PAT(read.config)
+    network.load_state_dict(read.state)
+    return network.eval().requires_grad_(False)
+
+
 def config_of(state: Mapping[str, Tensor]) -> PATConfig:
     """The configuration that weights with their names are of. Raises ValueError naming what is missing."""
     betas = sum(re.fullmatch(r"pam\.b2s\.\d+\.weight", name) is not None for name in state)
@@ -78,8 +87,6 @@ def renamed(weights: Mapping[str, Tensor], config: PATConfig) -> dict[str, Tenso
 
     Raises ValueError naming the first that is missing, too many, or of another shape.
     """
-    from .paper import PAT
-
     with torch.device("meta"):
         wanted = {name: tuple(t.shape) for name, t in PAT(config).state_dict().items()}
     names = dict(_names(config.betas))

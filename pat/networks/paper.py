@@ -7,7 +7,6 @@ configuration is the paper's; variants are configuration.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 import torch
@@ -22,7 +21,6 @@ from ..matching.filters import box_mean
 from ..matching.inputs import Inputs
 from ..matching.matches import Matches
 from ..support.blocks import ResidualASPP, ResidualBlock
-from .authors import read_authors
 from .configs import PATConfig
 from .protocol import FusionOutput, JoinsBands
 
@@ -59,14 +57,6 @@ class PAT(nn.Module):
         self.features = Features(config)
         self.engine = AttentionEngine(config)
         self.post = PostFusion(config)
-
-    @classmethod
-    def from_authors(cls, path: str | Path) -> PAT:
-        """The network of one of the authors' checkpoints (best.pth.tar), ready to use; see `read_authors`."""
-        read = read_authors(path)
-        network = cls(read.config)
-        network.load_state_dict(read.state)
-        return network.eval().requires_grad_(False)
 
     def forward(self, inputs: Inputs, matches: Matches | None = None) -> FusionOutput:
         """Fuse alpha with the betas, in the order the network was made for; matches are not used.

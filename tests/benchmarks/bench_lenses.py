@@ -26,7 +26,7 @@ import tyro
 from numpy.typing import NDArray
 from torch import Tensor
 
-from arraygeom import Camera, Distortion, Pose
+from arraygeom import Distortion
 from arraygeom.kornia_models import to_kornia_model
 from arraygeom.lenses import PolynomialFisheye
 from arraygeom.lenses.model import LensModel
@@ -266,10 +266,9 @@ def kornia(name: str) -> Library | None:
 
     def model(c: Array, points: int) -> Any:
         wide = np.repeat(c, points, 0)
-        at = Pose(torch.eye(3).double().expand(len(wide), 3, 3), torch.zeros(len(wide), 3).double())
         intrinsic = torch.from_numpy(K).expand(len(wide), 3, 3)
         lens = Distortion(name, torch.from_numpy(wide))
-        return to_kornia_model(Camera(K=intrinsic, cam_from_world=at, hw=(1000, 1000), distortion=lens))
+        return to_kornia_model(intrinsic, (1000, 1000), lens)
 
     from kornia.geometry.vector import Vector2, Vector3
 

@@ -109,7 +109,7 @@ class Known:
 
         Raises ValueError for options that do not go together, and for what is not of these cameras.
         """
-        from arraygeom.undistortion import with_pixels
+        from arraygeom.rig import with_pixels
 
         if self.depth_map is None:
             if self.matches is None:

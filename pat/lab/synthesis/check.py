@@ -12,8 +12,9 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
+from arraygeom.pair import Pair
 from arraygeom.pixels import pixel_grid
-from arraygeom.rig import Pair, Rig
+from arraygeom.rig import Rig
 from arraygeom.sampling import sample
 
 from .rendered import RenderedFrame, depth_between

@@ -13,7 +13,7 @@ import torch
 from arraygeom import Link, NearestVoxels, Pair, Positions, Rectified, View
 from arraygeom.fields.grid import FieldOnGrid
 from pat.matching.inputs import Inputs
-from pat.networks.authors import _names, read_authors
+from pat.networks.authors import _names, load_authors, read_authors
 from pat.networks.configs import PATConfig
 from pat.networks.paper import PAT
 from pat.networks.weights import load_weights, save_weights
@@ -83,7 +83,7 @@ def case(request, shared_data, tmp_path):
     outputs = np.load(folder / "reference.npz")
     weights = made_weights(dict(facts["weights"]))
     # Saved in float64, read in float32: the network is given the float64 numbers again.
-    network = PAT.from_authors(save(tmp_path / "best.pth.tar", weights)).double()
+    network = load_authors(save(tmp_path / "best.pth.tar", weights)).double()
     reread = read_authors(tmp_path / "best.pth.tar")
     network.load_state_dict({name: _exact(name, weights, reread.config) for name in reread.state})
     return facts, network, outputs[request.param], outputs[f"{request.param}_attention"]
@@ -154,7 +154,7 @@ def _by_lists(network: PAT, alpha, betas, lists) -> torch.Tensor:
 def test_a_checkpoint_as_theirs_round_trips(options, tmp_path):
     network = small(**options)
     path = save(tmp_path / "best.pth.tar", authors_state(network))
-    found = PAT.from_authors(path)
+    found = load_authors(path)
     assert found.config == network.config
     for name, tensor in network.state_dict().items():
         assert torch.equal(found.state_dict()[name], tensor), name
@@ -165,7 +165,7 @@ def test_a_checkpoint_as_theirs_round_trips(options, tmp_path):
 
 def test_a_bare_state_dict_and_names_without_module_are_read(tmp_path):
     torch.save(authors_state(small()), tmp_path / "bare.pth")
-    assert PAT.from_authors(tmp_path / "bare.pth").config.betas == 1
+    assert load_authors(tmp_path / "bare.pth").config.betas == 1
 
 
 class _Runs:
@@ -181,7 +181,7 @@ class _Runs:
 def test_a_pickle_that_would_run_code_is_refused_in_a_line(tmp_path):
     path = save(tmp_path / "best.pth.tar", authors_state(small()), epoch=_Runs(tmp_path / "ran"))
     with pytest.raises(ValueError, match="would run code") as refused:
-        PAT.from_authors(path)
+        load_authors(path)
     assert not (tmp_path / "ran").exists()
     assert "\n" not in str(refused.value)
     assert len(str(refused.value)) < 300
@@ -192,7 +192,7 @@ def test_a_text_or_a_file_cut_short_is_refused_in_a_line(share, tmp_path):
     whole = save(tmp_path / "whole", authors_state(small())).read_bytes()
     (tmp_path / "cut").write_bytes(b"# A text\n" if share is None else whole[: int(len(whole) * share)])
     with pytest.raises(ValueError, match="cut short") as refused:
-        PAT.from_authors(tmp_path / "cut")
+        load_authors(tmp_path / "cut")
     assert "\n" not in str(refused.value)
 
 
@@ -215,7 +215,7 @@ def changed(**changes):
 )
 def test_checkpoints_of_other_networks_name_what_does_not_fit_first(state, message, tmp_path):
     with pytest.raises(ValueError, match=message):
-        PAT.from_authors(save(tmp_path / "other", state))
+        load_authors(save(tmp_path / "other", state))
 
 
 @pytest.mark.parametrize(
@@ -224,9 +224,9 @@ def test_checkpoints_of_other_networks_name_what_does_not_fit_first(state, messa
 def test_files_without_weights_are_refused(content, tmp_path):
     torch.save(content, tmp_path / "other")
     with pytest.raises(ValueError, match="state_dict"):
-        PAT.from_authors(tmp_path / "other")
+        load_authors(tmp_path / "other")
 
 
 def test_no_file_is_said(tmp_path):
     with pytest.raises(FileNotFoundError):
-        PAT.from_authors(tmp_path / "none")
+        load_authors(tmp_path / "none")

@@ -1,0 +1,199 @@
+"""Pair: two views with their relation, and Link, the relation of views that are not calibrated."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from .batching import Batched
+from .camera import Camera, LensView, View
+from .checks import check_numbers, check_origin, checking, derived
+from .epipolar import fundamental_matrix
+from .homography import plane_homography
+from .pixels import HW, product, resize_matrix
+from .pose import Pose
+from .runtime.text import baseline_text, depth_text
+from .runtime.tracing import traced
+
+Depths = tuple[Float[Tensor, "*b"], Float[Tensor, "*b"]]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Link(Batched):
+    """The two-view geometry of an uncalibrated pair: x_beta^T F x_alpha = 0 and, roughly, x_beta ~ H x_alpha.
+
+    Of views with lenses, x are undistorted pixels (`LensView.undistort`).
+    """
+
+    item_axes: ClassVar = {"F": 2, "H": 2}
+    F: Float[Tensor, "*b 3 3"]
+    H: Float[Tensor, "*b 3 3"] | None = None
+
+    def __post_init__(self) -> None:
+        if checking():
+            for name, matrix in (("F", self.F), ("H", self.H)):
+                if not (name == "H" and matrix is None):
+                    check_numbers(matrix, (3, 3), name)
+
+    def reversed(self) -> Link:
+        """The same link with alpha and beta exchanged."""
+        return Link(self.F.transpose(-1, -2), None if self.H is None else torch.linalg.inv(self.H))
+
+    def _text(self) -> str:
+        return "F" if self.H is None else "F and H"
+
+    def transformed(self, A_alpha: Float[Tensor, "3 3"], A_beta: Float[Tensor, "3 3"]) -> Link:
+        """The link between images whose pixels are A x of the old ones."""
+        A_alpha, A_beta = A_alpha.to(self.F), A_beta.to(self.F)
+        back = torch.linalg.inv(A_alpha)
+        F = product(product(torch.linalg.inv(A_beta).T, self.F), back)
+        return Link(F, None if self.H is None else product(product(A_beta, self.H), back))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Pair(Batched):
+    """Alpha and one beta with their relation: two calibrated cameras, or a link, or only sizes."""
+
+    alpha: View
+    beta: View
+    depth: Depths | None = None
+    link: Link | None = None
+    unit: str = "m"
+    """Of lengths: "baselines" where the rig's scale is unknown."""
+    memo: dict[str, Any] = field(default_factory=dict, init=False, compare=False, repr=False)
+    """Cache of what fields compute once a pair; never copied."""
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether both cameras are calibrated."""
+        return isinstance(self.alpha, Camera) and isinstance(self.beta, Camera)
+
+    @property
+    def has_lens(self) -> bool:
+        """Whether either view has a lens that distorts, so that lines are curves in its image."""
+        lenses = [view.distortion for view in (self.alpha, self.beta) if isinstance(view, LensView)]
+        return any(lens is not None and not lens.harmless for lens in lenses)
+
+    @property
+    def cameras(self) -> tuple[Camera, Camera]:
+        """Both cameras. Raises ValueError unless the pair is calibrated."""
+        if not (isinstance(self.alpha, Camera) and isinstance(self.beta, Camera)):
+            raise ValueError(
+                "this field needs calibrated cameras and the pair has none: "
+                "use one that needs only F or sizes, such as HomographyDisplacement or Rectified"
+            )
+        return self.alpha, self.beta
+
+    @property
+    def beta_from_alpha(self) -> Pose:
+        """X_beta = R X_alpha + t; t is 0 where it is no more than the rounding of the cameras' poses."""
+        alpha, beta = self.cameras
+        if checking() and self.depth is not None:
+            check_origin(self.depth[0], alpha.t, beta.t, unit=self.unit)
+        # torch.compile cannot trace @ of these
+        pose = beta.cam_from_world.__matmul__(alpha.cam_from_world.inverse())
+        baseline, *sides = (t.detach().norm(dim=-1, keepdim=True) for t in (pose.t, alpha.t, beta.t))
+        is_rounding = baseline <= ROUNDED * torch.finfo(baseline.dtype).eps * sum(sides)
+        return derived(Pose, pose.R, pose.t - torch.where(is_rounding, pose.t.detach(), 0.0))
+
+    @property
+    def depth_range(self) -> Depths:
+        """(near, far) in metres. Raises ValueError if the rig states none."""
+        if self.depth is None:
+            raise ValueError(
+                "this field needs a depth range: give the rig one, `depth: [near, far]` in its file or "
+                "`rig.replace(depth=(near, far))`, or `--depth NEAR FAR` to `pat fuse` and `pat align`; "
+                "`pat rig doctor` says between which depths it finds points"
+            )
+        return self.depth
+
+    @property
+    def fundamental(self) -> Float[Tensor, "*b 3 3"]:
+        """F with x_beta^T F x_alpha = 0, from cameras or as given; between undistorted pixels through lenses.
+
+        0 without a baseline. Raises ValueError if neither is known.
+        """
+        if self.link is not None:
+            return self.link.F
+        if not self.calibrated:
+            raise ValueError(
+                "neither the cameras' calibration nor F is known for this pair: give the rig a link"
+            )
+        alpha, beta = self._central("fundamental matrix")
+        return fundamental_matrix(alpha.K, beta.K, self.beta_from_alpha)
+
+    @property
+    def homography(self) -> Float[Tensor, "*b 3 3"]:
+        """H with x_beta ~ H x_alpha, roughly: as given; or of the plane at the middle inverse depth.
+
+        A pair that is known only by sizes, or by F alone, is assumed to have the same field of view.
+        """
+        if self.link is not None and self.link.H is not None:
+            return self.link.H
+        if self.calibrated and self.depth is not None:
+            near, far = self.depth
+            return self.homography_at(2 / (1 / near + 1 / far))  # the middle of the disparities
+        if self.calibrated:
+            return self.homography_at(torch.tensor(torch.inf, dtype=torch.float64))
+        return resize_matrix(self.alpha.hw, self.beta.hw)
+
+    def resize_beta(self, hw: HW) -> Pair:
+        """The pair whose beta records images of another size."""
+        return self.transform_beta(resize_matrix(self.beta.hw, hw), hw)
+
+    def transform_beta(self, A: Float[Tensor, "3 3"], hw: HW) -> Pair:
+        """The pair in which beta's pixels are x' ~ A x and its image's size is `hw`."""
+        eye = torch.eye(3, dtype=A.dtype)
+        link = None if self.link is None else self.link.transformed(eye, A)
+        return dataclasses.replace(self, beta=self.beta.transformed(A, hw), link=link)
+
+    def homography_at(self, depth: Float[Tensor, "*d"]) -> Float[Tensor, "*b 3 3"]:
+        """The homography of the plane z = depth in alpha's frame (metres; may be inf)."""
+        alpha, beta = self._central("homography")
+        normal = alpha.K.new_tensor([0.0, 0.0, 1.0])
+        pose = self.beta_from_alpha
+        return plane_homography(alpha.K, beta.K, pose.R, pose.t, normal=normal, d=-depth.to(alpha.K))
+
+    def _central(self, what: str) -> tuple[Camera, Camera]:
+        """Both cameras. Raises ValueError if the rays of one do not meet in a point."""
+        for camera in self.cameras:
+            if not camera.central and camera.distortion is not None:
+                model = camera.distortion.model
+                raise ValueError(
+                    f"rays of a camera ({model}) do not meet in a point: there is no {what}; use Curved"
+                )
+        return self.cameras
+
+    def _text(self) -> str:
+        views = {"alpha": self.alpha, "beta": self.beta}
+        named = ", ".join(f"{name} {view._text()}" for name, view in views.items())
+        link = "" if self.link is None else f"link by {self.link._text()}"
+        lengths = baseline_text(views, self.unit), depth_text(self.depth, self.unit)
+        return "; ".join(filter(None, (named, *lengths, link)))
+
+
+ROUNDED = 8
+"""A baseline of so many units in the last place of the cameras' translations is none."""
+
+
+def depth_range(near: Any, far: Any) -> Depths:
+    """(near, far) as tensors, numbers in float64. Raises ValueError unless 0 < near <= far (where known)."""
+    bounds = [
+        d if isinstance(d, Tensor) else torch.tensor(float(d), dtype=torch.float64) for d in (near, far)
+    ]
+    near, far = bounds
+    if not traced() and not bool(((near > 0) & (far >= near)).all()):
+        raise ValueError(
+            "depth bounds must satisfy 0 < near <= far, in metres; "
+            f"got near = {_shown(near)}, far = {_shown(far)}"
+        )
+    return near, far
+
+
+def _shown(d: Tensor) -> str:
+    return ", ".join(f"{v:g}" for v in d.reshape(-1).tolist())
