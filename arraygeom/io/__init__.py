@@ -19,7 +19,7 @@ from ..camera import Camera, LensView
 from ..distortion import COEFFICIENT_COUNTS
 from ..pixels import HW
 from ..rig import Rig
-from ..rig_check import unit_oddity
+from ..rig_check import file_oddities
 from ..runtime.atomic import sweep, write_text, write_together
 from ..runtime.warned import warn
 from ..sensor import Sensor
@@ -112,8 +112,8 @@ def read_rig(
         raise RigFileError(path, None, f"states its lenses itself, or none: {lens} has no use: leave it out")
     rig = rig if scale == 1.0 else rig.scaled(scale)
     _check_magnitudes(path, rig)
-    if doubt := unit_oddity(rig):
-        RigSource(path).warn(doubt)
+    for doubt in file_oddities(rig):
+        source.warn(doubt)
     return rig
 
 
@@ -152,8 +152,8 @@ def recognise(path: str | Path) -> str:
     raise UnknownRigFormat(
         path,
         None,
-        f"is not a rig file of a known format. {likely}Write its numbers in a rig file: cameras: {{N: "
-        "{size: [w, h], focal: px, centre: [x, y], rotation: 3x3, translation: [x, y, z], distortion: {model: "
+        f"is not a rig file of a known format. {likely}Write a rig file of its numbers: cameras: {{N: "
+        "{size: [w, h], focal: px, centre: [x, y], rotation: 3x3, translation: [x y z], distortion: {model: "
         "brown-conrady, coefficients: [k1, k2, p1, p2]}}}; or name its format (`pat rig convert --read-as`)",
     )
 

@@ -16,7 +16,7 @@ from .source import LENS_NAME, Entry, RigSource, pose_of
 
 
 def recognises(path: Path, head: str) -> bool:
-    return '"cameras"' in head and '"image_size"' in head
+    return '"cameras"' in head and ('"image_size"' in head or '"camera_poses"' in head)
 
 
 def read(source: RigSource) -> Rig:

@@ -111,7 +111,8 @@ def _of_group(fields: Entry) -> Camera:
 
 def _named_camera(nodes: Entry, name: str) -> Camera:
     """A camera of EasyMocap's intri.yml and extri.yml."""
-    K, R, t = (nodes.find(kind + name) for kind in ("k", "(rot|r)", "t"))
+    K, matrix_R, vector_R, t = (nodes.find(kind + name) for kind in ("k", "rot", "r", "t"))
+    R = vector_R if matrix_R.value is None else matrix_R
     if K.value is None or R.value is None or t.value is None:
         raise nodes.fail(f"has not all of K_{name}, R_{name}, T_{name}: put extri.yml beside intri.yml")
     matrix, lens = K.intrinsics(), nodes.find(LENS_NAME + name).of_model(nodes.model())
@@ -196,8 +197,9 @@ def _value(node: Any) -> Any:
     if node.isMap() and node.getNode("data").empty():
         return {name: _value(node.getNode(name)) for name in node.keys()}  # noqa: SIM118
     if node.isMap():
-        count = node.getNode("rows").real() * node.getNode("cols").real()
-        return node.mat() if 0 <= count <= MOST_NUMBERS else None
+        data = node.getNode("data")  # one by one: mat() takes whole numbers' bits for those of real ones
+        numbers = _value(data) if data.size() <= MOST_NUMBERS else None
+        return numbers if isinstance(numbers, list | None) else [numbers]
     return None
 
 

@@ -46,7 +46,9 @@ SUSPECT = re.compile(
 """Names of what may be a lens, a flag or a unit."""
 SCALAR = re.compile(r"[kps][1-9]|t[12xy]")
 """Names of a lens's numbers where they stand alone."""
-HARMLESS = re.compile(r".*(err|std|sigma|cov|rms|noise|uncert|optim|name|path|initial|guess|squareunits).*")
+HARMLESS = re.compile(
+    r".*(err|std|sigma|cov|rms|noise|uncert|optim|name|path|initial|guess|squareunits|label|comment|frame|topic|title|serial).*"
+)
 BROWN_WORDS = (
     *("plumbbob", "radtan", "radialtangential", "brownconrady", "brown", "opencv", "fullopencv", "rational"),
     *("rationalpolynomial", "perspective", "pinhole", "standard", "radial", "simpleradial", "simplepinhole"),
@@ -55,7 +57,7 @@ FISHEYE_WORDS = (
     *("equidistant", "equi", "fisheye", "kannalabrandt", "kannalabrandt4", "kb4", "kb", "opencvfisheye"),
 )
 LENS_WORD = re.compile(
-    "|".join([*BROWN_WORDS[:3], *FISHEYE_WORDS, ".*(omni|fov|mei|eucm|sphere|division).*"])
+    "|".join([*BROWN_WORDS[:3], *FISHEYE_WORDS, ".*(fisheye|omni|fov|mei|eucm|sphere|division).*"])
 )
 SMALL_TANGENTIAL = 0.01
 """Above, the tangential coefficients of a lens are more likely a fisheye's third and fourth."""

@@ -44,6 +44,8 @@ LARGEST_XMP = 1 << 20
 """Bytes of an XMP packet, at most: those of cameras have some tens of thousands."""
 PHOTOGRAPHS = (".jpg", ".jpeg")
 SUFFIXES = (".tif", ".tiff", *PHOTOGRAPHS)
+USUAL_WIDTH = 20.0
+"""Nanometres of a band, where none are stated."""
 IN_PIXELS = 100.0
 """A focal length above is in pixels: no lens of these has so many millimetres, no image so few pixels."""
 LONGEST_TRANSLATION = 1.0
@@ -278,7 +280,9 @@ class _Image(NamedTuple):
         fields = self.tags.fields
         colour = len((self.text("BandName") or "").split(",")) == 3
         centre, width = (self._one(name) for name in ("CentralWavelength", "WavelengthFWHM"))
-        response = "rgb" if colour else Band(centre, width or 0.0) if centre else None
+        if centre and not width and not colour:
+            self.source.warn(f"WavelengthFWHM is not stated: a band {USUAL_WIDTH:g} nm wide is assumed")
+        response = "rgb" if colour else Band(centre, width or USUAL_WIDTH) if centre else None
         black = fields.get(BLACK_LEVEL, self.numbers("BlackCurrent", namespace=DJI))
         if colour or self.source.path.suffix.lower() in PHOTOGRAPHS:  # developed: sRGB, no counts of light
             return Sensor(response=response)
@@ -291,13 +295,13 @@ class _Image(NamedTuple):
             self.source.warn(
                 f"states no {names}: taken as {'0' if black is None else '1'}; a rig file may state it"
             )
-        black = (0.0,) if black is None else [float(value) for value in black]
+        levels = [0.0] if black is None else [float(value) for value in black]
         exposure = float(fields.get(EXPOSURE, (0.0,))[0]) or None
         return Sensor(
             response=response,
             coding="linear",
             bits=16,
-            black_level=float(sum(black) / len(black)),
+            black_level=sum(levels) / len(levels),
             exposure=exposure,
             gain=float(speed) / 100.0,
         )

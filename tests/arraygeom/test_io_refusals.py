@@ -130,6 +130,8 @@ FOCAL = {
     "splined_cubic.cameramodel": "150",
     "splined_quadratic.cameramodel": "200",
     "zed.conf": "698",
+    "azure.json": "0.625",
+    "extri.yml": "",
 }
 WITH_FOCAL = [f for f in TEXTS if FOCAL.get(f.name, "400")]
 
