@@ -21,6 +21,7 @@ from torch.nn.functional import interpolate
 from arraygeom import Camera, Rig
 from arraygeom.runtime.atomic import write_together
 from arraygeom.runtime.chunks import chunked
+from arraygeom.runtime.text import ASSUMED
 from arraygeom.runtime.threads import in_parallel
 
 from ..media.colour import linear_from_srgb
@@ -76,12 +77,12 @@ def save_frame(
     `view`, the rig of alpha alone goes to view.yaml and says so; with `rig`, that of all cameras to
     found_rig.yaml; with `points`, the camera of alpha, the pixels of known depth, which is `along` its axis
     or rays (`measured_along`), go to points.ply. With a `name` the files are name_fused.png and so on.
-    Without any known depth there are no depth files. With `bands`, the names of bands that cameras record one
-    by one, each goes to fused_NAME.png and confidence_NAME.png too; bands without names that are not one or
-    three go to fused_1.png and so on. Of other numbers than one and three fused.png is the mean. The image
-    comes last: where it is, the others are of the same frame, and points.ply, the page index.html and the
-    image in another format of a former one are gone. After an error all former files are as they were.
-    Returns what was written.
+    Without any known depth there are no depth files, and no bounds of it by a view whose focal lengths are
+    assumed. With `bands`, the names of bands that cameras record one by one, each goes to fused_NAME.png and
+    confidence_NAME.png too; bands without names that are not one or three go to fused_1.png and so on. Of
+    other numbers than one and three fused.png is the mean. The image comes last: where it is, the others are
+    of the same frame, and points.ply, the page index.html and the image in another format of a former one are
+    gone. After an error all former files are as they were. Returns what was written.
     """
     frame = frame.mapped(lambda tensor: tensor.detach().cpu())
     prefix = f"{name}_" if name else ""
@@ -95,7 +96,9 @@ def save_frame(
         confidence = partial(write_image, folder / f"{prefix}confidence.png", frame.confidence[None])
         tasks: list[Callable[[], object]] = [confidence]
         if frame.depth.isfinite().any():
-            for suffix, depth in zip(("", "_nearest", "_farthest"), (frame.depth, *frame.depth_interval)):
+            known = view is None or view.name != ASSUMED
+            bounds = zip(("_nearest", "_farthest"), frame.depth_interval) if known else ()
+            for suffix, depth in (("", frame.depth), *bounds):
                 path = folder / f"{prefix}depth{suffix}.tif"
                 tasks.append(partial(write_image, path, depth[None], bits=32, unknown=True))
             near = float(view.depth[0]) if view is not None and view.depth else None

@@ -92,7 +92,14 @@ class Align(Known):
             images = ViewFiles(array.recorded, one, alpha=array.alpha) if i else array.images
             name = _name_of(files, array.alpha, one)
             yield _Frame(
-                array.rig, array.recorded, images, one, array.alpha, array.notes, name, rig_found=True
+                array.rig,
+                array.recorded,
+                images,
+                one,
+                array.alpha,
+                array.notes,
+                name,
+                rig_found=array.lasting is not None,
             )
 
     def _align(self, frame: _Frame) -> None:

@@ -61,8 +61,8 @@ class Fuse(Known):
     """Without a rig: the focal length in pixels of a camera whose file does not state it."""
     out: Out = Path("out")
     """Folder for fused.png, confidence.png, depth.tif, depth_16.png (16 bits; 0 is unknown), depth.png,
-    depth_nearest.tif and depth_farthest.tif (the true depth is between them in 9 of 10 pixels), index.html (a
-    page that shows them) and view.yaml (the rig of the fused view)."""
+    depth_nearest.tif and depth_farthest.tif (the true depth is between them in 9 of 10 pixels; not by
+    assumed focal lengths), index.html (a page that shows them) and view.yaml (the rig of the fused view)."""
     align: bool = True
     """Find how far the other cameras lie off their search segments, and put that right."""
     exposure: Annotated[Literal["auto", "keep"] | None, optional("{auto,keep}")] = None
@@ -345,7 +345,7 @@ class Fuse(Known):
             frame, gain = self._exposed(frame)
             if image_array is None and not frame.depth.isfinite().any():
                 self.note("no depth: the rig knows its cameras by F alone, or the images match nowhere")
-            found = None if image_array is None else image_array.recorded
+            found = None if image_array is None else image_array.lasting
             written = self._saved(frame, rig, alpha, files, along=along, rig=found)
             shutil.rmtree(store, ignore_errors=True)
             if self.report:

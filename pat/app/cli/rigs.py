@@ -435,6 +435,7 @@ class RigFromImages:
 
     def run(self) -> None:
         """Write the rig and print its statistics. Raises ValueError for images with too little in common."""
+        from arraygeom.runtime.text import OPEN
         from calib.images.from_images import rig_from_images
 
         from ...media.images import read_image
@@ -447,7 +448,7 @@ class RigFromImages:
             result = rig_from_images(images, focal=focal, matches=matches)
         print(result.as_text())
         result.rig.save(self.out)
-        say(f"written: {self.out}")
+        say(f"written: {self.out}" + (f" ({OPEN})" if result.rig.name == OPEN else ""))
 
 
 @dataclass
