@@ -158,7 +158,7 @@ def _of_lens(name: str, camera: LensView) -> Iterator[str]:
     directions, has_ray = lens.unproject(points)
     back, has_image = lens.project(lens.origins(points) + directions)
     valid = has_ray & has_image
-    if ends := lens_end(name, camera):
+    if not bool(valid.all()) and (ends := lens_end(name, camera)):
         yield ends
     off = ((back - points) @ camera.K[:2, :2].mT).norm(dim=-1)
     off = torch.where(valid, off, 0.0)
