@@ -39,7 +39,9 @@ def coverage(camera: LensView) -> LensCoverage:
         grid = coarse_grid(camera.hw, max(8, max(camera.hw) // 128)).to(camera.K)
         if camera.distortion is None:
             return LensCoverage(1.0, float("nan"))
-        rays, valid = camera.distortion.unproject(_normalised(camera, grid))
+        points = _normalised(camera, grid)
+        rays, valid = camera.distortion.unproject(points)
+        valid = valid & camera.distortion.project(camera.distortion.origins(points) + rays)[1]
         angles = torch.rad2deg(torch.atan2(rays[..., :2].norm(dim=-1), rays[..., 2]))[valid]
         return LensCoverage(
             float(valid.double().mean()), float(angles.max()) if len(angles) else float("nan")

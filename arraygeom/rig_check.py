@@ -75,10 +75,8 @@ def lens_end(name: str, camera: LensView) -> str | None:
     refit = ": check the coefficients"
     if isinstance(camera.distortion, Distortion) and camera.distortion.model == BROWN_CONRADY:
         refit = ", as at a pole or a fold of its formula; fit one without: `pat rig convert --refit`"
-    return (
-        f"the lens model of '{name}' ends {covered.degrees:.1f} degrees off the axis: "
-        f"{100 * (1 - covered.share):.0f} % of its image is not used{refit}"
-    )
+    where = f"ends {covered.degrees:.1f} degrees off the axis" if covered.share else "covers nothing"
+    return f"the lens model of '{name}' {where}: {100 * (1 - covered.share):.0f} % of its image is not used{refit}"
 
 
 def file_oddities(rig: Rig) -> list[str]:
