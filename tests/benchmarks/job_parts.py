@@ -27,7 +27,6 @@ STAGES = {
     "attention": ["pat.attention.attend._attend"],
     "network": ["pat.networks.guided.GuidedPAT.forward"],
     "completion": ["pat.networks.completion.Completion.forward"],
-    "back-projection": ["pat.fusion.tiles.back_projected"],
     "depth": ["pat.fusion.tiles.measured_depth", "pat.fusion.fuse.background_filled"],
     "write": ["pat.fusion.results.save_frame", "pat.app.report.report_page"],
 }
