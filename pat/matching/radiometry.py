@@ -244,7 +244,9 @@ class _Points(NamedTuple):
         return bool((mean >= least * errors[0].mean()) & (mean >= times * deviation) & (mean > 0))
 
     def _squared_errors(self, response: Response) -> Float[Tensor, " n"]:
-        shades = self.bands.new_tensor(response.shading) @ _shading_terms(self.place) if response.shading else 0.0
+        shades = (
+            self.bands.new_tensor(response.shading) @ _shading_terms(self.place) if response.shading else 0.0
+        )
         even = self.bands * torch.as_tensor(shades).exp()
         error = self.alpha - response.weights @ (response.gain * even**response.gamma)
         return error.abs().clamp(max=SETTINGS.clipped).square()

@@ -14,6 +14,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from arraygeom.sampling import on_image
+
 from ..matching.colour_transfer import LEAST
 from ..matching.colour_transfer import SETTINGS as TRANSFER
 from ..matching.inputs import Inputs
@@ -26,6 +28,9 @@ from .completion import Completion
 from .configs import GuidedPATConfig
 from .protocol import FusionOutput, JoinsBands, required
 from .recall import by_example, with_less_noise
+
+NOWHERE = -30.0
+"""Size: log odds of a beta that has no match at a pixel, below any brightness and confidence."""
 
 
 class GuidedPAT(nn.Module):
@@ -138,7 +143,7 @@ def combined(carried: Sequence[Colours]) -> Colours:
     """
     if len(carried) == 1:
         return carried[0]
-    odds = [c.weight.clamp(LEAST, 1 - LEAST).logit() for c in carried]
+    odds = [c.weight.clamp(LEAST, 1 - LEAST).logit().where(c.weight > 0, NOWHERE) for c in carried]
     logits = torch.stack([o + TRANSFER.alike * (c.likeness + LEAST).log() for o, c in zip(odds, carried)])
     shares = logits.softmax(0)
 
@@ -179,7 +184,9 @@ def _output_of(
     for beta, matched in zip(inputs.betas, matches.betas):
         segments = beta.field.straight
         position.append(positions_of(segments, matched.surface, beyond_edge=True).movedim(-1, 1))
-        confidence.append(matched.confidence[:, 0].to(image) * segments.valid)
+        within = positions_of(segments, matched.surface)
+        seen = segments.valid & on_image(within, (beta.image.shape[-2], beta.image.shape[-1]))
+        confidence.append(matched.confidence[:, 0].to(image) * seen)
         deviation.append(torch.ones_like(confidence[-1]))
     joint = torch.stack(confidence).amax(0) if overall else None
     return FusionOutput(image, position, deviation, confidence, joint)
