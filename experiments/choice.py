@@ -20,9 +20,8 @@ from torch import Generator, Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits, pixel_shuffle
 
 from arraygeom import Segments, pixel_grid
-from experiments.completion.capture import fused_at_random
-from experiments.completion.samples import KINDS, PairTraining
 from experiments.fit import command, recipe_text
+from experiments.training_pairs.samples import KINDS, PairTraining, fused_at_random
 from pat.lab.data.pairs import Disparity, StereoPair
 from pat.lab.synthesis.rigs import below
 from pat.matching.certainty import SETTINGS, typical_facts

@@ -124,7 +124,8 @@ def frame_inputs(network: FusionNetwork, views: Views) -> FrameInputs:
                 f"alpha's and '{name}'s views do not overlap{bounds}: check the poses and the depth range"
             )
         placements.append(place)
-    return FrameInputs(Inputs(alpha, tuple(betas), m, network.beta_halo, bands=network.bands), placements, hw)
+    inputs = Inputs(alpha, tuple(betas), m, network.beta_halo, bands=network.bands, learned=network.learned)
+    return FrameInputs(inputs, placements, hw)
 
 
 def bytes_beside(inputs: Inputs, images: Iterable[Tensor]) -> float:

@@ -213,7 +213,7 @@ def matched_colours(
     statistics = statistics or MatchStatistics.of(alpha, soft, values, luma, brightness, valid, consistent)
     unlike = statistics.leveled(brightness) - soft
     alike = likeness(unlike) if sees_luma else torch.ones_like(unlike)
-    weight = match_weight(alike, matches.confidence, valid)
+    weight = match_weight(alike, matches, valid, sees_luma=sees_luma)
     if bands > 1:
         power = SETTINGS.saturation if sees_luma else 0.0
         colour, bright = _scaled_to_alpha(values - luma, luma, alpha, weight, power)
@@ -244,7 +244,7 @@ def _colours_of_bands(
         alpha, soft, values, brightness, brightness, valid, consistent
     )
     alike = likeness(brightness - soft)
-    weight = match_weight(alike, matches.confidence, valid)
+    weight = match_weight(alike, matches, valid)
     return torch.where(valid, colours, statistics.colour), weight, alike, statistics
 
 
@@ -265,12 +265,21 @@ def _scaled_to_alpha(
 
 
 def match_weight(
-    alike: Float[Tensor, "b 1 h w"], confidence: Float[Tensor, "b 1 h w"], valid: Tensor
+    alike: Float[Tensor, "b 1 h w"], matches: BetaMatches, valid: Tensor, *, sees_luma: bool = True
 ) -> Float[Tensor, "b 1 h w"]:
-    """The probability that the match shows the point that alpha sees, 0 to 1, from the match's confidence and
-    the photometric likeness."""
-    odds = confidence.clamp(LEAST, 1 - LEAST).logit() + SETTINGS.alike * alike
-    return odds.sigmoid() * valid
+    """Weight of a match's colours, 0 to 1.
+
+    The photometric likeness, halved where the left-right check fails. Where certainty is known, the geometric
+    mean of that and of the probability that the match is right, given the likeness; of an alpha that does not
+    see luma the confidence alone.
+    """
+    if not sees_luma:
+        return matches.confidence * valid
+    checked = alike * (1 + is_consistent(matches.facts)) / 2
+    if matches.certainty is None:
+        return checked * valid
+    odds = matches.confidence.clamp(LEAST, 1 - LEAST).logit() + SETTINGS.alike * alike
+    return (checked * odds.sigmoid()).sqrt() * valid
 
 
 def filled_from(

@@ -61,7 +61,7 @@ class Inputs:
     those of the result: so many, whose luminance (the mean, if they are not three) is what alpha sees, or
     None: those of all betas, of which alpha may see any combination. `sees_luma` is whether RGB betas' luma
     is about what alpha sees, as far as is known: not in the near infrared. `denoised`: the betas' images are
-    not what was recorded.
+    not what was recorded. `learned`: the networks of choice and certainty take part in matching.
     """
 
     alpha: Float[Tensor, "b c h w"]
@@ -70,6 +70,7 @@ class Inputs:
     beta_halo: int = 0
     luminance: float = 1.0
     bands: int | None = None
+    learned: bool = True
     sees_luma: bool = True
     denoised: bool = False
 

@@ -35,13 +35,16 @@ Matcher = Callable[[Inputs], Matches]
 
 def match(inputs: Inputs, choice: Choice | None = None) -> Matches:
     """Match alpha with every beta, say how certain each match is, and transfer the betas' bands to alpha's
-    view; with gradients as `transferred`, and of the positions. `choice` is another one than ships.
+    view; with gradients as `transferred`, and of the positions. `choice` is another one than ships. Without
+    `inputs.learned` matches have no certainty, and are semi-global ones with a left-right check.
 
     Raises ValueError for a beta whose field is not of straight segments, and for an alpha of odd sides.
     """
     if any(side % FINE for side in inputs.hw):
         h, w = inputs.hw
         raise ValueError(f"alpha has {w}x{h} pixels to match: pad both sides to whole multiples of {FINE}")
+    if not inputs.learned:
+        return transferred(inputs, located(inputs))
     matches = in_each_beta(inputs)
     if inputs.can_agree:
         with torch.no_grad():

@@ -36,7 +36,7 @@ class Colours(NamedTuple):
     """Bands of one beta carried to alpha's view, each minus alpha.
 
     bands: (B, C, H, W), at the match, with the detail that alpha has and beta has not.
-    weight: (B, 1, H, W), the probability that `bands` are of the point that alpha sees, 0 to 1.
+    weight: (B, 1, H, W), how far `bands` count as those of the point that alpha sees, 0 to 1.
     likeness: (B, 1, H, W), photometric similarity of alpha and beta at the match, 0 to 1; 1 where alpha does
         not see luma.
     fills: (B, FILLS, C, H, W), candidates for pixels that beta does not see.

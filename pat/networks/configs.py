@@ -37,15 +37,15 @@ class PATConfig:
 
 @dataclass(frozen=True)
 class GuidedPATConfig:
-    """Bands of the image (None: all of the betas'), and the widths of the U-Net that weighs candidates.
+    """Bands of the image; None: all of the betas'.
 
-    `keep_luminance` lets the network add colour to alpha, never luminance. `completion` has widths at 1/2,
-    1/4 and 1/8 of the size; empty without a U-Net, when nothing is trained.
+    `keep_luminance` lets the network add colour to alpha, never luminance. Without `learned` matching is
+    classical: semi-global with a left-right check, nothing trained, and no stated certainty.
     """
 
     bands: int | None = 3
     keep_luminance: bool = True
-    completion: tuple[int, ...] = ()
+    learned: bool = True
 
 
 CONFIGS = {"PAT": PATConfig, "GuidedPAT": GuidedPATConfig}

@@ -2,8 +2,8 @@
 
 Matching (`pat.matching`) gives the bands of each beta at its matches, the weight of each match, and fills for
 the rest. This network joins several betas, adds a fill by attention of alpha to itself
-(`pat.networks.recall`), smooths what is doubtful, and lets a small U-Net weigh the candidates
-(`pat.networks.completion`). Only the U-Net is trained.
+(`pat.networks.recall`), and smooths what is doubtful. Nothing of it is trained; the confidence and the depth
+that come with an image are (`pat.matching.choice`, `pat.matching.certainty`).
 """
 
 from __future__ import annotations
@@ -17,20 +17,15 @@ from torch import Tensor, nn
 from arraygeom.sampling import on_image
 
 from ..matching.colour_transfer import LEAST
-from ..matching.colour_transfer import SETTINGS as TRANSFER
 from ..matching.inputs import Inputs
 from ..matching.matches import BetaMatches, Colours, Matches
 from ..matching.positions import at_matches
 from ..matching.positions import matches as positions_of
 from ..media.colour import luminance
 from ..support.blocks import enlarge
-from .completion import Completion
 from .configs import GuidedPATConfig
 from .protocol import FusionOutput, JoinsBands, required
 from .recall import by_example, with_less_noise
-
-NOWHERE = -30.0
-"""Size: log odds of a beta that has no match at a pixel, below any brightness and confidence."""
 
 
 class GuidedPAT(nn.Module):
@@ -51,10 +46,9 @@ class GuidedPAT(nn.Module):
     def __init__(self, config: GuidedPATConfig = GuidedPATConfig()) -> None:
         super().__init__()
         self.config = config
-        self.bands = config.bands
+        self.bands, self.learned = config.bands, config.learned
         self.keeps_luminance = config.bands is not None and config.keep_luminance
         self.joins_bands: JoinsBands = "all" if config.bands is None else "neighbours"
-        self.completion = Completion(config.completion) if config.completion else None
 
     def working_bytes(self, alpha: int, betas: Sequence[int]) -> float:
         """Bytes of memory to fuse so many pixels of alpha, beside the inputs."""
@@ -85,30 +79,12 @@ class GuidedPAT(nn.Module):
         if parts and sum(bands) != wanted:
             raise ValueError(f"the betas have {sum(bands)} bands in all, this network makes {wanted}")
         used = carried if parts else [combined([one for one, n in zip(carried, bands) if n == wanted])]
-        residual = self.completed(alpha, used, trained=inputs.sees_luma)
+        residual = completed(alpha, used)
         if not inputs.sees_luma:
             residual = where_certain(residual, inputs, matches)
         if self.keeps_luminance:
             residual = residual - inputs.luminance * luminance(residual)
         return alpha + residual, not parts
-
-    def completed(
-        self, alpha: Float[Tensor, "b 1 h w"], carried: Sequence[Colours], *, trained: bool
-    ) -> Float[Tensor, "b c h w"]:
-        """Bands minus alpha at all pixels, of betas with different bands.
-
-        `trained` lets the U-Net weigh the candidates of one beta; its training saw RGB betas and alphas of
-        their luma only.
-        """
-        colour = _joined([one.bands for one in carried])
-        weight = _joined([one.weight.expand_as(one.bands) for one in carried])
-        fills = [_joined(fill) for fill in zip(*(one.fills.to(colour).unbind(1) for one in carried))]
-        recalled = by_example(alpha, colour, weight)
-        nearest = fills[-1]
-        mixed = with_less_noise(alpha, torch.lerp((recalled + nearest) / 2, colour, weight), weight)
-        if self.completion is None or len(carried) > 1 or not trained:
-            return mixed
-        return self.completion(alpha, weight[:, :1], mixed, (colour, *fills, recalled))
 
     def _any_bands(
         self, alpha: Float[Tensor, "b 1 h w"], carried: Colours, matches: BetaMatches
@@ -120,8 +96,18 @@ class GuidedPAT(nn.Module):
         """
         base, mix = carried.fills[:, 0].to(alpha), matches.comparison.mix
         above = carried._replace(bands=carried.bands - base, fills=carried.fills.to(alpha) - base[:, None])
-        image = alpha + base + self.completed(alpha, [above], trained=False)
+        image = alpha + base + completed(alpha, [above])
         return image if mix is None else mix.reconciled(image, alpha)
+
+
+def completed(alpha: Float[Tensor, "b 1 h w"], carried: Sequence[Colours]) -> Float[Tensor, "b c h w"]:
+    """Bands minus alpha at all pixels, from betas with different bands: carried ones by their weight, else
+    the mean of the nearest examples and of those found by attention, smoothed where weights are low."""
+    colour = _joined([one.bands for one in carried])
+    weight = _joined([one.weight.expand_as(one.bands) for one in carried])
+    nearest = _joined([one.fills[:, -1].to(colour) for one in carried])
+    filled = (by_example(alpha, colour, weight) + nearest) / 2
+    return with_less_noise(alpha, torch.lerp(filled, colour, weight), weight)
 
 
 def _as_alpha(carried: Colours, alpha: Tensor) -> Colours:
@@ -135,17 +121,11 @@ def _joined(bands: Sequence[Tensor]) -> Tensor:
 
 
 def combined(carried: Sequence[Colours]) -> Colours:
-    """Several betas of the same bands as one: the mean of their colours by the odds that each is right and by
-    the photometric likeness.
-
-    Beside depth edges one beta may show another surface and be as confident as the others: its brightness
-    tells.
-    """
+    """Several betas of the same bands as one: the mean of their colours by the odds of their weights."""
     if len(carried) == 1:
         return carried[0]
-    odds = [c.weight.clamp(LEAST, 1 - LEAST).logit().where(c.weight > 0, NOWHERE) for c in carried]
-    logits = torch.stack([o + TRANSFER.alike * (c.likeness + LEAST).log() for o, c in zip(odds, carried)])
-    shares = logits.softmax(0)
+    odds = [c.weight.clamp(LEAST, 1 - LEAST).logit() for c in carried]
+    shares = torch.stack(odds).softmax(0)
 
     def mean(parts: Sequence[Tensor]) -> Tensor:
         return (shares * torch.stack(list(parts))).sum(0)

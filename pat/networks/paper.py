@@ -48,7 +48,7 @@ class PAT(nn.Module):
     multiple = 1
     joins_bands: JoinsBands = "no"
     bands: int | None = None
-    uses_matches = keeps_luminance = False
+    uses_matches = learned = keeps_luminance = False
 
     def __init__(self, config: PATConfig = PATConfig()) -> None:
         super().__init__()

@@ -54,6 +54,8 @@ class FusionNetwork(Protocol):
     """The bands of its image; None: whatever the betas have."""
     uses_matches: bool
     """Whether it is called with matches; then its confidence is a trained probability."""
+    learned: bool
+    """Whether matching's trained networks take part in its matches."""
     keeps_luminance: bool
     """Whether the luminance of its image is alpha's."""
     halo: int
@@ -91,7 +93,12 @@ class Comparing(Protocol):
 
 def matched_for(network: FusionNetwork, inputs: Inputs) -> Matches | None:
     """The matches that a network wants of these inputs, if any."""
-    return match(replace(inputs, bands=network.bands)) if network.uses_matches else None
+    return match(wanted(network, inputs)) if network.uses_matches else None
+
+
+def wanted(network: FusionNetwork, inputs: Inputs) -> Inputs:
+    """Inputs that say what a network wants of its matches."""
+    return replace(inputs, bands=network.bands, learned=network.learned)
 
 
 def fused_at_once(network: FusionNetwork, inputs: Inputs) -> FusionOutput:

@@ -11,11 +11,11 @@ from safetensors import safe_open
 from torch.nn.functional import max_pool2d
 
 from experiments.choice import ChoiceTraining, Kept, losses, rows_of, train_choice, window
-from experiments.completion import samples
-from experiments.completion.pairs import HW, photo_pair, varied_pair
-from experiments.completion.shapes import seen_from_right, shape_pair
 from experiments.evaluation.certainty import unseeing
 from experiments.fit import command
+from experiments.training_pairs import samples
+from experiments.training_pairs.pairs import HW, photo_pair, varied_pair
+from experiments.training_pairs.shapes import seen_from_right, shape_pair
 from pat.lab.data.pairs import Disparity, StereoPair
 from pat.matching.choice import CANDIDATES, FACTS, Choice
 from pat.support.tensor_files import with_weights, write_tensors

@@ -115,15 +115,25 @@ def test_colour_at_matches_does_not_hang_on_what_the_other_image_shows_elsewhere
     assert (found.bands + alpha - alpha * tint)[..., 80:].abs().mean() < 0.009
 
 
-def certain(alpha: torch.Tensor, beta: torch.Tensor, certainty: float, seen: slice = slice(None)) -> Colours:
-    """Colours of one view for both cameras, in these columns, each match as certain."""
+def certain(
+    alpha: torch.Tensor,
+    beta: torch.Tensor,
+    certainty: float | None,
+    seen: slice = slice(None),
+    *,
+    facts: float = 0.0,
+    sees_luma: bool = True,
+) -> Colours:
+    """Colours of one view for both cameras, in these columns, each match as certain; None: not known."""
     h, w = alpha.shape[-2:]
     segments, blocks = in_place((h, w))
     segments.valid[:] = False
     segments.valid[..., seen] = True
     inputs = Inputs.of(alpha, [beta], [FieldOnGrid(lambda _: segments, 1, segments, blocks)])
-    facts, sure = torch.zeros(1, 3, h // 2, w // 2), torch.ones(1, 2, h // 2, w // 2)
-    matched = BetaMatches(0 * alpha, facts, Comparison.of(alpha, beta), certainty=certainty * sure)
+    inputs, sure = replace(inputs, sees_luma=sees_luma), torch.ones(1, 2, h // 2, w // 2)
+    stated = None if certainty is None else certainty * sure
+    planes = torch.full((1, 3, h // 2, w // 2), facts)
+    matched = BetaMatches(0 * alpha, planes, Comparison.of(alpha, beta), certainty=stated)
     (found,) = transferred(inputs, Matches((matched,))).betas
     return found.carried
 
@@ -137,22 +147,36 @@ def with_other_patch() -> tuple[torch.Tensor, torch.Tensor]:
 
 
 @pytest.mark.parametrize("certainty", [0.1, 0.5, 0.9])
-def test_weight_is_the_certainty_and_more_where_brightness_is_alike(certainty):
+def test_weight_grows_with_certainty_and_likeness(certainty):
     found = certain(*with_other_patch(), certainty)
     alike, unlike = (found.likeness[..., part] for part in (slice(70, 120), slice(44, 56)))
     assert alike.median() > 0.5
     assert unlike.max() < 0.01
-    added = found.weight.logit() - torch.tensor(certainty).logit()
-    torch.testing.assert_close(added, SETTINGS.alike * found.likeness, atol=1e-4, rtol=0)
+    right = (torch.tensor(certainty).logit() + SETTINGS.alike * found.likeness).sigmoid()
+    torch.testing.assert_close(found.weight, (right * found.likeness).sqrt(), atol=1e-4, rtol=0)
+    order = found.likeness.flatten().argsort()
+    assert (found.weight.flatten()[order].diff() > -1e-6).all()
+    assert (certain(*with_other_patch(), certainty + 0.05).weight >= found.weight).all()
+
+
+def test_without_certainty_weight_is_the_likeness_halved_where_the_check_fails():
+    (sure, halved) = (certain(*with_other_patch(), None, facts=facts) for facts in (0.0, 1.0))
+    torch.testing.assert_close(sure.weight, sure.likeness)
+    torch.testing.assert_close(halved.weight, halved.likeness / 2)
+
+
+def test_of_an_alpha_that_sees_something_else_weight_is_the_confidence():
+    found = certain(*with_other_patch(), 0.7, sees_luma=False)
+    torch.testing.assert_close(found.weight, torch.full_like(found.weight, 0.7))
+    assert (found.likeness == 1).all()
 
 
 @pytest.mark.parametrize("certainty", [0.0, 1.0])
-def test_weight_is_a_probability_whatever_the_certainty_and_none_off_beta(certainty):
+def test_weight_is_a_share_whatever_the_certainty_and_none_off_beta(certainty):
     weight = certain(*with_other_patch(), certainty, slice(64, None)).weight
     assert (weight[..., :64] == 0).all()
-    off = (weight[..., 64:] - certainty).abs()
-    assert off.max() < 0.01
-    assert off.min() > 0
+    assert weight.min() >= 0
+    assert weight.max() <= 1
 
 
 def test_statistics_of_pieces_are_those_of_the_whole():

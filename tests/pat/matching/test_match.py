@@ -140,7 +140,7 @@ class Plain:
     """A network without matches: beta's colours at the middle of each segment."""
 
     halo, beta_halo, multiple, equal_resolution, joins_bands = 0, 2, 2, True, "no"
-    bands, uses_matches, keeps_luminance = None, False, False
+    bands, uses_matches, learned, keeps_luminance = None, False, False, False
 
     def working_bytes(self, alpha, betas):
         return 8.0 * alpha

