@@ -22,7 +22,7 @@ from .inputs import Beta, Inputs
 from .likeness import likeness
 from .matches import BetaMatches, Colours, Matches, is_consistent
 from .normalisation import SETTINGS as NORMALISATION
-from .normalisation import combined_bands, explained_share, moments
+from .normalisation import Moments, combined_bands, explained_share, moments
 from .positions import at_matches
 from .semi_global import DISPARITY_FILL
 from .spectral_mix import SpectralMix
@@ -74,7 +74,7 @@ class MatchStatistics(NamedTuple):
 
     matches: (B, 1, 1, 1), how many, and one.
     colour: (B, C, 1, 1), beta's bands minus alpha, in the mean.
-    level: (3, B, 1, 1, 1), for brightness as alpha's: what is subtracted, the factor, what is added.
+    level: (4, B, 1, 1, 1), means of beta's brightness and of its square, and of alpha and of its square.
     explained, noise: (B, 1, 1, 1), as of `explained_share` and `colour_noise`.
     """
 
@@ -100,8 +100,9 @@ class MatchStatistics(NamedTuple):
         both = valid * consistent
         count = both.sum((-2, -1), keepdim=True) + 1
         colour = (both * (values - alpha)).sum((-2, -1), keepdim=True) / count
-        measured, wanted = moments(brightness, both), moments(alpha, both)
-        level = torch.stack([measured.mean, measured.gain(wanted, NORMALISATION.largest_gain), wanted.mean])
+        measured = [moments(image, both) for image in (brightness, alpha)]
+        squares = [one.mean.double().square() + one.deviation.double().square() for one in measured]
+        level = torch.stack([measured[0].mean, squares[0], measured[1].mean, squares[1]])
         one = cls(count, colour, level, torch.zeros_like(count), torch.zeros_like(count))
         if values.shape[1] == 1:
             return one
@@ -111,8 +112,9 @@ class MatchStatistics(NamedTuple):
 
     def leveled(self, brightness: Tensor) -> Tensor:
         """Beta's brightness, where matches are consistent with alpha's mean and standard deviation."""
-        mean, factor, middle = self.level
-        return (brightness - mean) * factor + middle
+        means, squares = self.level[::2], self.level[1::2]
+        measured, wanted = map(Moments, means, (squares - means.square()).clamp(min=1e-12).sqrt())
+        return measured.matched(brightness, wanted, NORMALISATION.largest_gain).to(brightness)
 
     @classmethod
     def mean(cls, pieces: Sequence[MatchStatistics]) -> MatchStatistics:
@@ -225,7 +227,6 @@ def matched_colours(
     return torch.where(valid, matched, statistics.colour), weight, alike, statistics
 
 
-@torch.no_grad()
 def _colours_of_bands(
     alpha: Tensor, beta: Beta, matches: BetaMatches, mix: SpectralMix, statistics: MatchStatistics | None
 ) -> tuple[Tensor, Tensor, Tensor, MatchStatistics]:

@@ -14,6 +14,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from arraygeom.sampling import on_image
+
 from ..matching.colour_transfer import LEAST
 from ..matching.inputs import Inputs
 from ..matching.matches import BetaMatches, Colours, Matches
@@ -162,7 +164,9 @@ def _output_of(
     for beta, matched in zip(inputs.betas, matches.betas):
         segments = beta.field.straight
         position.append(positions_of(segments, matched.surface, beyond_edge=True).movedim(-1, 1))
-        confidence.append(matched.confidence[:, 0].to(image) * segments.valid)
+        within = positions_of(segments, matched.surface)
+        seen = segments.valid & on_image(within, (beta.image.shape[-2], beta.image.shape[-1]))
+        confidence.append(matched.confidence[:, 0].to(image) * seen)
         deviation.append(torch.ones_like(confidence[-1]))
     joint = torch.stack(confidence).amax(0) if overall else None
     return FusionOutput(image, position, deviation, confidence, joint)

@@ -25,7 +25,7 @@ from pat.networks.weights import save_weights
 from tests.calib.board_scenes import board_poses, camera
 from tests.kills.killing import Job, files_of, mixed
 from tests.pat.fusion import moving
-from tests.pat.lab.training.runs import SMALL, short_run
+from tests.pat.lab.training.runs import short_run
 
 FIXTURES = Path(__file__).parents[1] / "arraygeom" / "fixtures"
 FRAMES = 6
@@ -94,7 +94,7 @@ def _fuse(folder: Path) -> list[str]:
     """The common part of commands that fuse; makes what they need."""
     if not (folder / "fusion" / "rig.yaml").exists():
         torch.manual_seed(0)
-        save_weights(GuidedPAT(SMALL), folder / "fusion" / "tiny.safetensors")
+        save_weights(GuidedPAT(), folder / "fusion" / "tiny.safetensors")
         frames, _ = moving.recording(FRAMES, 0.003)
         for name, images in frames.items():
             for i, image in enumerate(images):

@@ -5,20 +5,19 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import tyro
 
 from pat.lab.synthesis.rig_distribution import RigDistribution
-from pat.networks.configs import CONFIGS, GuidedPATConfig, PATConfig
+from pat.networks.configs import PATConfig
 from pat.support.schema import from_document, near, parse_yaml, to_document
 
 RECIPES = Path(__file__).parent / "recipes"
 RECTIFIED = RigDistribution(mode="rectified", parallax=(6.0, 110.0))
 GENERAL = RigDistribution(mode="general", parallax=(6.0, 90.0), focal_ratio=(0.8, 1.25))
-NetworkConfig = PATConfig | GuidedPATConfig
 UNSEEN = ("out", "device", "save", "tensorboard", "cache")
 """Entries that may differ between a run and its continuation: samples and steps do not depend on them."""
 
@@ -39,13 +38,11 @@ class RecordingConfig:
     """Error of the poses that fields are computed from: root mean square displacement of points, pixels."""
     lens: float = 0.0
     """Probability of lens distortion (|k1| up to 0.3), the image undistorted before fusion."""
-    spectral: float = 0.0
-    """Probability of random bands, one to four if one beta has them all, instead of red, green and blue."""
     ideal: bool = False
     """The ground truth is the scene itself; else it has alpha's luminance as recorded, noise included."""
 
     def __post_init__(self) -> None:
-        for name in ("gain", "blur", "noise", "paper", "lens", "spectral"):
+        for name in ("gain", "blur", "noise", "paper", "lens"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} is a probability, 0 to 1, got {getattr(self, name):g}")
         if not 0 <= self.miscalibrated < math.inf:
@@ -61,11 +58,12 @@ class TrainConfig:
 
     photos: tuple[Path, ...] = ()
     """Folders of photographs: the textures of layered scenes."""
-    out: Path = Path("runs/mono-colour")
+    out: Path = Path("runs/pat")
     """Folder for weights, checkpoints, figures and images."""
     start: Path | None = None
     """File of weights to start from."""
-    network: NetworkConfig = dataclasses.field(default_factory=GuidedPATConfig)
+    network: PATConfig = PATConfig()
+    """The network; with several betas each has a band, in order."""
     steps: int = 4000
     """Steps of the whole run."""
     minutes: float = float("inf")
@@ -76,10 +74,10 @@ class TrainConfig:
     """Batches a step, distributed over processes."""
     hw: tuple[int, int] = (96, 192)
     """Height and width of alpha in the scenes."""
-    loss: Literal["psnr", "psnr-ssim", "mse"] = "psnr-ssim"
-    """On the image: minus the mean PSNR, with or without SSIM, or the mean squared error."""
+    loss: Literal["psnr", "mse"] = "psnr"
+    """On the image: minus the mean PSNR, or the mean squared error."""
     attention: float = 0.0
-    """Weight of the cross-entropy of PAT's attention to the true position, beside the loss on the image."""
+    """Weight of the cross-entropy of attention to the true position, beside the loss on the image."""
     rate: float = 8e-4
     """Learning rate of Adam."""
     momenta: tuple[float, float] = (0.9, 0.99)
@@ -98,8 +96,6 @@ class TrainConfig:
     """Steps between validations, which save the weights if they are the best so far."""
     save: int = 250
     """Steps between checkpoints."""
-    filtered: float = 0.15
-    """Share of the batches with three betas, one a band."""
     rectified: float = 0.5
     """Share of the batches with rigs of `rectified_rigs`, the others being of `general_rigs`."""
     rectified_rigs: RigDistribution = RECTIFIED
@@ -108,10 +104,6 @@ class TrainConfig:
     """Share of the batches made of rendered scenes instead of layered ones."""
     rendered_from: tuple[Path, ...] = ()
     """Folders of rendered scenes, output of `pat render`."""
-    pairs: float = 0.0
-    """Share of the batches made of stereo pairs."""
-    pairs_from: tuple[Path, ...] = ()
-    """Folders of rectified stereo pairs in colour."""
     measured: float = 0.0
     """Share of the batches made of stereo pairs with true disparity."""
     measured_from: tuple[Path, ...] = ()
@@ -151,19 +143,19 @@ class TrainConfig:
         self._check_sources()
 
     def _check_sources(self) -> None:
-        for name in ("filtered", "rectified", "rendered", "pairs", "measured"):
+        for name in ("rectified", "rendered", "measured"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} is a share of the batches, 0 to 1, got {getattr(self, name):g}")
-        for name in ("rendered", "pairs", "measured"):
+        for name in ("rendered", "measured"):
             share, folders = getattr(self, name), getattr(self, f"{name}_from")
             if bool(share) != bool(folders):
                 given = "there is no folder" if share else f"{folders[0]} is given"
                 raise ValueError(
                     f"{name} is {share:g} and {given}: give both `{name}` and `{name}_from`, or neither"
                 )
-        total = self.rendered + self.pairs + self.measured
+        total = self.rendered + self.measured
         if total > 1:
-            raise ValueError(f"rendered, pairs and measured are shares of the batches, {total:g} in all")
+            raise ValueError(f"rendered and measured are shares of the batches, {total:g} in all")
 
 
 def recipes() -> tuple[str, ...]:
@@ -194,17 +186,7 @@ def parse_config(text: str, name: str = "config") -> TrainConfig:
             )
         if not isinstance(values, Mapping):
             raise ValueError(f"wanted entries (name: value), got {values!r}")
-        config = from_document(TrainConfig, {k: v for k, v in values.items() if k != "network"})
-        if "network" not in values:
-            return config
-        network = values["network"]
-        if not isinstance(network, Mapping):
-            raise ValueError(f"network: wanted entries such as kind: GuidedPAT, got {network!r}")
-        kind = network.get("kind", "GuidedPAT")
-        if kind not in CONFIGS:
-            raise ValueError(f"network.kind: no network '{kind}'{near(kind, CONFIGS)}")
-        entries = {k: v for k, v in network.items() if k != "kind"}
-        return replace(config, network=from_document(CONFIGS[kind], entries, "network"))
+        return from_document(TrainConfig, values)
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from None
 
@@ -213,10 +195,7 @@ def config_text(config: TrainConfig) -> str:
     """The recipe as YAML, every value written out; `parse_config` reads it back."""
     from arraygeom.runtime.safe_yaml import dump_yaml
 
-    plain = to_document(config, defaults=True)
-    kind = next(name for name, made_of in CONFIGS.items() if type(config.network) is made_of)
-    values = plain | {"network": {"kind": kind} | plain["network"]}
-    return dump_yaml(values, default_flow_style=None, width=118)
+    return dump_yaml(to_document(config, defaults=True), default_flow_style=None, width=118)
 
 
 def save_config(config: TrainConfig, path: Path) -> None:
@@ -242,7 +221,7 @@ def command_line(arguments: list[str]) -> TrainConfig:
         ),
         default=base,
         args=arguments,
-        config=(tyro.conf.AvoidSubcommands, tyro.conf.DisallowNone),
+        config=(tyro.conf.DisallowNone,),
     )
 
 

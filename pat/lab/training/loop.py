@@ -18,7 +18,8 @@ from torch.optim import Adam
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from arraygeom.runtime.together import sweep
-from pat.networks.weights import Network, new_network, save_weights, set_precision
+from pat.networks.paper import PAT
+from pat.networks.weights import new_network, save_weights, set_precision
 from pat.support.locks import folder_lock
 from pat.support.tensor_files import write_tensors
 
@@ -94,7 +95,7 @@ class Run:
     def __init__(self, config: TrainConfig, here: Process, former: Checkpoint | None) -> None:
         self.config, self.here, self.groups = config, here, here.share(config.groups)
         torch.manual_seed(config.seed)
-        self.network = new_network(config.network, config.start).to(here.device)
+        self.network = cast(PAT, new_network(config.network, config.start)).to(here.device)
         self.average = AveragedModel(self.network, multi_avg_fn=get_ema_multi_avg_fn(1 - 1 / config.average))
         set_precision(self.network, config.precision, compiled=config.compile)  # not the average's
         self.objective = Objective(self.network, config.loss, attention=config.attention)
@@ -115,9 +116,9 @@ class Run:
         self.began = time.monotonic() - 60 * minutes
 
     @property
-    def averaged(self) -> Network:
+    def averaged(self) -> PAT:
         """The network with averaged weights."""
-        return cast(Network, self.average.module)
+        return cast(PAT, self.average.module)
 
     @property
     def minutes(self) -> float:
@@ -128,7 +129,7 @@ class Run:
         """Step until done."""
         given = self.samples.steps(self.groups, start=self.step)
         recipe = self.config
-        for samples in made_ahead(given, self.network):
+        for samples in made_ahead(given):
             self.step += 1
             share = self.here.agreed(max(self.step / recipe.steps, self.minutes / recipe.minutes))
             self._advance(samples, share)

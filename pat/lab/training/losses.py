@@ -7,11 +7,11 @@ from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import avg_pool2d, mse_loss
+from torch.nn.functional import mse_loss
 
 from pat.attention.scores import Compared, peak_position
+from pat.networks.paper import PAT
 from pat.networks.protocol import Comparing, FusionNetwork, FusionOutput, fused_at_once
-from pat.networks.weights import Network
 
 from .attention_loss import attention_loss
 from .samples import Sample
@@ -25,56 +25,25 @@ def image_loss(image: Tensor, ground_truth: Tensor) -> Tensor:
     return ((image - ground_truth).square().flatten(1).mean(1) + 1e-5).log10().mean()
 
 
-def structure_loss(image: Tensor, ground_truth: Tensor) -> Tensor:
-    """One minus the mean SSIM of images (b, c, h, w) in windows of 7x7 pixels (Wang et al. 2004)."""
-
-    def mean(x: Tensor) -> Tensor:
-        return avg_pool2d(x, 7, 1)
-
-    a, b = mean(image), mean(ground_truth)
-    variances = mean(image * image) - a * a + mean(ground_truth * ground_truth) - b * b
-    common = mean(image * ground_truth) - a * b
-    similarity = (2 * a * b + 1e-4) * (2 * common + 9e-4) / ((a * a + b * b + 1e-4) * (variances + 9e-4))
-    return 1 - similarity.mean()
-
-
-IMAGE_LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
-    "psnr": image_loss,
-    "psnr-ssim": lambda image, ground_truth: (
-        image_loss(image, ground_truth) + structure_loss(image, ground_truth)
-    ),
-    "mse": mse_loss,
-}
+IMAGE_LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {"psnr": image_loss, "mse": mse_loss}
 
 
 class Objective(nn.Module):
     """A network and its loss in one module, so that DistributedDataParallel sees one forward."""
 
-    def __init__(self, network: Network, loss: str, *, attention: float = 0.0) -> None:
+    def __init__(self, network: PAT, loss: str, *, attention: float = 0.0) -> None:
         super().__init__()
-        if attention and not isinstance(network, Comparing):
-            raise ValueError(
-                f"attention: {type(network).__name__} has no attention to supervise: leave it at 0"
-            )
         self.network = network
         self.image_loss = IMAGE_LOSSES[loss]
         self.attention = attention
 
     def forward(self, sample: Sample) -> Tensor:
         """The loss of a group of samples."""
-        if self.attention and isinstance(self.network, Comparing):
-            fused, compared = self.network.compare(sample.inputs)
-            where = attention_loss(compared, sample.position, sample.visible)
-            return self.image_loss(fused.image, sample.ground_truth) + self.attention * where
-        fused = fused_sample(self.network, sample)
-        return self.image_loss(fused.image, sample.ground_truth)
-
-
-def fused_sample(network: FusionNetwork, sample: Sample) -> FusionOutput:
-    """The network's output for a group of samples, by their matches where they have some."""
-    if sample.matches is not None:
-        return network(sample.inputs, sample.matches)
-    return fused_at_once(network, sample.inputs)
+        if not self.attention:
+            return self.image_loss(self.network(sample.inputs).image, sample.ground_truth)
+        fused, compared = self.network.compare(sample.inputs)
+        where = attention_loss(compared, sample.position, sample.visible)
+        return self.image_loss(fused.image, sample.ground_truth) + self.attention * where
 
 
 @torch.no_grad()

@@ -1,6 +1,6 @@
 """Samples made in training: layered scenes from photographs, seen by random rigs, recorded by random cameras.
 
-A share of them may come from rendered scenes, and from stereo pairs.
+A share of them may come from rendered scenes, and from stereo pairs with true disparity.
 
 The samples of a step are a pure function of the seed and the number of the step, so that a run continues
 where it stopped, and processes share a step without communication.
@@ -30,17 +30,14 @@ from arraygeom.pixels import HW
 from arraygeom.sampling import Sampled
 from pat.lab.synthesis.layered import ArrayBatch, LayeredScenes
 from pat.lab.synthesis.photos import PhotoBank
-from pat.lab.synthesis.rigs import below
 from pat.matching.inputs import Inputs
-from pat.matching.matches import Matches
 from pat.media.colour import luminance
-from pat.networks.protocol import FusionNetwork, matched_for
 from pat.sensors import Clip, GaussianBlur, Jitter, Noise, Quantise, Step, augment, paper_cases, record
 
 from .config import RecordingConfig, TrainConfig
-from .lenses import LOST, MOST, Spectra, through_lenses
+from .lenses import LOST, through_lenses
 from .scenes import Crops, RenderedCrops
-from .stereo import MeasuredPairs, PairCrops
+from .stereo import MeasuredPairs
 
 CACHED = 48
 """Groups of scenes cached to be recorded again."""
@@ -51,7 +48,7 @@ SCENE, RECORDING = 0, 1
 
 
 class Sample(NamedTuple):
-    """A network's input, the ground truth, and, if known, the true position of each pixel in each beta."""
+    """A network's input, the ground truth, and the true position of each pixel in each beta."""
 
     alpha: Tensor
     betas: list[Tensor]
@@ -59,8 +56,6 @@ class Sample(NamedTuple):
     ground_truth: Tensor
     position: list[Tensor]
     visible: list[Tensor]
-    matches: Matches | None = None
-    """Those of the betas, if they are known and the network uses some."""
 
     @property
     def inputs(self) -> Inputs:
@@ -73,7 +68,6 @@ class Planned(NamedTuple):
 
     scenes: int
     kind: str
-    betas: int
     dropped: int | None
     """The number of the scenes to drop from the cache."""
 
@@ -81,7 +75,7 @@ class Planned(NamedTuple):
 def plan(config: TrainConfig, seed: int) -> Iterator[Planned]:
     """What each step of a recipe records, from step 0: new scenes, or some of the last `CACHED` again."""
     draw = random.Random(seed)
-    shares = {name: getattr(config, name) for name in ("rendered", "pairs", "measured")}
+    shares = {name: getattr(config, name) for name in ("rendered", "measured")}
     layered = max(1 - sum(shares.values()), 0.0)
     cached: list[Planned] = []
     for number in range(2**62):
@@ -92,9 +86,8 @@ def plan(config: TrainConfig, seed: int) -> Iterator[Planned]:
                 kind = draw.choices([*shares, kind], [*shares.values(), layered])[0]
             if kind == "layered":
                 kind = "rectified" if draw.random() < config.rectified else "general"
-            betas = 3 if draw.random() < config.filtered else 1
             dropped = cached.pop() if len(cached) > CACHED else None
-            cached.insert(0, Planned(number, kind, betas, None))
+            cached.insert(0, Planned(number, kind, None))
             yield cached[0]._replace(dropped=dropped.scenes if dropped else None)
         else:
             yield cached[int(draw.random() * len(cached))]
@@ -104,12 +97,11 @@ def plan(config: TrainConfig, seed: int) -> Iterator[Planned]:
 class SampleSource:
     """Samples by the number of the step: called with a count it gives the first group of that many steps.
 
-    Scenes are of `layered`, by the kind of their rigs and the number of betas, or of `folders`, by their
-    kind.
+    Scenes are of `layered`, by the kind of their rigs, or of `folders`, by their kind.
     """
 
     config: TrainConfig
-    layered: Mapping[tuple[str, int], LayeredScenes]
+    layered: Mapping[str, LayeredScenes]
     folders: Mapping[str, Crops]
     seed: int
     field: ReceptiveField
@@ -139,31 +131,25 @@ class SampleSource:
     def _made(self, planned: Planned, g: Generator) -> ArrayBatch:
         if planned.kind in self.folders:
             crops = self.folders[planned.kind]
-            return crops.sample(self.config.batch, g, number=planned.scenes, betas=planned.betas)
-        return self.layered[planned.kind, planned.betas].sample(self.config.batch, g)
+            betas = self.config.network.betas
+            return crops.sample(self.config.batch, g, number=planned.scenes, betas=betas)
+        return self.layered[planned.kind].sample(self.config.batch, g)
 
 
-def made_ahead(samples: Iterator[list[Sample]], network: FusionNetwork) -> Iterator[list[Sample]]:
-    """Samples with matches: those of the next step are made, and matched, while a step is computed.
-
-    They do not depend on the network's weights, so that results are the same.
-    """
-
-    def following() -> list[Sample]:
-        return [group._replace(matches=matched_for(network, group.inputs)) for group in next(samples)]
-
+def made_ahead(samples: Iterator[list[Sample]]) -> Iterator[list[Sample]]:
+    """The same samples: those of the next step are made while a step is computed."""
     with ThreadPoolExecutor(1) as beside:
-        coming = beside.submit(following)
+        coming = beside.submit(next, samples)
         while True:
             given = coming.result()
-            coming = beside.submit(following)
+            coming = beside.submit(next, samples)
             yield given
 
 
 def scenes(config: TrainConfig, *, device: str = "cpu") -> tuple[SampleSource, SampleSource]:
     """Sources of samples to learn from and to validate on, from different photographs, scenes and pairs."""
     field, n = named_field(config.field), config.held_out
-    layered = config.rendered + config.pairs + config.measured < 1
+    layered = config.rendered + config.measured < 1
     bank, unseen = photographs(config) if layered else (None, None)
 
     def source(photos: PhotoBank | None, seed: int, choose: Callable[[int], bool]) -> SampleSource:
@@ -183,12 +169,10 @@ def source_of(
 ) -> SampleSource:
     """A recipe's samples. `photos` may be None where all batches come from `folders`, by kind of scenes."""
     kinds = {"rectified": config.rectified_rigs, "general": config.general_rigs}
+    betas = config.network.betas
     layered = {
-        (kind, betas): LayeredScenes(
-            photos, replace(rigs, betas=betas), hw=config.hw, seed=seed, device=device
-        )
+        kind: LayeredScenes(photos, replace(rigs, betas=betas), hw=config.hw, seed=seed, device=device)
         for kind, rigs in kinds.items()
-        for betas in (1, 3)
         if photos is not None
     }
     return SampleSource(config, layered, folders, seed, field)
@@ -199,7 +183,6 @@ def crops(config: TrainConfig, seed: int, device: str, choose: Callable[[int], b
     general, rectified = config.general_rigs.resolutions, config.rectified_rigs.resolutions
     sources: dict[str, tuple[type[Crops], tuple[Path, ...], tuple[float, ...]]] = {
         "rendered": (RenderedCrops, config.rendered_from, general),
-        "pairs": (PairCrops, config.pairs_from, rectified),
         "measured": (MeasuredPairs, config.measured_from, rectified),
     }
     return {
@@ -232,7 +215,7 @@ def degraded(
     recording: RecordingConfig = RecordingConfig(),  # noqa: B008
 ) -> Sample:
     """Recorded images of a scene: alpha grey, betas in colour (or one band), at alpha's resolution."""
-    images, two_views = _banded(scene, g, recording.spectral), len(scene.images) == 2
+    images, two_views = scene.images, len(scene.images) == 2
     ideal, grey, cameras = images[0], luminance(scene.images[0]), scene.cameras
     alpha = recorded(grey, cameras[0], g, recording).values
     betas, on_grid, position, visible = [], [], [], []
@@ -244,21 +227,11 @@ def degraded(
             alpha, betas[0], _ = augment(alpha, betas[0], paper_cases(), g)
         pair = pair_of(scene, i, g)
         on_grid.append(FieldOnGrid.of(field, perturbed(pair, recording.miscalibrated, g)))
-        if scene.depth:
-            transferred = transfer(pair, scene.depth[0], scene.depth[i].masked_fill(~beta.valid, torch.nan))
-            position.append(transferred[0])
-            visible.append(transferred[1])
+        where, seen = transfer(pair, scene.depth[0], scene.depth[i].masked_fill(~beta.valid, torch.nan))
+        position.append(where)
+        visible.append(seen)
     ground_truth = ideal if recording.ideal else ideal + (alpha - grey)
     return Sample(alpha, betas, on_grid, ground_truth, position, visible)
-
-
-def _banded(scene: ArrayBatch, g: Generator, spectral: float) -> list[Tensor]:
-    """The scene's images, with this probability in other bands than red, green and blue."""
-    if spectral == 0 or not _chance(spectral, g):
-        return scene.images
-    count = 1 + below(MOST, g) if len(scene.images) == 2 else len(scene.images) - 1
-    spectra = Spectra.drawn(len(scene.images[0]), count, g)
-    return [spectra.of(image) for image in scene.images]
 
 
 def recorded(

@@ -1,7 +1,7 @@
 """Stereo pairs as training samples: a random window of an image as alpha and truth, of the other as beta.
 
-Where their depth is not known, the loss is on the image alone. Their cameras are assumed: rectified, a metre
-apart, with the pair's range of disparities.
+Their true disparity is known. Their cameras are assumed: rectified, a metre apart, with the pair's range of
+disparities.
 """
 
 from __future__ import annotations
@@ -35,19 +35,20 @@ REDUCED = 2
 
 
 class Pictures(NamedTuple):
-    """Two images (3, H, W), the largest disparity, pixels; and their disparities (H, W), 0 if not known."""
+    """Two images (3, H, W), their disparities (H, W), 0 where not known, and the largest; pixels."""
 
     left: Tensor
     right: Tensor
+    disparities: tuple[Tensor, Tensor]
     largest: float
-    disparities: tuple[Tensor, ...] = ()
 
 
-class PairCrops(Crops):
-    """Random windows of the rectified stereo pairs in folders.
+class MeasuredPairs(Crops):
+    """Random windows of Middlebury's pairs in folders, of the collections of 2003, 2005 and 2006.
 
     Raises ValueError for a folder without pairs, for a pair whose images differ in size, are not in colour or
-    are smaller than `hw`; when it is read, for an image that cannot be read.
+    are smaller than `hw`, or without the disparity of both images; when it is read, for an image that cannot
+    be read.
     """
 
     def _find(self, roots: Sequence[Path], choose: Callable[[int], bool]) -> None:
@@ -58,7 +59,7 @@ class PairCrops(Crops):
         self._pictures = lru_cache(ACTIVE)(lambda i: self.read(self.pairs[i]))
 
     def check(self, pair: PairFiles) -> None:
-        """Raise ValueError unless both images are in colour, of one size, and at least `hw`."""
+        """Raise ValueError unless both images are in colour, of one size, at least `hw`, and measured."""
         left, right = _header(pair.left), _header(pair.right)
         if left != right:
             raise ValueError(
@@ -72,15 +73,17 @@ class PairCrops(Crops):
             raise ValueError(
                 f"{pair.left} is {_described(left)}, smaller than the samples, {w}x{h}: lower `hw`"
             )
+        disparity_files(pair)
 
     def read(self, pair: PairFiles) -> Pictures:
-        """The images of a pair."""
-        return Pictures(read_image(pair.left), read_image(pair.right), pair.max_disparity)
+        """The images and disparities of a pair."""
+        left, right = (read_image(path)[0] * pair.max_disparity for path in disparity_files(pair))
+        return Pictures(read_image(pair.left), read_image(pair.right), (left, right), pair.max_disparity)
 
     def sample(self, batch: int, generator: Generator, *, number: int, betas: int = 1) -> ArrayBatch:
         """Windows of group `number`, of the pairs active then. Several betas are of the same camera.
 
-        `depth` is NaN where it is not known, and there is none without disparities.
+        `depth` is NaN where it is not known.
         """
         active = active_items(number, len(self.pairs), self.seed)
         sizes = self.beta_sizes(betas, generator)
@@ -90,8 +93,6 @@ class PairCrops(Crops):
         side, nearest = (torch.tensor(numbers, dtype=torch.float64) for numbers in (sides, largest))
         shown = [alpha, *(reduced(beta, size).clamp(max=1) for size in sizes)]
         cameras = assumed_cameras(shown, side, nearest, self.device)
-        if not disparities[0]:
-            return cameras
         near, far = (depth_of(torch.stack(same), self.hw[1]) for same in zip(*disparities))
         depth = [near, *(coarser(far, size) for size in sizes)]
         return replace(cameras, depth=[d.to(self.device) for d in depth])
@@ -109,24 +110,6 @@ class PairCrops(Crops):
         if below(2, g):
             return images, disparities, 1.0, pictures.largest / times
         return images[::-1], disparities[::-1], -1.0, pictures.largest / times
-
-
-class MeasuredPairs(PairCrops):
-    """Random windows of Middlebury's pairs in folders, of the collections of 2003, 2005 and 2006.
-
-    Raises ValueError as `PairCrops`, and for a pair without the disparity of both images.
-    """
-
-    def check(self, pair: PairFiles) -> None:
-        """Raise ValueError for a pair that cannot be used."""
-        super().check(pair)
-        disparity_files(pair)
-
-    def read(self, pair: PairFiles) -> Pictures:
-        """The images and disparities of a pair."""
-        left, right = (read_image(path)[0] * 255 for path in disparity_files(pair))
-        scale = 255 / pair.max_disparity
-        return super().read(pair)._replace(disparities=(left / scale, right / scale))
 
 
 def disparity_files(pair: PairFiles) -> tuple[Path, Path]:

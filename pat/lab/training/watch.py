@@ -24,9 +24,8 @@ from torch.nn.functional import interpolate
 
 from arraygeom.runtime.atomic import write_text
 from pat.media.images import write_image
-from pat.networks.protocol import FusionNetwork
+from pat.networks.protocol import FusionNetwork, fused_at_once
 
-from .losses import fused_sample
 from .samples import Sample
 
 SHOWN = 3
@@ -104,7 +103,7 @@ def contact_sheet(network: FusionNetwork, samples: list[Sample]) -> Float[Tensor
 
 
 def _row(network: FusionNetwork, sample: Sample) -> Tensor:
-    fused = fused_sample(network, sample)
+    fused = fused_at_once(network, sample.inputs)
     beta = torch.cat([b[:1] for b in sample.betas], 1)
     confidence = torch.stack([c[:1] for c in fused.confidence], 1).amin(1, keepdim=True)
     hw = (sample.ground_truth.shape[-2], sample.ground_truth.shape[-1])

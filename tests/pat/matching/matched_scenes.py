@@ -4,9 +4,11 @@ import cv2
 import torch
 
 from arraygeom import Pair, Rectified, Segments, View, lazily, pixel_grid
-from pat.matching.colour_transfer import diffused_from, matched_colours
-from pat.matching.matches import BetaMatches
-from pat.matching.normalisation import Comparison
+from arraygeom.fields.grid import FieldOnGrid
+from pat.matching.colour_transfer import transferred
+from pat.matching.inputs import Beta, Inputs
+from pat.matching.match import located_in_one
+from pat.matching.matches import BetaMatches, Matches
 from pat.matching.semi_global import matched_at_half_size
 from pat.matching.subpixel import matched_at_full_size
 
@@ -43,24 +45,23 @@ def faint(seed: int, *, contrast: float, blur: float) -> torch.Tensor:
     return (0.5 + contrast * (soft - soft.mean()) / soft.std()).clamp(0, 1)
 
 
-def matched(alpha, guide, segments, blocks, comparison, half=None):
-    """Disparity and facts of one beta whose brightness is `guide`; without `half` both sizes are matched."""
-    rough, facts = half or matched_at_half_size(comparison.half_views(alpha, guide), blocks)
-    found, unlike = matched_at_full_size(comparison.views(alpha, guide), segments, rough)
+def matched(alpha, beta, segments, blocks, comparison):
+    """Disparity and facts of one beta of one band."""
+    rough, facts = matched_at_half_size(comparison.half_views(alpha, beta), blocks)
+    found, unlike = matched_at_full_size(comparison.views(alpha, beta), segments, rough)
     return found, torch.cat([unlike, facts[:, 1:]], 1)
 
 
 def semi_global_matching(
     alpha: torch.Tensor,
-    guide: torch.Tensor,
     beta: torch.Tensor,
     segments: Segments,
-    blocks: Segments | None,
-    comparison: Comparison | None = None,
+    blocks: Segments,
+    *,
+    sees_luma: bool = True,
 ) -> BetaMatches:
-    """Matches of one beta, whose brightness is `guide`, and its colours by them, as `match` has."""
-    comparison = comparison or Comparison.of(alpha, guide)
-    disparity, facts = matched(alpha, guide, segments, blocks, comparison)
-    colours, weight, _ = matched_colours(alpha, guide, beta, segments, disparity, facts, comparison.whole)
-    diffused = diffused_from(colours, alpha, weight)
-    return BetaMatches(disparity, facts, comparison, colours, diffused)
+    """Matches of one beta with its colours, as `match` has them without a choice and certainty."""
+    field = FieldOnGrid(lambda _: segments, 1, segments, blocks)
+    inputs = Inputs(alpha, (Beta(beta, field),), bands=beta.shape[1], sees_luma=sees_luma)
+    (found,) = transferred(inputs, Matches((located_in_one(inputs),))).betas
+    return found

@@ -10,13 +10,12 @@ from arraygeom import Segments, pixel_grid
 from arraygeom.fields.grid import FieldOnGrid
 from pat.matching import colour_transfer as warped
 from pat.matching import inputs as inputs_module
-from pat.matching.colour_transfer import _diffused, colour_noise, match_weight, transferred
+from pat.matching.colour_transfer import SETTINGS, MatchStatistics, _diffused, colour_noise, transferred
 from pat.matching.inputs import Inputs, InputsSettings
-from pat.matching.likeness import UNLIKE
-from pat.matching.matches import BetaMatches, Matches
+from pat.matching.matches import BetaMatches, Colours, Matches
 from pat.matching.normalisation import Comparison, explained_share
 from pat.media.colour import luminance
-from tests.pat.matching.matched_scenes import beside, blurred, faint, matched, semi_global_matching
+from tests.pat.matching.matched_scenes import beside, blurred, faint, semi_global_matching
 
 
 def enlarged(image: torch.Tensor, times: int) -> torch.Tensor:
@@ -33,7 +32,7 @@ def chroma_errors(
     alpha: torch.Tensor, beta: torch.Tensor, ground_truth: torch.Tensor, segments: list[Segments]
 ) -> list[torch.Tensor]:
     """How far colour differences are from the true ones: those at the matches, and beta's where it is."""
-    matched = semi_global_matching(alpha, luminance(beta), beta, *segments).bands
+    matched = semi_global_matching(alpha, beta, *segments).carried.bands
     found, given, true = (image - luminance(image) for image in (matched, beta, ground_truth))
     return [found - true, given - true]
 
@@ -46,7 +45,7 @@ def test_what_nothing_sees_varies_with_brightness_as_nearby():
     weight[:, :16] = 1
     guide = np.full(brightness.shape, 100, np.uint8)
     unseen = np.where(weight < 1, 0, colour).astype(np.float32)
-    found = _diffused(unseen, brightness, weight, guide, (1000.0, 20.0))[0]
+    found = _diffused(unseen, brightness, weight, guide)
     assert np.abs(found - colour)[:, :, 16:].mean() < 0.6 * np.abs(colour - colour.mean()).mean()
 
 
@@ -109,18 +108,92 @@ def test_colour_at_matches_does_not_hang_on_what_the_other_image_shows_elsewhere
     """Alpha alone sees something dark on the left: whole images differ in level, what both see does not."""
     scene = faint(1, contrast=0.1, blur=3.0)
     scene[..., :48] -= 0.35
-    tint = torch.tensor([1.0, 0.6, 0.3]).view(1, 3, 1, 1)
+    tint = torch.tensor([1.3, 1.0, 0.2]).view(1, 3, 1, 1)
+    tint = tint / luminance(tint)
     alpha, beta, segments = beside(scene, 48)
-    found = semi_global_matching(alpha, beta, beta * tint, *segments)
+    found = semi_global_matching(alpha, beta * tint, *segments).carried
     assert (found.bands + alpha - alpha * tint)[..., 80:].abs().mean() < 0.009
 
 
-def test_a_match_of_other_brightness_has_less_weight():
-    unlike = torch.zeros(1, 1, 5, 12)
-    unlike[..., 6:] = -UNLIKE
-    weight = match_weight(unlike, torch.ones_like(unlike), torch.ones_like(unlike, dtype=torch.bool))
-    torch.testing.assert_close(weight[..., :5], torch.full((1, 1, 5, 5), 1.0001))
-    torch.testing.assert_close(weight[..., 7:], torch.full((1, 1, 5, 5), float(np.exp(-1)) + 1e-4))
+def certain(
+    alpha: torch.Tensor,
+    beta: torch.Tensor,
+    certainty: float | None,
+    seen: slice = slice(None),
+    *,
+    facts: float = 0.0,
+    sees_luma: bool = True,
+) -> Colours:
+    """Colours of one view for both cameras, in these columns, each match as certain; None: not known."""
+    h, w = alpha.shape[-2:]
+    segments, blocks = in_place((h, w))
+    segments.valid[:] = False
+    segments.valid[..., seen] = True
+    inputs = Inputs.of(alpha, [beta], [FieldOnGrid(lambda _: segments, 1, segments, blocks)])
+    inputs, sure = replace(inputs, sees_luma=sees_luma), torch.ones(1, 2, h // 2, w // 2)
+    stated = None if certainty is None else certainty * sure
+    planes = torch.full((1, 3, h // 2, w // 2), facts)
+    matched = BetaMatches(0 * alpha, planes, Comparison.of(alpha, beta), certainty=stated)
+    (found,) = transferred(inputs, Matches((matched,))).betas
+    return found.carried
+
+
+def with_other_patch() -> tuple[torch.Tensor, torch.Tensor]:
+    """Alpha, and a beta that shows something much darker in columns 40 to 59."""
+    alpha = faint(1, contrast=0.1, blur=3.0)[..., :128]
+    beta = alpha.clone()
+    beta[..., 40:60] -= 0.3
+    return alpha, beta
+
+
+@pytest.mark.parametrize("certainty", [0.1, 0.5, 0.9])
+def test_weight_grows_with_certainty_and_likeness(certainty):
+    found = certain(*with_other_patch(), certainty)
+    alike, unlike = (found.likeness[..., part] for part in (slice(70, 120), slice(44, 56)))
+    assert alike.median() > 0.5
+    assert unlike.max() < 0.01
+    right = (torch.tensor(certainty).logit() + SETTINGS.alike * found.likeness).sigmoid()
+    torch.testing.assert_close(found.weight, (right * found.likeness).sqrt(), atol=1e-4, rtol=0)
+    order = found.likeness.flatten().argsort()
+    assert (found.weight.flatten()[order].diff() > -1e-6).all()
+    assert (certain(*with_other_patch(), certainty + 0.05).weight >= found.weight).all()
+
+
+def test_without_certainty_weight_is_the_likeness_halved_where_the_check_fails():
+    (sure, halved) = (certain(*with_other_patch(), None, facts=facts) for facts in (0.0, 1.0))
+    torch.testing.assert_close(sure.weight, sure.likeness)
+    torch.testing.assert_close(halved.weight, halved.likeness / 2)
+
+
+def test_of_an_alpha_that_sees_something_else_weight_is_the_confidence():
+    found = certain(*with_other_patch(), 0.7, sees_luma=False)
+    torch.testing.assert_close(found.weight, torch.full_like(found.weight, 0.7))
+    assert (found.likeness == 1).all()
+
+
+@pytest.mark.parametrize("certainty", [0.0, 1.0])
+def test_weight_is_a_share_whatever_the_certainty_and_none_off_beta(certainty):
+    weight = certain(*with_other_patch(), certainty, slice(64, None)).weight
+    assert (weight[..., :64] == 0).all()
+    assert weight.min() >= 0
+    assert weight.max() <= 1
+
+
+def test_statistics_of_pieces_are_those_of_the_whole():
+    """Each part was brought to alpha's mean and contrast by itself, and likeness was wrong."""
+    g = torch.Generator().manual_seed(0)
+    alpha = torch.rand(1, 1, 40, 60, generator=g) * torch.linspace(0.2, 1, 60)
+    beta = 0.5 * alpha + 0.1
+    ones = torch.ones_like(alpha)
+
+    def statistics(columns: slice) -> MatchStatistics:
+        a, b, one = (image[..., columns] for image in (alpha, beta, ones))
+        return MatchStatistics.of(a, a, b, b, b, one, one)
+
+    whole = statistics(slice(None))
+    pieces = MatchStatistics.mean([statistics(slice(0, 20)), statistics(slice(20, 60))])
+    torch.testing.assert_close(whole.leveled(beta), alpha, atol=1e-3, rtol=0)
+    torch.testing.assert_close(pieces.leveled(beta), alpha, atol=1e-3, rtol=0)
 
 
 def test_a_match_of_one_band_has_alphas_detail_even_if_the_band_is_inverted():
@@ -131,7 +204,7 @@ def test_a_match_of_one_band_has_alphas_detail_even_if_the_band_is_inverted():
     ground_truth = 0.8 - 0.6 * alpha
     beta = blurred(ground_truth, 1.5)
     here = in_place((96, 128))
-    found = semi_global_matching(alpha, beta, beta, *here).bands + alpha
+    found = semi_global_matching(alpha, beta, *here).carried.bands + alpha
     left, lost = ((p - ground_truth)[..., 6:-6, 6:-6].abs().mean() for p in (found, beta))
     assert left < 0.7 * lost
 
@@ -153,13 +226,9 @@ def test_colour_is_as_strong_as_beta_shows_it_if_alpha_sees_something_else(sees_
     """Near infrared is half as bright: so are the materials in it, not the light."""
     scene = faint(3, contrast=0.12, blur=1.5)[..., :128]
     beta = scene * torch.tensor([1.3, 1.0, 0.4]).view(1, 3, 1, 1)
-    alpha, guide = 0.5 * luminance(beta), luminance(beta)
-    segments, blocks = in_place((64, 128))
-    comparison = Comparison.of(alpha, guide)
-    disparity, facts = matched(alpha, guide, segments, blocks, comparison)
-    there = alpha, guide, beta, segments, disparity, facts, comparison.whole
-    bands, _, _ = warped.matched_colours(*there, sees_luma=sees_luma)
-    found, given = (image - luminance(image) for image in (bands, beta))
+    alpha = 0.5 * luminance(beta)
+    matched = semi_global_matching(alpha, beta, *in_place((64, 128)), sees_luma=sees_luma)
+    found, given = (image - luminance(image) for image in (matched.carried.bands, beta))
     assert float((found * given).sum() / given.square().sum()) == pytest.approx(kept, abs=0.02)
 
 
@@ -178,7 +247,7 @@ def test_an_alpha_in_the_infrared_gives_no_detail():
     scene = faint(3, contrast=0.12, blur=1.5)[..., :128]
     beta = scene * torch.tensor([1.3, 1.0, 0.4]).view(1, 3, 1, 1)
     infrared = faint(9, contrast=0.12, blur=1.5)[..., :128]
-    found = semi_global_matching(infrared, luminance(beta), beta, *in_place((64, 128)))
+    found = semi_global_matching(infrared, beta, *in_place((64, 128))).carried
     chroma = [image - luminance(image) for image in (found.bands, beta)]
     assert (chroma[0] - chroma[1]).abs().mean() < 0.3 * (
         chroma[1] - chroma[1].mean((2, 3), keepdim=True)
@@ -241,6 +310,12 @@ def test_pieces_show_no_border_even_far_from_what_beta_sees(tint, monkeypatch):
     monkeypatch.setattr(inputs_module, "SETTINGS", InputsSettings(halo=64, at_once=40_000))
     assert len({piece.outer[0] for piece in inputs.pieces}) > 1 < len({p.outer[2] for p in inputs.pieces})
     (pieces,) = transferred(inputs, matches).betas
-    for one, other in zip(whole.colours, pieces.colours):
+    for one, other in (
+        (whole.carried.bands, pieces.carried.bands),
+        (whole.carried.weight, pieces.carried.weight),
+        (whole.carried.fills[:, 0], pieces.carried.fills[:, 0]),
+    ):
         assert (one - other).abs().max() < 0.1
-    assert float(whole.colours[0][..., h // 2 :, :].std((-2, -1)).max()) < 1e-6
+    by_example = (whole.carried.fills[:, 1] - pieces.carried.fills[:, 1]).abs()
+    assert by_example.max() < 0.15  # of what is seen in the piece
+    assert float(whole.carried.bands[..., h // 2 :, :].std((-2, -1)).max()) < 1e-6

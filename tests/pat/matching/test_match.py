@@ -15,7 +15,7 @@ from pat.fusion.views import Views
 from pat.matching.colour_transfer import transferred
 from pat.matching.inputs import Inputs, box_around
 from pat.matching.match import located, match
-from pat.matching.matches import Matches
+from pat.matching.matches import Colours, Matches
 from pat.matching.positions import enlarged
 from pat.media.colour import luminance
 from pat.networks.protocol import FusionOutput, fused_at_once
@@ -87,11 +87,12 @@ def test_positions_are_where_the_wall_is(inputs):
 
 def test_matches_are_located_first_and_coloured_then(inputs):
     whole, (bare,) = match(inputs), located(inputs).betas
-    assert bare.bands is None
+    assert bare.colours is None
     with pytest.raises(ValueError, match="no colours"):
-        bare.colours  # noqa: B018
-    again = transferred(inputs, Matches((bare,)))
-    assert torch.equal(again.betas[0].bands, whole.betas[0].bands)
+        bare.carried  # noqa: B018
+    sure = replace(bare, chosen=whole.betas[0].chosen, certainty=whole.betas[0].certainty)
+    (again,) = transferred(inputs, Matches((sure,))).betas
+    assert all(torch.equal(*planes) for planes in zip(again.carried, whole.betas[0].carried))
 
 
 def test_which_beta_is_matched_is_said(inputs, caplog):
@@ -174,13 +175,19 @@ def holed(plane):
         ("disparity", holed, "disparity is NaN or infinite: give any, with little certainty"),
         ("facts", holed, "facts is NaN"),
         ("bands", holed, "bands is NaN"),
+        ("weight", holed, "weight is NaN"),
         ("certainty", holed, "certainty is NaN"),
         ("certainty", lambda plane: plane + 7, "certainty is not within 0 to 1"),
         ("disparity", Tensor.double, "disparity and facts are float64 and float32: give one type"),
         ("disparity", Tensor.long, r"disparity is int64 \(1, 1, 64, 96\): wanted a tensor of floats"),
         ("facts", lambda plane: enlarged(plane), r"facts is float32 .*: wanted .* \(1, 3, 32, 48\)"),
         ("bands", lambda plane: plane[:, :1], r"bands is float32 \(1, 1, .*: wanted .* \(1, 3, 64, 96\)"),
-        ("diffused", lambda plane: plane[:, :1], r"diffused is float32 .*: wanted .* \(1, 2, 3, 64, 96\)"),
+        ("fills", lambda plane: plane[:, :1], r"fills is float32 .*: wanted .* \(1, 2, 3, 64, 96\)"),
+        (
+            "likeness",
+            lambda plane: plane.expand(-1, 3, -1, -1),
+            r"likeness is .*: wanted .* \(1, 1, 64, 96\)",
+        ),
         ("chosen", lambda plane: plane[..., ::2, ::2], r"chosen is float32 \(1, 1, 32, 48\): wanted"),
     ],
 )
@@ -190,6 +197,9 @@ def test_matches_of_ones_own_are_checked(network, flat, plane, change, problem):
 
     def matcher(inputs):
         (found,) = match(inputs).betas
+        if plane in Colours._fields:
+            changed = change(getattr(found.carried, plane))
+            return Matches((replace(found, colours=found.carried._replace(**{plane: changed})),))
         return Matches((replace(found, **{plane: change(getattr(found, plane))}),))
 
     with pytest.raises(ValueError, match=f"these matches' {problem}"):

@@ -1,6 +1,5 @@
 """Several RGB betas of one scene: what one cannot see another can."""
 
-import math
 from dataclasses import replace
 
 import pytest
@@ -16,12 +15,11 @@ from pat.matching import inputs as inputs_module
 from pat.matching import multiview as several
 from pat.matching.colour_transfer import transferred
 from pat.matching.match import in_each_beta, located, match
-from pat.matching.matches import Matches
+from pat.matching.matches import Colours, Matches
 from pat.matching.multiview import NEAR as AGREES
 from pat.matching.multiview import MatchedBeta, agreed, with_likeliest_colours
 from pat.media.colour import luminance
-from pat.networks.guided import SETTINGS as GUIDED
-from pat.networks.guided import BetaEstimate, combined
+from pat.networks.guided import combined
 from pat.networks.weights import load_weights
 from pat.support.metrics import score
 
@@ -83,22 +81,30 @@ def test_two_colour_cameras_on_opposite_sides_see_more_than_either(network, scen
     assert (depth - FAR).abs().nanmedian() < 0.5
 
 
-def test_of_betas_of_equal_confidence_that_as_bright_as_alpha_counts_more(network, scene, monkeypatch):
-    rig, images, _ = scene
-    inputs = frame_inputs(network, Views.of(rig, images, alpha="mono")).inputs
-    one, other = network.explain(inputs, match(inputs))[1]
-    bright, dark = (
-        e._replace(
-            colour=torch.full_like(e.colour, v),
-            logit=torch.ones_like(e.logit),
-            likeness=torch.full_like(e.likeness, v),
-        )
-        for e, v in ((one, 1.0), (other, 0.0))
-    )
-    dark_is_right = GUIDED.least_weight / (1 + GUIDED.least_weight)  # by its brightness
-    odds = torch.tensor(GUIDED.alike * (1 - math.log(dark_is_right))).sigmoid()
-    torch.testing.assert_close(combined([bright, dark]).colour, odds.expand_as(one.colour))
-    assert combined([dark, dark._replace(colour=bright.colour)]).colour.mean() == pytest.approx(0.5)
+def carried(bands, weight, likeness, fills=0.0):
+    """Colours of four pixels of one band, all alike."""
+    plane = torch.zeros(1, 1, 2, 2)
+    return Colours(plane + bands, plane + weight, plane + likeness, torch.zeros(1, 2, 1, 2, 2) + fills)
+
+
+def test_of_betas_each_counts_by_its_odds():
+    both = combined([carried(1.0, 0.9, 1.0, fills=1.0), carried(0.0, 0.6, 0.0)])
+    for plane in (both.bands, both.likeness, both.fills):
+        torch.testing.assert_close(plane, torch.full_like(plane, 9 / (9 + 1.5)))
+    torch.testing.assert_close(both.weight, torch.full_like(both.weight, 0.9))
+    one = carried(0.3, 0.6, 1.0)
+    assert combined([one]) is one
+
+
+def test_fills_that_betas_share_stay_shared():
+    one, other = carried(1.0, 0.9, 1.0), carried(0.0, 0.6, 1.0)
+    assert combined([one, other._replace(fills=one.fills)]).fills is one.fills
+
+
+def test_of_betas_a_pixel_that_one_does_not_see_is_the_others():
+    seen, nowhere = carried(1.0, 0.5, 0.0), carried(0.0, 0.0, 1.0)
+    assert combined([seen, nowhere]).bands.min() > 0.99
+    assert all(plane.isfinite().all() for plane in combined([nowhere, nowhere]))
 
 
 def test_colours_are_where_a_beta_is_most_like_alpha(network, scene):
@@ -128,20 +134,8 @@ def test_colour_that_betas_share_is_of_consistent_matches(network, scene):
     inputs = replace(frame_inputs(network, Views.of(rig, images, alpha="mono")).inputs, bands=3)
     one, other = located(inputs).betas
     given = Matches((one, replace(other, facts=torch.ones_like(other.facts))))
-    shared, alone = (transferred(replace(inputs, bands=n), given).betas[0].diffused for n in (3, 6))
+    shared, alone = (transferred(replace(inputs, bands=n), given).betas[0].carried.fills for n in (3, 6))
     assert (shared - alone).abs().mean() < 0.05 * alone.abs().mean()
-
-
-def test_of_betas_a_pixel_without_a_segment_never_counts(network):
-    """Not even where the other shows another brightness."""
-    one = torch.zeros(1, 1, 2, 2)
-    empty = one[:, 0]
-
-    def estimate(value, logit, likeness):
-        return BetaEstimate(one, empty, empty, one + value, one[None], one + logit, one, one, one + likeness)
-
-    dark, nowhere = estimate(1.0, -3.0, 0.0), estimate(0.0, GUIDED.nowhere, 1.0)
-    assert combined([dark, nowhere]).colour.min() > 0.99
 
 
 def test_the_order_of_the_betas_does_not_matter(network, scene):
@@ -191,10 +185,10 @@ def test_shared_colour_counts_once(network, scene):
     rig, images, _ = scene
     matches = match(frame_inputs(network, Views.of(rig, images, alpha="mono")).inputs)
     one, other = matches.betas
-    assert one.diffused is other.diffused
-    assert matches.nbytes == H * W * (2 * (8 + 3 + 4) + 2 * 2 * 3 + 2 * 6)
+    assert one.carried.fills is other.carried.fills
+    assert matches.nbytes == H * W * (2 * (8 + 3 + 4) + 2 * 2 * (3 + 1 + 1) + 2 * 2 * 3)
     one, other = matches.cut((0, 32, 0, 64)).betas
-    assert one.diffused is other.diffused
+    assert one.carried.fills is other.carried.fills
 
 
 def test_a_band_camera_beside_a_colour_camera_gives_better_depth(network, scene):

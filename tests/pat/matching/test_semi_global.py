@@ -22,16 +22,20 @@ from arraygeom import (
     pixel_grid,
     rotation_from_vector,
 )
-from pat.matching.matches import BetaMatches
+from pat.matching.matches import BetaMatches, Colours
 from pat.matching.normalisation import Comparison, Normalisation, equalising_blurs
 from pat.matching.positions import matches
 from pat.matching.semi_global import matched_at_half_size
+from pat.media.colour import luminance
 from pat.support.memory import limited
 from tests.pat.matching.matched_scenes import beside, blurred, faint, semi_global_matching
 
 HW = (64, 96)
 
-PARTS = ("disparity", "facts", "bands", "diffused")
+
+def parts_of(found: BetaMatches) -> list[torch.Tensor]:
+    """All planes that matching and carrying colour over give."""
+    return [found.disparity, found.facts, *found.carried]
 
 
 def test_lengths_of_plain_numbers_are_those_with_gradients():
@@ -92,9 +96,11 @@ def test_a_plane_is_found_again_by_unrectified_cameras(turn):
     """To half a pixel where beta sees it, though every segment has its own direction; colours too."""
     pair = pair_of(turn)
     alpha, beta, where = plane_seen(pair, 2.0)
-    colours = beta * torch.tensor([1.0, 0.6, 0.3]).view(1, 3, 1, 1).double()
+    tint = torch.tensor([1.3, 1.0, 0.2]).double().view(1, 3, 1, 1)
+    tint = tint / luminance(tint)  # alpha sees luma
+    colours = beta * tint
     segments = sampled_at(pair, 1)
-    found = semi_global_matching(alpha, beta, colours, segments, sampled_at(pair, 2))
+    found = semi_global_matching(alpha, colours, segments, sampled_at(pair, 2))
     position = matches(segments, found.disparity)[0]
     inner = torch.zeros(HW, dtype=torch.bool)
     inner[8:-8, 8:-8] = True
@@ -103,8 +109,8 @@ def test_a_plane_is_found_again_by_unrectified_cameras(turn):
     assert seen.float().mean() > 0.3
     assert off.median() < 0.5
     assert (off < 1.5).float().mean() > 0.95
-    wanted = alpha[0] * torch.tensor([1.0, 0.6, 0.3]).view(3, 1, 1).double() - alpha[0]
-    for colour in (found.bands[0], *found.diffused[0]):
+    wanted = (alpha * tint - alpha)[0]
+    for colour in (found.carried.bands[0], *found.carried.fills[0]):
         assert (colour - wanted)[:, seen].abs().mean() < 0.03
 
 
@@ -117,11 +123,11 @@ def in_blocks_of(monkeypatch, **sizes: int) -> None:
 def test_threads_and_blocks_change_nothing(monkeypatch):
     pair = pair_of(0.1)
     alpha, beta, _ = plane_seen(pair, 2.0)
-    call = alpha, beta, beta, sampled_at(pair, 1), sampled_at(pair, 2)
+    call = alpha, beta, sampled_at(pair, 1), sampled_at(pair, 2)
     whole = semi_global_matching(*call)
     with arraygeom.runtime.threads.limited_to(1 if torch.get_num_threads() > 1 else 3):
         again = semi_global_matching(*call)
-    assert all(torch.equal(getattr(whole, part), getattr(again, part)) for part in PARTS)
+    assert all(torch.equal(*parts) for parts in zip(parts_of(whole), parts_of(again), strict=True))
     in_blocks_of(monkeypatch, block=16)
     pieces = semi_global_matching(*call)
     assert (pieces.disparity - whole.disparity).abs().median() < 1e-3
@@ -171,30 +177,32 @@ def test_a_batch_is_its_images_one_by_one():
     pair = pair_of(0.1)
     alpha, beta, _ = plane_seen(pair, 2.0)
     fine, coarse = sampled_at(pair, 1), sampled_at(pair, 2)
-    one = semi_global_matching(alpha, beta, beta, fine, coarse)
-    other = semi_global_matching(alpha.flip(-1), beta.flip(-1), beta.flip(-1), fine, coarse)
-    both = semi_global_matching(*(torch.cat([p, p.flip(-1)]) for p in (alpha, beta, beta)), fine, coarse)
-    for part in PARTS:
-        assert torch.equal(torch.cat([getattr(one, part), getattr(other, part)]), getattr(both, part))
+    one = semi_global_matching(alpha, beta, fine, coarse)
+    other = semi_global_matching(alpha.flip(-1), beta.flip(-1), fine, coarse)
+    both = semi_global_matching(*(torch.cat([p, p.flip(-1)]) for p in (alpha, beta)), fine, coarse)
+    for first, second, together in zip(*map(parts_of, (one, other, both)), strict=True):
+        assert torch.equal(torch.cat([first, second]), together)
 
 
 def test_no_segment_is_nothing_found():
     x = torch.zeros(1, 32, 48, 2)
     nowhere = [Segments(v, v, torch.zeros(v.shape[:-1], dtype=torch.bool)) for v in (x, x[:, ::2, ::2])]
-    found = semi_global_matching(
-        torch.rand(1, 1, 32, 48), torch.rand(1, 1, 32, 48), torch.rand(1, 3, 32, 48), *nowhere
-    )
+    found = semi_global_matching(torch.rand(1, 1, 32, 48), torch.rand(1, 3, 32, 48), *nowhere)
     assert found.disparity.abs().max() == 0
-    assert found.diffused.isfinite().all()
+    assert found.carried.weight.max() == 0
+    assert all(plane.isfinite().all() for plane in found.carried)
 
 
 def test_a_cut_is_where_it_says():
     half, whole = torch.arange(48.0).view(1, 1, 6, 8), torch.arange(192.0).view(1, 1, 12, 16)
-    cut = BetaMatches(whole - 1, half, Comparison.of(whole, whole), whole + 1, whole).cut((4, 10, 2, 16))
+    colours = Colours(whole + 1, whole + 2, whole + 3, whole[None])
+    made = BetaMatches(whole - 1, half, Comparison.of(whole, whole), colours=colours)
+    cut = made.cut((4, 10, 2, 16))
     assert torch.equal(cut.disparity, whole[..., 4:10, 2:16] - 1)
     assert torch.equal(cut.facts, half[..., 2:5, 1:8])
-    assert torch.equal(cut.diffused, whole[..., 4:10, 2:16])
-    assert torch.equal(cut.bands, whole[..., 4:10, 2:16] + 1)
+    assert torch.equal(cut.carried.fills, whole[None, ..., 4:10, 2:16])
+    for plane, added in zip(cut.carried[:3], (1, 2, 3)):
+        assert torch.equal(plane, whole[..., 4:10, 2:16] + added)
 
 
 def test_the_sharper_of_two_images_is_blurred_whichever_it_is():
@@ -231,6 +239,6 @@ def test_what_lies_beyond_the_edge_of_beta_is_not_sought_within_it():
     """Beta ends, 40 columns of alpha are unseen: most are known as such, and matches beside are right."""
     alpha, beta, segments = beside(faint(0, contrast=0.03, blur=4.0), 40)
     noise = 0.01 * torch.randn(2, *alpha.shape, generator=torch.Generator().manual_seed(9))
-    found = semi_global_matching(alpha + noise[0], beta + noise[1], beta + noise[1], *segments)
+    found = semi_global_matching(alpha + noise[0], beta + noise[1], *segments)
     assert ((found.disparity[..., 48:72] - 40).abs() < 2).float().mean() > 0.98
     assert (found.facts[:, 0, :, :17] > pat.matching.semi_global.CONSISTENT).float().mean() > 0.845

@@ -12,7 +12,7 @@ from arraygeom.runtime.chunks import Tile
 from pat.fusion.inputs import frame_inputs
 from pat.fusion.tiles import fuse_tile, working_memory
 from pat.fusion.views import Views
-from pat.matching.matches import BetaMatches, Matches
+from pat.matching.matches import BetaMatches, Colours, Matches
 from pat.matching.multiview import agreed
 from pat.matching.normalisation import Comparison
 from pat.networks.weights import load_weights
@@ -34,7 +34,7 @@ def frame_of(side, betas):
 
 
 def found_in(inputs):
-    """Matches as they might be found; diffused colour is shared."""
+    """Matches as they might be found; fills are shared."""
     (h, w), n = inputs.hw, len(inputs.betas)
     fills = torch.rand(1, 2, 3, h, w)
     made = [
@@ -42,8 +42,7 @@ def found_in(inputs):
             5 * torch.rand(1, 1, h, w),
             torch.rand(1, 3, h // 2, w // 2),
             Comparison.of(inputs.alpha, inputs.betas[i].image),
-            torch.rand(1, 3, h, w),
-            fills,
+            colours=Colours(torch.rand(1, 3, h, w), *torch.rand(2, 1, 1, h, w), fills),
         )
         for i in range(n)
     ]

@@ -13,36 +13,35 @@ from pat.networks.weights import load_weights, set_precision
 from pat.support import eight_bits
 from pat.support.metrics import score
 
+FRAME = {"alpha": "mono", "align": False, "response": "rec601"}
 
-@pytest.mark.parametrize("precision", ["bfloat16", "int8"])
-def test_a_precision_changes_the_image_little_and_something(precision):
-    of = "avx512_bf16" if precision == "bfloat16" else "vnni"
-    if not getattr(torch.cpu, f"_is_{of}_supported")():
-        pytest.skip(f"this processor has no {precision}")
+
+def test_bfloat16_changes_the_image_little_and_something():
+    if not torch.cpu._is_avx512_bf16_supported():
+        pytest.skip("this processor has no bfloat16")
     sample = load_sample()
-    frame = {"alpha": "mono", "align": False, "response": "rec601"}
     exact, rounded = (
-        fuse(load_weights("mono-colour", precision=p), sample.rig, sample.images, **frame)
-        for p in ("float32", precision)
+        fuse(load_weights("pat-supervised", precision=p), sample.rig, sample.images, **FRAME)
+        for p in ("float32", "bfloat16")
     )
     apart = (exact.image - rounded.image).abs()
-    assert 0 < apart.max() < 0.05
+    assert 0 < apart.max() < 0.2
     scores = [score(frame.image.clamp(0, 1), sample.ground_truth).psnr for frame in (exact, rounded)]
-    assert abs(scores[0] - scores[1]) < 0.02
-    assert (exact.confidence - rounded.confidence).abs().max() < 0.02
+    assert abs(scores[0] - scores[1]) < 0.1
 
 
 def test_a_copy_of_a_network_in_bfloat16_computes_with_its_own_weights():
-    network = load_weights("mono-colour")
+    network = load_weights("pat-supervised")
     set_precision(network, "bfloat16")
     other = copy.deepcopy(network)
-    for parameter in other.encoder.parameters():
+    for parameter in other.features.parameters():
         parameter.zero_()
-    image = torch.rand(1, 1, 32, 32)
-    assert network.encoder(image).half.any()
-    assert not other.encoder(image).half.any()
+    image = torch.rand(1, 3, 32, 32)
+    given = torch.cat([image, image[:, :1]], 1) if network.config.normalised else image
+    assert network.features(given).any()
+    assert not other.features(given).any()
     again = pickle.loads(pickle.dumps(network))
-    assert again.encoder(image).half.equal(network.encoder(image).half)
+    assert again.features(given).equal(network.features(given))
 
 
 def test_a_precision_that_there_is_not_is_refused():

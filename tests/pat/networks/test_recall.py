@@ -97,9 +97,9 @@ def test_what_is_certain_counts_more_and_is_left_alone(halves):
     assert (weighted - colour).square().mean() < 0.1 * (equally - colour).square().mean()
     less = with_less_noise(alpha, mixed, certain)
     assert torch.equal(less[certain > 0], mixed[certain > 0])
-    doubtful = certain == 0
-    share = (less - mixed)[doubtful] / (weighted - mixed)[doubtful]
-    assert torch.allclose(share, torch.tensor(SETTINGS.share), atol=1e-3)
+    assert torch.allclose(less[certain == 0], weighted[certain == 0])
+    half = with_less_noise(alpha, mixed, torch.full_like(mixed, 0.5))
+    assert torch.allclose(half, (mixed + equally) / 2, atol=1e-5)
 
 
 def test_what_is_filled_in_is_smoothed_with_what_is_certain(halves):

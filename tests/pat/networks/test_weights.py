@@ -7,22 +7,21 @@ import resource
 import numpy as np
 import pytest
 import torch
-from pat.networks.bandwise import BandwisePAT
 from safetensors.torch import save_file
 
-from pat.networks.configs import BandwisePATConfig, GuidedPATConfig, PATConfig
+from pat.networks.configs import GuidedPATConfig, PATConfig
 from pat.networks.guided import GuidedPAT
 from pat.networks.paper import PAT
 from pat.networks.weights import FORMAT, SHIPPED, load_weights, save_weights, shipped
 
 NETWORKS = [
     PAT(PATConfig(betas=2, dim=8)),
-    GuidedPAT(GuidedPATConfig(widths=(8, 8, 8, 8))),
-    BandwisePAT(BandwisePATConfig(widths=(8, 8, 8, 8))),
+    GuidedPAT(GuidedPATConfig()),
+    GuidedPAT(GuidedPATConfig(bands=None, keep_luminance=False, learned=False)),
 ]
 
 
-@pytest.mark.parametrize("network", NETWORKS, ids=lambda network: type(network).__name__)
+@pytest.mark.parametrize("network", NETWORKS, ids=["PAT", "GuidedPAT", "classical"])
 def test_written_and_read_back(network, tmp_path):
     path = tmp_path / "w.safetensors"
     save_weights(network, path, facts={"seed": "0"})
@@ -76,10 +75,10 @@ def test_another_version_or_a_checkpoint_is_named(tmp_path):
 
 
 def test_the_tensor_that_does_not_fit_is_named(tmp_path):
-    network = GuidedPAT(GuidedPATConfig(widths=(8, 8, 8, 8)))
-    network.config = GuidedPATConfig(widths=(8, 8, 8, 16))
+    network = PAT(PATConfig(dim=8))
+    network.config = PATConfig(dim=16)
     save_weights(network, tmp_path / "w.safetensors")
-    with pytest.raises(ValueError, match=r"do not fit the GuidedPAT.*: \S+ is \(.*\), wanted \("):
+    with pytest.raises(ValueError, match=r"do not fit the PAT.*: \S+ is \(.*\), wanted \("):
         load_weights(tmp_path / "w.safetensors")
 
 
@@ -92,18 +91,18 @@ def weights_file(path, config, network="GuidedPAT", state=None) -> None:
 @pytest.mark.parametrize(
     ("network", "config", "problem"),
     [
-        ("GuidedPAT", {"widths": [16, 32, 40, 10**9]}, r"widths is 1000000000; wanted 1 to 1024"),
-        ("GuidedPAT", {"widths": [1024] * 4, "fine_dim": 1024}, "do not fit the GuidedPAT"),
-        ("GuidedPAT", {"propagation_steps": [1] * 10**5}, "propagation_steps has 100000 entries"),
-        ("GuidedPAT", {"widths": 5}, "widths: is 5; wanted a list"),
-        ("GuidedPAT", {"widths": [16, 32, 40, "x"]}, r"widths\[3\]: is 'x'; wanted a whole number"),
-        ("GuidedPAT", {"taps": 0}, "taps is 0; wanted 1 to"),
-        ("GuidedPAT", {"taps": 10**400}, "wanted 1 to"),
-        ("GuidedPAT", '{"window": NaN}', "window: is NaN"),
-        ("GuidedPAT", '{"window": Infinity}', "window is inf"),
+        ("GuidedPAT", {"bands": 10**9}, r"bands is 1000000000; wanted 1 to 1024"),
+        ("GuidedPAT", {}, "do not fit the GuidedPAT"),
+        ("GuidedPAT", {"completion": [1] * 10**5}, "completion: unknown key"),
+        ("GuidedPAT", {"bands": "x"}, "bands: is 'x'; wanted a whole number"),
+        ("PAT", {"dim": 10**9}, r"dim is 1000000000; wanted 1 to 1024"),
+        ("GuidedPAT", {"bands": 0}, "bands is 0; wanted 1 to"),
+        ("GuidedPAT", {"bands": 10**400}, "wanted 1 to"),
+        ("GuidedPAT", '{"bands": NaN}', "bands: is nan"),
+        ("GuidedPAT", '{"keep_luminance": Infinity}', "keep_luminance: is inf"),
         ("GuidedPAT", {"nonsense": 1}, "nonsense: unknown key"),
-        ("GuidedPAT", {"fine_head": 8}, r"\(fine_head: unknown key\): train it again, or take the weights"),
-        ("BandwisePAT", {"bands": 3}, "one band at a time"),
+        ("GuidedPAT", {"fine_head": 8}, "fine_head: unknown key.*: train it again, or take the weights"),
+        ("BandwisePAT", {"bands": 3}, "not weights of this package"),
         ("PAT", {"dim": 1024, "betas": 1024, "scale": 1024}, "do not fit the PAT"),
         ("PAT", {"betas": -1}, "betas is -1"),
         ("PAT", {"interpolation": "cubic"}, "interpolation: is 'cubic'"),

@@ -8,9 +8,9 @@ from torch import Generator
 
 from pat.lab.training.config import TrainConfig
 from pat.media.images import write_image
-from pat.networks.configs import GuidedPATConfig
+from pat.networks.configs import PATConfig
 
-SMALL = GuidedPATConfig(widths=(8, 8, 8, 8), taps=5)
+SMALL = PATConfig(dim=4, residual=True, interpolation="bilinear")
 
 
 def short_run(folder: Path, **changes) -> TrainConfig:

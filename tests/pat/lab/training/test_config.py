@@ -16,7 +16,7 @@ from pat.lab.training.config import (
     recipes,
     save_config,
 )
-from pat.networks.configs import GuidedPATConfig, PATConfig
+from pat.networks.configs import PATConfig
 
 
 def test_written_and_read_back(tmp_path):
@@ -26,7 +26,7 @@ def test_written_and_read_back(tmp_path):
     save_config(config, tmp_path / "c.yaml")
     assert load_config(tmp_path / "c.yaml") == config
     assert parse_config(config_text(TrainConfig())) == TrainConfig()
-    assert yaml.safe_load(config_text(config))["network"]["kind"] == "PAT"
+    assert yaml.safe_load(config_text(config))["network"]["dim"] == 8
 
 
 @pytest.mark.parametrize("name", recipes())
@@ -49,12 +49,9 @@ def test_the_papers_recipes_are_the_papers():
     [
         ("batchs: 4", "c: batchs: unknown key; did you mean 'batch'?"),
         ("recording: {gian: 1}", "c: recording.gian: unknown key; did you mean 'gain'?"),
-        ("network: {kind: PAT, dimm: 8}", "c: network.dimm: unknown key; did you mean 'dim'?"),
-        (
-            "network: {kind: Pat}",
-            "c: network.kind: no network 'Pat'; known here: PAT, GuidedPAT, BandwisePAT",
-        ),
-        ("network: 3", "c: network: wanted entries such as kind: GuidedPAT, got 3"),
+        ("network: {dimm: 8}", "c: network.dimm: unknown key; did you mean 'dim'?"),
+        ("network: {kind: GuidedPAT}", "c: network.kind: unknown key"),
+        ("network: 3", "c: network: is 3; wanted a mapping"),
         ("batch: four", "c: batch: is 'four'; wanted a whole number"),
         ("batch: 4.5", "c: batch: is 4.5; wanted a whole number"),
         ("batch: true", "c: batch: is True; wanted a whole number"),
@@ -65,7 +62,7 @@ def test_the_papers_recipes_are_the_papers():
         ("compile: 1", "c: compile: is 1; wanted true or false"),
         ("steps: 0", "c: steps must be at least 1, got 0"),
         ("minutes: -1", "c: minutes must be more than 0, got -1"),
-        ("filtered: 2", "c: filtered is a share of the batches, 0 to 1, got 2"),
+        ("loss: psnr-ssim", "c: loss: is 'psnr-ssim'; did you mean 'psnr'?"),
         ("rectified: -.5", "c: rectified is a share of the batches, 0 to 1, got -0.5"),
         ("recording: {noise: 60}", "c: recording: noise is a probability, 0 to 1, got 60"),
         ("recording: {miscalibrated: .nan}", "c: recording"),
@@ -76,13 +73,13 @@ def test_the_papers_recipes_are_the_papers():
         ("general_rigs: {resolutions: []}", "c: general_rigs: betas must be at least 1 and resolutions"),
         ("rendered: 1.5", "c: rendered is a share of the batches, 0 to 1, got 1.5"),
         ("rendered: 0.5", "c: rendered is 0.5 and there is no folder: give both `rendered` and"),
-        ("pairs_from: a", "c: pairs is 0 and a is given: give both `pairs` and `pairs_from`"),
+        ("rendered_from: a", "c: rendered is 0 and a is given: give both `rendered` and `rendered_from`"),
+        ("pairs: 0.5", "c: pairs: unknown key"),
         ("measured: 0.5", "c: measured is 0.5 and there is no folder: give both `measured` and"),
         ("measured_from: [a]", "give both `measured` and `measured_from`"),
-        ("{rendered: 0.7, rendered_from: a, pairs: 0.7, pairs_from: [b]}", "of the batches, 1.4 in all"),
-        ("{measured: 0.6, measured_from: [a], pairs: 0.6, pairs_from: [b]}", "of the batches, 1.2 in all"),
+        ("{rendered: 0.7, rendered_from: a, measured: 0.7, measured_from: [b]}", "batches, 1.4 in all"),
         ("attention: -1", "c: attention must be 0 or more"),
-        ("# to do", "c: the recipe is empty: write entries (name: value), or take mono-colour, "),
+        ("# to do", "c: the recipe is empty: write entries (name: value), or take paper-2, "),
         ("[1, 2]", "c: wanted entries (name: value), got [1, 2]"),
         ("a: [", "c: not valid YAML at line 2"),
     ],
@@ -101,20 +98,20 @@ def test_numbers_as_people_write_them():
 
 
 def test_the_command_line_goes_over_the_recipe(tmp_path):
-    save_config(TrainConfig(batch=6, network=GuidedPATConfig(taps=9)), tmp_path / "c.yaml")
+    save_config(TrainConfig(batch=6, network=PATConfig(dim=9)), tmp_path / "c.yaml")
     config = command_line(
         [
             str(tmp_path / "c.yaml"),
             "--rate",
             "1e-3",
-            "--network.window",
+            "--network.betas",
             "3",
             "--general-rigs.focal-ratio",
             "1",
             "3",
         ]
     )
-    assert (config.batch, config.rate, config.network.taps, config.network.window) == (6, 1e-3, 9, 3.0)
+    assert (config.batch, config.rate, config.network.dim, config.network.betas) == (6, 1e-3, 9, 3)
     assert config.general_rigs.focal_ratio == (1, 3)
     assert command_line(["paper-4", "--network.dim", "8"]).network == PATConfig(betas=3, in_channels=1, dim=8)
     with pytest.raises(FileNotFoundError, match=r"no recipe 'paper-3' .*; did you mean 'paper-4'\?"):

@@ -18,11 +18,11 @@ from pat.lab.training import loop
 from pat.lab.training.checkpoints import newest_checkpoint
 from pat.lab.training.config import TrainConfig, save_config
 from pat.lab.training.loop import rate_at, train
-from pat.lab.training.losses import Objective, validation
+from pat.lab.training.losses import validation
 from pat.lab.training.processes import Process
 from pat.lab.training.samples import SampleSource, made_ahead, scenes
 from pat.networks.configs import PATConfig
-from pat.networks.weights import load_weights, new_network, save_weights
+from pat.networks.weights import find_weights, load_weights, new_network, save_weights
 from pat.support.locks import folder_lock
 from tests.processes import room_for
 
@@ -53,10 +53,9 @@ def whole(folder):
     return config
 
 
-def test_samples_are_made_and_matched_ahead(folder):
-    """The second while the first is in use; a network that is given their matches computes the same."""
+def test_samples_are_made_ahead(folder):
+    """The second while the first is in use, and all in order."""
     config, asked = short_run(folder), threading.Event()
-    network = new_network(config.network)
 
     def source():
         for number, group in enumerate(scenes(config)[0].steps([0])):
@@ -64,12 +63,12 @@ def test_samples_are_made_and_matched_ahead(folder):
                 asked.set()
             yield group
 
-    given = next(made := made_ahead(source(), network))[0]
+    first = next(made := made_ahead(source()))[0]
     assert asked.wait(600)
+    second = next(made)[0]
     made.close()
-    objective = Objective(network, config.loss)
-    assert given.matches is not None
-    assert torch.equal(objective(given), objective(given._replace(matches=None)))
+    for given, plain in zip((first, second), scenes(config)[0](2)):
+        assert torch.equal(given.alpha, plain.alpha)
 
 
 class Stopped(Exception):
@@ -233,9 +232,9 @@ def test_starting_from_weights(folder, whole):
     network = new_network(SMALL, whole.out / "best.safetensors")
     theirs = load_weights(whole.out / "best.safetensors").state_dict()
     assert all(torch.equal(v, theirs[k]) for k, v in network.state_dict().items())
-    with pytest.raises(ValueError, match=r"GuidedPAT .* PAT "):
-        new_network(PATConfig(), whole.out / "best.safetensors")
-    save_weights(new_network(replace(SMALL, taps=7)), folder / "other.safetensors")
+    with pytest.raises(ValueError, match=r"holds a GuidedPAT .* a PAT "):
+        new_network(SMALL, find_weights("mono-colour"))
+    save_weights(new_network(replace(SMALL, dim=7)), folder / "other.safetensors")
     with pytest.raises(ValueError, match="give its own recipe"):
         new_network(SMALL, folder / "other.safetensors")
 
@@ -252,9 +251,7 @@ def test_no_photographs(folder, whole):
 
 def test_the_papers_network_trains_on_nearest_pixels(folder, whole):
     network = PATConfig(dim=4)
-    config = replace(
-        whole, network=network, loss="mse", field="nearest", out=folder / "paper", steps=2, filtered=0.0
-    )
+    config = replace(whole, network=network, loss="mse", field="nearest", out=folder / "paper", steps=2)
     assert load_weights(train(config)).config == network
 
 

@@ -9,11 +9,8 @@ from PIL import Image
 
 from arraygeom import sample
 from pat.lab.training.config import RecordingConfig, TrainConfig
-from pat.lab.training.losses import Objective
 from pat.lab.training.samples import degraded, scenes
 from pat.lab.training.stereo import MeasuredPairs
-from pat.networks.configs import GuidedPATConfig
-from pat.networks.guided import GuidedPAT
 
 HW, NEAR, FAR = (32, 48), 9, 3
 """Disparities of a square and of what is behind it."""
@@ -75,12 +72,6 @@ def test_pairs_without_the_disparity_of_both_images_are_refused(pair, tmp_path):
 
 
 def test_a_recipe_takes_its_batches_from_them(pair):
-    config = TrainConfig(measured=1.0, measured_from=(pair.parent,), hw=HW, batch=1, filtered=0, held_out=2)
+    config = TrainConfig(measured=1.0, measured_from=(pair.parent,), hw=HW, batch=1, held_out=2)
     with pytest.raises(ValueError, match="too few"):  # one pair cannot be learned from and held out
         scenes(config)
-
-
-def test_a_network_without_attention_of_its_own_is_not_supervised_by_it():
-    network = GuidedPAT(GuidedPATConfig(widths=(8, 12, 12, 16)))
-    with pytest.raises(ValueError, match="GuidedPAT has no attention to supervise"):
-        Objective(network, "psnr", attention=1.0)

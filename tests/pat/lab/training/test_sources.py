@@ -1,7 +1,6 @@
 """Rendered scenes, stereo pairs and lenses as sources of samples: what they give, what is wrong with them."""
 
 import json
-import math
 import shutil
 from dataclasses import replace
 from functools import partial
@@ -30,7 +29,6 @@ from pat.lab.synthesis.rigs import random_rigs
 from pat.lab.training.config import RecordingConfig, TrainConfig, save_config
 from pat.lab.training.lenses import lens_over, through_lenses
 from pat.lab.training.loop import train
-from pat.lab.training.losses import explained, match_loss, validation
 from pat.lab.training.samples import degraded, pair_of, plan, scenes, transfer
 from pat.lab.training.scenes import (
     ACTIVE,
@@ -41,11 +39,10 @@ from pat.lab.training.scenes import (
     batched,
     finite_window,
 )
-from pat.lab.training.stereo import PairCrops
+from pat.lab.training.stereo import MeasuredPairs
 from pat.media.colour import luminance
 from pat.media.images import write_image
 from pat.networks.configs import PATConfig
-from pat.networks.weights import new_network
 
 from .runs import losses, short_run
 from .test_loop import by_torchrun, ends_as, one_thread, stopped  # noqa: F401
@@ -86,14 +83,17 @@ def broken(rendered, tmp_path):
 
 
 def stereo(folder, *, count: int = 4, hw: tuple[int, int] = (80, 120), disparity: int = 6):
-    """Pairs cut from wide smooth images: what left has at x, right has at x - disparity."""
+    """Pairs cut from wide smooth images: what left has at x, right has at x - disparity; the scale is 3."""
     for i in range(count):
         coarse = torch.rand(1, 3, hw[0] // 6, hw[1] // 6, generator=generator(i))
         wide = torch.nn.functional.interpolate(coarse, (hw[0], hw[1] + disparity), mode="bicubic").clamp(
             0, 1
         )[0]
-        write_image(folder / f"{i}_L.png", wide[:, :, :-disparity])
-        write_image(folder / f"{i}_R.png", wide[:, :, disparity:])
+        one = folder / "2006_third" / str(i)
+        write_image(one / "view1.png", wide[:, :, :-disparity])
+        write_image(one / "view5.png", wide[:, :, disparity:])
+        for name in ("disp1.png", "disp5.png"):
+            write_image(one / name, torch.full((1, *hw), 3 * disparity / 255))
     return folder
 
 
@@ -114,19 +114,19 @@ def refused(crops, root, hw=(32, 48), **how):
 # What steps are made of ------------------------------------------------------------------------------------
 
 
-def test_without_these_sources_steps_are_what_they_were():
-    """The weights of the package were trained on this sequence."""
-    kinds = "".join(f"{p.kind[0]}{p.betas}" for p in islice(plan(TrainConfig(), 1), 20))
-    assert kinds == "r1g1r1g1r3g1g3r1g1r1g3r3r1r1r3g3r1g1r1r1"
+def test_without_these_sources_all_steps_are_of_layered_scenes():
+    kinds = {p.kind for p in islice(plan(TrainConfig(), 1), 200)}
+    assert kinds == {"rectified", "general"}
+    assert {p.kind for p in islice(plan(TrainConfig(rectified=1.0), 1), 200)} == {"rectified"}
 
 
 def test_shares_are_shares():
     config = TrainConfig(
-        rendered=0.3, rendered_from=(Path("a"),), pairs=0.2, pairs_from=(Path("b"),), reuse=1.0
+        rendered=0.3, rendered_from=(Path("a"),), measured=0.2, measured_from=(Path("b"),), reuse=1.0
     )
     kinds = [p.kind for p in islice(plan(config, 0), 2000)]
     assert kinds.count("rendered") / 2000 == pytest.approx(0.3, abs=0.03)
-    assert kinds.count("pairs") / 2000 == pytest.approx(0.2, abs=0.03)
+    assert kinds.count("measured") / 2000 == pytest.approx(0.2, abs=0.03)
     assert kinds.count("rectified") == pytest.approx(kinds.count("general"), rel=0.2)
 
 
@@ -297,19 +297,19 @@ def test_what_is_wrong_with_scenes(broken, tmp_path):
 
 
 def test_a_pairs_cameras_put_what_one_shows_where_the_other_shows_it(tmp_path):
-    """6 pixels of disparity are (6 / 120) of the nearest depth's: beta has there what alpha has."""
-    crops = PairCrops([stereo(tmp_path)], hw=(32, 48))
+    """6 pixels of disparity are (6 / 85) of the nearest depth's: beta has there what alpha has."""
+    crops = MeasuredPairs([stereo(tmp_path)], hw=(32, 48))
     sides, reductions = set(), set()
     for number in range(4):
         batch = crops.sample(3, generator(number), number=number)
         given = degraded(batch, generator(), recording=EXACT)
-        assert (given.position, given.visible, batch.depth) == ([], [], [])
         near, baseline = batch.depth_range[:, 0], batch.cameras[1].t[:, 0]
         sides |= set(baseline.sign().tolist())
-        reductions |= set((120 / (48 / near)).round().int().tolist())
-        depth = (near * 120 / 6)[:, None, None].expand(3, 32, 48)
-        where, _ = transfer(pair_of(batch, 1, generator()), depth, depth)
-        assert (at(given, where) - given.ground_truth)[..., 8:-8].abs().max() < 0.03
+        reductions |= set((85 / (48 / near)).round().int().tolist())
+        depth = (near * 85 / 6)[:, None, None].expand(3, 32, 48)
+        torch.testing.assert_close(batch.depth[0], depth, rtol=1e-3, atol=0)
+        assert given.visible[0][..., 8:-8].all()
+        assert (at(given, given.position[0]) - given.ground_truth)[..., 8:-8].abs().max() < 0.03
         assert (given.betas[0] - given.ground_truth)[..., 8:-8].abs().max() > 0.1
         torch.testing.assert_close(given.alpha, luminance(given.ground_truth), atol=0.003, rtol=0)
         held = given.fields[0].at(torch.tensor([[24.0, 16.0]]).double())
@@ -318,52 +318,37 @@ def test_a_pairs_cameras_put_what_one_shows_where_the_other_shows_it(tmp_path):
 
 
 def test_betas_of_pairs_are_reduced_and_three_are_bands(tmp_path):
-    crops = PairCrops([stereo(tmp_path)], hw=(32, 48), resolutions=(0.25,))
+    crops = MeasuredPairs([stereo(tmp_path)], hw=(32, 48), resolutions=(0.25,))
     batch = crops.sample(2, generator(), number=0, betas=3)
     assert [tuple(i.shape[2:]) for i in batch.images] == [(32, 48), (8, 12), (8, 12), (8, 12)]
     given = degraded(batch, generator(), recording=EXACT)
     assert [tuple(b.shape) for b in given.betas] == [(2, 1, 32, 48)] * 3
 
 
-def test_nobody_knows_where_a_pairs_points_are(tmp_path):
-    config = short_run(tmp_path)
-    crops = PairCrops([stereo(tmp_path / "stereo")], hw=(32, 48))
-    given = degraded(crops.sample(2, generator(), number=0), generator())
-    network = new_network(config.network)
-    fused, seen = explained(network, given)
-    assert match_loss(seen, given) == 0
-    (fused.image - given.ground_truth).square().mean().backward()
-    assert all(p.grad is not None for p in network.parameters())
-    facts = validation(network, [given])
-    assert math.isnan(facts["matched"])
-    assert facts["psnr"] > 5
-
-
 def test_middleburys_collections_say_their_largest_disparity(shared_data):
-    crops = PairCrops([shared_data / "middlebury"], hw=(96, 192))
-    assert {round(pair.max_disparity) for pair in crops.pairs} >= {64, 85, 128}
+    crops = MeasuredPairs([shared_data / "middlebury" / "2006_third"], hw=(96, 192))
+    assert {round(pair.max_disparity) for pair in crops.pairs} == {85}
     assert crops.sample(2, generator(), number=0).images[0].std() > 0.05
 
 
 def test_what_is_wrong_with_pairs(tmp_path):
-    said = partial(refused, PairCrops)
+    said = partial(refused, MeasuredPairs)
     (tmp_path / "empty").mkdir()
     assert "holds no stereo pair" in said(tmp_path / "empty")
     root = stereo(tmp_path / "pairs")
-    assert "0_L.png is 120x80 in colour, smaller than the samples, 256x96" in said(root, (96, 256))
-    file = root / "2_R.png"
+    assert "view1.png is 120x80 in colour, smaller than the samples, 256x96" in said(root, (96, 256))
+    file = root / "2006_third" / "2" / "view5.png"
     whole = file.read_bytes()
     write_image(file, torch.rand(3, 80, 119))
-    assert "2_L.png is 120x80 in colour and 2_R.png 119x80 in colour: pairs must be alike" in said(root)
+    assert "view1.png is 120x80 in colour and view5.png 119x80 in colour: pairs must be alike" in said(root)
     write_image(file, torch.rand(1, 80, 120))
-    assert "2_R.png 120x80 grey: pairs must be alike" in said(root)
-    write_image(root / "2_L.png", torch.rand(1, 80, 120))
-    assert "2_L.png is grey: pairs to train on must be in colour" in said(root)
+    assert "view5.png 120x80 grey: pairs must be alike" in said(root)
+    write_image(file.with_name("view1.png"), torch.rand(1, 80, 120))
+    assert "view1.png is grey: pairs to train on must be in colour" in said(root)
     file.write_bytes(b"nothing")
-    assert "2_R.png: not an image that can be read" in said(root)
-    for i in range(4):
-        for side in "LR":
-            (root / f"{i}_{side}.png").write_bytes(whole[: len(whole) // 2])
+    assert "view5.png: not an image that can be read" in said(root)
+    for image in root.glob("2006_third/*/view*.png"):
+        image.write_bytes(whole[: len(whole) // 2])
     assert "not an image that can be read: give a whole PNG" in said(root)
 
 
@@ -429,12 +414,11 @@ def mixed(rendered, tmp_path_factory):
     sources = {
         "rendered": 0.5,
         "rendered_from": (rendered,),
-        "pairs": 0.5,
-        "pairs_from": (stereo(folder / "pairs"),),
+        "measured": 0.5,
+        "measured_from": (stereo(folder / "pairs"),),
     }
     cheap = {
         "network": PATConfig(dim=4),
-        "filtered": 0.0,
         "steps": 6,
         "validate": 6,
         "batch": 1,
@@ -451,7 +435,7 @@ def mixed(rendered, tmp_path_factory):
 
 def test_a_run_on_all_sources_goes_on_bit_for_bit(mixed, monkeypatch):
     kinds = {p.kind for p in islice(plan(mixed, mixed.seed + 1), mixed.steps)}
-    assert {"rendered", "pairs"} == kinds
+    assert {"rendered", "measured"} == kinds
     config = replace(mixed, out=mixed.out.with_name("stopped"))
     stopped(config, 5, monkeypatch)
     train(config)
@@ -473,4 +457,4 @@ def test_photographs_are_not_needed_where_everything_comes_from_folders(mixed):
     assert {str(f) for f in learn.folders["rendered"].folders}.isdisjoint(
         map(str, examine.folders["rendered"].folders)
     )
-    assert set(learn.folders["pairs"].pairs).isdisjoint(examine.folders["pairs"].pairs)
+    assert set(learn.folders["measured"].pairs).isdisjoint(examine.folders["measured"].pairs)

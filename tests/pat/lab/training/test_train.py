@@ -7,9 +7,10 @@ import torch
 from torch import Generator
 
 from arraygeom import Epipolar, Segments, sample
-from pat.lab.training.losses import image_loss
+from pat.lab.training.losses import Objective, image_loss
 from pat.lab.training.samples import degraded, scenes
 from pat.media.colour import luminance
+from pat.networks.weights import new_network
 
 from .runs import short_run
 
@@ -24,11 +25,10 @@ def test_ground_truth_is_where_the_geometry_says(config):
     learn, _ = scenes(config)
     errors = []
     for given in learn(6):
-        if len(given.betas) == 1:
-            found = sample(given.betas[0], given.position[0]).values
-            off = (found - given.ground_truth).abs().mean(1)
-            errors.append(off[given.visible[0]].median())
-            assert (luminance(given.ground_truth) - given.alpha).abs().max() < 1e-5
+        found = sample(given.betas[0], given.position[0]).values
+        off = (found - given.ground_truth).abs().mean(1)
+        errors.append(off[given.visible[0]].median())
+        assert (luminance(given.ground_truth) - given.alpha).abs().max() < 1e-5
     assert torch.stack(errors).median() < 0.05
 
 
@@ -87,3 +87,14 @@ def test_degradation_keeps_the_ground_truth_in_colour(config):
     assert (
         given.ground_truth - luminance(given.ground_truth) - (ideal - luminance(ideal))
     ).abs().max() < 1e-5
+
+
+def test_three_betas_have_a_band_each(config):
+    """As many cameras as the network is made for, at places of their own."""
+    three = replace(config, network=replace(config.network, betas=3, in_channels=1))
+    for given in scenes(three)[0](4):
+        assert [beta.shape[1] for beta in given.betas] == [1, 1, 1]
+        found = torch.cat([sample(b, x).values for b, x in zip(given.betas, given.position)], 1)
+        seen = torch.stack(given.visible).all(0)
+        assert (found - given.ground_truth).abs().mean(1)[seen].median() < 0.08
+        assert torch.isfinite(Objective(new_network(three.network), "psnr", attention=1.0)(given))
