@@ -123,7 +123,8 @@ class BetaMatches:
         if self.colours is not None:
             planes |= self.colours._asdict()
             shapes |= {"bands": (batch, bands, *hw), "weight": (batch, 1, *hw), "likeness": (batch, 1, *hw)}
-            shapes |= {"fills": (batch, 1 + (inputs.bands is None), bands, *hw)}
+            count = self.colours.fills.shape[1] if self.colours.fills.ndim > 1 else 1
+            shapes |= {"fills": (batch, count, bands, *hw)}
         for name, plane in planes.items():
             if plane is None and name not in ("disparity", "facts"):
                 continue
