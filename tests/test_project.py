@@ -148,7 +148,7 @@ def imported_modules(path: Path) -> set[str]:
     ("room", "forbidden"),
     [
         ("pat/matching", r"pat\.(networks|fusion|cli)\b"),
-        ("pat/fusion", r"pat\.networks\.(paper|guided|bandwise)\b|pat\.cli\b"),
+        ("pat/fusion", r"pat\.networks\.(paper|guided)\b|pat\.cli\b"),
         ("pat/networks", r"pat\.matching\.\w+_numba\b|pat\.(fusion|cli)\b"),
         ("calib", r"pat\b|experiments\b"),
         ("pat", r"experiments\b"),

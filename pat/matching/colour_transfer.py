@@ -103,12 +103,12 @@ class MatchStatistics(NamedTuple):
         measured = [moments(image, both) for image in (brightness, alpha)]
         squares = [one.mean.double().square() + one.deviation.double().square() for one in measured]
         level = torch.stack([measured[0].mean, squares[0], measured[1].mean, squares[1]])
-        one = cls(count, colour, level, torch.zeros_like(count), torch.zeros_like(count))
+        explained = explained_share(combined, soft, both)
+        one = cls(count, colour, level, explained, torch.zeros_like(count))
         if values.shape[1] == 1:
             return one
         unlike = one.leveled(brightness) - soft
-        noise = colour_noise(unlike, soft, both * likeness(unlike))
-        return one._replace(explained=explained_share(combined, soft, both), noise=noise)
+        return one._replace(noise=colour_noise(unlike, soft, both * likeness(unlike)))
 
     def leveled(self, brightness: Tensor) -> Tensor:
         """Beta's brightness, where matches are consistent with alpha's mean and standard deviation."""
@@ -213,6 +213,8 @@ def matched_colours(
     statistics = statistics or MatchStatistics.of(alpha, soft, values, luma, brightness, valid, consistent)
     unlike = statistics.leveled(brightness) - soft
     alike = likeness(unlike) if sees_luma else torch.ones_like(unlike)
+    if bands == 1:  # which may be unlike alpha
+        alike = torch.lerp(torch.ones_like(alike), alike, statistics.explained.to(alike))
     weight = match_weight(alike, matches, valid, sees_luma=sees_luma)
     if bands > 1:
         power = SETTINGS.saturation if sees_luma else 0.0

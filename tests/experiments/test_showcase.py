@@ -23,7 +23,6 @@ from experiments.__main__ import Experiments
 from experiments.showcase import SLOW, SYNTIM, published_matrices, showcase
 from pat.app.cli.main import Pat, main
 from pat.media.images import read_image, write_image
-from pat.networks.configs import GuidedPATConfig
 from pat.networks.guided import GuidedPAT
 from pat.networks.weights import save_weights
 
@@ -129,7 +128,7 @@ def data(tmp_path_factory):
     write_syntim(root / "syntim")
     write_fast_slow(root / "hfr_lfr")
     torch.manual_seed(0)
-    save_weights(GuidedPAT(GuidedPATConfig(widths=(8, 8, 8, 8))), root / "small.safetensors")
+    save_weights(GuidedPAT(), root / "small.safetensors")
     return root
 
 

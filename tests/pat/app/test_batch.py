@@ -24,7 +24,6 @@ from pat.fusion.results import Frame
 from pat.media.images import read_image, write_image
 from pat.media.raw import LIGHT
 from pat.media.video import write_video
-from pat.networks.configs import GuidedPATConfig
 from pat.networks.guided import GuidedPAT
 from pat.networks.weights import save_weights
 from pat.sensors import NoiseLevel
@@ -38,7 +37,7 @@ def material(tmp_path_factory) -> Path:
     """A folder with weights of a tiny network, a rig, and seven fast and two slow images."""
     folder = tmp_path_factory.mktemp("material")
     torch.manual_seed(0)
-    network = GuidedPAT(GuidedPATConfig(widths=(8, 8, 8, 8)))
+    network = GuidedPAT()
     save_weights(network, folder / "tiny.safetensors")
     frames, _ = moving.recording(7, 0.003)
     for name, images in frames.items():

@@ -5,7 +5,6 @@ from collections import Counter
 import numpy as np
 import pytest
 import torch
-from pat.networks.bandwise import BandwisePAT
 
 import pat.fusion.tiles
 import pat.fusion.views
@@ -17,12 +16,11 @@ from pat.fusion.sequence import fuse_sequence
 from pat.fusion.tiles import MAX_HALO
 from pat.fusion.views import ViewFiles, Views
 from pat.media.images import write_image
-from pat.networks.configs import BandwisePATConfig, GuidedPATConfig
+from pat.networks.configs import GuidedPATConfig
 from pat.networks.guided import GuidedPAT
 from tests.arraygeom.rigs import parallel_rig
 
 HW = (64, 96)
-SMALL = {"widths": (8, 8, 8, 8)}
 
 
 def rig_of(names, *, lens=False, places=None, **sensor):
@@ -68,9 +66,7 @@ def test_each_file_is_read_and_developed_once(bands, lens, places, reads, tmp_pa
     rig, files = rig_of(names, lens=lens, places=places), {n: tmp_path / f"{n}.png" for n in names}
     for i, (name, channels) in enumerate(zip(names, bands)):
         write_image(files[name], smooth(channels, i))
-    network = (
-        BandwisePAT(BandwisePATConfig(**SMALL)) if len(bands) > 2 else GuidedPAT(GuidedPATConfig(**SMALL))
-    )
+    network = GuidedPAT(GuidedPATConfig(bands=None if len(bands) > 2 else 3))
     images = ViewFiles(rig, files, alpha="a")
     frame = fuse(network.eval(), images.developed, images, alpha="a", match_levels=True)
     assert frame.image.shape == (3, *HW)
@@ -96,7 +92,7 @@ def test_each_file_of_a_sequence_is_read_once(reads, tmp_path):
     for i, file in enumerate(files["a"] + files["b"]):
         write_image(file, smooth(1 if file.name.startswith("a") else 3, i))
     frames = {name: ImageFiles(paths, rig, name, alpha="a") for name, paths in files.items()}
-    network = GuidedPAT(GuidedPATConfig(**SMALL)).eval()
+    network = GuidedPAT().eval()
     assert len(list(fuse_sequence(network, rig, frames, alpha="a", match_levels=True))) == 9
     assert set(reads.values()) == {1, 12}
     assert reads["develop"] == 12
@@ -118,7 +114,7 @@ def test_each_field_is_evaluated_once_a_pixel(tiled, monkeypatch):
     torch.manual_seed(0)
     if tiled:
         monkeypatch.setattr(pat.fusion.tiles, "tiles_within", lambda *_: list(tiles_of(HW, 32, MAX_HALO)))
-    network, field = GuidedPAT(GuidedPATConfig(**SMALL)).eval(), Counted()
+    network, field = GuidedPAT().eval(), Counted()
     fuse(network, rig_of("ab"), {"a": smooth(1, 0), "b": smooth(3, 1)}, alpha="a", field=field)
     pixels = {xy: n for xy, n in field.asked.items() if xy[0] % 1 == 0}
     blocks = {xy: n for xy, n in field.asked.items() if xy[0] % 1 == 0.5}

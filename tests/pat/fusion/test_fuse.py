@@ -7,7 +7,6 @@ import weakref
 
 import pytest
 import torch
-from pat.networks.bandwise import BandwisePAT
 
 import pat.fusion.steps
 import pat.fusion.tiles
@@ -42,7 +41,7 @@ from pat.matching.inputs import Inputs, InputsSettings
 from pat.media.colour import linear_from_srgb, luminance
 from pat.media.images import read_image
 from pat.media.raw import LIGHT
-from pat.networks.configs import BandwisePATConfig, GuidedPATConfig, PATConfig
+from pat.networks.configs import GuidedPATConfig, PATConfig
 from pat.networks.guided import GuidedPAT
 from pat.networks.paper import PAT
 from pat.networks.weights import load_weights, set_precision
@@ -66,9 +65,7 @@ def network_of(kind: str):
     torch.manual_seed(1)
     if kind == "PAT":
         return PAT(PATConfig(dim=8, interpolation="bilinear")).eval()
-    if kind == "BandwisePAT":
-        return BandwisePAT(BandwisePATConfig(widths=(8, 8, 8, 8))).eval()
-    return GuidedPAT(GuidedPATConfig(widths=(8, 8, 8, 8))).eval()
+    return GuidedPAT(GuidedPATConfig(bands=None if kind == "any bands" else 3)).eval()
 
 
 def texture(channels: int, hw: tuple[int, int]) -> torch.Tensor:
@@ -96,7 +93,7 @@ def in_tiles(patched, hw, side, halo):
         ("PAT", torch.float32, 1e-5),
         ("GuidedPAT", torch.float64, 1e-9),
         ("GuidedPAT", torch.float32, 1e-5),
-        ("BandwisePAT", torch.float32, 1e-5),
+        ("any bands", torch.float32, 1e-5),
     ],
 )
 def test_tiled_equals_whole(kind, dtype, bound, monkeypatch):

@@ -57,12 +57,10 @@ def test_bands_must_add_up():
         fused_at_once(network, Inputs.of(torch.rand(1, 1, *HW), [torch.rand(1, 2, *HW)], [rectified()]))
 
 
-@pytest.mark.parametrize(
-    "config", [GuidedPATConfig(), GuidedPATConfig(learned=False), GuidedPATConfig(bands=None)], ids=str
-)
-def test_gradients_reach_the_rig(config):
+@pytest.mark.parametrize("change", [{}, {"learned": False}, {"bands": None}], ids=str)
+def test_gradients_reach_the_rig(change):
     torch.manual_seed(0)
-    network = GuidedPAT(config)
+    network = GuidedPAT(GuidedPATConfig(**change))
     translation = torch.tensor([-0.2, 0.0, 0.0], dtype=torch.float64, requires_grad=True)
     camera = Camera(K=intrinsics(60.0, HW), cam_from_world=Pose.identity(), hw=HW)
     beta = camera.replace(cam_from_world=Pose(torch.eye(3, dtype=torch.float64), translation))
@@ -261,5 +259,6 @@ def test_bands_unlike_alpha_keep_their_own_brightness(banded):
     there = FieldOnGrid.of(Rectified(16.0, alpha_is="left"), Pair(View(hw=hw), View(hw=hw)))
     fused = fused_at_once(banded, Inputs.of(alpha, [beta], [there])).image
     wanted = torch.cat([0.5 * alpha, 1 - alpha], 1)
-    assert (fused - wanted)[..., 12:-4].abs().mean() < 0.02
+    off, unlike = ((image - wanted)[..., 12:-4].abs().mean() for image in (fused, alpha))
+    assert off < 0.15 * unlike
     assert not banded.keeps_luminance
