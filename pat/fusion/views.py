@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from arraygeom import Curved, Epipolar, Moved, Pair, ReceptiveField, Rig, Sensor, ThroughLenses, Widened
+from arraygeom import Band, Curved, Epipolar, Moved, Pair, ReceptiveField, Rig, Sensor, ThroughLenses, Widened
 from arraygeom.batching import tensors_of
 from arraygeom.pixels import HW
 from arraygeom.runtime.warned import warn
@@ -279,8 +279,27 @@ def read_view(
     turned: Literal["apply", "ignore"] = "ignore" if raw else "apply"
     image = read_image(path, name=name, bits=view.sensor.bits, hw=hw, orientation=turned)
     image = recorded_bands(image, view.sensor)
+    _warn_of_contradictions(image, view.sensor, f"{name}: {path}")
     if view.sensor.bayer and image.shape[0] != 1:
         raise ValueError(
             f"{name}: {path}: is in colour, and the rig says raw {view.sensor.bayer}: drop 'bayer'"
         )
     return develop(image, view.sensor, like=like)
+
+
+SATURATED = 0.1
+"""Share of an image's pixels at the largest value from which that is said."""
+
+
+def _warn_of_contradictions(image: Float[Tensor, "c h w"], sensor: Sensor, label: str) -> None:
+    """Warn of an image that is saturated, or in colour where the rig states one band."""
+    share = float((image >= 1).any(0).float().mean())
+    if share > SATURATED:
+        warn(f"{label}: {share:.0%} of its pixels are saturated: they have no detail to match: expose less")
+    stated = sensor.response
+    if len(image) == 3 and (isinstance(stated, Band) or stated in SINGLE_BANDS) and is_in_colour(image):
+        warn(f"{label}: is in colour, and the rig says response {stated}: give that band, or state rgb")
+
+
+SINGLE_BANDS = ("mono", "nir", "red", "green", "blue")
+"""Names of responses of one band."""
