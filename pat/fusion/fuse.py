@@ -37,7 +37,7 @@ from .luminance import SHARES, Luminance, check_luminance, with_alpha_detail, wi
 from .results import Frame
 from .steps import Undo, steps_for, undone
 from .tiles import LARGE, Plan, fused_in_tiles, plan_frame
-from .views import Views, check_bands
+from .views import Views, check_bands, check_dense
 
 LOG = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -252,6 +252,7 @@ def ready_frame(
     """
     say = explain or (lambda line: None)
     views = Views.of(rig, images, alpha=alpha, depth=settings.depth, field=settings.field)
+    check_dense(views, settings.limit)
     views, low_light = denoised_views(views, settings.noise)
     if network is None:
         weights = weights_for([len(views.images[name]) for name in views.betas])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +14,19 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from arraygeom import Band, Curved, Epipolar, Moved, Pair, ReceptiveField, Rig, Sensor, ThroughLenses, Widened
+from arraygeom import (
+    Band,
+    Curved,
+    Dense,
+    Epipolar,
+    Moved,
+    Pair,
+    ReceptiveField,
+    Rig,
+    Sensor,
+    ThroughLenses,
+    Widened,
+)
 from arraygeom.batching import tensors_of
 from arraygeom.pixels import HW
 from arraygeom.runtime.warned import warn
@@ -103,6 +116,25 @@ def innermost(field: ReceptiveField | None) -> ReceptiveField | None:
     while isinstance(field, Widened | Moved):
         field = field.field
     return field
+
+
+def dense_bytes(alpha: HW, beta: HW, stride: int = 1) -> float:
+    """Bytes of the positions that the dense field has for every 2 x 2 pixels of alpha."""
+    return math.prod(alpha) / 4 * math.prod(beta) / stride**2 * 8
+
+
+def check_dense(views: Views, limit: float | None) -> None:
+    """Raise ValueError if a dense field takes more than a limit (bytes), or than this machine has."""
+    has = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") if os.name == "posix" else math.inf
+    most, (h, w) = limit or has, views.rig[views.alpha].hw
+    for name in views.betas:
+        field, beta = innermost(views.fields.get(name)), views.rig[name].hw
+        if isinstance(field, Dense) and (needed := dense_bytes((h, w), beta, field.stride)) > most:
+            raise ValueError(
+                f"the dense field of {w}x{h} pixels in {beta[1]}x{beta[0]} of '{name}' takes "
+                f"{needed / 2**30:.1f} GiB, and there are {most / 2**30:.1f}: reduce the images, or take "
+                "another field"
+            )
 
 
 LARGEST_VALUE = 32.0

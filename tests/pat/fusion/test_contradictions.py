@@ -5,12 +5,14 @@ import warnings
 import pytest
 import torch
 
-from arraygeom import Rig, Sensor, View
+from arraygeom import Dense, Rig, Sensor, View
 from pat.app.cli.options import response_of
 from pat.fusion.corrections import Corrections
+from pat.fusion.fuse import fuse
 from pat.fusion.views import read_view
 from pat.matching.radiometry import Response
 from pat.media.images import write_image
+from pat.networks.weights import load_weights
 
 
 def rig(**sensor) -> Rig:
@@ -67,6 +69,15 @@ def test_fourteen_bits_in_sixteen_are_named(tmp_path):
             read_view(rig(), "a", tmp_path / "a.png")
             read_view(rig(bits=16), "a", tmp_path / "a.png")
         assert ["bits: 14" in str(warning.message) for warning in caught] == [True] * named
+
+
+def test_a_dense_field_that_does_not_fit_is_refused_before_the_work():
+    """640x400 was killed at 22 GB, whatever the limit."""
+    wide = Rig({name: View(hw=(400, 640)) for name in ("mono", "colour")})
+    images = {"mono": torch.rand(1, 400, 640), "colour": torch.rand(3, 400, 640)}
+    for further in ({}, {"max_memory": "4GiB"}):
+        with pytest.raises(ValueError, match=r"dense field .*GiB"):
+            fuse(load_weights("mono-colour"), wide, images, alpha="mono", field=Dense(), **further)
 
 
 @pytest.mark.parametrize("text", ["1,1,1", "0.1,0.1,0.1", "30,59,11", "nan,1,0"])
