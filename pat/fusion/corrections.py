@@ -94,8 +94,8 @@ class Corrections:
         lines = [] if self.response.is_rec601 else [str(self.response)]
         if self.response.exchanged:
             lines.append(
-                "beta's red and blue look exchanged: alpha fits them the other way round. Is the file BGR, or "
-                "`bayer` another one, such as RGGB for BGGR?"
+                "beta's red and blue look exchanged: alpha fits them the other way round. Is the file BGR, "
+                "or `bayer` another one, such as RGGB for BGGR?"
             )
         for name, move in self.misalignments.items():
             if move != Misalignment():
