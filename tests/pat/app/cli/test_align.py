@@ -60,7 +60,7 @@ def test_files(folder, counts, capsys):  # noqa: F811
 def test_what_is_put_right_is_said_and_on_the_page(folder, counts, capsys):  # noqa: F811
     colour = cv2.imread(str(counts / "colour.png"), cv2.IMREAD_UNCHANGED)
     cv2.imwrite(str(counts / "colour.png"), np.roll(colour, 1, axis=0))
-    page = (align(folder, counts) / "index.html").read_text()
+    page = (align(counts, folder) / "index.html").read_text()
     said = capsys.readouterr().err
     assert "plan: 1 piece, " in said
     for words in (

@@ -15,11 +15,12 @@ from torch.nn.functional import avg_pool2d
 
 from arraygeom import Camera, Pose, Rig, Sensor, View
 from experiments.evaluation.paper import with_found_rig
-from pat import fuse, load_weights
+from pat import FuseSettings, fuse, load_weights
 from pat.app.cli.fuse import Fuse
 from pat.app.from_images import ImageArray, array_from_images, camera_names, found_rig
 from pat.app.sample_array import load_sample
-from pat.fusion.results import Frame, save_frame
+from pat.fusion.frame import Frame
+from pat.fusion.results import save_frame
 from pat.media.headers import focal_length
 from pat.media.images import read_image, write_image
 from pat.media.video import read_video, write_video
@@ -59,7 +60,7 @@ def folder(halved, tmp_path_factory):
 def test_images_alone_are_fused_about_as_well_as_with_the_rig(halved, folder):
     rig, images, ground_truth = halved
     assert {path.name for path in (folder / "out").iterdir()} == ALL
-    known = fuse(load_weights("mono-colour"), rig, images, alpha="mono")
+    known = fuse(images, rig, alpha="mono", network=load_weights("mono-colour"))
     with_rig = score(known.image.clamp(0, 1), ground_truth).psnr
     assert score(read_image(folder / "out" / "fused.png"), ground_truth).psnr > with_rig - 0.5
 
@@ -337,7 +338,10 @@ def test_depth_is_rough_where_no_poses_fit_as_well_as_lines_alone(halved, monkey
     assert rig.links
     assert any("lines by F; depths are rough" in line for line in lines)
     network = load_weights("mono-colour")
-    frames = [fuse(network, r, images, alpha="mono", align=False) for r in (rig, known)]
+    frames = [
+        fuse(images, r, alpha="mono", network=network, settings=FuseSettings(align=False))
+        for r in (rig, known)
+    ]
     sure = (frames[0].confidence > 0.7) & (frames[1].confidence > 0.7)
     ratio = (frames[0].depth / frames[1].depth)[sure]
     assert ratio.isfinite().double().mean() > 0.95
