@@ -89,7 +89,7 @@ def array_from_images(
     line: fewer than two images, an image of one colour, images that do not show the same things, a focal
     length of no camera.
     """
-    sources, focal = _by_camera(sources), focal or {}
+    sources, focal = by_camera(sources), focal or {}
     files = {name: Path(path) for name, path in sources.items() if isinstance(path, str | Path)}
     images: dict[str, Any] = {name: image for name, image in sources.items() if name not in files}
     for name, image in images.items():
@@ -137,7 +137,7 @@ def _with_sensors(rig: Rig, sensors: Mapping[str, Sensor]) -> Rig:
     return rig.replace(cameras={name: rig[name].replace(sensor=sensor) for name, sensor in sensors.items()})
 
 
-def _by_camera(sources: ImageSources) -> Mapping[str, str | Path | Tensor]:
+def by_camera(sources: ImageSources) -> Mapping[str, str | Path | Tensor]:
     """Files or tensors by camera. Raises ValueError for fewer than two, TypeError for one without a name."""
     if isinstance(sources, str | Path):
         raise ValueError(f"an array has two images or more, got {sources}: give a list of them")

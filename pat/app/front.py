@@ -206,8 +206,8 @@ def _known(
         weights = str(network) if isinstance(network, str | Path) else None
         array = array_from_images(images, alpha=alpha, weights=weights, say=say)
         settings = replace(settings, match_levels=settings.match_levels or array.match_levels)
-        loaded = network if isinstance(network, FusionNetwork) else load_weights(array.weights)
-        return _Complete(array.images, array.rig, array.alpha, loaded, settings, found=True)
+        ready = _loaded(array.weights if network is None else network)
+        return _Complete(array.images, array.rig, array.alpha, ready, settings, found=True)
     rig = Rig.load(rig) if isinstance(rig, str | Path) else rig
     if not isinstance(rig, Rig):
         raise TypeError(f"the rig is a {type(rig).__name__}: give a Rig, or its file")
@@ -218,16 +218,26 @@ def _known(
         betas = (shown[name] for name in rig.betas(alpha) if name in shown)
         network = weights_for([len(image) for image in betas if isinstance(image, Tensor)])
         say(f"weights: {network}")
-    loaded = network if isinstance(network, FusionNetwork) else load_weights(network)
-    return _Complete(shown, rig, alpha, loaded, settings, found=False)
+    return _Complete(shown, rig, alpha, _loaded(network), settings, found=False)
+
+
+def _loaded(network: FusionNetwork | str | Path) -> FusionNetwork:
+    """The network itself, or that of weights by name or file."""
+    if isinstance(network, str | Path):
+        return load_weights(network)
+    if not isinstance(network, FusionNetwork):
+        raise TypeError(
+            f"network is a {type(network).__name__}: give the name or file of weights, or a network"
+        )
+    return network
 
 
 def _with_images(images: ImageSources, rig: Rig, alpha: str) -> tuple[Images, Rig]:
     """The images, of files developed as the rig says, and the rig that describes them."""
     if not isinstance(images, Mapping):
-        from .from_images import camera_names
+        from .from_images import by_camera
 
-        images = camera_names([Path(path) for path in images])
+        images = by_camera(images)
     # a mapping that is no dict reads its images when asked
     files = {n: x for n, x in images.items() if isinstance(x, str | Path)} if isinstance(images, dict) else {}
     if not files:

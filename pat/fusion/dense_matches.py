@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import reduce
 from typing import NamedTuple
 
 import torch
@@ -12,10 +13,13 @@ from torch import Tensor
 from arraygeom import Rig
 from arraygeom.runtime.chunks import whole
 from arraygeom.runtime.threads import torch_in_one_thread
+from arraygeom.sampling import on_image
 
 from ..matching.inputs import Inputs
 from ..matching.match import match
 from ..matching.matches import Matches
+from ..matching.positions import Extent
+from ..matching.positions import matches as matches_at
 from ..matching.radiometry import Response
 from ..media.images import Images
 from ..networks.protocol import FusionOutput, JoinsBands, required
@@ -27,6 +31,9 @@ from .inputs import prepared
 from .steps import steps_for, undone
 from .tiles import fused_in_tiles
 from .views import Views
+
+AROUND = [step / 2 for step in range(-6, 7)]
+"""Pixels along the segment from a match, one of which is on beta's image where the match says something."""
 
 
 class MatchedDepth(NamedTuple):
@@ -55,10 +62,12 @@ class MatchesAlone:
         """Alpha's image and the matches. Raises ValueError without them."""
         positions, confidences = [], []
         for beta, matched in zip(inputs.betas, required(matches, inputs).betas):
-            segments, hw = beta.field.straight.to(inputs.alpha.device, torch.float64), beta.image.shape[-2:]
-            where, inside = matched.positions(segments, (hw[0], hw[1]))
-            positions.append(where.movedim(-1, 1))
-            confidences.append(inside.to(inputs.alpha))
+            hw = beta.image.shape[-2], beta.image.shape[-1]
+            segments = beta.field.straight.to(inputs.alpha.device, torch.float64)
+            positions.append(matched.positions(segments, hw)[0].movedim(-1, 1))
+            middle, towards = matches_at(segments, matched.disparity), Extent.of(segments).towards
+            near = (on_image(middle + step * towards, hw) for step in AROUND)
+            confidences.append(reduce(torch.logical_or, near).to(inputs.alpha))
         return FusionOutput(inputs.alpha, positions, [0 * c for c in confidences], confidences)
 
 

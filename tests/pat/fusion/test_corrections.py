@@ -57,9 +57,9 @@ def combined(image, weights):
     return (image * torch.tensor(weights)[:, None, None]).sum(0, keepdim=True)
 
 
-def psnr(network, sample, images, **options):
-    rig, settings = options.pop("rig", sample.rig), FuseSettings(**options)
-    frame = fuse(images, rig, alpha=ALPHA, network=network, settings=settings)
+def psnr(network, sample, images, *, rig=None, explain=None, **options):
+    given = {"alpha": ALPHA, "network": network, "settings": FuseSettings(**options)}
+    frame = fuse(images, rig or sample.rig, explain=explain, **given)
     return score(frame.image.clamp(0, 1), sample.ground_truth).psnr
 
 

@@ -160,33 +160,33 @@ def test_halos_are_wide_enough_for_the_weights(folder, precision, most, rms, sha
 
 WRONG = """
 import torch
-from pat import fuse, load_weights
-from pat.app.sample_array import SAMPLE, load_sample
+from pat import FuseSettings, fuse
+from pat.app.sample_array import load_sample
 from pat.media.images import write_image
 
-sample, network = load_sample(), load_weights("mono-colour")
+sample = load_sample()
 rig, images = sample.rig, sample.images
 for use in (
-    lambda: fuse(network, rig, {name: f"{name}.png" for name in images}, alpha="mono"),
-    lambda: fuse(network, rig, {name: image.numpy() for name, image in images.items()}, alpha="mono"),
-    lambda: fuse(network, SAMPLE / "rig.yaml", images, alpha="mono"),
-    lambda: fuse("mono-colour", rig, images, alpha="mono"),
-    lambda: fuse(network, rig, images, alpha="mono", noise="much"),
-    lambda: fuse(network, rig, images, alpha="mono", response="luma"),
-    lambda: fuse(network, rig, images, alpha="mono", noise=0.1),
-    lambda: fuse(network, rig, images, alpha="mono", noise={"mono": 200}),
-    lambda: fuse(network, rig, [*images.values()], alpha="mono"),
+    lambda: fuse({name: f"{name}.png" for name in images}, rig, alpha="mono"),
+    lambda: fuse({name: image.numpy() for name, image in images.items()}, rig, alpha="mono"),
+    lambda: fuse(images, {"mono": 1}, alpha="mono"),
+    lambda: fuse("mono-colour", rig, alpha="mono"),
+    lambda: fuse(images, rig, alpha="mono", settings=FuseSettings(noise="much")),
+    lambda: fuse(images, rig, alpha="mono", settings=FuseSettings(response="luma")),
+    lambda: fuse(images, rig, alpha="mono", settings=FuseSettings(noise=0.1)),
+    lambda: fuse(images, rig, alpha="mono", settings=FuseSettings(noise={"mono": 200})),
+    lambda: fuse([*images.values()], rig, alpha="mono"),
     lambda: fuse([*images.values()]),
-    lambda: fuse(torch.nn.Linear(2, 2), rig, images, alpha="mono"),
-    lambda: fuse(network, rig, images, alpha="mono", settings={"noise": None}),
-    lambda: fuse(network, rig, images, alpha="mono", corrections={"colour": 1}),
-    lambda: fuse(network, rig, images, alpha="mono", matcher=lambda inputs: 3),
-    lambda: fuse(network, rig, images, alpha=0),
+    lambda: fuse(images, rig, alpha="mono", network=torch.nn.Linear(2, 2)),
+    lambda: fuse(images, rig, alpha="mono", settings={"noise": None}),
+    lambda: fuse(images, rig, alpha="mono", corrections={"colour": 1}),
+    lambda: fuse(images, rig, alpha="mono", matcher=lambda inputs: 3),
+    lambda: fuse(images, rig, alpha=0),
     lambda: write_image("x.png", torch.zeros(3, 8, 8, dtype=torch.uint8)),
 ):
     try:
         print("taken", use())
-    except (TypeError, ValueError) as error:
+    except (OSError, TypeError, ValueError) as error:
         print(error)
 """
 
@@ -195,18 +195,18 @@ def test_what_is_not_what_it_should_be_is_refused_in_a_line():
     """Apart, where nothing else checks types."""
     done = subprocess.run([sys.executable, "-c", WRONG], capture_output=True, text=True)
     expected = (
-        "the image of 'mono' is a str: give a tensor",
+        "mono: mono.png: no such",
         "the image of 'mono' is a ndarray: give a tensor",
-        "fuse takes a network, a rig, images and alpha=NAME",
-        "fuse takes a network, a rig, images and alpha=NAME",
+        "the rig is a dict",
+        "an array has two images or more, got mono-colour",
         "noise is 'estimate', 'auto' or a NoiseLevel of each camera; got 'much'",
         "response is 'fit', 'rec601' or three weights; got 'luma'",
         "noise is 'estimate', 'auto' or a NoiseLevel of each camera; got 0.1: give {NAME",
         "noise is 'estimate', 'auto' or a NoiseLevel of each camera; got {'mono': 200}: give {NAME",
-        "the images are a list: give {NAME: image}, by camera",
         "an image is a Tensor without a name: give files, or {NAME: tensor} by camera",
-        "fuse takes a network, a rig, images and alpha=NAME",
-        "wanted FuseSettings, got a dict",
+        "an image is a Tensor without a name: give files, or {NAME: tensor} by camera",
+        "network is a Linear",
+        "settings are a dict",
         "wanted Corrections, got a dict",
         "wanted Matches, got a int",
         "the rig has no camera '0'",
