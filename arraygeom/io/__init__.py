@@ -18,7 +18,8 @@ from ..camera import Camera, LensView
 from ..pixels import HW
 from ..rig import Rig
 from ..rig_check import unit_oddity
-from ..runtime.atomic import sweep, write_text, write_together
+from ..runtime.atomic import write_text
+from ..runtime.together import sweep, write_together
 from ..runtime.warned import warn
 from ..sensor import Sensor
 from . import kitti
@@ -94,7 +95,8 @@ def write_rig(rig: Rig, path: str | Path, *, format: str = "native") -> None:
 
     What a format leaves out of the rig is named by one RigFileWarning: all but the native one the depth
     range, links, what a sensor records; OpenCV's where the first camera is in the world. Raises ValueError
-    for an unknown format, for a rig that the format cannot hold, and a batch.
+    for an unknown format, for a rig that the format cannot hold, and a batch; FileExistsError for a folder
+    with files of these names that nothing here wrote.
     """
     if format not in WRITERS:
         raise ValueError(f"cannot write rig format '{format}' (known: {', '.join(WRITERS)})")
@@ -102,9 +104,8 @@ def write_rig(rig: Rig, path: str | Path, *, format: str = "native") -> None:
     if format != "native" and (lost := _left_out(rig, format)):
         warn(f"{path}: {format} files do not hold the rig's {lost}: use the native format", RigFileWarning)
     if isinstance(contents, Mapping):
-        last = list(contents)[-1]
-        sweep(path, Path(last).stem)
-        with write_together(path, last=last) as folder:
+        sweep(path, format)
+        with write_together(path, group=format, last=list(contents)[-1]) as folder:
             for name, text in contents.items():
                 write_text(folder / name, text)
     else:

@@ -56,26 +56,30 @@ class Show:
     def run(self) -> None:
         """Write the drawings, and warn of a rig that does not fit the images."""
         from arraygeom import Camera
+        from arraygeom.runtime.together import refuse_others, write_together
         from arraygeom.viz import draw_fields, draw_matches, draw_rig
 
         from ...media.figures import save_figure
 
         options.writable(self.out, folder=True)
+        refuse_others(self.out, ["rig.png", "fields.png", "matches.png"], group="show")
         rig = load_rig(self.rig)
         alpha = rig.require(self.alpha or rig.names[0])
         images = options.read_images(rig, self.image)
         warn_of_misfit(rig, images)
-        written = []
+        figures = {}
         if any(isinstance(camera, Camera) for camera in rig.cameras.values()):
-            written.append(save_figure(draw_rig(rig, alpha=alpha), self.out / "rig.png"))
+            figures["rig.png"] = draw_rig(rig, alpha=alpha)
         if len(rig.names) > 1:
-            fields = draw_fields(rig, alpha, _twelve_pixels(rig[alpha].hw), images=images)
-            written.append(save_figure(fields, self.out / "fields.png"))
+            figures["fields.png"] = draw_fields(rig, alpha, _twelve_pixels(rig[alpha].hw), images=images)
         with options.working("matching points of the images"):
             points = matched_points(rig, alpha, images)
         if points:
-            written.append(save_figure(draw_matches(rig, alpha, points, images), self.out / "matches.png"))
-        say(f"written: {', '.join(map(str, written))}")
+            figures["matches.png"] = draw_matches(rig, alpha, points, images)
+        with write_together(self.out, group="show", last="rig.png") as folder:
+            for name, figure in figures.items():
+                save_figure(figure, folder / name)
+        say(f"written: {', '.join(str(self.out / name) for name in figures)}")
 
 
 def warn_of_misfit(rig: Rig, images: Mapping[str, Tensor]) -> None:
@@ -424,6 +428,7 @@ class RigFromImages:
 
     def run(self) -> None:
         """Write the rig and print its statistics. Raises ValueError for images with too little in common."""
+        from arraygeom.runtime.text import OPEN
         from calib.images.from_images import rig_from_images
 
         from ...media.images import read_image
@@ -436,7 +441,7 @@ class RigFromImages:
             result = rig_from_images(images, focal=focal, matches=matches)
         print(result.as_text())
         result.rig.save(self.out)
-        say(f"written: {self.out}")
+        say(f"written: {self.out}" + (f" ({OPEN})" if result.rig.name == OPEN else ""))
 
 
 @dataclass

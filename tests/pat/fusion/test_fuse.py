@@ -32,7 +32,6 @@ from arraygeom.runtime.chunks import Tile, tiles_of
 from arraygeom.runtime.threads import limited_to
 from calib.images.matches import match_points, seen_depths
 from pat import FuseSettings, fuse
-from pat.fusion.fuse import corrections_of
 from pat.fusion.inputs import FrameInputs, prepared
 from pat.fusion.steps import quarter_turns, resolution_ratio, steps_for, without_lenses
 from pat.fusion.tiles import MAX_HALO, SLACK, tiles_within, working_memory
@@ -629,12 +628,3 @@ def test_several_betas_of_float64_are_fused():
         fuse(images, both, alpha="mono", network=network_of("GuidedPAT").double()).image.dtype
         == torch.float64
     )
-
-
-@pytest.mark.parametrize("of", [fuse, corrections_of])
-def test_an_argument_that_is_none_is_named_with_what_there_is(of):
-    """It was an argument of FuseSettings.__init__, which nobody had called."""
-    rig, images = scene((24, 32), (24, 32))
-    message = r"^there is no argument or setting 'device': .*, luminance; on a GPU "
-    with pytest.raises(TypeError, match=message):
-        of(network_of("PAT"), rig, images, alpha="mono", device="cuda")

@@ -60,7 +60,7 @@ def test_files(folder, counts, capsys):  # noqa: F811
 def test_what_is_put_right_is_said_and_on_the_page(folder, counts, capsys):  # noqa: F811
     colour = cv2.imread(str(counts / "colour.png"), cv2.IMREAD_UNCHANGED)
     cv2.imwrite(str(counts / "colour.png"), np.roll(colour, 1, axis=0))
-    page = (align(counts, folder) / "index.html").read_text()
+    page = (align(folder, counts) / "index.html").read_text()
     said = capsys.readouterr().err
     assert "plan: 1 piece, " in said
     for words in (
@@ -107,7 +107,8 @@ def test_images_are_not_overwritten_by_what_is_made_of_them(folder, tmp_path, re
     files = " ".join(f"--image {path.stem}={path}" for path in before)
     command = f"align {folder / 'rig.yaml'} --to mono {files} -o {tmp_path} --no-correct --response rec601"
     said = refusal(*command.split(), "--separate")
-    assert ".tif: is one of the images: give another --out" in said
+    assert "mono.tif" in said
+    assert "give another" in said
     assert {path: path.read_bytes() for path in tmp_path.glob("*.*")} == before
     pat(command)
     assert (tmp_path / "aligned.tif").is_file()
