@@ -2,7 +2,6 @@
 
 import warnings
 from dataclasses import replace
-from functools import partial
 
 import pytest
 import torch
@@ -304,7 +303,11 @@ def test_a_noisy_sequence_is_denoised(fused):
     frames, ground_truth, _, _ = fused
     level = NoiseLevel.of_electrons(60, 2)
     recorded, network, rig = noisy(frames, level), load_weights("mono-colour-small"), moving.rig(0.003)
-    fusion = partial(fuse_sequence, network, rig, recorded, alpha="fast")
+
+    def fusion(**settings):
+        how = FuseSettings(**settings)
+        return fuse_sequence(recorded, rig, alpha="fast", network=network, settings=how)
+
     plain = psnr(fusion(), ground_truth)
     stated = dict.fromkeys(recorded, level)
     assert psnr(fusion(noise=stated), ground_truth) > plain + 2.0
