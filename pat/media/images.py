@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
@@ -22,6 +23,7 @@ from torch import Tensor
 from arraygeom.runtime.atomic import write_atomically
 from arraygeom.runtime.chunks import ROWS, spans
 from arraygeom.runtime.image_bytes import (
+    JPEG,
     MINISBLACK,
     MINISWHITE,
     PNG,
@@ -31,6 +33,7 @@ from arraygeom.runtime.image_bytes import (
     decodable,
     first_tiff_page,
     has_further_images,
+    jpeg_colours,
     tiff_colours,
 )
 from arraygeom.runtime.warned import warn
@@ -298,6 +301,10 @@ def _log_level(level: int) -> int:
 
 def decoded(content: bytes, flags: int = cv2.IMREAD_UNCHANGED) -> NDArray | None:
     """What OpenCV makes of a file's bytes, without its own messages; None for a damaged file."""
+    if content[:2] == JPEG and flags == cv2.IMREAD_UNCHANGED:
+        with suppress(Exception):  # damaged, which `decodable` says
+            if (colours := jpeg_colours(content)) is not None:
+                return colours[..., 0] if colours.shape[2] == 1 else colours[..., ::-1]
     level, checked = _log_level(0), decodable(content)
     try:
         return None if checked is None else cv2.imdecode(np.frombuffer(checked, np.uint8), flags)
