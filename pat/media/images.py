@@ -54,7 +54,7 @@ GREY_WITH_ALPHA = 4
 MOST_PIXELS = 2**28
 """Images with more are read only where their size is expected: some 3 GiB in colour."""
 
-_LZW = [cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_LZW]
+_DEFLATED = [cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_ADOBE_DEFLATE]
 _HEIF = tuple(b"ftyp" + brand for brand in (b"heic", b"heix", b"mif1", b"msf1", b"heim", b"heis"))
 
 
@@ -410,11 +410,12 @@ def _encode(path: Path, colours: NDArray, bits: int) -> bytes:
     suffix = path.suffix.lower()
     if suffix in (".jpg", ".jpeg") and bits != 8:
         raise ValueError(f"{path}: JPEG holds 8 bits, not {bits}: write .png or .tif")
-    if bits == 32 and suffix not in (".tif", ".tiff"):
+    tiff = suffix in (".tif", ".tiff")
+    if bits == 32 and not tiff:
         raise ValueError(f"{path}: 32-bit floats need a name that ends in .tif")
     try:
-        # Without the option OpenCV writes float colours as LogLuv, which has 3 digits.
-        succeeded, content = cv2.imencode(suffix, _quantised(colours, bits), _LZW if bits == 32 else [])
+        # OpenCV writes float colours as LogLuv else, of 3 digits, and LZW, which tifffile cannot read.
+        succeeded, content = cv2.imencode(suffix, _quantised(colours, bits), _DEFLATED if tiff else [])
     except cv2.error:
         succeeded = False
     if not succeeded:
