@@ -7,7 +7,7 @@ images), colours in the order red, green, blue. Files are written atomically.
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
@@ -65,6 +65,8 @@ Images = Mapping[str, Any]
 
 Not `Mapping[str, Tensor]`: what checks types would read one.
 """
+ImageSources = Mapping[str, Any] | Sequence[str | Path]
+"""An image file or tensor (C, H, W) in 0..1 of each camera by name; or files alone, which name cameras."""
 
 
 def read_image(
