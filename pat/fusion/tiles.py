@@ -22,8 +22,8 @@ from ..matching.matches import Matches
 from ..networks.protocol import FusionNetwork, matched_for
 from ..support.tensor_files import read_tensors, write_tensors
 from .depth import certain, measured_depth
+from .frame import Frame
 from .inputs import FrameInputs
-from .results import Frame
 
 MAX_HALO = 256
 """The widest halo, pixels: what is farther off changes an image of KITTI's by 7e-6 with trained weights (at

@@ -7,8 +7,8 @@ import torch
 
 from arraygeom import Camera, Epipolar, Pair, Pose, Rectified, Rig, Segments, View, intrinsics
 from arraygeom.fields.grid import FieldOnGrid
+from pat import FuseSettings, fuse
 from pat.app.sample_array import load_sample
-from pat.fusion.fuse import fuse
 from pat.fusion.steps import co_located
 from pat.matching.colour_transfer import transferred
 from pat.matching.inputs import Inputs
@@ -172,7 +172,13 @@ def test_certain_colours_are_those_at_the_chosen_position_if_alpha_sees_somethin
 def test_confidence_shows_no_grid_of_the_pixels_that_are_made_of_one():
     """The four pixels of each at half the size differed by up to .02 in the mean."""
     sample = load_sample()
-    found = fuse(load_weights("mono-colour"), sample.rig, sample.images, alpha="mono", align=False).confidence
+    found = fuse(
+        sample.images,
+        sample.rig,
+        alpha="mono",
+        network=load_weights("mono-colour"),
+        settings=FuseSettings(align=False),
+    ).confidence
     apart = found.unflatten(0, (-1, 2)).unflatten(2, (-1, 2)).mean((0, 2))
     assert float(apart.max() - apart.min()) < 0.002
 
