@@ -145,6 +145,7 @@ class Experiments:
         "evaluate": commands.Evaluate,
         "conditions": commands.Conditions,
         "outside": commands.Outside,
+        "stages": commands.Stages,
         "certainty": commands.Certainty,
         "sweeps": commands.Sweeps,
         "fields": commands.Fields,

@@ -23,7 +23,7 @@ from pat.networks.protocol import Comparing
 from pat.networks.weights import Network, load_weights
 from pat.support.tensor_files import write_tensors
 
-from . import certainty, conditions, fields, paper, sweeps
+from . import certainty, conditions, fields, paper, stages, sweeps
 from .halves import of_half
 from .outside import evaluate_outside, outside_markdown
 from .sweep_report import write_report
@@ -124,6 +124,26 @@ class Conditions(Pairs):
         rows = conditions.evaluate_conditions(pairs, network, names, progress=progress("evaluating"))
         conditions.save_condition_curves(rows, self.out / "conditions.png")
         finished(self.out / "conditions.md", conditions.conditions_markdown(rows))
+
+
+@dataclass
+class Stages(Pairs):
+    """Fuse stereo pairs with each stage left out in turn: PSNR, depth and core seconds as they change.
+
+    Example: python -m experiments stages --middlebury data/middlebury --half tune --rates 2 4
+    """
+
+    half: Half = "tune"
+    """Pairs on which a stage may be judged."""
+    rates: tuple[int, ...] = (2, 4)
+    """Reductions of beta."""
+    out: Out = Path("out/stages")
+    """Folder for stages.md."""
+
+    def run(self) -> None:
+        """Write and print the table. Raises ValueError for no images."""
+        scores = stages.score_stages(self.pairs(), self.rates)
+        finished(self.out / "stages.md", stages.stages_markdown(scores))
 
 
 @dataclass

@@ -192,7 +192,7 @@ def fuse(
         text = "is in colour: colours come from the betas, its own only where they do not see"
         warn(f"the image of alpha, '{alpha}', {text}")
     noisy = bool(low_light.noisy)
-    right = replace(inputs.inputs, luminance=SHARES[luminance], denoised=noisy)
+    right = replace(inputs.inputs, luminance=SHARES[luminance])
     inputs = inputs._replace(inputs=right)
     with limited(planned(settings.limit, plan.memory, large=math.prod(inputs.hw) > LARGE)):
         with torch.set_grad_enabled(differentiable):

@@ -113,7 +113,6 @@ def frame_inputs(network: FusionNetwork, views: Views) -> FrameInputs:
             on_grid,
             track=place.track if place.has_track else None,
             around=around,
-            enlargement=views.enlargement.get(name, (1.0, 1.0)),
             cameras=views.joined.get(name, (name,)),
         )
         betas.append(beta)

@@ -116,9 +116,7 @@ def equal_resolution(network: FusionNetwork, views: Views) -> StepResult:
         image = of_size(views.images[name], hw_at_alphas_resolution(views.pair(name)))
         if image is not views.images[name]:
             rig = views.rig.resize(name, (image.shape[-2], image.shape[-1]))
-            h, w = views.images[name].shape[-2:]
-            enlargement = {**views.enlargement, name: (image.shape[-2] / h, image.shape[-1] / w)}
-            views = dataclasses.replace(views.replace({name: image}, rig=rig), enlargement=enlargement)
+            views = views.replace({name: image}, rig=rig)
     return StepResult(views)
 
 

@@ -21,7 +21,6 @@ from ..matching.inputs import Inputs
 from ..matching.matches import Matches
 from ..networks.protocol import FusionNetwork, matched_for
 from ..support.tensor_files import read_tensors, write_tensors
-from .back_projection import back_projected
 from .depth import certain, measured_depth
 from .inputs import FrameInputs
 from .results import Frame
@@ -213,8 +212,6 @@ def _fused(
     box = (top - tile.outer[0], bottom - tile.outer[0], left - tile.outer[2], right - tile.outer[2])
     with convolutions_in_parallel():
         output = certain(network(inputs, matches), matches, inputs)
-    if matches is not None and not inputs.denoised:
-        output = back_projected(output, matches, inputs, keeps_luminance=network.keeps_luminance)
     output = output.cut(box)
     cropped = replace(inputs, betas=tuple(replace(beta, field=beta.field.cut(box)) for beta in inputs.betas))
     hw = bottom - top, right - left
@@ -272,10 +269,9 @@ def _digest(network: FusionNetwork, frame: FrameInputs) -> str:
     """Of all that a frame's tiles depend on; of fields of positions, those of some pixels."""
     inputs = frame.inputs
     how = type(network).__name__, FusedTile._fields, inputs.luminance, inputs.bands, inputs.sees_luma
-    recorded = inputs.denoised, [beta.enlargement for beta in inputs.betas]
     module = network if isinstance(network, nn.Module) else nn.Module()
     rounded = [name for name, layer in module.named_modules() if "forward" in vars(layer)]  # by `in_bfloat16`
-    digest = hashlib.sha256(f"{how} {recorded} {rounded}".encode())
+    digest = hashlib.sha256(f"{how} {rounded}".encode())
     parameters = module.state_dict().values()
     some = pixel_grid(inputs.hw, dtype=torch.float64)[::64, ::64].reshape(-1, 2)
     samples = [b.field.at(some) if b.field.pixels is None else b.field.pixels for b in inputs.betas]

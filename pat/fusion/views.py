@@ -37,8 +37,6 @@ class Views:
     fields: Fields = dataclasses.field(default_factory=dict)
     alpha_in_colour: bool = False
     """Whether alpha's image was, before it was made grey."""
-    enlargement: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
-    """How many times as high and wide a beta's image is as it was, if it was resized."""
     joined: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
     """The cameras whose bands a beta's image has, if they are several."""
 

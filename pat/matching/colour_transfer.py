@@ -173,9 +173,9 @@ def _transferred_piece(
         colours, each, _ = zip(*(one for one, counts in zip(of_each, sharing) if counts))
         weights = torch.stack(each)
         mixed = ((weights + LEAST) * torch.stack(colours)).sum(0) / (weights + LEAST).sum(0)
-        fills = [filled_from(mixed, alpha, weights.amax(0))]
+        fills = [filled_from(mixed, alpha, weights.amax(0), regressed=piece.bands is None)]
     alone = (one for one, counts in zip(of_each, sharing) if not counts)
-    fills += [filled_from(colour, alpha, weight) for colour, weight, _ in alone]
+    fills += [filled_from(one[0], alpha, one[1], regressed=piece.bands is None) for one in alone]
     return [*fills, *(plane for one in of_each for plane in one)]
 
 
@@ -285,12 +285,20 @@ def match_weight(
 
 
 def filled_from(
-    colour: Float[Tensor, "b c h w"], alpha: Float[Tensor, "b 1 h w"], weight: Float[Tensor, "b 1 h w"]
+    colour: Float[Tensor, "b c h w"],
+    alpha: Float[Tensor, "b 1 h w"],
+    weight: Float[Tensor, "b 1 h w"],
+    *,
+    regressed: bool = False,
 ) -> Float[Tensor, "b fills c h w"]:
-    """Candidate colours of pixels that beta does not see: diffused along the regression on brightness over
-    what is connected in alpha, and by example."""
+    """Colours of pixels that beta does not see, by nearest examples; if `regressed` after the regression on
+    brightness over what is connected in alpha, above which the examples are."""
     planes = zip(numpy_of(colour), numpy_of(alpha[:, 0]), numpy_of(weight[:, 0]), to_bytes(alpha[:, 0]))
-    fills = [np.stack([_diffused(c, a, w + LEAST, guide), by_examples(c, a, w)]) for c, a, w, guide in planes]
+    fills = []
+    for bands, brightness, w, guide in planes:
+        base = [_diffused(bands, brightness, w + LEAST, guide)] if regressed else []
+        nearest = by_examples(bands - sum(base), brightness, w) + sum(base)
+        fills.append(np.stack([*base, nearest]))
     return torch.from_numpy(np.stack(fills)).to(alpha)
 
 

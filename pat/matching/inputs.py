@@ -36,8 +36,7 @@ class Beta:
     """One beta's image (B, C, H, W) and the field of alpha's pixels in it.
 
     `offset` is the (x, y) of its first pixel in the whole image, other than (0, 0) for a part of an image.
-    `cameras` are the names of those whose bands it shows, one after another. `enlargement`
-    says how many times as high and wide it is as what the camera recorded.
+    `cameras` are the names of those whose bands it shows, one after another.
     `track` gives the tracks of alpha's pixels (*n, 2) in the image of a calibrated beta. With `around` each
     segment is around what is known of its own pixel: positions along the segments of two pixels are not to be
     compared.
@@ -48,7 +47,6 @@ class Beta:
     offset: tuple[int, int] = (0, 0)
     track: Callable[[Tensor], Track] | None = None
     around: bool = False
-    enlargement: tuple[float, float] = (1.0, 1.0)
     cameras: tuple[str, ...] = ()
 
 
@@ -60,8 +58,8 @@ class Inputs:
     `luminance` is alpha's share of the result's, for networks that keep it; the rest is beta's. `bands` are
     those of the result: so many, whose luminance (the mean, if they are not three) is what alpha sees, or
     None: those of all betas, of which alpha may see any combination. `sees_luma` is whether RGB betas' luma
-    is about what alpha sees, as far as is known: not in the near infrared. `denoised`: the betas' images are
-    not what was recorded. `learned`: the networks of choice and certainty take part in matching.
+    is about what alpha sees, as far as is known: not in the near infrared.
+    `learned`: the networks of choice and certainty take part in matching.
     """
 
     alpha: Float[Tensor, "b c h w"]
@@ -72,7 +70,6 @@ class Inputs:
     bands: int | None = None
     learned: bool = True
     sees_luma: bool = True
-    denoised: bool = False
 
     @classmethod
     def of(cls, alpha: Tensor, images: Sequence[Tensor], fields: Sequence[FieldOnGrid]) -> Inputs:

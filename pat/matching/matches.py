@@ -25,8 +25,6 @@ def is_consistent(facts: Float[Tensor, "b 3 h2 w2"]) -> Float[Tensor, "b 1 h w"]
     return enlarged((facts[:, :1] < CONSISTENT).to(facts))
 
 
-FILLS = 2
-"""Size: fills of each beta, along the regression on brightness, and by example."""
 CHANNELS = {"disparity": 1, "chosen": 1, "facts": 3, "stated": 2, "certainty": 2}
 """Channels of each plane of `BetaMatches`."""
 AT_HALF_SIZE = ("facts", "stated", "certainty")
@@ -39,7 +37,8 @@ class Colours(NamedTuple):
     weight: (B, 1, H, W), how far `bands` count as those of the point that alpha sees, 0 to 1.
     likeness: (B, 1, H, W), photometric similarity of alpha and beta at the match, 0 to 1; 1 where alpha does
         not see luma.
-    fills: (B, FILLS, C, H, W), candidates for pixels that beta does not see.
+    fills: (B, F, C, H, W), the bands by nearest examples at pixels that beta does not see; before it, where
+        the bands' spectra are not known, their local regression on brightness.
     """
 
     bands: Tensor
@@ -124,7 +123,8 @@ class BetaMatches:
         if self.colours is not None:
             planes |= self.colours._asdict()
             shapes |= {"bands": (batch, bands, *hw), "weight": (batch, 1, *hw), "likeness": (batch, 1, *hw)}
-            shapes |= {"fills": (batch, FILLS, bands, *hw)}
+            count = self.colours.fills.shape[1] if self.colours.fills.ndim > 1 else 1
+            shapes |= {"fills": (batch, count, bands, *hw)}
         for name, plane in planes.items():
             if plane is None and name not in ("disparity", "facts"):
                 continue

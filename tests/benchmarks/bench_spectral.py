@@ -29,7 +29,6 @@ from pat.lab.synthesis.layered import LayeredScenes
 from pat.lab.synthesis.photos import PhotoBank
 from pat.lab.synthesis.rig_distribution import RigDistribution
 from pat.lab.training.config import TrainConfig
-from pat.lab.training.lenses import Spectra
 from pat.lab.training.samples import photographs
 from pat.media.colour import luminance
 from pat.networks.protocol import FusionNetwork
