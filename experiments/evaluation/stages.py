@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pat.fusion.fuse import FuseSettings
 from pat.lab.data.pairs import StereoPair
 from pat.lab.evaluation.protocols import mono_colour_task, rectified_fusion
 from pat.lab.evaluation.stereo import disparity_errors
@@ -76,9 +77,8 @@ def score_stages(pairs: Sequence[StereoPair], rates: Sequence[int]) -> dict[str,
     """Scores of fusion with each stage left out, by stage and rate, a list of pairs each."""
     scores: dict[str, dict[int, list[StageScore]]] = {}
     for stage in (*STAGES, *NETWORKS):
-        method = rectified_fusion(
-            load_weights(NETWORKS.get(stage, "mono-colour")), response="rec601", align=False
-        )
+        how = FuseSettings(response="rec601", align=False)
+        method = rectified_fusion(load_weights(NETWORKS.get(stage, "mono-colour")), settings=how)
         for rate in rates:
             with left_out(stage):
                 scores.setdefault(stage, {})[rate] = [_score(method, pair, rate) for pair in pairs]

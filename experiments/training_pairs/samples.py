@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -15,9 +15,11 @@ from torch import Generator, Tensor
 
 from experiments.evaluation.halves import of_half
 from experiments.fit import Recipe
+from pat.fusion.fuse import FuseSettings
 from pat.lab.data.pairs import StereoPair, folder_pairs, middlebury_pairs
 from pat.lab.evaluation.protocols import mono_colour_task, rectified_fusion
 from pat.lab.synthesis.rigs import below
+from pat.matching.match import Matcher, match
 from pat.networks.guided import GuidedPAT
 from pat.networks.weights import load_weights
 from pat.sensors import generator_for
@@ -132,14 +134,15 @@ class PairTraining(Recipe):
         return [pair for one in pairs for pair in (one, mirrored(one, self.stereo))]
 
 
-def fused_at_random(network: GuidedPAT, pair: StereoPair, seed: int, **options: Any) -> Tensor:
+def fused_at_random(network: GuidedPAT, pair: StereoPair, seed: int, matcher: Matcher = match) -> Tensor:
     """Fuse a pair recorded at random, left as alpha, its largest disparity known; returns left as it is."""
     assert pair.max_disparity is not None
     rng, g = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
     alpha, beta, truth, _ = mono_colour_task(pair, int(rng.choice(RATES)))
+    settings = FuseSettings(response="rec601", align=False)
     if rng.random() < NOISY:
         level = NoiseLevel.of_electrons(float(np.exp(rng.uniform(np.log(50), np.log(2000)))), READ_NOISE)
         alpha, beta = (level.recorded(image[None], g)[0] for image in (alpha, beta))
-        options = {**options, "noise": {"alpha": level, "beta": level}}
-    rectified_fusion(network, response="rec601", align=False, **options)(alpha, beta, pair.max_disparity)
+        settings = replace(settings, noise={"alpha": level, "beta": level})
+    rectified_fusion(network, settings=settings, matcher=matcher)(alpha, beta, pair.max_disparity)
     return truth

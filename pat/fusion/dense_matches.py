@@ -46,7 +46,7 @@ class MatchedDepth(NamedTuple):
 class MatchesAlone:
     """A `FusionNetwork` whose image is alpha, and whose positions and confidences are the matches'."""
 
-    uses_matches = equal_resolution = True
+    uses_matches = equal_resolution = learned = True
     keeps_luminance = False
     halo, beta_halo, multiple = 0, 96, 16
     joins_bands: JoinsBands = "no"

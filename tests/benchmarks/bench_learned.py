@@ -2,7 +2,7 @@
 
     python -m tests.benchmarks.bench_learned [--out tests/benchmarks/RESULTS_learned.md]
 
-Behind each / without it: semi-global matches as they are, the fusion network's own confidence, no completion.
+Behind each / without it: semi-global matches with a left-right check (`classical`).
 Scenes are photographs as layers, the nearest depth moved by 12 to 60 pixels, beta as sharp as alpha if not
 said otherwise; and Middlebury's pairs of the report half, beta reduced 2x, the cameras turned. *All*, *seen*:
 alpha's pixels, and those beta sees, whose depth is right to a pixel of beta at alpha's resolution. *ECE*: the
@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from copy import copy
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -39,10 +38,6 @@ from pat.lab.synthesis.layered import LayeredScenes
 from pat.lab.synthesis.photos import PhotoBank
 from pat.lab.synthesis.rig_distribution import RigDistribution
 from pat.lab.synthesis.rigs import RigBatch, log_uniform, uniform
-from pat.matching.colour_transfer import transferred
-from pat.matching.inputs import Inputs
-from pat.matching.match import located
-from pat.matching.matches import Matches
 from pat.media.colour import luminance
 from pat.networks.weights import load_weights
 from pat.support.metrics import score
@@ -166,17 +161,9 @@ def over(found: Sequence[tuple[tuple[float, ...], tuple[Tensor, Tensor]]]) -> li
     return [*np.mean(shares, 0).tolist(), error, float(right.double().mean()), float(stated.double().mean())]
 
 
-def unlearned(inputs: Inputs) -> Matches:
-    """Semi-global matches as they are."""
-    with torch.no_grad():
-        return transferred(inputs, located(inputs))
-
-
 def table(data: Path, count: int, turns: tuple[int, ...]) -> Iterator[str]:
     """A row for each kind."""
-    network = load_weights("mono-colour")
-    bare = copy(network)
-    bare._modules = {**network._modules, "completion": None}
+    network, bare = load_weights("mono-colour"), load_weights("classical")
     scenes = LayeredScenes(PhotoBank.load(data / "photos/city100", max_edge=640), RigDistribution(), hw=HW)
     made = {name: partial(layered, kind, scenes, count) for name, kind in KINDS.items()}
     for k in turns:
@@ -188,7 +175,7 @@ def table(data: Path, count: int, turns: tuple[int, ...]) -> Iterator[str]:
             given = case.images, case.rig
             frames = (
                 fuse(*given, alpha="alpha", network=network),
-                fuse(*given, alpha="alpha", network=bare, matcher=unlearned),
+                fuse(*given, alpha="alpha", network=bare),
             )
             found.append([figures(case, frame) for frame in frames])
         cells = zip(FORMATS, *map(over, zip(*found)))

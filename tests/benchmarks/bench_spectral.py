@@ -12,10 +12,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 import tyro
+from jaxtyping import Float
 from torch import Generator, Tensor
 
 from arraygeom import Rig
@@ -27,7 +29,6 @@ from pat.lab.synthesis.layered import LayeredScenes
 from pat.lab.synthesis.photos import PhotoBank
 from pat.lab.synthesis.rig_distribution import RigDistribution
 from pat.lab.training.config import TrainConfig
-from pat.lab.training.lenses import Spectra
 from pat.lab.training.samples import photographs
 from pat.media.colour import luminance
 from pat.networks.protocol import FusionNetwork
@@ -45,6 +46,42 @@ KINDS = {
     "three random bands at three places": (3, 3),
 }
 """Number of places, and of random bands (0 for red, green and blue)."""
+
+
+class Spectra(NamedTuple):
+    """C bands for each of a batch: mixtures of red, green and blue, each with its own gamma and contrast.
+
+    mixture: (B, C, 3), rows add up to 1. gamma, low, high: (B, C), the band is low where the mixture is 0 and
+    high where it is 1; low is above high for bands that are dark where others are bright.
+    """
+
+    mixture: Tensor
+    gamma: Tensor
+    low: Tensor
+    high: Tensor
+
+    @classmethod
+    def drawn(cls, batch: int, count: int, generator: Generator) -> Spectra:
+        """Half of the bands are of one colour, half have a gamma curve, one in ten is inverted."""
+
+        def chance(p: float) -> Tensor:
+            return torch.rand(batch, count, generator=generator) < p
+
+        parts = torch.rand(batch, count, 3, generator=generator).square() + 1e-3
+        one = torch.eye(3)[torch.randint(3, (batch, count), generator=generator)]
+        mixture = torch.where(chance(0.5)[..., None], one, parts / parts.sum(-1, keepdim=True))
+        exponent = 1.4 * torch.rand(batch, count, generator=generator) - 0.7
+        gamma = torch.where(chance(0.5), exponent, 0.0).exp2()
+        low = 0.2 * torch.rand(batch, count, generator=generator)
+        high = 1 - 0.4 * torch.rand(batch, count, generator=generator)
+        inverted = chance(0.1)
+        return cls(mixture, gamma, torch.where(inverted, high, low), torch.where(inverted, low, high))
+
+    def of(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b c h w"]:
+        """The bands of a colour image."""
+        mixture, gamma, low, high = (tensor.to(image) for tensor in self)
+        mixed = torch.einsum("bck,bkhw->bchw", mixture, image).clamp(min=1e-6) ** gamma[..., None, None]
+        return low[..., None, None] + (high - low)[..., None, None] * mixed
 
 
 def cases(

@@ -20,7 +20,8 @@ from pat.lab.evaluation.ablation import sample_photographs
 from pat.lab.training.config import TrainConfig, load_config
 from pat.lab.training.losses import Objective
 from pat.lab.training.samples import Sample, SampleSource, source_of
-from pat.networks.weights import Network, new_network, set_precision
+from pat.networks.paper import PAT
+from pat.networks.weights import set_precision
 from tests.benchmarks.printed import spread, timed
 
 
@@ -50,7 +51,7 @@ HOW = {"float32": (False, False), "bfloat16": (True, False), "compiled": (False,
 
 def measure(name: str, repeats: int) -> None:
     """Print the figures of a recipe's network."""
-    config = replace(load_config(name), reuse=1.0, filtered=0.0)
+    config = replace(load_config(name), reuse=1.0)
     made = source(config)
     given, numbers = next(made(1)), count(1)
     print(f"\n{name}, {config.batch} samples of {config.hw[1]} x {config.hw[0]}, one step:\n")
@@ -61,15 +62,15 @@ def measure(name: str, repeats: int) -> None:
     report("making new scenes, fields included", scenes, config.batch)
 
 
-def prepared(config: TrainConfig, *, half: bool, compiled: bool) -> Network:
+def prepared(config: TrainConfig, *, half: bool, compiled: bool) -> PAT:
     """A new network whose convolutions compute as `precision` and `compile` have them."""
     torch.manual_seed(0)
-    network = new_network(config.network)
+    network = PAT(config.network)
     set_precision(network, "bfloat16" if half else "float32", compiled=compiled)
     return network
 
 
-def main(repeats: int = 3, names: tuple[str, ...] = ("mono-colour", "mono-colour", "paper-2")) -> None:
+def main(repeats: int = 3, names: tuple[str, ...] = ("pat-supervised", "paper-2")) -> None:
     """Measure and print the networks of recipes."""
     torch.set_num_threads(1)
     for name in names:

@@ -26,7 +26,6 @@ STAGES = {
     "choice": ["pat.matching.match.chosen"],
     "attention": ["pat.attention.attend._attend"],
     "network": ["pat.networks.guided.GuidedPAT.forward"],
-    "completion": ["pat.networks.completion.Completion.forward"],
     "depth": ["pat.fusion.tiles.measured_depth", "pat.fusion.fuse.background_filled"],
     "write": ["pat.fusion.results.save_frame", "pat.app.report.report_page"],
 }

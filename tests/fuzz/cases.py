@@ -27,8 +27,8 @@ from pat.lab.synthesis.photos import read_photographs
 from pat.lab.training.checkpoints import collect, newest_checkpoint, restore, write_checkpoint
 from pat.media.images import read_image, write_image
 from pat.media.video import Video, read_video
-from pat.networks.configs import GuidedPATConfig
-from pat.networks.guided import GuidedPAT
+from pat.networks.configs import PATConfig
+from pat.networks.paper import PAT
 from pat.networks.weights import load_weights, save_weights
 from tests.arraygeom.test_damaged_files import matlab_pair
 
@@ -299,14 +299,14 @@ def faults_of_video(video: Video) -> str:
 # Weights, checkpoints, documents ----------------------------------------------------------------------------
 
 
-def small_network() -> GuidedPAT:
+def small_network() -> PAT:
     torch.manual_seed(0)
-    return GuidedPAT(GuidedPATConfig())
+    return PAT(PATConfig(dim=4))
 
 
 def weight_seeds(folder: Path) -> Iterator[Seed]:
     save_weights(small_network(), folder / "weights" / "small.safetensors")
-    yield Seed("weights", "guided", folder / "weights" / "small.safetensors")
+    yield Seed("weights", "PAT", folder / "weights" / "small.safetensors")
 
 
 def training() -> tuple[nn.Module, torch.optim.Optimizer, torch.optim.swa_utils.AveragedModel]:

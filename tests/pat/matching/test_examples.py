@@ -134,10 +134,12 @@ def test_fills_of_a_batch_are_of_each_image():
     alpha, colour = (torch.from_numpy(x.copy()) for x in bands_of_brightness())
     weight = torch.from_numpy(hidden(colour.numpy())[1])[None, None].repeat(2, 1, 1, 1)
     both = torch.stack([colour, -colour]), torch.stack([alpha, 1 - alpha])[:, None], weight
-    fills = filled_from(*both)
+    fills = filled_from(*both, regressed=True)
     assert fills.shape == (2, 2, 3, H, W)
     for i in range(2):
-        assert torch.equal(fills[i : i + 1], filled_from(*(part[i : i + 1] for part in both)))
+        one = filled_from(*(part[i : i + 1] for part in both), regressed=True)
+        assert torch.equal(fills[i : i + 1], one)
+    assert torch.equal(filled_from(*both, regressed=False), fills[:, 1:])
     by_example = by_examples(colour.numpy(), alpha.numpy(), weight[0, 0].numpy())
     assert np.array_equal(fills[0, 1].numpy(), by_example)
     rows = (torch.arange(H) % 16 > 2) & (torch.arange(H) % 16 < 13)

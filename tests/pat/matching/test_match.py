@@ -189,7 +189,7 @@ def holed(plane):
         ("disparity", Tensor.long, r"disparity is int64 \(1, 1, 64, 96\): wanted a tensor of floats"),
         ("facts", lambda plane: enlarged(plane), r"facts is float32 .*: wanted .* \(1, 3, 32, 48\)"),
         ("bands", lambda plane: plane[:, :1], r"bands is float32 \(1, 1, .*: wanted .* \(1, 3, 64, 96\)"),
-        ("fills", lambda plane: plane[:, :1], r"fills is float32 .*: wanted .* \(1, 2, 3, 64, 96\)"),
+        ("fills", lambda plane: plane[:, :, :1], r"fills is float32 .*: wanted .* \(1, 1, 3, 64, 96\)"),
         (
             "likeness",
             lambda plane: plane.expand(-1, 3, -1, -1),

@@ -84,7 +84,7 @@ def test_two_colour_cameras_on_opposite_sides_see_more_than_either(network, scen
 def carried(bands, weight, likeness, fills=0.0):
     """Colours of four pixels of one band, all alike."""
     plane = torch.zeros(1, 1, 2, 2)
-    return Colours(plane + bands, plane + weight, plane + likeness, torch.zeros(1, 2, 1, 2, 2) + fills)
+    return Colours(plane + bands, plane + weight, plane + likeness, torch.zeros(1, 1, 1, 2, 2) + fills)
 
 
 def test_of_betas_each_counts_by_its_odds():
@@ -186,7 +186,7 @@ def test_shared_colour_counts_once(network, scene):
     matches = match(frame_inputs(network, Views.of(rig, images, alpha="mono")).inputs)
     one, other = matches.betas
     assert one.carried.fills is other.carried.fills
-    assert matches.nbytes == H * W * (2 * (8 + 3 + 4) + 2 * 2 * (3 + 1 + 1) + 2 * 2 * 3)
+    assert matches.nbytes == H * W * (2 * (8 + 3 + 4) + 2 * 2 * (3 + 1 + 1) + 2 * 3)
     one, other = matches.cut((0, 32, 0, 64)).betas
     assert one.carried.fills is other.carried.fills
 

@@ -36,7 +36,7 @@ def frame_of(side, betas):
 def found_in(inputs):
     """Matches as they might be found; fills are shared."""
     (h, w), n = inputs.hw, len(inputs.betas)
-    fills = torch.rand(1, 2, 3, h, w)
+    fills = torch.rand(1, 1, 3, h, w)
     made = [
         BetaMatches(
             5 * torch.rand(1, 1, h, w),

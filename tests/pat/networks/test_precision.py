@@ -13,8 +13,6 @@ from pat.networks.weights import load_weights, set_precision
 from pat.support import eight_bits
 from pat.support.metrics import score
 
-FRAME = {"alpha": "mono", "align": False, "response": "rec601"}
-
 
 def test_bfloat16_changes_the_image_little_and_something():
     if not torch.cpu._is_avx512_bf16_supported():
