@@ -34,6 +34,8 @@ SLACK = 1.05
 """What a process may take over what is counted here: freed blocks smaller than a page cannot be returned."""
 MATCHING_BYTES = 360.0
 """Working memory of matching for each pixel of alpha, measured."""
+FILLING_BYTES = 80.0
+"""Working memory of filling for each pixel of the whole frame, counted."""
 FRAME_BYTES = 12.0
 """A fused frame's for each pixel: depth, confidence and half-width."""
 BAND_BYTES = (4.0, 2.0)
@@ -97,7 +99,8 @@ def plan_frame(
     probe = Probe.of(network, frame) if wanted else None
     for_each = (probe.matches if probe else 0.0) + (0.0 if stored else of_frame)
     held = kept + LIBRARIES + frame.inputs.nbytes + pixels * for_each
-    matching = MATCHING_BYTES * max(area(tile.outer) for tile in pieces) if network.uses_matches else 0.0
+    matching = max(MATCHING_BYTES * max(area(tile.outer) for tile in pieces), FILLING_BYTES * pixels)
+    matching = matching if network.uses_matches else 0.0
     tiles = tiles_within(network, frame, limit, held, matching)
     work = max(matching, *(working_memory(network, frame.inputs, tile) for tile in tiles))
     held = max(held + work, LIBRARIES + kept + pixels * (of_frame + WRITING_BYTES))

@@ -132,22 +132,43 @@ def transferred(inputs: Inputs, matches: Matches) -> Matches:
     matches of another size or number of betas.
     """
     matches.check(inputs)
-    agree, large = inputs.can_agree, len(inputs.pieces) > 1
-    sharing = [agree and inputs.shows_all_bands(beta) for beta in inputs.betas]
+    large = len(inputs.pieces) > 1
     statistics = _statistics_of_frame(inputs, matches) if large else None
 
-    def of(piece: Inputs, there: Matches) -> list[Tensor]:
-        parts = _transferred_piece(piece, there, sharing, statistics)
-        return [plane if plane.requires_grad or not large else plane.half() for plane in parts]
+    def stored(plane: Tensor) -> Tensor:
+        return plane if plane.requires_grad or not large else plane.half()
 
-    parts = inputs.in_pieces(of, matches)
-    fills, planes = parts[: -3 * len(sharing)], iter(parts[-3 * len(sharing) :])
-    own = iter(fills[1:] if any(sharing) else fills)
-    made = []
-    for match, shares in zip(matches.betas, sharing):
-        carried = next(planes), next(planes), next(planes)
-        made.append(replace(match, colours=Colours(*carried, fills[0] if shares else next(own))))
-    return Matches(tuple(made))
+    def of(piece: Inputs, there: Matches) -> list[Tensor]:
+        given: Sequence[MatchStatistics | None] = statistics or [None] * len(piece.betas)
+        parts = zip(piece.betas, there.betas, given)
+        carried = (transferred_bands(piece.alpha, *one, sees_luma=piece.sees_luma)[:3] for one in parts)
+        return [stored(plane) for planes in carried for plane in planes]
+
+    planes = iter(inputs.in_pieces(of, matches))
+    carried = list(zip(planes, planes, planes))
+    fills = [stored(fill) for fill in _fills(inputs, carried)]
+    return Matches(
+        tuple(replace(m, colours=Colours(*one, fill)) for m, one, fill in zip(matches.betas, carried, fills))
+    )
+
+
+def _fills(inputs: Inputs, carried: Sequence[tuple[Tensor, Tensor, Tensor]]) -> list[Tensor]:
+    """The fills of each beta, from its bands and their weight, over the whole frame: pieces of one would find
+    other examples, and their borders would show. Betas that stand in for each other share theirs."""
+    sharing = [inputs.can_agree and inputs.shows_all_bands(beta) for beta in inputs.betas]
+    regressed = inputs.bands is None
+    shared: Tensor | None = None
+    if any(sharing):
+        some = [one for one, shares in zip(carried, sharing) if shares]
+        weights = torch.stack([weight.float() + LEAST for _, weight, _ in some])
+        mixed = (weights * torch.stack([bands.float() for bands, _, _ in some])).sum(0) / weights.sum(0)
+        shared = filled_from(mixed, inputs.alpha, weights.amax(0), regressed=regressed)
+    return [
+        shared
+        if shares and shared is not None
+        else filled_from(one[0], inputs.alpha, one[1], regressed=regressed)
+        for one, shares in zip(carried, sharing)
+    ]
 
 
 def _statistics_of_frame(inputs: Inputs, matches: Matches) -> list[MatchStatistics]:
@@ -158,25 +179,6 @@ def _statistics_of_frame(inputs: Inputs, matches: Matches) -> list[MatchStatisti
         for piece, there in pieces
     ]
     return [MatchStatistics.mean(of_beta) for of_beta in zip(*of_pieces)]
-
-
-def _transferred_piece(
-    piece: Inputs, matches: Matches, sharing: Sequence[bool], statistics: Sequence[MatchStatistics] | None
-) -> list[Tensor]:
-    """The fills that betas share, if any do, each other beta's, and each beta's first three `Colours`."""
-    alpha = piece.alpha
-    given: Sequence[MatchStatistics | None] = statistics or [None] * len(piece.betas)
-    parts = zip(piece.betas, matches.betas, given)
-    of_each = [transferred_bands(alpha, *one, sees_luma=piece.sees_luma)[:3] for one in parts]
-    fills = []
-    if any(sharing):
-        colours, each, _ = zip(*(one for one, counts in zip(of_each, sharing) if counts))
-        weights = torch.stack(each)
-        mixed = ((weights + LEAST) * torch.stack(colours)).sum(0) / (weights + LEAST).sum(0)
-        fills = [filled_from(mixed, alpha, weights.amax(0), regressed=piece.bands is None)]
-    alone = (one for one, counts in zip(of_each, sharing) if not counts)
-    fills += [filled_from(one[0], alpha, one[1], regressed=piece.bands is None) for one in alone]
-    return [*fills, *(plane for one in of_each for plane in one)]
 
 
 def transferred_bands(

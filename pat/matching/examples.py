@@ -5,6 +5,7 @@ Nearest neighbours among alpha's own seen pixels (Welsh et al. 2002 colour a gre
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -32,12 +33,14 @@ class ExampleSettings:
         (140.0, 90.0), "Strong classical line, nine tune pairs: distances across and down that count as one"
     )
     soft: float = tuned(0.15, "Strong classical line: distance added to the nearest in the weights' width")
-    seen: float = size(0.5, "Weight from which a pixel counts as seen")
+    seen: float = size(0.5, "Weight above which a pixel counts as seen")
     sources: int = size(60_000, "Seen pixels searched at most")
     error: float = size(0.5, "Relative error of the approximate nearest-neighbour search")
 
 
 SETTINGS = ExampleSettings()
+EVERY = (slice(None, None, 2),) * 2
+"""Size: every second pixel is looked up."""
 
 
 def by_examples(
@@ -45,36 +48,52 @@ def by_examples(
 ) -> Float[NDArray, "c h w"]:
     """Colour with the pixels of low weight replaced by the mean of their nearest seen pixels.
 
-    `weight` (0 to 1) is the probability that a pixel's colour is its own. Every second pixel in each
-    direction is looked up, and the mean is interpolated between them. Where fewer pixels are seen than a mean
-    takes, colour is returned as it is.
+    `weight` (0 to 1) is how far a pixel's colour is its own. Every second pixel in each direction is looked
+    up among such pixels, and what is between them is interpolated. Where fewer are seen than a mean takes,
+    colour is returned as it is.
     """
     seen = weight > SETTINGS.seen
-    sources = np.zeros_like(seen)
-    step = max(2, int(np.ceil(np.sqrt(seen.sum() / SETTINGS.sources))))
-    sources[::step, ::step] = seen[::step, ::step]
-    asked = np.zeros_like(seen)
-    asked[::2, ::2] = cv2.dilate((~seen).astype(np.uint8), np.ones((3, 3), np.uint8))[::2, ::2] > 0
+    near = cv2.dilate((~seen).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    asked, seen_there = near[EVERY], seen[EVERY]
+    step = max(1, int(np.ceil(np.sqrt(np.count_nonzero(seen_there) / SETTINGS.sources))))
+    sources = np.zeros_like(seen_there)
+    sources[::step, ::step] = seen_there[::step, ::step]
     if np.count_nonzero(sources) < SETTINGS.neighbours or not asked.any():
         return colour
-    features = _features(alpha)
-    tree = cKDTree(features[:, sources].T, compact_nodes=False, balanced_tree=False)
-    distance, index = tree.query(features[:, asked].T, k=SETTINGS.neighbours, eps=SETTINGS.error)
-    share = np.exp(-np.square(distance / (distance[:, :1] + SETTINGS.soft))) * weight[sources][index]
+    features = [(plane[sources], plane[asked]) for plane in _features(alpha)]
+    known, wanted = (np.stack(planes, 1) for planes in zip(*features))
+    tree = cKDTree(known, compact_nodes=False, balanced_tree=False)
+    distance, index = tree.query(wanted, k=SETTINGS.neighbours, eps=SETTINGS.error)
+    share = np.exp(-np.square(distance / (distance[:, :1] + SETTINGS.soft))) * weight[EVERY][sources][index]
     share = (share / share.sum(1, keepdims=True)).astype(np.float32)
-    found = np.zeros((len(colour) + 1, *seen.shape), np.float32)
-    found[:-1, asked] = np.einsum("cnk,nk->cn", colour[:, sources][:, index], share)
-    found[-1, asked] = 1
-    *sums, total = (cv2.GaussianBlur(plane, (0, 0), 1.0) for plane in found)
-    return np.where(seen, colour, np.stack(sums) / np.maximum(total, 1e-6))
+    out = np.empty_like(colour)
+    for own, filled in zip(colour, out):
+        plane = np.where(seen, own, 0)[EVERY]
+        plane[asked] = np.einsum("nk,nk->n", plane[sources][index], share)
+        filled[:] = np.where(seen, own, _between(plane, (alpha.shape[0], alpha.shape[1])))
+    return out
 
 
-def _features(alpha: Plane) -> Float[NDArray, "7 h w"]:
-    """Brightness, its mean and standard deviation in windows, and place, scaled so that distances compare."""
+def _between(plane: Plane, hw: tuple[int, int]) -> Plane:
+    """A plane of every second pixel, from the first, at all pixels, by linear interpolation."""
+    back = np.array([[0.5, 0, 0], [0, 0.5, 0]], np.float32)
+    how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    between: Plane = cv2.warpAffine(plane, back, (hw[1], hw[0]), flags=how, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[assignment]
+    return between
+
+
+def _features(alpha: Plane) -> Iterator[Plane]:
+    """Brightness, its means and standard deviations in windows, and place, scaled so that distances compare,
+    of every second pixel."""
     alpha = np.ascontiguousarray(alpha, np.float32)
-    means = [cv2.boxFilter(alpha, -1, (2 * r + 1,) * 2) for r in SETTINGS.radii]
-    squares = [cv2.boxFilter(alpha * alpha, -1, (2 * r + 1,) * 2) for r in SETTINGS.radii]
-    deviations = [np.sqrt(np.maximum(s - m * m, 0)) for s, m in zip(squares, means)]
-    y, x = np.indices(alpha.shape, dtype=np.float32)
-    planes = [scale * plane for scale, plane in zip(SETTINGS.scales, (alpha, *means, *deviations))]
-    return np.stack([*planes, x / SETTINGS.place[0], y / SETTINGS.place[1]])
+    scales = iter(SETTINGS.scales)
+    yield next(scales) * alpha[EVERY]
+    sides = [(2 * r + 1,) * 2 for r in SETTINGS.radii]
+    means = [cv2.boxFilter(alpha, -1, side) for side in sides]
+    for mean in means:
+        yield next(scales) * mean[EVERY]
+    for mean, side in zip(means, sides):
+        square = cv2.boxFilter(alpha * alpha, -1, side)
+        yield next(scales) * np.sqrt(np.maximum(square - mean * mean, 0))[EVERY]
+    for indices, unit in zip(np.indices(alpha[EVERY].shape, dtype=np.float32)[::-1], SETTINGS.place):
+        yield indices * np.float32(2 / unit)

@@ -235,15 +235,14 @@ class _Points(NamedTuple):
         """Whether a response explains alpha clearly better than a simpler one, and all over the image.
 
         Things of few hues, and shading that differs between the cameras, make wrong weights fit somewhat
-        better in some places: the gain must be large, and many times its standard error over blocks.
+        better in some places: the gain must be large, and many times its standard error over blocks. For
+        points without a place the gain alone counts.
         """
         errors = [self._squared_errors(one) for one in (simpler, response)]
         block = ((self.place + 0.5) * SETTINGS.blocks).long().clamp(0, SETTINGS.blocks - 1)
         block = block[:, 1] * SETTINGS.blocks + block[:, 0]
         count = torch.bincount(block).to(self.alpha)
         enough = count >= SETTINGS.points_of_group
-        if int(enough.sum()) < 2:
-            return False
         gains = torch.bincount(block, errors[0] - errors[1])[enough] / count[enough]
         share = count[enough].sqrt() / count[enough].sqrt().sum()
         mean = share @ gains
