@@ -256,8 +256,8 @@ def _mapped_rig(tagged: Rig, images: Images, alpha: str, note: Say) -> tuple[Rig
     reduced = {name: scaled(image, factors[name]) for name, image in pinhole.items()}
     found = rig_from_images(reduced, focal=focal, alpha=alpha)
     lensless = Rig({name: View(hw=found.rig[name].hw) for name in images})
-    links = {pair: link_of_points(lensless, pair, points) for pair, points in found.matches.items()}
-    links = resized_rig(lensless.replace(links=links), pinhole).links
+    fitted = {pair: link_of_points(lensless, pair, points) for pair, points in found.matches.items()}
+    links = resized_rig(lensless.replace(links=fitted), pinhole).links
     names = [alpha, *(name for name in images if (alpha, name) in links)]
     if len(names) < 2:
         raise ValueError(f"no image shows enough of what '{alpha}' shows: choose another with --alpha NAME")
