@@ -204,23 +204,18 @@ def fit(
         return Response.rec601()
     points = _Points(x[:, unclipped], y[unclipped], place[unclipped])
     groups = _Groups.of(*points)
-    none = y.new_zeros(len(groups.terms))
-    response = rec601 = Response.rec601()
-    exposed, weighed = (groups.explained_by(none, kinds, vignetted=False).response for kinds in (LUMA, KINDS))
-    if points.hold(exposed, rec601):
-        response = exposed
-    # Weights as recorded need no exposure that luma would: they are held against luma as recorded.
-    before = rec601 if weighed.gain == weighed.gamma == 1 else response
-    kinds = LUMA
-    if weighed.weights.tolist() != list(REC601) and points.hold(weighed, before):
-        response, kinds = weighed, OTHERS
-    explained = max(exposed.explained, weighed.explained)
+    luma, any_weights = (groups.most_probable(kinds) for kinds in (LUMA, KINDS))
+    response = points.held(luma, any_weights)
+    explained = max(luma.explained, any_weights.explained)
     if where is not None:
-        shaded = groups.shaded(kinds)
-        explained = max(explained, shaded.explained)
-        if points.hold(shaded, response):
+        luma, any_weights = (groups.most_probable(kinds, vignetted=True) for kinds in (LUMA, KINDS))
+        explained = max(explained, luma.explained, any_weights.explained)
+        shaded = points.held(luma, any_weights)
+        # Shading may explain in part what other weights explain: it never takes them back.
+        lost = shaded.weights.tolist() == list(REC601) != response.weights.tolist()
+        if shaded.shading and not lost and points.hold(shaded, response):
             response = shaded
-    response = response if explained >= SETTINGS.explained else rec601
+    response = response if explained >= SETTINGS.explained else Response.rec601()
     return response._replace(explained=explained)
 
 
@@ -230,6 +225,18 @@ class _Points(NamedTuple):
     bands: Float[Tensor, "3 n"]
     alpha: Float[Tensor, " n"]
     place: Float[Tensor, "n 2"]
+
+    def held(self, luma: Response, any_weights: Response) -> Response:
+        """The response with any weights if it holds against that with luma's, else that, else Rec. 601's.
+
+        Weights that need no exposure are held against luma as recorded, not against one exposed to fit.
+        """
+        rec601 = Response.rec601()
+        exposed = luma if self.hold(luma, rec601) else rec601
+        as_recorded = any_weights.gain == any_weights.gamma == 1 and not any_weights.shading
+        simpler = rec601 if as_recorded else exposed
+        unlike = any_weights.weights.tolist() != list(REC601)
+        return any_weights if unlike and self.hold(any_weights, simpler) else exposed
 
     def hold(self, response: Response, simpler: Response) -> bool:
         """Whether a response explains alpha clearly better than a simpler one, and all over the image.
@@ -325,7 +332,6 @@ KINDS = tuple(
 """Luma, a sensor without filters, or any other; beta exposed as alpha, or otherwise. The first of each is
 as usual."""
 LUMA = tuple(kind for kind in KINDS if kind.weights == REC601)
-OTHERS = tuple(kind for kind in KINDS if kind.weights != REC601)
 
 
 class _Explanation(NamedTuple):
@@ -383,12 +389,12 @@ class _Groups(NamedTuple):
         counts, share = torch.bincount(group).to(y), weight / weights[group]
         return cls(points, share, group, means[5], level, terms, counts, variance, spread)
 
-    def shaded(self, kinds: Sequence[_Kind]) -> Response:
-        """The most probable response of these kinds with vignetting."""
+    def most_probable(self, kinds: Sequence[_Kind], *, vignetted: bool = False) -> Response:
+        """The most probable response of these kinds, with vignetting or without."""
         shading = self.y.new_zeros(len(self.terms))
-        for _ in range(SETTINGS.steps):
+        for _ in range(SETTINGS.steps if vignetted else 0):
             shading = shading + self.explained_by(shading, kinds, vignetted=True).further
-        return self.explained_by(shading, kinds, vignetted=True).response
+        return self.explained_by(shading, kinds, vignetted=vignetted).response
 
     def explained_by(self, shading: Tensor, kinds: Sequence[_Kind], *, vignetted: bool) -> _Explanation:
         """The most probable response of these kinds, without a gamma and with one, this shading taken out of

@@ -231,8 +231,8 @@ def rig_of(names, places):
 def test_co_located_cameras_are_one_with_several_bands(banded):
     bands, alpha = texture(3, (64, 96))[0], texture(3, (64, 96))[0, :1]
     images = {"alpha": alpha, **dict(zip("rgb", bands.split(1)))}
-    apart = fuse(banded, rig_of("rgb", [1, 1, 1]), images, alpha="alpha")
-    whole = fuse(banded, rig_of("c", [1]), {"alpha": alpha, "c": bands}, alpha="alpha")
+    apart = fuse(images, rig_of("rgb", [1, 1, 1]), alpha="alpha", network=banded)
+    whole = fuse({"alpha": alpha, "c": bands}, rig_of("c", [1]), alpha="alpha", network=banded)
     assert torch.equal(apart.image, whole.image)
     assert torch.equal(apart.confidence, whole.confidence)
 
@@ -241,8 +241,8 @@ def test_bands_come_out_in_the_order_of_their_cameras(banded):
     """The second camera is elsewhere, the first and the third at one place."""
     bands, alpha = texture(3, (64, 96))[0], texture(3, (64, 96))[0, :1]
     images = dict(zip("rgb", bands.split(1)))
-    mixed = fuse(banded, rig_of("rgb", [1, 2, 1]), {"alpha": alpha, **images}, alpha="alpha")
-    sorted_ = fuse(banded, rig_of("rbg", [1, 1, 2]), {"alpha": alpha, **images}, alpha="alpha")
+    mixed = fuse({"alpha": alpha, **images}, rig_of("rgb", [1, 2, 1]), alpha="alpha", network=banded)
+    sorted_ = fuse({"alpha": alpha, **images}, rig_of("rbg", [1, 1, 2]), alpha="alpha", network=banded)
     assert torch.equal(mixed.image, sorted_.image[[0, 2, 1]])
     assert mixed.image.shape[0] == 3
 
