@@ -398,8 +398,6 @@ def say_when_compiling() -> None:
     """Say once, in one line, that kernels are compiled, before they are: that takes some seconds."""
     from numba.core import event
 
-    from arraygeom.runtime.compiled import COMPILED
-
     first = Lock()
 
     class Compiling(event.Listener):
@@ -410,7 +408,7 @@ def say_when_compiling() -> None:
         def on_end(self, event: object) -> None:
             pass
 
-    event.register(COMPILED, Compiling())
+    event.register("numba:compile", Compiling())
 
 
 def print_json(document: Any) -> None:
