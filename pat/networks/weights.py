@@ -126,7 +126,7 @@ def _load(path: Path, networks: Mapping[str, tuple[Any, Any]]) -> Any:
         if _is_of_pytorch(path):
             raise ValueError(
                 f"{path}: a checkpoint of PyTorch's: "
-                "`pat weights import` makes weights of one of the paper's authors"
+                "`pat lab weights import` makes weights of one of the paper's authors"
             ) from None
         raise ValueError(f"{path}: {not_whole(error)}") from None
     if not undamaged(state, metadata):

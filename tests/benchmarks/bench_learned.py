@@ -22,12 +22,12 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-import tyro
 from torch import Generator, Tensor
 
 from arraygeom import Camera, Pose, Rig, intrinsics, pixel_grid, rotation_from_vector
 from experiments.evaluation.certainty import Reliability
 from experiments.evaluation.halves import of_half
+from pat.app.cli.parser import script
 from pat.fusion.fuse import fuse
 from pat.fusion.results import Frame
 from pat.fusion.steps import hw_at_alphas_resolution
@@ -211,4 +211,4 @@ def main(
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    script(main)

@@ -15,10 +15,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import tyro
 from torch import Generator, Tensor
 
 from arraygeom import Rig
+from pat.app.cli.parser import script
 from pat.fusion.classical import classical, classical_baseline
 from pat.fusion.fuse import fuse
 from pat.lab.evaluation.ablation import recorded
@@ -121,4 +121,4 @@ def main(
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    script(main)

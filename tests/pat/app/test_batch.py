@@ -235,17 +235,17 @@ def test_a_full_disk_leaves_whole_files_only(material, tmp_path, monkeypatch):
 
 def test_the_command_line_fuses_a_sequence(material, tmp_path, capsys, refusal):
     images = " ".join(f"--image {name}={material / name}" for name in ("fast", "slow"))
-    given = f"fuse --rig {material / 'rig.yaml'} --alpha fast {images} --out {tmp_path / 'out'}"
-    given += f" --weights {material / 'tiny.safetensors'} --bits 16"
-    pat(f"{given} --sequence")
+    given = f"sequence --rig {material / 'rig.yaml'} --alpha fast {images} --out {tmp_path / 'out'}"
+    given += f" --weights {material / 'tiny.safetensors'} --format png16"
+    pat(given)
     assert read_image(tmp_path / "out" / "fast_14_fused.png").shape == (3, *moving.HW)
     assert (tmp_path / "out" / "fused.mp4").stat().st_size > 1000
     assert Rig.load(tmp_path / "out" / "view.yaml").names == ("fast",)
     capsys.readouterr()
-    pat(f"{given} --sequence --resume")
+    pat(f"{given} --resume")
     assert "0 made, 7 there already" in " ".join(capsys.readouterr().err.split())
-    assert "near one of alpha in time" in refusal(*given.split(), "--sequence", "--time-offset", "slow=9")
-    assert "as many images of each camera" in refusal(*given.split())
+    assert "near one of alpha in time" in refusal(*given.split(), "--time-offset", "slow=9")
+    assert "as many images of each camera" in refusal("batch", *given.split()[1:])
 
 
 def test_the_light_that_alpha_measured_is_known_of_sequences_too(material, tmp_path):

@@ -132,7 +132,7 @@ def test_a_killed_command_is_resumed_to_the_same_bits(material, tmp_path):  # no
     (tmp_path / "run.py").write_text(run)
 
     def command(out: str, *more: str) -> subprocess.Popen:
-        line = [sys.executable, tmp_path / "run.py", "fuse", *given, *images, "--out", tmp_path / out, *more]
+        line = [sys.executable, tmp_path / "run.py", "batch", *given, *images, "--out", tmp_path / out, *more]
         environment = {**os.environ, "PYTHONPATH": os.getcwd()}
         return subprocess.Popen([str(a) for a in line], env=environment, start_new_session=True)
 

@@ -1,4 +1,4 @@
-"""`pat fuse` of several frames, one of which cannot be read: it stops there or skips it, and is resumed."""
+"""`pat batch` of several frames, one of which cannot be read: it stops there or skips it, and is resumed."""
 
 import pytest
 
@@ -35,7 +35,7 @@ def fuse(folder, *options):
     given = ["--rig", str(folder / "rig.yaml"), "--alpha", "mono", *images, "--out", str(folder / "out")]
     status = 0
     try:
-        main(["fuse", *given, *options])
+        main(["batch", *given, *options])
     except SystemExit as ended:
         status = ended.code
     return status, sorted(p.name.partition("_")[0] for p in (folder / "out").glob("*_fused.png"))

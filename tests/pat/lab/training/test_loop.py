@@ -128,7 +128,7 @@ def test_a_stopped_run_goes_on_bit_for_bit(step, what, folder, whole, monkeypatc
 
 def command(*arguments, launcher=(), **environment):
     return subprocess.Popen(
-        [sys.executable, *launcher, "-m", "pat", "train", *map(str, arguments)],
+        [sys.executable, *launcher, "-m", "pat", "lab", "train", *map(str, arguments)],
         env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT), **environment},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
