@@ -234,7 +234,7 @@ def test_arraygeom_touches_files_only_in_io():
         for p in sources("arraygeom")
         if names(p) & READING_FILES
         and "io" not in p.relative_to(ROOT).parts
-        and p.name not in ("atomic.py", "compiled.py")
+        and p.name not in ("atomic.py", "compiled.py", "together.py")
     } == {}
 
 

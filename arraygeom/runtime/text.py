@@ -11,11 +11,15 @@ from torch import Tensor
 
 UNSCALED = "found from images: lengths are multiples of the baseline, not metres"
 """The name of a rig of unknown scale."""
+ASSUMED = f"{UNSCALED}; focal lengths are assumed, and the proportions of depth with them"
+"""The name of one whose focal lengths nobody stated: an interval of its depths would be a guess."""
+OPEN = "found from images that leave lines and depth open: of these images alone"
+"""The name of a rig whose cameras one homography relates as well as any lines."""
 
 
 def length_unit(rig: Any) -> str:
     """What lengths of a rig are in: "m", or "baselines" of one of unknown scale."""
-    return "baselines" if rig.name == UNSCALED else "m"
+    return "baselines" if rig.name in (UNSCALED, ASSUMED) else "m"
 
 
 def baseline_text(cameras: Mapping[str, Any], unit: str = "m") -> str:

@@ -15,8 +15,10 @@ from torch import Tensor
 
 from arraygeom import Rig, View, intrinsics
 from arraygeom.runtime.progress import part, stage
+from arraygeom.runtime.text import OPEN
 from arraygeom.runtime.threads import torch_in_one_thread
 
+from .explanations import Explanation, explain
 from .lenses import describe_lenses
 from .matches import (
     AGREE,
@@ -30,6 +32,7 @@ from .matches import (
     image_sizes,
     line_distance,
     match_cameras,
+    undistort_matches,
     with_map,
 )
 from .refinement import refine_matches
@@ -40,25 +43,32 @@ class UncalibratedRig(NamedTuple):
     """An uncalibrated rig, with statistics of each of its links.
 
     fits: with the points that agree, and how far they are from the rough map. distance: median distance of
-    held-out points from their lines, pixels of beta. by_focal: whether focal lengths were used. matches: all
-    points.
+    held-out points from their lines, pixels of beta. by_focal: whether focal lengths were used. explained:
+    what the points determine. matches: all points.
     """
 
     rig: Rig
     fits: dict[tuple[str, str], FittedLink]
     distance: dict[tuple[str, str], float]
     by_focal: dict[tuple[str, str], bool]
+    explained: dict[tuple[str, str], Explanation]
     matches: dict[tuple[str, str], PointMatches]
 
     def as_text(self) -> str:
         """One line per link, and one on lenses if there are any."""
-        lines = [
-            f"{a} > {b}: {len(fit.matches.alpha)} points, held-out ones {self.distance[a, b]:.2f} px from "
-            f"their lines, all within {fit.displacement:.0f} px of the rough map"
-            + (", with the given focal lengths" if self.by_focal[a, b] else "")
-            for (a, b), fit in self.fits.items()
-        ]
+        lines = [f"{a} > {b}: {self.describe(a, b)}" for a, b in self.fits]
         return "\n".join([*lines, *filter(None, [describe_lenses(self.rig)])])
+
+    def describe(self, a: str, b: str) -> str:
+        """The explanation taken of a link's points and what it leaves open, and how well its lines fit."""
+        explained = self.explained[a, b].as_text(focal_lengths=self.by_focal[a, b])
+        if not self.explained[a, b].has_lines:
+            return explained
+        return (
+            f"{explained}; held-out points {self.distance[a, b]:.2f} px from their lines, all within "
+            f"{self.fits[a, b].displacement:.0f} px of the rough map"
+            + (", with the given focal lengths" if self.by_focal[a, b] else "")
+        )
 
 
 @torch_in_one_thread()
@@ -76,6 +86,7 @@ def rig_from_images(
     MAGSAC++ (Barath et al. 2020), and a rough map. With rough focal lengths, in pixels, of both cameras an
     essential matrix is fitted too, with five degrees of freedom instead of seven: it is used where it fits
     held-out points better. All F are then fitted jointly, with lenses, and accepted on the same condition.
+    Points that one homography explains leave the lines open (`Explanation`): that homography is then the map.
     `matches` of pairs of images are taken in place of those that would be found. Raises ValueError, one line:
     as `match_cameras`, too few points, a focal length of no camera.
     """
@@ -98,9 +109,18 @@ def rig_from_images(
         rig = refined.rig
         _, held_out = split([matched])
         distance |= {names: median_off(rig, {names: m}) for names, m in held_out.items()}
-    fits = {names: with_map(rig.pair(*names), points) for names, points in matched.items()}
+    fits, explained = {}, {}
+    for names, points in matched.items():
+        pair = rig.pair(*names)
+        fits[names] = with_map(pair, points)
+        explained[names] = explain(undistort_matches(pair, points), pair)
+        if not explained[names].has_lines:
+            link = fits[names].link.replace(H=explained[names].H)
+            fits[names] = fits[names]._replace(link=link)
     rig = rig.replace(links={names: fit.link for names, fit in fits.items()})
-    return UncalibratedRig(rig, fits, distance, by_focal, matched)
+    if not all(explanation.has_lines for explanation in explained.values()):
+        rig = rig.replace(name=OPEN)
+    return UncalibratedRig(rig, fits, distance, by_focal, explained, matched)
 
 
 def _fundamental(

@@ -19,15 +19,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from arraygeom import Camera, LensView, Link, Pair, Pose, Rig, View, intrinsics, rotation_from_vector
-from arraygeom.pixels import HW, map_homogeneous
-from arraygeom.robust import cauchy, least_squares, normal_deviation, robust_least_squares
+from arraygeom.pixels import map_homogeneous
 from arraygeom.runtime.text import UNSCALED, angle
 from arraygeom.runtime.threads import torch_in_one_thread
 
 from .lenses import with_lens_of
 from .matches import (
     ENOUGH,
-    LOCALISED,
     Images,
     PointMatches,
     contrast_equalised,
@@ -72,8 +70,6 @@ DENSE_POINTS = 2000
 SPACING = 4
 """Dense points at most, and their least distance, pixels."""
 LEAST_CONFIDENCE = 0.5
-STILL_SHARE = 0.9
-"""The share of points that move as one smooth map does from which on the others may be wrong matches."""
 WELL_LOCALISED = 0.3
 """Largest standard deviation of a dense point, pixels."""
 
@@ -96,15 +92,14 @@ class RefinedPair(NamedTuple):
 def self_calibrated(
     views: Mapping[str, View], link: Link, matches: PointMatches, *, focal: Mapping[str, float]
 ) -> RefinedPair | None:
-    """Alpha and beta, with epipolar lines as near `link`'s as can be; None for points without parallax.
+    """Alpha and beta, with epipolar lines as near `link`'s as can be; None for points that no
+    poses explain.
 
     Alpha is at the origin with the principal point in the middle, and the baseline is 1. `focal` has focal
     lengths in pixels, by camera; others are assumed. Cameras have the lenses of their views; the pair then is
     not `exact`.
     """
     alpha, beta = views
-    if not has_parallax(matches, views[alpha].hw):
-        return None
     lenses = {
         n: view for n, view in views.items() if isinstance(view, LensView) and view.distortion is not None
     }
@@ -135,23 +130,6 @@ def self_calibrated(
     for name, view in lenses.items():
         rig = rig.with_camera(name, with_lens_of(rig[name], view))
     return upright_trial._replace(rig=rig, exact=upright_trial.distance <= best and not lenses)
-
-
-def has_parallax(matches: PointMatches, hw: HW) -> bool:
-    """Whether points of alpha, an image of this size, move as lenses and a rotation do not explain.
-
-    Those move all points by one smooth map, here a cubic one as radial distortion is; so does a plane, whose
-    depths two images of unknown lenses do not determine.
-    """
-    x, y = (2 * (matches.alpha - matches.alpha.new_tensor(hw).flip(0) / 2) / max(hw)).unbind(-1)
-    terms = torch.stack([x**i * y**j for i in range(4) for j in range(4 - i)])
-
-    def weigh(rest: Tensor) -> Tensor:
-        return cauchy(size := rest.norm(dim=-1), normal_deviation(size, LOCALISED))
-
-    start = least_squares(terms, matches.beta, torch.ones_like(x))
-    rest = robust_least_squares(terms, matches.beta, start, weigh).rest
-    return float(rest.norm(dim=-1).quantile(STILL_SHARE)) > LOCALISED
 
 
 @torch_in_one_thread()

@@ -19,7 +19,7 @@ from torch.nn.functional import interpolate
 from arraygeom import Link, Rig, Sensor
 from arraygeom.io.xmp import named_by_band, rig_of_images, states_cameras
 from arraygeom.runtime.progress import log_step, part, stage
-from arraygeom.runtime.text import UNSCALED
+from arraygeom.runtime.text import ASSUMED, OPEN, UNSCALED
 from arraygeom.undistortion import pixels_between
 from calib.images.focal_length import common_focal_length
 from calib.images.from_images import UncalibratedRig, rig_from_images
@@ -74,6 +74,11 @@ class ImageArray:
     weights: str
     match_levels: bool
     notes: tuple[str, ...]
+
+    @property
+    def lasting(self) -> Rig | None:
+        """The rig for other captures of these cameras; None if the images leave its lines and depth open."""
+        return None if self.recorded.name == OPEN else self.recorded
 
 
 def array_from_images(
@@ -255,13 +260,17 @@ def found_rig(
         )
     for name in images.keys() - {alpha, *betas}:
         note(f"{name}: left out, too little in common with {alpha}")
-    observed = {} if lengths.keys() & {alpha, *betas} else _observed_focal_lengths(uncalibrated, alpha, betas)
+    with_lines = [name for name in betas if uncalibrated.explained[alpha, name].has_lines]
+    known = lengths.keys() & {alpha, *betas}
+    observed = {} if known else _observed_focal_lengths(uncalibrated, alpha, with_lines)
     for name, (length, deviation) in observed.items():
         note(
             f"{name}: focal length {length / factors[name]:.0f} pixels +- {deviation:.0%}, by matched points"
         )
     lengths |= {name: length for name, (length, _) in observed.items()}
     rig = _calibrated(uncalibrated, reduced, alpha, betas, lengths, network, note)
+    if rig.name == UNSCALED and known != {alpha, *betas}:
+        rig = rig.replace(name=ASSUMED)
     return resized_rig(rig, images), [alpha, *betas]
 
 
@@ -337,18 +346,16 @@ def _calibrated(
 def _calibrated_pair(
     uncalibrated: UncalibratedRig, alpha: str, name: str, focal: Mapping[str, float], note: Say
 ) -> RefinedPair | None:
-    """Alpha and one beta with poses by their points; None without parallax. What was found is said."""
+    """Alpha and one beta with poses by their points; None without. What they determine and leave open is
+    said."""
     views = {n: uncalibrated.rig[n] for n in (alpha, name)}
     link, matches = uncalibrated.rig.links[alpha, name], uncalibrated.matches[alpha, name]
+    note(f"{alpha} > {name}: {uncalibrated.describe(alpha, name)}")
+    if not uncalibrated.explained[alpha, name].has_lines:
+        return None
     pair = self_calibrated(views, link, matches, focal=focal)
-    if pair is None or not pair.exact:
-        lines = uncalibrated.as_text().splitlines()
-        note(next(line for line in lines if line.startswith(f"{alpha} > {name}")))
     if pair is None:
-        note(
-            f"no depth by {name}: "
-            f"its points show no parallax, beside {alpha} it is too near, or its scene too far or flat"
-        )
+        note(f"no depth by {name}: no poses of it and {alpha} have such lines")
         return None
     exact = f"{pair.points} points, {pair.distance:.2f} px from their lines; refining"
     rough = f"lines by F; depths are rough, by poses whose lines are {pair.distance:.2f} px off"

@@ -5,11 +5,11 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from io import BytesIO
 from pathlib import Path
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -19,9 +19,13 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from arraygeom import Camera, Rig
-from arraygeom.runtime.atomic import write_together
+from arraygeom.io.native import write as rig_text
+from arraygeom.runtime.atomic import alone, write_text
 from arraygeom.runtime.chunks import chunked
+from arraygeom.runtime.file_names import file_names
+from arraygeom.runtime.text import ASSUMED
 from arraygeom.runtime.threads import in_parallel
+from arraygeom.runtime.together import LISTS, refuse_others, write_listed, write_together
 
 from ..media.colour import linear_from_srgb
 from ..media.depth_maps import write_points
@@ -43,9 +47,26 @@ HEALED_RIG = "healed_rig.yaml"
 """A given rig as its images have it."""
 RESULT = re.compile(
     r"(.*_)?((fused|confidence)(_.*)?|depth(_16|_nearest|_farthest)?)\.(png|tif|exr|mp4)"
-    r"|(view|settings)\.yaml|inputs\.json"
+    r"|(view|settings|found_rig|healed_rig)\.yaml|points\.ply|index\.html"
 )
-"""What files are called that a fusion writes or takes away."""
+"""What files are called that a fusion writes."""
+
+
+def fused_group(name: str) -> str:
+    """The group (`write_together`) of a frame's files."""
+    return f"{name}_fused" if name else "fused"
+
+
+def refuse_to_replace(out: Path, names: Iterable[str] = ("",)) -> None:
+    """Raise FileExistsError if frames of these names would replace files in `out` that no run wrote."""
+    names = {*names}
+    found = [(path.name, match[1]) for path in _files(out) if (match := RESULT.fullmatch(path.name))]
+    results = [file for file, prefix in found if (prefix or "").removesuffix("_") in names or not prefix]
+    refuse_others(out, results, group=fused_group(""), by_name=names != {""})
+
+
+def _files(out: Path) -> Iterable[Path]:
+    return out.iterdir() if out.is_dir() else ()
 
 
 def check_no_result(inputs: Iterable[Path], out: Path) -> None:
@@ -67,6 +88,8 @@ def save_frame(
     along: Literal["depth", "distance"] = "depth",
     name: str = "",
     bands: Sequence[str] = (),
+    pages: Mapping[str, str] | None = None,
+    about: Mapping[str, str] | None = None,
 ) -> list[Path]:
     """Write fused.png, confidence.png, depth.tif (metres, float; NaN where unknown), depth_16.png
     (`write_depth`), depth.png (red is near), depth_nearest.tif and depth_farthest.tif (the true depth is
@@ -76,32 +99,35 @@ def save_frame(
     `view`, the rig of alpha alone goes to view.yaml and says so; with `rig`, that of all cameras to
     found_rig.yaml; with `points`, the camera of alpha, the pixels of known depth, which is `along` its axis
     or rays (`measured_along`), go to points.ply. With a `name` the files are name_fused.png and so on.
-    Without any known depth there are no depth files. With `bands`, the names of bands that cameras record one
-    by one, each goes to fused_NAME.png and confidence_NAME.png too; bands without names that are not one or
-    three go to fused_1.png and so on. Of other numbers than one and three fused.png is the mean. The image
-    comes last: where it is, the others are of the same frame, and points.ply, the page index.html and the
-    image in another format of a former one are gone. After an error all former files are as they were.
-    Returns what was written.
+    Without any known depth there are no depth files, and no bounds of it by a view whose focal lengths are
+    assumed. With `bands`, the names of bands that cameras record one by one, each goes to fused_NAME.png and
+    confidence_NAME.png too (NAME by `file_names`); bands without names that are not one or three go to
+    fused_1.png and so on. Of other numbers than one and three fused.png is the mean. `pages` are further text
+    files. All are swapped in together, the image last, and those of a former frame of this name are gone
+    (`write_together`, which keeps `about`). Returns what was written.
+
+    Raises FileExistsError for files in the way that no fusion wrote.
     """
     frame = frame.mapped(lambda tensor: tensor.detach().cpu())
     prefix = f"{name}_" if name else ""
     last = f"{prefix}fused.{kind}"
-    depths = {
-        f"{prefix}depth{suffix}" for suffix in (".tif", ".png", "_16.png", "_nearest.tif", "_farthest.tif")
-    }
-    stale = depths | {f"{prefix}fused.{other}" for other in get_args(ImageFormat)}
-    stale |= set() if name else {"points.ply", "index.html"}
-    with write_together(out, last=last, stale=stale) as folder:
+    if view is not None and name:
+        _write_shared(out / "view.yaml", rig_text(view))
+    with write_together(out, group=fused_group(name), last=last, about=about) as folder:
         confidence = partial(write_image, folder / f"{prefix}confidence.png", frame.confidence[None])
         tasks: list[Callable[[], object]] = [confidence]
         if frame.depth.isfinite().any():
-            for suffix, depth in zip(("", "_nearest", "_farthest"), (frame.depth, *frame.depth_interval)):
+            known = view is None or view.name != ASSUMED
+            bounds = zip(("_nearest", "_farthest"), frame.depth_interval) if known else ()
+            for suffix, depth in (("", frame.depth), *bounds):
                 path = folder / f"{prefix}depth{suffix}.tif"
                 tasks.append(partial(write_image, path, depth[None], bits=32, unknown=True))
             near = float(view.depth[0]) if view is not None and view.depth else None
             tasks.append(partial(write_depth, folder / f"{prefix}depth_16.png", frame.depth, near=near))
             tasks.append(lambda: write_image(folder / f"{prefix}depth.png", colour_depth(frame.depth)))
-        if view is not None:
+        for file, text in (pages or {}).items():
+            write_text(folder / file, text)
+        if view is not None and not name:
             view.save(folder / "view.yaml")
         if rig is not None:
             rig.save(folder / FOUND_RIG)
@@ -109,6 +135,7 @@ def save_frame(
             write_points(folder / "points.ply", points, frame.depth, frame.image, along=along)
         image = linear_from_srgb(frame.image) if bits == 32 else frame.image
         bands = bands or ([] if len(image) in (1, 3) else [str(i + 1) for i in range(len(image))])
+        bands = list(file_names(bands).values()) if len({*bands}) == len(bands) else bands
         for band, values in zip(bands, image):
             write_image(folder / f"{prefix}fused_{band}.{kind}", values[None], bits=bits)
         for band, confidence in zip(bands, () if frame.by_band is None else frame.by_band):
@@ -118,6 +145,14 @@ def save_frame(
         in_parallel(tasks, most=how_many_fit(4 * image.nbytes))
         names = {file.name for file in folder.iterdir()} - {last}
     return [out / last, *(out / file for file in sorted(names, key=lambda name: ("fused" not in name, name)))]
+
+
+def _write_shared(path: Path, text: str) -> None:
+    """Write a text that frames of a batch have in common, each in its own process."""
+    (path.parent / LISTS).mkdir(parents=True, exist_ok=True)
+    with alone(path.parent / LISTS / f"{path.name}.lock", 60):
+        if not path.is_file() or path.read_bytes() != text.encode():
+            write_listed(path, text)
 
 
 def band_names(frame: Frame, betas: Iterable[str]) -> list[str]:
@@ -131,7 +166,10 @@ def describe_bands(frame: Frame, names: Sequence[str], kind: ImageFormat) -> str
     """Which files have a frame's bands, in a line; empty for an ordinary image."""
     if not names and len(frame.image) in (1, 3):
         return ""
-    listed = ", ".join(f"fused_{name}.{kind}" for name in names) or f"fused_1.{kind} and so on"
+    listed = (
+        ", ".join(f"fused_{name}.{kind}" for name in file_names(names).values())
+        or f"fused_1.{kind} and so on"
+    )
     picture = "the three as a picture" if len(frame.image) == 3 else "their mean"
     return f"bands at alpha's view: {listed}; fused.{kind} is {picture}"
 

@@ -102,12 +102,22 @@ class Align(Around, Known):
             images = ViewFiles(array.recorded, one, alpha=array.alpha) if i else array.images
             name = _name_of(files, array.alpha, one)
             yield _Frame(
-                array.rig, array.recorded, images, one, array.alpha, array.notes, name, rig_found=True
+                array.rig,
+                array.recorded,
+                images,
+                one,
+                array.alpha,
+                array.notes,
+                name,
+                rig_found=array.lasting is not None,
             )
 
     def _align(self, frame: _Frame) -> None:
         """Align a frame, and write and say what comes of it."""
-        from ...fusion.aligned_files import save_aligned
+        from arraygeom.io.native import write
+        from arraygeom.runtime.together import sweep, write_listed
+
+        from ...fusion.aligned_files import refuse_to_replace, save_aligned
         from ...fusion.results import FOUND_RIG
         from ...support.locks import folder_lock
 
@@ -116,21 +126,24 @@ class Align(Around, Known):
         with folder_lock(self.out):
             if frame.name:
                 self._refuse_several()
+            sweep(self.out)
+            separate = "separate" in self._extras
+            refuse_to_replace(self.out, frame.recorded.names, separate=separate, name=frame.name)
             aligned = self._aligned(frame)
+            shown = "page" in self._extras and not frame.name
+            page = self._page(aligned, frame, time.monotonic() - begin) if shown else None
             written = save_aligned(
                 aligned,
                 self.out,
-                separate="separate" in self._extras,
+                separate=separate,
                 positions="tif" if "tif" in self._extras else "npy" if "npy" in self._extras else "none",
                 name=frame.name,
                 keep=frame.files.values(),
+                pages={} if page is None else {"index.html": page},
             )
             if frame.rig_found:
-                frame.recorded.save(self.out / FOUND_RIG)
+                write_listed(self.out / FOUND_RIG, write(frame.recorded))
                 written.append(self.out / FOUND_RIG)
-            if "page" in self._extras and not frame.name:
-                self._write_page(aligned, frame, time.monotonic() - begin)
-                written.append(self.out / "index.html")
         prefix = f"{frame.name}_" if frame.name else ""
         print((self.out / f"{prefix}visibility.txt").read_text(), end="")
         say(f"written to {self.out}: {', '.join(path.name for path in written)}")
@@ -166,16 +179,14 @@ class Align(Around, Known):
                 announce=None if frame.name else announce,
             )
 
-    def _write_page(self, aligned: Aligned, frame: _Frame, seconds: float) -> None:
-        """Write index.html."""
-        from arraygeom.runtime.atomic import write_text
-
+    def _page(self, aligned: Aligned, frame: _Frame, seconds: float) -> str:
+        """The page index.html."""
         from ..aligned_page import aligned_page
         from ..report import Facts
 
         texts = [str(message) for message in options.WARNED]
         facts = Facts((*self._notes, *frame.notes), texts, seconds)
-        write_text(self.out / "index.html", aligned_page(aligned, frame.recorded, facts))
+        return aligned_page(aligned, frame.recorded, facts)
 
 
 @dataclass(frozen=True)

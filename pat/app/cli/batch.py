@@ -59,16 +59,20 @@ class Batch(Fusing):
     command: ClassVar[str] = "batch"
 
     def _fuse(self, recordings: Recordings) -> None:
+        from arraygeom.io.native import write
+        from arraygeom.runtime.together import refuse_others, write_listed
+
         from ...fusion.results import FOUND_RIG
 
         if recordings.found is None:
             return self._many(self.judged_rig(recordings))
-        path = self.out / FOUND_RIG
+        path, text = self.out / FOUND_RIG, write(recordings.rig)
+        refuse_others(self.out, [FOUND_RIG])
         if not path.exists():  # frames that fail may want it; another job's is kept until this one is done
-            recordings.rig.save(path)
+            write_listed(path, text)
         say(f"the rig that was found: {path}")
         self._many(recordings)
-        recordings.rig.save(path)
+        write_listed(path, text)
 
     def judged_rig(self, recordings: Recordings) -> Recordings:
         """The recordings with the rig as their first frame healed it."""

@@ -27,15 +27,17 @@ class Demo:
 
     def run(self) -> None:
         """Fuse both arrays, and write and print what each method scores."""
-        from arraygeom.runtime.atomic import write_text
+        from arraygeom.runtime.together import refuse_others, write_listed, write_together
 
-        from ...fusion.results import save_frame
+        from ...fusion.results import refuse_to_replace, save_frame
         from ...networks.weights import load_weights
         from ...support.metrics import score
         from ..demo import as_real_cameras, classical_methods, save_demo_figure
         from ..sample_array import ALPHA, load_motorcycle, load_sample
 
         options.writable(self.out, folder=True)
+        refuse_to_replace(self.out)
+        refuse_others(self.out, ["demo.png", "demo.md"])
         network = load_weights(self.weights)
         sample = load_sample()
         arrays = {
@@ -62,10 +64,11 @@ class Demo:
                     "classical, denoised and corrected": methods["classical, denoised and corrected"],
                     "fusion": methods["fusion"],
                 }
-                save_demo_figure(panels, CORNER, self.out / "demo.png")
+                with write_together(self.out, group="demo.png", last="demo.png") as folder:
+                    save_demo_figure(panels, CORNER, folder / "demo.png")
         table = table_of(columns)
         print(table, end="")
-        write_text(self.out / "demo.md", f"```\n{table}```\n")
+        write_listed(self.out / "demo.md", f"```\n{table}```\n")
         written += [self.out / "demo.png", self.out / "demo.md"]
         say(f"written: {', '.join(map(str, written))}")
 

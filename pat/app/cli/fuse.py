@@ -52,8 +52,8 @@ class Fuse(Around, Fusing):
 
     out: Out = Path("out")
     """Folder for fused.png, confidence.png, depth.tif, depth_16.png (16 bits; 0 is unknown), depth.png,
-    depth_nearest.tif and depth_farthest.tif (the true depth is between them in 9 of 10 pixels), index.html (a
-    page that shows them) and view.yaml (the rig of the fused view)."""
+    depth_nearest.tif and depth_farthest.tif (the true depth is between them in 9 of 10 pixels; not by
+    assumed focal lengths), index.html (a page that shows them) and view.yaml (the rig of the fused view)."""
     exposure: Annotated[Literal["auto", "keep"] | None, Option("{auto,keep}")] = None
     """Brightness of the fused image: auto makes a dark or overexposed one as bright as a photograph; keep
     leaves it as alpha has it. By default auto without a rig, else keep."""
@@ -89,8 +89,9 @@ class Fuse(Around, Fusing):
     def _fuse(self, frame: Recordings) -> None:
         """Fuse the frame and write its files."""
         from arraygeom import Camera
-        from arraygeom.runtime.atomic import sweep
+        from arraygeom.runtime.together import sweep
 
+        from ...fusion.results import refuse_to_replace, save_frame
         from ...fusion.views import ViewFiles
         from ...media.raw import developed_rig
         from ...support.locks import folder_lock
@@ -102,6 +103,7 @@ class Fuse(Around, Fusing):
             )
         with folder_lock(self.out):
             sweep(self.out)
+            refuse_to_replace(self.out)
             images: Mapping[str, Tensor]
             if found is None:
                 views = ViewFiles(frame.rig, frame.first, alpha=alpha)
@@ -112,13 +114,22 @@ class Fuse(Around, Fusing):
             fused, gain = self._exposed(fused, found)
             if found is None and not fused.depth.isfinite().any():
                 self.note("no depth: the rig knows its cameras by F alone, or the images match nowhere")
-            written = self._saved(fused, rig, frame, along=along)
+            further, pages = self._options_of_saving(fused, rig, frame), {}
             if {"page", "classical"} & self._extras:
                 facts = self._facts(rig, () if found is None else found.notes, time.monotonic() - begin)
-                written.append(self._page(fused, rig, images, alpha, facts, gain))
+                pages["index.html"] = self._page(fused, rig, images, alpha, facts, gain)
+            written = save_frame(fused, self.out, along=along, pages=pages, **further)
+            shutil.rmtree(self.tiles, ignore_errors=True)
         say(f"written to {self.out}: {', '.join(path.name for path in written)}")
-        if written[-1].name == "index.html":
-            say(f"to see the result, open {written[-1]} in a browser")
+        if pages:
+            say(f"to see the result, open {self.out / 'index.html'} in a browser")
+
+    @property
+    def tiles(self) -> Path:
+        """The folder of finished tiles, while not all are there."""
+        from arraygeom.runtime.together import LISTS
+
+        return self.out / LISTS / "tiles"
 
     def _fused(
         self, rig: Rig, images: Mapping[str, Tensor], frame: Recordings
@@ -127,7 +138,7 @@ class Fuse(Around, Fusing):
         from ...fusion.inputs import measured_along
         from ...fusion.views import Views
 
-        store, field = self.out / ".tiles", options.field_named(self.field)
+        field = options.field_named(self.field)
         along = measured_along(Views(rig, images, frame.alpha, dict.fromkeys(images, field)))
         rig, around = self.with_known(rig, frame.alpha, frame.first, field)
         settings = self.fuse_settings(noise_by_default=self.luminance in ("alpha", "recorded"))
@@ -139,35 +150,28 @@ class Fuse(Around, Fusing):
             device=self.device,
             settings=replace(settings, field=around),
             explain=self.note,
-            store=store,
+            store=self.tiles,
         )
-        shutil.rmtree(store, ignore_errors=True)
         return fused, along
 
-    def _saved(
-        self, frame: Frame, fused: Rig, recorded: Recordings, *, along: Literal["depth", "distance"]
-    ) -> list[Path]:
-        """Write the files of a frame, and note what some hold."""
-        from ...fusion.results import band_names, describe_bands, save_frame, view_of
+    def _options_of_saving(self, frame: Frame, fused: Rig, recorded: Recordings) -> dict[str, Any]:
+        """Options of `save_frame`; notes what some files will hold."""
+        from ...fusion.results import band_names, describe_bands, view_of
 
         alpha, points = recorded.alpha, "points" in self._extras
         bands = band_names(frame, (name for name in fused.betas(alpha) if name in recorded.files))
-        written = save_frame(
-            frame,
-            self.out,
-            bits=self.bits,
-            kind=self.kind,
-            view=view_of(fused, alpha, bits=self.bits, bands=len(frame.image)),
-            points=fused[alpha] if points else None,
-            along=along,
-            rig=None if recorded.found is None else recorded.rig,
-            bands=bands,
-        )
         if said := describe_bands(frame, bands, self.kind):
             self.note(said)
         if points:
             self.note("points.ply: the pixels of known depth, in alpha's frame")
-        return written
+        return {
+            "bits": self.bits,
+            "kind": self.kind,
+            "view": view_of(fused, alpha, bits=self.bits, bands=len(frame.image)),
+            "points": fused[alpha] if points else None,
+            "rig": None if recorded.found is None else recorded.found.lasting,
+            "bands": bands,
+        }
 
     def _facts(self, rig: Rig, adopted: tuple[str, ...], seconds: float) -> Facts:
         """What the page says."""
@@ -182,17 +186,13 @@ class Fuse(Around, Fusing):
 
     def _page(
         self, frame: Frame, rig: Rig, images: Mapping[str, Tensor], alpha: str, facts: Facts, gain: float
-    ) -> Path:
-        """Write index.html, with the classical baseline if it is asked for."""
-        from arraygeom.runtime.atomic import write_text
-
+    ) -> str:
+        """The page index.html, with the classical baseline if it is asked for."""
         from ..report import report_page
 
         if "classical" in self._extras:
             facts = facts._replace(classical=self._classical(rig, images, alpha, gain))
-        path = self.out / "index.html"
-        write_text(path, report_page(frame, images, rig, alpha, facts))
-        return path
+        return report_page(frame, images, rig, alpha, facts)
 
     def _classical(self, rig: Rig, images: Mapping[str, Tensor], alpha: str, gain: float) -> Tensor | None:
         """The classical baseline, bright as the fused image; None, and a line, if cameras do not allow it."""

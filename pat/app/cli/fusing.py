@@ -159,10 +159,8 @@ class Fusing(Known):
         from ...fusion.results import check_no_result
         from ...media.images import has_many_bits
 
-        check_no_result(
-            [*self.given, *self.known_files(), *(path for paths in files.values() for path in paths)],
-            self.out,
-        )
+        images = (path for paths in files.values() for path in paths)
+        check_no_result([*self.given, *self.known_files(), *images], self.out)
         files = self.frames(files)
         deep = any(has_many_bits(paths[0]) for paths in files.values())
         stated = self.format.removeprefix(self.kind)
@@ -186,6 +184,9 @@ class Fusing(Known):
 
     def healed(self, views: ViewFiles) -> Rig:
         """The rig of views, or the one that these healed, which is written beside the results."""
+        from arraygeom.io.native import write
+        from arraygeom.runtime.together import write_listed
+
         from ...fusion.results import HEALED_RIG
         from ..healing import checked_rig
 
@@ -198,8 +199,7 @@ class Fusing(Known):
         if path.resolve() == self.given[0].resolve():
             self.note(f"the healed rig is not written: {path} is the one that was given: give another --out")
         else:
-            self.out.mkdir(parents=True, exist_ok=True)
-            healed.rig.save(path)
+            write_listed(path, write(healed.rig))
             self.note(f"the healed rig: {path}")
         return healed.rig
 

@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from arraygeom import Distortion, LensView, Pose, Rig, intrinsics, rotation_from_vector
+from arraygeom import Distortion, LensView, Pose, Rig, intrinsics
 from arraygeom.pixels import coarse_grid
 from calib.images import self_calibration
 from calib.images.matches import PointMatches, with_map
@@ -14,7 +14,6 @@ from calib.images.residuals import line_distances
 from calib.images.self_calibration import (
     RefinedPair,
     dense_matches,
-    has_parallax,
     joined,
     refined_by_depth,
     self_calibrated,
@@ -137,18 +136,3 @@ def test_pairs_are_joined_at_their_scales():
     assert rig.names == ("left", "right", "up")
     assert torch.allclose(rig["up"].t, 0.5 * rig["right"].t)
     assert [float(bound) for bound in rig.depth] == [1.5, 8.0]
-
-
-def test_points_that_one_smooth_map_moves_have_no_parallax():
-    """Two lenses at one place had a depth, by how they differ."""
-    one = rectified_pair()["left"]
-    turned = Pose(
-        rotation_from_vector(torch.tensor([0.01, -0.02, 0.03], dtype=torch.float64)), torch.zeros(3).double()
-    )
-    lens = Distortion("brown-conrady", torch.tensor([-0.05, 0.01, 0.0, 0.0], dtype=torch.float64))
-    rig = Rig({"left": one, "right": one.replace(cam_from_world=turned, distortion=lens)})
-    (seen,) = seen_points(rig, noise=0.1, near=1.6, far=7.0).values()
-    assert float((seen.alpha - seen.beta).norm(dim=-1).median()) > 4
-    assert not has_parallax(seen, HW)
-    (apart,) = seen_points(rectified_pair(), noise=0.1, near=1.6, far=7.0).values()
-    assert has_parallax(apart, HW)

@@ -253,11 +253,10 @@ def test_types_that_differ_go_to_files_of_their_own(tmp_path):
 
 
 def test_files_of_a_former_alignment_are_gone(found, tmp_path):
-    save_aligned(found, tmp_path)
-    (tmp_path / "index.html").write_text("its page")
+    save_aligned(found, tmp_path, pages={"index.html": "its page"})
     unknown = replace(found, depth=np.full_like(found.depth, np.nan))
     written = save_aligned(unknown, tmp_path, separate=True, positions="none")
-    assert {path.name for path in written} == {path.name for path in tmp_path.iterdir()}
+    assert {path.name for path in written} == {path.name for path in tmp_path.iterdir() if path.is_file()}
 
 
 def test_a_camera_called_depth_has_no_file_of_its_own(found, tmp_path):
@@ -269,8 +268,31 @@ def test_a_camera_called_depth_has_no_file_of_its_own(found, tmp_path):
     layers = shown_layers(found)
     assert torch.equal(layers["depth"], usual["nir"])
     assert torch.equal(layers["derived depth"], usual["depth"])
-    with pytest.raises(ValueError, match=r"'depth' .*depth\.tif"):
+    with pytest.raises(ValueError, match=r"depth\.tif"):
         save_aligned(found, tmp_path, separate=True)
+
+
+def test_cameras_of_any_name_write_into_the_folder_and_never_share_a_file(found, tmp_path):
+    """They wrote where their names led: beside the folder, and over what was there."""
+    rig, images = array()
+    evil, other, out = "../../evil", str(tmp_path / "evil"), tmp_path / "a" / "b" / "out"
+    rig = Rig({evil: rig["mono"], other: rig["nir"]}, depth=rig.depth)
+    found = align(rig, {evil: images["mono"], other: images["nir"]}, alpha=evil, correct=False)
+    written = save_aligned(found, out, separate=True, name="7")
+    assert {path.parent for path in written} == {out}
+    assert [path for path in tmp_path.rglob("*evil*") if path.parent != out] == []
+    assert len([path for path in written if path.suffix == ".tif"]) == 3
+    views = dict(zip(("x", "x_positions"), found.views.values()))
+    with pytest.raises(ValueError, match=r"x_positions\.tif"):
+        save_aligned(replace(found, alpha="x_positions", views=views), out, separate=True, positions="tif")
+
+
+def test_a_file_of_the_user_is_not_replaced(found, tmp_path):
+    (tmp_path / "depth.tif").write_text("mine")
+    with pytest.raises(FileExistsError, match=r"depth\.tif"):
+        save_aligned(found, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["depth.tif"]
+    assert (tmp_path / "depth.tif").read_text() == "mine"
 
 
 def test_ndvi_needs_both_bands_and_both_views(found):

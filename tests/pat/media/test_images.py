@@ -16,7 +16,8 @@ import tifffile
 import torch
 from PIL import Image, ImageOps
 
-from arraygeom.runtime.atomic import sweep, write_atomically, write_together
+from arraygeom.runtime.atomic import write_atomically
+from arraygeom.runtime.together import sweep, write_together
 from pat.media.colour import from_luma_chroma, luminance, to_luma_chroma
 from pat.media.headers import image_header
 from pat.media.images import decoded_photograph, read_image, read_recorded, write_image
@@ -342,7 +343,8 @@ def test_no_room_is_said_of_the_file_whoever_writes(tmp_path):
     ):
         np.save(temporary, np.zeros(1000))
     said = rf"{re.escape(str(tmp_path))}: not written whole \("
-    with room_for(1000), pytest.raises(OSError, match=said), write_together(tmp_path, last="b.npy") as folder:
+    together = write_together(tmp_path, group="b", last="b.npy")
+    with room_for(1000), pytest.raises(OSError, match=said), together as folder:
         np.save(folder / "b.npy", np.zeros(1000))
     assert os.listdir(tmp_path) == []
 

@@ -59,7 +59,8 @@ def folder(halved, tmp_path_factory):
 
 def test_images_alone_are_fused_about_as_well_as_with_the_rig(halved, folder):
     rig, images, ground_truth = halved
-    assert {path.name for path in (folder / "out").iterdir()} == ALL
+    bounds = {"depth_nearest.tif", "depth_farthest.tif"}  # not by focal lengths that are assumed
+    assert {path.name for path in (folder / "out").glob("*.*")} - {".arraygeom"} == ALL - bounds
     known = fuse(load_weights("mono-colour"), rig, images, alpha="mono")
     with_rig = score(known.image.clamp(0, 1), ground_truth).psnr
     assert score(read_image(folder / "out" / "fused.png"), ground_truth).psnr > with_rig - 0.5
@@ -331,7 +332,7 @@ def test_why_there_is_no_depth_is_said(halved, monkeypatch):
     lines = []
     rig, _ = found_rig(halved[1], "mono", {}, load_weights("mono-colour"), lines.append)
     assert not isinstance(rig["mono"], Camera)
-    assert any(line.startswith("no depth by colour: its points show no parallax") for line in lines)
+    assert any(line.startswith("no depth by colour") for line in lines)
 
 
 def test_depth_is_rough_where_no_poses_fit_as_well_as_lines_alone(halved, monkeypatch):
@@ -354,7 +355,7 @@ def test_depth_is_rough_where_no_poses_fit_as_well_as_lines_alone(halved, monkey
 
 def test_focal_lengths_are_of_the_images_as_given(halved, monkeypatch):
     """Of images that were reduced to find their rig they were taken for those of the reduced ones."""
-    monkeypatch.setattr("pat.app.from_images.MATCHED", 160)
+    monkeypatch.setattr("pat.app.from_images.MATCHED", 240)
     known, images, _ = halved
     focal = {name: float(known[name].K[0, 0]) for name in known.names}
     rig, _ = found_rig(images, "mono", focal, load_weights("mono-colour"), lambda line: None)

@@ -1,0 +1,120 @@
+"""Explanations of the points matched between two images, and what these leave undetermined.
+
+Points that one homography explains, and lenses, which bend images smoothly, fit an F through any epipole:
+those on one plane, those of cameras at one place, however unlike their focal lengths, and those of a scene
+far away (Hartley and Zisserman, section 11.9; Chum, Werner and Matas 2005). Their lines and depth would be an
+arbitrary choice. Where points do move along lines beyond any homography, lines are determined, but lengths
+only as multiples of the baseline, and without focal lengths not the proportions of depth either: the
+bas-relief ambiguity (Belhumeur, Kriegman and Yuille 1999).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from arraygeom import Pair, apply_homography, epipolar_lines
+from arraygeom.pixels import to_homogeneous
+from arraygeom.robust import cauchy, normal_deviation, robust_least_squares
+
+from .matches import LOCALISED, PointMatches
+from .residuals import FEW, displacements
+
+OFF = 4.0
+"""Points are off an explanation by more than this many standard deviations of the points' noise."""
+STEPS = 20
+"""Weightings of the fit of a homography and lenses."""
+
+
+class Explanation(NamedTuple):
+    """The simplest explanation of a pair's points within their noise, and its evidence.
+
+    H: the homography nearest to most points. points: their number. beyond, wrong: how many are off H and
+    smooth lenses along the lines of F, and how many off these lines. noise: standard deviation of the
+    distances from the lines, pixels of beta.
+    """
+
+    H: Float[Tensor, "3 3"]
+    points: int
+    beyond: int
+    wrong: int
+    noise: float
+
+    @property
+    def has_lines(self) -> bool:
+        """Whether the points determine epipolar lines: many move along them, far more than lie off them."""
+        return self.beyond >= max(self.wrong + FEW, 2 * self.wrong)
+
+    def as_text(self, *, focal_lengths: bool = False) -> str:
+        """The explanation that is taken and what it leaves open; with or without known focal lengths."""
+        if not self.has_lines:
+            return (
+                f"one homography explains {self.points - self.beyond} of {self.points} points to "
+                f"{self.noise:.2f} px (one plane, cameras at one place, or all too far): it is taken; open: "
+                "lines and depth"
+            )
+        bas_relief = "" if focal_lengths else ", and the proportions of depth without focal lengths"
+        return (
+            f"{self.beyond} of {self.points} points move along lines beyond one homography: lines are taken; "
+            f"open: scale{bas_relief}"
+        )
+
+
+def explain(matches: PointMatches, pair: Pair) -> Explanation:
+    """Compare one homography with the pair's F, which fits as well, by undistorted points.
+
+    Counted are points that are off the homography along the lines of F, against those off the lines: noise
+    and wrong matches put as many there.
+    """
+    x, y = (points.double() for points in matches)
+    H = _fit_to_most(x, y)
+    line = epipolar_lines(pair.fundamental.to(x), x)
+    line = line / line[:, :2].norm(dim=-1, keepdim=True)
+    distance = ((line[:, :2] * y).sum(-1) + line[:, 2]).abs()
+    along = (_beyond(H, x, y, pair) * torch.stack([-line[:, 1], line[:, 0]], -1)).sum(-1).abs()
+    noise = normal_deviation(distance, LOCALISED / OFF)
+    beyond, wrong = (int((off > OFF * noise).sum()) for off in (along, distance))
+    return Explanation(H, len(x), beyond, wrong, noise)
+
+
+def _fit_to_most(x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"]) -> Float[Tensor, "3 3"]:
+    H = None
+    for method in (cv2.USAC_MAGSAC, 0):
+        H, _ = cv2.findHomography(x.numpy(), y.numpy(), method, 1.0)
+        if H is not None:
+            break
+    return torch.eye(3, dtype=torch.float64) if H is None else torch.from_numpy(H).double()
+
+
+def _beyond(H: Tensor, x: Tensor, y: Tensor, pair: Pair) -> Float[Tensor, "n 2"]:
+    """Displacements of beta's points that no homography near H and no smooth lenses of the views explain."""
+    moved = to_homogeneous(x) @ H.T
+    there, w = moved[:, :2] / moved[:, 2:], moved[:, 2:, None]
+    J = (H[:2, :2] - there[:, :, None] * H[2:, :2]) / w
+    ones = to_homogeneous((x - x.mean(0)) / max(pair.alpha.hw))
+    relative = (there - there.mean(0)) / max(pair.beta.hw)
+    terms = (
+        torch.cat(
+            [
+                torch.stack([ones, 0 * ones], 1),
+                torch.stack([0 * ones, ones], 1),
+                relative[:, :, None] * ones[:, None, :2],
+                displacements(pair.beta.hw, y),
+                J @ displacements(pair.alpha.hw, x),
+            ],
+            -1,
+        )
+        .flatten(0, 1)
+        .T
+    )
+
+    def weigh(rest: Tensor) -> Tensor:
+        size = rest.reshape(-1, 2).norm(dim=-1)
+        return cauchy(size, normal_deviation(size, LOCALISED)).repeat_interleave(2)
+
+    off = (y - apply_homography(H, x).x).flatten()
+    return robust_least_squares(terms, off, terms.new_zeros(len(terms)), weigh, steps=STEPS).rest.view(-1, 2)

@@ -1,0 +1,132 @@
+"""Explanations of matched points: one homography against epipolar lines."""
+
+import pytest
+import torch
+
+from arraygeom import Camera, Distortion, Link, Pair, Pose, Rig, View, intrinsics, rotation_from_vector
+from arraygeom.runtime.text import ASSUMED, OPEN, UNSCALED
+from calib.images.explanations import explain
+from calib.images.from_images import rig_from_images
+from calib.images.matches import PointMatches, fit_fundamental
+from pat.app.cli.main import main
+from pat.fusion.results import Frame, save_frame, view_of
+from pat.media.images import write_image
+from tests.calib.scenes import HW, rectified_pair, seen_points, vector
+
+VGA = (480, 640)
+
+
+def points_of(depth, *, t=(-0.1, 0.0, 0.0), turn=(0, 0.05, 0.02), focal=600.0, noise=0.3, seed=0, count=150):
+    """Points matched between two cameras: pixels of the first, their depths by a function of the rays."""
+    g = torch.Generator().manual_seed(seed)
+    K, K_beta = (intrinsics(f, VGA).double() for f in (600.0, focal))
+    x = torch.rand(count, 2, generator=g).double() * vector(600, 440) + 20
+    rays = torch.cat([x, torch.ones(count, 1).double()], -1) @ torch.linalg.inv(K).T
+    X = rays * depth(rays, g)[:, None]
+    Y = (X @ rotation_from_vector(vector(*turn)).T + vector(*t)) @ K_beta.T
+    y = Y[:, :2] / Y[:, 2:] + noise * torch.randn(count, 2, generator=g).double()
+    inside = ((y > 0) & (y < vector(640, 480))).all(-1)
+    return PointMatches(x[inside], y[inside])
+
+
+def wall(rays, g):
+    return 3 / (rays @ vector(0.2, 0.1, 1.0))
+
+
+def room(rays, g):
+    return 1.5 + 4 * torch.rand(len(rays), generator=g).double()
+
+
+def explained(matches):
+    return explain(matches, Pair(View(hw=VGA), View(hw=VGA), link=Link(fit_fundamental(matches))))
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"depth": wall},
+        {"depth": wall, "count": 3000},
+        {"depth": room, "t": (0.0, 0.0, 0.0), "focal": 1100.0},
+        {"depth": lambda rays, g: 300 * room(rays, g)},
+    ],
+    ids=["plane", "plane, many points", "one place, another zoom", "far"],
+)
+def test_points_of_one_homography_leave_lines_open(change, seed):
+    assert not explained(points_of(**change, seed=seed)).has_lines
+
+
+@pytest.mark.parametrize("wrong", [2, 5])
+def test_a_few_wrong_matches_make_no_lines(wrong):
+    matches = points_of(wall)
+    matches.beta[:wrong] += vector(25.0, 3.0) * torch.linspace(-1, 1.5, wrong).double()[:, None]
+    assert not explained(matches).has_lines
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(
+    "change",
+    [{}, {"t": (0.0, 0.0, -0.3)}, {"turn": (0.0, 0.0, 0.0)}, {"focal": 1000.0}],
+    ids=["aside", "ahead", "parallel", "another zoom"],
+)
+def test_depth_makes_lines(change, seed):
+    assert explained(points_of(room, **change, seed=seed)).has_lines
+
+
+def test_a_few_things_before_a_wall_make_lines():
+    """DEGENSAC's case: most points are on one plane."""
+
+    def mostly_wall(rays, g):
+        return torch.where(torch.arange(len(rays)) % 10 == 0, room(rays, g), wall(rays, g))
+
+    assert explained(points_of(mostly_wall, count=300)).has_lines
+
+
+def test_lenses_are_no_parallax():
+    """Two lenses at one place had a depth, by how they differ."""
+    one = rectified_pair()["left"]
+    turned = Pose(rotation_from_vector(vector(0.01, -0.02, 0.03)), torch.zeros(3).double())
+    lens = Distortion("brown-conrady", vector(-0.05, 0.01, 0.0, 0.0))
+    rig = Rig({"left": one, "right": one.replace(cam_from_world=turned, distortion=lens)})
+    (seen,) = seen_points(rig, noise=0.1, near=1.6, far=7.0).values()
+    pair = Pair(View(hw=HW), View(hw=HW), link=Link(fit_fundamental(seen)))
+    assert float((seen.alpha - seen.beta).norm(dim=-1).median()) > 4
+    assert not explain(seen, pair).has_lines
+
+
+def test_a_rig_of_one_homography_has_it_as_its_map():
+    """The case planar_matches: any F was written, its lines 34 to 80 degrees wrong."""
+    images = {name: torch.zeros(1, *VGA) for name in "ab"}
+    matches = points_of(wall)
+    found = rig_from_images(images, matches={("a", "b"): matches})
+    assert found.rig.name == OPEN
+    assert "lines and depth" in found.as_text()
+    exact = points_of(wall, noise=0.0)
+    moved = torch.cat([exact.alpha, torch.ones(len(exact.alpha), 1)], -1) @ found.rig.links["a", "b"].H.T
+    assert float((moved[:, :2] / moved[:, 2:] - exact.beta).norm(dim=-1).max()) < 0.5
+    assert rig_from_images(images, matches={("a", "b"): points_of(room)}).rig.name != OPEN
+
+
+def test_the_command_says_that_the_file_is_for_these_images(tmp_path, capsys):
+    matches = points_of(wall)
+    rows = "\n".join(",".join(map(str, row)) for row in torch.cat(list(matches), -1).tolist())
+    (tmp_path / "m.csv").write_text(f"x0,y0,x1,y1\n{rows}\n")
+    for name in "ab":
+        write_image(tmp_path / f"{name}.png", torch.rand(1, *VGA))
+    files = [f"--image={name}={tmp_path / name}.png" for name in "ab"]
+    main(["rig", "start", *files, "--matches", str(tmp_path / "m.csv"), "--out", str(tmp_path / "rig.yaml")])
+    said = "".join(capsys.readouterr())
+    assert OPEN in " ".join(said.split())
+    assert not isinstance(Rig.load(tmp_path / "rig.yaml")["a"], Camera)
+
+
+def test_depth_has_no_bounds_where_focal_lengths_are_assumed(tmp_path):
+    """They were stated as if the focal lengths were known: 123 to 156 baselines of a skyline."""
+    rig = rectified_pair()
+    depth = torch.full((16, 16), 3.0)
+    frame = Frame(torch.rand(3, 16, 16), depth, depth / 3, 0.01 * depth)
+    for name, bounds in ((UNSCALED, True), (ASSUMED, False)):
+        view = view_of(rig.replace(name=name), "left", bits=8)
+        written = {path.name for path in save_frame(frame, tmp_path / name[-5:], view=view)}
+        assert "depth.tif" in written
+        assert ({"depth_nearest.tif", "depth_farthest.tif"} <= written) == bounds
