@@ -51,10 +51,12 @@ class Batch(Fusing):
         for option, count in {"--workers": self.workers, "--threads": self.threads}.items():
             if count is not None and count < 1:
                 raise UsageError(option, "1 or more", count)
+        image, with_rig = self.named(self.command)
         from arraygeom.runtime.threads import limited_to
 
-        with self.judged(), limited_to(self.threads), self.recordings(self.command) as recordings:
-            self._fuse(recordings)
+        with self.judged(), limited_to(self.threads):
+            with self.recordings(image, with_rig=with_rig) as recordings:
+                self._fuse(recordings)
 
     command: ClassVar[str] = "batch"
 

@@ -69,8 +69,9 @@ class Fuse(Around, Fusing):
         extras = self._extras = {*self.extras.split(",")}
         if unknown := extras - {*EXTRAS}:
             raise UsageError("--extras", f"some of {', '.join(EXTRAS)}", min(unknown))
+        image, with_rig = self.named("fuse")
         options.device_of(self.device)
-        with self.judged(), self.recordings("fuse") as frame:
+        with self.judged(), self.recordings(image, with_rig=with_rig) as frame:
             self._fuse(frame)
 
     def known_files(self) -> list[Path]:

@@ -86,9 +86,14 @@ class Fusing(Known):
         """The rig with what the command line says of its clocks."""
         return rig
 
+    def named(self, command: str) -> tuple[tuple[str, ...], bool]:
+        """The images NAME=FILE of a rig's cameras, and whether there is a rig. Raises as `named_images`."""
+        return named_images(self.given, self.image, command)
+
     @contextmanager
-    def recordings(self, command: str) -> Iterator[Recordings]:
-        """The images with the rig that is given, or with one that is found from them; all weights are chosen.
+    def recordings(self, image: Sequence[str], *, with_rig: bool) -> Iterator[Recordings]:
+        """The images (of `named`) with the rig that is given, or with one that is found from them; all weights
+        are chosen.
 
         Raises ValueError for options that do not go together, before images are read.
         """
@@ -96,7 +101,6 @@ class Fusing(Known):
             from ...media.images import exr_writer
 
             exr_writer(self.out)
-        image, with_rig = named_images(self.given, self.image, command)
         self.fuse_settings()
         if with_rig:
             yield self._with_rig(image)

@@ -14,9 +14,9 @@ import sys
 import textwrap
 import types
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, is_dataclass, replace
-from functools import cache, partial
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
@@ -223,7 +223,7 @@ def _number(kind: Callable[[str], Any], name: str, text: str) -> Any:
         raise argparse.ArgumentTypeError(f"expected {name}, got '{text}'") from None
 
 
-def _entries(kind: Any, base: Any, before: str = "") -> typing.Iterator[_Entry]:
+def _entries(kind: Any, base: Any, before: str = "") -> Iterator[_Entry]:
     """The options of a class or function, those of dataclasses in it by dotted names."""
     hints = typing.get_type_hints(kind, include_extras=True)
     if not is_dataclass(kind):
@@ -231,6 +231,7 @@ def _entries(kind: Any, base: Any, before: str = "") -> typing.Iterator[_Entry]:
             default = MISSING if parameter.default is parameter.empty else parameter.default
             yield _Entry(name, hints[name], default, "")
         return
+    docs = field_docs(kind)
     for field in dataclasses.fields(kind):
         made = field.default_factory
         default = field.default if made is MISSING else made()
@@ -238,17 +239,14 @@ def _entries(kind: Any, base: Any, before: str = "") -> typing.Iterator[_Entry]:
         if is_dataclass(default) and not isinstance(default, type):
             yield from _entries(type(default), default, f"{before}{field.name}.")
         elif field.init:
-            yield _Entry(
-                before + field.name, hints[field.name], default, field_docs(kind).get(field.name, "")
-            )
+            yield _Entry(before + field.name, hints[field.name], default, docs.get(field.name, ""))
 
 
-@cache
 def field_docs(kind: Any) -> dict[str, str]:
     """The docstrings that follow a dataclass's fields, and those of the classes it is made from."""
     docs: dict[str, str] = {}
     for parent in reversed(kind.__mro__):
-        if not is_dataclass(parent):
+        if parent is object:
             continue
         (body,) = ast.parse(textwrap.dedent(inspect.getsource(parent))).body
         statements = typing.cast(ast.ClassDef, body).body

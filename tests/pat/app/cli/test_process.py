@@ -87,7 +87,7 @@ REFUSED = {
     "fuse --alpha": "--alpha",
     "rig info r a=A": "--image",
     "lab evaluate --rates x": "--rates",
-    "rig convert a": "target",
+    "rig convert a": "OUT",
 }
 
 
