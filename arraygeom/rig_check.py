@@ -76,7 +76,8 @@ def lens_end(name: str, camera: LensView) -> str | None:
     if isinstance(camera.distortion, Distortion) and camera.distortion.model == BROWN_CONRADY:
         refit = ", as at a pole or a fold of its formula; fit one without: `pat rig convert --refit`"
     where = f"ends {covered.degrees:.1f} degrees off the axis" if covered.share else "covers nothing"
-    return f"the lens model of '{name}' {where}: {100 * (1 - covered.share):.0f} % of its image is not used{refit}"
+    unused = 100 * (1 - covered.share)
+    return f"the lens model of '{name}' {where}: {unused:.0f} % of its image is not used{refit}"
 
 
 def file_oddities(rig: Rig) -> list[str]:

@@ -176,7 +176,7 @@ GEOMETRY_MAY_USE = {
     "atomic.py": {"filelock"},
     "compiled.py": {"numba"},
     "opencv.py": {"cv2"},
-    "image_bytes.py": {"tifffile"},
+    "image_bytes.py": {"kornia_rs", "PIL", "tifffile"},
     "matfile.py": {"scipy"},
     "viz.py": {"matplotlib"},
     "xmp.py": {"PIL"},

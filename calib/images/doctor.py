@@ -33,7 +33,7 @@ from .matches import (
     match_cameras,
 )
 from .parameters import SIGMA
-from .residuals import image_parts, line_distances, related
+from .residuals import image_parts, line_distances, related, within_lenses
 
 LOG = logging.getLogger(__name__)
 
@@ -70,7 +70,8 @@ class Diagnosis:
     before, after: statistics of the given rig and of the repaired one. tried: of all, best first. matches:
     number of points used. healthy: the given rig fits the images. certain: all explanations that are
     as good as the one named are undone by the same rig. depth: bounds of the points' depth, as of
-    `depth_seen`, by the rig named, if that states no depth range.
+    `depth_seen`, by the rig named, if that states no depth range. beyond: points left out, where a lens model
+    of the given rig has ended.
     """
 
     named: Hypothesis
@@ -82,6 +83,7 @@ class Diagnosis:
     healthy: bool
     certain: bool
     depth: tuple[float, float] | None = None
+    beyond: int = 0
 
     @property
     def verdict(self) -> str:
@@ -107,6 +109,11 @@ class Diagnosis:
         """The verdict, and the statistics before and after, as text."""
         unit = length_unit(self.named.rig)
         lines = [self.verdict, f"as given: {self.before.as_text(unit)}"]
+        if self.beyond:
+            lines.append(
+                f"{self.beyond} of {self.beyond + self.matches} points lie where a lens model has ended, "
+                "and are left out: `pat rig info` says where, `pat rig convert --refit` fits a lens anew"
+            )
         if self.named.kind != "nothing":
             lines.append(f"repaired: {self.after.as_text(unit)}")
         lines.append(f"from {self.matches} points seen in two images")
@@ -159,6 +166,8 @@ def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnos
     """`diagnose` from matched points of images of these sizes."""
     pairs = {names: _thinned(matches) for names, matches in related(rig, pairs).items()}
     fits = all(rig[name].hw == hw for name, hw in sizes.items())
+    found = sum(len(matches.alpha) for matches in pairs.values())
+    pairs = within_lenses(rig, pairs) if fits else pairs
     tried = hypotheses(rig, sizes)
     if fits:
         tried += [*_ignored_lens(rig, pairs), *_degrees(rig, pairs), *_depth_range(rig, pairs)]
@@ -183,7 +192,8 @@ def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnos
         before=fit[given],
         after=fit[named],
         tried={h: fit[h] for h in table},
-        matches=sum(len(matches.alpha) for matches in pairs.values()),
+        matches=(kept := sum(len(matches.alpha) for matches in pairs.values())),
+        beyond=found - kept,
         healthy=healthy,
         certain=named is not given and all(_same_rig(named.rig, h.rig, pairs) for h in others),
         depth=depth_seen(named.rig, pairs) if named.rig.depth is None else None,

@@ -54,9 +54,9 @@ class Batch(Fusing):
         image, with_rig = self.named(self.command)
         from arraygeom.runtime.threads import limited_to
 
-        with self.judged(), limited_to(self.threads):
-            with self.recordings(image, with_rig=with_rig) as recordings:
-                self._fuse(recordings)
+        found = self.recordings(image, with_rig=with_rig)
+        with self.judged(), limited_to(self.threads), found as recordings:
+            self._fuse(recordings)
 
     command: ClassVar[str] = "batch"
 

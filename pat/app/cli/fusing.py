@@ -92,8 +92,7 @@ class Fusing(Known):
 
     @contextmanager
     def recordings(self, image: Sequence[str], *, with_rig: bool) -> Iterator[Recordings]:
-        """The images (of `named`) with the rig that is given, or with one that is found from them; all weights
-        are chosen.
+        """The images (of `named`) with the rig that is given, or with one that is found; weights are chosen.
 
         Raises ValueError for options that do not go together, before images are read.
         """

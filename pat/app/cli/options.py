@@ -16,6 +16,7 @@ from tempfile import TemporaryFile
 from threading import Lock
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
+from ...support.folders import printable
 from .parser import Option, UsageError
 
 if TYPE_CHECKING:
@@ -299,7 +300,7 @@ def warn(message: Warning | str, *_: Any, **__: Any) -> None:
 
 def say(text: object, style: str | None = None) -> None:
     """Print a line on standard error."""
-    console().print(f"{text}", style=style, markup=False, soft_wrap=True)
+    console().print(printable(f"{text}"), style=style, markup=False, emoji=False, soft_wrap=True)
 
 
 def progress(title: str) -> Callable[[Iterable[T], int], Iterable[T]]:
@@ -326,7 +327,10 @@ def working(title: str) -> Iterator[Callable[[str], None]]:
 
     from ...support.steps import steps_shown
 
-    title_column, step_column = TextColumn("{task.description}"), TextColumn("{task.fields[step]}")
+    title_column, step_column = (
+        TextColumn(text, markup=False) for text in ("{task.description}", "{task.fields[step]}")
+    )
+    title = printable(title)
     columns = SpinnerColumn(), title_column, TimeElapsedColumn(), step_column
     terminal, printed = console().is_terminal, time.monotonic()
     with Progress(*columns, console=console(), transient=True, disable=not terminal) as bar:

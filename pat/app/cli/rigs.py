@@ -237,7 +237,7 @@ def print_tables(cameras: Sequence[CameraSummary], pairs: Sequence[PairSummary],
         further = share, _two(p.length, " - "), _two(p.depth_step, " - ")
         of_pairs.add_row(f"{p.alpha} > {p.beta}", f"{p.baseline:.4g}", f"{p.rotation:.2f}", *further)
     for table in (of_cameras, of_lenses, of_pairs)[: 2 + bool(pairs)]:
-        Console().print(table)
+        Console(markup=False, emoji=False).print(table)
 
 
 def _two(values: tuple[float, float] | None, between: str = ", ") -> str:

@@ -231,6 +231,11 @@ def command_line(arguments: list[str], prog: str = "pat lab train") -> TrainConf
     base = TrainConfig()
     if arguments and not arguments[0].startswith("-"):
         base, arguments = load_config(arguments[0]), arguments[1:]
+        if ":" in base.field and not any(base.field in a.split("=") for a in arguments):
+            raise ValueError(
+                f"field: {base.field} is code, which a recipe alone does not run: if you trust it, "
+                f"add --field {base.field}"
+            )
     description = (
         "Train weights on scenes made from photographs while training. RECIPE is a YAML file or one of\n"
         f"{', '.join(recipes())}; the options below change it.\n\n"

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from arraygeom import Distortion, Link, Pose, Rig, View, triangulate
+from arraygeom import Camera, Distortion, Link, Pose, Rig, View, triangulate
 from arraygeom.lenses import PolynomialFisheye
 from arraygeom.runtime.text import UNSCALED
 from calib.images.doctor import diagnose, diagnose_matches
 from calib.images.hypotheses import TRANSPOSE, hypotheses, on_cameras, swap
 from calib.images.least_squares import most_probable
+from calib.images.matches import PointMatches
 from calib.images.parameters import UNCERTAIN, apply_change, free_parameters
 from calib.images.residuals import sampson_of_pairs
 from pat.app.cli.main import main
@@ -320,3 +321,33 @@ def test_a_rig_without_a_depth_range_is_told_one():
     assert 0.8 * near < found.depth[0] < found.depth[1] < 1.3 * far
     assert f"--depth {found.depth[0]:.3g} {found.depth[1]:.3g}" in found.as_text()
     assert json.loads(found.as_json())["depth"] == list(found.depth)
+
+
+def test_points_beyond_the_end_of_a_lens_count_for_nobody():
+    """A factory lens with a pole within its image: points beyond do not make its rig 1000 px off."""
+    c = [-9.2, 65.3, 0, 0, -87.72, -9.278, 65.55, -87.83]
+    K = torch.tensor([[808.0, 0, 640], [0, 808, 400], [0, 0, 1]], dtype=torch.float64)
+    lens = Distortion("brown-conrady", torch.tensor(c, dtype=torch.float64))
+    left = Camera(K=K, cam_from_world=Pose.identity(), hw=(800, 1280), distortion=lens)
+    right = left.replace(cam_from_world=Pose(torch.eye(3).double(), torch.tensor([-0.075, 0, 0]).double()))
+    rig = Rig({"left": left, "right": right})
+    g = torch.Generator().manual_seed(0)
+    depth = 1 + 3 * torch.rand(1500, generator=g, dtype=torch.float64)
+    xy = (torch.rand(1500, 2, generator=g, dtype=torch.float64) - 0.5) * torch.tensor([1.5, 0.9])
+    X = torch.cat([xy, torch.ones(1500, 1)], -1) * depth[:, None]
+
+    def seen(camera: Camera) -> torch.Tensor:
+        """The formula's pixels, of points beyond the pole too."""
+        x = (X + camera.t)[:, :2] / X[:, 2:]
+        u = x.square().sum(-1, keepdim=True)
+        k1, k2, _, _, k3, k4, k5, k6 = c
+        x = x * (1 + u * (k1 + u * (k2 + u * k3))) / (1 + u * (k4 + u * (k5 + u * k6)))
+        return x * 808 + K[:2, 2] + 0.05 * torch.randn(x.shape, generator=g, dtype=torch.float64)
+
+    points = PointMatches(seen(left), seen(right))
+    inside = left.contains(points.alpha) & right.contains(points.beta)
+    inside &= (xy.norm(dim=-1) > 0.72) | (torch.rand(1500, generator=g) < 0.1)
+    found = diagnose_matches(rig, sizes(rig), {("left", "right"): points.only(inside)})
+    assert found.healthy
+    assert found.beyond > 50
+    assert f"{found.beyond} of" in found.as_text()
