@@ -167,7 +167,7 @@ def test_published_matrices_are_brought_to_our_pixels(data):
 
 def test_a_file_without_the_matrices_is_named(tmp_path):
     (tmp_path / "f.json").write_text('{"pillow": {}}')
-    with pytest.raises(ValueError, match=r"f\.json: wanted 3x3 matrices F1"):
+    with pytest.raises(ValueError, match=r"f\.json: "):
         published_matrices(tmp_path / "f.json")
 
 

@@ -15,7 +15,7 @@ from .parser import Option, UsageError
 
 
 @dataclass
-class Batch(Fusing):
+class FuseBatch(Fusing):
     """Fuse many frames of an array, one by one: folders, or quoted patterns, of each camera's images.
 
     Examples:

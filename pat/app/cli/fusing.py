@@ -87,7 +87,12 @@ class Fusing(Known):
         return rig
 
     def named(self, command: str) -> tuple[tuple[str, ...], bool]:
-        """The images NAME=FILE of a rig's cameras, and whether there is a rig. Raises as `named_images`."""
+        """The images NAME=FILE of a rig's cameras, and whether there is a rig. Raises as `named_images`, and
+        ImportError for a format that cannot be written."""
+        if self.kind == "exr":
+            from ...media.images import exr_writer
+
+            exr_writer(self.out)
         return named_images(self.given, self.image, command)
 
     @contextmanager
@@ -96,10 +101,6 @@ class Fusing(Known):
 
         Raises ValueError for options that do not go together, before images are read.
         """
-        if self.kind == "exr":
-            from ...media.images import exr_writer
-
-            exr_writer(self.out)
         self.fuse_settings()
         if with_rig:
             yield self._with_rig(image)

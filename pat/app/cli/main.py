@@ -41,8 +41,8 @@ class Pat:
 
     commands: ClassVar[Mapping[str, Any]] = {
         "fuse": fuse.Fuse,
-        "batch": batch.Batch,
-        "sequence": sequence.Sequence,
+        "batch": batch.FuseBatch,
+        "sequence": sequence.FuseSequence,
         "align": align.Align,
         "show": rigs.Show,
         "explore": rigs.Explore,

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from collections.abc import Sequence as List
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from . import options
-from .batch import Batch
+from .batch import FuseBatch
 from .fusing import Files, Recordings, with_sensor
 from .options import Numbers, Out
 from .parser import Option, UsageError
@@ -19,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class Sequence(Batch):
+class FuseSequence(FuseBatch):
     """Fuse frames in order of time into frames at alpha's view and a video; cameras may be unsynchronised.
 
     Examples:
@@ -32,7 +31,7 @@ class Sequence(Batch):
 
     headings: ClassVar[Mapping[str, str]] = {
         "time": "frame_rate time_offset speed propagate video",
-        **Batch.headings,
+        **FuseBatch.headings,
     }
     command: ClassVar[str] = "sequence"
 
@@ -56,7 +55,7 @@ class Sequence(Batch):
         warn_of_gaps(files)
         return files
 
-    def refuse_videos(self, videos: List[Path]) -> None:
+    def refuse_videos(self, videos: Sequence[Path]) -> None:
         """Videos are sequences."""
 
     def timed(self, rig: Rig) -> Rig:

@@ -17,7 +17,7 @@ from torch.nn.functional import avg_pool2d
 from arraygeom import Camera, Pose, Rig, Sensor, View
 from experiments.evaluation.paper import with_found_rig
 from pat import fuse, load_weights
-from pat.app.cli.sequence import Sequence
+from pat.app.cli.sequence import FuseSequence
 from pat.app.from_images import ImageArray, array_from_images, camera_names, found_rig
 from pat.app.sample_array import load_sample
 from pat.fusion.results import Frame, save_frame
@@ -261,7 +261,7 @@ def test_the_rate_that_is_asked_for_is_that_of_the_video(
         "pat.app.from_images.frames_of_videos", lambda *_: (files, {"mono": 12.0, "colour": 24.0})
     )
     monkeypatch.setattr("pat.media.images.has_many_bits", lambda path: False)
-    command = Sequence(given=(Path("mono.mp4"), Path("colour.mp4")), out=tmp_path, **options)
+    command = FuseSequence(given=(Path("mono.mp4"), Path("colour.mp4")), out=tmp_path, **options)
     with monkeypatch.context() as patched:
         patched.setattr("pat.app.cli.fusing.named_images", lambda *_: ((), False))
         command.run()
@@ -317,7 +317,7 @@ def test_a_wrong_rig_is_refused_before_the_work_with_the_doctors_verdict(
     rig.replace(cameras=wrong).save(tmp_path / "wrong.yaml")
     files = images(folder, *rig.names)
     with pytest.raises(SystemExit) as stop:
-        pat(f"fuse {tmp_path / 'wrong.yaml'} --alpha mono {files} --strict -o {tmp_path / 'out'}")
+        pat(f"fuse {tmp_path / 'wrong.yaml'} --alpha mono {files} --misfit refuse -o {tmp_path / 'out'}")
     assert stop.value.code == 3
     text = " ".join(capsys.readouterr().err.split())
     assert "behind the cameras or outside the depth range" in text
