@@ -42,17 +42,10 @@ from arraygeom.runtime.together import (
 )
 
 from ..fusion.checks import confidence_checked
+from ..fusion.frame import Frame
 from ..fusion.frames import ImageFiles
-from ..fusion.fuse import FuseSettings, fuse
-from ..fusion.results import (
-    Frame,
-    ImageFormat,
-    band_names,
-    fused_group,
-    refuse_to_replace,
-    save_frame,
-    view_of,
-)
+from ..fusion.fuse import FuseSettings, fuse_frame
+from ..fusion.results import ImageFormat, band_names, fused_group, refuse_to_replace, save_frame, view_of
 from ..fusion.sequence import KeyColour, SequenceFusion, readable
 from ..fusion.timeline import KeyFrame
 from ..fusion.views import ViewFiles
@@ -91,7 +84,7 @@ class Batch:
     weights: str = "mono-colour"
     sequence: bool = False
     speed: float | None = None
-    settings: FuseSettings = FuseSettings()  # noqa: RUF009
+    settings: FuseSettings = FuseSettings()
     bits: int = 8
     kind: ImageFormat = "png"
     alone: bool = False
@@ -303,7 +296,8 @@ class Batch:
         if not self.sequence:
             images = ViewFiles(self.rig, {n: files[i] for n, files in self.files.items()}, alpha=self.alpha)
             network = _network(self.weights, precision=self.precision)
-            return fuse(network, images.developed, images, alpha=self.alpha, settings=self.settings)
+            how: dict[str, Any] = {"alpha": self.alpha, "network": network, "settings": self.settings}
+            return fuse_frame(images, images.developed, **how)
         fusion = self.fusion
         return fusion.alone(i) if self.alone else fusion.frame(i, fusion.timeline.key_frames(), self._fetch)
 

@@ -20,7 +20,7 @@ from arraygeom import Camera, Rig
 from arraygeom.runtime.threads import in_parallel
 from arraygeom.viz import COLOURS, frustum, frustum_size
 
-from ..fusion.results import Frame, picture_of
+from ..fusion.frame import Frame, picture_of
 from ..media.colour import to_bytes
 from ..media.figures import colour_depth, reduced
 from ..support.memory import how_many_fit

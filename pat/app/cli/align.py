@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
@@ -155,26 +155,20 @@ class Align(Around, Known):
 
     def _aligned(self, frame: _Frame) -> Aligned:
         """The frame aligned, with the plan and a bar on the terminal."""
-        from ...fusion.align import align
         from ...fusion.aligned_files import RecordedFiles
+        from ..front import align
 
-        settings = self.settings()
         rig, field = self.with_known(frame.rig, frame.alpha, frame.files, None)
         with options.working_by_plan(f"aligning {frame.name}".strip()) as announce:
             return align(
-                rig,
                 frame.images,
+                rig,
                 alpha=frame.alpha,
+                settings=replace(self.settings(align=self.correct), field=field),
                 recorded=RecordedFiles(frame.recorded, frame.files),
-                field=field,
                 interpolation=self.interpolation,
                 min_confidence=self.confidence,
                 fill=self.fill,
-                max_memory=settings.max_memory,
-                match_levels=settings.match_levels,
-                response=settings.response,
-                correct=self.correct,
-                noise=settings.noise,
                 explain=lambda line: self.note(f"{frame.name}: {line}" if frame.name else line),
                 announce=None if frame.name else announce,
             )

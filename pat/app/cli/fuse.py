@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from arraygeom import Rig
     from arraygeom.runtime.chunks import Tile
 
-    from ...fusion.results import Frame
+    from ...fusion.frame import Frame
     from ..from_images import ImageArray
     from ..report import Facts
 
@@ -232,8 +232,8 @@ def fuse_with_progress(
     **further: Any,
 ) -> Frame:
     """`fuse` with weights by name, the plan and a bar on the terminal. The frame is on the CPU."""
-    from ...fusion.fuse import fuse
     from ...networks.weights import load_weights
+    from ..front import fuse
 
     where = options.device_of(device)
     network = load_weights(weights).to(where)
@@ -241,7 +241,7 @@ def fuse_with_progress(
         rig, images = rig.to(where), {name: image.to(where) for name, image in images.items()}
     options.say_when_compiling()
     with options.working_by_plan("fusing") as announce:
-        frame = fuse(network, rig, images, progress=_numbered, announce=announce, **further)
+        frame = fuse(images, rig, network=network, progress=_numbered, announce=announce, **further)
     return frame.mapped(lambda tensor: tensor.cpu())
 
 

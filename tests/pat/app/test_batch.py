@@ -19,8 +19,8 @@ from arraygeom.runtime.together import LISTS
 from pat.app.batch import KEYS, PLAN, Batch, find_images, fuse_one
 from pat.app.from_images import frames_of_videos
 from pat.fusion.checks import LowConfidenceWarning
+from pat.fusion.frame import Frame
 from pat.fusion.fuse import FuseSettings
-from pat.fusion.results import Frame
 from pat.media.images import read_image, write_image
 from pat.media.raw import LIGHT
 from pat.media.video import write_video

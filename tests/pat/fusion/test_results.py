@@ -8,7 +8,8 @@ import tifffile
 import torch
 from PIL import Image, ImageCms
 
-from pat.fusion.results import Frame, depth_scale, refuse_to_replace, save_frame, write_depth
+from pat.fusion.frame import Frame
+from pat.fusion.results import depth_scale, refuse_to_replace, save_frame, write_depth
 from pat.media.images import read_image
 from tests.processes import room_for
 

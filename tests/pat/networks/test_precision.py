@@ -7,7 +7,7 @@ from inspect import unwrap
 import pytest
 import torch
 
-from pat import fuse
+from pat import FuseSettings, fuse
 from pat.app.sample_array import load_sample
 from pat.networks.weights import load_weights, set_precision
 from pat.support.metrics import score
@@ -17,9 +17,15 @@ def test_a_precision_changes_the_image_little_and_something():
     if not torch.cpu._is_avx512_bf16_supported():
         pytest.skip("this processor does not multiply bfloat16")
     sample = load_sample()
-    frame = {"alpha": "mono", "align": False, "response": "rec601"}
+    settings = FuseSettings(align=False, response="rec601")
     exact, rounded = (
-        fuse(load_weights("mono-colour", precision=p), sample.rig, sample.images, **frame)
+        fuse(
+            sample.images,
+            sample.rig,
+            alpha="mono",
+            network=load_weights("mono-colour", precision=p),
+            settings=settings,
+        )
         for p in ("float32", "bfloat16")
     )
     apart = (exact.image - rounded.image).abs()

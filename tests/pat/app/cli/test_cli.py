@@ -517,7 +517,7 @@ def test_an_alpha_in_colour_and_a_beta_without_are_said(small, capsys):
 
 
 def test_a_bad_out_is_found_before_the_fusion(small, refusal, monkeypatch):
-    monkeypatch.setattr("pat.fusion.fuse.fuse", lambda *_, **__: pytest.fail("fused"))
+    monkeypatch.setattr("pat.app.front.fuse", lambda *_, **__: pytest.fail("fused"))
     (small / "out").write_text("a file")
     assert "out: cannot write there (" in refusal(*arguments(small))
     folders = arguments(small, mono=f"{small}/mon*.png", extra=["--out", "/proc/out"])
@@ -528,7 +528,7 @@ def test_a_bad_out_is_found_before_the_fusion(small, refusal, monkeypatch):
 @pytest.mark.parametrize("name", ["fused.png", "depth.png", "1_fused.png", "fused_red.png"])
 def test_images_that_results_would_replace_are_refused(small, name, refusal, monkeypatch):
     """A colour image that was called fused.png was overwritten by the result."""
-    monkeypatch.setattr("pat.fusion.fuse.fuse", lambda *_, **__: pytest.fail("fused"))
+    monkeypatch.setattr("pat.app.front.fuse", lambda *_, **__: pytest.fail("fused"))
     (small / "out").mkdir()
     given = (small / "colour.png").rename(small / "out" / name)
     assert f"{name}: is called as a result" in refusal(*arguments(small, colour=given))
