@@ -72,14 +72,19 @@ def command_paths(group: Any = Pat, before: tuple[str, ...] = ()) -> Iterator[tu
 def main(arguments: list[str] | None = None, *, group: Any = Pat, prog: str = "pat") -> None:
     """Run `pat`, or another group. Errors in what was given: a line on standard error and exit status 2."""
     arguments = sys.argv[1:] if arguments is None else arguments
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:  # closed: the next file that is opened would take its place
+            setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115
     try:
         try:
             _run([a for a in arguments if a != "--debug"], group, prog, debug="--debug" in arguments)
         finally:
             sys.stdout.flush()
-    except BrokenPipeError:
+    except OSError as error:  # of the flush
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(141)
+        if not isinstance(error, BrokenPipeError):
+            say(f"pat: standard output: {error.strerror}", style="red")
+        sys.exit(141 if isinstance(error, BrokenPipeError) else 2)
 
 
 def _run(arguments: list[str], group: Any, prog: str, *, debug: bool) -> None:

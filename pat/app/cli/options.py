@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -304,7 +304,8 @@ def warn(message: Warning | str, *_: Any, **__: Any) -> None:
 
 def say(text: object, style: str | None = None) -> None:
     """Print a line on standard error."""
-    console().print(printable(f"{text}"), style=style, markup=False, emoji=False, soft_wrap=True)
+    with suppress(OSError):  # the work goes on where nothing can be said, as on a full disk
+        console().print(printable(f"{text}"), style=style, markup=False, emoji=False, soft_wrap=True)
 
 
 def progress(title: str) -> Callable[[Iterable[T], int], Iterable[T]]:

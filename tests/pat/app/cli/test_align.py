@@ -11,9 +11,10 @@ import torch
 from PIL import Image
 
 from arraygeom import Rig
-from pat.app.from_images import _tagged_rig, camera_names
+from pat.app.from_images import _tagged_rig, array_from_images, camera_names
 from pat.media.profiles import srgb_profile
 from tests.arraygeom.test_xmp import FISHEYE, PERSPECTIVE, image_of
+from tests.calib.scenes import texture
 from tests.pat.app.cli.test_known import FAR, NEAR, ON_POST, H, W, folder  # noqa: F401
 from tests.pat.commands import images, pat
 
@@ -162,6 +163,30 @@ def capture(tmp_path):
 def test_captures_that_do_not_go_together(capture, tmp_path, refusal, options, message):
     assert message in refusal("align", *capture(**options), "-o", tmp_path / "out")
     assert not (tmp_path / "out" / "aligned.tif").exists()
+
+
+def test_a_flights_bands_have_no_parallax(tmp_path):
+    """Far ground: tags state lenses, no poses; one homography is the map, here of a rotation."""
+    ground = (texture((300, 400), seed=1)[0].numpy() * 60000).astype(np.uint16)
+    tags = {**PERSPECTIVE, "PrincipalPoint": "0.6,0.45", "PerspectiveDistortion": "-0.01,0,0,0,0"}
+    K = np.array([[1466.667, 0, 180], [0, 1466.667, 140], [0, 0, 1]])
+    A = K @ cv2.Rodrigues(np.array([0.003, -0.004, 0.02]))[0] @ np.linalg.inv(K)
+    moved = cv2.warpPerspective(ground, A, (400, 300), flags=cv2.INTER_CUBIC)
+    shown = {"Green": ground[20:260, 20:340], "NIR": moved[20:260, 20:340]}
+    for i, (band, image) in enumerate(shown.items()):
+        path = image_of(tmp_path / f"IMG_{i}.tif", {**tags, "BandName": band}, hw=image.shape)
+        with tifffile.TiffFile(path) as file:
+            offset = file.pages[0].dataoffsets[0]
+        with path.open("r+b") as file:
+            file.seek(offset)
+            file.write(image.astype("<u2").tobytes())
+    found = array_from_images([tmp_path / "IMG_0.tif", tmp_path / "IMG_1.tif"], alpha="green")
+    H = found.rig.links["green", "nir"].H
+    x = torch.tensor([[100.0, 80, 1], [200, 150, 1]], dtype=torch.float64) @ H.T
+    wanted = torch.from_numpy(np.array([[120.0, 100, 1], [220, 170, 1]]) @ A.T)
+    wanted = wanted[:, :2] / wanted[:, 2:] - 20
+    assert float((x[:, :2] / x[:, 2:] - wanted).norm(dim=-1).max()) < 0.5
+    assert found.rig["nir"].distortion is not None
 
 
 def test_translations_that_will_be_found_are_not_asked_for(capture):
