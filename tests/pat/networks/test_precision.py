@@ -1,4 +1,4 @@
-"""Convolutions in bfloat16, and in 8 bits."""
+"""Convolutions in bfloat16."""
 
 import copy
 import pickle
@@ -10,7 +10,6 @@ import torch
 from pat import FuseSettings, fuse
 from pat.app.sample_array import load_sample
 from pat.networks.weights import load_weights, set_precision
-from pat.support import eight_bits
 from pat.support.metrics import score
 
 
@@ -50,20 +49,12 @@ def test_a_copy_of_a_network_in_bfloat16_computes_with_its_own_weights():
 
 
 def test_a_precision_that_there_is_not_is_refused():
-    with pytest.raises(ValueError, match=r"precision is 'float16'.*float32"):
+    with pytest.raises(ValueError, match="precision"):
         unwrap(load_weights)("mono-colour", precision="float16")
-
-
-def test_weights_without_ranges_and_processors_without_8_bits_refuse_them(monkeypatch):
-    with pytest.raises(ValueError, match="state no ranges" if torch.cpu._is_vnni_supported() else "float32"):
-        load_weights("mono-colour", precision="int8")
-    monkeypatch.setattr(eight_bits, "available", lambda: False)
-    with pytest.raises(ValueError, match=r"8-bit integers.*float32"):
-        load_weights("mono-colour", precision="int8")
 
 
 def test_a_processor_without_bfloat16_refuses_it(monkeypatch):
     monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: False)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    with pytest.raises(ValueError, match=r"bfloat16.*float32"):
+    with pytest.raises(ValueError, match="bfloat16"):
         load_weights("mono-colour", precision="bfloat16")
