@@ -21,8 +21,22 @@ from arraygeom.runtime.threads import torch_in_one_thread
 
 from .depth_change import relative_change
 from .evidence import SCALES, DriftEvidence, FitStatistics, fit_statistics, observations
-from .hypotheses import SHIFTS, TURNS, Hypothesis, from_degrees, hypotheses, ignored_lens, in_degrees
+from .hypotheses import (
+    SHIFTS,
+    TURNS,
+    Hypothesis,
+    focal_length_of,
+    from_degrees,
+    hypotheses,
+    ignored_lens,
+    implausible,
+    in_degrees,
+    is_plausible,
+    is_short,
+    zoomed,
+)
 from .matches import (
+    ENOUGH,
     Images,
     Pairs,
     PointMatches,
@@ -32,7 +46,7 @@ from .matches import (
     image_sizes,
     match_cameras,
 )
-from .parameters import SIGMA
+from .parameters import LARGEST_CHANGE, SIGMA
 from .residuals import image_parts, line_distances, related
 
 LOG = logging.getLogger(__name__)
@@ -41,6 +55,12 @@ MOST = 250
 """Largest number of matches used of a pair."""
 HEALTHY_MISFIT = 0.2
 """A rig with a smaller misfit than this, in pixels, is healthy."""
+USUAL_MISFIT = 0.0015
+"""And so is one with a smaller misfit than this share of the image's longer side that no mistake explains."""
+FOCAL_SHARES, FOCAL_SHARE = (0.3, 3.0), 1.2
+"""Focal lengths that are tried, as shares of the image's longer side; of equal ones that nearest to this."""
+OF_SIZES = ("resized", "focal length")
+"""Mistakes that an image's size shows, though lines may not."""
 EQUAL = (1.4, 0.03)
 """Explanations are equal whose misfit is less than 1.4 times the best one's plus 0.03 px."""
 LARGEST_REMAINDER = (0.33, 0.2)
@@ -68,9 +88,9 @@ class Diagnosis:
     named: the mistake, with the repaired rig; or that of kind "nothing": no mistake explains the images
     clearly better than a drift of the cameras does. equal: other kinds of mistake that explain them as well.
     before, after: statistics of the given rig and of the repaired one. tried: of all, best first. matches:
-    number of points used. healthy: the given rig fits the images. certain: all explanations that are
-    as good as the one named are undone by the same rig. depth: bounds of the points' depth, as of
-    `depth_seen`, by the rig named, if that states no depth range.
+    number of points used. beyond: of others, which lie where a lens model has no rays. healthy: the given rig
+    fits the images. certain: all explanations that are as good as the one named are undone by the same rig.
+    depth: bounds of the points' depth, as of `depth_seen`, by the rig named, if that states no depth range.
     """
 
     named: Hypothesis
@@ -79,6 +99,7 @@ class Diagnosis:
     after: FitStatistics
     tried: Mapping[Hypothesis, FitStatistics]
     matches: int
+    beyond: int
     healthy: bool
     certain: bool
     depth: tuple[float, float] | None = None
@@ -89,8 +110,13 @@ class Diagnosis:
         others = "; or: ".join(hypothesis.words for hypothesis in self.equal)
         if self.named.kind != "nothing":
             return f"likely mistake: {self.named.words}" + (f"; or: {others}" if others else "")
-        if self.healthy:
+        if self.healthy and self.before.misfit < HEALTHY_MISFIT:
             return "nothing wrong: the points lie on their lines to the accuracy of their positions"
+        if self.healthy:
+            return (
+                f"healthy: none of the usual mistakes, and {self.before.misfit:.2f} px off these images, as "
+                "factory calibrations are; `pat rig refine` may bring the lines nearer"
+            )
         if self.before.misfit < HEALTHY_MISFIT:  # of the rig's own oddities, where lines say nothing
             words = (
                 "none of the usual mistakes: the points lie on their lines, but behind the cameras, outside "
@@ -109,7 +135,10 @@ class Diagnosis:
         lines = [self.verdict, f"as given: {self.before.as_text(unit)}"]
         if self.named.kind != "nothing":
             lines.append(f"repaired: {self.after.as_text(unit)}")
-        lines.append(f"from {self.matches} points seen in two images")
+        beyond = (
+            f"; {self.beyond} more lie beyond the lenses' domains and do not count" if self.beyond else ""
+        )
+        lines.append(f"from {self.matches} points seen in two images{beyond}")
         if self.depth is not None:
             near, far = (f"{bound:.3g}" for bound in self.depth)
             lines.append(
@@ -128,6 +157,7 @@ class Diagnosis:
             "as_good": [{"mistake": h.kind, "words": h.words} for h in self.equal],
             "healthy": self.healthy,
             "matches": self.matches,
+            "beyond_lenses": self.beyond,
             "depth": self.depth,
             "before": _rounded(self.before),
             "after": _rounded(self.after),
@@ -157,24 +187,38 @@ def diagnose(rig: Rig, images: Images, matches: Pairs | None = None) -> Diagnosi
 
 def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnosis:
     """`diagnose` from matched points of images of these sizes."""
-    pairs = {names: _thinned(matches) for names, matches in related(rig, pairs).items()}
     fits = all(rig[name].hw == hw for name, hw in sizes.items())
+    pairs = related(rig, pairs)
+    every = sum(len(matches.alpha) for matches in pairs.values())
+    pairs = _within_lenses(rig, pairs) if fits else pairs
+    beyond = every - sum(len(matches.alpha) for matches in pairs.values())
+    pairs = {names: _thinned(matches) for names, matches in pairs.items()}
     tried = hypotheses(rig, sizes)
     if fits:
         tried += [*_ignored_lens(rig, pairs), *_degrees(rig, pairs), *_depth_range(rig, pairs)]
+        tried += _zoomed(rig, pairs)
     LOG.info("trying %d mistakes on %d pairs", len(tried), len(pairs))
     fit, inliers, noise = fit_statistics(tried, pairs)
     misfit = {h: f.penalised_misfit for h, f in fit.items()}
     given = named = tried[0]
     table = sorted(tried if fits else tried[1:], key=lambda h: misfit[h])
-    healthy = fits and misfit[given] < HEALTHY_MISFIT
+    odd = implausible(rig) if fits else []
+    by_size = [h for h in table if odd and h.kind in OF_SIZES and is_plausible(h.rig, odd)]
+    by_size = [h for h in by_size if misfit[h] <= EQUAL[0] * misfit[given] + EQUAL[1]]
+    healthy = fits and misfit[given] < HEALTHY_MISFIT and not by_size
     as_good: list[Hypothesis] = []
     if not fits:
         as_good = [h for h in table if misfit[h] <= EQUAL[0] * misfit[table[0]] + EQUAL[1]]
         named = min(as_good, key=tried.index)
     elif not healthy:
-        LOG.info("comparing the mistakes that leave least with a drift")
-        named, as_good = _by_evidence(misfit, table, pairs, inliers, noise, mirrored=fit[given].handed < 0.5)
+        if not misfit[given] < HEALTHY_MISFIT:
+            LOG.info("comparing the mistakes that leave least with a drift")
+            mirrored = fit[given].handed < 0.5
+            named, as_good = _by_evidence(misfit, table, pairs, inliers, noise, mirrored=mirrored)
+        if named is given and by_size:
+            named, as_good = min(by_size, key=lambda h: _far_from_range(h, fit[h].depth)), by_size
+        usual = USUAL_MISFIT * max(max(hw) for hw in sizes.values())
+        healthy = named is given and not as_good and misfit[given] < usual
     equal = {h.kind: h for h in reversed(as_good) if h.kind != named.kind}
     others = (h for h in as_good if h is not named)
     return Diagnosis(
@@ -184,6 +228,7 @@ def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnos
         after=fit[named],
         tried={h: fit[h] for h in table},
         matches=sum(len(matches.alpha) for matches in pairs.values()),
+        beyond=beyond,
         healthy=healthy,
         certain=named is not given and all(_same_rig(named.rig, h.rig, pairs) for h in others),
         depth=depth_seen(named.rig, pairs) if named.rig.depth is None else None,
@@ -268,6 +313,45 @@ def _ignored_lens(rig: Rig, pairs: Pairs) -> list[Hypothesis]:
         k1, step = candidates[best], candidates[1] - candidates[0]
         lowest, highest = k1 - step, k1 + step
     return [ignored_lens(rig, bare, k1)]
+
+
+def _within_lenses(rig: Rig, pairs: Pairs) -> Pairs:
+    """The points where both lenses have rays; all of a pair where too few are left."""
+    kept = {}
+    for names, matches in pairs.items():
+        pair = rig.pair(*names)
+        valid = pair.alpha.undistort(matches.alpha)[1] & pair.beta.undistort(matches.beta)[1]
+        kept[names] = matches.only(valid) if int(valid.sum()) >= ENOUGH else matches
+    return kept
+
+
+def _far_from_range(hypothesis: Hypothesis, depth: float) -> float:
+    """By what factor, as a logarithm, the points' median depth is from the middle of the depth range."""
+    if hypothesis.rig.depth is None or not (depth > 0 and float(hypothesis.rig.depth[0]) > 0):
+        return 0.0
+    near, far = (float(bound) for bound in hypothesis.rig.depth)
+    return abs(math.log(depth) - math.log(near * min(far, 100 * near)) / 2)
+
+
+def _zoomed(rig: Rig, pairs: Pairs) -> list[Hypothesis]:
+    """The focal lengths that fit best: of one camera, or of all that cannot be in pixels."""
+    names = [name for name in cameras_of(rig, pairs) if isinstance(rig[name], Camera)]
+    short = [name for name in names if is_short(rig[name])]
+    found = []
+    for group in [short] if short else [[name] for name in names]:
+        length, side = focal_length_of(rig[group[0]]), max(rig[group[0]].hw)
+        low, high = (math.log(share * side / length) for share in FOCAL_SHARES)
+        for _ in range(3):
+            factors = torch.linspace(low, high, 25, dtype=torch.float64).exp().tolist()
+            off = observations([zoomed(rig, group, factor).rig for factor in factors], pairs).off
+            off = off.abs().median(1).values
+            equal = [f for f, o in zip(factors, off) if o <= EQUAL[0] * off.min() + EQUAL[1]]
+            best = min(equal, key=lambda f: abs(math.log(f * length / (FOCAL_SHARE * side))))
+            step = (high - low) / 24
+            low, high = math.log(best) - step, math.log(best) + step
+        if abs(math.log(best)) > LARGEST_CHANGE * SIGMA["focal"]:
+            found.append(zoomed(rig, group, best))
+    return found
 
 
 def _degrees(rig: Rig, pairs: Pairs) -> list[Hypothesis]:
