@@ -51,6 +51,8 @@ class Rig(Batched):
         object.__setattr__(
             self, "cameras", {name: _view(name, camera) for name, camera in self.cameras.items()}
         )
+        if odd := [name for name in self.cameras if not name.isprintable()]:
+            raise ValueError(f"the camera {odd[0]!a} has a name that cannot be printed: rename it")
         if self.depth is not None:
             if not isinstance(self.depth, Sequence | Tensor) or len(self.depth) != 2:
                 raise TypeError(f"depth is {self.depth!r}: wanted (near, far), in metres")

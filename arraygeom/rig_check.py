@@ -10,7 +10,9 @@ from torch import Tensor
 
 from .camera import Camera, LensView, View
 from .checks import derived
+from .distortion import BROWN_CONRADY, Distortion
 from .fields.default import recorded_field
+from .lens_fit import coverage
 from .pair import Pair
 from .pixels import HW, coarse_grid, map_homogeneous
 from .rig import Rig
@@ -26,8 +28,8 @@ DECENTRED = 0.1
 of another image: exchanging the sides of a 4:3 image moves the middle by 0.18, halving the image by 0.3."""
 LEAST_DISPARITY = 0.5
 """Pixels that matches move from near to far below which depth is not seen."""
-COVERED = 0.5
-"""Share of an image below which its lens model hardly covers it."""
+COVERED = 0.995
+"""Share of an image below which it is said where its lens model ends."""
 OFF_BACK = 0.05
 """Pixels by which projecting a pixel's ray may miss it: lenses in float32 do by thousandths."""
 MOST_CAMERAS = 16
@@ -63,6 +65,26 @@ def unit_oddity(rig: Rig) -> str | None:
             "and read as millimetres? Then read it by `arraygeom.io.read_rig(path, scale=1000)`"
         )
     return None
+
+
+def lens_end(name: str, camera: LensView) -> str | None:
+    """The sentence on a lens model that ends within its image; None if it covers it."""
+    covered = coverage(camera)
+    if camera.distortion is None or covered.share >= COVERED:
+        return None
+    refit = ": check the coefficients"
+    if isinstance(camera.distortion, Distortion) and camera.distortion.model == BROWN_CONRADY:
+        refit = ", as at a pole or a fold of its formula; fit one without: `pat rig convert --refit`"
+    where = f"ends {covered.degrees:.1f} degrees off the axis" if covered.share else "covers nothing"
+    unused = 100 * (1 - covered.share)
+    return f"the lens model of '{name}' {where}: {unused:.0f} % of its image is not used{refit}"
+
+
+def file_oddities(rig: Rig) -> list[str]:
+    """The sentences that reading a rig's file warns of: its unit, lenses that fold within their images."""
+    views = [(name, camera) for name, camera in rig.cameras.items() if isinstance(camera, LensView)]
+    ends = [lens_end(*view) for view in views if getattr(view[1].distortion, "model", None) == BROWN_CONRADY]
+    return [sentence for sentence in (unit_oddity(rig), *ends) if sentence is not None]
 
 
 def _all(rig: Rig) -> Iterator[str]:
@@ -135,9 +157,8 @@ def _of_lens(name: str, camera: LensView) -> Iterator[str]:
     directions, has_ray = lens.unproject(points)
     back, has_image = lens.project(lens.origins(points) + directions)
     valid = has_ray & has_image
-    share = float(valid.double().mean())
-    if share < COVERED:
-        yield f"the lens model of '{name}' covers {100 * share:.0f} % of its image: check the coefficients"
+    if not bool(valid.all()) and (ends := lens_end(name, camera)):
+        yield ends
     off = ((back - points) @ camera.K[:2, :2].mT).norm(dim=-1)
     off = torch.where(valid, off, 0.0)
     if not bool((off <= OFF_BACK).all()):

@@ -9,8 +9,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .camera import Camera
+from .camera import Camera, LensView
+from .distortion import Distortion
 from .fields import Curved, Epipolar, sampling_locations
+from .lens_fit import coverage
 from .pair import Pair
 from .pixels import coarse_grid, pixel_grid
 from .rig import Rig
@@ -19,13 +21,20 @@ from .segments import Segments
 
 
 class CameraSummary(NamedTuple):
-    """One camera. `field_of_view` (across, down), degrees; footprints: millimetres a pixel, near and far."""
+    """One camera. `field_of_view` (across, down), degrees; footprints: millimetres a pixel, near and far.
+
+    lens: its model's name, None for a pinhole; coefficients: their numbers, none for models of surfaces.
+    covered: share of the image whose pixels have a ray through the lens.
+    """
 
     name: str
     wh: tuple[int, int]
     field_of_view: tuple[float, float] | None
     focal: tuple[float, float] | None
     footprint: tuple[float, float] | None
+    lens: str | None
+    coefficients: tuple[float, ...]
+    covered: float
 
 
 class PairSummary(NamedTuple):
@@ -73,14 +82,18 @@ def summarise_pairs(rig: Rig, alpha: str | None = None) -> list[PairSummary]:
 def _camera(name: str, rig: Rig) -> CameraSummary:
     camera = rig[name]
     h, w = camera.hw
+    lens = camera.distortion if isinstance(camera, LensView) else None
+    c = tuple(lens.coefficients.tolist()) if isinstance(lens, Distortion) else ()
+    covered = coverage(camera).share if isinstance(camera, LensView) else 1.0
+    of_lens = (None if lens is None else lens.model, c, covered)
     if not isinstance(camera, Camera):
-        return CameraSummary(name, (w, h), None, None, None)
+        return CameraSummary(name, (w, h), None, None, None, *of_lens)
     focal = (float(camera.K[0, :2].norm()), float(camera.K[1, :2].norm()))
     footprint = None
     if rig.depth is not None:
         near, far = (float(1000 * d / math.sqrt(focal[0] * focal[1])) for d in rig.depth)
         footprint = near, far
-    return CameraSummary(name, (w, h), field_of_view(camera), focal, footprint)
+    return CameraSummary(name, (w, h), field_of_view(camera), focal, footprint, *of_lens)
 
 
 def field_of_view(camera: Camera) -> tuple[float, float]:

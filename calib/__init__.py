@@ -19,3 +19,17 @@ def _lazy(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
         return getattr(import_module(f"{package}.{modules[name]}"), name)
 
     return get
+
+
+__all__ = ["boards", "images"]
+
+
+def __getattr__(name: str) -> Any:
+    """The two packages, imported on first use."""
+    if name not in __all__:
+        raise AttributeError(f"module 'calib' has no attribute '{name}'")
+    return import_module(f"calib.{name}")
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -37,9 +37,10 @@ from calib.images.matches import seen_depths
 from calib.images.refinement import EXTRA_FREE, FREE, refine
 from experiments.evaluation.halves import of_half
 from experiments.names import refuse_unknown
+from pat import FuseSettings, align
 from pat.app.aligned_page import shown_layers
 from pat.app.from_images import array_from_images, camera_names
-from pat.fusion.align import LEAST_CONFIDENCE, SEEN, Aligned, align, resampled_values
+from pat.fusion.align import LEAST_CONFIDENCE, SEEN, Aligned, resampled_values
 from pat.fusion.aligned_files import RecordedFiles
 from pat.fusion.steps import without_lenses
 from pat.fusion.views import ViewFiles
@@ -136,11 +137,11 @@ def evaluate_alignment(data: Path, out: Path, names: Sequence[str], *, each: Cal
 def aligned_scene(scene: AlignmentScene, min_confidence: float = LEAST_CONFIDENCE) -> Aligned:
     """Its bands at the pixels of alpha."""
     return align(
-        scene.rig,
         scene.images,
+        scene.rig,
         alpha=scene.alpha,
+        settings=FuseSettings(match_levels=scene.match_levels),
         recorded=scene.recorded,
-        match_levels=scene.match_levels,
         min_confidence=min_confidence,
     )
 

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from arraygeom import Rig, pixel_grid, sample
-from pat.fusion.results import Frame
+from pat.fusion.frame import Frame
 from pat.media.colour import linear_from_srgb, luminance, srgb_from_linear
 from pat.media.raw import light_of
 

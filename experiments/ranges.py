@@ -19,6 +19,7 @@ import tyro
 from experiments.evaluation.commands import finished
 from experiments.evaluation.conditions import CONDITIONS
 from experiments.evaluation.halves import of_half
+from pat.fusion.fuse import FuseSettings
 from pat.lab.data.pairs import StereoPair, middlebury_pairs
 from pat.lab.evaluation.protocols import rectified_fusion
 from pat.lab.evaluation.tables import markdown_table
@@ -79,7 +80,9 @@ def psnr(network: Network, pair: StereoPair, name: str) -> float:
     task = condition.recorded(pair)
     noise = None if condition.noise is None else dict.fromkeys(("alpha", "beta"), condition.noise)
     assert pair.max_disparity is not None
-    fused = rectified_fusion(network, noise=noise)(task.alpha, task.beta, pair.max_disparity)
+    fused = rectified_fusion(network, settings=FuseSettings(noise=noise))(
+        task.alpha, task.beta, pair.max_disparity
+    )
     return score(fused.image, task.ground_truth).psnr
 
 

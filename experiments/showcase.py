@@ -19,8 +19,8 @@ from arraygeom import HomographyDisplacement, Rig, View, apply_homography, pixel
 from arraygeom.runtime.atomic import write_text
 from calib.images.matches import FittedLink, fit_link, line_distance, match_points, near_lines, seen_depths
 from experiments.evaluation.halves import of_half
+from pat import FuseSettings, fuse
 from pat.fusion.classical import classical
-from pat.fusion.fuse import fuse
 from pat.fusion.steps import resolution_ratio
 from pat.lab.evaluation.protocols import BASELINES, rectified_fusion
 from pat.lab.evaluation.stereo import (
@@ -119,7 +119,7 @@ def syntim_scene(folder: Path, name: str) -> SyntimScene:
 def _syntim(network: FusionNetwork, scene: SyntimScene, out: Path) -> str:
     name, rig, left, right = scene
     images = {"left": luminance_of(left), "right": right}
-    frame = fuse(network, rig, images, alpha="left")
+    frame = fuse(images, rig, alpha="left", network=network)
     results = {
         "alpha": images["left"].expand(3, -1, -1),
         "classical": classical(rig, images, "left", "right"),
@@ -158,7 +158,13 @@ class FastSlowArray(NamedTuple):
 
 def _fast_and_slow(network: FusionNetwork, array: FastSlowArray, out: Path) -> str:
     field = HomographyDisplacement(array.displacement)
-    frame = fuse(network, array.rig, array.images, alpha=FAST, field=field, match_levels=True)
+    frame = fuse(
+        array.images,
+        array.rig,
+        alpha=FAST,
+        network=network,
+        settings=FuseSettings(field=field, match_levels=True),
+    )
     shown = {"alpha: the fast camera": array.images[FAST]}
     shown |= {f"beta: {name}": array.images[name] for name in SLOW}
     shown |= {"betas by the rough homography alone": transformed(array), "fusion": frame.image}

@@ -20,10 +20,12 @@ from arraygeom import Rig
 from arraygeom.runtime.atomic import write_text
 from experiments.hdr import merged, missed, tone_curve, usable_range
 from experiments.names import refuse_unknown
+from pat import fuse
 from pat.fusion.classical import classical_baseline
+from pat.fusion.frame import Frame
 from pat.fusion.frames import ImageFiles
-from pat.fusion.fuse import FuseSettings, fuse
-from pat.fusion.results import Frame, save_frame, view_of
+from pat.fusion.fuse import FuseSettings
+from pat.fusion.results import save_frame, view_of
 from pat.fusion.sequence import SequenceFusion
 from pat.fusion.views import ViewFiles
 from pat.lab.evaluation.tables import markdown_table
@@ -184,7 +186,7 @@ def _still(recorded: Recorded) -> tuple[list[str], Panels]:
     alpha, ground_truth = rig.names[0], recording.ground_truth[0]
     views = ViewFiles(rig, {name: paths[0] for name, paths in files.items()}, alpha=alpha)
     read, images = views.developed, dict(views)
-    frame = fuse(network, read, images, alpha=alpha, max_memory=max_memory)
+    frame = fuse(images, read, alpha=alpha, network=network, settings=FuseSettings(max_memory=max_memory))
     save_frame(frame, out, bits=16, view=view_of(read, alpha, bits=16))
     baseline = classical_baseline(read, images, alpha)
     if len(images) == 2:
@@ -338,7 +340,7 @@ def _permuted(
     betas = rig.betas(alpha)
     order = [2, 0, 1]
     permuted = rig.replace(cameras={n: rig[n] for n in (alpha, *(betas[i] for i in order))})
-    other = fuse(network, permuted, images, alpha=alpha).image
+    other = fuse(images, permuted, alpha=alpha, network=network).image
     same, before = (
         score(other.clamp(0, 1), image.clamp(0, 1)).psnr for image in (frame.image[order], frame.image)
     )

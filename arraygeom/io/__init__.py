@@ -7,6 +7,7 @@ paragraph that begins "Source convention:".
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Mapping
 from importlib import import_module
 from pathlib import Path
@@ -15,10 +16,12 @@ from typing import Any
 import torch
 
 from ..camera import Camera, LensView
+from ..distortion import COEFFICIENT_COUNTS
 from ..pixels import HW
 from ..rig import Rig
-from ..rig_check import unit_oddity
-from ..runtime.atomic import sweep, write_text, write_together
+from ..rig_check import file_oddities
+from ..runtime.atomic import write_text
+from ..runtime.together import sweep, write_together
 from ..runtime.warned import warn
 from ..sensor import Sensor
 from . import kitti
@@ -27,8 +30,8 @@ from .source import RigFileError, RigFileWarning, RigSource, UnknownRigFormat, d
 
 FORMATS = (
     *("colmap", "opencv", "kalibr", "boofcv", "ros", "native", "bouguet", "matlab", "kitti-raw", "kitti"),
-    *("middlebury", "syntim", "nerfstudio", "multical", "aniposelib", "pycalib", "strecha", "open3d"),
-    *("metashape", "xmp", "luxonis", "mrcal", "lensboy", "realsense", "zed"),
+    *("middlebury", "syntim", "nerfstudio", "multical", "aniposelib", "strecha", "open3d"),
+    *("metashape", "xmp", "luxonis", "mrcal", "lensboy", "realsense", "zed", "azure", "pycalib"),
 )
 """Each a module, in the order in which they are asked whether they recognise a file."""
 READERS: dict[str, Any] = {
@@ -37,6 +40,17 @@ READERS: dict[str, Any] = {
 ANY_SCALE = ("colmap", "nerfstudio", "pycalib", "strecha")
 """Formats that state no unit: their lengths are metres only if whoever wrote the file scaled them so."""
 READERS["caliscope"] = READERS["aniposelib"]
+LIKELY = {
+    r"Camera\d?\.fx|Camera\.type": "ORB-SLAM's settings, whose numbers are not read as a rig",
+    r"T_cn_cnm1|cam_overlaps|rostopic": "Kalibr: wanted cam0, cam1, ... with intrinsics",
+    r"(?i)opencv|FileStorage|camera_?matrix": "OpenCV: wanted !!opencv-matrix entries, as FileStorage has",
+    r"(?i)distortion_model|camera_info|camera_model": "ROS or Kalibr: wanted camera_matrix, K, or cam0",
+    r"(?i)<(calibration|photogroup|BlocksExchange|Cameras)\b": "Agisoft, ContextCapture or RealityCapture: "
+    "export cameras as Agisoft XML with a chunk, or as COLMAP",
+    r"(?i)\[(left|right|stereo)|\bbaseline\b": "a stereo camera's own settings",
+    r"(?i)fisheye|distort|focal|intrinsic": "some tool for cameras",
+}
+"""Formats that a file that no reader recognises is likely of, by words in it."""
 WRITERS = {name: READERS[name] for name in ("native", "opencv", "colmap", "kalibr", "nerfstudio")}
 
 __all__ = [
@@ -50,11 +64,20 @@ __all__ = [
 ]
 
 
-def read_rig(path: str | Path, *, format: str | None = None, scale: float = 1.0, hw: HW | None = None) -> Rig:
+def read_rig(
+    path: str | Path,
+    *,
+    format: str | None = None,
+    scale: float = 1.0,
+    hw: HW | None = None,
+    lens: str | None = None,
+) -> Rig:
     """The rig of a file (or folder, for formats of several files); its format is recognised unless named.
 
     `scale` multiplies all lengths, for files in another unit than their format's. `hw` is the images'
-    (height, width), for formats that do not state it. Suspicious but readable values give a RigFileWarning.
+    (height, width), and `lens` the model of the coefficients, for files that do not state them. Suspicious
+    but readable values, and entries that look like a lens, a flag or a unit and are not read, give a
+    RigFileWarning.
     Raises RigFileError, which names the file and the entry; FileNotFoundError; ValueError for an unknown
     format.
     """
@@ -66,9 +89,11 @@ def read_rig(path: str | Path, *, format: str | None = None, scale: float = 1.0,
     format = recognise(path) if format is None else format
     if format not in READERS:
         raise ValueError(f"unknown rig format '{format}' (known: {', '.join(READERS)})")
-    reader = READERS[format]
+    if lens is not None and lens not in COEFFICIENT_COUNTS:
+        raise ValueError(f"unknown lens model '{lens}' (known: {', '.join(COEFFICIENT_COUNTS)})")
+    source = RigSource(path, hw=hw, lens=lens)
     try:
-        rig = reader.read(RigSource(path, hw=hw))
+        rig = READERS[format].read(source)
     except (RigFileError, FileNotFoundError):
         raise
     except (
@@ -82,10 +107,14 @@ def read_rig(path: str | Path, *, format: str | None = None, scale: float = 1.0,
     ) as error:
         cause = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise RigFileError(path, None, f"cannot be read as {format} ({cause}); is the file whole?") from error
+    source.warn_of_unread()
+    lenses = [view.distortion for view in rig.cameras.values() if isinstance(view, LensView)]
+    if lens is not None and not any(one is not None and one.model == lens for one in lenses):
+        raise RigFileError(path, None, f"states its lenses itself, or none: {lens} has no use: leave it out")
     rig = rig if scale == 1.0 else rig.scaled(scale)
     _check_magnitudes(path, rig)
-    if doubt := unit_oddity(rig):
-        RigSource(path).warn(doubt)
+    for doubt in file_oddities(rig):
+        source.warn(doubt)
     return rig
 
 
@@ -94,7 +123,8 @@ def write_rig(rig: Rig, path: str | Path, *, format: str = "native") -> None:
 
     What a format leaves out of the rig is named by one RigFileWarning: all but the native one the depth
     range, links, what a sensor records; OpenCV's where the first camera is in the world. Raises ValueError
-    for an unknown format, for a rig that the format cannot hold, and a batch.
+    for an unknown format, for a rig that the format cannot hold, and a batch; FileExistsError for a folder
+    with files of these names that nothing here wrote.
     """
     if format not in WRITERS:
         raise ValueError(f"cannot write rig format '{format}' (known: {', '.join(WRITERS)})")
@@ -102,9 +132,8 @@ def write_rig(rig: Rig, path: str | Path, *, format: str = "native") -> None:
     if format != "native" and (lost := _left_out(rig, format)):
         warn(f"{path}: {format} files do not hold the rig's {lost}: use the native format", RigFileWarning)
     if isinstance(contents, Mapping):
-        last = list(contents)[-1]
-        sweep(path, Path(last).stem)
-        with write_together(path, last=last) as folder:
+        sweep(path, format)
+        with write_together(path, group=format, last=list(contents)[-1]) as folder:
             for name, text in contents.items():
                 write_text(folder / name, text)
     else:
@@ -120,8 +149,14 @@ def recognise(path: str | Path) -> str:
     for name, reader in READERS.items():
         if reader.recognises(path, head):
             return name
-    formats = ", ".join(READERS)
-    raise UnknownRigFormat(path, None, f"is not a rig file of a known format ({formats}); or name its format")
+    likely = next((f"It may be of {name}. " for word, name in LIKELY.items() if re.search(word, head)), "")
+    raise UnknownRigFormat(
+        path,
+        None,
+        f"is not a rig file of a known format. {likely}Write a rig file of its numbers: cameras: {{N: "
+        "{size: [w, h], focal: px, centre: [x, y], rotation: 3x3, translation: [x y z], distortion: {model: "
+        "brown-conrady, coefficients: [k1, k2, p1, p2]}}}; or name its format (`pat rig convert --read-as`)",
+    )
 
 
 def _left_out(rig: Rig, format: str) -> str:

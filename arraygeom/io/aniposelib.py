@@ -12,7 +12,7 @@ from pathlib import Path
 
 from ..camera import Camera
 from ..rig import Rig
-from .source import Entry, RigSource, pose_of
+from .source import LENS_NAME, Entry, RigSource, pose_of
 
 
 def recognises(path: Path, head: str) -> bool:
@@ -26,7 +26,7 @@ def read(source: RigSource) -> Rig:
     cameras = [(k, fields) for k, fields in tables.items() if isinstance(fields.value, dict)]
     if not any("matrix" in fields for _, fields in cameras):
         raise source.fail("matrix", "is in no table; is this a camera array of aniposelib or caliscope?")
-    used = [(k, f) for k, f in cameras if k != "metadata" and not f.get("ignore", False).value]
+    used = [(k, f) for k, f in cameras if k != "metadata" and not f.value.get("ignore")]
     return source.rig((_name(key, fields), _camera(fields)) for key, fields in used)
 
 
@@ -35,10 +35,10 @@ def _name(key: str, fields: Entry) -> str:
 
 
 def _camera(fields: Entry) -> Camera:
-    c = fields.get("distortions")
+    K = fields["matrix"].intrinsics()
     return Camera(
-        K=fields["matrix"].intrinsics(),
+        K=K,
         cam_from_world=pose_of(fields["rotation"], fields["translation"]),
-        hw=fields["size"].size(),
-        distortion=c.kannala_brandt() if fields.get("fisheye").value else c.brown_conrady(),
+        hw=fields.sized("size", K=K),
+        distortion=fields.find(LENS_NAME).of_model(fields.model()),
     )

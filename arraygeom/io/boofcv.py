@@ -39,10 +39,11 @@ def _camera(fields: Entry, pose: Pose) -> Camera:
     if model.value not in MODELS:
         raise model.fail(f"is '{model.value}'; supported: {', '.join(MODELS)}")
     pinhole, lens = fields["pinhole"], fields.get("radial_tangential")
+    K = pinhole.listed("fx", "fy", "cx", "cy").focal_and_centre(skew=pinhole.get("skew", 0.0).number())
     return Camera(
-        K=pinhole.listed("fx", "fy", "cx", "cy").focal_and_centre(skew=pinhole.get("skew", 0.0).number()),
+        K=K,
         cam_from_world=pose,
-        hw=pinhole.listed("width", "height").size(),
+        hw=pinhole.sized("width", "height", K=K),
         distortion=None if lens.value is None else _lens(lens),
     )
 

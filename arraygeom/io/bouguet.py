@@ -44,10 +44,9 @@ def _camera(fields: Entry, which: str, pose: Pose) -> Camera:
     f = f.expand(2) if len(f) == 1 else focal.numbers((2,))
     skew = fields.get(f"alpha_c{which}", 0.0).number() * float(f[0])
     K = fields.at([*f, *centre], f"fc{which}, cc{which}").focal_and_centre(skew=skew)
-    stated = "nx" in fields and "ny" in fields
     return Camera(
         K=K,
         cam_from_world=pose,
-        hw=fields.listed("nx", "ny").size() if stated else fields.source.size_unstated(K),
-        distortion=fields.get(f"kc{which}").brown_conrady(),
+        hw=fields.sized("nx", "ny", K=K),
+        distortion=fields[f"kc{which}"].brown_conrady(),
     )

@@ -1,10 +1,10 @@
 """Kalibr camchain files.
 
 Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; `T_cn_cnm1` takes points of
-camera n-1 into camera n, so poses are chained products; metres. The world is camera 0, or the IMU where every
-camera states `T_cam_imu`. `timeshift_cam_imu` (t_imu = t_cam + shift) becomes the sensor's time offset.
-Camera models pinhole (with radtan, equidistant, fov or no distortion), omni (with radtan or none), ds and
-eucm (with none).
+camera n-1 into camera n, so poses are chained products; metres. The world is camera 0, or the IMU where
+every camera states `T_cam_imu`. `timeshift_cam_imu` (t_imu = t_cam + shift) becomes the sensor's time
+offset. Camera models pinhole (with radtan, equidistant, fov or no distortion), omni (with radtan or none),
+ds and eucm (with none). EuRoC's `sensor.yaml` has the same intrinsics; `T_BS` is camera->body, inverted.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from ..rig import Rig
 from ..runtime.safe_yaml import dump_yaml
 from ..sensor import Sensor
 from .export import at_origin, brown_conrady, calibrated, focal_and_centre, pose_rows
-from .source import Entry, RigSource
+from .source import LENS_NAME, Entry, RigSource, decoded
 
 MODELS: dict[str, tuple[str | None, int, tuple[str, ...]]] = {
     "pinhole": (None, 0, ("radtan", "equidistant", "fov", "none")),
@@ -33,15 +33,23 @@ MODELS: dict[str, tuple[str | None, int, tuple[str, ...]]] = {
 """Of each camera model: the lens, the numbers before the focal lengths, distortion models."""
 DISTORTIONS = {"radtan": (BROWN_CONRADY, 4), "equidistant": (KANNALA_BRANDT, 4), "fov": (FOV, 1)}
 """The lens of a pinhole's distortion model, and how many numbers it has."""
+ALSO = ("plumb_bob", "radial-tangential", "fisheye")
+"""Distortion models as EuRoC and ROS name them."""
 AGAIN = "calibrate again with --models pinhole-radtan, or ds-none for wide angles"
 
 
 def recognises(path: Path, head: str) -> bool:
-    return "cam0:" in head and "camera_model" in head
+    if path.is_dir():
+        return bool(_sensors(path))
+    return "T_BS" in head or (re.search(r"^cam\d+:", head, re.M) is not None and "intrinsics" in head)
 
 
 def read(source: RigSource) -> Rig:
-    """Cameras cam0, cam1, ..."""
+    """Cameras cam0, cam1, ...; EuRoC's sensor.yaml, or a folder of them, by the names of their folders."""
+    if files := _sensors(source.path) if source.path.is_dir() else []:
+        return source.rig((file.parent.name, _sensor(source.beside(file).yaml())) for file in files)
+    if "T_BS" in source.text():
+        return source.rig([(source.path.resolve().parent.name, _sensor(source.yaml()))])
     chain = {name: fields for name, fields in source.yaml().items() if re.fullmatch(r"cam\d+", name)}
     if not chain:
         raise source.fail("cam0", "is missing; is this a Kalibr camchain?")
@@ -50,6 +58,17 @@ def read(source: RigSource) -> Rig:
         raise source.fail(names[-1], f"the chain has a gap: it holds {', '.join(names)}")
     entries = [chain[name].mapping() for name in names]
     return source.rig(zip(names, map(_camera, entries, _poses(entries))))
+
+
+def _sensors(folder: Path) -> list[Path]:
+    """EuRoC's files of cameras, in a data set's folder or its mav0."""
+    files = [file for place in ("", "*/", "mav0/*/") for file in sorted(folder.glob(f"{place}sensor.yaml"))]
+    return [file for file in files if "camera" in decoded(file.read_bytes()[:4096])]
+
+
+def _sensor(fields: Entry) -> Camera:
+    """A camera of EuRoC's; the world is the body, to which T_BS takes points of the camera."""
+    return _camera(fields, fields["T_BS"]["data"].pose_matrix().inverse())
 
 
 def write(rig: Rig) -> str:
@@ -91,10 +110,11 @@ def _camera(fields: Entry, pose: Pose) -> Camera:
         raise model.fail(f"is '{model.value}'; supported: {', '.join(MODELS)}: {AGAIN}")
     first = MODELS[model.value][1]
     numbers = listed.numbers((first + 4,))
+    K = fields.at(numbers[first:], "intrinsics").focal_and_centre()
     return Camera(
-        K=fields.at(numbers[first:], "intrinsics").focal_and_centre(),
+        K=K,
         cam_from_world=pose,
-        hw=fields["resolution"].size(),
+        hw=fields.sized("resolution", K=K),
         distortion=_lens(model.value, numbers[:first].tolist(), fields),
         sensor=Sensor(time_offset=fields.get("timeshift_cam_imu", 0.0).number()),
     )
@@ -103,11 +123,18 @@ def _camera(fields: Entry, pose: Pose) -> Camera:
 def _lens(camera: str, before: list[float], fields: Entry) -> Distortion | None:
     """The lens of a camera model and a distortion model; `before` are the numbers before focal lengths."""
     lens, _, supported = MODELS[camera]
-    model = fields.get("distortion_model", "none")
-    if model.value not in supported:
+    model = fields.get("distortion_model")
+    coefficients = fields.find(LENS_NAME)
+    if model.value in (None, *ALSO) and camera == "pinhole":
+        return coefficients.of_model(model)
+    if (model.value or "none") not in supported:
         raise model.fail(f"is '{model.value}'; supported for {camera}: {', '.join(supported)}: {AGAIN}")
     bent, count = DISTORTIONS.get(model.value, (None, 0))
-    c = fields["distortion_coeffs"].numbers((count,)).tolist() if count else []
+    if not count and coefficients.value is not None and coefficients.numbers().any():
+        raise coefficients.fail("has coefficients, and distortion_model names none of them: state it")
+    if count and coefficients.value is None:
+        raise fields.fail(f"has distortion_model {model.value} and no distortion_coeffs")
+    c = coefficients.numbers((count,)).tolist() if count else []
     if lens is not None:
         c = [0.0] * 4 if lens == UNIFIED and not c else c
         return fields.at([*before, *c], "intrinsics").lens(lens)

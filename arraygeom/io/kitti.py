@@ -18,7 +18,7 @@ from ..rig import Rig
 from .source import Entry, RigSource, pose_of
 
 ENTRIES = r"(P|S|K|D|R|T)\d?(_rect)?(_\d\d)?"
-"""Names of the lines that are read; others (dates, say) are passed over."""
+"""Names of the lines that are read; others may be dates, say."""
 
 
 def recognises(path: Path, head: str) -> bool:
@@ -28,7 +28,7 @@ def recognises(path: Path, head: str) -> bool:
 def read(source: RigSource) -> Rig:
     """The rectified cameras: P0..P3 of `calib.txt`, P_rect and S_rect of `calib_cam_to_cam.txt`."""
     entries = source.lines(":", ENTRIES)
-    names = [name for name, _ in entries.items() if re.fullmatch(r"P\d|P_rect_\d\d", name)]
+    names = [name for name in entries.value if re.fullmatch(r"P\d|P_rect_\d\d", name)]
     if not names:
         raise source.fail("P0", "is missing; is this a KITTI calibration file?")
     return source.rig((f"cam{int(name[-1])}", _rectified(entries, name)) for name in names)
@@ -38,8 +38,9 @@ def _rectified(entries: Entry, name: str) -> Camera:
     P, size = entries[name].numbers((3, 4)), name.replace("P_", "S_")
     K = entries.at(P[:, :3], name).intrinsics()
     pose = Pose(torch.eye(3, dtype=torch.float64), torch.linalg.solve(K, P[:, 3]))
-    stated = size != name and size in entries
-    hw = entries[size].size() if stated else entries.source.size_unstated(K)
+    if size != name:  # the raw cameras' lenses are not those of the rectified images
+        entries.use(name.replace("P_rect", "D"))
+    hw = entries.sized(size, K=K) if size != name else entries.source.size_unstated(K)
     return Camera(K=K, cam_from_world=pose, hw=hw)
 
 
@@ -54,16 +55,17 @@ class Raw:
     def read(source: RigSource) -> Rig:
         """The unrectified cameras: S, K, D, R and T."""
         entries = source.lines(":", ENTRIES)
-        numbers = sorted(name[-2:] for name, _ in entries.items() if re.fullmatch(r"K_\d\d", name))
+        numbers = sorted(name[-2:] for name in entries.value if re.fullmatch(r"K_\d\d", name))
         if not numbers:
             raise source.fail("K_00", "is missing; is this KITTI's calib_cam_to_cam.txt?")
         return source.rig((f"cam{int(n)}", Raw._camera(entries, n)) for n in numbers)
 
     @staticmethod
     def _camera(entries: Entry, n: str) -> Camera:
+        K = entries[f"K_{n}"].intrinsics()
         return Camera(
-            K=entries[f"K_{n}"].intrinsics(),
+            K=K,
             cam_from_world=pose_of(entries[f"R_{n}"], entries[f"T_{n}"]),
-            hw=entries[f"S_{n}"].size(),
+            hw=entries.sized(f"S_{n}", K=K),
             distortion=entries[f"D_{n}"].brown_conrady(),
         )

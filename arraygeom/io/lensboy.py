@@ -31,10 +31,11 @@ def recognises(path: Path, head: str) -> bool:
 def read(source: RigSource) -> Rig:
     """The one camera, by its file's name."""
     fields = source.json()
+    K = fields.listed("fx", "fy", "cx", "cy").focal_and_centre()
     camera = Camera(
-        K=fields.listed("fx", "fy", "cx", "cy").focal_and_centre(),
+        K=K,
         cam_from_world=Pose.identity(),
-        hw=fields.listed("image_width", "image_height").size(),
+        hw=fields.sized("image_width", "image_height", K=K),
         distortion=_lens(fields),
     )
     return source.rig([(source.path.stem, camera)])
@@ -43,7 +44,7 @@ def read(source: RigSource) -> Rig:
 def _lens(fields: Entry) -> LensModel | None:
     kind = fields["type"]
     if kind.value == "opencv":
-        return fields.get("distortion_coeffs").brown_conrady()
+        return fields["distortion_coeffs"].brown_conrady()
     if kind.value != "pinhole_splined":
         raise kind.fail(f"is '{kind.value}'; opencv and pinhole_splined are read")
     version = str(fields["lensboy-version"].value).partition(".")[0]

@@ -28,6 +28,7 @@ def read(source: RigSource) -> Rig:
     """The calibrated cameras by their sockets: "CAM_A" (colour on most), "CAM_B", "CAM_C", ..."""
     listed = source.json()["cameraData"]
     entries: dict[int, Entry] = {}
+    left_out: list[str] = []
     for item in listed.each():
         if not isinstance(item.value, list) or len(item.value) != 2:
             raise listed.fail("is not a list of [socket, camera]; is the file whole?")
@@ -35,8 +36,14 @@ def read(source: RigSource) -> Rig:
         if not 0 <= socket < len(SOCKETS) or socket in entries:
             raise listed.fail(f"has socket {socket} twice, or a socket that no board has; keep one")
         entry = source.at(item.value[1], _name(socket))
-        if entry.get("width").value and entry.get("height").value:  # others are not calibrated
-            entries[socket] = entry
+        if entry.get("width").value and entry.get("height").value:
+            if entry["intrinsicMatrix"].value and not entry["intrinsicMatrix"].tensor().any():
+                left_out.append(entry.name)
+                entry.use()
+            else:
+                entries[socket] = entry
+    if left_out:
+        source.warn(f"{', '.join(left_out)}: not calibrated, K is zeros: left out")
     if not entries:
         raise listed.fail("holds no calibrated camera; is the file whole?")
     root, first_to_root = _to_root(entries, min(entries))
@@ -71,15 +78,12 @@ def _to_root(entries: dict[int, Entry], socket: int) -> tuple[int, Pose]:
 
 
 def _camera(entry: Entry, pose: Pose) -> Camera:
-    kind, lens = entry.get("cameraType", PERSPECTIVE), entry.get("distortionCoeff", [])
+    kind, lens = entry.get("cameraType", PERSPECTIVE), entry["distortionCoeff"]
     if kind.value not in (PERSPECTIVE, FISHEYE):
         raise kind.fail(f"is {kind.value}; perspective (0) and fisheye (1) are read")
-    if kind.value == FISHEYE and not bool(lens.numbers()[4:].any()):
-        # Padded with zeros to fourteen numbers by some versions.
-        lens = entry.at(lens.numbers()[:4], "distortionCoeff")
     return Camera(
         K=entry["intrinsicMatrix"].intrinsics(),
         cam_from_world=pose,
         hw=entry.listed("width", "height").size(),
-        distortion=lens.kannala_brandt() if kind.value == FISHEYE else lens.brown_conrady(),
+        distortion=lens.of_model(kind),
     )

@@ -95,6 +95,7 @@ def _camera(fields: Entry, pose: Pose) -> Camera:
     if FISHEYE in fisheye:
         K, lens = _fisheye(fisheye)
         return Camera(K=K, cam_from_world=pose, hw=_size(fisheye, K), distortion=lens)
+    fields.use("WorldUnits")  # of the board's poses
     stated = fields["K", "IntrinsicMatrix"]
     K = (stated if "K" in fields else stated.transposed(3)).intrinsics(first_pixel=1.0)
     return Camera(K=K, cam_from_world=pose, hw=_size(fields, K), distortion=_lens(fields))
@@ -119,6 +120,8 @@ def _size(fields: Entry, K: Tensor) -> HW:
 
 
 def _lens(fields: Entry) -> Distortion | None:
+    if not any(f"{kind}Distortion" in fields for kind in ("Radial", "Tangential")):
+        raise fields.fail("has no RadialDistortion: state it, [0 0] of an undistorted image")
     radial, tangential = (
         fields.get(f"{kind}Distortion", []).numbers().tolist() for kind in ("Radial", "Tangential")
     )

@@ -4,12 +4,14 @@ Source convention: pixels with the first centre at 0.5 (shift -0.5), the princip
 image's middle; OpenCV axes; `transform` is camera->chunk, inverted; the world is the chunk's frame, in the
 scale that the chunk or its component states, taken as metres (its rotation and translation into geographic
 coordinates are left out). In Brown's polynomials p1 and p2 change places; b1 adds to the first focal length
-and b2 is the skew. Frame and fisheye sensors.
+and b2 is the skew. Frame and fisheye sensors. Of a multi-camera system's slaves, `rotation` and `location`
+of the sensor take its points into the master's, in the chunk's unit.
 """
 
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
+from collections import Counter
 from pathlib import Path
 
 from ..camera import Camera, LensView
@@ -18,7 +20,7 @@ from ..lenses.central import THIN_PRISM_FISHEYE
 from ..pose import Pose
 from ..rig import Rig
 from ..runtime.safe_yaml import LARGEST_TEXT
-from .source import RigSource
+from .source import Entry, RigSource, pose_of
 
 LENS_NUMBERS = ("k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
 
@@ -37,10 +39,14 @@ def read(source: RigSource) -> Rig:
     scale = _scale(source, chunks[0])
     views: dict[str, LensView] = {}
     cameras, left_out = [], []
-    for camera in chunks[0].iter("camera"):
-        name, sensor = camera.get("label") or f"camera{camera.get('id')}", camera.get("sensor_id") or ""
-        transform = camera.findtext("transform")
-        if transform is None:
+    images = {camera.get("id"): camera for camera in chunks[0].iter("camera")}
+    labels = Counter(camera.get("label") for camera in images.values())
+    for camera in images.values():
+        name, sensor = _name(camera, labels), camera.get("sensor_id") or ""
+        master = images.get(camera.get("master_id"))
+        transform = (camera if master is None else master).findtext("transform")
+        offset = None if master is None or sensor not in sensors else _offset(source, sensors[sensor])
+        if transform is None or (master is not None and offset is None):
             left_out.append(name)
             continue
         if sensor not in sensors:
@@ -49,15 +55,37 @@ def read(source: RigSource) -> Rig:
             views[sensor] = _sensor(source, sensors[sensor], f"sensor {sensor}")
         view, entry = views[sensor], f"{name}.transform"
         pose = source.at(transform, entry).words().pose_matrix().inverse()
+        pose = pose if offset is None else offset.inverse() @ pose
         component_scale = scales.get(camera.get("component_id"))
         metres = component_scale if component_scale is not None else scale if scale is not None else 1.0
         pose = Pose(pose.R, pose.t * metres)
         cameras.append((name, Camera(K=view.K, cam_from_world=pose, hw=view.hw, distortion=view.distortion)))
     if left_out:
         source.warn(
-            f"holds {len(left_out)} cameras that are not aligned (such as {left_out[0]}); they are left out"
+            f"holds {len(left_out)} cameras that are not aligned, or of a multi-camera system whose sensors "
+            f"state no place (such as {left_out[0]}); they are left out"
         )
     return source.rig(cameras)
+
+
+def _name(camera: ET.Element, labels: Counter[str | None]) -> str:
+    """An image's label; of several with one label with its folder, where that is stated, else its number."""
+    label, photo = camera.get("label"), camera.find(".//photo")
+    if label is None or labels[label] == 1:
+        return label or f"camera{camera.get('id')}"
+    return f"{label}_{camera.get('id')}" if photo is None else str(photo.get("path"))
+
+
+def _offset(source: RigSource, sensor: ET.Element) -> Pose | None:
+    """The master's points from a slave's, in a multi-camera system; None if the sensor does not state it."""
+    R, t = sensor.findtext("rotation"), sensor.findtext("location")
+    if R is None and t is None:
+        return None
+    words = (
+        source.at(R or "1 0 0 0 1 0 0 0 1", "rotation").words(),
+        source.at(t or "0 0 0", "location").words(),
+    )
+    return pose_of(*words)
 
 
 def _document(source: RigSource) -> ET.Element:
@@ -83,26 +111,24 @@ def _sensor(source: RigSource, sensor: ET.Element, entry: str) -> LensView:
         raise source.fail(entry, "has no resolution")
     sides = [resolution.get(side) or "" for side in ("width", "height")]
     h, w = source.at(sides, f"{entry} resolution").words().size()
-    f, cx, cy, b1, b2 = (_number(source, calibration, name, entry) for name in ("f", "cx", "cy", "b1", "b2"))
+    fields = source.at({child.tag: child.text for child in calibration if child.text}, entry)
+    f, cx, cy, b1, b2 = (_number(fields, name) for name in ("f", "cx", "cy", "b1", "b2"))
     numbers = source.at([f + b1, f, w / 2 + cx, h / 2 + cy], f"{entry} f")
     K = numbers.focal_and_centre(first_pixel=0.5, skew=b2)
-    return LensView(hw=(h, w), K=K, distortion=_lens(source, calibration, entry))
+    return LensView(hw=(h, w), K=K, distortion=_lens(fields, calibration.get("type", "frame")))
 
 
-def _lens(source: RigSource, calibration: ET.Element, entry: str) -> Distortion | None:
-    k1, k2, k3, k4, p1, p2, p3, p4 = (_number(source, calibration, name, entry) for name in LENS_NUMBERS)
-    kind = calibration.get("type", "frame")
+def _lens(fields: Entry, kind: str) -> Distortion | None:
+    k1, k2, k3, k4, p1, p2, p3, p4 = (_number(fields, name) for name in LENS_NUMBERS)
     if kind not in ("frame", "fisheye"):
-        raise source.fail(
-            entry, f"is of type '{kind}'; frame and fisheye are read: undistort the images first"
-        )
+        raise fields.fail(f"is of type '{kind}'; frame and fisheye are read: undistort the images first")
     if p3 or p4 or (k4 and kind == "frame"):
-        raise source.fail(
-            entry, "has p3, p4, or for a frame k4, which are not read: optimise the cameras without them"
+        raise fields.fail(
+            "has p3, p4, or for a frame k4, which are not read: optimise the cameras without them"
         )
     if kind == "frame":
-        return source.at([k1, k2, p2, p1, k3], entry).brown_conrady()
-    return source.at([k1, k2, p2, p1, k3, k4, 0.0, 0.0], entry).lens(THIN_PRISM_FISHEYE)
+        return fields.at([k1, k2, p2, p1, k3], "k1").brown_conrady()
+    return fields.at([k1, k2, p2, p1, k3, k4, 0.0, 0.0], "k1").lens(THIN_PRISM_FISHEYE)
 
 
 def _scale(source: RigSource, element: ET.Element) -> float | None:
@@ -111,9 +137,6 @@ def _scale(source: RigSource, element: ET.Element) -> float | None:
     return None if text is None else source.at(text, "scale").words().number()
 
 
-def _number(source: RigSource, calibration: ET.Element, name: str, entry: str) -> float:
+def _number(fields: Entry, name: str) -> float:
     """A number of a calibration; 0 where it is not stated, but for f."""
-    text = calibration.findtext(name)
-    if text is None and name == "f":
-        raise source.fail(entry, "has no f, the focal length")
-    return 0.0 if text is None else source.at(text, f"{entry} {name}").words().number()
+    return (fields[name] if name == "f" else fields.get(name, "0")).words().number()

@@ -33,7 +33,7 @@ def read(source: RigSource) -> Rig:
     doffs = entries.get("doffs", apart).number()
     if abs(doffs - apart) > 0.5:
         raise source.fail("doffs", f"is {doffs:g}, which is not the difference of the principal points")
-    hw = entries.listed("width", "height").size()
+    hw = entries.sized("width", "height", K=Ks[0])
     metres = baseline * 1e-3
     first = Pose.identity()
     poses = first, Pose(first.R, first.t.new_tensor([-metres, 0.0, 0.0]))

@@ -37,7 +37,7 @@ def recognises(path: Path, head: str) -> bool:
 def read(source: RigSource) -> Rig:
     """The cameras by the names of their files."""
     files = sorted(source.path.glob(f"*{SUFFIX}")) if source.path.is_dir() else [source.path]
-    return source.rig((file.stem, _camera(RigSource(file))) for file in files)
+    return source.rig((file.stem, _camera(source.beside(file))) for file in files)
 
 
 def _camera(source: RigSource) -> Camera:
@@ -45,10 +45,11 @@ def _camera(source: RigSource) -> Camera:
     rt = fields["rt_cam_ref" if "rt_cam_ref" in fields else "extrinsics"]
     R, t = rt.numbers((6,)).split(3)
     numbers = fields["intrinsics"].numbers()
+    K = fields.at(numbers[:4], "intrinsics").focal_and_centre()
     return Camera(
-        K=fields.at(numbers[:4], "intrinsics").focal_and_centre(),
+        K=K,
         cam_from_world=pose_of(source.at(R, rt.name), source.at(t, rt.name)),
-        hw=fields["imagersize"].size(),
+        hw=fields.sized("imagersize", K=K),
         distortion=_lens(fields["lensmodel"], fields["intrinsics"]),
     )
 

@@ -12,11 +12,11 @@ from pathlib import Path
 from ..camera import Camera
 from ..pose import Pose
 from ..rig import Rig
-from .source import Entry, RigSource, pose_of
+from .source import LENS_NAME, Entry, RigSource, pose_of
 
 
 def recognises(path: Path, head: str) -> bool:
-    return '"cameras"' in head and '"image_size"' in head
+    return '"cameras"' in head and ('"image_size"' in head or '"camera_poses"' in head)
 
 
 def read(source: RigSource) -> Rig:
@@ -53,10 +53,10 @@ def _poses(entries: Entry, cameras: dict[str, Entry]) -> dict[str, Pose]:
 
 
 def _camera(fields: Entry, pose: Pose) -> Camera:
-    fisheye = "fisheye" in str(fields.get("model", "").value).lower()
+    K = fields["K"].intrinsics()
     return Camera(
-        K=fields["K"].intrinsics(),
+        K=K,
         cam_from_world=pose,
-        hw=fields["image_size"].size(),
-        distortion=fields["dist"].kannala_brandt() if fisheye else fields.get("dist").brown_conrady(),
+        hw=fields.sized("image_size", K=K),
+        distortion=fields.find(LENS_NAME).of_model(fields.model()),
     )

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import ChainMap
 from pathlib import Path
 from typing import Any
 
@@ -36,10 +37,10 @@ def recognises(path: Path, head: str) -> bool:
 def read(source: RigSource) -> Rig:
     """One camera for each frame, named by its `file_path`."""
     document = source.json()
-    shared = {key: value for key, value in document.value.items() if key != "frames"}
+    frames, shared = document["frames"].each(), document.value
     cameras = []
-    for frame in document["frames"].each():
-        fields = Entry(source, shared | frame.mapping().value, frame.name)
+    for frame in frames:
+        fields = Entry(source, ChainMap(frame.mapping().value, shared), frame.name)
         cameras.append((str(fields["file_path"].value), _camera(fields)))
     return source.rig(cameras)
 
@@ -51,7 +52,11 @@ def write(rig: Rig) -> str:
 
 
 def _camera(fields: Entry) -> Camera:
-    h, w = fields.listed("w", "h").size()
+    stated = [fields.get(f"fl_{axis}", fields.get("fl_x").value).value for axis in "xy"]
+    centre = [fields.get(key).value for key in ("cx", "cy")]
+    known = None not in (*stated, *centre)
+    K = fields.at([*stated, *centre], "fl_x, fl_y").focal_and_centre(first_pixel=0.5) if known else None
+    h, w = fields.sized("w", "h", K=K)
     fx = _focal(fields, "x", w)
     fy = _focal(fields, "y", h) if "fl_y" in fields or "camera_angle_y" in fields else fx
     centre = [fields.get(k, n / 2).number() for k, n in (("cx", w), ("cy", h))]
@@ -77,11 +82,15 @@ def _lens(fields: Entry) -> Distortion | None:
     if name not in FISHEYES + PERSPECTIVES:
         raise model.fail(f"is {name}; supported: {', '.join(PERSPECTIVES + FISHEYES)}")
     value = {k: fields.get(k, 0.0).number() for k in ("k1", "k2", "p1", "p2", "k3", "k4")}
+    if (listed := fields.get("distortion_params")).value is not None:
+        value |= dict(zip(("k1", "k2", "k3", "k4", "p1", "p2"), listed.numbers((6,)).tolist()))
     if fields.get("is_fisheye").value or name in FISHEYES:
+        if value["p1"] or value["p2"]:
+            raise fields.at(None, "p1, p2").fail("are not 0, and a fisheye of this format has none")
         return fields.at([value[k] for k in ("k1", "k2", "k3", "k4")], "k1").kannala_brandt()
     if value["k4"] != 0:
         raise fields["k4"].fail("is the r^8 term of a perspective lens, which OpenCV's model does not have")
-    return fields.at(list(value.values())[: 5 if "k3" in fields else 4], "k1").brown_conrady()
+    return fields.at(list(value.values())[: 5 if "k3" in fields or value["k3"] else 4], "k1").brown_conrady()
 
 
 def _frame(name: str, camera: Camera) -> dict[str, Any]:

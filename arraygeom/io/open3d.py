@@ -1,7 +1,8 @@
 """JSON of Open3D: PinholeCameraParameters, or a PinholeCameraTrajectory of several.
 
 Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; metres; `intrinsic_matrix` and
-`extrinsic` (world->camera, 4 x 4) column by column. Cameras of a trajectory are named cam0, cam1, ...
+`extrinsic` (world->camera, 4 x 4) column by column; intrinsics alone (`intrinsic.json` of its Azure Kinect
+recorder) are a camera at the origin. Cameras are named cam0, cam1, ...
 """
 
 from __future__ import annotations
@@ -9,12 +10,13 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..camera import Camera
+from ..pose import Pose
 from ..rig import Rig
 from .source import Entry, RigSource
 
 
 def recognises(path: Path, head: str) -> bool:
-    return head.lstrip().startswith("{") and '"PinholeCamera' in head
+    return head.lstrip().startswith("{") and ('"PinholeCamera' in head or '"intrinsic_matrix"' in head)
 
 
 def read(source: RigSource) -> Rig:
@@ -25,9 +27,11 @@ def read(source: RigSource) -> Rig:
 
 
 def _camera(fields: Entry) -> Camera:
-    intrinsic = fields["intrinsic"]
+    intrinsic = fields if "intrinsic_matrix" in fields else fields["intrinsic"]
+    K = intrinsic["intrinsic_matrix"].transposed(3).intrinsics()
+    posed = intrinsic is not fields
     return Camera(
-        K=intrinsic["intrinsic_matrix"].transposed(3).intrinsics(),
-        cam_from_world=fields["extrinsic"].transposed(4).pose_matrix(),
-        hw=intrinsic.listed("width", "height").size(),
+        K=K,
+        cam_from_world=fields["extrinsic"].transposed(4).pose_matrix() if posed else Pose.identity(),
+        hw=intrinsic.sized("width", "height", K=K),
     )

@@ -1,9 +1,11 @@
-"""OpenCV FileStorage (YAML, XML or JSON): one camera, or a stereo pair in one file or two.
+"""OpenCV FileStorage (YAML, XML or JSON): one camera, or a stereo pair in one file or two; MC-Calib,
+EasyMocap.
 
-Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; X_2 = R X_1 + T, so the world is
-camera 1; lengths in the unit of the calibration board, taken as metres. OpenCV's stereo sample writes
+Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; X_2 = R X_1 + T, so the world
+is camera 1; lengths in the unit of the calibration board, taken as metres. OpenCV's stereo sample writes
 `intrinsics.yml` (M1 D1 M2 D2) and `extrinsics.yml` (R T ...): name either, or their folder. It states no
-image size.
+image size. EasyMocap's `intri.yml` and `extri.yml` are world->camera; MC-Calib's `camera_pose_matrix` is
+camera->reference camera, inverted.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from ..camera import Camera
@@ -23,40 +26,41 @@ from ..rig import Rig
 from ..runtime.extras import needs
 from ..runtime.safe_yaml import DEEPEST, LARGEST_TEXT
 from .export import brown_conrady, calibrated, focal_and_centre
-from .source import Entry, RigSource, pose_of
+from .source import K_NAME, LENS_NAME, R_NAME, T_NAME, Entry, RigSource, plain, pose_of
 
-K_NAMES = ("M{}", "cameraMatrix{}", "camera_matrix{}", "Camera_Matrix{}", "K{}", "CM{}", "intrinsicMatrix{}")
-D_NAMES = (
-    *("D{}", "distCoeffs{}", "distortion_coefficients{}", "Distortion_Coefficients{}"),
-    *("dist_coeffs{}", "distortionCoefficients{}"),
-)
 MOST_NUMBERS = 10_000
 """Of a matrix; a file may state any number."""
-PARTS = ("intrinsic", "extrinsic")
+PARTS = ("intri", "extri")
 
 
 def recognises(path: Path, head: str) -> bool:
     if path.is_dir():
         return any(_named(path, kind) for kind in PARTS)
-    return "opencv-matrix" in head or "<opencv_storage>" in head
+    return "opencv-matrix" in head or "opencv_storage" in head or '"type_id": "opencv' in head
 
 
 def read(source: RigSource) -> Rig:
     """One camera at the origin, named "camera"; or a pair, named "left" and "right" unless the file says."""
     entries: dict[str, Any] = {}
     for path in _files(source.path):
-        entries |= _nodes(RigSource(path))
+        entries |= _nodes(source.beside(path))
     nodes = source.at(entries).mapping()
-    if not any(name.format(1) in nodes for name in K_NAMES):
-        if "R" in nodes and "T" in nodes:
+    if "nb_camera" in nodes:
+        numbers = range(int(nodes["nb_camera"].number()))
+        return source.rig((f"camera_{i}", _of_group(nodes[f"camera_{i}"])) for i in numbers)
+    if isinstance(names := nodes.value.get("names"), list):
+        return source.rig((str(name), _named_camera(nodes, plain(name))) for name in names)
+    R, t = nodes.find(R_NAME), nodes.find(T_NAME)
+    if nodes.find(K_NAME, "2").value is None:
+        if R.value is not None and t.value is not None and nodes.find(K_NAME).value is None:
             raise source.fail(
                 "M1", "is missing: a pair's R and T are here without its intrinsics.yml beside them"
             )
         name = str(nodes.get("camera_name", "camera").value)
         return source.rig([(name, _camera(nodes, "", Pose.identity()))])
-    if "R" not in nodes or "T" not in nodes:
+    if R.value is None or t.value is None:
         raise source.fail("R, T", "are missing: put the pair's extrinsics.yml beside its intrinsics.yml")
-    poses = Pose.identity(), pose_of(nodes["R"], nodes["T"])
+    poses = Pose.identity(), pose_of(R, t)
     names = [str(nodes.get(f"name{i}", default).value) for i, default in ((1, "left"), (2, "right"))]
     return source.rig((name, _camera(nodes, i, pose)) for i, name, pose in zip("12", names, poses))
 
@@ -88,11 +92,38 @@ _HEADER = "%YAML:1.0\n---\n"
 
 
 def _camera(nodes: Entry, i: str, pose: Pose) -> Camera:
-    K = nodes[tuple(name.format(i) for name in K_NAMES)].intrinsics()
-    c = nodes.get(next((name.format(i) for name in D_NAMES if name.format(i) in nodes), D_NAMES[0].format(i)))
-    fisheye = bool(nodes.get(f"fisheye_model{i}", nodes.get("fisheye_model", 0).value).value)
-    lens = c.kannala_brandt() if fisheye else c.brown_conrady()
+    entry = nodes.find(K_NAME, i)
+    if entry.value is None:
+        raise nodes.fail(f"has no camera_matrix{i}, nor K{i} or M{i}")
+    K = entry.intrinsics()
+    lens = nodes.find(LENS_NAME, i).of_model(nodes.model(i))
     return Camera(K=K, cam_from_world=pose, hw=_size(nodes, i, K), distortion=lens)
+
+
+def _of_group(fields: Entry) -> Camera:
+    """A camera of MC-Calib's; its pose takes the camera's points into the group's reference camera."""
+    K, pose = fields["camera_matrix"].intrinsics(), fields["camera_pose_matrix"].pose_matrix().inverse()
+    if fields.get("camera_group", 0).number():
+        raise fields["camera_group"].fail("is not 0: cameras of several groups have no common frame")
+    lens = fields["distortion_vector"].of_model(fields["distortion_type"])
+    return Camera(K=K, cam_from_world=pose, hw=fields.sized("img_width", "img_height", K=K), distortion=lens)
+
+
+def _named_camera(nodes: Entry, name: str) -> Camera:
+    """A camera of EasyMocap's intri.yml and extri.yml."""
+    K, matrix_R, vector_R, t = (nodes.find(kind + name) for kind in ("k", "rot", "r", "t"))
+    R = vector_R if matrix_R.value is None else matrix_R
+    if K.value is None or R.value is None or t.value is None:
+        raise nodes.fail(f"has not all of K_{name}, R_{name}, T_{name}: put extri.yml beside intri.yml")
+    matrix, lens = K.intrinsics(), nodes.find(LENS_NAME + name).of_model(nodes.model())
+    w, h = nodes.find("w" + name), nodes.find("h" + name)
+    stated = w.value is not None and h.value is not None
+    hw = (
+        nodes.at([w.value, h.value], f"W_{name}, H_{name}").size()
+        if stated
+        else nodes.source.size_unstated(matrix)
+    )
+    return Camera(K=matrix, cam_from_world=pose_of(R, t), hw=hw, distortion=lens)
 
 
 def _size(nodes: Entry, i: str, K: Tensor) -> HW:
@@ -117,7 +148,8 @@ def _files(path: Path) -> list[Path]:
 
 
 def _named(folder: Path, kind: str) -> Path | None:
-    candidates = [folder / f"{kind}s{suffix}" for suffix in (".yml", ".yaml", ".xml", ".json")]
+    suffixes = (".yml", ".yaml", ".xml", ".json")
+    candidates = [folder / f"{kind}{end}{suffix}" for end in ("nsics", "nsic", "") for suffix in suffixes]
     return next((path for path in candidates if path.exists()), None)
 
 
@@ -162,9 +194,12 @@ def _value(node: Any) -> Any:
         return node.real()
     if node.isSeq():
         return [_value(node.at(i)) for i in range(node.size())]
-    if node.isMap() and not node.getNode("data").empty():
-        count = node.getNode("rows").real() * node.getNode("cols").real()
-        return node.mat() if 0 <= count <= MOST_NUMBERS else None
+    if node.isMap() and node.getNode("data").empty():
+        return {name: _value(node.getNode(name)) for name in node.keys()}  # noqa: SIM118
+    if node.isMap():
+        data = node.getNode("data")  # one by one: mat() takes whole numbers' bits for those of real ones
+        numbers = _value(data) if data.size() <= MOST_NUMBERS else None
+        return numbers if isinstance(numbers, list | None) else [numbers]
     return None
 
 
@@ -180,9 +215,12 @@ def _camera_text(name: str, camera: Camera, i: str) -> str:
     text += _matrix_text(
         f"M{i}" if i else "camera_matrix", camera.K.new_tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     )
-    if lens is None:
-        return text
-    c = lens.coefficients if fisheye else camera.K.new_tensor(brown_conrady(name, lens, at_most=14))
+    c = camera.K.new_tensor([] if fisheye else brown_conrady(name, lens, at_most=14))
+    c = (
+        lens.coefficients
+        if fisheye and lens is not None
+        else torch.nn.functional.pad(c, (0, max(0, 5 - len(c))))
+    )
     return text + _matrix_text(f"D{i}" if i else "distortion_coefficients", c[None])
 
 

@@ -42,6 +42,7 @@ def read(source: RigSource) -> Rig:
     for name, listed in INTRINSIC.findall(text):
         fields = source.at(dict(ENTRY.findall(listed)), name)
         hw = fields.listed("Width", "Height").words().size()
+        fields.use()  # of the streams that are left out, too
         earlier = streams.get(name)
         wanted = hw == source.hw if source.hw is not None else earlier is None or hw > earlier[0]
         if wanted or earlier is None:

@@ -1,4 +1,4 @@
-"""ROS CameraInfo YAML: one camera a file, or a folder of such files as one rig.
+"""ROS CameraInfo: the YAML of its calibrators or a message as text; a file a camera, or a folder of them.
 
 Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; metres. `projection_matrix` P =
 K' [I | t] acts on points of the *rectified* frame, which all cameras of a stereo pair share and which is the
@@ -8,15 +8,15 @@ zeros states nothing: the camera is then at the world's origin, rotated by R_rec
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import torch
 
 from ..camera import Camera
-from ..distortion import Distortion
 from ..pose import Pose
 from ..rig import Rig
-from .source import Entry, RigSource, decoded
+from .source import LENS_NAME, Entry, RigSource, decoded
 
 
 def recognises(path: Path, head: str) -> bool:
@@ -29,7 +29,7 @@ def read(source: RigSource) -> Rig:
     """The cameras, under their `camera_name` (else the file's name)."""
     files = _yaml_files(source.path) if source.path.is_dir() else [source.path]
     infos = [file for file in files if len(files) == 1 or _is_camera_info(decoded(file.read_bytes()))]
-    return source.rig(_camera(RigSource(file, hw=source.hw)) for file in infos)
+    return source.rig(_camera(source.beside(file)) for file in infos)
 
 
 def _yaml_files(folder: Path) -> list[Path]:
@@ -37,39 +37,35 @@ def _yaml_files(folder: Path) -> list[Path]:
 
 
 def _is_camera_info(text: str) -> bool:
-    return "camera_matrix:" in text and "distortion_model:" in text and "opencv-matrix" not in text
+    K = re.search(r"^(camera_matrix|K|k):", text, re.M)
+    return K is not None and "distortion_model:" in text and "opencv-matrix" not in text
 
 
 def _camera(source: RigSource) -> tuple[str, Camera]:
-    info = source.yaml()
-    camera = Camera(
-        K=info["camera_matrix"]["data"].intrinsics(),
-        cam_from_world=_pose(info),
-        hw=info.listed("image_width", "image_height").size(),
-        distortion=_lens(info),
-    )
-    return str(info.get("camera_name").value or source.path.stem), camera
+    info = source.yaml(
+        re.split(r"^---", source.text().removeprefix("---"), flags=re.M)[0]
+    )  # the first message
+    K = _numbers(info["camera_matrix", "K", "k"]).intrinsics()
+    topic = "width" if "width" in info else "image_width", "height" if "height" in info else "image_height"
+    lens = _numbers(info.find(LENS_NAME)).of_model(info["distortion_model"])
+    camera = Camera(K=K, cam_from_world=_pose(info), hw=info.sized(*topic, K=K), distortion=lens)
+    frame = (info.get("header").value or {}).get("frame_id")
+    return str(info.get("camera_name").value or frame or source.path.stem), camera
+
+
+def _numbers(entry: Entry) -> Entry:
+    """The numbers of a file's matrix, or a message's."""
+    return entry["data"] if isinstance(entry.value, dict) else entry
 
 
 def _pose(info: Entry) -> Pose:
     rect_from_cam = stereo = Pose.identity()
-    if "rectification_matrix" in info:
-        rect_from_cam = Pose(info["rectification_matrix"]["data"].rotation(), stereo.t)
-    if "projection_matrix" in info:
-        entry = info["projection_matrix"]["data"]
+    R, entry = (_numbers(info.find(name)) for name in ("rectificationmatrix|r", "projectionmatrix|p"))
+    if R.value is not None and R.tensor().any():
+        rect_from_cam = Pose(R.rotation(), stereo.t)
+    if entry.value is not None:
         P = entry.numbers((3, 4))
         if P.any():
             K = entry.source.at(P[:, :3], entry.name).intrinsics()
             stereo = Pose(stereo.R, torch.linalg.solve(K, P[:, 3]))
     return rect_from_cam.inverse() @ stereo
-
-
-def _lens(info: Entry) -> Distortion | None:
-    model, c = info["distortion_model"], "distortion_coefficients"
-    if model.value in ("plumb_bob", "rational_polynomial"):
-        return info[c]["data"].brown_conrady()
-    if model.value in ("equidistant", "fisheye"):
-        return info[c]["data"].kannala_brandt()
-    if model.value in ("", "none"):
-        return None
-    raise model.fail(f"is '{model.value}'; supported: plumb_bob, rational_polynomial, equidistant")

@@ -26,6 +26,41 @@ from ..runtime.warned import warn
 
 # Of a rotation vector, in radians; it may go round a few times.
 LARGEST_ANGLE = 1e3
+K_NAME = r"(m|k|cm|(camera|cam|intrinsics?)?(matrix|mat|mtx)|intrinsics?|camerak)"
+LENS_NAME = (
+    r"(d|kc|((lens|camera|cam)?dist(ort(ion)?)?|d)(coef|coeff|coefficient|param|parameter|vec|vector|mat"
+    r"|matrix|array|value)?s?|coef(f|ficient)?s?)"
+)
+R_NAME, T_NAME = "(r|rot|rotation)(vector|vec|matrix|mat)?", "(t|trans|translation)(vector|vec|matrix)?"
+"""Usual names of K, R, t and of a lens's coefficients, in small letters without signs."""
+MODEL_NAMES = (
+    r"(lens|distortion|dist)(model|type)",
+    r"(is)?fisheye(model|lens|camera)?",
+    r"(camera|cam|projection)?(model|type)|projection|lens",
+)
+"""Names of a lens's model, and those that may be of another thing."""
+SUSPECT = re.compile(
+    rf"(left|right|[lr])?{LENS_NAME}(left|right|[lr]|\d*)|.*(distort|distcoef|coef|radial|tangential|fisheye"
+    r"|dewarp|undist|thinprism|vignetting|hmatrix|blackl|blackc|units?$).*|xi|skew|alphac|is(omni|rectified)"
+)
+"""Names of what may be a lens, a flag or a unit."""
+SCALAR = re.compile(r"[kps][1-9]|t[12xy]")
+"""Names of a lens's numbers where they stand alone."""
+HARMLESS = re.compile(
+    r".*(err|std|sigma|cov|rms|noise|uncert|optim|name|path|initial|guess|squareunits|label|comment|frame|topic|title|serial).*"
+)
+BROWN_WORDS = (
+    *("plumbbob", "radtan", "radialtangential", "brownconrady", "brown", "opencv", "fullopencv", "rational"),
+    *("rationalpolynomial", "perspective", "pinhole", "standard", "radial", "simpleradial", "simplepinhole"),
+)
+FISHEYE_WORDS = (
+    *("equidistant", "equi", "fisheye", "kannalabrandt", "kannalabrandt4", "kb4", "kb", "opencvfisheye"),
+)
+LENS_WORD = re.compile(
+    "|".join([*BROWN_WORDS[:3], *FISHEYE_WORDS, ".*(fisheye|omni|fov|mei|eucm|sphere|division).*"])
+)
+SMALL_TANGENTIAL = 0.01
+"""Above, the tangential coefficients of a lens are more likely a fisheye's third and fourth."""
 NO_MAPPING = "is not a mapping of names to values, or an empty one; is the file whole?"
 
 
@@ -52,10 +87,36 @@ class RigFileWarning(UserWarning):
 
 
 class RigSource:
-    """One rig file being read. `hw` is the images' size for files that do not state it."""
+    """One rig file being read. `hw` and `lens`: the images' size and the lens model, if files state none."""
 
-    def __init__(self, path: Path, *, hw: HW | None = None) -> None:
-        self.path, self.hw = path, hw
+    def __init__(self, path: Path, *, hw: HW | None = None, lens: str | None = None) -> None:
+        self.path, self.hw, self.lens = path, hw, lens
+        self.lookups: dict[int, tuple[Entry, set[str]]] = {}
+
+    def beside(self, path: Path) -> RigSource:
+        """Another file of the same rig."""
+        source = RigSource(path, hw=self.hw, lens=self.lens)
+        source.lookups = self.lookups
+        return source
+
+    def warn_of_unread(self) -> None:
+        """Warn of entries that no reader has looked up, beside others that it has, if they look like a lens,
+        a model, a flag or a unit."""
+        unread: dict[Path, list[str]] = {}
+        for entry, used in self.lookups.values():
+            left = [
+                key for key, value in entry.value.items() if str(key) not in used and suspicious(key, value)
+            ]
+            unread.setdefault(entry.source.path, []).extend(entry.at(None, str(key)).name for key in left)
+        for path, names in {tuple(names): (path, names) for path, names in reversed(unread.items())}.values():
+            if names:
+                listed = ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
+                warn(
+                    f"{path}: {listed}: not read, and may change what the cameras see: state the lens under "
+                    "a name that is read, such as distortion_coefficients and distortion_model, or in a file "
+                    "of ours (`pat rig convert`); without meaning here, remove it",
+                    RigFileWarning,
+                )
 
     def fail(self, entry: str | None, message: str) -> RigFileError:
         """The error to raise about an entry."""
@@ -122,11 +183,12 @@ class RigSource:
             ) from None
 
     def lines(self, separator: str, pattern: str) -> Entry:
-        """Numbers by name, one a line, of the names that a pattern matches."""
-        entries: dict[str, Tensor] = {}
+        """Numbers by name, one a line, of the names that a pattern matches; the text of others."""
+        entries: dict[str, Tensor | str] = {}
         for line in self.text().splitlines():
             name, separated, value = (text.strip() for text in line.partition(separator))
             if not separated or not re.fullmatch(pattern, name):
+                entries |= {name: value} if separated else {}
                 continue
             if name in entries:
                 raise self.fail(name, "occurs twice; keep one")
@@ -137,10 +199,15 @@ class RigSource:
             entries[name] = self.at(value, name).words().numbers()
         return self.at(entries)
 
-    def size_unstated(self, K: Tensor) -> HW:
-        """The size for a format that states none: as given by the user, else guessed, with a warning."""
+    def size_unstated(self, K: Tensor | None) -> HW:
+        """The size for a file that states none: as given by the user, else guessed from K, with a warning."""
         if self.hw is not None:
             return self.hw
+        if K is None:
+            raise self.fail(
+                "w, h",
+                "are not stated, the images' size: give it by `pat rig convert --size W H`, or read_rig's hw",
+            )
         w, h = (max(1, round(2 * c + 1)) for c in K[:2, 2].tolist())
         self.warn(
             f"states no image size: took {w} x {h}, twice the principal point; give it by "
@@ -193,17 +260,62 @@ class Entry:
         """What a mapping has under the first of the keys that is there."""
         keys = (keys,) if isinstance(keys, str) else keys
         for key in keys:
+            self.use(key)
             if (value := self._named().get(key)) is not None:
                 return self.at(value, key)
         raise self.fail(f"has no {' or '.join(keys)}")
 
     def get(self, key: str, default: Any = None) -> Entry:
         """What a mapping has under a key, or the default."""
+        self.use(key)
         return self.at(self._named().get(key, default), key)
+
+    def use(self, *keys: Any) -> None:
+        """Note that keys (by default all) are read, or left out for a reason: see `warn_of_unread`."""
+        keys = keys or tuple(self._named())
+        for mapping in getattr(self._named(), "maps", [self.value]):
+            entry = Entry(self.source, mapping, self.name)
+            self.source.lookups.setdefault(id(mapping), (entry, set()))[1].update(map(str, keys))
 
     def items(self) -> list[tuple[str, Entry]]:
         """All that a mapping has."""
+        self.use()
         return [(str(key), self.at(value, str(key))) for key, value in self._named().items()]
+
+    def find(self, name: str, side: str = "") -> Entry:
+        """The entry whose name matches a pattern (small letters, no signs), and the side "1" or "2", or none;
+        with the value None if there is none. Names with the side are preferred; equal ones are an error."""
+        ends = {"1": ("left|l", "1"), "2": ("right|r", "2")}.get(side)
+        name = f"({name})"
+        one = f"({ends[0]}){name}|{name}({ends[0]}|{ends[1]})" if ends else name
+        keys = [
+            key
+            for key, value in self._named().items()
+            if re.fullmatch(one, plain(key))
+            and value is not None
+            and not (SCALAR.fullmatch(plain(key)) and single(value))
+        ]
+        for key in keys[1:]:
+            if str(self.value[key]) != str(self.value[keys[0]]):
+                raise self.at(None, key).fail(f"and {keys[0]} are of the same camera, and differ: keep one")
+        if keys:
+            self.use(*keys)
+        return self.at(self.value[keys[0]], keys[0]) if keys else self.at(None, "")
+
+    def model(self, side: str = "") -> Entry:
+        """The entry that names the lens's model, of one side or of all; its value is None if none does."""
+        for name in MODEL_NAMES:
+            for which in dict.fromkeys((side, "")):
+                word, sure = self.find(name, which), name != MODEL_NAMES[-1]
+                if word.value is not None and (sure or LENS_WORD.fullmatch(plain(word.value))):
+                    return word
+        return self.at(None, "")
+
+    def sized(self, *keys: str, K: Tensor | None) -> HW:
+        """The size under two keys (width, height) or one, else that of a file without (`size_unstated`)."""
+        if any(self.get(key).value is None for key in keys):
+            return self.source.size_unstated(K)
+        return (self[keys[0]] if len(keys) == 1 else self.listed(*keys)).size()
 
     def each(self) -> list[Entry]:
         """The parts of a list."""
@@ -321,6 +433,50 @@ class Entry:
             raise self.fail(f"has {c.numel()} coefficients; the fisheye model has 4 (k1 k2 k3 k4)")
         return Distortion(KANNALA_BRANDT, torch.nn.functional.pad(c, (0, 4 - c.numel())))
 
+    def of_model(self, word: Entry) -> Distortion | None:
+        """The lens of the model that an entry names, by a word or a flag of fisheyes.
+
+        Where it names none: of the model that the user gives, else of OpenCV's that fits, with a warning if
+        there are four numbers, which both have.
+        """
+        said = plain(word.value) if isinstance(word.value, str) else None
+        if said is None and word.value is not None:
+            said = "fisheye" if word.value else "brown"
+        wanted, none = self.source.lens, said in ("", "none")
+        model = BROWN_CONRADY if said in BROWN_WORDS else KANNALA_BRANDT if said in FISHEYE_WORDS else wanted
+        if said and not none and said not in [*BROWN_WORDS, *FISHEYE_WORDS]:
+            supported = "plumb_bob, radtan, rational_polynomial; equidistant, fisheye"
+            raise word.fail(f"is '{word.value}', which is not read: {supported} are")
+        if said and wanted not in (None, model):
+            raise word.fail(f"is '{word.value}', which is not {wanted}: leave the model out of the command")
+        c = None if self.value is None else self.numbers()
+        if none and c is not None and c.any() and wanted is None:
+            raise word.fail(f"is '{word.value}', and there are coefficients ({self.name}): state their model")
+        if c is None and said and model == KANNALA_BRANDT:
+            raise word.fail(
+                f"is '{word.value}', and no coefficients are found, such as distortion_coefficients"
+            )
+        if (none and wanted is None) or (c is not None and not len(c)):
+            return None
+        if c is None:
+            self.source.warn(
+                "states no lens, such as distortion_coefficients: taken as a pinhole; if it is, state zeros"
+            )
+            return None
+        if model is None:
+            tangential = float(c[2:4].abs().max()) if len(c) == 4 else 0.0
+            model = KANNALA_BRANDT if tangential > SMALL_TANGENTIAL else BROWN_CONRADY
+            if len(c) == 4 and c.any():
+                other = BROWN_CONRADY if model == KANNALA_BRANDT else KANNALA_BRANDT
+                self.source.warn(
+                    f"{self.name}: four coefficients whose model is not stated: took {model}"
+                    f" (the third and fourth are up to {tangential:.2g}). If they are of the other kind, "
+                    f"`pat rig convert --lens {other}`, or read_rig's lens='{other}'"
+                )
+        if model == KANNALA_BRANDT and len(c) > 4 and not c[4:].any():
+            return Entry(self.source, c[:4], self.name).kannala_brandt()  # padded by some tools
+        return self.lens(model)
+
     def lens(self, model: str) -> Distortion | None:
         """A lens of any model; others than the two above from all coefficients, within the model's bounds."""
         if model in (BROWN_CONRADY, KANNALA_BRANDT):
@@ -330,6 +486,36 @@ class Entry:
         if not lens.project(c.new_tensor([0.0, 0.0, 1.0]))[1]:
             raise self.fail(f"is {short(c.tolist())}, which no {model} lens has; was the calibration good?")
         return lens
+
+
+def plain(key: Any) -> str:
+    """A name in small letters without signs."""
+    return re.sub(r"[\W_]", "", str(key).lower())
+
+
+def single(value: Any) -> bool:
+    """Whether a value is a number by itself."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def suspicious(key: Any, value: Any) -> bool:
+    """Whether an entry may be a lens, a model, a flag or a unit, and states something."""
+    name = plain(key)
+    if value is None or HARMLESS.fullmatch(name):
+        return False
+    if isinstance(value, str) and not re.fullmatch(r"[-+\d.eE,\s]+", value):
+        word = plain(value)
+        return bool(LENS_WORD.fullmatch(word)) or (
+            name.endswith(("unit", "units")) and word[:1] not in ("", "p")
+        )
+    if isinstance(value, Mapping):
+        return bool(re.fullmatch(rf"(lens|{LENS_NAME}).?", name)) and bool(value)
+    if isinstance(value, str):
+        value = [float(word) for word in re.findall(r"[-+]?\d[\d.]*(?:[eE][-+]?\d+)?", value)]
+    if SCALAR.fullmatch(name):
+        return value != 0 if single(value) else isinstance(value, list) and len(value) == 1 and value[0] != 0
+    numbers = None if isinstance(value, bool) else float64_of(value)
+    return bool(SUSPECT.fullmatch(name)) and bool(value if numbers is None else numbers.any())
 
 
 def pose_of(R: Entry, t: Entry, metres: float = 1.0) -> Pose:

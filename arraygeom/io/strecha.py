@@ -25,7 +25,7 @@ def read(source: RigSource) -> Rig:
     files = _files(source.path) if source.path.is_dir() else [source.path]
     if not files:
         raise source.fail(None, "holds no .camera file")
-    return source.rig((file.name.removesuffix(".camera"), _camera(RigSource(file))) for file in files)
+    return source.rig((file.name.removesuffix(".camera"), _camera(source.beside(file))) for file in files)
 
 
 def _files(folder: Path) -> list[Path]:

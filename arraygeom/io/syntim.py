@@ -27,7 +27,7 @@ def read(source: RigSource) -> Rig:
     if side not in SIDES:
         return source.rig([(source.path.name, _camera(source))])
     files = {name: source.path.with_name(source.path.name[:-2] + end) for end, name in SIDES.items()}
-    return source.rig((name, _camera(RigSource(file))) for name, file in files.items() if file.exists())
+    return source.rig((name, _camera(source.beside(file))) for name, file in files.items() if file.exists())
 
 
 def _camera(source: RigSource) -> Camera:

@@ -1,16 +1,16 @@
 """Tags of the images of one capture: Pix4D's `Camera:` (MicaSense, Parrot Sequoia, senseFly), `drone-dji`.
 
-A file is one image; the others of its capture are those beside it whose names differ in what follows the last
-"_".
+A file is one image; the others of its capture are those beside it whose names differ in what follows the
+last "_".
 
 Source convention: principal points in millimetres (pixels where the units say so) from the image's first
-pixel, whose centre is 0 (shift 0), as in MicaSense's own code; focal lengths in millimetres or, above 100 or
-where the units say so, in pixels; radial R1 R2 R3 and tangential T1 T2 as OpenCV's k1 k2 k3 p1 p2. Fisheye:
-theta = 2 / pi times the angle off axis goes to p0 + p1 theta + p2 theta^2 + ..., which the matrix C D E F
-takes to pixels. `RigRelatives` are degrees about x, y and z, R = Rx Ry Rz: camera->rig, inverted;
-`RigTranslations` are the cameras' centres, metres. DJI's `DewarpData` is fx fy cx cy k1 k2 p1 p2 k3, with cx
-and cy counted from `CalibratedOpticalCenter`. All are of the pixels as stored: the rig is of the images as
-their orientation tags say.
+pixel, whose centre is 0 (shift 0), as in MicaSense's own code; focal lengths in millimetres or, above 100
+or where the units say so, in pixels; radial R1 R2 R3 and tangential T1 T2 as OpenCV's k1 k2 k3 p1 p2.
+Fisheye: theta = 2 / pi times the angle off axis goes to p0 + p1 theta + p2 theta^2 + ..., which the matrix
+C D E F takes to pixels. `RigRelatives` are degrees about x, y and z, R = Rx Ry Rz: camera->rig, inverted;
+`RigTranslations` are the cameras' centres, metres. DJI's `DewarpData` is fx fy cx cy k1 k2 p1 p2 k3, with
+cx and cy counted from `CalibratedOpticalCenter`, for images whose `DewarpFlag` is not 1. All are of the
+pixels as stored: the rig is of the images as their orientation tags say.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from ..pose import Pose, rotation_from_vector
 from ..rig import Rig
 from ..runtime.extras import needs
 from ..sensor import Band, Sensor
-from .source import RigSource
+from .source import Entry, RigSource
 
 PIX4D, DJI, MICASENSE = "pix4d.com", "drone-dji", "micasense.com/MicaSense"
 """Parts of the names of XMP's namespaces; those of Pix4D's `Camera:` differ between makers."""
@@ -42,8 +42,10 @@ EXIF, GPS = 0x8769, 0x8825
 """Tags of TIFF's directories with EXIF's fields (2.32)."""
 LARGEST_XMP = 1 << 20
 """Bytes of an XMP packet, at most: those of cameras have some tens of thousands."""
-SUFFIXES = (".tif", ".tiff", ".jpg", ".jpeg")
-VIGNETTING = "VignettingPolynomial", "VignettingPolynomial2D"
+PHOTOGRAPHS = (".jpg", ".jpeg")
+SUFFIXES = (".tif", ".tiff", *PHOTOGRAPHS)
+USUAL_WIDTH = 20.0
+"""Nanometres of a band, where none are stated."""
 IN_PIXELS = 100.0
 """A focal length above is in pixels: no lens of these has so many millimetres, no image so few pixels."""
 LONGEST_TRANSLATION = 1.0
@@ -107,15 +109,21 @@ def rig_of_images(files: Mapping[str, Path]) -> Rig:
     Warns of what the tags do not state. Raises RigFileError for images without tags, of several captures or
     bodies, and for numbers that no camera has.
     """
-    images = {name: _Image.of(path) for name, path in files.items()}
+    if not files:
+        raise ValueError("there are no images")
+    first = RigSource(next(iter(files.values())))
+    images = {name: _Image.of(first.beside(path)) for name, path in files.items()}
     _check_one_capture(images)
     cameras = [(name, image.camera()) for name, image in images.items()]
-    first = next(iter(images.values())).source
     rig = first.rig(cameras)
     if unrotated := [name for name, image in images.items() if image.rotation is None][1:]:
         first.warn(f"RigRelatives are not stated of {', '.join(unrotated)}: parallel axes are assumed")
-    if any(image.text(name) for image in images.values() for name in VIGNETTING):
-        first.warn("vignetting polynomials are stated, and not applied: values are as recorded")
+    vignetting = [
+        (image, ns, key) for image in images.values() for ns, key in image.tags.xmp if "Vignetting" in key
+    ]
+    if [image.text(key, ns) for image, ns, key in vignetting]:
+        first.warn("vignetting is stated, and not applied: values are as recorded")
+    first.warn_of_unread()
     if len(cameras) > 1 and not any(bool(image.centre.any()) for image in images.values()):
         first.warn(
             "RigTranslations are not stated: all cameras are at one point; state the translations, in metres"
@@ -128,21 +136,27 @@ class _Image(NamedTuple):
 
     source: RigSource
     tags: ImageTags
+    stated: dict[str, Entry]
 
     @classmethod
-    def of(cls, path: Path) -> _Image:
-        source = RigSource(path)
-        tags = image_tags(path)
+    def of(cls, source: RigSource) -> _Image:
+        tags = image_tags(source.path)
         if tags is None or not _states_camera(tags):
             raise source.fail(None, "has no tags of a camera (Camera: or drone-dji): give a rig file instead")
-        return cls(source, tags)
+        xmp = tags.xmp.items()
+        names = (PIX4D, DJI, MICASENSE)
+        return cls(
+            source, tags, {ns: source.at({key: v for (one, key), v in xmp if one == ns}) for ns in names}
+        )
 
-    def text(self, name: str) -> str | None:
-        return self.tags.text(PIX4D, name)
+    def text(self, name: str, namespace: str = PIX4D) -> str | None:
+        """An XMP tag; None if it is not stated."""
+        value = self.stated[namespace].get(name).value
+        return None if value is None else str(value)
 
     def numbers(self, name: str, *count: int, namespace: str = PIX4D) -> Tensor | None:
         """The numbers of a tag, as many as are wanted; None if it is not stated."""
-        text = self.tags.text(namespace, name)
+        text = self.text(name, namespace)
         words = None if text is None else self.source.at(re.sub("[,;]", " ", text), name).words()
         return None if words is None else words.numbers(count or None)
 
@@ -234,7 +248,7 @@ class _Image(NamedTuple):
 
     def _dji(self) -> tuple[Tensor, Distortion | None]:
         """K and the lens by DJI's DewarpData: fx, fy, cx, cy from the middle, k1, k2, p1, p2, k3."""
-        (h, w), text = self.tags.hw, self.tags.text(DJI, "DewarpData") or ""
+        (h, w), text = self.tags.hw, self.text("DewarpData", DJI) or ""
         dated, _, numbers = text.rpartition(";")
         if not dated:
             raise self.source.fail("DewarpData", "is not a date and nine numbers: give a rig file instead")
@@ -246,7 +260,10 @@ class _Image(NamedTuple):
         ]
         x, y = (half if stated is None else float(stated[0]) for stated, half in middle)
         K = torch.tensor([[fx, 0, x + cx], [0, fy, y + cy], [0, 0, 1]], dtype=torch.float64)
-        return K, self.source.at(c, "DewarpData").brown_conrady()
+        flag = self.numbers("DewarpFlag", 1, namespace=DJI)
+        if flag is None:
+            self.source.warn("DewarpFlag is not stated: taken as not dewarped, with the lens of DewarpData")
+        return K, None if flag is not None and flag.any() else self.source.at(c, "DewarpData").brown_conrady()
 
     def _checked(self, K: Tensor) -> Tensor:
         """An intrinsic matrix, its principal point near the image's middle."""
@@ -263,23 +280,35 @@ class _Image(NamedTuple):
         fields = self.tags.fields
         colour = len((self.text("BandName") or "").split(",")) == 3
         centre, width = (self._one(name) for name in ("CentralWavelength", "WavelengthFWHM"))
-        response = "rgb" if colour else Band(centre, width or 0.0) if centre else None
-        if colour:  # a developed photograph: sRGB, no counts of light
+        if centre and not width and not colour:
+            self.source.warn(f"WavelengthFWHM is not stated: a band {USUAL_WIDTH:g} nm wide is assumed")
+        response = "rgb" if colour else Band(centre, width or USUAL_WIDTH) if centre else None
+        black = fields.get(BLACK_LEVEL, self.numbers("BlackCurrent", namespace=DJI))
+        if colour or self.source.path.suffix.lower() in PHOTOGRAPHS:  # developed: sRGB, no counts of light
             return Sensor(response=response)
-        speed = fields.get(ISO, fields.get(ISO_SPEED, (100.0,)))[0]
-        black = fields.get(BLACK_LEVEL, (0.0,))
+        stated = fields.get(ISO, fields.get(ISO_SPEED))
+        gain = self.numbers("SensorGain", 1, namespace=DJI)
+        speed = float(stated[0]) if stated else 100.0 if gain is None else 100.0 * float(gain)
+        missing = {"black level": black is None, "gain (ISO speed)": stated is None and gain is None}
+        if any(missing.values()):
+            names = " and no ".join(name for name, is_missing in missing.items() if is_missing)
+            self.source.warn(
+                f"states no {names}: taken as {'0' if black is None else '1'}; a rig file may state it"
+            )
+        levels = [0.0] if black is None else [float(value) for value in black]
         exposure = float(fields.get(EXPOSURE, (0.0,))[0]) or None
         return Sensor(
             response=response,
             coding="linear",
             bits=16,
-            black_level=float(sum(black) / len(black)),
+            black_level=sum(levels) / len(levels),
             exposure=exposure,
             gain=float(speed) / 100.0,
         )
 
     def _one(self, name: str) -> float | None:
         numbers = self.numbers(name)
+        numbers = self.numbers(name, namespace=DJI) if numbers is None else numbers
         return None if numbers is None else float(numbers[0])
 
 

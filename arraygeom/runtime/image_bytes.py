@@ -1,7 +1,7 @@
 """Bytes of image files, checked before a decoder that trusts them sees them.
 
-OpenCV 4.11 to 4.13 crash on damaged animated PNGs, take what is missing of a planar TIFF for black, and do
-not read a PNM of text without a line break at its end.
+OpenCV 4.11 to 4.13 crash on damaged animated PNGs, take what is missing of a planar TIFF for black, do not
+read a PNM of text without a line break at its end, and give pixels where libjpeg and libtiff report damage.
 """
 
 from __future__ import annotations
@@ -13,8 +13,11 @@ from contextlib import contextmanager
 from io import BytesIO
 from typing import Any
 
+import numpy as np
+
 PNG = b"\x89PNG\r\n\x1a\n"
 TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+JPEG = b"\xff\xd8"
 PNM_OF_TEXT = (b"P1", b"P2", b"P3")
 ANIMATION = (b"acTL", b"fcTL", b"fdAT")
 """Chunks of a PNG file beside those of its first image."""
@@ -22,6 +25,9 @@ SEPARATE = 2
 """A TIFF file's PlanarConfiguration: one plane after the other."""
 MINISWHITE, MINISBLACK = 0, 1
 """Of its PhotometricInterpretation."""
+YCBCR = 6
+DEFLATE, LZW, JPEG_IN_TIFF = (8, 32946), (5,), (7,)
+"""Of its Compression."""
 REDUCED, MASK = 1, 4
 """Of a TIFF directory's NewSubfileType."""
 DAMAGED = (OSError, SyntaxError, ValueError, struct.error, LookupError, TypeError, ArithmeticError)
@@ -33,7 +39,7 @@ def decodable(content: bytes) -> bytes | None:
     text with a line break at its end, others as they are.
 
     None for a PNG that is cut or fails its own checks, which OpenCV leaves to a library that writes to the
-    terminal, and for a TIFF that lacks some of its pixels.
+    terminal, for a TIFF that lacks some of its pixels, and where the decoder of compressed pixels warns.
     """
     if content.startswith(PNG):
         chunks = png_chunks(content)
@@ -41,7 +47,7 @@ def decodable(content: bytes) -> bytes | None:
         if not (ends and all(_is_undamaged(content, chunk) for chunk in chunks)):
             return None
         return PNG + b"".join(content[start:end] for kind, start, end in chunks if kind not in ANIMATION)
-    if content[:4] in TIFF and not _is_whole(content):
+    if (content[:4] in TIFF and not _is_whole(content)) or (content[:2] == JPEG and not _is_sound(content)):
         return None
     return content + b"\n" if content[:2] in PNM_OF_TEXT else content
 
@@ -124,4 +130,59 @@ def _is_whole(content: bytes) -> bool:
         bool(starts)
         and len(starts) == len(lengths)
         and all(a + b <= len(content) for a, b in zip(starts, lengths))
+        and all(
+            _decompresses(page, content[a : a + b], i) for i, (a, b) in enumerate(zip(starts, lengths)) if b
+        )
     )
+
+
+def _decompresses(page: Any, segment: bytes, i: int) -> bool:
+    """Whether a TIFF page's i-th strip or tile is decompressed without a warning, to its length."""
+    if page.compression in DEFLATE:
+        try:
+            return len(zlib.decompress(segment)) >= _length(page, i)
+        except zlib.error:
+            return False
+    if page.compression in LZW:
+        from .lzw import lzw_length
+
+        wanted, data = _length(page, i), np.frombuffer(segment, np.uint8)
+        unusual = segment[:2] == b"\0\1" or page.fillorder != 1  # as before TIFF 6; bits reversed
+        return bool(unusual or wanted == 1 or lzw_length(data, wanted) == wanted)
+    tables = page.jpegtables[:-2] if page.jpegtables else JPEG
+    return page.compression not in JPEG_IN_TIFF or _is_sound(tables + segment[2:])
+
+
+def _length(page: Any, i: int) -> int:
+    """Bytes of a page's i-th strip or tile once it is decompressed; 1 where that depends on its colours."""
+    if page.photometric == YCBCR:
+        return 1
+    rows, width, height = page.rowsperstrip, page.imagewidth, page.imagelength
+    if page.is_tiled:
+        rows, width, height = page.tilelength, page.tilewidth, page.tilelength * (i + 1)
+    strips = -(-height // rows)
+    samples = 1 if page.planarconfig == SEPARATE else page.samplesperpixel
+    bits = page.bitspersample
+    bits = max(bits) if isinstance(bits, tuple | list) else bits
+    return int(min(rows, height - i % strips * rows) * -(-width * samples * bits // 8))
+
+
+def _is_sound(content: bytes) -> bool:
+    """Whether libjpeg decodes a JPEG without a warning, or one of other colours than it gives."""
+    try:
+        jpeg_colours(content)
+    except Exception:  # the decoder raises nothing narrower
+        return False
+    return True
+
+
+def jpeg_colours(content: bytes) -> Any:
+    """Values (H, W, 1 or 3; red first) of a JPEG file, as OpenCV's; None for other colours than RGB and grey.
+
+    Raises an Exception where libjpeg warns: OpenCV prints the warning, and gives the pixels that it has.
+    """
+    from kornia_rs import io
+    from PIL.JpegImagePlugin import JpegImageFile
+
+    mode = {"L": "mono", "RGB": "rgb"}.get(JpegImageFile(BytesIO(content)).mode)
+    return None if mode is None else np.asarray(io.decode_image_jpegturbo(content, mode))

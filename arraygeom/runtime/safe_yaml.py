@@ -1,6 +1,7 @@
 """YAML and JSON of unknown origin: bounded in nesting, YAML in size and aliases, no repeated keys.
 
-The one loader of each in the project. Both build plain values only, so nothing in a file can run code.
+The one loader of each in the project. Both build plain values only. What uses these may still run code that
+they name: a field or a generator MODULE:OBJECT, which commands import only if their own options name it too.
 """
 
 from __future__ import annotations

@@ -39,3 +39,7 @@ __getattr__ = _lazy(
         "write_board": "target",
     },
 )
+
+
+def __dir__() -> list[str]:
+    return __all__

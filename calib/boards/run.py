@@ -16,7 +16,8 @@ import numpy as np
 
 from arraygeom import Rig
 from arraygeom.pair import depth_range
-from arraygeom.runtime.atomic import sweep, write_text, write_together
+from arraygeom.runtime.atomic import write_text
+from arraygeom.runtime.together import refuse_others, sweep, write_together
 
 from .adequacy import coverage_advice, coverages, next_views, point_counts
 from .board import Board
@@ -66,6 +67,9 @@ def calibrate_photos(
         raise ValueError(f"{out}: a rig file's name ends in .yaml")
     if depth is not None:
         depth_range(*depth)
+    written = [out.with_suffix(".html"), out.with_suffix(".covariance.json"), out]
+    sweep(out.parent, out.name)
+    refuse_others(out.parent, [path.name for path in written[:2]], group=out.name)
     target = parse_boards([board] if isinstance(board, str) else board)
     nominal = None if start is None else Rig.load(start)
     if nominal is not None:
@@ -81,15 +85,13 @@ def calibrate_photos(
     lenses = [f"{name}: {c.advice}" for name, c in comparisons.items()]
     stated = depth if depth is not None or nominal is None else nominal.depth
     rig = calibration.rig.replace(depth=stated, name=out.stem)
-    written = [out.with_suffix(".html"), out.with_suffix(".covariance.json"), out]
     notes = by_cameras([*lenses, *collected.notes, *calibration.notes, *coverage_advice(calibration)])
     title = f"Calibration of {out.name}"
     report = report_html(
         calibration, title=title, notes=notes, detected=collected.views, photos=collected.photos
     )
     covariance = rig_covariance(calibration.fit)
-    sweep(out.parent, out.stem)
-    with write_together(out.parent, last=out.name, stale=[path.name for path in written[:2]]) as folder:
+    with write_together(out.parent, group=out.name, last=out.name, given=[out.name]) as folder:
         write_text(folder / written[0].name, report)
         if covariance is not None:
             covariance.save(folder / written[1].name, rig)

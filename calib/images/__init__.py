@@ -19,3 +19,7 @@ __getattr__ = _lazy(
         "rig_from_images": "from_images",
     },
 )
+
+
+def __dir__() -> list[str]:
+    return __all__

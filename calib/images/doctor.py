@@ -36,7 +36,6 @@ from .hypotheses import (
     zoomed,
 )
 from .matches import (
-    ENOUGH,
     Images,
     Pairs,
     PointMatches,
@@ -47,7 +46,7 @@ from .matches import (
     match_cameras,
 )
 from .parameters import LARGEST_CHANGE, SIGMA
-from .residuals import image_parts, line_distances, related
+from .residuals import image_parts, line_distances, related, within_lenses
 
 LOG = logging.getLogger(__name__)
 
@@ -88,9 +87,10 @@ class Diagnosis:
     named: the mistake, with the repaired rig; or that of kind "nothing": no mistake explains the images
     clearly better than a drift of the cameras does. equal: other kinds of mistake that explain them as well.
     before, after: statistics of the given rig and of the repaired one. tried: of all, best first. matches:
-    number of points used. beyond: of others, which lie where a lens model has no rays. healthy: the given rig
-    fits the images. certain: all explanations that are as good as the one named are undone by the same rig.
-    depth: bounds of the points' depth, as of `depth_seen`, by the rig named, if that states no depth range.
+    number of points used. healthy: the given rig fits the images. certain: all explanations that are
+    as good as the one named are undone by the same rig. depth: bounds of the points' depth, as of
+    `depth_seen`, by the rig named, if that states no depth range. beyond: points left out, where a lens model
+    of the given rig has ended.
     """
 
     named: Hypothesis
@@ -99,10 +99,10 @@ class Diagnosis:
     after: FitStatistics
     tried: Mapping[Hypothesis, FitStatistics]
     matches: int
-    beyond: int
     healthy: bool
     certain: bool
     depth: tuple[float, float] | None = None
+    beyond: int = 0
 
     @property
     def verdict(self) -> str:
@@ -133,12 +133,14 @@ class Diagnosis:
         """The verdict, and the statistics before and after, as text."""
         unit = length_unit(self.named.rig)
         lines = [self.verdict, f"as given: {self.before.as_text(unit)}"]
+        if self.beyond:
+            lines.append(
+                f"{self.beyond} of {self.beyond + self.matches} points lie where a lens model has ended, "
+                "and are left out: `pat rig info` says where, `pat rig convert --refit` fits a lens anew"
+            )
         if self.named.kind != "nothing":
             lines.append(f"repaired: {self.after.as_text(unit)}")
-        beyond = (
-            f"; {self.beyond} more lie beyond the lenses' domains and do not count" if self.beyond else ""
-        )
-        lines.append(f"from {self.matches} points seen in two images{beyond}")
+        lines.append(f"from {self.matches} points seen in two images")
         if self.depth is not None:
             near, far = (f"{bound:.3g}" for bound in self.depth)
             lines.append(
@@ -187,12 +189,10 @@ def diagnose(rig: Rig, images: Images, matches: Pairs | None = None) -> Diagnosi
 
 def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnosis:
     """`diagnose` from matched points of images of these sizes."""
+    pairs = {names: _thinned(matches) for names, matches in related(rig, pairs).items()}
     fits = all(rig[name].hw == hw for name, hw in sizes.items())
-    pairs = related(rig, pairs)
-    every = sum(len(matches.alpha) for matches in pairs.values())
-    pairs = _within_lenses(rig, pairs) if fits else pairs
-    beyond = every - sum(len(matches.alpha) for matches in pairs.values())
-    pairs = {names: _thinned(matches) for names, matches in pairs.items()}
+    found = sum(len(matches.alpha) for matches in pairs.values())
+    pairs = within_lenses(rig, pairs) if fits else pairs
     tried = hypotheses(rig, sizes)
     if fits:
         tried += [*_ignored_lens(rig, pairs), *_degrees(rig, pairs), *_depth_range(rig, pairs)]
@@ -227,8 +227,8 @@ def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnos
         before=fit[given],
         after=fit[named],
         tried={h: fit[h] for h in table},
-        matches=sum(len(matches.alpha) for matches in pairs.values()),
-        beyond=beyond,
+        matches=(kept := sum(len(matches.alpha) for matches in pairs.values())),
+        beyond=found - kept,
         healthy=healthy,
         certain=named is not given and all(_same_rig(named.rig, h.rig, pairs) for h in others),
         depth=depth_seen(named.rig, pairs) if named.rig.depth is None else None,
@@ -313,16 +313,6 @@ def _ignored_lens(rig: Rig, pairs: Pairs) -> list[Hypothesis]:
         k1, step = candidates[best], candidates[1] - candidates[0]
         lowest, highest = k1 - step, k1 + step
     return [ignored_lens(rig, bare, k1)]
-
-
-def _within_lenses(rig: Rig, pairs: Pairs) -> Pairs:
-    """The points where both lenses have rays; all of a pair where too few are left."""
-    kept = {}
-    for names, matches in pairs.items():
-        pair = rig.pair(*names)
-        valid = pair.alpha.undistort(matches.alpha)[1] & pair.beta.undistort(matches.beta)[1]
-        kept[names] = matches.only(valid) if int(valid.sum()) >= ENOUGH else matches
-    return kept
 
 
 def _far_from_range(hypothesis: Hypothesis, depth: float) -> float:

@@ -342,8 +342,8 @@ def _of_numbers(rig: Rig, names: Sequence[str]) -> Iterator[Hypothesis]:
         yield from _of_groups(rig, every, "resized", {words: _same_size(A)})
         for what, columns in (("principal point", slice(2, 3)), ("focal lengths", slice(0, 2))):
             words = f"{what} of {{}} for images {1 / factor:.3g} times as large"
-            change = partial(on_cameras, change=partial(_partly_scaled, A, columns))
-            yield from _of_groups(rig, _groups(calibrated), "resized", {words: change})
+            undo: Change = partial(on_cameras, change=partial(_partly_scaled, A, columns))
+            yield from _of_groups(rig, _groups(calibrated), "resized", {words: undo})
     curved = [name for name in calibrated if rig[name].distortion is not None]
     yield from _of_groups(rig, _groups(curved), "distortion", CURVED)
     lenses = [name for name in curved if isinstance(rig[name].distortion, Distortion)]

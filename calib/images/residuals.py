@@ -87,6 +87,15 @@ def _residuals(pair: Pair, matches: PointMatches) -> tuple[EpipolarResiduals, tu
     return EpipolarResiduals(algebraic / both.sqrt(), line, valid), (a, b)
 
 
+def within_lenses(rig: Rig, pairs: Pairs) -> dict[tuple[str, str], PointMatches]:
+    """The matches whose points have rays through their cameras' lens models; all of a pair with few such."""
+    kept = {}
+    for names, matches in pairs.items():
+        valid = epipolar_residuals(rig.pair(*names), matches).valid
+        kept[names] = matches.only(valid) if valid.sum() >= 2 * FEW else matches
+    return kept
+
+
 def sampson_of_pairs(rig: Rig, pairs: Pairs) -> list[Float[Tensor, " n"]]:
     """Sampson distances of the points of each pair, pixels; 0 where a pixel has no ray."""
     parts = [epipolar_residuals(rig.pair(*names), matches) for names, matches in pairs.items()]

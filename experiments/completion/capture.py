@@ -7,15 +7,16 @@ differences from that.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pat.fusion.fuse import FuseSettings
 from pat.lab.data.pairs import StereoPair
 from pat.lab.evaluation.protocols import mono_colour_task, rectified_fusion
+from pat.matching.match import Matcher, match
 from pat.media.colour import to_luma_chroma
 from pat.networks.completion import CANDIDATES, Completion, differences
 from pat.networks.guided import GuidedPAT
@@ -45,24 +46,28 @@ class Recorder(Completion):
         return mixed
 
 
-def fused_at_random(network: GuidedPAT, pair: StereoPair, seed: int, **options: Any) -> Tensor:
+def fused_at_random(network: GuidedPAT, pair: StereoPair, seed: int, matcher: Matcher = match) -> Tensor:
     """Fuse a pair recorded at random, left as alpha, its largest disparity known; returns left as it is."""
     assert pair.max_disparity is not None
     rng, g = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
     alpha, beta, truth, _ = mono_colour_task(pair, int(rng.choice(RATES)))
+    noise = None
     if rng.random() < NOISY:
         level = NoiseLevel.of_electrons(float(np.exp(rng.uniform(np.log(50), np.log(2000)))), READ_NOISE)
         alpha, beta = (level.recorded(image[None], g)[0] for image in (alpha, beta))
-        options = {**options, "noise": {"alpha": level, "beta": level}}
-    rectified_fusion(network, response="rec601", align=False, **options)(alpha, beta, pair.max_disparity)
+        noise = {"alpha": level, "beta": level}
+    settings = FuseSettings(response="rec601", align=False, noise=noise)
+    rectified_fusion(network, settings=settings, matcher=matcher)(alpha, beta, pair.max_disparity)
     return truth
 
 
-def captured(network: GuidedPAT, pair: StereoPair, seed: int, **options: Any) -> Float[Tensor, "p h w"]:
-    """The planes of a pair recorded at random, left as alpha, its largest disparity known; options are those
-    of `fuse`."""
+def captured(
+    network: GuidedPAT, pair: StereoPair, seed: int, matcher: Matcher = match
+) -> Float[Tensor, "p h w"]:
+    """The planes of a pair recorded at random, left as alpha, its largest disparity known; `matcher` is as of
+    `fuse`."""
     recorder = network.completion = Recorder()
-    truth = fused_at_random(network, pair, seed, **options)
+    truth = fused_at_random(network, pair, seed, matcher)
     alpha, confidence, mixed, candidates = recorder.given
     colours = [to_luma_chroma(c)[1] for c in (mixed, *differences(confidence, mixed, candidates))]
     h, w = truth.shape[1:]

@@ -74,7 +74,7 @@ def planes_of(
     """What is kept of a pair of a kind."""
     learned = config.choices and kind in ("pairs", "shapes") and pair.disparity is not None
     best = unseeing(config.choices, pair.name) if learned else None
-    return {"planes": levels(captured(network, pair, seed, matcher=partial(match, choice=best)))}
+    return {"planes": levels(captured(network, pair, seed, partial(match, choice=best)))}
 
 
 def losses(

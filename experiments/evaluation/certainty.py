@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float
 from torch import Generator, Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
+from pat.fusion.fuse import FuseSettings
 from pat.lab.data.pairs import PAPER_DISPARITY, StereoPair
 from pat.lab.evaluation.protocols import hw_of, rectified_fusion
 from pat.lab.evaluation.tables import grouped, markdown_table
@@ -129,7 +130,9 @@ def judged_pair(network: FusionNetwork, pair: StereoPair, condition: str, choice
         kept.extend(matches.betas)
         return matches
 
-    fused = rectified_fusion(network, noise=stated, matcher=matcher)(task.alpha, task.beta, PAPER_DISPARITY)
+    fused = rectified_fusion(network, settings=FuseSettings(noise=stated), matcher=matcher)(
+        task.alpha, task.beta, PAPER_DISPARITY
+    )
     assert fused.disparity is not None
     (value, valid), (h, w) = task.disparity, hw_of(task.alpha)
     places = valid.nonzero()

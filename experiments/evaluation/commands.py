@@ -12,6 +12,7 @@ from tyro.conf import arg
 from arraygeom.runtime.atomic import write_text
 from experiments.names import refuse_unknown
 from pat.app.cli.options import MaybePath, Out, Weights, progress, say, writable
+from pat.fusion.fuse import FuseSettings
 from pat.lab import commands as research
 from pat.lab.data.pairs import StereoPair, middlebury_pairs
 from pat.lab.evaluation import protocols, stereo
@@ -95,7 +96,8 @@ class Evaluate(Pairs, research.Evaluate):
         field = paper.AuthorsRows() if self.as_authors else None
         if self.as_authors:
             sets = {name: map(paper.halved, pairs) for name, pairs in sets.items()}
-        fusion = protocols.rectified_fusion(network, bands=bands, field=field)
+        settings = FuseSettings(field=field)
+        fusion = protocols.rectified_fusion(network, bands=bands, settings=settings)
         methods = {**protocols.BASELINES, "fusion": fusion, **compared}
         rows = stereo.evaluate_sets(sets, methods, self.rates, out=self.out)
         text = stereo.sets_markdown(rows, printed=paper.PRINTED[self.protocol])

@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -22,6 +22,7 @@ from torch.nn.functional import interpolate
 from arraygeom import Rectified
 from arraygeom.sampling import sample
 from arraygeom.viz import new_figure
+from pat import FuseSettings
 from pat.fusion.classical import classical_fusion, denoised_knowing, raw_disparity
 from pat.fusion.fuse import corrections_of
 from pat.lab.data.pairs import PAPER_DISPARITY, Disparity, StereoPair
@@ -161,9 +162,9 @@ def methods_of(network: FusionNetwork, level: NoiseLevel | None) -> dict[str, St
         methods["denoised, classical"] = lambda a, b, d: classical(
             denoised_knowing(a, level), denoised_knowing(b, level), d
         )
-    methods["uncorrected"] = rectified_fusion(network, response="rec601", align=False)
-    noisy: dict[str, Any] = {} if level is None else {"noise": {"alpha": level, "beta": level}}
-    methods["fusion"] = rectified_fusion(network, **noisy)
+    methods["uncorrected"] = rectified_fusion(network, settings=FuseSettings(response="rec601", align=False))
+    noise = None if level is None else {"alpha": level, "beta": level}
+    methods["fusion"] = rectified_fusion(network, settings=FuseSettings(noise=noise))
     return methods
 
 
@@ -173,7 +174,9 @@ def corrected_classical(
     """The classical baseline with alpha's response as the fusion finds it."""
     rig = rectified_rig(hw_of(alpha), {"beta": hw_of(beta)}, max_disparity)
     images, field = {"alpha": alpha, "beta": beta}, Rectified(max_disparity, alpha_is="left")
-    response = corrections_of(network, rig, images, alpha="alpha", field=field, align=False).response
+    response = corrections_of(
+        images, rig, alpha="alpha", network=network, settings=FuseSettings(field=field, align=False)
+    ).response
     image = classical_fusion(response.of_alpha(alpha), response.of_beta(beta), max_disparity)
     return StereoResult(response.undone(image))
 

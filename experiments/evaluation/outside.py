@@ -15,6 +15,7 @@ from torch.nn.functional import interpolate
 from arraygeom import ReceptiveField
 from arraygeom.fields import AroundDepth
 from pat.fusion.classical import checked_disparity
+from pat.fusion.fuse import FuseSettings
 from pat.lab.data.pairs import PAPER_DISPARITY, Disparity, StereoPair
 from pat.lab.evaluation.protocols import MonoColourTask, enlarged, hw_of, mono_colour_task, rectified_fusion
 from pat.lab.evaluation.stereo import disparity_errors
@@ -66,7 +67,9 @@ def _row(
     pair: str, task: MonoColourTask, network: FusionNetwork, source: str, field_of: FieldOf
 ) -> OutsideRow:
     began = time.perf_counter()
-    fused = rectified_fusion(network, field=field_of(task))(task.alpha, task.beta, PAPER_DISPARITY)
+    fused = rectified_fusion(network, settings=FuseSettings(field=field_of(task)))(
+        task.alpha, task.beta, PAPER_DISPARITY
+    )
     seconds = time.perf_counter() - began
     assert fused.disparity is not None
     error, within = disparity_errors(fused.disparity, _truth(task))

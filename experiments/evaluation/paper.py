@@ -15,9 +15,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from arraygeom import Pair, Positions, ReceptiveField, Rectified, Segments
+from pat import FuseSettings, fuse
 from pat.app.from_images import found_rig
 from pat.app.sample_array import BETA, SAMPLE
-from pat.fusion.fuse import fuse
 from pat.fusion.steps import of_size
 from pat.lab.data.pairs import Disparity, StereoPair
 from pat.lab.evaluation.protocols import (
@@ -100,7 +100,9 @@ def controls(network: FusionNetwork, *, bands: bool = False) -> dict[str, Stereo
 
     def shuffled(alpha: Tensor, beta: Tensor, max_disparity: float) -> StereoResult:
         field = ShuffledField(Rectified(max_disparity, alpha_is="left"))
-        return rectified_fusion(network, bands=bands, field=field)(alpha, beta, max_disparity)
+        return rectified_fusion(network, bands=bands, settings=FuseSettings(field=field))(
+            alpha, beta, max_disparity
+        )
 
     return {
         "no beta": lambda alpha, beta, most: fusion(alpha, torch.zeros_like(beta), most),
@@ -114,8 +116,8 @@ def with_found_rig(network: Network) -> StereoMethod:
 
     def fused(alpha: Tensor, beta: Tensor, max_disparity: float) -> StereoResult:
         images = {"alpha": alpha, "beta": beta}
-        rig, _ = found_rig(images, "alpha", {}, network, lambda line: None)
-        return StereoResult(fuse(network, rig, images, alpha="alpha").image)
+        rig, _ = found_rig(images, "alpha", {}, network.bands, lambda line: None)
+        return StereoResult(fuse(images, rig, alpha="alpha", network=network).image)
 
     return fused
 

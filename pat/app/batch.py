@@ -1,9 +1,9 @@
 """Many frames, and sequences, from folders to a folder: `pat fuse` with more than one image a camera.
 
-Every frame is a task of its own that leaves its image last; `settings.yaml` beside the images says what they
-were made with, and a job is resumed with the same settings only; `inputs.json` says from which images, and
-frames whose images have changed are made again. One command at a time writes to a folder. The colours of a
-sequence's key frames wait in `.keys` until all frames are there.
+Every frame is a task of its own, whose files are swapped in with the list of them (`write_together`);
+`settings.yaml` beside the images says what they were made with, and a job is resumed with the same settings
+only; frames whose images or results are not those of before, by their digests, are made again. One command at
+a time writes to a folder. The colours of a sequence's key frames wait until all frames are there.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import re
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -27,13 +27,25 @@ from arraygeom import Rig, ThroughLenses, Widened
 from arraygeom.fields import FIELDS
 from arraygeom.io.native import read_text as rig_of_text
 from arraygeom.io.native import write as rig_text
-from arraygeom.runtime.atomic import sweep, write_text
+from arraygeom.runtime.atomic import write_text
 from arraygeom.runtime.safe_yaml import dump_yaml, load_yaml
+from arraygeom.runtime.threads import in_parallel
+from arraygeom.runtime.together import (
+    LISTS,
+    digest,
+    list_file,
+    read_about,
+    retire,
+    sweep,
+    write_listed,
+    write_together,
+)
 
 from ..fusion.checks import confidence_checked
+from ..fusion.frame import Frame
 from ..fusion.frames import ImageFiles
-from ..fusion.fuse import FuseSettings, fuse
-from ..fusion.results import Frame, ImageFormat, band_names, save_frame, view_of
+from ..fusion.fuse import FuseSettings, fuse_frame
+from ..fusion.results import ImageFormat, band_names, fused_group, refuse_to_replace, save_frame, view_of
 from ..fusion.sequence import KeyColour, SequenceFusion, readable
 from ..fusion.timeline import KeyFrame
 from ..fusion.views import ViewFiles
@@ -46,11 +58,10 @@ from ..sensors import NoiseLevel
 from ..support.jobs import HERE, JobReport, OnError, Task, Workers, run_tasks
 from ..support.locks import folder_lock
 from ..support.memory import limited
-from ..support.schema import entries_of
 from ..support.tensor_files import read_tensors, write_tensors
 
-INPUTS = "inputs.json"
-SETTINGS, KEYS, PLAN = "settings.yaml", ".keys", "plan.json"
+SETTINGS, VIDEO = "settings.yaml", "fused.mp4"
+KEYS, PLAN = f"{LISTS}/keys", "plan.json"
 
 PLAN_FORMAT = "pat-batch 1"
 _network = lru_cache(maxsize=2)(load_weights)
@@ -73,7 +84,7 @@ class Batch:
     weights: str = "mono-colour"
     sequence: bool = False
     speed: float | None = None
-    settings: FuseSettings = FuseSettings()  # noqa: RUF009
+    settings: FuseSettings = FuseSettings()
     bits: int = 8
     kind: ImageFormat = "png"
     alone: bool = False
@@ -100,7 +111,7 @@ class Batch:
         names = [file.stem for file in self.files[self.alpha]]
         return names if len(set(names)) == len(names) else [f"{i:06d}" for i in range(len(names))]
 
-    @property
+    @cached_property
     def dependencies(self) -> str:
         """What the results depend on, as text."""
         digest = hashlib.sha256(find_weights(self.weights).read_bytes()).hexdigest()
@@ -114,14 +125,25 @@ class Batch:
             entries["frames"] = {name: len(paths) for name, paths in files.items()}
         return dump_yaml(entries)
 
-    @property
-    def inputs(self) -> dict[str, str]:
-        """A digest of names, sizes and times of the images each frame is made from: all, in a sequence."""
-        stamps = {name: [_stamp(file) for file in files] for name, files in self.files.items()}
-        if self.sequence:
-            return dict.fromkeys(self.names, _digest(stamps))
-        frames = ({n: indices[i] for n, indices in stamps.items()} for i in range(len(self.names)))
-        return dict(zip(self.names, map(_digest, frames)))
+    @cached_property
+    def _of_sequence(self) -> str:
+        """As `inputs`, of all frames of a sequence; empty for frames of their own."""
+        files = {name: list(map(digest, paths)) for name, paths in self.files.items()}
+        return _digest([self.dependencies, files]) if self.sequence else ""
+
+    def inputs(self, i: int) -> str:
+        """A digest of the settings and of the images a frame is made from: all, in a sequence."""
+        own = {name: digest(files[i]) for name, files in self.files.items() if not self.sequence}
+        return self._of_sequence or _digest([self.dependencies, own])
+
+    def list_file(self, i: int) -> Path:
+        """The list of a fused frame's files, which is there when it is made."""
+        return list_file(self.out, fused_group(self.names[i]))
+
+    def _is_made(self, i: int) -> bool:
+        """Whether a frame is there, whole, from these images and settings."""
+        about = read_about(self.out, fused_group(self.names[i]))
+        return about is not None and about.get("inputs") == self.inputs(i)
 
     def fused_file(self, i: int) -> Path:
         """The file of a fused frame."""
@@ -150,23 +172,27 @@ class Batch:
             if self.sequence:
                 self.fusion.timeline.warn_of_ends()
             if self.sequence and not self.alone:
-                missing = [i for i in many if not (resume and self.fused_file(i).exists())]
+                missing = [i for i in many if not self.list_file(i).exists()]
                 keys = [(k, f"key frame {self.names[k.alpha]}") for k in self.fusion.keys_of(missing)]
                 first = [Task(self._key_file(k), fuse_key, (plan, k), about) for k, about in keys]
                 run_tasks(first, title="key frames", **how)
-            tasks = [Task(self.fused_file(i), fuse_one, (plan, i)) for i in many]
-            report = run_tasks(tasks, title="frames", **how)
+            tasks = [
+                Task(self.list_file(i), fuse_one, (plan, i, self._of_sequence), self.fused_file(i).name)
+                for i in many
+            ]
+            report = run_tasks(tasks, title="frames", **{**how, "resume": True})
             if video is not None and (report.made or report.kept):
-                made = [p for i in many if (p := self.fused_file(i)).exists()]
-                write_video(self.out / "fused.mp4", (read_image(p) for p in made), rate=video)
+                made = [self.fused_file(i) for i in many if self.list_file(i).exists()]
+                with write_together(self.out, group=VIDEO, last=VIDEO) as folder:
+                    write_video(folder / VIDEO, (read_image(p) for p in made), rate=video)
             if not report.failed:
                 shutil.rmtree(self.out / KEYS)
             return report
 
     def _begin(self, resume: bool) -> None:
-        """Write the settings and what frames are made from; or, to resume, compare them with those before.
+        """Write the settings and the plan; or, to resume, compare the settings with those before.
 
-        Frames whose images are not those of before are removed.
+        Frames that are not there whole, from these images, are retired.
         """
         text, file = self.dependencies, self.out / SETTINGS
         changed = _differing(text, file.read_text(encoding="utf-8")) if resume and file.is_file() else []
@@ -175,16 +201,20 @@ class Batch:
                 f"{file}: the frames there were made with other settings ({', '.join(changed)}): "
                 "give the same ones, or another --out"
             )
-        now, before = self.inputs, entries_of(self.out / INPUTS) if resume else {}
-        other = [i for i, name in enumerate(self.names) if before.get(name) != now[name]]
-        if not resume or (self.sequence and other):
+        vars(self).pop("_of_sequence", None)  # files may have changed since another run
+        sweep(self.out)
+        refuse_to_replace(self.out, self.names)
+        same = [partial(self._is_made, i) for i in range(len(self.names))]
+        made = in_parallel(same) if resume else [False] * len(same)
+        before = self.out / KEYS / "inputs.txt"
+        if not (resume and before.is_file() and before.read_text() == self._of_sequence):
             shutil.rmtree(self.out / KEYS, ignore_errors=True)
-        for i in other:
-            self.fused_file(i).unlink(missing_ok=True)
-        for folder in (self.out, self.out / KEYS):
-            sweep(folder)
-        write_text(file, text)
-        write_text(self.out / INPUTS, json.dumps(now, indent=1))
+        for name, kept in zip(self.names, made):
+            if not kept:
+                retire(self.out, fused_group(name))
+        sweep(self.out / KEYS)
+        write_text(before, self._of_sequence)
+        write_listed(file, text)
         write_text(self.out / KEYS / PLAN, self.to_json())
 
     def to_json(self) -> str:
@@ -232,15 +262,22 @@ class Batch:
             colour = self.fusion.colour(key)
         write_tensors(self._key_file(key), colour._asdict())
 
-    def fuse_one(self, i: int) -> None:
-        """Write a frame."""
+    def fuse_one(self, i: int, inputs: str = "") -> None:
+        """Write a frame; `inputs`, its `inputs`, if they are known."""
         with limited(self.settings.limit):
             with confidence_checked(strict=self.strict):
                 frame = self._frame(i)
             view = view_of(self.rig, self.alpha, bits=self.bits, bands=len(frame.image))
             bands = band_names(frame, self._betas) or self._propagated_bands(frame)
             save_frame(
-                frame, self.out, bits=self.bits, kind=self.kind, view=view, name=self.names[i], bands=bands
+                frame,
+                self.out,
+                bits=self.bits,
+                kind=self.kind,
+                view=view,
+                name=self.names[i],
+                bands=bands,
+                about={"inputs": inputs or self.inputs(i)},
             )
 
     @property
@@ -259,7 +296,8 @@ class Batch:
         if not self.sequence:
             images = ViewFiles(self.rig, {n: files[i] for n, files in self.files.items()}, alpha=self.alpha)
             network = _network(self.weights, precision=self.precision)
-            return fuse(network, images.developed, images, alpha=self.alpha, settings=self.settings)
+            how: dict[str, Any] = {"alpha": self.alpha, "network": network, "settings": self.settings}
+            return fuse_frame(images, images.developed, **how)
         fusion = self.fusion
         return fusion.alone(i) if self.alone else fusion.frame(i, fusion.timeline.key_frames(), self._fetch)
 
@@ -298,9 +336,9 @@ def fuse_key(plan: Path, key: KeyFrame) -> None:
     _planned(plan, plan.stat().st_mtime_ns).fuse_key(key)
 
 
-def fuse_one(plan: Path, i: int) -> None:
+def fuse_one(plan: Path, i: int, inputs: str = "") -> None:
     """The task of a frame."""
-    _planned(plan, plan.stat().st_mtime_ns).fuse_one(i)
+    _planned(plan, plan.stat().st_mtime_ns).fuse_one(i, inputs)
 
 
 def _differing(now: str, before: str) -> list[str]:
@@ -315,14 +353,6 @@ def _differing(now: str, before: str) -> list[str]:
     if names == ["settings"] and isinstance(former.get("settings"), dict):
         names = [n for n, value in stated["settings"].items() if former["settings"].get(n) != value]
     return names
-
-
-def _stamp(file: Path) -> str:
-    try:
-        facts = file.stat()
-    except OSError:
-        return f"{file.name}: missing"
-    return f"{file.name}: {facts.st_size} bytes of {facts.st_mtime_ns}"
 
 
 def _digest(document: object) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 from torch import Generator, Tensor
 
 from ..fusion.classical import classical, denoised_knowing
-from ..fusion.fuse import corrections_of
+from ..fusion.fuse import FuseSettings, corrections_of
 from ..media.colour import luminance
 from ..media.figures import save_panels
 from ..networks.protocol import FusionNetwork
@@ -46,7 +46,8 @@ def classical_methods(
     if noise is None:
         return methods
     denoised = {name: denoised_knowing(image, noise[name]) for name, image in images.items()}
-    response = corrections_of(network, rig, denoised, alpha=ALPHA, align=False).response
+    settings = FuseSettings(align=False)
+    response = corrections_of(denoised, rig, alpha=ALPHA, network=network, settings=settings).response
 
     def corrected(given: Mapping[str, Tensor]) -> Tensor:
         scaled = {ALPHA: response.of_alpha(given[ALPHA]), BETA: response.of_beta(given[BETA])}

@@ -27,22 +27,21 @@ from calib.images.known_intrinsics import centres_found
 from calib.images.lenses import describe_lenses
 from calib.images.self_calibration import RefinedPair, joined, refined_by_depth, self_calibrated
 
-from ..fusion.fuse import ImageSources, fuse
-from ..fusion.results import Frame
+from ..fusion.dense_matches import MatchedDepth, matched_depth
 from ..fusion.steps import without_lenses
 from ..fusion.views import is_in_colour, range_of, read_view
 from ..media.headers import focal_length
-from ..media.images import read_image, write_image
+from ..media.images import ImageSources, read_image, write_image
 from ..media.raw import developed_rig
 from ..media.video import read_video
-from ..networks.weights import Network, load_weights, weights_for
+from ..networks.weights import load_weights
 
 LOG = logging.getLogger(__name__)
 
 MATCHED = 1600
 """Images are reduced to this many pixels along their longer side to match features."""
 COARSE = 640
-"""And to this many of alpha for the first, coarse fusion."""
+"""And to this many of alpha for dense matches."""
 LINES = 0.45
 """The share of the time to find a rig that epipolar lines take; the rest is calibration."""
 EVEN = 0.004
@@ -95,7 +94,7 @@ def array_from_images(
     line: fewer than two images, an image of one colour, images that do not show the same things, a focal
     length of no camera.
     """
-    sources, focal = _by_camera(sources), focal or {}
+    sources, focal = by_camera(sources), focal or {}
     files = {name: Path(path) for name, path in sources.items() if isinstance(path, str | Path)}
     images: dict[str, Any] = {name: image for name, image in sources.items() if name not in files}
     for name, image in images.items():
@@ -124,8 +123,8 @@ def array_from_images(
     images = {name: images[name] for name in (alpha, *names)}
     if tagged is None:
         lengths = _focal_lengths(images, files, focal, note)
-        network = load_weights(weights or _weights_of(images, alpha))
-        rig, names = found_rig(images, alpha, lengths, network, note)
+        bands = load_weights(weights or _weights_of(images, alpha)).bands
+        rig, names = found_rig(images, alpha, lengths, bands, note)
         sensors = {name: Sensor({1: "mono", 3: "rgb"}.get(len(images[name]))) for name in names}
         recorded = rig = _with_sensors(rig, sensors)
     else:
@@ -143,7 +142,7 @@ def _with_sensors(rig: Rig, sensors: Mapping[str, Sensor]) -> Rig:
     return rig.replace(cameras={name: rig[name].replace(sensor=sensor) for name, sensor in sensors.items()})
 
 
-def _by_camera(sources: ImageSources) -> Mapping[str, str | Path | Tensor]:
+def by_camera(sources: ImageSources) -> Mapping[str, str | Path | Tensor]:
     """Files or tensors by camera. Raises ValueError for fewer than two, TypeError for one without a name."""
     if isinstance(sources, str | Path):
         raise ValueError(f"an array has two images or more, got {sources}: give a list of them")
@@ -241,9 +240,11 @@ def _translated_rig(tagged: Rig, images: Images, alpha: str, note: Say) -> tuple
 
 @stage()
 def found_rig(
-    images: Images, alpha: str, focal: Mapping[str, float], network: Network, note: Say
+    images: Images, alpha: str, focal: Mapping[str, float], bands: int | None, note: Say
 ) -> tuple[Rig, list[str]]:
     """The rig of the cameras of images, and which of them it relates to alpha; alpha comes first in both.
+
+    A beta of `bands` is compared with alpha by its luma, others by the combination of bands most like alpha.
 
     Calibrated, up to a scale, where points matched between alpha and a beta have parallax; else known by F
     alone.
@@ -268,7 +269,7 @@ def found_rig(
             f"{name}: focal length {length / factors[name]:.0f} pixels +- {deviation:.0%}, by matched points"
         )
     lengths |= {name: length for name, (length, _) in observed.items()}
-    rig = _calibrated(uncalibrated, reduced, alpha, betas, lengths, network, note)
+    rig = _calibrated(uncalibrated, reduced, alpha, betas, lengths, bands, note)
     if rig.name == UNSCALED and known != {alpha, *betas}:
         rig = rig.replace(name=ASSUMED)
     return resized_rig(rig, images), [alpha, *betas]
@@ -299,16 +300,16 @@ def _calibrated(
     alpha: str,
     betas: Sequence[str],
     focal: Mapping[str, float],
-    network: Network,
+    bands: int | None,
     note: Say,
 ) -> Rig:
-    """The rig of alpha and these betas: calibrated, each pair refined by what a coarse fusion of it matches.
+    """The rig of alpha and these betas: calibrated, each pair refined by dense matches at reduced size.
 
     A pair whose lines no poses fit as well as F alone keeps F's, with the nearest poses for rough depths; one
     without parallax has F alone. Each is said in a line.
     """
     pairs: dict[str, RefinedPair] = {}
-    depths: dict[str, Frame] = {}
+    depths: dict[str, MatchedDepth] = {}
     links: dict[tuple[str, str], Link] = {}
     for i, name in enumerate(betas):
         log_step(LOG, LINES + (1 - LINES) * i / len(betas), "calibrating %s and %s", alpha, name)
@@ -319,7 +320,7 @@ def _calibrated(
             continue
         pairs[name] = pair
         if pair.exact or len(betas) > 1:
-            pairs[name], depths[name] = _refined(pair, images, network, links)
+            pairs[name], depths[name] = _refined(pair, images, bands, links)
         if pairs[name] is not pair:
             points, distance = pairs[name].points, pairs[name].distance
             note(f"{alpha} > {name}: {points} points, {distance:.2f} px from their lines")
@@ -364,28 +365,26 @@ def _calibrated_pair(
 
 
 def _refined(
-    pair: RefinedPair, images: Images, network: Network, links: Mapping[tuple[str, str], Link]
-) -> tuple[RefinedPair, Frame]:
-    """The pair refined by a fusion's matches at reduced size, unless it has one of these links; and that."""
+    pair: RefinedPair, images: Images, bands: int | None, links: Mapping[tuple[str, str], Link]
+) -> tuple[RefinedPair, MatchedDepth]:
+    """The pair refined by dense matches at reduced size, unless it has one of these links; their depth."""
     alpha, beta = pair.rig.names
     factor = min(COARSE / max(images[alpha].shape[-2:]), 1.0)
     small = {name: scaled(images[name], factor) for name in (alpha, beta)}
-    bands = len(small[beta])
     link = links.get((alpha, beta))
     rig = resized_rig(pair.rig if link is None else pair.rig.replace(links={(alpha, beta): link}), small)
     with warnings.catch_warnings(action="ignore"):
-        network = network if network.bands in (None, bands) else load_weights(weights_for([bands]))
-        LOG.info("coarse fusion of %s and %s", alpha, beta)
-        frame = fuse(network, rig, small, alpha=alpha, align=False, response="rec601")
+        LOG.info("dense matches of %s and %s", alpha, beta)
+        depth = matched_depth(small, rig, alpha=alpha, bands=bands if bands == len(small[beta]) else None)
     if link is not None:
-        return pair, frame
-    refined = refined_by_depth(pair._replace(rig=rig), small, frame.depth, frame.confidence)
+        return pair, depth
+    refined = refined_by_depth(pair._replace(rig=rig), small, *depth)
     if refined.rig is rig:
-        return pair, frame
-    return refined._replace(rig=resized_rig(refined.rig, images), distance=refined.distance / factor), frame
+        return pair, depth
+    return refined._replace(rig=resized_rig(refined.rig, images), distance=refined.distance / factor), depth
 
 
-def _relative_scale(first: Frame, other: Frame) -> float:
+def _relative_scale(first: MatchedDepth, other: MatchedDepth) -> float:
     """The factor that brings another pair's depths to those of the first."""
     sure = (first.confidence > 0.5) & (other.confidence > 0.5)
     both = sure & first.depth.isfinite() & other.depth.isfinite()

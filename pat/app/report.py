@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import html
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -19,7 +20,7 @@ from arraygeom import Camera, Rig
 from arraygeom.runtime.threads import in_parallel
 from arraygeom.viz import COLOURS, frustum, frustum_size
 
-from ..fusion.results import Frame, picture_of
+from ..fusion.frame import Frame, picture_of
 from ..media.colour import to_bytes
 from ..media.figures import colour_depth, reduced
 from ..support.memory import how_many_fit
@@ -119,9 +120,7 @@ def filled_page(
         for name in overlays
     )
     page = PAGE.read_text(encoding="utf-8")
-    for name, text in parts.items():
-        page = page.replace(f"{{{{{name}}}}}", text)
-    return page
+    return re.sub(r"{{(\w+)}}", lambda match: parts[match[1]], page)  # at once: a name may be as a part's
 
 
 def rig_drawing(rig: Rig, alpha: str) -> str:

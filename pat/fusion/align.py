@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import DTypeLike, NDArray
 from torch import Tensor
 
-from arraygeom import Band, LensView, ReceptiveField, Rig, Segments, View, pixel_grid, sample
+from arraygeom import Band, LensView, Rig, Segments, View, pixel_grid, sample
 from arraygeom.rig import with_pixels
 from arraygeom.runtime.chunks import chunked
 from arraygeom.runtime.threads import torch_in_one_thread
@@ -27,7 +27,6 @@ from arraygeom.undistortion import pixels_between, recorded_pixels, resampled
 
 from ..matching.match import Matcher, match
 from ..matching.matches import BetaMatches
-from ..matching.radiometry import ResponseSpec
 from ..media.images import Images
 from ..networks.protocol import FusionNetwork
 from ..support.blocks import without_autocast
@@ -35,7 +34,6 @@ from ..support.memory import limited
 from .checks import warn_of_confidence
 from .fuse import FuseSettings, Progress, matches_by, ready_frame
 from .inputs import FrameInputs, Placement
-from .low_light import Noise
 from .steps import has_lens, undone
 from .tiles import Plan, fused_in_tiles
 
@@ -138,60 +136,37 @@ class Aligned(Mapping[str, AlignedView]):
 
 @torch_in_one_thread()
 @without_autocast()
-def align(
-    rig: Rig,
+def align_frame(
     images: Images,
+    rig: Rig,
     *,
     alpha: str,
+    network: FusionNetwork,
+    settings: FuseSettings = FuseSettings(),
     recorded: Recorded | None = None,
-    network: FusionNetwork | None = None,
-    depth: tuple[float, float] | None = None,
-    field: ReceptiveField | Mapping[str, ReceptiveField | None] | None = None,
     interpolation: Resampling = "bilinear",
     min_confidence: float = LEAST_CONFIDENCE,
     fill: Fill = "none",
-    max_memory: float | str | None = None,
-    match_levels: bool = False,
-    response: ResponseSpec = "fit",
-    correct: bool = True,
-    noise: Noise | None = None,
     explain: Callable[[str], None] | None = None,
     progress: Progress | None = None,
     announce: Callable[[Plan], None] | None = None,
     matcher: Matcher = match,
 ) -> Aligned:
-    """Every camera's own values at the pixels of camera `alpha`.
+    """Every camera's own values at the pixels of camera `alpha`, of a rig that is known.
 
-    `rig`, `images`, `depth`, `field`, `max_memory`, `match_levels`, `response`, `noise`, `explain`,
-    `progress`, `announce` and `matcher` are as of `fuse`, and `correct` is its `align`; they serve to find
-    where alpha's pixels are in each beta. A pixel counts as occluded where the confidence that beta sees its
-    point, and there, is low.
-
-    Args:
-        recorded: the values to align, by camera, (C, H, W) of any type, as large as the images; by default
-            the images.
-        network: the one whose confidence is taken; by default the shipped weights for bands as the betas'.
-        interpolation: "nearest" keeps recorded values, "bilinear" and "cubic" are between them; of integers
-            rounded.
-        min_confidence: from which confidence on a camera counts as seeing a point, 0 to 1.
-        fill: "none" invents no values; "propagate" gives pixels that a camera does not see its nearest seen
-            value.
-
-    Raises ValueError as `fuse`, for a network that uses no matches, and for recorded values that are missing,
-    no numbers, or of another size than the rig says.
+    What `pat.align` calls, which says more; images and rig are as of `fuse_frame`. Raises as `pat.align`.
     """
     rule = _ViewRule(interpolation, min_confidence, fill)
     rig = with_pixels(rig)
     betas = [name for name in rig.betas(alpha) if name in images]
     recordings = images if recorded is None else recorded
     _check_recorded(rig, recordings, (alpha, *betas))
-    if network is not None and not network.uses_matches:
+    if not network.uses_matches:
         raise ValueError("these weights use no matches to align by: take others, such as mono-spectral")
-    how = FuseSettings(depth, field, max_memory, match_levels, response, align=correct, noise=noise)
-    network, inputs, undo, plan, *_ = ready_frame(
-        network, rig, images, alpha, how, joined=False, explain=explain, announce=announce
+    inputs, undo, plan, *_ = ready_frame(
+        images, rig, alpha, network, settings, joined=False, explain=explain, announce=announce
     )
-    with limited(how.limit), torch.no_grad():
+    with limited(settings.limit), torch.no_grad():
         matches = matches_by(matcher, inputs.inputs)
         fused = fused_in_tiles(network, inputs, matches, plan.tiles, progress=progress)
         warn_of_confidence(network, fused.frame, inputs)

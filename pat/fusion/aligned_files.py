@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 from xml.sax.saxutils import escape
@@ -12,11 +14,13 @@ import tifffile
 import torch
 from numpy.typing import NDArray
 
-from arraygeom.runtime.atomic import write_together
+from arraygeom.runtime.atomic import write_text
+from arraygeom.runtime.file_names import file_names
+from arraygeom.runtime.together import refuse_others, write_together
 
 from ..media.images import read_recorded, write_image
 from ..media.raw import demosaiced, recorded_bands
-from .align import Aligned, AlignedView
+from .align import Aligned
 from .views import FilesOfCameras
 
 PositionFormat = Literal["npy", "tif", "none"]
@@ -59,56 +63,68 @@ def save_aligned(
     positions: PositionFormat = "npy",
     name: str = "",
     keep: Iterable[Path] = (),
+    pages: Mapping[str, str] | None = None,
 ) -> list[Path]:
     """Write aligned.tif (all bands, alpha's first, with their names and wavelengths), and of each camera
     NAME_visibility.png (0 beyond its edge, 128 occluded, 255 seen), NAME_confidence.png and
-    NAME_positions.npy (or .tif: x, y); depth.tif (metres) if any is known.
+    NAME_positions.npy (or .tif: x, y); depth.tif (metres) if any is known. NAME is by `file_names`.
 
     One file a camera, NAME.tif, if `separate`, or if their types differ: values keep theirs. With a `name`
-    the files are name_aligned.tif and so on. All are written, or none. Of a former alignment bands, depth,
-    positions and the page index.html are gone; files of a camera that nothing replaces stay, as they may be
-    its images. Returns what was written.
+    the files are name_aligned.tif and so on. `pages` are further text files. All are swapped in together, and
+    those of a former alignment of this name are gone (`write_together`). Returns what was written.
 
-    Raises ValueError for a camera with a file of its own that is called "depth", and rather than write over a
-    file of `keep`, such as the images.
+    Raises ValueError for two files of one name, and rather than write over a file of `keep`, such as the
+    images; FileExistsError for files in the way that no run wrote.
     """
     prefix = f"{name}_" if name else ""
-    unlike = len({view.values.dtype for view in aligned.values()}) > 1
-    if (separate or unlike) and "depth" in aligned:
-        raise ValueError(
-            "the camera 'depth' would have its values in depth.tif, where the depth goes: rename the camera"
-        )
-    stale = {f"{prefix}aligned.tif", f"{prefix}depth.tif"} | (set() if name else {"index.html"})
-    stale |= {f"{prefix}{camera}_positions.{kind}" for camera in aligned for kind in ("npy", "tif")}
-    kept = {path.resolve() for path in keep}
-    stale = {file for file in stale if (out / file).resolve() not in kept}
-    with write_together(out, last=f"{prefix}visibility.txt", stale=stale) as folder:
-        if separate or unlike:
-            for camera, view in aligned.items():
-                write_bands(folder / f"{prefix}{camera}.tif", view.values, view.bands, view.wavelengths)
-        else:
-            write_bands(folder / f"{prefix}aligned.tif", aligned.stack(), aligned.bands, aligned.wavelengths)
-        if np.isfinite(aligned.depth).any():
-            depth = torch.from_numpy(aligned.depth)[None]
-            write_image(folder / f"{prefix}depth.tif", depth, bits=32, unknown=True)
+    files = _files(aligned, separate, positions)
+    files = [(f"{prefix}{file}", *how) for file, *how in files]
+    files += [(file, write_text, text) for file, text in (pages or {}).items()]
+    kept, count = {path.resolve() for path in keep}, Counter(file.casefold() for file, *_ in files)
+    for file, *_ in files:
+        if count[file.casefold()] > 1:
+            raise ValueError(f"{out / file}: two results would have this name: rename the camera")
+        if (out / file).resolve() in kept:
+            raise ValueError(f"{out / file}: is one of the images: give another --out")
+    with write_together(out, group=f"{prefix}aligned", last=f"{prefix}visibility.txt") as folder:
+        for file, write, *parts in files:
+            write(folder / file, *parts)
+    return [out / file for file in sorted(file for file, *_ in files)]
+
+
+def refuse_to_replace(out: Path, cameras: Iterable[str], *, separate: bool, name: str = "") -> None:
+    """Raise FileExistsError if an alignment would replace files in `out` that no run wrote."""
+    kinds = "_visibility.png", "_confidence.png", "_positions.npy", "_positions.tif", *[".tif"] * separate
+    own = [f"{called}{kind}" for called in file_names(cameras).values() for kind in kinds]
+    prefix = f"{name}_" if name else ""
+    names = [f"{prefix}{file}" for file in ("aligned.tif", "depth.tif", "visibility.txt", *own)]
+    refuse_others(out, [*names, *["index.html"] * (not name)], group=f"{prefix}aligned")
+
+
+def _files(aligned: Aligned, separate: bool, positions: PositionFormat) -> list[tuple[Any, ...]]:
+    """Name of each file of an alignment, the function that writes it, and what that is given."""
+    called = file_names(aligned)
+    files: list[tuple[Any, ...]] = [("visibility.txt", write_text, _shares(aligned))]
+    if np.isfinite(aligned.depth).any():
+        write_depth = partial(write_image, bits=32, unknown=True)
+        files.append(("depth.tif", write_depth, torch.from_numpy(aligned.depth)[None]))
+    if separate or len({view.values.dtype for view in aligned.values()}) > 1:
         for camera, view in aligned.items():
-            if camera != aligned.alpha:
-                _write_view(folder, f"{prefix}{camera}", view, positions)
-        (folder / f"{prefix}visibility.txt").write_text(_shares(aligned), encoding="utf-8")
-        names = sorted(file.name for file in folder.iterdir())
-        if over := [out / file for file in names if (out / file).resolve() in kept]:
-            raise ValueError(f"{over[0]}: is one of the images: give another --out")
-    return [out / file for file in names]
-
-
-def _write_view(folder: Path, stem: str, view: AlignedView, positions: PositionFormat) -> None:
-    write_image(folder / f"{stem}_visibility.png", torch.from_numpy(GREY[view.visibility])[None])
-    write_image(folder / f"{stem}_confidence.png", torch.from_numpy(view.confidence)[None])
-    if positions == "npy":
-        np.save(folder / f"{stem}_positions.npy", view.positions)
-    elif positions == "tif":
-        planes = view.positions.transpose(2, 0, 1)
-        write_bands(folder / f"{stem}_positions.tif", planes, ("x", "y"), (None, None))
+            files.append((f"{called[camera]}.tif", write_bands, view.values, view.bands, view.wavelengths))
+    else:
+        files.append(("aligned.tif", write_bands, aligned.stack(), aligned.bands, aligned.wavelengths))
+    for camera, view in aligned.items():
+        if camera != aligned.alpha:
+            shown = {"visibility": GREY[view.visibility], "confidence": view.confidence}
+            for kind, values in shown.items():
+                files.append((f"{called[camera]}_{kind}.png", write_image, torch.from_numpy(values)[None]))
+            file = f"{called[camera]}_positions.{positions}"
+            if positions == "npy":
+                files.append((file, np.save, view.positions))
+            elif positions == "tif":
+                planes = view.positions.transpose(2, 0, 1)
+                files.append((file, write_bands, planes, ("x", "y"), (None, None)))
+    return files
 
 
 def _shares(aligned: Aligned) -> str:

@@ -13,9 +13,9 @@ from arraygeom.runtime.warned import warn
 
 from ..matching.inputs import Inputs
 from ..networks.protocol import FusionNetwork
+from .frame import Frame
 from .inputs import FrameInputs
 from .low_light import shown_noise
-from .results import Frame
 
 LOW_CONFIDENCE = 0.25
 UNFIT_CONFIDENCE = 0.16

@@ -28,7 +28,7 @@ from ..matching.filters import filled
 from ..media.colour import from_luma_chroma, luminance, luminance_of, to_bytes
 from ..media.figures import reduced
 from ..sensors import NoiseLevel
-from .results import Frame
+from .frame import Frame
 from .steps import undistort
 from .views import Views
 

@@ -36,8 +36,8 @@ from ..matching.radiometry import Response, ResponseSpec, fit, given_response
 from ..matching.semi_global import CONSISTENT
 from ..networks.protocol import FusionNetwork
 from ..support.settings import size, tuned
+from .frame import Frame
 from .inputs import FrameInputs, padded
-from .results import Frame
 
 LOG = logging.getLogger(__name__)
 

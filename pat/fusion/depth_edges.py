@@ -22,8 +22,8 @@ from arraygeom.runtime.threads import in_parallel
 from ..matching.filters import numpy_of
 from ..support.settings import size, tuned
 from . import depth_edges_numba as kernels
+from .frame import Frame
 from .inputs import FrameInputs
-from .results import Frame
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,8 @@ from ..matching.filters import nearest_known, numpy_of
 from ..matching.positions import FINE
 from ..matching.surfaces import Plane, Planes, repeated
 from ..support.settings import physics, tuned
+from .frame import Frame
 from .inputs import FrameInputs, Placement
-from .results import Frame
 
 
 @dataclass(frozen=True)

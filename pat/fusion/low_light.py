@@ -26,8 +26,8 @@ from ..networks.weights import load_denoiser
 from ..sensors import NoiseLevel, generator_for
 from ..sensors.steps import normal
 from ..support.settings import physics, size, tuned
+from .frame import Frame
 from .non_local_means import averaged_with_alike
-from .results import Frame
 from .steps import FusionStep
 from .views import Views
 

@@ -23,7 +23,7 @@ from ..matching.normalisation import Normalisation
 from ..media.colour import from_luma_chroma, luminance, to_luma_chroma
 from ..networks.protocol import FusionNetwork
 from ..support.settings import size
-from .results import Frame
+from .frame import Frame
 
 Luminance = Literal["alpha", "mix", "beta"]
 SHARES: dict[Luminance, float] = {"alpha": 1.0, "mix": 0.5, "beta": 0.0}

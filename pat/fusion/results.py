@@ -5,24 +5,25 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from io import BytesIO
 from pathlib import Path
-from typing import Literal, NamedTuple, get_args
+from typing import Literal
 
 import torch
 from jaxtyping import Float
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 from torch import Tensor
-from torch.nn.functional import interpolate
 
 from arraygeom import Camera, Rig
-from arraygeom.runtime.atomic import write_together
+from arraygeom.io.native import write as rig_text
+from arraygeom.runtime.atomic import alone, write_text
 from arraygeom.runtime.chunks import chunked
+from arraygeom.runtime.file_names import file_names
 from arraygeom.runtime.text import ASSUMED
 from arraygeom.runtime.threads import in_parallel
+from arraygeom.runtime.together import LISTS, refuse_others, write_listed, write_together
 
 from ..media.colour import linear_from_srgb
 from ..media.depth_maps import write_points
@@ -30,9 +31,8 @@ from ..media.figures import colour_depth
 from ..media.images import write_image
 from ..media.raw import developed
 from ..support.memory import how_many_fit
+from .frame import Frame, picture_of
 
-SHOWN = 480
-"""Pixels of a notebook's picture of a frame, along its longer side: three of them are as wide as a page."""
 MOST = 65535
 """The largest count of 16 bits."""
 
@@ -44,9 +44,26 @@ HEALED_RIG = "healed_rig.yaml"
 """A given rig as its images have it."""
 RESULT = re.compile(
     r"(.*_)?((fused|confidence)(_.*)?|depth(_16|_nearest|_farthest)?)\.(png|tif|exr|mp4)"
-    r"|(view|settings)\.yaml|inputs\.json"
+    r"|(view|settings|found_rig|healed_rig)\.yaml|points\.ply|index\.html"
 )
-"""What files are called that a fusion writes or takes away."""
+"""What files are called that a fusion writes."""
+
+
+def fused_group(name: str) -> str:
+    """The group (`write_together`) of a frame's files."""
+    return f"{name}_fused" if name else "fused"
+
+
+def refuse_to_replace(out: Path, names: Iterable[str] = ("",)) -> None:
+    """Raise FileExistsError if frames of these names would replace files in `out` that no run wrote."""
+    names = {*names}
+    found = [(path.name, match[1]) for path in _files(out) if (match := RESULT.fullmatch(path.name))]
+    results = [file for file, prefix in found if (prefix or "").removesuffix("_") in names or not prefix]
+    refuse_others(out, results, group=fused_group(""), by_name=names != {""})
+
+
+def _files(out: Path) -> Iterable[Path]:
+    return out.iterdir() if out.is_dir() else ()
 
 
 def check_no_result(inputs: Iterable[Path], out: Path) -> None:
@@ -68,6 +85,8 @@ def save_frame(
     along: Literal["depth", "distance"] = "depth",
     name: str = "",
     bands: Sequence[str] = (),
+    pages: Mapping[str, str] | None = None,
+    about: Mapping[str, str] | None = None,
 ) -> list[Path]:
     """Write fused.png, confidence.png, depth.tif (metres, float; NaN where unknown), depth_16.png
     (`write_depth`), depth.png (red is near), depth_nearest.tif and depth_farthest.tif (the true depth is
@@ -79,20 +98,19 @@ def save_frame(
     or rays (`measured_along`), go to points.ply. With a `name` the files are name_fused.png and so on.
     Without any known depth there are no depth files, and no bounds of it by a view whose focal lengths are
     assumed. With `bands`, the names of bands that cameras record one by one, each goes to fused_NAME.png and
-    confidence_NAME.png too; bands without names that are not one or three go to fused_1.png and so on. Of
-    other numbers than one and three fused.png is the mean. The image comes last: where it is, the others are
-    of the same frame, and points.ply, the page index.html and the image in another format of a former one are
-    gone. After an error all former files are as they were. Returns what was written.
+    confidence_NAME.png too (NAME by `file_names`); bands without names that are not one or three go to
+    fused_1.png and so on. Of other numbers than one and three fused.png is the mean. `pages` are further text
+    files. All are swapped in together, the image last, and those of a former frame of this name are gone
+    (`write_together`, which keeps `about`). Returns what was written.
+
+    Raises FileExistsError for files in the way that no fusion wrote.
     """
     frame = frame.mapped(lambda tensor: tensor.detach().cpu())
     prefix = f"{name}_" if name else ""
     last = f"{prefix}fused.{kind}"
-    depths = {
-        f"{prefix}depth{suffix}" for suffix in (".tif", ".png", "_16.png", "_nearest.tif", "_farthest.tif")
-    }
-    stale = depths | {f"{prefix}fused.{other}" for other in get_args(ImageFormat)}
-    stale |= set() if name else {"points.ply", "index.html"}
-    with write_together(out, last=last, stale=stale) as folder:
+    if view is not None and name:
+        _write_shared(out / "view.yaml", rig_text(view))
+    with write_together(out, group=fused_group(name), last=last, about=about) as folder:
         confidence = partial(write_image, folder / f"{prefix}confidence.png", frame.confidence[None])
         tasks: list[Callable[[], object]] = [confidence]
         if frame.depth.isfinite().any():
@@ -104,7 +122,9 @@ def save_frame(
             near = float(view.depth[0]) if view is not None and view.depth else None
             tasks.append(partial(write_depth, folder / f"{prefix}depth_16.png", frame.depth, near=near))
             tasks.append(lambda: write_image(folder / f"{prefix}depth.png", colour_depth(frame.depth)))
-        if view is not None:
+        for file, text in (pages or {}).items():
+            write_text(folder / file, text)
+        if view is not None and not name:
             view.save(folder / "view.yaml")
         if rig is not None:
             rig.save(folder / FOUND_RIG)
@@ -112,6 +132,7 @@ def save_frame(
             write_points(folder / "points.ply", points, frame.depth, frame.image, along=along)
         image = linear_from_srgb(frame.image) if bits == 32 else frame.image
         bands = bands or ([] if len(image) in (1, 3) else [str(i + 1) for i in range(len(image))])
+        bands = list(file_names(bands).values()) if len({*bands}) == len(bands) else bands
         for band, values in zip(bands, image):
             write_image(folder / f"{prefix}fused_{band}.{kind}", values[None], bits=bits)
         for band, confidence in zip(bands, () if frame.by_band is None else frame.by_band):
@@ -121,6 +142,14 @@ def save_frame(
         in_parallel(tasks, most=how_many_fit(4 * image.nbytes))
         names = {file.name for file in folder.iterdir()} - {last}
     return [out / last, *(out / file for file in sorted(names, key=lambda name: ("fused" not in name, name)))]
+
+
+def _write_shared(path: Path, text: str) -> None:
+    """Write a text that frames of a batch have in common, each in its own process."""
+    (path.parent / LISTS).mkdir(parents=True, exist_ok=True)
+    with alone(path.parent / LISTS / f"{path.name}.lock", 60):
+        if not path.is_file() or path.read_bytes() != text.encode():
+            write_listed(path, text)
 
 
 def band_names(frame: Frame, betas: Iterable[str]) -> list[str]:
@@ -134,14 +163,12 @@ def describe_bands(frame: Frame, names: Sequence[str], kind: ImageFormat) -> str
     """Which files have a frame's bands, in a line; empty for an ordinary image."""
     if not names and len(frame.image) in (1, 3):
         return ""
-    listed = ", ".join(f"fused_{name}.{kind}" for name in names) or f"fused_1.{kind} and so on"
+    listed = (
+        ", ".join(f"fused_{name}.{kind}" for name in file_names(names).values())
+        or f"fused_1.{kind} and so on"
+    )
     picture = "the three as a picture" if len(frame.image) == 3 else "their mean"
     return f"bands at alpha's view: {listed}; fused.{kind} is {picture}"
-
-
-def picture_of(image: Float[Tensor, "c h w"]) -> Float[Tensor, "d h w"]:
-    """An image of one channel or three: the mean of any other number of bands."""
-    return image if len(image) in (1, 3) else image.mean(0, keepdim=True)
 
 
 def depth_scale(near: float) -> float:
@@ -173,55 +200,3 @@ def view_of(rig: Rig, alpha: str, *, bits: int, bands: int = 3) -> Rig:
     response = "rgb" if bands == 3 else rig[alpha].sensor.response
     sensor = dataclasses.replace(developed(rig[alpha].sensor), coding=coding, response=response)
     return Rig({alpha: rig[alpha].replace(sensor=sensor)}, depth=rig.depth, name=rig.name)
-
-
-class Frame(NamedTuple):
-    """A fused frame at alpha's view.
-
-    image: (C, H, W), in alpha's coding, not cut to 0..1.
-    depth: (H, W), metres along alpha's axis, or its rays (`measured_along`); NaN where no calibrated beta
-        sees the point.
-    confidence: (H, W), the probability that every band's beta sees the point and its position is right to a
-        pixel.
-    half_width: (H, W), 1/metres: in 9 of 10 pixels the true inverse depth is within it of 1 / depth; NaN
-        where that is.
-    by_band: (C, H, W), the confidence of each band alone, where each is another beta's; else None.
-    """
-
-    image: Float[Tensor, "c h w"]
-    depth: Float[Tensor, "h w"]
-    confidence: Float[Tensor, "h w"]
-    half_width: Float[Tensor, "h w"]
-    by_band: Float[Tensor, "c h w"] | None = None
-
-    @property
-    def depth_interval(self) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
-        """The nearest and farthest depth (metres; infinite too) around the true one in 9 of 10 pixels."""
-        inverse = 1 / self.depth
-        farthest = inverse - self.half_width
-        beyond = farthest <= 0
-        farthest = torch.where(beyond, torch.inf, 1 / torch.where(beyond, 1.0, farthest))
-        return 1 / (inverse + self.half_width), farthest
-
-    def mapped(self, change: Callable[[Tensor], Tensor]) -> Frame:
-        """The frame whose every part is changed, such as moved to another device."""
-        return Frame(*(tensor if tensor is None else change(tensor) for tensor in self))  # type: ignore[arg-type]
-
-    def __repr__(self) -> str:
-        """Sizes, the range of depth and the mean confidence, in a line."""
-        bands, h, w = self.image.shape
-        finite = self.depth[self.depth.isfinite()]
-        depth = f"depth {finite.min():.3g} to {finite.max():.3g}" if len(finite) else "depth unknown"
-        return f"Frame({w}x{h}, {bands} bands, {depth}, mean confidence {self.confidence.mean():.2f})"
-
-    def _repr_png_(self) -> bytes:
-        """For notebooks: the image and, beside it, depth (red is near) and confidence, as a PNG file."""
-        confidence = self.confidence[None].expand(3, -1, -1)
-        parts = picture_of(self.image).expand(3, -1, -1), colour_depth(self.depth), confidence
-        factor = min(SHOWN / max(self.image.shape[-2:]), 1.0)
-        hw = [max(round(n * factor), 1) for n in self.image.shape[-2:]]
-        shown = [interpolate(image.detach().cpu().float()[None], size=hw, mode="area")[0] for image in parts]
-        values = (torch.cat(shown, -1).clamp(0, 1) * 255).round().to(torch.uint8)
-        file = BytesIO()
-        Image.fromarray(values.permute(1, 2, 0).numpy()).save(file, format="PNG")
-        return file.getvalue()

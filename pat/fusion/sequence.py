@@ -13,9 +13,9 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import torch
 from jaxtyping import Float
@@ -32,11 +32,11 @@ from ..networks.protocol import FusionNetwork
 from ..sensors import NoiseLevel
 from ..support.settings import physics, size
 from .corrections import Corrections
+from .frame import Frame
 from .frames import CachedFrames, Frames
-from .fuse import FuseSettings, corrections_of, fuse
+from .fuse import FuseSettings, corrections_of, fuse_frame
 from .low_light import noise_levels
 from .optical_flow import flow_between, warped
-from .results import Frame
 from .steps import with_own_levels
 from .timeline import KeyFrame, Timeline
 from .views import grey_alpha
@@ -84,7 +84,7 @@ class SequenceFusion:
     frames: Mapping[str, Frames]
     alpha: str
     speed: float | None = None
-    settings: FuseSettings = FuseSettings()  # noqa: RUF009
+    settings: FuseSettings = FuseSettings()
 
     def __post_init__(self) -> None:
         check_above(0, speed=self.speed)
@@ -197,16 +197,19 @@ class SequenceFusion:
         if levels is not None:
             alpha_level, beta_levels = levels
             images = {name: beta_levels[name].matched(image, alpha_level) for name, image in images.items()}
-        frame = fuse(
-            self.network,
-            self.rig,
-            {self.alpha: self.recorded(i), **images},
-            alpha=self.alpha,
-            settings=self.settings,
-            corrections=self._corrections,
+        settings = replace(
+            self.settings,
             field={**{name: self._given_field(name) for name in betas}, **fields},
             match_levels=match_levels and alone,
             noise=self._noise,
+        )
+        frame = fuse_frame(
+            {self.alpha: self.recorded(i), **images},
+            self.rig,
+            alpha=self.alpha,
+            network=self.network,
+            settings=settings,
+            corrections=self._corrections,
         )
         if levels is None or self.network.keeps_luminance:
             return frame
@@ -262,14 +265,13 @@ class SequenceFusion:
     def _found_at(self, key: KeyFrame) -> Corrections:
         gaps = (self._time(key.alpha) - self.timeline.time(name, j) for name, j in key.betas.items())
         together = all(abs(gap) * self.timeline.rate(self.alpha) < SETTINGS.synchronous for gap in gaps)
+        align = self.settings.align is not False and together
         return corrections_of(
-            self.network,
-            self.rig,
             self._images_at(key),
+            self.rig,
             alpha=self.alpha,
-            settings=self.settings,
-            align=self.settings.align is not False and together,
-            noise=self._noise,
+            network=self.network,
+            settings=replace(self.settings, align=align, noise=self._noise),
         )
 
     def _levels(self, names: Iterable[str], i: int) -> tuple[Moments, dict[str, Moments]]:
@@ -312,29 +314,29 @@ def mixed(base: Float[Tensor, "1 h w"], sources: Sequence[tuple[float, KeyColour
 
 
 def fuse_sequence(
-    network: FusionNetwork,
-    rig: Rig,
     frames: Mapping[str, Frames],
+    rig: Rig,
     *,
     alpha: str,
+    network: FusionNetwork,
     speed: float | None = None,
-    **settings: Any,
+    settings: FuseSettings = FuseSettings(),
 ) -> Iterator[Frame]:
     """Fuse every frame of alpha, in order, as they are asked for.
 
     Args:
-        network: as of `fuse`, and so are settings (`FuseSettings`); response, alignment and noise are
-            found once, at the key frame in the middle.
-        rig: cameras with `frame_rate` (a second) and `time_offset` (seconds after a common clock).
         frames: by camera name, in the order of time. Cameras without are left out.
+        rig: cameras with `frame_rate` (a second) and `time_offset` (seconds after a common clock).
         alpha: the camera whose frames are wanted.
+        network: as of `fuse`, and so are settings; response, alignment and noise are found once, at the key
+            frame in the middle.
         speed: how fast things move at most, pixels of alpha a second, for the room that fields leave where a
             beta did not record at a key frame's time. By default a quarter of the motion seen between alpha's
             frames.
 
     Raises ValueError for frame rates that are not known and for recordings that do not overlap in time.
     """
-    job = SequenceFusion(network, rig, frames, alpha, speed, FuseSettings().changed(settings))
+    job = SequenceFusion(network, rig, frames, alpha, speed, settings)
     keys = job.timeline.key_frames()
     job.timeline.warn_of_ends()
 

@@ -43,7 +43,7 @@ from ..matching.normalisation import Moments, moments, normalised
 from ..media.images import Images
 from ..media.raw import LIGHT, match_luminance
 from ..networks.protocol import FusionNetwork, JoinsBands
-from .results import Frame
+from .frame import Frame
 from .views import Fields, Views, innermost
 
 Undo = Callable[[Frame], Frame]

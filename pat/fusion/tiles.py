@@ -23,8 +23,8 @@ from ..networks.protocol import FusionNetwork, matched_for
 from ..support.tensor_files import read_tensors, write_tensors
 from .back_projection import back_projected
 from .depth import certain, measured_depth
+from .frame import Frame
 from .inputs import FrameInputs
-from .results import Frame
 
 MAX_HALO = 256
 """The widest halo, pixels: what is farther off changes an image of KITTI's by 7e-6 with trained weights (at

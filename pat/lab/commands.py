@@ -180,13 +180,21 @@ class Render:
     """Only every N-th scene from the I-th on, for batch systems."""
     scheduler: Annotated[str | None, optional("ADDRESS")] = None
     """Address of a Dask scheduler whose workers render the scenes, such as tcp://host:8786."""
+    generator: Annotated[str | None, optional("MODULE:FUNCTION")] = None
+    """The file's `blender.generator`, if it is code of your own: the file alone does not run it."""
 
     def run(self) -> None:
         """Render what is missing; exit status 1 if the job is not complete then."""
         from .farm.job import RenderConfig, Shard, render
 
+        config = RenderConfig.load(self.config)
+        if ":" in (named := config.blender.generator) and self.generator != named:
+            raise ValueError(
+                f"{self.config}: blender.generator: {named} is code, which a file alone does not run: "
+                f"if you trust it, add --generator {named}"
+            )
         report = render(
-            RenderConfig.load(self.config),
+            config,
             scenes=self.scenes,
             out=self.out,
             workers=self.workers,

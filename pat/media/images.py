@@ -7,7 +7,8 @@ images), colours in the order red, green, blue. Files are written atomically.
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
@@ -22,6 +23,7 @@ from torch import Tensor
 from arraygeom.runtime.atomic import write_atomically
 from arraygeom.runtime.chunks import ROWS, spans
 from arraygeom.runtime.image_bytes import (
+    JPEG,
     MINISBLACK,
     MINISWHITE,
     PNG,
@@ -31,6 +33,7 @@ from arraygeom.runtime.image_bytes import (
     decodable,
     first_tiff_page,
     has_further_images,
+    jpeg_colours,
     tiff_colours,
 )
 from arraygeom.runtime.warned import warn
@@ -51,7 +54,7 @@ GREY_WITH_ALPHA = 4
 MOST_PIXELS = 2**28
 """Images with more are read only where their size is expected: some 3 GiB in colour."""
 
-_LZW = [cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_LZW]
+_DEFLATED = [cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_ADOBE_DEFLATE]
 _HEIF = tuple(b"ftyp" + brand for brand in (b"heic", b"heix", b"mif1", b"msf1", b"heim", b"heis"))
 
 
@@ -60,6 +63,8 @@ Images = Mapping[str, Any]
 
 Not `Mapping[str, Tensor]`: what checks types would read one.
 """
+ImageSources = Mapping[str, Any] | Sequence[str | Path]
+"""An image file or tensor (C, H, W) in 0..1 of each camera by name; or files alone, which name cameras."""
 
 
 def read_image(
@@ -296,6 +301,10 @@ def _log_level(level: int) -> int:
 
 def decoded(content: bytes, flags: int = cv2.IMREAD_UNCHANGED) -> NDArray | None:
     """What OpenCV makes of a file's bytes, without its own messages; None for a damaged file."""
+    if content[:2] == JPEG and flags == cv2.IMREAD_UNCHANGED:
+        with suppress(Exception):  # damaged, which `decodable` says
+            if (colours := jpeg_colours(content)) is not None:
+                return colours[..., 0] if colours.shape[2] == 1 else colours[..., ::-1]
     level, checked = _log_level(0), decodable(content)
     try:
         return None if checked is None else cv2.imdecode(np.frombuffer(checked, np.uint8), flags)
@@ -401,11 +410,12 @@ def _encode(path: Path, colours: NDArray, bits: int) -> bytes:
     suffix = path.suffix.lower()
     if suffix in (".jpg", ".jpeg") and bits != 8:
         raise ValueError(f"{path}: JPEG holds 8 bits, not {bits}: write .png or .tif")
-    if bits == 32 and suffix not in (".tif", ".tiff"):
+    tiff = suffix in (".tif", ".tiff")
+    if bits == 32 and not tiff:
         raise ValueError(f"{path}: 32-bit floats need a name that ends in .tif")
     try:
-        # Without the option OpenCV writes float colours as LogLuv, which has 3 digits.
-        succeeded, content = cv2.imencode(suffix, _quantised(colours, bits), _LZW if bits == 32 else [])
+        # OpenCV writes float colours as LogLuv else, of 3 digits, and LZW, which tifffile cannot read.
+        succeeded, content = cv2.imencode(suffix, _quantised(colours, bits), _DEFLATED if tiff else [])
     except cv2.error:
         succeeded = False
     if not succeeded:

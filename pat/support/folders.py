@@ -5,6 +5,9 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+MOST_SHOWN = 2000
+"""Characters of a message."""
+
 
 def files_below(folder: str | Path, within: frozenset[str] = frozenset()) -> list[Path]:
     """All regular files in a folder and in those within it, behind symbolic links too, sorted.
@@ -29,3 +32,11 @@ def error_text(error: Exception) -> str:
     if isinstance(error, OSError) and error.filename:
         text = f"{error.filename}: {error.strerror}"
     return " ".join(text.split())
+
+
+def printable(text: str) -> str:
+    """One line for a terminal, whatever others put into it: control characters as escapes, the middle of a
+    very long one left out."""
+    if len(text) > MOST_SHOWN:
+        text = f"{text[: MOST_SHOWN // 2]} ... {text[-MOST_SHOWN // 2 :]}"
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)

@@ -36,7 +36,7 @@ from rich.progress import (
 from arraygeom.runtime.extras import needs
 from arraygeom.runtime.warned import warn
 
-from .folders import error_text
+from .folders import error_text, printable
 from .steps import about, steps_shown
 
 if TYPE_CHECKING:
@@ -154,7 +154,8 @@ def run_tasks(
         if on_error == "stop":
             text = f"{named[outcome.makes]}: {outcome.error} ({report}; begin again with --resume)"
             raise JobError(text) from next(iter(outcome.warnings[::-1]), None)
-        console.print(f"skipped {named[outcome.makes]}: {outcome.error}", style="yellow", markup=False)
+        skipped = printable(f"skipped {named[outcome.makes]}: {outcome.error}")
+        console.print(skipped, style="yellow", markup=False)
     return report
 
 
@@ -168,7 +169,7 @@ def followed(
     """The outcomes as they come, counted: as a bar on a terminal, elsewhere as a line now and then."""
     printed = time.monotonic()
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    further = (TimeRemainingColumn(), TextColumn("{task.fields[status]}"))
+    further = (TimeRemainingColumn(), TextColumn("{task.fields[status]}", markup=False))
     hidden = not console.is_terminal
     with Progress(*columns, *further, console=console, disable=hidden, speed_estimate_period=math.inf) as bar:
         shown = bar.add_task(title, total=total, completed=done, status="")

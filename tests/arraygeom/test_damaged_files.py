@@ -48,7 +48,7 @@ def test_a_matrix_that_claims_a_size_takes_no_memory(tmp_path):
         "data: [1]\n"
     )
     (tmp_path / "a.yml").write_text(text)
-    with pytest.raises(RigFileError, match="cameraMatrix"):
+    with pytest.raises(RigFileError, match="camera_matrix"):
         read_rig(tmp_path / "a.yml", format="opencv")
 
 

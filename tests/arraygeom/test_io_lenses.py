@@ -104,11 +104,11 @@ def test_realsenses_other_lenses(kind, case, tmp_path):
 
 
 def test_zeds_rows_are_those_that_the_makers_code_makes():
-    """It gives OpenCV's rectification the rotation vector (RX, CV, RZ) and (Baseline, TY, TZ) as they are."""
+    """Its calibration tool writes OpenCV's rotation vector (RX, CV, RZ) and T = (-Baseline, TY, TZ)."""
     rig = read_rig(FIXTURES / "zed.conf")
     K = [np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]) for fx, fy, cx, cy in ZED_K]
     cv2 = pytest.importorskip("cv2")
-    R, t = cv2.Rodrigues(np.array([0.0024, 0.007, -0.0021]))[0], np.array([119.905, 0.5, -2.5])
+    R, t = cv2.Rodrigues(np.array([0.0024, 0.007, -0.0021]))[0], np.array([-119.905, 0.5, -2.5])
     R1, R2, P1, P2 = cv2.stereoRectify(K[0], ZED_C[0], K[1], ZED_C[1], (1280, 720), R, t)[:4]
     rows = [
         cv2.undistortPoints(pixels(rig, name, POINTS)[:, None], *camera)[:, 0, 1]

@@ -42,6 +42,7 @@ def image_of(
     hw=(960, 1280),
     taken="2018:04:13 08:06:58",
     exposure=(3, 1000),
+    black=True,
 ) -> Path:
     """A TIFF file of zeros with these Camera: tags, half of them as elements."""
     parts = [f'Camera:{k}="{v}"' for k, v in list(tags.items())[::2]]
@@ -68,6 +69,7 @@ def image_of(
         (0x829A, "2I", 1, exposure, True),
         (50714, "H", 4, (4000, 4002, 4000, 4002), True),
     ]
+    fields = fields if black else fields[:-1]
     tifffile.imwrite(path, np.zeros(hw, np.uint16), extratags=fields, metadata=None)
     return path
 
@@ -143,6 +145,36 @@ def test_missing_translations_are_said(tmp_path):
         assert set(Rig.load(path).names) == {"green", "nir"}
 
 
+@pytest.mark.parametrize("flag", [0, 1])
+def test_djis_other_tags(flag, tmp_path):
+    """DewarpFlag 1: dewarped already, so that no lens is left; black level, gain and band."""
+    data = {
+        "DewarpFlag": str(flag),
+        "DewarpData": "2022-01-01;2200,2201,10,-5,-0.1,0.05,0.001,-0.002,0.01",
+        "BandName": "NIR",
+        "CentralWavelength": "860",
+        "BlackCurrent": "3200",
+        "SensorGain": "2.0",
+    }
+    camera = Rig.load(image_of(tmp_path / "DJI_1.tif", {}, dji=data, black=False))["nir"]
+    assert (camera.distortion is None) == bool(flag)
+    assert (camera.sensor.black_level, camera.sensor.gain) == (3200, 2)
+    assert camera.sensor.response == Band(860, 20)
+
+
+def test_what_tags_do_not_state_is_said(tmp_path):
+    """No black level is not one of 0, no ISO speed not a gain of 1, no DewarpFlag not one of 0."""
+    data = {
+        "DewarpData": "2022-01-01;2200,2201,10,-5,-0.1,0.05,0.001,-0.002,0.01",
+        "CalibratedHMatrix": "1,0,0",
+    }
+    path = image_of(tmp_path / "DJI_1.tif", {}, dji=data, black=False)
+    with pytest.warns(RigFileWarning) as caught:
+        Rig.load(path)
+    said = " ".join(str(w.message) for w in caught)
+    assert all(name in said for name in ("black level", "gain", "DewarpFlag", "CalibratedHMatrix"))
+
+
 def test_dewarp_data(tmp_path):
     data = {
         "DewarpData": "2022-01-01;2200,2201,10,-5,0.01,-0.02,0.001,-0.002,0.03",
@@ -194,7 +226,7 @@ def test_images_of_two_places_are_named(tmp_path, monkeypatch):
 
 
 def test_stated_vignetting_is_said_to_be_left(tmp_path):
-    with pytest.warns(RigFileWarning, match="vignetting polynomials are stated, and not applied"):
+    with pytest.warns(RigFileWarning, match="vignetting is stated, and not applied"):
         Rig.load(pair(tmp_path, {**FISHEYE, "VignettingPolynomial": "1e-5,2e-7"}))
 
 

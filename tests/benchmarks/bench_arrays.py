@@ -18,7 +18,7 @@ import tyro
 from tyro.conf import Positional
 
 from arraygeom import Rig
-from pat import fuse, load_weights
+from pat import FuseSettings, fuse, load_weights
 from pat.lab.data.windows import read_view, reduced, scene_folders, scene_rig
 from pat.lab.evaluation.tables import markdown_header, markdown_row
 from pat.media.colour import luminance, srgb_image
@@ -52,7 +52,13 @@ def scores(network: FusionNetwork, folder: Path) -> list[float]:
     for betas in SETS:
         names = ("alpha", *betas)
         some = rig.replace(cameras={name: rig[name] for name in names})
-        frame = fuse(network, some, {name: images[name] for name in names}, alpha="alpha", response="rec601")
+        frame = fuse(
+            {name: images[name] for name in names},
+            some,
+            alpha="alpha",
+            network=network,
+            settings=FuseSettings(response="rec601"),
+        )
         found.append(score(frame.image.clamp(0, 1), seen["alpha"]).psnr)
     return found
 

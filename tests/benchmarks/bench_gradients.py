@@ -23,7 +23,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 from tyro.conf import Positional
 
-from pat import fuse, load_weights
+from pat import FuseSettings, fuse, load_weights
 from tests.benchmarks.printed import head
 from tests.pat.fusion.recovering import jacobian, recovered
 from tests.pat.layered_array import load_sample, middle_of_sample
@@ -49,7 +49,9 @@ def rows(degrees: float) -> list[str]:
             far: Tensor, name: str = f"colour.{kind}", way: Tensor = way, **options: bool
         ) -> tuple[Tensor, Tensor, Tensor]:
             moved = rig.perturbed({name: far * way})
-            frame = fuse(network, moved, images, alpha="mono", align=False, **options)
+            frame = fuse(
+                images, moved, alpha="mono", network=network, settings=FuseSettings(align=False), **options
+            )
             return (frame.image - truth).square().mean(), 1 / frame.depth, frame.confidence.detach()
 
         far = torch.tensor(degrees, dtype=torch.float64, requires_grad=True)

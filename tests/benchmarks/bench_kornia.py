@@ -26,7 +26,7 @@ from torch import Tensor
 
 from arraygeom import Camera, Distortion, Pose, Rig, relative_pose
 from docs.update_readme import write_block
-from pat.fusion.fuse import fuse
+from pat import fuse
 from pat.lab.evaluation.tables import markdown_table
 from pat.networks.guided import GuidedPAT
 from tests.arraygeom.rigs import random_rig
@@ -158,7 +158,7 @@ def fused() -> None:
     """A small fusion."""
     rig = Rig({"alpha": random_rig(1)["alpha"], "beta": random_rig(1)["beta"]}, depth=(1.5, 10.0))
     images = {"alpha": torch.rand(1, 48, 64), "beta": torch.rand(3, 40, 60)}
-    fuse(GuidedPAT(), rig, images, alpha="alpha")
+    fuse(images, rig, alpha="alpha", network=GuidedPAT())
 
 
 def main() -> None:

@@ -28,8 +28,8 @@ from torch import Generator, Tensor
 from arraygeom import Camera, Pose, Rig, intrinsics, pixel_grid, rotation_from_vector
 from experiments.evaluation.certainty import Reliability
 from experiments.evaluation.halves import of_half
-from pat.fusion.fuse import fuse
-from pat.fusion.results import Frame
+from pat import fuse
+from pat.fusion.frame import Frame
 from pat.fusion.steps import hw_at_alphas_resolution
 from pat.lab.data.pairs import middlebury_pairs
 from pat.lab.evaluation.ablation import recorded
@@ -185,10 +185,10 @@ def table(data: Path, count: int, turns: tuple[int, ...]) -> Iterator[str]:
     for name, cases in made.items():
         found = []
         for case in cases():
-            given = case.rig, case.images
+            given = case.images, case.rig
             frames = (
-                fuse(network, *given, alpha="alpha"),
-                fuse(bare, *given, alpha="alpha", matcher=unlearned),
+                fuse(*given, alpha="alpha", network=network),
+                fuse(*given, alpha="alpha", network=bare, matcher=unlearned),
             )
             found.append([figures(case, frame) for frame in frames])
         cells = zip(FORMATS, *map(over, zip(*found)))

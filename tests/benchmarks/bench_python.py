@@ -34,7 +34,7 @@ for name, image in sample.images.items():
     rig = rig.resize(name, tuple(images[name].shape[1:]))
 for i in range({frames} + 1):
     begin = time.monotonic()
-    fuse(network, rig, images, alpha="mono")
+    fuse(images, rig, alpha="mono", network=network)
     print(time.monotonic() - begin, flush=True)
 """
 SIZES = {"640x400": 1, "1280x800": 2}

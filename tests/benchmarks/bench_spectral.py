@@ -19,8 +19,8 @@ import tyro
 from torch import Generator, Tensor
 
 from arraygeom import Rig
+from pat import fuse
 from pat.fusion.classical import classical, classical_baseline
-from pat.fusion.fuse import fuse
 from pat.lab.evaluation.ablation import recorded
 from pat.lab.evaluation.tables import markdown_header, markdown_row
 from pat.lab.synthesis.layered import LayeredScenes
@@ -91,7 +91,7 @@ def row(
         answers = {"classical": baseline(rig, images, places, random)}
         for name, network in networks.items():
             if name == "mono-spectral" or len(ground_truth) == 3:
-                answers[name] = fuse(network, rig, images, alpha="alpha").image
+                answers[name] = fuse(images, rig, alpha="alpha", network=network).image
         for name, image in answers.items():
             found.setdefault(name, []).append(tuple(score(image.clamp(0, 1), ground_truth)))
     cells = {name: "{:.2f} / {:.4f}".format(*np.mean(values, 0)) for name, values in found.items()}

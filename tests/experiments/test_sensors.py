@@ -208,7 +208,7 @@ def test_rendered_scenes_are_recorded_by_their_responses_for_fusion(rendered, tm
     ideal = srgb_from_linear(luminance(view.rgb)).clamp(0, 1)
     assert 0 < (mono - ideal).square().mean().sqrt() < 0.02
     rig, images = Rig.load(out / "rig.yaml"), {"mono": mono, "colour": colour}
-    frame = fuse(load_weights("mono-colour-small"), rig, images, alpha="mono")
+    frame = fuse(images, rig, alpha="mono", network=load_weights("mono-colour-small"))
     assert frame.image.shape == (3, 48, 64)
 
 

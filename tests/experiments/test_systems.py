@@ -13,7 +13,7 @@ from experiments.hdr import merged, usable_range
 from experiments.sensors import Mosaic
 from experiments.stage import SystemScene
 from pat.app.cli.main import main
-from pat.fusion.results import Frame
+from pat.fusion.frame import Frame
 from pat.fusion.steps import resolution_ratio
 from pat.fusion.views import ViewFiles
 from pat.media.colour import linear_from_srgb, srgb_from_linear

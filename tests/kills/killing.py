@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import psutil
 
+from arraygeom.runtime.together import LISTS
 from pat.app.cli.main import main
 from tests.kills.long_writes import sitecustomize
 from tests.processes import ROOT, dask_cluster, forked
@@ -243,7 +244,8 @@ def _made_again(job: Job, out: Path, kept: dict[str, int]) -> list[str]:
 
 def left_over(out: Path) -> list[str]:
     """Temporary files in a folder whose command came to its end."""
-    hidden = [path.relative_to(out) for path in out.rglob(".*") if path.name != ".work"]
+    hidden = [path.relative_to(out) for path in out.rglob(".*") if path.name not in (".work", LISTS)]
+    hidden += [path.relative_to(out) for path in out.glob(f"{LISTS}/*/")]
     return [f"left over: {path}" for path in hidden]
 
 

@@ -37,7 +37,7 @@ def test_files_written_in_place_are_seen(conversion, monkeypatch):
         arraygeom.runtime.atomic.flush(path)
 
     @contextmanager
-    def one_by_one(folder, *, last):
+    def one_by_one(folder, *, group, last):
         yield folder
 
     monkeypatch.setattr(arraygeom.io, "write_together", one_by_one)

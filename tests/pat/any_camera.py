@@ -95,7 +95,7 @@ def fused_in_the_room(rig: Rig, *, wide: bool) -> Fused:
     depth = distance if wide else X[..., 2]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        frame = fuse(load_weights("mono-colour"), rig, images, alpha="alpha")
+        frame = fuse(images, rig, alpha="alpha", network=load_weights("mono-colour"))
     shown = images["alpha"].expand(3, -1, -1), frame.image
     alone, psnr = (score(image.clamp(0, 1), truth).psnr for image in shown)
     off = float(((frame.depth - depth) / depth).abs().nanmedian())

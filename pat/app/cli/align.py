@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
@@ -104,7 +104,10 @@ class Align(Known):
 
     def _align(self, frame: _Frame) -> None:
         """Align a frame, and write and say what comes of it."""
-        from ...fusion.aligned_files import save_aligned
+        from arraygeom.io.native import write
+        from arraygeom.runtime.together import sweep, write_listed
+
+        from ...fusion.aligned_files import refuse_to_replace, save_aligned
         from ...fusion.results import FOUND_RIG
         from ...support.locks import folder_lock
 
@@ -113,7 +116,11 @@ class Align(Known):
         with folder_lock(self.out):
             if frame.name:
                 self.refuse_several()
+            sweep(self.out)
+            refuse_to_replace(self.out, frame.recorded.names, separate=self.separate, name=frame.name)
             aligned = self._aligned(frame)
+            shown = self.report and not frame.name
+            page = self._page(aligned, frame, time.monotonic() - begin) if shown else None
             written = save_aligned(
                 aligned,
                 self.out,
@@ -121,56 +128,45 @@ class Align(Known):
                 positions=self.positions,
                 name=frame.name,
                 keep=frame.files.values(),
+                pages={} if page is None else {"index.html": page},
             )
             if frame.rig_found:
-                frame.recorded.save(self.out / FOUND_RIG)
+                write_listed(self.out / FOUND_RIG, write(frame.recorded))
                 written.append(self.out / FOUND_RIG)
-            if self.report and not frame.name:
-                self._write_page(aligned, frame, time.monotonic() - begin)
-                written.append(self.out / "index.html")
         prefix = f"{frame.name}_" if frame.name else ""
         print((self.out / f"{prefix}visibility.txt").read_text(), end="")
         say(f"written to {self.out}: {', '.join(path.name for path in written)}")
 
     def _aligned(self, frame: _Frame) -> Aligned:
         """The frame aligned, with the plan and a bar on the terminal."""
-        from ...fusion.align import align
         from ...fusion.aligned_files import RecordedFiles
-        from ...networks.weights import load_weights
+        from ..front import align
 
-        settings = self.settings()
         rig, field = self.with_known(frame.rig, frame.alpha, frame.files, options.field_named(self.field))
         with options.working_by_plan(f"aligning {frame.name}".strip()) as announce:
             return align(
-                rig,
                 frame.images,
+                rig,
                 alpha=frame.alpha,
+                network=self.weights,
+                settings=replace(self.settings(align=self.correct), field=field),
                 recorded=RecordedFiles(frame.recorded, frame.files),
-                network=None if self.weights is None else load_weights(self.weights),
-                field=field,
                 interpolation=self.interpolation,
                 min_confidence=self.confidence,
                 fill=self.fill,
-                max_memory=settings.max_memory,
-                match_levels=settings.match_levels,
-                response=settings.response,
-                correct=self.correct,
-                noise=settings.noise,
                 explain=lambda line: self.note(f"{frame.name}: {line}" if frame.name else line),
                 announce=None if frame.name else announce,
             )
 
-    def _write_page(self, aligned: Aligned, frame: _Frame, seconds: float) -> None:
-        """Write index.html."""
-        from arraygeom.runtime.atomic import write_text
-
+    def _page(self, aligned: Aligned, frame: _Frame, seconds: float) -> str:
+        """The page index.html."""
         from ..aligned_page import aligned_page
         from ..report import Facts
 
         texts = [str(message) for message in options.WARNED]
         weights = () if self.weights is None else (f"weights: {self.weights}",)
         facts = Facts((*weights, *self._notes, *frame.notes), texts, seconds)
-        write_text(self.out / "index.html", aligned_page(aligned, frame.recorded, facts))
+        return aligned_page(aligned, frame.recorded, facts)
 
 
 @dataclass(frozen=True)

@@ -27,15 +27,18 @@ class Demo:
 
     def run(self) -> None:
         """Fuse both arrays, and write and print what each method scores."""
-        from arraygeom.runtime.atomic import write_text
+        from arraygeom.runtime.together import refuse_others, write_listed, write_together
 
-        from ...fusion.results import save_frame
+        from ...fusion.fuse import FuseSettings
+        from ...fusion.results import refuse_to_replace, save_frame
         from ...networks.weights import load_weights
         from ...support.metrics import score
         from ..demo import as_real_cameras, classical_methods, save_demo_figure
         from ..sample_array import ALPHA, load_motorcycle, load_sample
 
         options.writable(self.out, folder=True)
+        refuse_to_replace(self.out)
+        refuse_others(self.out, ["demo.png", "demo.md"])
         network = load_weights(self.weights)
         sample = load_sample()
         arrays = {
@@ -51,7 +54,8 @@ class Demo:
                 **classical_methods(network, array, noise),
             }
             say(f"{name}: fusion with the weights '{self.weights}'")
-            frame = fuse_with_progress(self.weights, array.rig, array.images, alpha=ALPHA, noise=noise)
+            settings = FuseSettings(noise=noise)
+            frame = fuse_with_progress(self.weights, array.rig, array.images, alpha=ALPHA, settings=settings)
             methods["fusion"] = frame.image.clamp(0, 1)
             scores = {method: score(image, array.ground_truth) for method, image in methods.items()}
             columns[name] = {method: f"{psnr:.2f} / {ssim:.3f}" for method, (psnr, ssim) in scores.items()}
@@ -62,10 +66,11 @@ class Demo:
                     "classical, denoised and corrected": methods["classical, denoised and corrected"],
                     "fusion": methods["fusion"],
                 }
-                save_demo_figure(panels, CORNER, self.out / "demo.png")
+                with write_together(self.out, group="demo.png", last="demo.png") as folder:
+                    save_demo_figure(panels, CORNER, folder / "demo.png")
         table = table_of(columns)
         print(table, end="")
-        write_text(self.out / "demo.md", f"```\n{table}```\n")
+        write_listed(self.out / "demo.md", f"```\n{table}```\n")
         written += [self.out / "demo.png", self.out / "demo.md"]
         say(f"written: {', '.join(map(str, written))}")
 
@@ -97,7 +102,7 @@ class WarmUp:
         from arraygeom.runtime.compiled import cache_folder
 
         from ...attention.kernels import forward
-        from ...fusion.fuse import fuse
+        from ...fusion.fuse import FuseSettings, fuse_frame
         from ...networks.weights import load_weights
         from ...sensors import NoiseLevel
         from ..sample_array import ALPHA, load_sample
@@ -108,8 +113,8 @@ class WarmUp:
         colour = sample.rig["colour"].replace(distortion=lens)
         rig = sample.rig.with_camera("colour", colour).with_camera("second", colour)
         images = {**sample.images, "second": sample.images["colour"]}
-        noise = dict.fromkeys(images, NoiseLevel.of_electrons(300))
-        fuse(load_weights("mono-colour"), rig, images, alpha=ALPHA, noise=noise)
+        settings = FuseSettings(noise=dict.fromkeys(images, NoiseLevel.of_electrons(300)))
+        fuse_frame(images, rig, alpha=ALPHA, network=load_weights("mono-colour"), settings=settings)
         folder = cache_folder(forward)
         kept = "" if folder is None else f", kept in {folder}"
         say(f"kernels are ready: {time.monotonic() - begin:.0f} s{kept}")

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from arraygeom import Rig
     from arraygeom.runtime.chunks import Tile
 
+    from ...fusion.frame import Frame
     from ...fusion.fuse import FuseSettings
-    from ...fusion.results import Frame
     from ...fusion.views import ViewFiles
     from ..from_images import ImageArray
     from ..healing import Healed
@@ -203,6 +203,9 @@ class Fuse(Known):
 
     def _without_rig_from(self, files: dict[str, list[Path]], rates: Mapping[str, float]) -> None:
         """Find the rig from each camera's first image and fuse; `rates` are frames a second, of videos."""
+        from arraygeom.io.native import write
+        from arraygeom.runtime.together import refuse_others, write_listed
+
         from ...fusion.results import FOUND_RIG
         from ...networks.weights import load_weights
 
@@ -222,11 +225,12 @@ class Fuse(Known):
         if self.video is None:
             self.video = rates.get(array.alpha)
         path = self.out / FOUND_RIG
+        refuse_others(self.out, [FOUND_RIG])
         if not path.exists():  # frames that fail may want it; another job's is kept until this one is done
-            rig.save(path)
+            write_listed(path, write(rig))
         say(f"the rig that was found: {path}")
         self._many(rig, {name: files[name] for name in rig.names}, array.alpha)
-        rig.save(path)
+        write_listed(path, write(rig))
 
     def _choose_bits(self, files: Mapping[str, Sequence[Path]]) -> None:
         """As many bits as the images have, unless asked otherwise."""
@@ -308,16 +312,17 @@ class Fuse(Known):
         """Fuse one frame. `rig` is of the files as they are developed; `image_array` is what they say of it,
         where it was found from them; `healing` gives the rig healed by them, and the frame is fused again."""
         from arraygeom import Camera
-        from arraygeom.runtime.atomic import sweep
+        from arraygeom.runtime.together import LISTS, sweep
 
         from ...fusion.inputs import measured_along
+        from ...fusion.results import refuse_to_replace, save_frame
         from ...fusion.views import Views
         from ...media.raw import developed_rig
         from ...support.locks import folder_lock
 
         if self.points and not isinstance(rig[alpha], Camera):
             raise ValueError("--points needs a calibrated alpha, and the rig has only F for it: leave it out")
-        begin, store, field = time.monotonic(), self.out / ".tiles", options.field_named(self.field)
+        begin, store, field = time.monotonic(), self.out / LISTS / "tiles", options.field_named(self.field)
         along = measured_along(Views(rig, images, alpha, dict.fromkeys(images, field)))
 
         def fused(rig: Rig) -> Frame:
@@ -336,6 +341,7 @@ class Fuse(Known):
 
         with folder_lock(self.out):
             sweep(self.out)
+            refuse_to_replace(self.out)
             if not self.resume:
                 shutil.rmtree(store, ignore_errors=True)
             frame = fused(rig)
@@ -346,38 +352,43 @@ class Fuse(Known):
             if image_array is None and not frame.depth.isfinite().any():
                 self.note("no depth: the rig knows its cameras by F alone, or the images match nowhere")
             found = None if image_array is None else image_array.lasting
-            written = self._saved(frame, rig, alpha, files, along=along, rig=found)
-            shutil.rmtree(store, ignore_errors=True)
+            further = self._options_of_saving(frame, rig, alpha, files)
+            pages = {}
             if self.report:
                 adopted = () if image_array is None else image_array.notes
                 facts = self._facts(rig, adopted, time.monotonic() - begin)
-                written.append(self._page(frame, rig, images, alpha, facts, gain))
+                pages["index.html"] = self._page(frame, rig, images, alpha, facts, gain)
+            written = save_frame(frame, self.out, along=along, rig=found, pages=pages, **further)
+            shutil.rmtree(store, ignore_errors=True)
         say(f"written to {self.out}: {', '.join(path.name for path in written)}")
         if self.report:
             say(f"to see the result, open {self.out / 'index.html'} in a browser")
 
-    def _saved(
-        self, frame: Frame, fused: Rig, alpha: str, files: Container[str], **further: Any
-    ) -> list[Path]:
-        """Write the files of a frame, `further` being options of `save_frame`, and note what some hold."""
-        from ...fusion.results import band_names, describe_bands, save_frame, view_of
+    def _options_of_saving(
+        self, frame: Frame, fused: Rig, alpha: str, files: Container[str]
+    ) -> dict[str, Any]:
+        """Options of `save_frame`; notes what some files will hold."""
+        from ...fusion.results import band_names, describe_bands, view_of
 
         bits = self.bits or 8
         bands = band_names(frame, (name for name in fused.betas(alpha) if name in files))
-        further |= {
-            "view": view_of(fused, alpha, bits=bits, bands=len(frame.image)),
-            "points": fused[alpha] if self.points else None,
-            "bands": bands,
-        }
-        written = save_frame(frame, self.out, bits=bits, kind=self.kind, **further)
         if said := describe_bands(frame, bands, self.kind):
             self.note(said)
         if self.points:
             self.note("points.ply: the pixels of known depth, in alpha's frame")
-        return written
+        return {
+            "bits": bits,
+            "kind": self.kind,
+            "view": view_of(fused, alpha, bits=bits, bands=len(frame.image)),
+            "points": fused[alpha] if self.points else None,
+            "bands": bands,
+        }
 
     def _healed(self, rig: Rig, healed: Healed | None) -> Rig:
         """The rig, or the one that its images healed, which is written beside the results."""
+        from arraygeom.io.native import write
+        from arraygeom.runtime.together import write_listed
+
         from ...fusion.results import HEALED_RIG
 
         if healed is None:
@@ -387,8 +398,7 @@ class Fuse(Known):
         if path.resolve() == self.given[0].resolve():
             self.note(f"the healed rig is not written: {path} is the one that was given: give another --out")
         else:
-            self.out.mkdir(parents=True, exist_ok=True)
-            healed.rig.save(path)
+            write_listed(path, write(healed.rig))
             self.note(f"the healed rig: {path}")
         return healed.rig
 
@@ -411,17 +421,13 @@ class Fuse(Known):
 
     def _page(
         self, frame: Frame, rig: Rig, images: Mapping[str, Tensor], alpha: str, facts: Facts, gain: float
-    ) -> Path:
-        """Write index.html, with the classical baseline if it is asked for."""
-        from arraygeom.runtime.atomic import write_text
-
+    ) -> str:
+        """The page index.html, with the classical baseline if it is asked for."""
         from ..report import report_page
 
         if self.classical:
             facts = facts._replace(classical=self._classical(rig, images, alpha, gain))
-        path = self.out / "index.html"
-        write_text(path, report_page(frame, images, rig, alpha, facts))
-        return path
+        return report_page(frame, images, rig, alpha, facts)
 
     def _classical(self, rig: Rig, images: Mapping[str, Tensor], alpha: str, gain: float) -> Tensor | None:
         """The classical baseline, bright as the fused image; None, and a line, if cameras do not allow it."""
@@ -493,8 +499,8 @@ def fuse_with_progress(
     **further: Any,
 ) -> Frame:
     """`fuse` with weights by name, the plan and a bar on the terminal. The frame is on the CPU."""
-    from ...fusion.fuse import fuse
     from ...networks.weights import load_weights
+    from ..front import fuse
 
     where = options.device_of(device)
     network = load_weights(weights, precision=precision).to(where)
@@ -502,7 +508,7 @@ def fuse_with_progress(
         rig, images = rig.to(where), {name: image.to(where) for name, image in images.items()}
     options.say_when_compiling()
     with options.working_by_plan("fusing") as announce:
-        frame = fuse(network, rig, images, progress=_numbered, announce=announce, **further)
+        frame = fuse(images, rig, network=network, progress=_numbered, announce=announce, **further)
     return frame.mapped(lambda tensor: tensor.cpu())
 
 

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 from tyro.conf import Positional, UseAppendAction, arg
 
 from ...media.suffixes import IMAGE_SUFFIXES, VIDEO_SUFFIXES
+from ...support.folders import printable
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -337,7 +338,7 @@ def warn(message: Warning | str, *_: Any, **__: Any) -> None:
 
 def say(text: object, style: str | None = None) -> None:
     """Print a line on standard error."""
-    console().print(f"{text}", style=style, markup=False, soft_wrap=True)
+    console().print(printable(f"{text}"), style=style, markup=False, emoji=False, soft_wrap=True)
 
 
 def progress(title: str) -> Callable[[Iterable[T], int], Iterable[T]]:
@@ -364,7 +365,10 @@ def working(title: str) -> Iterator[Callable[[str], None]]:
 
     from ...support.steps import steps_shown
 
-    title_column, step_column = TextColumn("{task.description}"), TextColumn("{task.fields[step]}")
+    title_column, step_column = (
+        TextColumn(text, markup=False) for text in ("{task.description}", "{task.fields[step]}")
+    )
+    title = printable(title)
     columns = SpinnerColumn(), title_column, TimeElapsedColumn(), step_column
     terminal, printed = console().is_terminal, time.monotonic()
     with Progress(*columns, console=console(), transient=True, disable=not terminal) as bar:

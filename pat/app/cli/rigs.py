@@ -56,26 +56,30 @@ class Show:
     def run(self) -> None:
         """Write the drawings, and warn of a rig that does not fit the images."""
         from arraygeom import Camera
+        from arraygeom.runtime.together import refuse_others, write_together
         from arraygeom.viz import draw_fields, draw_matches, draw_rig
 
         from ...media.figures import save_figure
 
         options.writable(self.out, folder=True)
+        refuse_others(self.out, ["rig.png", "fields.png", "matches.png"], group="show")
         rig = load_rig(self.rig)
         alpha = rig.require(self.alpha or rig.names[0])
         images = options.read_images(rig, self.image)
         warn_of_misfit(rig, images)
-        written = []
+        figures = {}
         if any(isinstance(camera, Camera) for camera in rig.cameras.values()):
-            written.append(save_figure(draw_rig(rig, alpha=alpha), self.out / "rig.png"))
+            figures["rig.png"] = draw_rig(rig, alpha=alpha)
         if len(rig.names) > 1:
-            fields = draw_fields(rig, alpha, _twelve_pixels(rig[alpha].hw), images=images)
-            written.append(save_figure(fields, self.out / "fields.png"))
+            figures["fields.png"] = draw_fields(rig, alpha, _twelve_pixels(rig[alpha].hw), images=images)
         with options.working("matching points of the images"):
             points = matched_points(rig, alpha, images)
         if points:
-            written.append(save_figure(draw_matches(rig, alpha, points, images), self.out / "matches.png"))
-        say(f"written: {', '.join(map(str, written))}")
+            figures["matches.png"] = draw_matches(rig, alpha, points, images)
+        with write_together(self.out, group="show", last="rig.png") as folder:
+            for name, figure in figures.items():
+                save_figure(figure, folder / name)
+        say(f"written: {', '.join(str(self.out / name) for name in figures)}")
 
 
 def warn_of_misfit(rig: Rig, images: Mapping[str, Tensor]) -> None:
@@ -206,11 +210,11 @@ class Info:
 
 def warn_of_oddities(rig: Rig) -> None:
     """Say on standard error what is odd about a rig, but for what reading its file has warned of."""
-    from arraygeom.rig_check import unit_oddity
+    from arraygeom.rig_check import file_oddities
 
-    warned = unit_oddity(rig)
+    warned = file_oddities(rig)
     for oddity in rig.check():
-        if warned is None or not oddity.endswith(warned):
+        if not any(map(oddity.endswith, warned)):
             say(f"pat: {oddity}", style="yellow")
 
 
@@ -222,8 +226,11 @@ def print_tables(cameras: Sequence[CameraSummary], pairs: Sequence[PairSummary],
     fine, baseline = ("mm", "baseline m") if unit == "m" else (f"{unit}/1000", "baseline")
     footprint = f"{fine} a pixel, near - far"
     of_cameras = Table("camera", "pixels", "focal px", "view deg", footprint, box=None)
+    of_lenses = Table("camera", "lens", "covers", "coefficients", box=None)
     for c in cameras:
         further = _two(c.focal), _two(c.field_of_view, " x "), _two(c.footprint, " - ")
+        numbers = " ".join(f"{number:.4g}" for number in c.coefficients)
+        of_lenses.add_row(c.name, c.lens or "none", f"{100 * c.covered:.0f} %", numbers)
         of_cameras.add_row(c.name, f"{c.wh[0]}x{c.wh[1]}", *further)
     lengths = "segment px, median - longest", f"depth step {unit}, near - far"
     of_pairs = Table("alpha > beta", baseline, "rotation deg", "seen", *lengths, box=None)
@@ -231,8 +238,8 @@ def print_tables(cameras: Sequence[CameraSummary], pairs: Sequence[PairSummary],
         share = "" if p.seen is None else f"{p.seen:.0%}"
         further = share, _two(p.length, " - "), _two(p.depth_step, " - ")
         of_pairs.add_row(f"{p.alpha} > {p.beta}", f"{p.baseline:.4g}", f"{p.rotation:.2f}", *further)
-    for table in (of_cameras, of_pairs)[: 1 + bool(pairs)]:
-        Console().print(table)
+    for table in (of_cameras, of_lenses, of_pairs)[: 2 + bool(pairs)]:
+        Console(markup=False, emoji=False).print(table)
 
 
 def _two(values: tuple[float, float] | None, between: str = ", ") -> str:
@@ -253,21 +260,29 @@ class Convert:
     """Format of the source; by default recognised."""
     size: Annotated[tuple[int, int] | None, optional("W H")] = None
     """Of the images, pixels: for files that state none, or several."""
+    lens: Annotated[str | None, optional("MODEL")] = None
+    """Lens model of the coefficients, as brown-conrady or kannala-brandt: for files that do not say."""
+    refit: bool = False
+    """Fit lenses anew that end within their image, as at a pole: brown-conrady's k1 k2 p1 p2 k3."""
     write_as: Annotated[str, arg(metavar="FORMAT")] = "native"
     """Format of the target."""
 
     def run(self) -> None:
         """Write the rig. Raises ValueError for a size the file contradicts, and what OUT cannot hold."""
         from arraygeom.io import read_rig, write_rig
+        from arraygeom.lens_fit import refit_rig
 
         hw = None if self.size is None else (self.size[1], self.size[0])
         if hw is not None and min(hw) < 1:
             raise ValueError("--size: wanted width and height in pixels")
-        rig = read_rig(self.source, format=self.read_as, hw=hw)
-        for name in rig.names if hw is not None else ():
-            if (stated := rig[name].hw) != hw:
-                h, w = stated
-                raise ValueError(f"--size: the file states {w}x{h} for '{name}': leave it out")
+        rig = read_rig(self.source, format=self.read_as, hw=hw, lens=self.lens)
+        if hw is not None and all(view.hw != hw for view in rig.cameras.values()):
+            h, w = rig[rig.names[0]].hw
+            raise ValueError(f"--size: the file states {w}x{h} for '{rig.names[0]}': leave it out")
+        if self.refit:
+            rig, said = refit_rig(rig)
+            for sentence in said or ["no lens ends within its image: none is fitted anew"]:
+                say(sentence)
         write_rig(rig, self.target, format=self.write_as)
         say(f"written: {self.target} ({len(rig.names)} cameras)")
 

@@ -39,8 +39,13 @@ class Explorer:
         if self.scene is None:
             return {"error": self.error}
         try:
+            for name, _, options in choices(self.scene, self.controls):
+                if controls[name] not in options:
+                    raise ValueError(
+                        f"{name}: {controls[name]!r:.80} was not given when the explorer was started"
+                    )
             return answer(self.scene, self.alpha, controls)
-        except (ValueError, TypeError, AttributeError, LookupError, ArithmeticError) as error:
+        except (ValueError, TypeError, AttributeError, LookupError, ArithmeticError, RuntimeError) as error:
             return {"error": str(error)}
 
     def values(self) -> dict[str, Any]:

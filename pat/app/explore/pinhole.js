@@ -20,7 +20,7 @@ function modelOf(values, ask) {
 const asksServer = () => async (controls) => {
   const headers = { "Content-Type": "application/json" };
   let reply;
-  try { reply = await fetch("/answer", { method: "POST", headers, body: JSON.stringify(controls) }); }
+  try { reply = await fetch("answer", { method: "POST", headers, body: JSON.stringify(controls) }); }
   catch { throw "the server has ended: start `pat explore` again"; }
   return reply.json();
 };

@@ -1,13 +1,20 @@
-"""Serving the explorer to this machine alone, by the standard library."""
+"""Serving the explorer to one user of this machine alone, by the standard library."""
 
 from __future__ import annotations
 
 import json
+import secrets
 import sys
 import threading
 import webbrowser
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
+
+from arraygeom.runtime.safe_yaml import load_json
 
 from .page import Explorer, page
 
@@ -23,6 +30,7 @@ class _Server(ThreadingHTTPServer):
     def __init__(self, explorer: Explorer, port: int) -> None:
         super().__init__(("127.0.0.1", port), _Handler)
         self.explorer, self.turn = explorer, threading.Lock()
+        self.token = secrets.token_urlsafe(24)
         self.page = page(explorer.values(), "asksServer()").encode()  # computes what answers would wait for
 
     def handle_error(self, request: Any, client_address: Any) -> None:
@@ -35,7 +43,7 @@ class _Handler(BaseHTTPRequestHandler):
     server: _Server
 
     def do_GET(self) -> None:
-        if self._is_own() and self.path == "/":
+        if self._is_own() and self._asks_for(""):
             self._send(200, "text/html; charset=utf-8", self.server.page)
         else:
             self._refuse()
@@ -43,17 +51,21 @@ class _Handler(BaseHTTPRequestHandler):
     def do_POST(self) -> None:
         length = self.headers.get("Content-Length", "")
         short = length.isdecimal() and int(length) <= LARGEST
-        if not (self._is_own() and self.path == "/answer" and short):
+        if not (self._is_own() and self._asks_for("answer") and short):
             self._refuse()
             return
         try:
-            controls = {**self.server.explorer.controls, **json.loads(self.rfile.read(int(length)))}
+            controls = {**self.server.explorer.controls, **load_json(self.rfile.read(int(length)).decode())}
         except (ValueError, TypeError):
             self._send(400, "text/plain", b"the question is not a JSON object\n")
             return
         with self.server.turn:
             text = json.dumps(self.server.explorer.answer(controls))
         self._send(200, "application/json", text.encode())
+
+    def _asks_for(self, name: str) -> bool:
+        wanted = f"/{self.server.token}/{name}"
+        return secrets.compare_digest(self.path.encode(), wanted.encode())
 
     def _is_own(self) -> bool:
         hosts = [f"{name}:{self.server.server_port}" for name in OWN_NAMES]
@@ -69,6 +81,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_response(status)
         self.send_header("Content-Type", kind)
         self.send_header("Content-Length", str(len(body)))
+        self.send_header("Referrer-Policy", "no-referrer")
         self.end_headers()
         self.wfile.write(body)
 
@@ -79,6 +92,7 @@ class _Handler(BaseHTTPRequestHandler):
 def serve(explorer: Explorer, *, port: int = 0, browser: bool = True) -> None:
     """Serve the explorer to this machine alone until interrupted; port 0 takes a free one.
 
+    Its address has a token, without which nothing is served: other users of the machine do not know it.
     Requests for other host names than this machine's, or from pages of other origins, are refused: a foreign
     page whose name is made to resolve to this machine must not read the images. Raises ValueError for a port
     that is none or in use.
@@ -89,13 +103,22 @@ def serve(explorer: Explorer, *, port: int = 0, browser: bool = True) -> None:
         server = _Server(explorer, port)
     except OSError as error:
         raise ValueError(f"--port {port}: {error.strerror}: give another, or 0 for a free one") from None
-    address = f"http://localhost:{server.server_port}"
+    address = f"http://localhost:{server.server_port}/{server.token}/"
     print(f"the explorer is at {address} (Ctrl+C ends it)", flush=True)
-    if browser:
-        webbrowser.open(address)
-    try:
-        server.serve_forever()
-    except KeyboardInterrupt:
-        pass
-    finally:
-        server.server_close()
+    with _opened(address) if browser else nullcontext():
+        try:
+            server.serve_forever()
+        except KeyboardInterrupt:
+            pass
+        finally:
+            server.server_close()
+
+
+@contextmanager
+def _opened(address: str) -> Iterator[None]:
+    """The address in a browser, by a file that only this user can read: others see arguments of programs."""
+    with TemporaryDirectory() as folder:
+        file = Path(folder) / "explorer.html"
+        file.write_text(f'<meta http-equiv="refresh" content="0;url={address}">', encoding="utf-8")
+        webbrowser.open(file.as_uri())
+        yield

@@ -50,7 +50,7 @@ from arraygeom.runtime.atomic import write_text
 from arraygeom.segments import clip_to_image
 
 from ...fusion.classical import classical
-from ...fusion.fuse import fuse
+from ...fusion.fuse import FuseSettings, fuse_frame
 from ...fusion.steps import resolution_ratio
 from ...media.colour import luminance, srgb_image
 from ...media.depth_maps import at_distance
@@ -117,11 +117,12 @@ class FieldFamily:
 
     def fuse(self, network: FusionNetwork, rig: Rig, case: AblationCase, far: float) -> tuple[Tensor, Tensor]:
         """Alpha's view fused (3, H, W), its depth. Raises ValueError for a rig that cannot be rectified."""
+        settings = FuseSettings(field=self.field(far))
         if not self.warped:
-            frame = fuse(network, rig, case.images, alpha=ALPHA, field=self.field(far))
+            frame = fuse_frame(case.images, rig, alpha=ALPHA, network=network, settings=settings)
             return frame.image, frame.depth
         level = rectified(rig, case.images)
-        frame = fuse(network, level.rig, level.images, alpha=ALPHA, field=self.field(far))
+        frame = fuse_frame(level.images, level.rig, alpha=ALPHA, network=network, settings=settings)
         return level.back(frame.image), level.depth_back(frame.depth)
 
 

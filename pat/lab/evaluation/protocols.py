@@ -7,17 +7,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import NamedTuple
 
 from jaxtyping import Float, Shaped
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
-from arraygeom import Camera, Pose, ReceptiveField, Rectified, Rig, intrinsics
+from arraygeom import Camera, Pose, Rectified, Rig, intrinsics
 from arraygeom.pixels import HW
 
 from ...fusion.classical import classical_fusion
-from ...fusion.fuse import fuse
+from ...fusion.fuse import FuseSettings, fuse_frame
+from ...matching.match import Matcher, match
 from ...media.colour import luminance
 from ...networks.protocol import FusionNetwork
 from ..data.pairs import Disparity, StereoPair
@@ -94,20 +96,20 @@ def rectified_fusion(
     network: FusionNetwork,
     *,
     bands: bool = False,
-    field: ReceptiveField | None = None,
-    **options: Any,
+    settings: FuseSettings = FuseSettings(),
+    matcher: Matcher = match,
 ) -> StereoMethod:
     """`fuse` with a network as a method, alpha on the left: segments are rows, `max_disparity` pixels long.
 
-    With `bands` each channel of beta is a camera. `field` is another field than rows of that length. Other
-    options go to `fuse`.
+    With `bands` each channel of beta is a camera. A field in the settings replaces rows of that length.
     """
 
     def fused(alpha: Tensor, beta: Tensor, max_disparity: float) -> StereoResult:
         betas = dict(zip("rgb", beta.split(1))) if bands else {"beta": beta}
         rig = rectified_rig(hw_of(alpha), {name: hw_of(band) for name, band in betas.items()}, max_disparity)
-        looked_at = field or Rectified(max_disparity, alpha_is="left")
-        frame = fuse(network, rig, {"alpha": alpha, **betas}, alpha="alpha", field=looked_at, **options)
+        field = settings.field or Rectified(max_disparity, alpha_is="left")
+        how, images = replace(settings, field=field), {"alpha": alpha, **betas}
+        frame = fuse_frame(images, rig, alpha="alpha", network=network, settings=how, matcher=matcher)
         return StereoResult(frame.image, alpha.shape[-1] / frame.depth)
 
     return fused

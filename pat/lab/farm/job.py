@@ -24,8 +24,9 @@ from rich.console import Console
 
 from arraygeom.io.native import write as rig_text
 from arraygeom.rig import Rig
-from arraygeom.runtime.atomic import flush, sweep, write_text
+from arraygeom.runtime.atomic import flush, write_text
 from arraygeom.runtime.safe_yaml import dump_yaml, load_yaml
+from arraygeom.runtime.together import sweep
 from pat.lab.synthesis.check import CheckLimits
 from pat.lab.synthesis.rendered import Rendered
 from pat.sensors import seed_for

@@ -232,6 +232,11 @@ def command_line(arguments: list[str]) -> TrainConfig:
     base = TrainConfig()
     if arguments and not arguments[0].startswith("-"):
         base, arguments = load_config(arguments[0]), arguments[1:]
+        if ":" in base.field and not any(base.field in a.split("=") for a in arguments):
+            raise ValueError(
+                f"field: {base.field} is code, which a recipe alone does not run: if you trust it, "
+                f"add --field {base.field}"
+            )
     return tyro.cli(
         TrainConfig,
         prog="pat train [RECIPE]",

@@ -17,7 +17,7 @@ from torch.nn.utils import clip_grad_norm_
 from torch.optim import Adam
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from arraygeom.runtime.atomic import sweep
+from arraygeom.runtime.together import sweep
 from pat.networks.weights import Network, new_network, save_weights, set_precision
 from pat.support.locks import folder_lock
 from pat.support.tensor_files import write_tensors

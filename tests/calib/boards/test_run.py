@@ -60,7 +60,7 @@ def mine(photos, tmp_path):
 def test_photographs_become_a_rig_with_report_and_covariance(mine, capsys):
     run(mine, "--depth", "0.5", "3")
     out = mine / "out"
-    assert sorted(p.name for p in out.iterdir()) == ["rig.covariance.json", "rig.html", "rig.yaml"]
+    assert sorted(p.name for p in out.glob("rig*")) == ["rig.covariance.json", "rig.html", "rig.yaml"]
     rig = Rig.load(out / "rig.yaml")
     assert float(rig["b"].centre[0]) == pytest.approx(0.15, abs=3e-3)
     assert [float(d) for d in rig.depth] == [0.5, 3.0]

@@ -15,11 +15,12 @@ import torch
 import arraygeom.runtime.atomic
 from arraygeom import Epipolar, EpipolarLine, HomographyDisplacement, Rectified, Rig, ThroughLenses, Widened
 from arraygeom.io.native import write as rig_text
+from arraygeom.runtime.together import LISTS
 from pat.app.batch import KEYS, PLAN, Batch, find_images, fuse_one
 from pat.app.from_images import frames_of_videos
 from pat.fusion.checks import LowConfidenceWarning
+from pat.fusion.frame import Frame
 from pat.fusion.fuse import FuseSettings
-from pat.fusion.results import Frame
 from pat.media.images import read_image, write_image
 from pat.media.raw import LIGHT
 from pat.media.video import write_video
@@ -126,13 +127,13 @@ def test_a_stopped_sequence_is_resumed_to_the_same_bits(material, tmp_path, monk
     whole = batch(material, tmp_path / "whole", sequence=True)
     assert len(whole.run(video=25.0).made) == 7
     assert (tmp_path / "whole" / "fused.mp4").is_file()
-    assert not (tmp_path / "whole" / ".keys").exists()
+    assert not (tmp_path / "whole" / KEYS).exists()
     part, fuse_one = batch(material, tmp_path / "part", sequence=True), Batch.fuse_one
 
-    def stop_at_4(self, i):
+    def stop_at_4(self, i, inputs):
         if i == 4:
             raise KeyboardInterrupt
-        fuse_one(self, i)
+        fuse_one(self, i, inputs)
 
     with monkeypatch.context() as patched:
         patched.setattr(Batch, "fuse_one", stop_at_4)
@@ -183,7 +184,7 @@ def test_a_corrupt_image_costs_its_frame_or_stops_the_job(material, tmp_path):
     with pytest.raises(JobError, match=r"fast_10_fused.png: fast: .*fast_10.png: "):
         bad.run()
     report = bad.run(resume=True, on_error="skip")
-    assert [p.name for p in report.failed] == ["fast_10_fused.png"]
+    assert [p.name for p in report.failed] == ["fast_10_fused.json"]
     good = batch(material, tmp_path / "good")
     good.run()
     wanted = {name: content for name, content in contents(tmp_path / "good").items() if "_10_" not in name}
@@ -229,7 +230,7 @@ def test_a_full_disk_leaves_whole_files_only(material, tmp_path, monkeypatch):
         job.run()
     images = [p for p in (tmp_path / "out").iterdir() if p.name.endswith("fused.png")]
     assert len(images) == 2
-    assert not [p for p in os.listdir(tmp_path / "out") if p.startswith(".") and p != ".keys"]
+    assert [p for p in os.listdir(tmp_path / "out") if p.startswith(".")] == [LISTS]
     assert len(job.run(resume=True).made) == 5
 
 
@@ -272,8 +273,23 @@ def test_frames_whose_images_changed_are_made_again(sequence, material, tmp_path
     report = job.run(resume=True)
     assert len(report.made) == (count if sequence else 1)
     assert contents(tmp_path / "out")["fast_11_fused.png"] != before["fast_11_fused.png"]
-    (tmp_path / "out" / "inputs.json").unlink()
-    assert len(job.run(resume=True).made) == count
+    os.utime(changed, (0, 0))
+    assert len(job.run(resume=True).kept) == count
+    copy = shutil.copytree(tmp_path / "out", tmp_path / "copy", copy_function=shutil.copyfile)
+    assert len(replace(job, out=copy).run(resume=True).kept) == count
+
+
+def test_a_torn_empty_or_missing_file_of_a_frame_is_made_again(material, tmp_path):
+    """They counted as there."""
+    job = batch(material, tmp_path / "out")
+    job.run()
+    before = contents(tmp_path / "out")
+    (tmp_path / "out" / "fast_8_fused.png").write_bytes(before["fast_8_fused.png"][:500])
+    (tmp_path / "out" / "fast_9_confidence.png").write_bytes(b"")
+    (tmp_path / "out" / "fast_10_confidence.png").unlink()
+    report = job.run(resume=True)
+    assert (len(report.made), len(report.kept)) == (3, 4)
+    assert contents(tmp_path / "out") == before
 
 
 def test_a_job_of_videos_is_resumed(material, tmp_path):
@@ -294,11 +310,11 @@ def test_one_command_at_a_time_writes_to_a_folder(material, tmp_path, monkeypatc
     first, second = batch(material, tmp_path / "out"), batch(material, tmp_path / "out", match_levels=True)
     fuse_one = Batch.fuse_one
 
-    def meanwhile(self, i):
+    def meanwhile(self, i, inputs):
         if i == 2:
             with pytest.raises(ValueError, match="another command is writing there"):
                 second.run()
-        fuse_one(self, i)
+        fuse_one(self, i, inputs)
 
     monkeypatch.setattr(Batch, "fuse_one", meanwhile)
     assert len(first.run().made) == 7
@@ -325,7 +341,8 @@ def test_frames_that_hardly_match_are_warned_of_once_and_fail_if_strict(material
     with pytest.raises(JobError, match="mean confidence") as stopped:
         replace(job, strict=True).run()
     assert isinstance(stopped.value.__cause__, LowConfidenceWarning)
-    assert not list((tmp_path / "out").glob("*_fused.png"))
+    assert len(list((tmp_path / "out").glob("*_fused.png"))) == 2  # of before
+    assert len(job.run(resume=True).made) == 2
 
 
 class Payload:

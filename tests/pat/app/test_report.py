@@ -10,7 +10,7 @@ from arraygeom import Distortion, Pose, Rig, View
 from pat.app.report import Facts, report_page, rig_drawing
 from pat.app.sample_array import SAMPLE, load_sample
 from pat.fusion.classical import classical_view
-from pat.fusion.results import Frame
+from pat.fusion.frame import Frame
 from pat.media.figures import reduced
 from pat.support.metrics import score
 from tests.browser import CHROMIUM, DRIVER, browser

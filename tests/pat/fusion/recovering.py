@@ -10,7 +10,7 @@ from torch import Tensor
 
 from arraygeom import Pair, Rig
 from arraygeom.multiview import warp
-from pat import fuse
+from pat import FuseSettings, fuse
 from pat.media.colour import luminance
 from pat.networks.protocol import FusionNetwork
 
@@ -48,7 +48,9 @@ def rotation_left(error_of: Callable[[Tensor], Tensor]) -> float:
 
 def residuals(network: FusionNetwork, rig: Rig, images: dict[str, Tensor]) -> Tensor:
     """Colour's luminance where the depth found says that alpha's pixels are, minus alpha; 0 where unsure."""
-    frame = fuse(network, rig, images, alpha="mono", align=False, differentiable=True)
+    frame = fuse(
+        images, rig, alpha="mono", network=network, settings=FuseSettings(align=False), differentiable=True
+    )
     colour, pair = luminance(images["colour"])[None].double(), Pair(rig["mono"], rig["colour"])
     seen, valid = warp(pair, colour, frame.depth[None].double(), interpolation="bicubic")
     likely = valid[0] & (frame.confidence > 0.5)

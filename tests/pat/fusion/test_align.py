@@ -23,7 +23,7 @@ from arraygeom import (
     sample,
 )
 from arraygeom.undistortion import recorded_pixels, straight_pixels
-from pat import align
+from pat import FuseSettings, align
 from pat.app.aligned_page import aligned_page, ndvi, shown_layers
 from pat.app.report import Facts
 from pat.fusion.align import OUTSIDE, SEEN, filled, resampled_values
@@ -71,7 +71,8 @@ def array(lens: Distortion | None = None, turns: int = 0) -> tuple[Rig, dict[str
 @pytest.fixture(scope="module")
 def found():
     """The array, aligned."""
-    return align(*array(), alpha="mono", correct=False)
+    rig, images = array()
+    return align(images, rig, alpha="mono", settings=FuseSettings(align=False))
 
 
 @pytest.mark.parametrize("count", [1, 3])
@@ -81,7 +82,7 @@ def test_fine_texture_and_short_segments_are_no_reason_for_doubt(count):
     offsets = torch.tensor([[-0.15, 0, 0], [0.15, 0, 0], [0, -0.15, 0]], dtype=torch.float64)[:count]
     betas = [alpha.replace(cam_from_world=Pose(alpha.R, t)) for t in offsets]
     rig = Rig({"green": alpha} | {f"band{i}": beta for i, beta in enumerate(betas)}, depth=(3.5, 6.0))
-    aligned = align(rig, {name: recorded_by(rig[name]) for name in rig.names}, alpha="green")
+    aligned = align({name: recorded_by(rig[name]) for name in rig.names}, rig, alpha="green")
     for view in list(aligned.values())[1:]:
         inside = view.visibility != OUTSIDE
         assert view.confidence[inside].mean() > 0.8
@@ -98,7 +99,7 @@ def in_order(pair, x):
 def test_positions_are_of_the_recorded_image(lens, turns, field):
     """Also of images that are not undistorted: betas' were distorted twice, and alpha's lens was an error."""
     rig, images = array(lens, turns)
-    found = align(rig, images, alpha="mono", correct=False, field=field)
+    found = align(images, rig, alpha="mono", settings=FuseSettings(align=False, field=field))
     view = found["nir"]
     y, x = np.mgrid[: HW[0], : HW[1]]
     pixels = torch.from_numpy(np.stack([x, y], -1).astype(float))
@@ -118,7 +119,10 @@ def test_points_that_move_may_do_so_within_a_band(lens):
     rig, images = array(lens)
     step = torch.stack([torch.full(HW, 4.0), torch.full(HW, 1.0)])
     within, around = Widened(Moved(Epipolar(), step), along=2.0), Moved(Widened(Epipolar(), along=2.0), step)
-    one, other = (align(rig, images, alpha="mono", correct=False, field=field) for field in (within, around))
+    one, other = (
+        align(images, rig, alpha="mono", settings=FuseSettings(align=False, field=field))
+        for field in (within, around)
+    )
     assert np.array_equal(one.depth, other.depth, equal_nan=True)
     assert np.array_equal(one["nir"].positions, other["nir"].positions, equal_nan=True)
 
@@ -132,7 +136,7 @@ def test_positions_are_those_that_were_chosen(lens):
         return Matches((replace(found, chosen=found.chosen + 4),))
 
     found, moved = (
-        align(rig, images, alpha="mono", correct=False, matcher=matcher)["nir"].positions
+        align(images, rig, alpha="mono", settings=FuseSettings(align=False), matcher=matcher)["nir"].positions
         for matcher in (match, farther)
     )
     assert np.nanmedian(np.linalg.norm(moved - found, axis=-1)) == pytest.approx(4, abs=0.2)
@@ -146,7 +150,14 @@ def test_values_are_samples_of_what_was_recorded(interpolation, kind):
     counts = np.rint(20000 + 20000 * images["nir"].numpy()).astype(np.uint16)
     for recorded in (counts, counts.astype(np.float32)):
         own = {"mono": images["mono"], "nir": recorded}
-        found = align(rig, images, alpha="mono", recorded=own, interpolation=interpolation, correct=False)
+        found = align(
+            images,
+            rig,
+            alpha="mono",
+            settings=FuseSettings(align=False),
+            recorded=own,
+            interpolation=interpolation,
+        )
         view = found["nir"]
         assert view.values.dtype == recorded.dtype
         where = torch.from_numpy(np.nan_to_num(view.positions)).double()[None]
@@ -197,7 +208,9 @@ def test_without_a_view_there_are_no_values_unless_filled(found):
     full = filled(np.where(view.valid, view.values, 0), view.valid, "propagate")
     assert np.isin(full, view.values[:, view.valid]).all()
     assert (full[:, view.valid] == view.values[:, view.valid]).all()
-    everything = align(*array(), alpha="mono", correct=False, min_confidence=0.0)["nir"]
+    rig, images = array()
+    settings = FuseSettings(align=False)
+    everything = align(images, rig, alpha="mono", settings=settings, min_confidence=0.0)["nir"]
     assert (everything.visibility[~beyond] == SEEN).all()
 
 
@@ -218,7 +231,7 @@ def test_recorded_pixels_undo_all_that_was_done_to_a_view(undistorted):
 def test_views_without_calibration():
     _, images = array()
     rig = Rig({"mono": View(hw=HW), "nir": View(hw=HW)})
-    view = align(rig, images, alpha="mono", correct=False)["nir"]
+    view = align(images, rig, alpha="mono", settings=FuseSettings(align=False))["nir"]
     assert np.abs(view.values[0] - images["mono"][0].numpy())[view.valid].mean() < 0.03
 
 
@@ -229,7 +242,7 @@ def test_files_have_names_wavelengths_and_types(tmp_path):
         tifffile.imwrite(tmp_path / f"{name}.tif", values[0])
     recorded = RecordedFiles(rig, {name: tmp_path / f"{name}.tif" for name in counts})
     assert (recorded["nir"] == counts["nir"]).all()
-    found = align(rig, images, alpha="mono", recorded=recorded, correct=False)
+    found = align(images, rig, alpha="mono", settings=FuseSettings(align=False), recorded=recorded)
     written = save_aligned(found, tmp_path / "out", positions="tif")
     with tifffile.TiffFile(tmp_path / "out" / "aligned.tif") as file:
         assert (file.asarray() == found.stack()).all()
@@ -246,38 +259,62 @@ def test_files_have_names_wavelengths_and_types(tmp_path):
 def test_types_that_differ_go_to_files_of_their_own(tmp_path):
     rig, images = array()
     own = {"mono": (images["mono"].numpy() * 255).astype(np.uint8), "nir": images["nir"].numpy()}
-    save_aligned(align(rig, images, alpha="mono", recorded=own, correct=False), tmp_path)
+    save_aligned(align(images, rig, alpha="mono", settings=FuseSettings(align=False), recorded=own), tmp_path)
     assert tifffile.imread(tmp_path / "mono.tif").dtype == np.uint8
     assert tifffile.imread(tmp_path / "nir.tif").dtype == np.float32
     assert not (tmp_path / "aligned.tif").exists()
 
 
 def test_files_of_a_former_alignment_are_gone(found, tmp_path):
-    save_aligned(found, tmp_path)
-    (tmp_path / "index.html").write_text("its page")
+    save_aligned(found, tmp_path, pages={"index.html": "its page"})
     unknown = replace(found, depth=np.full_like(found.depth, np.nan))
     written = save_aligned(unknown, tmp_path, separate=True, positions="none")
-    assert {path.name for path in written} == {path.name for path in tmp_path.iterdir()}
+    assert {path.name for path in written} == {path.name for path in tmp_path.iterdir() if path.is_file()}
 
 
 def test_a_camera_called_depth_has_no_file_of_its_own(found, tmp_path):
     usual, (rig, images) = shown_layers(found), array()
     rig = Rig({"mono": rig["mono"], "depth": rig["nir"]}, depth=rig.depth)
     images = {"mono": images["mono"], "depth": images["nir"]}
-    found = align(rig, images, alpha="mono", correct=False)
+    found = align(images, rig, alpha="mono", settings=FuseSettings(align=False))
     assert (tifffile.imread(save_aligned(found, tmp_path)[0]) == found.stack())[0].all()
     layers = shown_layers(found)
     assert torch.equal(layers["depth"], usual["nir"])
     assert torch.equal(layers["derived depth"], usual["depth"])
-    with pytest.raises(ValueError, match=r"'depth' .*depth\.tif"):
+    with pytest.raises(ValueError, match=r"depth\.tif"):
         save_aligned(found, tmp_path, separate=True)
+
+
+def test_cameras_of_any_name_write_into_the_folder_and_never_share_a_file(found, tmp_path):
+    """They wrote where their names led: beside the folder, and over what was there."""
+    rig, images = array()
+    evil, other, out = "../../evil", str(tmp_path / "evil"), tmp_path / "a" / "b" / "out"
+    rig = Rig({evil: rig["mono"], other: rig["nir"]}, depth=rig.depth)
+    found = align(
+        {evil: images["mono"], other: images["nir"]}, rig, alpha=evil, settings=FuseSettings(align=False)
+    )
+    written = save_aligned(found, out, separate=True, name="7")
+    assert {path.parent for path in written} == {out}
+    assert [path for path in tmp_path.rglob("*evil*") if path.parent != out] == []
+    assert len([path for path in written if path.suffix == ".tif"]) == 3
+    views = dict(zip(("x", "x_positions"), found.views.values()))
+    with pytest.raises(ValueError, match=r"x_positions\.tif"):
+        save_aligned(replace(found, alpha="x_positions", views=views), out, separate=True, positions="tif")
+
+
+def test_a_file_of_the_user_is_not_replaced(found, tmp_path):
+    (tmp_path / "depth.tif").write_text("mine")
+    with pytest.raises(FileExistsError, match=r"depth\.tif"):
+        save_aligned(found, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["depth.tif"]
+    assert (tmp_path / "depth.tif").read_text() == "mine"
 
 
 def test_ndvi_needs_both_bands_and_both_views(found):
     assert ndvi(found) is None
     rig, images = array()
     red = rig.with_camera("mono", rig["mono"].replace(sensor=Sensor(response=Band(660.0, 40.0))))
-    found = align(red, images, alpha="mono", correct=False)
+    found = align(images, red, alpha="mono", settings=FuseSettings(align=False))
     index, (r, nir) = ndvi(found), (found.band(name) for name in ("mono", "nir"))
     seen = found["nir"].valid
     assert np.isnan(index[~seen]).all()
@@ -287,13 +324,19 @@ def test_ndvi_needs_both_bands_and_both_views(found):
 def test_mistakes_are_named(found):
     rig, images = array()
     with pytest.raises(ValueError, match=r"'nir' .*1x4x4.*\(C, 96, 160\)"):
-        align(rig, images, alpha="mono", recorded={**images, "nir": np.zeros((1, 4, 4))}, correct=False)
+        align(
+            images,
+            rig,
+            alpha="mono",
+            settings=FuseSettings(align=False),
+            recorded={**images, "nir": np.zeros((1, 4, 4))},
+        )
     for recorded, said in (
         ({"mono": images["mono"]}, "no recorded values of 'nir'"),
         ({**images, "nir": images["nir"].numpy().astype(complex)}, "'nir' are complex128"),
     ):
         with pytest.raises(ValueError, match=said):  # before anything is matched
-            align(rig, images, alpha="mono", recorded=recorded, matcher=lambda inputs: pytest.fail("matched"))
+            align(images, rig, alpha="mono", recorded=recorded, matcher=lambda inputs: pytest.fail("matched"))
     with pytest.raises(KeyError, match="there are: mono, nir"):
         found.band("red")
 
@@ -304,7 +347,7 @@ def test_weights_without_matches_are_refused():
     for name in rig.names:
         rig, images[name] = rig.crop(name, 0, 0, (95, 159)), images[name][:, :95, :159]
     with pytest.raises(ValueError, match="use no matches"):
-        align(rig, images, alpha="mono", network=PAT(PATConfig(betas=1, dim=4, in_channels=1)))
+        align(images, rig, alpha="mono", network=PAT(PATConfig(betas=1, dim=4, in_channels=1)))
     inputs = Inputs(images["mono"][None], betas=())
     with pytest.raises(ValueError, match="159x95 pixels to match: pad"):
         match(inputs)
@@ -315,7 +358,7 @@ def test_values_in_bfloat16_and_names_beyond_ascii(tmp_path):
     rig = Rig({"möno": rig["mono"], "nir": rig["nir"]}, depth=rig.depth)
     images = {"möno": images["mono"], "nir": images["nir"]}
     recorded = {name: image.bfloat16() for name, image in images.items()}
-    found = align(rig, images, alpha="möno", recorded=recorded, correct=False)
+    found = align(images, rig, alpha="möno", settings=FuseSettings(align=False), recorded=recorded)
     assert found["nir"].values.dtype == np.float32
     save_aligned(found, tmp_path)
     with tifffile.TiffFile(tmp_path / "aligned.tif") as file:
@@ -339,7 +382,14 @@ def test_ndvi_is_of_light_where_the_sensors_are_stated():
         cameras[name] = rig[name].replace(sensor=sensor)
         counts[name] = np.rint(black + images[name].numpy() * 1e6 * exposure * gain).astype(np.uint16)
     stated = rig.replace(cameras=cameras)
-    found = align(stated, images, alpha="mono", recorded=counts, correct=False, interpolation="nearest")
+    found = align(
+        images,
+        stated,
+        alpha="mono",
+        settings=FuseSettings(align=False),
+        recorded=counts,
+        interpolation="nearest",
+    )
     index, nir = ndvi(found, stated), found["nir"]
     where = np.rint(np.nan_to_num(nir.positions)).astype(int)
     seen = nir.valid
@@ -352,5 +402,5 @@ def test_of_an_alpha_in_colour_nothing_is_said(recwarn):
     """It said where colours come from, though nothing is fused."""
     rig, images = array()
     images["mono"] = torch.cat([images["mono"], *(0.9 * images["mono"] for _ in range(2))])
-    align(rig, images, alpha="mono", correct=False)
+    align(images, rig, alpha="mono", settings=FuseSettings(align=False))
     assert not [w for w in recwarn if "in colour" in str(w.message)]

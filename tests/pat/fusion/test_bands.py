@@ -8,12 +8,13 @@ import pytest
 import torch
 
 from arraygeom import Rig
+from pat import FuseSettings, fuse
 from pat.app.from_images import _ordered_betas, show_colour
 from pat.app.sample_array import load_sample
 from pat.fusion.checks import LowConfidenceWarning, noise_advice, warn_of_confidence
-from pat.fusion.fuse import fuse
+from pat.fusion.frame import Frame
 from pat.fusion.inputs import FrameInputs
-from pat.fusion.results import Frame, band_names, save_frame
+from pat.fusion.results import band_names, save_frame
 from pat.matching.inputs import Inputs
 from pat.networks.weights import load_weights
 from pat.sensors import NoiseLevel
@@ -62,7 +63,13 @@ def test_a_red_edge_is_ordered_before_red():
 def test_bands_keep_their_own_values_where_levels_are_matched():
     """They were scaled to alpha's mean and contrast."""
     rig, images = sample_of_bands({"a": 1.0, "b": 0.25})
-    frame = fuse(load_weights("mono-spectral"), rig, images, alpha="mono", match_levels=True, align=False)
+    frame = fuse(
+        images,
+        rig,
+        alpha="mono",
+        network=load_weights("mono-spectral"),
+        settings=FuseSettings(match_levels=True, align=False),
+    )
     truth = load_sample().ground_truth[:2].flatten(1).mean(1)
     for mean, wanted in zip(frame.image.flatten(1).mean(1), (float(truth[0]), 0.25 * float(truth[1]))):
         assert float(mean) == pytest.approx(wanted, rel=0.1)

@@ -6,8 +6,9 @@ from dataclasses import replace
 import pytest
 import torch
 
+from pat import FuseSettings, fuse
 from pat.fusion.corrections import Corrections, find_corrections
-from pat.fusion.fuse import corrections_of, fuse
+from pat.fusion.fuse import corrections_of
 from pat.fusion.inputs import prepared
 from pat.fusion.sequence import SequenceFusion
 from pat.fusion.views import Views
@@ -56,8 +57,9 @@ def combined(image, weights):
     return (image * torch.tensor(weights)[:, None, None]).sum(0, keepdim=True)
 
 
-def psnr(network, sample, images, **options):
-    frame = fuse(network, options.pop("rig", sample.rig), images, alpha=ALPHA, **options)
+def psnr(network, sample, images, *, rig=None, explain=None, **options):
+    given = {"alpha": ALPHA, "network": network, "settings": FuseSettings(**options)}
+    frame = fuse(images, rig or sample.rig, explain=explain, **given)
     return score(frame.image.clamp(0, 1), sample.ground_truth).psnr
 
 
@@ -105,8 +107,14 @@ def test_vignetting_is_found_by_itself(network, middle):
 
 def test_nothing_is_changed_where_the_cameras_are_as_the_rig_says(sample, network, images):
     lines: list[str] = []
-    given = fuse(network, sample.rig, images, alpha=ALPHA, explain=lines.append)
-    plain = fuse(network, sample.rig, images, alpha=ALPHA, response="rec601", align=False)
+    given = fuse(images, sample.rig, alpha=ALPHA, network=network, explain=lines.append)
+    plain = fuse(
+        images,
+        sample.rig,
+        alpha=ALPHA,
+        network=network,
+        settings=FuseSettings(response="rec601", align=False),
+    )
     assert lines == []
     assert torch.equal(given.image, plain.image)
     assert torch.equal(given.confidence, plain.confidence)
@@ -122,16 +130,16 @@ def test_a_rotated_camera_is_put_right(sample, network, images, ideal, degrees):
 
 def test_found_corrections_serve_other_frames(sample, network, images):
     rig = with_beta_rotated(sample.rig, 0.3)
-    found = corrections_of(network, rig, images, alpha=ALPHA)
-    one = fuse(network, rig, images, alpha=ALPHA)
-    assert torch.equal(fuse(network, rig, images, alpha=ALPHA, corrections=found).image, one.image)
+    found = corrections_of(images, rig, alpha=ALPHA, network=network)
+    one = fuse(images, rig, alpha=ALPHA, network=network)
+    assert torch.equal(fuse(images, rig, alpha=ALPHA, network=network, corrections=found).image, one.image)
 
 
 def test_corrections_of_other_betas_are_refused(sample, network, images):
     found = Corrections(Response.rec601(), {"a": Misalignment(), "b": Misalignment()})
     message = "corrections are of 'a', 'b', this frame has '.*': take those of a frame of the same cameras"
     with pytest.raises(ValueError, match=message):
-        fuse(network, sample.rig, images, alpha=ALPHA, corrections=found)
+        fuse(images, sample.rig, alpha=ALPHA, network=network, corrections=found)
 
 
 def test_betas_without_names_are_corrected_too(middle, network):

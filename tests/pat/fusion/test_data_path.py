@@ -10,8 +10,8 @@ import pat.fusion.tiles
 import pat.fusion.views
 from arraygeom import Distortion, Epipolar, Sensor
 from arraygeom.runtime.chunks import tiles_of
+from pat import FuseSettings, fuse
 from pat.fusion.frames import ImageFiles
-from pat.fusion.fuse import fuse
 from pat.fusion.sequence import fuse_sequence
 from pat.fusion.tiles import MAX_HALO
 from pat.fusion.views import ViewFiles, Views
@@ -72,7 +72,9 @@ def test_each_file_is_read_and_developed_once(bands, lens, places, reads, tmp_pa
         BandwisePAT(BandwisePATConfig(**SMALL)) if len(bands) > 2 else GuidedPAT(GuidedPATConfig(**SMALL))
     )
     images = ViewFiles(rig, files, alpha="a")
-    frame = fuse(network.eval(), images.developed, images, alpha="a", match_levels=True)
+    frame = fuse(
+        images, images.developed, alpha="a", network=network.eval(), settings=FuseSettings(match_levels=True)
+    )
     assert frame.image.shape == (3, *HW)
     assert reads == {**dict.fromkeys(map(str, files.values()), 1), "develop": len(names)}
 
@@ -97,7 +99,16 @@ def test_each_file_of_a_sequence_is_read_once(reads, tmp_path):
         write_image(file, smooth(1 if file.name.startswith("a") else 3, i))
     frames = {name: ImageFiles(paths, rig, name, alpha="a") for name, paths in files.items()}
     network = GuidedPAT(GuidedPATConfig(**SMALL)).eval()
-    assert len(list(fuse_sequence(network, rig, frames, alpha="a", match_levels=True))) == 9
+    assert (
+        len(
+            list(
+                fuse_sequence(
+                    frames, rig, alpha="a", network=network, settings=FuseSettings(match_levels=True)
+                )
+            )
+        )
+        == 9
+    )
     assert set(reads.values()) == {1, 12}
     assert reads["develop"] == 12
 
@@ -119,7 +130,13 @@ def test_each_field_is_evaluated_once_a_pixel(tiled, monkeypatch):
     if tiled:
         monkeypatch.setattr(pat.fusion.tiles, "tiles_within", lambda *_: list(tiles_of(HW, 32, MAX_HALO)))
     network, field = GuidedPAT(GuidedPATConfig(**SMALL)).eval(), Counted()
-    fuse(network, rig_of("ab"), {"a": smooth(1, 0), "b": smooth(3, 1)}, alpha="a", field=field)
+    fuse(
+        {"a": smooth(1, 0), "b": smooth(3, 1)},
+        rig_of("ab"),
+        alpha="a",
+        network=network,
+        settings=FuseSettings(field=field),
+    )
     pixels = {xy: n for xy, n in field.asked.items() if xy[0] % 1 == 0}
     blocks = {xy: n for xy, n in field.asked.items() if xy[0] % 1 == 0.5}
     assert set(pixels.values()) == set(blocks.values()) == {1}

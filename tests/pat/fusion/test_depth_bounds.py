@@ -8,8 +8,8 @@ from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.lenses import Equirectangular
 from pat.fusion.depth import measured_depth
 from pat.fusion.depth_filling import background_filled
+from pat.fusion.frame import Frame
 from pat.fusion.inputs import FrameInputs, Placement, frame_inputs, measured_along
-from pat.fusion.results import Frame
 from pat.fusion.steps import quarter_turns
 from pat.fusion.views import Views
 from pat.matching.inputs import Beta, Inputs

@@ -8,8 +8,8 @@ from arraygeom import Segments
 from arraygeom.fields.grid import FieldOnGrid
 from pat.fusion import depth_edges
 from pat.fusion.depth_edges import SETTINGS, beside_edges
+from pat.fusion.frame import Frame
 from pat.fusion.inputs import FrameInputs
-from pat.fusion.results import Frame
 from pat.matching.inputs import Beta, Inputs
 
 HALF_WIDTH = 0.005

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from arraygeom import Rig
-from pat import fuse, load_weights
+from pat import FuseSettings, fuse, load_weights
 from tests.pat.fusion.recovering import recovered, rotated, rotation_left
 from tests.pat.layered_array import middle_of_sample
 
@@ -23,7 +23,9 @@ def error_of(cropped, angle: torch.Tensor) -> torch.Tensor:
     """Of the image fused with the colour camera rotated, against the ground truth."""
     rig, images, ground_truth = cropped
     network, turned = load_weights("mono-colour"), rotated(rig, angle)
-    frame = fuse(network, turned, images, alpha="mono", align=False, differentiable=True)
+    frame = fuse(
+        images, turned, alpha="mono", network=network, settings=FuseSettings(align=False), differentiable=True
+    )
     return (frame.image - ground_truth).square().mean()
 
 
@@ -60,7 +62,9 @@ def test_depths_follow_a_camera_that_moves_along_the_segments(cropped, kind, axi
 
     def fused(far: torch.Tensor, **options):
         changed = rig.perturbed({f"colour0.{kind}": far * way})
-        return fuse(network, changed, images, alpha="mono", align=False, **options)
+        return fuse(
+            images, changed, alpha="mono", network=network, settings=FuseSettings(align=False), **options
+        )
 
     before, after = (fused(torch.tensor(s, dtype=torch.float64)) for s in (-step, step))
     far = torch.zeros((), dtype=torch.float64, requires_grad=True)
@@ -78,9 +82,11 @@ def test_gradients_reach_rig_images_and_weights(cropped, luminance, recwarn):
     network = load_weights("mono-colour-small").requires_grad_(True)
     angle = torch.zeros((), dtype=torch.float64, requires_grad=True)
     images = {name: image.clone().requires_grad_() for name, image in images.items()}
-    options = {"align": False, "luminance": luminance, "differentiable": True}
+    settings = FuseSettings(align=False, luminance=luminance)
     torch.set_warn_always(True)
-    frame = fuse(network, rotated(rig, angle), images, alpha="mono", **options)
+    frame = fuse(
+        images, rotated(rig, angle), alpha="mono", network=network, settings=settings, differentiable=True
+    )
     torch.set_warn_always(False)
     frame.image.square().mean().backward()
     assert not recwarn.list
@@ -94,7 +100,7 @@ def test_without_differentiable_everything_is_detached(cropped):
     rig, images, _ = cropped
     angle = torch.zeros((), dtype=torch.float64, requires_grad=True)
     images = images | {"colour": images["colour"].clone().requires_grad_()}
-    frame = fuse(load_weights("mono-colour-small"), rotated(rig, angle), images, alpha="mono")
+    frame = fuse(images, rotated(rig, angle), alpha="mono", network=load_weights("mono-colour-small"))
     assert [part.requires_grad for part in frame[:3]] == [False, False, False]
 
 
@@ -102,12 +108,12 @@ def test_a_differentiable_fusion_is_of_the_whole_frame(cropped, tmp_path):
     rig, images, _ = cropped
     network = load_weights("mono-colour-small")
     for more, message in (
-        ({"max_memory": "2GiB"}, "max_memory and store"),
+        ({"settings": FuseSettings(max_memory="2GiB")}, "max_memory and store"),
         ({"store": tmp_path}, "max_memory and store"),
-        ({"noise": "estimate"}, "leave out noise"),
+        ({"settings": FuseSettings(noise="estimate")}, "leave out noise"),
     ):
         with pytest.raises(ValueError, match=message):
-            fuse(network, rig, images, alpha="mono", differentiable=True, **more)
+            fuse(images, rig, alpha="mono", network=network, differentiable=True, **more)
 
 
 def test_a_transformation_of_torch_func_is_refused(cropped):
@@ -116,7 +122,14 @@ def test_a_transformation_of_torch_func_is_refused(cropped):
 
     def depth(angle: torch.Tensor) -> torch.Tensor:
         turned = rotated(rig, angle)
-        return fuse(network, turned, images, alpha="mono", align=False, differentiable=True).depth[96, 128]
+        return fuse(
+            images,
+            turned,
+            alpha="mono",
+            network=network,
+            settings=FuseSettings(align=False),
+            differentiable=True,
+        ).depth[96, 128]
 
     with pytest.raises(NotImplementedError, match=r"torch\.autograd"):
         torch.func.grad(depth)(torch.zeros((), dtype=torch.float64))

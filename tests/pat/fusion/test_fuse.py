@@ -31,7 +31,7 @@ from arraygeom.fields import AroundDepth
 from arraygeom.runtime.chunks import Tile, tiles_of
 from arraygeom.runtime.threads import limited_to
 from calib.images.matches import match_points, seen_depths
-from pat.fusion.fuse import corrections_of, fuse
+from pat import FuseSettings, fuse
 from pat.fusion.inputs import FrameInputs, prepared
 from pat.fusion.steps import quarter_turns, resolution_ratio, steps_for, without_lenses
 from pat.fusion.tiles import MAX_HALO, SLACK, tiles_within, working_memory
@@ -104,25 +104,25 @@ def test_tiled_equals_whole(kind, dtype, bound, monkeypatch):
     hw, network = (34, 1620), network_of(kind).to(dtype)
     rig, images = scene(hw, (30, 1110))
     images = {name: image.to(dtype) for name, image in images.items()}
-    whole = fuse(network, rig, images, alpha="mono")
+    whole = fuse(images, rig, alpha="mono", network=network)
     assert any(t.outer[3] - t.outer[2] < hw[1] for t in in_tiles(monkeypatch, hw, 160, network.halo))
-    tiled = fuse(network, rig, images, alpha="mono")
+    tiled = fuse(images, rig, alpha="mono", network=network)
     assert (tiled.image - whole.image).abs().max() < bound
     assert torch.equal(tiled.depth.isnan(), whole.depth.isnan())
     assert (tiled.confidence - whole.confidence).abs().max() < bound
     assert torch.allclose(1 / tiled.depth, 1 / whole.depth, atol=10 * bound, equal_nan=True)
     monkeypatch.setattr(type(network), "halo", 16)
     in_tiles(monkeypatch, hw, 160, 16)
-    assert (fuse(network, rig, images, alpha="mono").image - whole.image).abs().max() > bound
+    assert (fuse(images, rig, alpha="mono", network=network).image - whole.image).abs().max() > bound
 
 
 def test_matching_in_pieces_is_nearly_that_of_the_whole_and_tiles_do_not_matter(monkeypatch):
     sample, network = load_sample(), load_weights("mono-colour-small")
     images = {name: sample.images[name] for name in sample.rig.names}
-    whole = fuse(network, sample.rig, images, alpha="mono")
+    whole = fuse(images, sample.rig, alpha="mono", network=network)
     monkeypatch.setattr(pat.matching.inputs, "SETTINGS", InputsSettings(halo=128, at_once=150_000))
     assert sample.rig["mono"].hw[0] * sample.rig["mono"].hw[1] > 150_000
-    pieces = fuse(network, sample.rig, images, alpha="mono")
+    pieces = fuse(images, sample.rig, alpha="mono", network=network)
     ground_truth = sample.ground_truth
     assert (
         score(pieces.image.clamp(0, 1), ground_truth).psnr
@@ -131,7 +131,7 @@ def test_matching_in_pieces_is_nearly_that_of_the_whole_and_tiles_do_not_matter(
     off = (pieces.image - whole.image).abs().amax(0)
     assert (off > 0.005).float().mean() < 2.5e-3
     in_tiles(monkeypatch, sample.rig["mono"].hw, 192, MAX_HALO)
-    tiled = fuse(network, sample.rig, images, alpha="mono")
+    tiled = fuse(images, sample.rig, alpha="mono", network=network)
     assert (tiled.image - pieces.image).abs().max() < 1e-5
     assert (tiled.confidence - pieces.confidence).abs().max() < 1e-5
 
@@ -147,11 +147,11 @@ def test_halos_are_wide_enough_for_the_weights(folder, precision, most, rms, sha
     images = {"left": luminance(pair.left), "right": pair.right}
     rig = Rig({name: View(hw=image.shape[1:]) for name, image in images.items()})
     field = Rectified(alpha_is="left", max_disparity=pair.max_disparity)
-    whole = fuse(network, rig, images, alpha="left", field=field)
+    whole = fuse(images, rig, alpha="left", network=network, settings=FuseSettings(field=field))
     h, w = rig["left"].hw
     with pytest.MonkeyPatch.context() as patched:
         in_tiles(patched, (h, w), (-(-h // 32) * 16, -(-w // 64) * 16), MAX_HALO)
-        tiled = fuse(network, rig, images, alpha="left", field=field)
+        tiled = fuse(images, rig, alpha="left", network=network, settings=FuseSettings(field=field))
     assert (tiled.image - whole.image).abs().max() < most
     assert (tiled.image - whole.image).square().mean().sqrt() < rms
     assert (tiled.confidence - whole.confidence).abs().max() < most
@@ -159,33 +159,33 @@ def test_halos_are_wide_enough_for_the_weights(folder, precision, most, rms, sha
 
 WRONG = """
 import torch
-from pat import fuse, load_weights
-from pat.app.sample_array import SAMPLE, load_sample
+from pat import FuseSettings, fuse
+from pat.app.sample_array import load_sample
 from pat.media.images import write_image
 
-sample, network = load_sample(), load_weights("mono-colour")
+sample = load_sample()
 rig, images = sample.rig, sample.images
 for use in (
-    lambda: fuse(network, rig, {name: f"{name}.png" for name in images}, alpha="mono"),
-    lambda: fuse(network, rig, {name: image.numpy() for name, image in images.items()}, alpha="mono"),
-    lambda: fuse(network, SAMPLE / "rig.yaml", images, alpha="mono"),
-    lambda: fuse("mono-colour", rig, images, alpha="mono"),
-    lambda: fuse(network, rig, images, alpha="mono", noise="much"),
-    lambda: fuse(network, rig, images, alpha="mono", response="luma"),
-    lambda: fuse(network, rig, images, alpha="mono", noise=0.1),
-    lambda: fuse(network, rig, images, alpha="mono", noise={"mono": 200}),
-    lambda: fuse(network, rig, [*images.values()], alpha="mono"),
+    lambda: fuse({name: f"{name}.png" for name in images}, rig, alpha="mono"),
+    lambda: fuse({name: image.numpy() for name, image in images.items()}, rig, alpha="mono"),
+    lambda: fuse(images, {"mono": 1}, alpha="mono"),
+    lambda: fuse("mono-colour", rig, alpha="mono"),
+    lambda: fuse(images, rig, alpha="mono", settings=FuseSettings(noise="much")),
+    lambda: fuse(images, rig, alpha="mono", settings=FuseSettings(response="luma")),
+    lambda: fuse(images, rig, alpha="mono", settings=FuseSettings(noise=0.1)),
+    lambda: fuse(images, rig, alpha="mono", settings=FuseSettings(noise={"mono": 200})),
+    lambda: fuse([*images.values()], rig, alpha="mono"),
     lambda: fuse([*images.values()]),
-    lambda: fuse(torch.nn.Linear(2, 2), rig, images, alpha="mono"),
-    lambda: fuse(network, rig, images, alpha="mono", settings={"noise": None}),
-    lambda: fuse(network, rig, images, alpha="mono", corrections={"colour": 1}),
-    lambda: fuse(network, rig, images, alpha="mono", matcher=lambda inputs: 3),
-    lambda: fuse(network, rig, images, alpha=0),
+    lambda: fuse(images, rig, alpha="mono", network=torch.nn.Linear(2, 2)),
+    lambda: fuse(images, rig, alpha="mono", settings={"noise": None}),
+    lambda: fuse(images, rig, alpha="mono", corrections={"colour": 1}),
+    lambda: fuse(images, rig, alpha="mono", matcher=lambda inputs: 3),
+    lambda: fuse(images, rig, alpha=0),
     lambda: write_image("x.png", torch.zeros(3, 8, 8, dtype=torch.uint8)),
 ):
     try:
         print("taken", use())
-    except (TypeError, ValueError) as error:
+    except (OSError, TypeError, ValueError) as error:
         print(error)
 """
 
@@ -194,18 +194,18 @@ def test_what_is_not_what_it_should_be_is_refused_in_a_line():
     """Apart, where nothing else checks types."""
     done = subprocess.run([sys.executable, "-c", WRONG], capture_output=True, text=True)
     expected = (
-        "the image of 'mono' is a str: give a tensor",
+        "mono: mono.png: no such",
         "the image of 'mono' is a ndarray: give a tensor",
-        "fuse takes a network, a rig, images and alpha=NAME",
-        "fuse takes a network, a rig, images and alpha=NAME",
+        "the rig is a dict",
+        "an array has two images or more, got mono-colour",
         "noise is 'estimate', 'auto' or a NoiseLevel of each camera; got 'much'",
         "response is 'fit', 'rec601' or three weights; got 'luma'",
         "noise is 'estimate', 'auto' or a NoiseLevel of each camera; got 0.1: give {NAME",
         "noise is 'estimate', 'auto' or a NoiseLevel of each camera; got {'mono': 200}: give {NAME",
-        "the images are a list: give {NAME: image}, by camera",
         "an image is a Tensor without a name: give files, or {NAME: tensor} by camera",
-        "fuse takes a network, a rig, images and alpha=NAME",
-        "wanted FuseSettings, got a dict",
+        "an image is a Tensor without a name: give files, or {NAME: tensor} by camera",
+        "network is a Linear",
+        "settings are a dict",
         "wanted Corrections, got a dict",
         "wanted Matches, got a int",
         "the rig has no camera '0'",
@@ -223,7 +223,7 @@ def test_what_is_no_field_or_no_list_is_refused_in_a_line():
         return x, x
 
     with pytest.raises(ValueError, match="the field ends gave a tuple: fields give Segments or Positions"):
-        fuse(network_of("GuidedPAT"), rig, images, alpha="mono", field=ends)
+        fuse(images, rig, alpha="mono", network=network_of("GuidedPAT"), settings=FuseSettings(field=ends))
 
     def fewer(pair, x):
         found = Epipolar()(pair, x)
@@ -232,7 +232,7 @@ def test_what_is_no_field_or_no_list_is_refused_in_a_line():
     with pytest.raises(
         ValueError, match=r"the field fewer gave \(0,\) pixels for \(1,\): a field is asked for x"
     ):
-        fuse(network_of("GuidedPAT"), rig, images, alpha="mono", field=fewer)
+        fuse(images, rig, alpha="mono", network=network_of("GuidedPAT"), settings=FuseSettings(field=fewer))
     with pytest.raises(ValueError, match=r"got mono\.png: give a list"):
         fuse("mono.png")
 
@@ -242,14 +242,14 @@ def test_an_image_of_one_colour_is_named():
     rig, images = scene()
     images["colour"] = torch.ones(3, 64, 96)
     with pytest.warns(UserWarning, match="'colour' is of one colour, with nothing to match: give another"):
-        fuse(network_of("GuidedPAT"), rig, images, alpha="mono")
+        fuse(images, rig, alpha="mono", network=network_of("GuidedPAT"))
 
 
 def test_a_network_elsewhere_is_refused():
     """It gave NaN, without a word."""
     rig, images = scene()
     with pytest.raises(ValueError, match="'mono' is on cpu, the network on meta: give all on one device"):
-        fuse(network_of("GuidedPAT").to("meta"), rig, images, alpha="mono")
+        fuse(images, rig, alpha="mono", network=network_of("GuidedPAT").to("meta"))
 
 
 def test_precision_is_that_of_the_weights():
@@ -258,11 +258,13 @@ def test_precision_is_that_of_the_weights():
     with pytest.raises(
         ValueError, match=r"float64, the network's weights are float32: .*network.to\(torch.float64\)"
     ):
-        fuse(network, rig, double, alpha="mono")
-    whole = fuse(network, rig, images, alpha="mono").image
+        fuse(double, rig, alpha="mono", network=network)
+    whole = fuse(images, rig, alpha="mono", network=network).image
     with torch.autocast("cpu", torch.bfloat16):
-        assert torch.equal(fuse(network, rig, images, alpha="mono").image, whole)
-    found = fuse(network.double(), rig, double, alpha="mono", noise="estimate").image
+        assert torch.equal(fuse(images, rig, alpha="mono", network=network).image, whole)
+    found = fuse(
+        double, rig, alpha="mono", network=network.double(), settings=FuseSettings(noise="estimate")
+    ).image
     assert found.dtype == torch.float64
 
 
@@ -274,8 +276,8 @@ def test_images_are_asked_for_once_and_only_when_they_are_needed():
             asked.append(name)
             return super().__getitem__(name)
 
-    found = fuse(network, rig, Files(given), alpha="mono")
-    assert torch.equal(found.image, fuse(network, rig, given, alpha="mono").image)
+    found = fuse(Files(given), rig, alpha="mono", network=network)
+    assert torch.equal(found.image, fuse(given, rig, alpha="mono", network=network).image)
     assert sorted(asked) == ["colour", "mono"]
 
 
@@ -312,7 +314,7 @@ def test_tiles_are_those_with_the_least_work():
 
 def test_the_plan_is_announced_before_the_work():
     plans, (rig, images) = [], scene((50, 70), (40, 60))
-    fuse(network_of("PAT"), rig, images, alpha="mono", announce=plans.append)
+    fuse(images, rig, alpha="mono", network=network_of("PAT"), announce=plans.append)
     assert str(plans[0]).startswith("1 piece, 0.4")
     assert plans[0].seconds is None
 
@@ -323,10 +325,10 @@ def test_a_wide_beta_is_enlarged_only_where_alpha_sees():
     rig, images = scene(beta_hw=wide, beta_focal=100.0)
     views = pat.fusion.steps.equal_resolution(network, Views.of(rig, images, alpha="mono")).views
     assert math.prod(views.images["colour"].shape[1:]) < 0.6 * 9 * math.prod(wide)
-    cut = fuse(network, rig, images, alpha="mono")
+    cut = fuse(images, rig, alpha="mono", network=network)
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(pat.fusion.steps, "_cropped", lambda network, views, name: views)
-        whole = fuse(network, rig, images, alpha="mono")
+        whole = fuse(images, rig, alpha="mono", network=network)
     # What the views have in common sets the levels at which they are compared: that is where the two differ.
     assert (cut.image - whole.image).abs().mean() < 5e-2
 
@@ -334,7 +336,7 @@ def test_a_wide_beta_is_enlarged_only_where_alpha_sees():
 def test_a_stopped_frame_goes_on_with_its_tiles(tmp_path, monkeypatch):
     (rig, images), network = scene((34, 300), (30, 210)), network_of("PAT")
     in_tiles(monkeypatch, (34, 300), 64, network.halo)
-    whole, made, fuse_tile = fuse(network, rig, images, alpha="mono"), [], pat.fusion.tiles.fuse_tile
+    whole, made, fuse_tile = fuse(images, rig, alpha="mono", network=network), [], pat.fusion.tiles.fuse_tile
 
     def counted(network, frame, state, tile):
         if len(made) == 3:
@@ -344,17 +346,17 @@ def test_a_stopped_frame_goes_on_with_its_tiles(tmp_path, monkeypatch):
 
     monkeypatch.setattr(pat.fusion.tiles, "fuse_tile", counted)
     with pytest.raises(KeyboardInterrupt):
-        fuse(network, rig, images, alpha="mono", store=tmp_path)
+        fuse(images, rig, alpha="mono", network=network, store=tmp_path)
     made.clear()
     damaged = sorted(tmp_path.iterdir())[0]
     content = damaged.read_bytes()
     damaged.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
-    resumed = fuse(network, rig, images, alpha="mono", store=tmp_path)
+    resumed = fuse(images, rig, alpha="mono", network=network, store=tmp_path)
     assert len(made) == 3
     assert all(torch.equal(a.nan_to_num(), b.nan_to_num()) for a, b in zip(resumed[:3], whole[:3]))
     made.clear()
     with pytest.raises(KeyboardInterrupt):
-        fuse(network, rig, images | {"mono": images["mono"] * 0.9}, alpha="mono", store=tmp_path)
+        fuse(images | {"mono": images["mono"] * 0.9}, rig, alpha="mono", network=network, store=tmp_path)
 
 
 def test_tiles_of_another_depth_map_are_not_taken(tmp_path, monkeypatch):
@@ -366,7 +368,14 @@ def test_tiles_of_another_depth_map_are_not_taken(tmp_path, monkeypatch):
     for value in (2.0, 3.0):
         depth[5:20, 10:50] = value
         known = AroundDepth(depth.clone())
-        fuse(network, rig, images, alpha="mono", store=tmp_path, align=False, response="rec601", field=known)
+        fuse(
+            images,
+            rig,
+            alpha="mono",
+            network=network,
+            settings=FuseSettings(align=False, response="rec601", field=known),
+            store=tmp_path,
+        )
         counts.append(len(list(tmp_path.iterdir())))
     assert counts[1] == 2 * counts[0]
 
@@ -375,14 +384,14 @@ def test_fields_of_cameras_that_are_not_there_and_other_bands_of_alpha_are_refus
     """A misspelt name was ignored; two or four bands ended in an error of torch's."""
     (rig, images), network = scene(), network_of("GuidedPAT")
     with pytest.raises(ValueError, match="'color'"):
-        fuse(network, rig, images, alpha="mono", field={"color": Epipolar()})
+        fuse(images, rig, alpha="mono", network=network, settings=FuseSettings(field={"color": Epipolar()}))
     with pytest.raises(ValueError, match="no camera 'color'; did you mean 'colour'"):
-        fuse(network, rig, {**images, "color": images["colour"]}, alpha="mono")
+        fuse({**images, "color": images["colour"]}, rig, alpha="mono", network=network)
     for bands in (2, 4):
         with pytest.raises(ValueError, match=f"alpha, 'mono', has {bands} bands"):
-            fuse(network, rig, {**images, "mono": texture(bands, (64, 96))}, alpha="mono")
+            fuse({**images, "mono": texture(bands, (64, 96))}, rig, alpha="mono", network=network)
     with pytest.raises(ValueError, match=r"'colour' is float32 of shape \(0, 64, 96\)"):
-        fuse(network, rig, {**images, "colour": images["colour"][:0]}, alpha="mono")
+        fuse({**images, "colour": images["colour"][:0]}, rig, alpha="mono", network=network)
 
 
 def test_tiles_of_another_luminance_scale_or_precision_are_not_taken(tmp_path, monkeypatch):
@@ -397,7 +406,14 @@ def test_tiles_of_another_luminance_scale_or_precision_are_not_taken(tmp_path, m
         )
 
     def stored(rig, **changes):
-        fuse(network, rig, images, alpha="mono", store=tmp_path, align=False, response="rec601", **changes)
+        fuse(
+            images,
+            rig,
+            alpha="mono",
+            network=network,
+            settings=FuseSettings(align=False, response="rec601", **changes),
+            store=tmp_path,
+        )
         return len(list(tmp_path.iterdir()))
 
     count = stored(rig)
@@ -424,7 +440,13 @@ def test_colour_comes_from_where_the_field_says():
     network = network_of("GuidedPAT")
     for turns in (0, 1):
         images = {"mono": ground_truth, "colour": ground_truth.rot90(turns, (-2, -1))}
-        image = fuse(network, rig.rot90("colour", turns), images, alpha="mono", depth=(5, 20)).image
+        image = fuse(
+            images,
+            rig.rot90("colour", turns),
+            alpha="mono",
+            network=network,
+            settings=FuseSettings(depth=(5, 20)),
+        ).image
         assert image[0, :, 10:40].mean() > image[2, :, 10:40].mean() + 0.1
         assert image[2, :, 56:86].mean() > image[0, :, 56:86].mean() + 0.1
 
@@ -432,9 +454,9 @@ def test_colour_comes_from_where_the_field_says():
 def test_light_that_alpha_measured_stays():
     """Where the rig says that alpha measured it; else the coded values' luminance is alpha's."""
     (rig, images), network = scene((48, 64), (48, 64)), load_weights("mono-colour")
-    plain = fuse(network, rig, images, alpha="mono").image
+    plain = fuse(images, rig, alpha="mono", network=network).image
     rig = rig.with_camera("mono", rig["mono"].replace(sensor=Sensor(response=LIGHT)))
-    light = fuse(network, rig, images, alpha="mono").image
+    light = fuse(images, rig, alpha="mono", network=network).image
     assert (luminance(plain) - images["mono"]).abs().max() < 1e-5
     assert (luminance(linear_from_srgb(light)) - linear_from_srgb(images["mono"])).abs().max() < 1e-4
     assert (luminance(light) - images["mono"]).abs().max() > 0.01
@@ -446,7 +468,13 @@ def test_uncalibrated_rigs_fuse_without_depth():
     views = {name: View(hw=hw) for name in ("mono", "red", "green", "blue")}
     links = {("mono", name): Link(F) for name in ("red", "green", "blue")}
     images = {name: torch.rand(1, *hw) for name in views}
-    frame = fuse(network_of("GuidedPAT"), Rig(views, links=links), images, alpha="mono", match_levels=True)
+    frame = fuse(
+        images,
+        Rig(views, links=links),
+        alpha="mono",
+        network=network_of("GuidedPAT"),
+        settings=FuseSettings(match_levels=True),
+    )
     assert frame.image.shape == (3, *hw)
     assert frame.depth.isnan().all()
 
@@ -455,19 +483,21 @@ def test_uncalibrated_rigs_fuse_without_depth():
 def test_cameras_of_several_types_are_fused(names):
     """K in float64 and the pose in float32, as a file's and an optimiser's."""
     rig, images = scene((50, 70), (40, 60))
-    wanted = fuse(network_of("GuidedPAT"), rig, images, alpha="mono").image
+    wanted = fuse(images, rig, alpha="mono", network=network_of("GuidedPAT")).image
     for name in names:
         pose = rig[name].cam_from_world
         rig = rig.with_camera(name, rig[name].replace(cam_from_world=Pose(pose.R.float(), pose.t.float())))
     assert rig[names[0]].K.dtype != rig[names[0]].R.dtype
-    assert (fuse(network_of("GuidedPAT"), rig, images, alpha="mono").image - wanted).abs().mean() < 1e-4
+    assert (
+        fuse(images, rig, alpha="mono", network=network_of("GuidedPAT")).image - wanted
+    ).abs().mean() < 1e-4
 
 
 def test_depth_and_confidence_are_the_same_bits_on_any_number_of_threads():
     (rig, images), found = scene((96, 128), (80, 120)), []
     for threads in (1, 2, 3):
         with limited_to(threads):
-            found.append(fuse(network_of("GuidedPAT"), rig, images, alpha="mono"))
+            found.append(fuse(images, rig, alpha="mono", network=network_of("GuidedPAT")))
     for one in found[1:]:
         assert torch.equal(one.depth.nan_to_num(-1), found[0].depth.nan_to_num(-1))
         assert torch.equal(one.confidence, found[0].confidence)
@@ -479,9 +509,9 @@ def test_views_must_overlap():
     back = torch.diag(torch.tensor([-1.0, 1.0, -1.0], dtype=torch.float64))
     rig = rig.with_camera("colour", rig["colour"].replace(cam_from_world=Pose(back, torch.zeros(3).double())))
     with pytest.raises(ValueError, match=r"'colour'.* 2 and 20 m"):
-        fuse(network_of("PAT"), rig, images, alpha="mono", field=Epipolar())
+        fuse(images, rig, alpha="mono", network=network_of("PAT"), settings=FuseSettings(field=Epipolar()))
     with pytest.raises(ValueError, match="0 < near <= far"):
-        fuse(network_of("PAT"), rig, images, alpha="mono", depth=(20, 2))
+        fuse(images, rig, alpha="mono", network=network_of("PAT"), settings=FuseSettings(depth=(20, 2)))
 
 
 def has_lens(lens_of, rig, images):
@@ -509,14 +539,14 @@ def test_lenses_are_seen_through(with_lens):
     """The sample array behind lenses: the same colours at alpha's own, bent pixels, alpha's detail kept."""
     (rig, images, ground_truth), network = less_of_alpha(), load_weights("mono-colour")
     lensed, taken = has_lens({name: LENSES[name] for name in with_lens}, rig, images)
-    clean = (fuse(network, rig, images, alpha="mono").image - ground_truth).square().mean()
-    frame = fuse(network, lensed, taken, alpha="mono")
+    clean = (fuse(images, rig, alpha="mono", network=network).image - ground_truth).square().mean()
+    frame = fuse(taken, lensed, alpha="mono", network=network)
     if "mono" in with_lens:
         ground_truth = resampled(ground_truth, rig["mono"], lensed["mono"]).values[0]
     seen = ground_truth.sum(0) > 0
     error = (frame.image - ground_truth)[:, seen].square().mean()
     assert (luminance(frame.image) - taken["mono"]).abs().max() < 1e-5
-    blind = fuse(network, rig, taken, alpha="mono")
+    blind = fuse(taken, rig, alpha="mono", network=network)
     assert error < 1.3 * clean
     assert error < 0.85 * (blind.image - ground_truth)[:, seen].square().mean()
     assert torch.isfinite(frame.image).all()
@@ -530,10 +560,10 @@ def test_lenses_of_cameras_known_by_f_are_seen_through():
     pair = rig.pair("mono", "colour")
     links = {("mono", "colour"): Link(pair.fundamental, pair.homography)}
     views = {name: LensView(hw=c.hw, K=c.K, distortion=c.distortion) for name, c in lensed.cameras.items()}
-    frame = fuse(network, Rig(views, links=links), taken, alpha="mono")
+    frame = fuse(taken, Rig(views, links=links), alpha="mono", network=network)
     without = Rig({n: View(hw=v.hw) for n, v in views.items()}, links=links)
-    blind = fuse(network, without, taken, alpha="mono", align=False)
-    clean = fuse(network, without, images, alpha="mono")
+    blind = fuse(taken, without, alpha="mono", network=network, settings=FuseSettings(align=False))
+    clean = fuse(images, without, alpha="mono", network=network)
     errors = [(clean.image - ground_truth).square().mean()]
     ground_truth = resampled(ground_truth, rig["mono"], lensed["mono"]).values[0]
     seen = ground_truth.sum(0) > 0
@@ -548,9 +578,9 @@ def test_a_rotated_beta_is_brought_upright():
     (rig, images), network = scene((60, 80), (60, 80)), network_of("GuidedPAT")
     for turns in range(4):
         assert quarter_turns(rig.rot90("colour", turns).pair("mono", "colour")) == -turns % 4
-    upright = fuse(network, rig, images, alpha="mono")
+    upright = fuse(images, rig, alpha="mono", network=network)
     images["colour"] = images["colour"].rot90(3, (1, 2))
-    turned = fuse(network, rig.rot90("colour", 3), images, alpha="mono")
+    turned = fuse(images, rig.rot90("colour", 3), alpha="mono", network=network)
     assert (upright.image - turned.image).abs().max() < 1e-4
 
 
@@ -563,11 +593,11 @@ def test_real_lenses(shared_data):
     straight_rig, straight = without_lenses(rig, {"left": left, "right": right})
     depth = seen_depths(straight_rig.pair("left", "right"), match_points(*straight.values()))
     images = {"left": luminance(left), "right": right}
-    frame = fuse(network, rig, images, alpha="left", depth=depth)
+    frame = fuse(images, rig, alpha="left", network=network, settings=FuseSettings(depth=depth))
     no_lens = rig
     for name in rig.names:
         no_lens = no_lens.with_camera(name, rig[name].replace(distortion=None))
-    ignored = fuse(network, no_lens, images, alpha="left", depth=depth)
+    ignored = fuse(images, no_lens, alpha="left", network=network, settings=FuseSettings(depth=depth))
     grey, seen, blind = (
         score(p.clamp(0, 1), left).psnr
         for p in (luminance(left).expand(3, -1, -1), frame.image, ignored.image)
@@ -594,13 +624,7 @@ def test_several_betas_of_float64_are_fused():
     beside = rig["colour"].replace(cam_from_world=Pose(rig["mono"].R, rig["colour"].t * -1))
     both = Rig({**rig.cameras, "other": beside}, depth=rig.depth)
     images = {name: image.double() for name, image in {**images, "other": images["colour"]}.items()}
-    assert fuse(network_of("GuidedPAT").double(), both, images, alpha="mono").image.dtype == torch.float64
-
-
-@pytest.mark.parametrize("of", [fuse, corrections_of])
-def test_an_argument_that_is_none_is_named_with_what_there_is(of):
-    """It was an argument of FuseSettings.__init__, which nobody had called."""
-    rig, images = scene((24, 32), (24, 32))
-    message = r"^there is no argument or setting 'device': .*, luminance; on a GPU "
-    with pytest.raises(TypeError, match=message):
-        of(network_of("PAT"), rig, images, alpha="mono", device="cuda")
+    assert (
+        fuse(images, both, alpha="mono", network=network_of("GuidedPAT").double()).image.dtype
+        == torch.float64
+    )

@@ -12,9 +12,9 @@ import pat.fusion.tiles
 from arraygeom import Pair, Rectified, Rig, View
 from arraygeom.distortion import Distortion
 from arraygeom.fields.grid import FieldOnGrid
+from pat import FuseSettings, fuse
 from pat.fusion.classical import classical, non_local_means
 from pat.fusion.corrections import find_corrections
-from pat.fusion.fuse import fuse
 from pat.fusion.inputs import FrameInputs, Placement
 from pat.fusion.low_light import (
     Brightness,
@@ -59,7 +59,13 @@ def fused(network):
     @cache
     def of(electrons, *, told=True):
         sample, images, noise = in_low_light(electrons)
-        return fuse(network, sample.rig, images, alpha=ALPHA, noise=noise if told else "estimate")
+        return fuse(
+            images,
+            sample.rig,
+            alpha=ALPHA,
+            network=network,
+            settings=FuseSettings(noise=noise if told else "estimate"),
+        )
 
     return of
 
@@ -71,7 +77,10 @@ def psnr(image, sample):
 @pytest.mark.parametrize("noise", [{}, {ALPHA: NoiseLevel.of_electrons(1e6)}])
 def test_views_without_noticeable_noise_are_fused_as_ever(network, noise):
     sample = middle_of_sample()
-    plain, same = (fuse(network, sample.rig, sample.images, alpha=ALPHA, noise=n) for n in (None, noise))
+    plain, same = (
+        fuse(sample.images, sample.rig, alpha=ALPHA, network=network, settings=FuseSettings(noise=n))
+        for n in (None, noise)
+    )
     assert torch.equal(plain.image, same.image)
     assert torch.equal(plain.confidence, same.confidence)
 
@@ -94,7 +103,7 @@ def test_averaged_colours_improve_on_denoising_alone(network, fused, monkeypatch
     sample, images, noise = in_low_light(50)
     averaged = fused(50).image
     monkeypatch.setattr("pat.fusion.low_light.averaged_with_alike", lambda image, *_: image)
-    alone = fuse(network, sample.rig, images, alpha=ALPHA, noise=noise).image
+    alone = fuse(images, sample.rig, alpha=ALPHA, network=network, settings=FuseSettings(noise=noise)).image
     assert psnr(averaged, sample) > psnr(alone, sample) + 0.02
 
 
@@ -104,9 +113,9 @@ def test_a_betas_light_improves_on_alphas_brightness(network, monkeypatch, elect
     sample, images, noise = in_low_light(50)
     noise[BETA] = NoiseLevel.of_electrons(electrons, 2)
     images[BETA] = noise[BETA].recorded(sample.images[BETA][None], generator_for(0, BETA))[0]
-    joined = fuse(network, sample.rig, images, alpha=ALPHA, noise=noise).image
+    joined = fuse(images, sample.rig, alpha=ALPHA, network=network, settings=FuseSettings(noise=noise)).image
     monkeypatch.setattr("pat.fusion.low_light.seen_by_another", lambda estimate, *_: 0 * estimate)
-    alone = fuse(network, sample.rig, images, alpha=ALPHA, noise=noise).image
+    alone = fuse(images, sample.rig, alpha=ALPHA, network=network, settings=FuseSettings(noise=noise)).image
     seen, denoised, true = map(luminance, (joined, alone, sample.ground_truth))
     assert float((seen - true).square().mean()) < 10 ** (-gain / 10) * float(
         (denoised - true).square().mean()
@@ -147,7 +156,7 @@ def test_brightness_that_no_beta_explains_is_alphas_alone(network, monkeypatch, 
     monkeypatch.setattr("pat.fusion.fuse.find_corrections", partial(find_corrections_explaining, share))
     asked = []
     monkeypatch.setattr("pat.fusion.low_light.brightness_change", lambda alpha, *_: asked.append(alpha) or 0)
-    fuse(network, sample.rig, images, alpha=ALPHA, noise=noise)
+    fuse(images, sample.rig, alpha=ALPHA, network=network, settings=FuseSettings(noise=noise))
     assert len(asked) == (share == 1.0)
 
 
@@ -161,7 +170,13 @@ def test_alphas_values_are_kept(network, given):
     """Asked for, or because no noise of alpha is stated."""
     sample, images, noise = in_low_light(200)
     noise = {name: noise[name] for name in given}
-    frame = fuse(network, sample.rig, images, alpha=ALPHA, noise=noise, keep_alpha=ALPHA in given)
+    frame = fuse(
+        images,
+        sample.rig,
+        alpha=ALPHA,
+        network=network,
+        settings=FuseSettings(noise=noise, keep_alpha=ALPHA in given),
+    )
     torch.testing.assert_close(luminance(frame.image), images[ALPHA], atol=1e-4, rtol=0)
 
 
@@ -181,7 +196,7 @@ def test_tiles_are_denoised_as_the_whole(network, fused, monkeypatch):
     assert float(((tiles - whole).abs() > 1e-3).float().mean()) < 1e-3
     sample, images, noise = in_low_light(200)
     monkeypatch.setattr("pat.fusion.low_light.in_tiles", partial(ordinary_tiles, rows=160))
-    in_tiles = fuse(network, sample.rig, images, alpha=ALPHA, noise=noise)
+    in_tiles = fuse(images, sample.rig, alpha=ALPHA, network=network, settings=FuseSettings(noise=noise))
     assert len(pieces) > 6
     assert float(((in_tiles.image - fused(200).image).abs() > 2e-3).float().mean()) < 0.01
 
@@ -190,7 +205,7 @@ def test_a_distorted_alpha_is_denoised_too(network):
     sample, images, noise = in_low_light(50)
     lens = Distortion("brown-conrady", torch.tensor([-0.05, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64))
     rig = sample.rig.with_camera(ALPHA, sample.rig[ALPHA].replace(distortion=lens))
-    frame = fuse(network, rig, images, alpha=ALPHA, noise=noise)
+    frame = fuse(images, rig, alpha=ALPHA, network=network, settings=FuseSettings(noise=noise))
     recorded, found = (
         float((x - x.roll(1, -1)).square().mean()) for x in (images[ALPHA], luminance(frame.image))
     )
@@ -211,7 +226,10 @@ def test_noisy_bands_at_one_position_are_joined():
     }
     noise = {ALPHA: noise[ALPHA], **dict.fromkeys("rgb", noise[BETA])}
     network = load_weights("mono-spectral")
-    recorded, quiet = (fuse(network, rig, seen, alpha=ALPHA, noise=n).image for n in (None, noise))
+    recorded, quiet = (
+        fuse(seen, rig, alpha=ALPHA, network=network, settings=FuseSettings(noise=n)).image
+        for n in (None, noise)
+    )
     wanted = sample.ground_truth[:, 100:260, 200:400]
     one, other = (
         [score(i[None].clamp(0, 1), w[None]).psnr for i, w in zip(x, wanted)] for x in (recorded, quiet)
@@ -253,7 +271,14 @@ def test_what_is_held_for_low_light_is_planned_for(network):
 
     for given in (None, noise):
         with pytest.raises(InterruptedError):
-            fuse(network, sample.rig, images, alpha=ALPHA, noise=given, announce=end_there)
+            fuse(
+                images,
+                sample.rig,
+                alpha=ALPHA,
+                network=network,
+                settings=FuseSettings(noise=given),
+                announce=end_there,
+            )
     views = sum(image.nbytes for image in images.values())
     assert plans[1].memory > plans[0].memory + 4 * views
 
@@ -265,7 +290,14 @@ def test_the_time_announced_has_the_correction_in_it(network, monkeypatch):
     monkeypatch.setattr(pat.fusion.low_light, "SETTINGS", slow)
     plans, steps = [], []
     with steps_shown(steps.append):
-        fuse(network, sample.rig, images, alpha=ALPHA, noise=noise, announce=plans.append)
+        fuse(
+            images,
+            sample.rig,
+            alpha=ALPHA,
+            network=network,
+            settings=FuseSettings(noise=noise),
+            announce=plans.append,
+        )
     assert plans[0].seconds > 1e3
     wanted = [f"denoising {name}" for name in (*images, "the fused image")]
     assert [s.split(" (")[0] for s in steps if "denoising" in s] == wanted
@@ -307,7 +339,7 @@ def test_positions_are_those_of_the_matched_colours(network, monkeypatch):
         return image
 
     monkeypatch.setattr("pat.fusion.low_light.colours_averaged", noted)
-    fuse(network, sample.rig, images, alpha=ALPHA, noise=noise)
+    fuse(images, sample.rig, alpha=ALPHA, network=network, settings=FuseSettings(noise=noise))
     high = (seen["confidence"] > 0.8).expand_as(seen["image"])
     assert float((seen["beta"].denoised - seen["image"])[high].abs().mean()) < 0.04
 
@@ -316,7 +348,9 @@ def test_a_darker_beta_keeps_its_colours(network, fused):
     """The joint correction saw a beta at its own exposure, and pulled colours towards its darker ones."""
     sample, images, noise = in_low_light(200)
     darker = noise[BETA].recorded(0.5 * sample.images[BETA][None], generator_for(0, BETA))[0]
-    dark = fuse(network, sample.rig, {**images, BETA: darker}, alpha=ALPHA, noise=noise)
+    dark = fuse(
+        {**images, BETA: darker}, sample.rig, alpha=ALPHA, network=network, settings=FuseSettings(noise=noise)
+    )
     bright, dark = (float((f.image.amax(0) - f.image.amin(0)).mean()) for f in (fused(200), dark))
     assert dark == pytest.approx(bright, rel=0.1)
 
@@ -324,7 +358,14 @@ def test_a_darker_beta_keeps_its_colours(network, fused):
 def test_noise_that_shows_plainly_is_removed_unasked(network, fused):
     sample, images, _ = in_low_light(200)
     said: list[str] = []
-    frame = fuse(network, sample.rig, images, alpha=ALPHA, noise="auto", explain=said.append)
+    frame = fuse(
+        images,
+        sample.rig,
+        alpha=ALPHA,
+        network=network,
+        settings=FuseSettings(noise="auto"),
+        explain=said.append,
+    )
     assert torch.equal(frame.image, fused(200, told=False).image)
     assert sum(line.startswith("noise shows plainly and is removed: mono ") for line in said) == 1
     clean = {name: image * 255 // 1 / 255 for name, image in sample.images.items()}

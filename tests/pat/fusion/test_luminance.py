@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from pat.fusion.fuse import fuse
+from pat import FuseSettings, fuse
 from pat.media.colour import luminance
 from pat.networks.weights import load_weights
 from tests.pat.layered_array import ALPHA, middle_of_sample
@@ -26,7 +26,13 @@ def fused(sample, images):
     network = load_weights("mono-colour-small")
 
     def frame(kept):
-        return fuse(network, sample.rig, images, alpha=ALPHA, response="rec601", align=False, luminance=kept)
+        return fuse(
+            images,
+            sample.rig,
+            alpha=ALPHA,
+            network=network,
+            settings=FuseSettings(response="rec601", align=False, luminance=kept),
+        )
 
     return {kept: frame(kept) for kept in ("alpha", "mix", "beta")}
 
@@ -48,10 +54,11 @@ def test_betas_luminance_has_alphas_detail(sample, fused, monkeypatch):
     monkeypatch.setattr(module, "with_alpha_detail", lambda frame, alpha: frame)
     images = dict(sample.images) | {ALPHA: luminance(sample.ground_truth)}
     network = load_weights("mono-colour-small")
-    options = {"alpha": ALPHA, "response": "rec601", "align": False, "luminance": "beta"}
-    plain = fuse(network, sample.rig, images, **options)
+    options = {"alpha": ALPHA, "network": network}
+    options["settings"] = FuseSettings(response="rec601", align=False, luminance="beta")
+    plain = fuse(images, sample.rig, **options)
     monkeypatch.undo()
-    detailed = fuse(network, sample.rig, images, **options)
+    detailed = fuse(images, sample.rig, **options)
     seen = detailed.confidence > 0.8
 
     def fine(image):
@@ -72,4 +79,10 @@ def test_betas_luminance_has_alphas_detail(sample, fused, monkeypatch):
 )
 def test_what_cannot_be_is_refused(sample, weights, options, message):
     with pytest.raises(ValueError, match=message):
-        fuse(load_weights(weights), sample.rig, sample.images, alpha=ALPHA, **options)
+        fuse(
+            sample.images,
+            sample.rig,
+            alpha=ALPHA,
+            network=load_weights(weights),
+            settings=FuseSettings(**options),
+        )

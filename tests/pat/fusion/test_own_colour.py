@@ -3,10 +3,10 @@
 import pytest
 import torch
 
+from pat import FuseSettings, fuse
 from pat.app.sample_array import load_sample
-from pat.fusion.fuse import fuse
+from pat.fusion.frame import Frame
 from pat.fusion.luminance import with_own_colours
-from pat.fusion.results import Frame
 from pat.media.colour import from_luma_chroma, luminance, to_luma_chroma
 from pat.networks.weights import load_weights
 
@@ -38,7 +38,13 @@ def test_what_no_beta_sees_has_alphas_colours(in_colour):
     rig = rig.with_camera("colour", rig["colour"].crop(0, 0, (180, 110)))
     with pytest.warns(UserWarning, match="is in colour") if in_colour else torch.no_grad():
         images = {"mono": alpha if in_colour else luminance(alpha), "colour": beta}
-        frame = fuse(load_weights("mono-colour"), rig, images, alpha="mono", align=False, response="rec601")
+        frame = fuse(
+            images,
+            rig,
+            alpha="mono",
+            network=load_weights("mono-colour"),
+            settings=FuseSettings(align=False, response="rec601"),
+        )
     unseen = frame.confidence < 0.1
     assert 0.2 < float(unseen.float().mean()) < 0.9
     off = float((frame.image - alpha).abs().mean(0)[unseen].mean())

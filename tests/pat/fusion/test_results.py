@@ -8,7 +8,8 @@ import tifffile
 import torch
 from PIL import Image, ImageCms
 
-from pat.fusion.results import Frame, depth_scale, save_frame, write_depth
+from pat.fusion.frame import Frame
+from pat.fusion.results import depth_scale, refuse_to_replace, save_frame, write_depth
 from pat.media.images import read_image
 from tests.processes import room_for
 
@@ -39,11 +40,11 @@ def test_a_full_disk_leaves_the_former_files_all_of_one_frame(tmp_path):
     """The depth fits and the fused image does not, as on a full disk."""
     former = Frame(torch.full((3, 60, 80), 0.5), *torch.ones(3, 60, 80))
     save_frame(former, tmp_path, kind="tif", bits=16)
-    before = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
+    before = {p.name: p.read_bytes() for p in tmp_path.iterdir() if p.is_file()}
     with room_for(25_000), pytest.raises(OSError, match=r"too large: '.*/fused\.tif'$") as caught:
         save_frame(Frame(torch.rand(3, 60, 80), *torch.rand(3, 60, 80)), tmp_path, kind="tif", bits=16)
     assert caught.value.filename == str(tmp_path / "fused.tif")
-    assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == before
+    assert {p.name: p.read_bytes() for p in tmp_path.iterdir() if p.is_file()} == before
 
 
 def test_depth_in_16_bits_says_its_scale(tmp_path):
@@ -68,7 +69,30 @@ def test_depth_and_image_of_a_former_frame_do_not_stay_beside_one_without(tmp_pa
     """An image in another format stayed, and looked like that of the new depth and confidence."""
     save_frame(Frame(torch.rand(3, 6, 8), torch.ones(6, 8), *torch.rand(2, 6, 8)), tmp_path, kind="tif")
     save_frame(frame_of(3), tmp_path)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["confidence.png", "fused.png"]
+    assert sorted(p.name for p in tmp_path.iterdir() if p.is_file()) == ["confidence.png", "fused.png"]
+
+
+def test_bands_of_any_name_stay_in_the_folder(tmp_path):
+    written = save_frame(frame_of(2), tmp_path / "out", bands=["cam0/1", "../../evil"])
+    assert len(written) == 4
+    assert {path.parent for path in written} == {tmp_path / "out"}
+
+
+def test_files_of_the_user_stop_a_fusion_before_it_begins(tmp_path):
+    """`-o .` deleted and replaced them."""
+    for name in ("points.ply", "index.html", "depth.tif", "mine.txt", "7_fused.png"):
+        (tmp_path / name).write_text("mine")
+    for act in (lambda: refuse_to_replace(tmp_path), lambda: save_frame(frame_of(1), tmp_path, name="7")):
+        with pytest.raises(FileExistsError, match=r"depth\.tif|7_fused\.png"):
+            act()
+    assert {path.read_text() for path in tmp_path.iterdir() if path.is_file()} == {"mine"}
+    out = tmp_path / "out"
+    save_frame(frame_of(1), out, pages={"index.html": "page"})
+    refuse_to_replace(out)
+    (out / "index.html").write_text("retouched")
+    with pytest.raises(FileExistsError, match=r"index\.html"):
+        refuse_to_replace(out)
+    refuse_to_replace(out, ["7"])
 
 
 def test_unknown_depth_is_nan_in_the_file_as_in_memory(tmp_path):
@@ -87,5 +111,5 @@ def test_a_frame_that_wants_gradients_is_shown_and_saved(tmp_path):
     assert wanting._repr_png_() == frame._repr_png_()
     for name, one in (("plain", frame), ("wanting", wanting)):
         save_frame(one, tmp_path / name)
-    for path in (tmp_path / "plain").iterdir():
+    for path in (tmp_path / "plain").glob("*.*g"):
         assert (tmp_path / "wanting" / path.name).read_bytes() == path.read_bytes(), path.name

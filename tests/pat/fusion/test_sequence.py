@@ -1,14 +1,15 @@
 """Sequences: clocks, motion, colour that stays on what moves and does not flicker, confidence that knows."""
 
 import warnings
-from functools import partial
+from dataclasses import replace
 
 import pytest
 import torch
 
 from arraygeom import Distortion, Epipolar, Moved, Rectified, Rig, Sensor, View, Widened, pixel_grid
 from experiments.system import flicker
-from pat.fusion.fuse import FuseSettings, fuse
+from pat import fuse
+from pat.fusion.fuse import FuseSettings
 from pat.fusion.optical_flow import Flow, flow_between, warped
 from pat.fusion.sequence import KeyColour, SequenceFusion, fuse_sequence, mixed
 from pat.fusion.timeline import KeyFrame, Timeline
@@ -99,7 +100,9 @@ def test_a_displacement_of_another_size_is_refused(distortion):
     images = {"fast": torch.rand(1, *moving.HW), "slow": torch.rand(3, *moving.HW)}
     field = Moved(Epipolar(), torch.zeros(2, 48, 80))
     with pytest.raises(ValueError, match="displacement is of 80x48 pixels, alpha has 160x96"):
-        fuse(load_weights("mono-colour"), rig, images, alpha="fast", field=field)
+        fuse(
+            images, rig, alpha="fast", network=load_weights("mono-colour"), settings=FuseSettings(field=field)
+        )
 
 
 def test_flow_finds_a_shift_and_its_weight_the_border():
@@ -171,10 +174,11 @@ def test_bands_keep_their_own_level_where_levels_are_matched():
     """As those of single frames do; in a sequence they had alpha's."""
     frames, _ = moving.recording(2)
     band = [0.3 * image[1:2] + 0.05 for image in frames["slow"]]
-    given = {"alpha": "fast", "align": False, "match_levels": True}
+    settings = FuseSettings(align=False, match_levels=True)
     network, frames = load_weights("mono-spectral"), {"fast": frames["fast"], "slow": band}
-    first = next(fuse_sequence(network, moving.rig(), frames, **given))
-    alone = fuse(network, moving.rig(), {name: some[0] for name, some in frames.items()}, **given)
+    given = {"alpha": "fast", "network": network, "settings": settings}
+    first = next(fuse_sequence(frames, moving.rig(), **given))
+    alone = fuse({name: some[0] for name, some in frames.items()}, moving.rig(), **given)
     assert (first.image - alone.image).abs().mean() < 0.01
 
 
@@ -188,26 +192,36 @@ def test_cameras_behind_filters_at_one_place_are_fused_between_key_frames_too(al
     filtered = Rig({"fast": rig["fast"], **views}, depth=rig.depth)
     bands = {name: [image[i : i + 1] for image in frames["slow"]] for i, name in enumerate(names)}
     job = fuse_sequence(
-        load_weights("mono-colour"), filtered, {"fast": frames["fast"], **bands}, alpha="fast", align=align
+        {"fast": frames["fast"], **bands},
+        filtered,
+        alpha="fast",
+        network=load_weights("mono-colour"),
+        settings=FuseSettings(align=align),
     )
     errors = [(frame.image - truth).abs().mean() for frame, truth in zip(job, ground_truth)]
     assert len(errors) == 13
     assert max(errors) < 0.05
 
 
-def test_a_response_that_is_none_is_refused_of_sequences_too():
+def test_a_response_that_is_none_is_refused_before_a_sequence_is_fused():
     """It was taken for an image that cannot be read, and left out."""
-    frames, _ = moving.recording(2)
-    given = {"alpha": "fast", "response": (-1.0, 0.0, 0.0)}
     with pytest.raises(ValueError, match="three weights"):
-        next(fuse_sequence(load_weights("mono-colour"), moving.rig(), frames, **given))
+        FuseSettings(response=(-1.0, 0.0, 0.0))
 
 
 def test_a_field_may_be_given_for_each_beta():
     frames, _ = moving.recording(2)
-    given = {"alpha": "fast", "align": False, "response": "rec601"}
+    settings, network = FuseSettings(align=False, response="rec601"), load_weights("mono-colour")
     rows, *of_all = (
-        next(fuse_sequence(load_weights("mono-colour"), moving.rig(), frames, field=field, **given))
+        next(
+            fuse_sequence(
+                frames,
+                moving.rig(),
+                alpha="fast",
+                network=network,
+                settings=replace(settings, field=field),
+            )
+        )
         for field in ({"slow": Rectified(20, alpha_is="left")}, Rectified(20, alpha_is="left"), None)
     )
     assert torch.equal(rows.image, of_all[0].image)
@@ -222,7 +236,7 @@ def fused():
     network = load_weights("mono-colour")
     rig = moving.rig(offset)
     job = SequenceFusion(network, rig, frames, "fast")
-    carried_frames = list(fuse_sequence(network, rig, frames, alpha="fast"))
+    carried_frames = list(fuse_sequence(frames, rig, alpha="fast", network=network))
     return frames, ground_truth, carried_frames, {i: job.alone(i) for i in (1, 2, 3, 4)}
 
 
@@ -289,7 +303,11 @@ def test_a_noisy_sequence_is_denoised(fused):
     frames, ground_truth, _, _ = fused
     level = NoiseLevel.of_electrons(60, 2)
     recorded, network, rig = noisy(frames, level), load_weights("mono-colour-small"), moving.rig(0.003)
-    fusion = partial(fuse_sequence, network, rig, recorded, alpha="fast")
+
+    def fusion(**settings):
+        how = FuseSettings(**settings)
+        return fuse_sequence(recorded, rig, alpha="fast", network=network, settings=how)
+
     plain = psnr(fusion(), ground_truth)
     stated = dict.fromkeys(recorded, level)
     assert psnr(fusion(noise=stated), ground_truth) > plain + 2.0

@@ -7,9 +7,9 @@ import torch
 from skimage.data import stereo_motorcycle
 
 from experiments.evaluation.certainty import Reliability
+from pat import fuse
 from pat.app.sample_array import load_motorcycle, load_sample
-from pat.fusion.fuse import fuse
-from pat.fusion.results import Frame
+from pat.fusion.frame import Frame
 from pat.matching import certainty, choice
 from pat.matching.certainty import MEASURED, measured, typical_facts, with_certainty
 from pat.matching.match import match
@@ -47,7 +47,7 @@ def test_other_threads_find_the_networks_as_they_were():
         cameras={name: sample.rig[name].crop(0, 0, (64, 96)) for name in sample.rig.names}
     )
     images = {name: image[:, :64, :96].double() for name, image in sample.images.items()}
-    frame = fuse(load_weights("mono-colour").double(), rig, images, alpha="mono")
+    frame = fuse(images, rig, alpha="mono", network=load_weights("mono-colour").double())
     assert frame.image.dtype == torch.float64
     for network in (certainty.fitted_network(), choice.fitted_choice()):
         assert {weight.dtype for weight in network.parameters()} == {torch.float32}
@@ -77,7 +77,7 @@ def kept():
         return found[-1][1]
 
     images = {name: sample.images[name] for name in ("mono", "colour")}
-    frame = fuse(load_weights("mono-colour-small"), sample.rig, images, alpha="mono", matcher=matcher)
+    frame = fuse(images, sample.rig, alpha="mono", network=load_weights("mono-colour-small"), matcher=matcher)
     return (*found[-1], frame, sample)
 
 
@@ -104,7 +104,7 @@ def test_confidence_is_the_matches_whatever_the_network(kept):
     """The same for other weights: where matches lie is the same."""
     *_, frame, sample = kept
     images = {name: sample.images[name] for name in ("mono", "colour")}
-    other = fuse(load_weights("mono-colour"), sample.rig, images, alpha="mono")
+    other = fuse(images, sample.rig, alpha="mono", network=load_weights("mono-colour"))
     assert (frame.confidence - other.confidence).abs().mean() < 1e-4
 
 
@@ -112,7 +112,7 @@ def test_confidence_is_the_matches_whatever_the_network(kept):
 def motorcycle():
     """The frame of a real pair, and its true depth, NaN where that is not known."""
     array = load_motorcycle()
-    frame = fuse(load_weights("mono-colour-small"), array.rig, array.images, alpha="mono")
+    frame = fuse(array.images, array.rig, alpha="mono", network=load_weights("mono-colour-small"))
     disparity = torch.from_numpy(stereo_motorcycle()[2][:, :740].copy())
     pair = array.rig.pair("mono", "colour")
     baseline = float(pair.beta_from_alpha.t.norm())

@@ -11,8 +11,8 @@ from torch.nn.functional import grid_sample
 from arraygeom import Rectified, Segments, pixel_grid
 from arraygeom.fields.default import default_field
 from arraygeom.fields.grid import FieldOnGrid
+from pat import fuse
 from pat.app.sample_array import load_motorcycle
-from pat.fusion.fuse import fuse
 from pat.lab.evaluation.protocols import rectified_rig
 from pat.matching import choice
 from pat.matching import inputs as parts
@@ -91,7 +91,7 @@ def motorcycle():
         found.append((inputs, Matches((located_in_one(inputs),))))
         return match(inputs)
 
-    fuse(load_weights("mono-colour-small"), array.rig, array.images, alpha="mono", matcher=matcher)
+    fuse(array.images, array.rig, alpha="mono", network=load_weights("mono-colour-small"), matcher=matcher)
     return found[0]
 
 
@@ -122,7 +122,9 @@ def test_depth_is_of_what_was_chosen_and_colour_of_the_match():
         return Matches((replace(found, chosen=found.chosen + 4),))
 
     one, other = (
-        fuse(load_weights("mono-colour-small"), array.rig, array.images, alpha="mono", matcher=matcher)
+        fuse(
+            array.images, array.rig, alpha="mono", network=load_weights("mono-colour-small"), matcher=matcher
+        )
         for matcher in (match, farther)
     )
     pixel = 1 / (994.978 * 0.193001)

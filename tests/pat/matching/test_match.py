@@ -9,7 +9,7 @@ from torch import Tensor
 
 from arraygeom import Local, pixel_grid
 from arraygeom.fields.grid import FieldOnGrid
-from pat.fusion.fuse import fuse
+from pat import FuseSettings, fuse
 from pat.fusion.inputs import frame_inputs
 from pat.fusion.views import Views
 from pat.matching.colour_transfer import transferred
@@ -116,7 +116,14 @@ def test_matches_from_a_file_take_the_place_of_those_found(network, flat, tmp_pa
         sure = torch.tensor([0.0, 1.0, 0.0])[:, None, None].expand_as(one.facts[0])[None]
         return transferred(inputs, Matches((replace(one, disparity=disparity, facts=sure.to(one.facts)),)))
 
-    frame = fuse(network, rig, other, alpha="mono", matcher=from_file, align=False, response="rec601")
+    frame = fuse(
+        other,
+        rig,
+        alpha="mono",
+        network=network,
+        settings=FuseSettings(align=False, response="rec601"),
+        matcher=from_file,
+    )
     assert float((frame.depth[:, 10:] - DEPTH).abs().nanmedian()) < 1e-3
 
 
@@ -157,7 +164,7 @@ def test_a_network_without_matches_is_not_matched_for(flat):
         raise AssertionError("no matches were asked for")
 
     rig, images = flat
-    frame = fuse(Plain(), rig, images, alpha="mono", matcher=never)
+    frame = fuse(images, rig, alpha="mono", network=Plain(), matcher=never)
     assert frame.image.shape == (3, H, W)
     assert float(frame.depth.nanmedian()) == pytest.approx(2 / (1 / 2 + 1 / 50), rel=0.01)
 
@@ -193,4 +200,11 @@ def test_matches_of_ones_own_are_checked(network, flat, plane, change, problem):
         return Matches((replace(found, **{plane: change(getattr(found, plane))}),))
 
     with pytest.raises(ValueError, match=f"these matches' {problem}"):
-        fuse(network, rig, images, alpha="mono", matcher=matcher, align=False, response="rec601")
+        fuse(
+            images,
+            rig,
+            alpha="mono",
+            network=network,
+            settings=FuseSettings(align=False, response="rec601"),
+            matcher=matcher,
+        )

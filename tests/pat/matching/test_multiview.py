@@ -9,7 +9,7 @@ import torch
 from arraygeom import Camera, Pose, Rig, Segments, intrinsics, pixel_grid
 from arraygeom.fields import pinhole_track
 from arraygeom.runtime.chunks import tiles_of
-from pat.fusion.fuse import fuse
+from pat import fuse
 from pat.fusion.inputs import frame_inputs
 from pat.fusion.views import Views
 from pat.matching import inputs as inputs_module
@@ -68,7 +68,7 @@ def scene():
 
 def fused(network, scene, *names):
     rig, images, ground_truth = scene
-    frame = fuse(network, rig, {name: images[name] for name in ("mono", *names)}, alpha="mono")
+    frame = fuse({name: images[name] for name in ("mono", *names)}, rig, alpha="mono", network=network)
     return score(frame.image.clamp(0, 1), ground_truth).psnr, frame
 
 
@@ -147,7 +147,7 @@ def test_of_betas_a_pixel_without_a_segment_never_counts(network):
 def test_the_order_of_the_betas_does_not_matter(network, scene):
     rig, images, _ = scene
     turned = Rig({n: rig[n] for n in ("mono", "right", "left")}, depth=(NEAR, FAR))
-    one, other = (fuse(network, r, images, alpha="mono").image for r in (rig, turned))
+    one, other = (fuse(images, r, alpha="mono", network=network).image for r in (rig, turned))
     assert (one - other).abs().max() < 2e-2
     assert (one - other).abs().mean() < 1e-4
 
@@ -159,19 +159,19 @@ def test_tiles_of_several_betas_are_as_the_whole(network, scene, monkeypatch):
     plan = module.plan_frame
     tiles = list(tiles_of((H, W), 64, 640))
     assert len(tiles) > 1
-    whole = fuse(network, rig, images, alpha="mono").image
+    whole = fuse(images, rig, alpha="mono", network=network).image
     monkeypatch.setattr(module, "plan_frame", lambda *a, **k: plan(*a, **k)._replace(tiles=tiles))
-    assert (fuse(network, rig, images, alpha="mono").image - whole).abs().max() < 1e-5
+    assert (fuse(images, rig, alpha="mono", network=network).image - whole).abs().max() < 1e-5
 
 
 def test_strips_change_nothing_and_pieces_little(network, scene, monkeypatch):
     rig, images, _ = scene
-    whole = fuse(network, rig, images, alpha="mono").image
+    whole = fuse(images, rig, alpha="mono", network=network).image
     monkeypatch.setattr(several, "STRIP", 10 * W)
-    assert (fuse(network, rig, images, alpha="mono").image - whole).abs().max() < 1e-6
+    assert (fuse(images, rig, alpha="mono", network=network).image - whole).abs().max() < 1e-6
     monkeypatch.setattr(inputs_module, "SETTINGS", inputs_module.InputsSettings(halo=32, at_once=15_000))
     assert len(frame_inputs(network, Views.of(rig, images, alpha="mono")).inputs.pieces) > 1
-    found = fuse(network, rig, images, alpha="mono").image
+    found = fuse(images, rig, alpha="mono", network=network).image
     assert ((found - whole).abs().amax(0) > 0.02).float().mean() < 0.05
 
 
@@ -199,7 +199,7 @@ def test_shared_colour_counts_once(network, scene):
 
 def test_a_band_camera_beside_a_colour_camera_gives_better_depth(network, scene):
     rig, images, _ = scene
-    frame = fuse(network, rig, images | {"right": luminance(images["right"])}, alpha="mono")
+    frame = fuse(images | {"right": luminance(images["right"])}, rig, alpha="mono", network=network)
     _, alone = fused(network, scene, "left")
     assert frame.image.shape[0] == 3
     depth = torch.full((H, W), FAR)
@@ -218,7 +218,7 @@ def test_uncalibrated_colour_cameras_are_fused_too(network, scene):
         for n in ("left", "right")
     }
     known = Rig({n: Known(hw=rig[n].hw) for n in rig.cameras}, links=links)
-    frame = fuse(network, known, images, alpha="mono")
+    frame = fuse(images, known, alpha="mono", network=network)
     assert frame.image.shape == (3, H, W)
     assert frame.depth.isnan().all()
 
@@ -264,7 +264,7 @@ def test_a_band_unlike_alpha_is_matched_through_one_that_is_like_it():
     found = {}
     for name, more in near.items():
         rig = Rig({n: cameras[n] for n in images | more}, depth=(NEAR, FAR))
-        frame = fuse(network, rig, images | more, alpha="mono")
+        frame = fuse(images | more, rig, alpha="mono", network=network)
         found[name] = score(frame.image[:1].clamp(0, 1), unlike(seen_from(0.0))).psnr
     assert found["with"] > found["alone"] + 3
 
@@ -275,7 +275,7 @@ def test_betas_whose_lengths_do_not_fit_agree_all_the_same(network, scene):
     cameras = {"mono": camera(0.0), "left": camera(-0.25), "right": camera(0.25)}
     wrong = cameras | {"right": camera(0.4)}
     true, found = (
-        fuse(network, Rig(c, depth=(NEAR, 2 * FAR)), images, alpha="mono").image.clamp(0, 1)
+        fuse(images, Rig(c, depth=(NEAR, 2 * FAR)), alpha="mono", network=network).image.clamp(0, 1)
         for c in (cameras, wrong)
     )
     assert score(found, ground_truth).psnr > score(true, ground_truth).psnr - 0.5

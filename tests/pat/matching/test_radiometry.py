@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from pat.fusion.fuse import fuse
+from pat import FuseSettings, fuse
 from pat.matching import radiometry
 from pat.matching.radiometry import KINDS, SETTINGS, Response, fit, stated_response
 from pat.media.colour import REC601, luminance
@@ -206,7 +206,9 @@ def test_fusion_of_another_response():
     images = {ALPHA: combined(sample.ground_truth), BETA: sample.images[BETA]}
 
     def psnr(response, given=images):
-        frame = fuse(network, sample.rig, given, alpha=ALPHA, response=response)
+        frame = fuse(
+            given, sample.rig, alpha=ALPHA, network=network, settings=FuseSettings(response=response)
+        )
         return score(frame.image.clamp(0, 1), sample.ground_truth).psnr, frame
 
     ideal, _ = psnr("rec601", images | {ALPHA: luminance(sample.ground_truth)})

@@ -8,7 +8,7 @@ import torch
 
 from arraygeom import Dense, Epipolar, Local, NearestVoxels, Positions, Segments
 from arraygeom.fields.grid import FieldOnGrid
-from pat import fuse, load_weights
+from pat import FuseSettings, fuse, load_weights
 from pat.matching import cost
 from pat.matching import semi_global_numba as kernels
 from pat.matching.cost import planes_of
@@ -56,7 +56,11 @@ def test_sets_are_fused_and_said_to_have_no_order(field):
     s = middle_of_sample()
     with pytest.warns(UserWarning, match="without an order"):
         frame = fuse(
-            load_weights("mono-colour"), s.rig, s.images, alpha=ALPHA, field=field, response="rec601"
+            s.images,
+            s.rig,
+            alpha=ALPHA,
+            network=load_weights("mono-colour"),
+            settings=FuseSettings(field=field, response="rec601"),
         )
     assert bool(frame.image.isfinite().all())
 
@@ -65,7 +69,10 @@ def test_a_curve_of_ones_own_is_fused_as_well_as_the_segment():
     s, network = middle_of_sample(), load_weights("mono-colour")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        frames = [fuse(network, s.rig, s.images, alpha=ALPHA, field=f) for f in (None, along_the_segment)]
+        frames = [
+            fuse(s.images, s.rig, alpha=ALPHA, network=network, settings=FuseSettings(field=f))
+            for f in (None, along_the_segment)
+        ]
     straight, own = (score(f.image.clamp(0, 1), s.ground_truth).psnr for f in frames)
     assert own > straight - 0.2
 

@@ -16,7 +16,8 @@ import tifffile
 import torch
 from PIL import Image, ImageOps
 
-from arraygeom.runtime.atomic import sweep, write_atomically, write_together
+from arraygeom.runtime.atomic import write_atomically
+from arraygeom.runtime.together import sweep, write_together
 from pat.media.colour import from_luma_chroma, luminance, to_luma_chroma
 from pat.media.headers import image_header
 from pat.media.images import decoded_photograph, read_image, read_recorded, write_image
@@ -342,7 +343,8 @@ def test_no_room_is_said_of_the_file_whoever_writes(tmp_path):
     ):
         np.save(temporary, np.zeros(1000))
     said = rf"{re.escape(str(tmp_path))}: not written whole \("
-    with room_for(1000), pytest.raises(OSError, match=said), write_together(tmp_path, last="b.npy") as folder:
+    together = write_together(tmp_path, group="b", last="b.npy")
+    with room_for(1000), pytest.raises(OSError, match=said), together as folder:
         np.save(folder / "b.npy", np.zeros(1000))
     assert os.listdir(tmp_path) == []
 
@@ -462,3 +464,15 @@ def test_comments_bigtiff_and_damaged_orientation(tmp_path):
     assert image_header((tmp_path / "big.tif").read_bytes())[:3] == ((3, 4), 1, 16)
     with_orientation(tmp_path / "b.png", np.zeros((3, 4, 3), np.uint8), 9)
     assert read_image(tmp_path / "b.png").shape == (3, 3, 4)
+
+
+@pytest.mark.parametrize("bits", [8, 16, 32])
+def test_tiffs_are_read_without_further_codecs(bits, tmp_path):
+    """By tifffile alone, which scikit-image and imageio read them by: LZW it does not."""
+    tifffile = pytest.importorskip("tifffile")
+    image = torch.rand(3, 12, 17)
+    write_image(tmp_path / "a.tif", image, bits=bits)
+    page = tifffile.TiffFile(tmp_path / "a.tif").pages[0]
+    assert page.compression in (tifffile.COMPRESSION.NONE, tifffile.COMPRESSION.ADOBE_DEFLATE)
+    scale = 1 if bits == 32 else 2**bits - 1
+    assert np.abs(page.asarray() / scale - image.permute(1, 2, 0).numpy()).max() < 1 / 200

@@ -5,7 +5,7 @@ import torch
 
 from arraygeom import Pair, Rectified, Rig, View
 from arraygeom.fields.grid import FieldOnGrid
-from pat.fusion.fuse import fuse
+from pat import fuse
 from pat.fusion.steps import co_located
 from pat.matching.inputs import Inputs
 from pat.networks.bandwise import BandwisePAT
@@ -63,8 +63,8 @@ def rig_of(names, places):
 def test_co_located_cameras_are_one_with_several_bands(network):
     bands, alpha = texture(3, (64, 96))[0], texture(3, (64, 96))[0, :1]
     images = {"alpha": alpha, **dict(zip("rgb", bands.split(1)))}
-    apart = fuse(network, rig_of("rgb", [1, 1, 1]), images, alpha="alpha")
-    whole = fuse(network, rig_of("c", [1]), {"alpha": alpha, "c": bands}, alpha="alpha")
+    apart = fuse(images, rig_of("rgb", [1, 1, 1]), alpha="alpha", network=network)
+    whole = fuse({"alpha": alpha, "c": bands}, rig_of("c", [1]), alpha="alpha", network=network)
     assert torch.equal(apart.image, whole.image)
     assert torch.equal(apart.confidence, whole.confidence)
 
@@ -73,8 +73,8 @@ def test_bands_come_out_in_the_order_of_their_cameras(network):
     """The second camera is elsewhere, the first and the third at one place."""
     bands, alpha = texture(3, (64, 96))[0], texture(3, (64, 96))[0, :1]
     images = dict(zip("rgb", bands.split(1)))
-    mixed = fuse(network, rig_of("rgb", [1, 2, 1]), {"alpha": alpha, **images}, alpha="alpha")
-    sorted_ = fuse(network, rig_of("rbg", [1, 1, 2]), {"alpha": alpha, **images}, alpha="alpha")
+    mixed = fuse({"alpha": alpha, **images}, rig_of("rgb", [1, 2, 1]), alpha="alpha", network=network)
+    sorted_ = fuse({"alpha": alpha, **images}, rig_of("rbg", [1, 1, 2]), alpha="alpha", network=network)
     assert torch.equal(mixed.image, sorted_.image[[0, 2, 1]])
     assert mixed.image.shape[0] == 3
 

@@ -22,7 +22,7 @@ from arraygeom import (
 )
 from arraygeom.distortion import Distortion
 from arraygeom.fields.grid import FieldOnGrid
-from pat import fuse, load_weights
+from pat import FuseSettings, fuse, load_weights
 from pat.matching.inputs import Inputs
 from pat.networks.configs import PATConfig
 from pat.networks.paper import PAT
@@ -92,7 +92,14 @@ def test_a_rotation_is_recovered_by_optimising_through_attention_alone():
 
     def error_of(angle):
         turned = rotated(rig, angle)
-        frame = fuse(supervised, turned, images, alpha="mono", align=False, differentiable=True)
+        frame = fuse(
+            images,
+            turned,
+            alpha="mono",
+            network=supervised,
+            settings=FuseSettings(align=False),
+            differentiable=True,
+        )
         return (frame.image - sample.ground_truth[window]).square().mean()
 
     assert abs(rotation_left(error_of)) < 0.02

@@ -7,8 +7,8 @@ import torch
 
 from arraygeom import Camera, Epipolar, Pair, Pose, Rectified, Segments, View, intrinsics
 from arraygeom.fields.grid import FieldOnGrid
+from pat import FuseSettings, fuse
 from pat.app.sample_array import load_sample
-from pat.fusion.fuse import fuse
 from pat.matching.inputs import Inputs
 from pat.matching.matches import Matches
 from pat.matching.positions import at_matches
@@ -180,6 +180,12 @@ def test_features_are_as_exact_as_the_image_and_positions_more(monkeypatch):
 def test_confidence_shows_no_grid_of_the_pixels_that_are_made_of_one():
     """The four pixels of each at half the size differed by up to .02 in the mean."""
     sample = load_sample()
-    found = fuse(load_weights("mono-colour"), sample.rig, sample.images, alpha="mono", align=False).confidence
+    found = fuse(
+        sample.images,
+        sample.rig,
+        alpha="mono",
+        network=load_weights("mono-colour"),
+        settings=FuseSettings(align=False),
+    ).confidence
     apart = found.unflatten(0, (-1, 2)).unflatten(2, (-1, 2)).mean((0, 2))
     assert float(apart.max() - apart.min()) < 0.002

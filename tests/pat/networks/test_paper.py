@@ -87,7 +87,7 @@ def test_four_inputs_a_band_each_give_the_colours():
     def psnr(bands: str) -> float:
         taken = {"mono": mono} | dict(zip(bands, images["colour"].split(1)))
         return score(
-            fuse(load_weights("pat-supervised-4"), four, taken, alpha="mono").image.clamp(0, 1), truth
+            fuse(taken, four, alpha="mono", network=load_weights("pat-supervised-4")).image.clamp(0, 1), truth
         ).psnr
 
     assert psnr("rgb") > score(mono.expand(3, -1, -1), truth).psnr + 5

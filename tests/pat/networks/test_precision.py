@@ -7,7 +7,7 @@ from inspect import unwrap
 import pytest
 import torch
 
-from pat import fuse
+from pat import FuseSettings, fuse
 from pat.app.sample_array import load_sample
 from pat.networks.weights import load_weights, set_precision
 from pat.support import eight_bits
@@ -20,9 +20,15 @@ def test_a_precision_changes_the_image_little_and_something(precision):
     if not getattr(torch.cpu, f"_is_{of}_supported")():
         pytest.skip(f"this processor has no {precision}")
     sample = load_sample()
-    frame = {"alpha": "mono", "align": False, "response": "rec601"}
+    settings = FuseSettings(align=False, response="rec601")
     exact, rounded = (
-        fuse(load_weights("mono-colour", precision=p), sample.rig, sample.images, **frame)
+        fuse(
+            sample.images,
+            sample.rig,
+            alpha="mono",
+            network=load_weights("mono-colour", precision=p),
+            settings=settings,
+        )
         for p in ("float32", precision)
     )
     apart = (exact.image - rounded.image).abs()

@@ -11,10 +11,11 @@ import torch
 from torch.nn.functional import interpolate
 
 from arraygeom import Rig
+from pat import FuseSettings
+from pat import align as aligned
 from pat.app.cli.fuse import Fuse
 from pat.app.cli.known import Known
 from pat.fusion.align import OCCLUDED
-from pat.fusion.align import align as aligned
 from pat.media.images import read_image, write_image
 from tests.arraygeom.rigs import parallel_rig
 from tests.pat.commands import images, pat
@@ -79,7 +80,7 @@ def test_what_the_post_hides_is_occluded(folder):
     given = {name: read_image(folder / f"{name}.png") for name in rig.names}
     depth = torch.from_numpy(tifffile.imread(folder / "depth.tif"))
     field = AroundDepth(depth, 0.02, rig["mono"])
-    view = aligned(rig, given, alpha="mono", correct=False, field=field)["colour"]
+    view = aligned(given, rig, alpha="mono", settings=FuseSettings(align=False, field=field))["colour"]
     hidden = slice(ON_POST.start - (NEAR - FAR), ON_POST.start)
     assert (view.visibility[:, hidden][:, 2:-2] == OCCLUDED).mean() > 0.9
     assert view.valid[:, ON_POST].mean() > 0.9

@@ -15,11 +15,12 @@ from torch.nn.functional import avg_pool2d
 
 from arraygeom import Camera, Pose, Rig, Sensor, View
 from experiments.evaluation.paper import with_found_rig
-from pat import fuse, load_weights
+from pat import FuseSettings, fuse, load_weights
 from pat.app.cli.fuse import Fuse
 from pat.app.from_images import ImageArray, array_from_images, camera_names, found_rig
 from pat.app.sample_array import load_sample
-from pat.fusion.results import Frame, save_frame
+from pat.fusion.frame import Frame
+from pat.fusion.results import save_frame
 from pat.media.headers import focal_length
 from pat.media.images import read_image, write_image
 from pat.media.video import read_video, write_video
@@ -59,8 +60,8 @@ def folder(halved, tmp_path_factory):
 def test_images_alone_are_fused_about_as_well_as_with_the_rig(halved, folder):
     rig, images, ground_truth = halved
     bounds = {"depth_nearest.tif", "depth_farthest.tif"}  # not by focal lengths that are assumed
-    assert {path.name for path in (folder / "out").iterdir()} == ALL - bounds
-    known = fuse(load_weights("mono-colour"), rig, images, alpha="mono")
+    assert {path.name for path in (folder / "out").glob("*.*")} - {".arraygeom"} == ALL - bounds
+    known = fuse(images, rig, alpha="mono", network=load_weights("mono-colour"))
     with_rig = score(known.image.clamp(0, 1), ground_truth).psnr
     assert score(read_image(folder / "out" / "fused.png"), ground_truth).psnr > with_rig - 0.5
 
@@ -71,7 +72,7 @@ def test_fuse_of_images_alone_is_that_of_the_command(folder, monkeypatch):
     frame = fuse([folder / "colour.png", folder / "mono.png"], explain=said.append)
     assert float((frame.image.clamp(0, 1) - read_image(folder / "out" / "fused.png")).abs().max()) < 2 / 255
     assert any(line.startswith("alpha, whose view and detail the result has: mono") for line in said)
-    with pytest.raises(TypeError, match="or images alone"):
+    with pytest.raises(TypeError, match="images come first"):
         fuse(load_weights("mono-colour"), alpha="mono")
     with pytest.raises(ValueError, match=r"focal tele=900: .*mono, colour"):
         array_from_images({name: folder / f"{name}.png" for name in ("mono", "colour")}, focal={"tele": 900})
@@ -322,7 +323,7 @@ def test_why_there_is_no_depth_is_said(halved, monkeypatch):
     monkeypatch.setattr("pat.app.from_images.self_calibrated", lambda *given, **options: None)
     monkeypatch.setattr("pat.app.from_images.MATCHED", 300)
     lines = []
-    rig, _ = found_rig(halved[1], "mono", {}, load_weights("mono-colour"), lines.append)
+    rig, _ = found_rig(halved[1], "mono", {}, 3, lines.append)
     assert not isinstance(rig["mono"], Camera)
     assert any(line.startswith("no depth by colour") for line in lines)
 
@@ -334,11 +335,14 @@ def test_depth_is_rough_where_no_poses_fit_as_well_as_lines_alone(halved, monkey
     monkeypatch.setattr("calib.images.self_calibration.SLACK", 0.0)
     known, images, _ = halved
     focal, lines = {name: float(known[name].K[0, 0]) for name in known.names}, []
-    rig, _ = found_rig(images, "mono", focal, load_weights("mono-colour"), lines.append)
+    rig, _ = found_rig(images, "mono", focal, 3, lines.append)
     assert rig.links
     assert any("lines by F; depths are rough" in line for line in lines)
     network = load_weights("mono-colour")
-    frames = [fuse(network, r, images, alpha="mono", align=False) for r in (rig, known)]
+    frames = [
+        fuse(images, r, alpha="mono", network=network, settings=FuseSettings(align=False))
+        for r in (rig, known)
+    ]
     sure = (frames[0].confidence > 0.7) & (frames[1].confidence > 0.7)
     ratio = (frames[0].depth / frames[1].depth)[sure]
     assert ratio.isfinite().double().mean() > 0.95
@@ -350,7 +354,7 @@ def test_focal_lengths_are_of_the_images_as_given(halved, monkeypatch):
     monkeypatch.setattr("pat.app.from_images.MATCHED", 240)
     known, images, _ = halved
     focal = {name: float(known[name].K[0, 0]) for name in known.names}
-    rig, _ = found_rig(images, "mono", focal, load_weights("mono-colour"), lambda line: None)
+    rig, _ = found_rig(images, "mono", focal, 3, lambda line: None)
     assert float(rig["mono"].K[0, 0]) == pytest.approx(focal["mono"], rel=1e-3)
 
 
@@ -366,10 +370,10 @@ def test_a_focal_length_that_points_determine_is_used_and_said(halved, monkeypat
     fit = SimpleNamespace(length=250.0, deviation=0.07)
     monkeypatch.setattr("pat.app.from_images.common_focal_length", lambda *given: fit)
     lines = []
-    found_rig(same, "mono", {}, load_weights("mono-colour"), lines.append)
+    found_rig(same, "mono", {}, 3, lines.append)
     assert any("mono: focal length" in line and "+- 7%, by matched points" in line for line in lines)
     assert not any("focal lengths assumed of mono" in line for line in lines)
     given = []
     monkeypatch.setattr("pat.app.from_images._calibrated", lambda found, *_: found.rig)
-    found_rig(same, "mono", {"mono": 300.0}, load_weights("mono-colour"), given.append)
+    found_rig(same, "mono", {"mono": 300.0}, 3, given.append)
     assert not any("by matched points" in line for line in given)

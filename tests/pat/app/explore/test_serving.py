@@ -1,5 +1,6 @@
 """The explorer's server: for this machine's own names only, ports that are checked, a quiet end."""
 
+import os
 import re
 import signal
 import subprocess
@@ -12,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from pat.app.explore.page import opened
+from pat.app.explore.serving import _opened
 from pat.app.sample_array import SAMPLE, load_sample
 
 ROOT = Path(__file__).parents[4]
@@ -26,7 +28,7 @@ def server():
     # also if the tests run in the background
     heard = partial(signal.signal, signal.SIGINT, signal.default_int_handler)
     process = subprocess.Popen(command, cwd=ROOT, preexec_fn=heard, **pipes)
-    yield process, re.search(r"http://localhost:(\d+)", process.stdout.readline())[1]
+    yield process, *re.search(r"http://localhost:(\d+)(/\S+/)", process.stdout.readline()).groups()
     process.kill()
     process.communicate()
 
@@ -40,24 +42,72 @@ def status(port, path, data=None, **headers) -> int:
         return error.code
 
 
+def another_user(ask) -> bool:
+    """Whether a process of another user of this machine is refused all that it asks for."""
+    child = os.fork()
+    if not child:
+        os.setgid(65534)
+        os.setuid(65534)
+        os._exit(0 if all(answer == 404 for answer in ask()) else 1)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+
+
+def test_the_browser_is_not_told_the_token_where_others_see_it(monkeypatch):
+    """The arguments of its process are seen by all users."""
+    opened_by_browser = []
+    monkeypatch.setattr("webbrowser.open", opened_by_browser.append)
+    with _opened("http://localhost:1/token/"):
+        (file,) = [Path(url.removeprefix("file://")) for url in opened_by_browser]
+        assert "url=http://localhost:1/token/" in file.read_text()
+        assert file.parent.stat().st_mode & 0o077 == 0
+
+
+def test_only_what_was_given_is_imported_or_looked_up(tmp_path, monkeypatch):
+    """A question imported any module, and told by the weights which files there are."""
+    (tmp_path / "evilmod.py").write_text("open('ran', 'w')\nfield = None\n")
+    (tmp_path / "a.safetensors").touch()
+    monkeypatch.chdir(tmp_path)
+    explorer = opened(load_sample().rig)
+    errors = set()
+    for change in (
+        {"field": "evilmod:field"},
+        {"second": "evilmod:field"},
+        {"weights": "a.safetensors"},
+        {"weights": "b.safetensors"},
+        {"field": ["epipolar"]},
+        {"near": [[[1]]]},
+    ):
+        errors.add(explorer.answer({**explorer.controls, **change})["error"].replace("b.s", "a.s"))
+    assert len(errors) == 5
+    assert not (tmp_path / "ran").exists()
+    assert "error" not in explorer.answer({**explorer.controls, "field": "epipolar"})
+
+
 def test_foreign_hosts_are_refused_whatever_their_origin_and_ctrl_c_is_quiet(server):
-    process, port = server
+    process, port, page = server
     for host in (f"localhost:{port}", f"127.0.0.1:{port}"):
-        assert status(port, "/", Host=host) == 200
+        assert status(port, page, Host=host) == 200
     for host in (
         f"evil.example:{port}",
         "evil.example",
         f"localhost.evil.example:{port}",
         f"xlocalhost:{port}",
     ):
-        for path in ("/", "/answer", "/elsewhere"):
+        for path in (page, f"{page}answer", "/elsewhere"):
             assert status(port, path, Host=host) == 403
-        assert status(port, "/answer", b"{}", Host=host, Origin=f"http://{host}") == 403
+        assert status(port, f"{page}answer", b"{}", Host=host, Origin=f"http://{host}") == 403
     own = f"localhost:{port}"
-    assert status(port, "/answer", b"{}", Host=own, Origin="http://evil.example") == 403
-    assert status(port, "/answer", b"{}", Host=own, Origin=f"http://{own}") == 200
-    assert status(port, "/answer", b"[1", Host=own) == 400
-    assert status(port, "/elsewhere", Host=own) == 404
+    answer = f"{page}answer"
+    assert status(port, answer, b"{}", Host=own, Origin="http://evil.example") == 403
+    assert status(port, answer, b"{}", Host=own, Origin=f"http://{own}") == 200
+    for text in (b"[1", b"[" * 60_000, b"\xff", b"3"):
+        assert status(port, answer, text, Host=own) == 400
+    deep = b'{"moved": ' + b'{"a":' * 900 + b"1" + b"}" * 900 + b"}"
+    assert status(port, answer, deep, Host=own) in (200, 400)
+    for path in ("/", "/answer", "/elsewhere", page[:-2] + "/", f"{page}../"):
+        assert status(port, path, Host=own) == status(port, path, b"{}", Host=own) == 404
+    if os.geteuid() == 0 and sys.platform == "linux":
+        assert another_user(lambda: [status(port, "/", Host=own), status(port, "/answer", b"{}", Host=own)])
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=300)
     assert process.returncode == 0
@@ -71,7 +121,7 @@ def test_a_port_that_is_none_is_one_line(port, refusal):
 
 
 def test_a_port_in_use_is_one_line(server, refusal):
-    _, port = server
+    _, port, _ = server
     said = refusal(*EXPLORE, "--port", port)
     assert said == f"pat: --port {port}: Address already in use: give another, or 0 for a free one"
 

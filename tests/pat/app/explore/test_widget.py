@@ -341,5 +341,5 @@ def test_the_served_page_in_a_browser(driver, tmp_path):
 
 TIMES = """const done = arguments[0], times = [];
 (async () => { for (let i = 0; i < 12; i++) { const start = performance.now();
-  await (await fetch('/answer', { method: 'POST', body: JSON.stringify({ x: [20 + 5 * i, 30] }) })).json();
+  await (await fetch('answer', { method: 'POST', body: JSON.stringify({ x: [20 + 5 * i, 30] }) })).json();
   times.push(performance.now() - start); } done(times); })()"""

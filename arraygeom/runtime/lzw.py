@@ -1,0 +1,42 @@
+"""How much a TIFF strip in LZW holds: libtiff reports damage in it to a terminal, if at all."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .compiled import compiled
+
+CLEAR, END = 256, 257
+
+
+@compiled(nogil=True, cache=True)
+def lzw_length(data, wanted):
+    """Bytes that LZW codes (uint8, the most significant bit first) stand for, once they reach `wanted`.
+
+    0 if a code is not in the table, follows a full one, or is cut.
+    """
+    lengths = np.ones(4096, np.int64)
+    width, known, before, total, position = 9, END + 1, -1, 0, 0
+    while total < wanted and position + width <= 8 * len(data):
+        byte, bits = position >> 3, 0
+        for k in range(3):
+            bits = (bits << 8) | (data[byte + k] if byte + k < len(data) else 0)
+        code = (bits >> (24 - width - (position & 7))) & ((1 << width) - 1)
+        position += width
+        if code == END:
+            return total
+        if code == CLEAR:
+            width, known, before = 9, END + 1, -1
+            continue
+        if before >= 0:
+            if known == 4096:
+                return 0
+            lengths[known] = lengths[before] + 1
+            known += 1
+        if code >= known:
+            return 0
+        total += lengths[code]
+        before = code
+        if known >= (1 << width) - 1 and width < 12:
+            width += 1
+    return total

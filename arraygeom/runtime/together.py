@@ -1,0 +1,217 @@
+"""Files of one making: swapped in whole or not at all, and listed, so that only they are replaced later.
+
+A folder of results has a folder `.arraygeom`, in which a JSON file for each group of files lists their names
+and digests. The list is moved there last: with it a new making is complete.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import shutil
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from uuid import uuid4
+
+from .atomic import flush, naming, speaks_for_itself, write_text
+
+LISTS = ".arraygeom"
+"""The folder of the lists, and of what an unfinished run keeps."""
+_LIST, _FORMER = ".list.json", ".former"
+"""In a temporary folder: the list of the files in it, and the files that they replace."""
+ANY = "any"
+"""Stands for any digest."""
+_SHOWN = 4
+"""Names in a message."""
+
+
+@contextmanager
+def write_together(
+    folder: str | Path,
+    *,
+    group: str,
+    last: str,
+    about: Mapping[str, str] | None = None,
+    given: Collection[str] = (),
+) -> Iterator[Path]:
+    """A temporary folder inside `folder` for files that belong together, the one named `last` among them.
+
+    When the block ends without error they replace the group's former files, those of other names too: the
+    former last one goes first and the new one comes last, so where it is, the others are of the same making.
+    After an error (a full disk, say) all former files are as they were; after a kill they are so again once
+    `recover` has run, which the next call does. `about` is kept in the list (`read_about`). Missing folders
+    are made.
+
+    Raises FileExistsError for a file in the way that no list has as it is, unless its name is `given`, that
+    is, chosen by the user; OSError that names the file.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    recover(folder, group)
+    temporary = folder / f".{group}-{uuid4().hex}"
+    temporary.mkdir()
+    try:
+        yield temporary
+        _swap(folder, temporary, group, last, dict(about or {}), given)
+    except OSError as error:
+        if (error.filename and Path(error.filename).parent != temporary) or speaks_for_itself(error):
+            raise
+        written = folder / Path(error.filename).name if error.filename else folder
+        raise naming(written, error, temporary) from error
+    finally:
+        with suppress(OSError):  # what cannot be put back now is put back by the next call
+            _undo(folder, temporary)
+            shutil.rmtree(temporary, ignore_errors=True)
+
+
+def write_listed(path: Path, text: str, *, given: bool = False) -> None:
+    """`write_together` of one text file, a group of its own name. Raises as it does."""
+    chosen = (path.name,) if given else ()
+    with write_together(path.parent, group=path.name, last=path.name, given=chosen) as folder:
+        write_text(folder / path.name, text)
+
+
+def _swap(
+    folder: Path, temporary: Path, group: str, last: str, about: dict[str, str], given: Collection[str]
+) -> None:
+    """Move former files out and new ones in; the move of the list, the last one, makes it count."""
+    names = sorted((file.name for file in temporary.iterdir()), key=lambda name: name == last)
+    files = {name: digest(temporary / name) for name in names}
+    refuse_others(folder, {name: files[name] for name in names if name not in given}, group=group)
+    former = _listed(_lists(folder, group))
+    gone = [name for name, known in former.items() if name not in files and digest(folder / name) in known]
+    (temporary / _FORMER).mkdir()
+    (folder / LISTS).mkdir(exist_ok=True)
+    for name in names:
+        flush(temporary / name)
+    write_text(temporary / _LIST, json.dumps({"about": about, "files": files}, indent=1))
+    flush(temporary)
+    for name in (*names[::-1], *gone):
+        if os.path.lexists(folder / name):
+            os.replace(folder / name, temporary / _FORMER / name)
+    for name in names:
+        os.replace(temporary / name, folder / name)
+    flush(folder)
+    os.replace(temporary / _LIST, list_file(folder, group))
+    with suppress(OSError):
+        list_file(folder, group, retired=True).unlink()
+
+
+def _undo(folder: Path, temporary: Path) -> None:
+    """Put a folder back as it was before a swap that was not completed; may be stopped and repeated."""
+    if not (temporary / _LIST).is_file():
+        return
+    files = list(_read_list(temporary / _LIST)["files"])
+    for name in files[::-1]:
+        if not os.path.lexists(temporary / name):
+            os.replace(folder / name, temporary / name)
+    if (temporary / _FORMER).is_dir():
+        for file in sorted((temporary / _FORMER).iterdir(), key=lambda file: file.name == files[-1]):
+            os.replace(file, folder / file.name)
+    (temporary / _LIST).unlink()
+
+
+def recover(folder: Path, group: str | None = None) -> None:
+    """Put back what a killed swap of a group, or of any, had moved. Raises OSError if that cannot be done."""
+    for path in _temporary(folder, group):
+        if (path / _LIST).is_file():
+            _undo(folder, path)
+            shutil.rmtree(path, ignore_errors=True)
+
+
+def sweep(folder: Path, stem: str | None = None) -> None:
+    """`recover`, and remove temporary files and folders of killed processes, those of safetensors too; or
+    only those of a stem or group."""
+    recover(folder, stem)
+    for path in _temporary(folder, stem):
+        shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
+
+
+def _temporary(folder: Path, stem: str | None) -> list[Path]:
+    ours = rf"\.{'.*' if stem is None else re.escape(stem)}-[0-9a-f]{{32}}(\.\w+)?"
+    ours = ours if stem else rf"{ours}|\.tmp\w{{6}}"
+    return [path for path in folder.glob(".*") if re.fullmatch(ours, path.name)]
+
+
+def retire(folder: Path, group: str) -> None:
+    """Count a group as not made any more; its files stay until a new making replaces them, changed or not."""
+    with suppress(FileNotFoundError):
+        os.replace(list_file(folder, group), list_file(folder, group, retired=True))
+
+
+def read_about(folder: Path, group: str) -> dict[str, str] | None:
+    """What a group's list says of it, if all its files are there as they were written; else None."""
+    document = _read_list(list_file(folder, group))
+    if any(digest(folder / name) != known for name, known in document["files"].items()):
+        return None
+    return document["about"] if document["files"] else None
+
+
+def refuse_others(
+    folder: Path, names: Iterable[str] | Mapping[str, str], *, group: str = "", by_name: bool = False
+) -> None:
+    """Raise FileExistsError if files of these names are in the folder that no list has as they are.
+
+    Of a mapping, to digests, files of the same content are no obstacle. `group` names the likeliest list;
+    with `by_name` files are not read, and one whose name is listed will do.
+    """
+    new = names if isinstance(names, Mapping) else dict.fromkeys(names, "")
+    there = {name: {""} for name in new if os.path.lexists(folder / name)}
+    if not by_name:
+        there = {name: {digest(folder / name)} - {new[name]} for name in there}
+    for pattern in (group, None) if group else (None,):
+        listed = _listed(_lists(folder, pattern)) if there else {}
+        there = {
+            name: found
+            for name, found in there.items()
+            if found and not (name in listed if by_name else (found | {ANY}) & listed.get(name, set()))
+        }
+    if there:
+        shown = ", ".join(sorted(there)[:_SHOWN]) + f" and {len(there) - _SHOWN} more" * (len(there) > _SHOWN)
+        raise FileExistsError(
+            f"{folder}: has {shown}, which no run wrote, or which changed since: "
+            "give another folder or name, or move them away"
+        )
+
+
+def digest(path: Path) -> str:
+    """The SHA-256 of a file's content, in hexadecimal; of what is no file "none"."""
+    if not path.is_file():
+        return "none"
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def list_file(folder: Path, group: str, *, retired: bool = False) -> Path:
+    """The file that lists a group: it is there when the group was made; if that is `retired`, another one."""
+    return folder / LISTS / f"{group}.{'former' if retired else 'json'}"
+
+
+def _lists(folder: Path, group: str | None) -> list[Path]:
+    """The files with the lists of a group, or of all."""
+    if group is not None:
+        return [list_file(folder, group), list_file(folder, group, retired=True)]
+    return [*(folder / LISTS).glob("*.json"), *(folder / LISTS).glob("*.former")]
+
+
+def _listed(lists: Iterable[Path]) -> dict[str, set[str]]:
+    """The digests of each file's name in lists, and `ANY` if a retired one has it."""
+    listed: dict[str, set[str]] = {}
+    for path in lists:
+        for name, known in _read_list(path)["files"].items():
+            listed.setdefault(name, set()).update({known} if path.suffix == ".json" else {known, ANY})
+    return listed
+
+
+def _read_list(path: Path) -> dict[str, dict[str, str]]:
+    """A list's `about`, and `files` but for those in other folders; both empty if there is no whole list."""
+    try:
+        document = json.loads(path.read_bytes())
+        about, files = ({str(k): str(v) for k, v in document[part].items()} for part in ("about", "files"))
+    except (FileNotFoundError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
+        about, files = {}, {}
+    own = {name: known for name, known in files.items() if name not in ("", "..") and Path(name).name == name}
+    return {"about": about, "files": own}

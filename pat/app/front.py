@@ -1,0 +1,248 @@
+"""The front door: `fuse` and `align`, of images alone or with their rig, as files or tensors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import wraps
+from pathlib import Path
+from typing import NamedTuple, ParamSpec, TypeVar
+
+from torch import Tensor
+
+from arraygeom import Rig
+from arraygeom.runtime.threads import torch_in_one_thread
+
+from ..fusion.align import LEAST_CONFIDENCE, Aligned, Fill, Recorded, Resampling, align_frame
+from ..fusion.corrections import Corrections
+from ..fusion.frame import Frame
+from ..fusion.fuse import FuseSettings, Progress, fuse_frame
+from ..fusion.tiles import Plan
+from ..fusion.views import ViewFiles
+from ..matching.match import Matcher, match
+from ..media.images import Images, ImageSources
+from ..networks.protocol import FusionNetwork
+from ..networks.weights import load_weights, weights_for
+from ..support.blocks import without_autocast
+
+P, T = ParamSpec("P"), TypeVar("T")
+
+
+class _Complete(NamedTuple):
+    """All that fusing and aligning need, once what was not given is found."""
+
+    images: Images
+    rig: Rig
+    alpha: str
+    network: FusionNetwork
+    settings: FuseSettings
+    found: bool
+    """Whether the rig was found from the images."""
+
+
+def _images_first(function: Callable[P, T]) -> Callable[P, T]:
+    """The function, with a TypeError that says the order for a network or a rig in the images' place."""
+
+    @wraps(function)
+    def checked(*args: P.args, **kwargs: P.kwargs) -> T:
+        if len(args) > 2 or (args and isinstance(args[0], FusionNetwork | Rig)):
+            name = function.__name__
+            raise TypeError(f"images come first, then the rig: {name}(images, rig, alpha=NAME, network=...)")
+        return function(*args, **kwargs)
+
+    return checked
+
+
+@_images_first
+@torch_in_one_thread()
+@without_autocast()
+def fuse(
+    images: ImageSources,
+    rig: Rig | str | Path | None = None,
+    *,
+    alpha: str | None = None,
+    network: FusionNetwork | str | Path | None = None,
+    settings: FuseSettings = FuseSettings(),
+    corrections: Corrections | None = None,
+    explain: Callable[[str], None] | None = None,
+    progress: Progress | None = None,
+    announce: Callable[[Plan], None] | None = None,
+    store: Path | None = None,
+    differentiable: bool = False,
+    matcher: Matcher = match,
+) -> Frame:
+    """Fuse one frame at camera `alpha`'s view.
+
+    Without a rig it is found from the images as by `pat fuse`, noise is looked for, and depths are multiples
+    of the baseline. Frames too large for the memory allowed are fused in tiles of alpha, each with the part
+    of every beta that its segments touch, and a halo: equal to the whole to 1e-4. Distorted images are first
+    resampled to pinhole views (`pat.fusion.steps.undistort`), rotated betas made upright, and betas resized
+    to alpha's angular resolution; the result is at alpha's own pixels all the same. Where alpha is known to
+    measure the luminance of linear light and one beta the colours, the result is as bright in that sense
+    (`pat.media.raw.match_luminance`).
+
+    Args:
+        images: an image of each camera by name: files, or tensors (C, H, W) in 0..1; or files alone, which
+            name the cameras. Of tensors a mapping that reads them when asked saves memory.
+        rig: the cameras, or their file. Those without an image are left out. Files are developed as it says.
+        alpha: the camera whose view is wanted; without a rig by default the largest grey image.
+        network: weights by name or file, or a network; by default "mono-colour" for betas in colour, else
+            "mono-spectral".
+        settings: what frames of the same cameras have in common.
+        corrections: what is known of response and alignment from another frame of the same cameras
+            (`corrections_of`), instead.
+        explain: called with a line for each thing that was found and put right.
+        progress: shows the tiles as they are done.
+        announce: called with the plan before the work begins; the time of a large frame is estimated by
+            fusing a piece.
+        store: a folder for finished tiles of a frame of several, so that one that was stopped goes on;
+            tiles of other images, rigs or weights are not taken. The caller deletes it.
+        differentiable: keep gradients with respect to the numbers of the rig, the images and the network's
+            weights (which `requires_grad_(True)` frees). A match moves along its segment as images and rig
+            move the best agreement around it; which match is the best, the alignment and the response are
+            constants. Else the frame is detached, whatever requires gradients.
+        matcher: what finds the matches of a network that uses some: `pat.matching.match.match`, or your own.
+
+    Raises:
+        ValueError: a camera that the rig lacks, an image of another size, a rig whose views do not overlap,
+            bands that the network does not make, `differentiable` with a memory limit, `store` or noise;
+            without a rig, images that do not show the same things.
+        NotImplementedError: within a transformation of `torch.func`.
+
+    Warns:
+        LowConfidenceWarning: the images hardly match: the rig is probably wrong. A filter makes it an error,
+            as `warnings.simplefilter("error", LowConfidenceWarning)`.
+    """
+    known = _known(images, rig, alpha, network, settings, explain)
+    if known.found and settings.luminance == "alpha" and not differentiable and settings.noise is None:
+        known = known._replace(settings=replace(known.settings, noise="auto"))
+    return fuse_frame(
+        known.images,
+        known.rig,
+        alpha=known.alpha,
+        network=known.network,
+        settings=known.settings,
+        corrections=corrections,
+        explain=explain,
+        progress=progress,
+        announce=announce,
+        store=store,
+        differentiable=differentiable,
+        matcher=matcher,
+    )
+
+
+@_images_first
+@torch_in_one_thread()
+@without_autocast()
+def align(
+    images: ImageSources,
+    rig: Rig | str | Path | None = None,
+    *,
+    alpha: str | None = None,
+    network: FusionNetwork | str | Path | None = None,
+    settings: FuseSettings = FuseSettings(),
+    recorded: Recorded | None = None,
+    interpolation: Resampling = "bilinear",
+    min_confidence: float = LEAST_CONFIDENCE,
+    fill: Fill = "none",
+    explain: Callable[[str], None] | None = None,
+    progress: Progress | None = None,
+    announce: Callable[[Plan], None] | None = None,
+    matcher: Matcher = match,
+) -> Aligned:
+    """Every camera's own values at the pixels of camera `alpha`.
+
+    Arguments that are not named here are as of `fuse`; of the settings `keep_alpha` and `luminance` have no
+    effect. They serve to find where alpha's pixels are in each beta. A pixel counts as occluded where the
+    confidence that beta sees its point, and there, is low.
+
+    Args:
+        network: the one whose confidence is taken, which must use matches.
+        recorded: the values to align, by camera, (C, H, W) of any type, as large as the images; by default
+            the images.
+        interpolation: "nearest" keeps recorded values, "bilinear" and "cubic" are between them; of integers
+            rounded.
+        min_confidence: from which confidence on a camera counts as seeing a point, 0 to 1.
+        fill: "none" invents no values; "propagate" gives pixels that a camera does not see its nearest seen
+            value.
+
+    Raises ValueError as `fuse`, for a network that uses no matches, and for recorded values that are missing,
+    no numbers, or of another size than the rig says.
+    """
+    known = _known(images, rig, alpha, network, settings, explain)
+    return align_frame(
+        known.images,
+        known.rig,
+        alpha=known.alpha,
+        network=known.network,
+        settings=known.settings,
+        recorded=recorded,
+        interpolation=interpolation,
+        min_confidence=min_confidence,
+        fill=fill,
+        explain=explain,
+        progress=progress,
+        announce=announce,
+        matcher=matcher,
+    )
+
+
+def _known(
+    images: ImageSources,
+    rig: Rig | str | Path | None,
+    alpha: str | None,
+    network: FusionNetwork | str | Path | None,
+    settings: FuseSettings,
+    explain: Callable[[str], None] | None,
+) -> _Complete:
+    """Images as tensors, the rig, alpha, the network and settings: as given, or found."""
+    if not isinstance(settings, FuseSettings):
+        raise TypeError(f"settings are a {type(settings).__name__}: give FuseSettings(depth=..., noise=...)")
+    say = explain or (lambda line: None)
+    if rig is None:
+        from .from_images import array_from_images
+
+        weights = str(network) if isinstance(network, str | Path) else None
+        array = array_from_images(images, alpha=alpha, weights=weights, say=say)
+        settings = replace(settings, match_levels=settings.match_levels or array.match_levels)
+        ready = _loaded(array.weights if network is None else network)
+        return _Complete(array.images, array.rig, array.alpha, ready, settings, found=True)
+    rig = Rig.load(rig) if isinstance(rig, str | Path) else rig
+    if not isinstance(rig, Rig):
+        raise TypeError(f"the rig is a {type(rig).__name__}: give a Rig, or its file")
+    if alpha is None:
+        raise ValueError(f"alpha: give the camera whose view is wanted, one of {', '.join(rig.names)}")
+    shown, rig = _with_images(images, rig, rig.require(alpha))
+    if network is None:
+        betas = (shown[name] for name in rig.betas(alpha) if name in shown)
+        network = weights_for([len(image) for image in betas if isinstance(image, Tensor)])
+        say(f"weights: {network}")
+    return _Complete(shown, rig, alpha, _loaded(network), settings, found=False)
+
+
+def _loaded(network: FusionNetwork | str | Path) -> FusionNetwork:
+    """The network itself, or that of weights by name or file."""
+    if isinstance(network, str | Path):
+        return load_weights(network)
+    if not isinstance(network, FusionNetwork):
+        raise TypeError(
+            f"network is a {type(network).__name__}: give the name or file of weights, or a network"
+        )
+    return network
+
+
+def _with_images(images: ImageSources, rig: Rig, alpha: str) -> tuple[Images, Rig]:
+    """The images, of files developed as the rig says, and the rig that describes them."""
+    if not isinstance(images, Mapping):
+        from .from_images import by_camera
+
+        images = by_camera(images)
+    # a mapping that is no dict reads its images when asked
+    files = {n: x for n, x in images.items() if isinstance(x, str | Path)} if isinstance(images, dict) else {}
+    if not files:
+        return images, rig
+    for name in files:
+        rig.require(name)
+    views = ViewFiles(rig, files, alpha=alpha)
+    return {**images, **views}, views.developed

@@ -1,0 +1,91 @@
+"""Depth by dense matches of one beta alone, no image: what finding a rig refines it by."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import reduce
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from arraygeom import Rig
+from arraygeom.runtime.chunks import whole
+from arraygeom.runtime.threads import torch_in_one_thread
+from arraygeom.sampling import on_image
+
+from ..matching.inputs import Inputs
+from ..matching.match import match
+from ..matching.matches import Matches
+from ..matching.positions import Extent
+from ..matching.positions import matches as matches_at
+from ..matching.radiometry import Response
+from ..media.images import Images
+from ..networks.protocol import FusionOutput, JoinsBands, required
+from ..support.blocks import without_autocast
+from .corrections import Corrections
+from .depth_edges import beside_edges
+from .depth_filling import background_filled
+from .inputs import prepared
+from .steps import steps_for, undone
+from .tiles import fused_in_tiles
+from .views import Views
+
+AROUND = [step / 2 for step in range(-6, 7)]
+"""Pixels along the segment from a match, one of which is on beta's image where the match says something."""
+
+
+class MatchedDepth(NamedTuple):
+    """Depth (H, W) at alpha's pixels, NaN where unknown, and its confidence, as of `Frame`."""
+
+    depth: Float[Tensor, "h w"]
+    confidence: Float[Tensor, "h w"]
+
+
+class MatchesAlone:
+    """A `FusionNetwork` whose image is alpha, and whose positions and confidences are the matches'."""
+
+    uses_matches = equal_resolution = True
+    keeps_luminance = False
+    halo, beta_halo, multiple = 0, 96, 16
+    joins_bands: JoinsBands = "no"
+
+    def __init__(self, bands: int | None) -> None:
+        self.bands = bands
+
+    def working_bytes(self, alpha: int, betas: Sequence[int]) -> float:
+        """None beside the matches."""
+        return 0.0
+
+    def __call__(self, inputs: Inputs, matches: Matches | None = None) -> FusionOutput:
+        """Alpha's image and the matches. Raises ValueError without them."""
+        positions, confidences = [], []
+        for beta, matched in zip(inputs.betas, required(matches, inputs).betas):
+            hw = beta.image.shape[-2], beta.image.shape[-1]
+            segments = beta.field.straight.to(inputs.alpha.device, torch.float64)
+            positions.append(matched.positions(segments, hw)[0].movedim(-1, 1))
+            middle, towards = matches_at(segments, matched.disparity), Extent.of(segments).towards
+            near = (on_image(middle + step * towards, hw) for step in AROUND)
+            confidences.append(reduce(torch.logical_or, near).to(inputs.alpha))
+        return FusionOutput(inputs.alpha, positions, [0 * c for c in confidences], confidences)
+
+
+@torch_in_one_thread()
+@without_autocast()
+@torch.no_grad()
+def matched_depth(images: Images, rig: Rig, *, alpha: str, bands: int | None) -> MatchedDepth:
+    """Depth at alpha's pixels by matches. With `bands`, the number of beta's, alpha is compared with their
+    luma; with None with the combination of them that is most like it.
+
+    Raises ValueError as `fuse_frame` for images that do not fit the rig, and views that do not overlap.
+    """
+    network = MatchesAlone(bands)
+    views = Views.of(rig, images, alpha=alpha)
+    inputs, undo = prepared(network, views, steps_for(network, normalise=False))
+    as_they_are = Corrections(Response.rec601()).applied(inputs.inputs, inputs.hw)
+    inputs = inputs._replace(inputs=as_they_are)
+    matches = match(as_they_are)
+    frame = fused_in_tiles(network, inputs, matches, [whole(inputs.hw)], keep_matched=False).frame
+    depth = beside_edges(background_filled(frame, inputs), frame, inputs)
+    return MatchedDepth(*undone(frame._replace(depth=depth), undo)[1:3])
