@@ -92,6 +92,11 @@ class Corrections:
     def described(self, hw: HW) -> list[str]:
         """A line for each thing that is put right; `hw` is alpha's size."""
         lines = [] if self.response.is_rec601 else [str(self.response)]
+        if self.response.exchanged:
+            lines.append(
+                "beta's red and blue look exchanged: alpha fits them the other way round. Is the file BGR, "
+                "or `bayer` another one, such as RGGB for BGGR?"
+            )
         for name, move in self.misalignments.items():
             if move != Misalignment():
                 off = f"'{name}' is up to {move.largest(hw):.1f} px off its search segments"

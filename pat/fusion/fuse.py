@@ -36,7 +36,7 @@ from .low_light import LowLight, Noise, check_noise, denoised_views
 from .luminance import SHARES, Luminance, check_luminance, with_alpha_detail, with_own_colours
 from .steps import Undo, steps_for, undone
 from .tiles import LARGE, Plan, fused_in_tiles, plan_frame
-from .views import Views, check_bands
+from .views import Views, check_bands, check_dense
 
 LOG = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -196,6 +196,7 @@ def ready_frame(
     """
     say = explain or (lambda line: None)
     views = Views.of(rig, images, alpha=alpha, depth=settings.depth, field=settings.field)
+    check_dense(views, settings.limit)
     views, low_light = denoised_views(views, settings.noise)
     check_bands(views, network.bands)
     if settings.noise == "auto" and low_light.noisy:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +14,19 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from arraygeom import Curved, Epipolar, Moved, Pair, ReceptiveField, Rig, Sensor, ThroughLenses, Widened
+from arraygeom import (
+    Band,
+    Curved,
+    Dense,
+    Epipolar,
+    Moved,
+    Pair,
+    ReceptiveField,
+    Rig,
+    Sensor,
+    ThroughLenses,
+    Widened,
+)
 from arraygeom.batching import tensors_of
 from arraygeom.pixels import HW
 from arraygeom.runtime.warned import warn
@@ -103,6 +116,25 @@ def innermost(field: ReceptiveField | None) -> ReceptiveField | None:
     while isinstance(field, Widened | Moved):
         field = field.field
     return field
+
+
+def dense_bytes(alpha: HW, beta: HW, stride: int = 1) -> float:
+    """Bytes of the positions that the dense field has for every 2 x 2 pixels of alpha."""
+    return math.prod(alpha) / 4 * math.prod(beta) / stride**2 * 8
+
+
+def check_dense(views: Views, limit: float | None) -> None:
+    """Raise ValueError if a dense field takes more than a limit (bytes), or than this machine has."""
+    has = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") if os.name == "posix" else math.inf
+    most, (h, w) = limit or has, views.rig[views.alpha].hw
+    for name in views.betas:
+        field, beta = innermost(views.fields.get(name)), views.rig[name].hw
+        if isinstance(field, Dense) and (needed := dense_bytes((h, w), beta, field.stride)) > most:
+            raise ValueError(
+                f"the dense field of {w}x{h} pixels in {beta[1]}x{beta[0]} of '{name}' takes "
+                f"{needed / 2**30:.1f} GiB, and there are {most / 2**30:.1f}: reduce the images, or take "
+                "another field"
+            )
 
 
 LARGEST_VALUE = 32.0
@@ -279,8 +311,27 @@ def read_view(
     turned: Literal["apply", "ignore"] = "ignore" if raw else "apply"
     image = read_image(path, name=name, bits=view.sensor.bits, hw=hw, orientation=turned)
     image = recorded_bands(image, view.sensor)
+    _warn_of_contradictions(image, view.sensor, f"{name}: {path}")
     if view.sensor.bayer and image.shape[0] != 1:
         raise ValueError(
             f"{name}: {path}: is in colour, and the rig says raw {view.sensor.bayer}: drop 'bayer'"
         )
     return develop(image, view.sensor, like=like)
+
+
+SATURATED = 0.1
+"""Share of an image's pixels at the largest value from which that is said."""
+
+
+def _warn_of_contradictions(image: Float[Tensor, "c h w"], sensor: Sensor, label: str) -> None:
+    """Warn of an image that is saturated, or in colour where the rig states one band."""
+    share = float((image >= 1).any(0).float().mean())
+    if share > SATURATED:
+        warn(f"{label}: {share:.0%} of its pixels are saturated: they have no detail to match: expose less")
+    stated = sensor.response
+    if len(image) == 3 and (isinstance(stated, Band) or stated in SINGLE_BANDS) and is_in_colour(image):
+        warn(f"{label}: is in colour, and the rig says response {stated}: give that band, or state rgb")
+
+
+SINGLE_BANDS = ("mono", "nir", "red", "green", "blue")
+"""Names of responses of one band."""

@@ -39,6 +39,7 @@ class ResponseSettings:
     prior: float = tuned(0.2, "Middlebury: standard deviation of weights about these")
     negative: float = physics(0.05, "Of negative weights, which no sensor has")
     exposure: float = physics(0.5, "Of a gain, a share of it: of a stop to either side")
+    exchanged: float = physics(0.06, "Of a luma's weights, as of a fit on few colours")
     bend: float = physics(0.35, "Of a gamma's logarithm: from 1 / 2.2 to 2.2 are 2.2 of it to either side")
     vignetting: float = physics(
         0.3, "Of the coefficients of its logarithm: cos^4 of 30 degrees in the corners is .6"
@@ -103,6 +104,13 @@ class Response(NamedTuple):
     def explains(self) -> bool:
         """Whether this is about what alpha sees."""
         return self.explained >= SETTINGS.explained
+
+    @property
+    def exchanged(self) -> bool:
+        """Whether alpha is the luma of beta with red and blue exchanged, and not that of beta as it is."""
+        luma = self.weights.new_tensor(REC601)
+        off, other = ((luma - weights).abs().max() for weights in (self.weights, self.weights.flip(0)))
+        return self.explains and bool(other < SETTINGS.exchanged < off / 2)
 
     def __str__(self) -> str:
         red, green, blue = self.weights.tolist()

@@ -42,8 +42,10 @@ from .headers import HW, ImageHeader, image_header
 from .profiles import in_srgb, with_srgb_profile
 from .suffixes import RAW_SUFFIXES
 
-FEW_BITS = (8, 10, 12)
+FEW_BITS = (8, 10, 12, 14)
 """Bits of cameras that may be stored in 16 bits as they are."""
+HIGHLIGHTS = 0.98 * 2**14
+"""The largest value of an image that has highlights, of 14 bits."""
 CHANNELS = "give a grey (1) or RGB (3) image"
 KINDS = "save it with 8 or 16 bits without sign, or as float 0..1"
 DECODED = ("bool", "uint8", "uint16", "float32", "float64")
@@ -363,10 +365,12 @@ def _counts(planes: NDArray, label: str, bits: int | None, white: int) -> NDArra
         )
     if largest > white:
         raise ValueError(f"{label}: has values up to {largest}, its header says {white}: save it again")
-    if white == 2**16 - 1 and not bits and 0 < largest < 2 ** max(FEW_BITS):
+    few = 0 < largest < 2**12 or HIGHLIGHTS <= largest < 2**14
+    if white == 2**16 - 1 and not bits and few:
         needed = next(n for n in FEW_BITS if largest < 2**n)
+        black = "nearly black" if needed < 14 else "dark, with the highlights of a camera of 14 bits"
         warn(
-            f"{label}: has 16 bits a value, and none above {largest}, so it is nearly black: "
+            f"{label}: has 16 bits a value, and none above {largest}, so it is {black}: "
             f"if its camera counts to {2**needed - 1}, state `bits: {needed}` in the rig file, "
             f"or save it with its values times {65535 // (2**needed - 1)}"
         )

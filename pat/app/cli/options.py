@@ -55,6 +55,10 @@ def response_of(text: str) -> Any:
         raise ValueError(
             f"--response: '{text}' is neither 'fit' nor 'rec601' nor R,G,B, such as 0.33,0.33,0.33"
         ) from None
+    if not 0.8 <= red + green + blue <= 1.25:  # an exposure is fitted or stated, not a part of the weights
+        raise ValueError(
+            f"--response: {text} add up to {red + green + blue:.3g}: give weights that add up to 1"
+        )
     return red, green, blue
 
 

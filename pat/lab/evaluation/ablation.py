@@ -52,6 +52,7 @@ from arraygeom.segments import clip_to_image
 from ...fusion.classical import classical
 from ...fusion.fuse import FuseSettings, fuse_frame
 from ...fusion.steps import resolution_ratio
+from ...fusion.views import dense_bytes
 from ...media.colour import luminance, srgb_image
 from ...media.depth_maps import at_distance
 from ...media.figures import save_panels
@@ -280,7 +281,8 @@ def _case(
         notes["classical"] = str(error)
     for name, family in chosen.items():
         rig = family.assumed(case.rig, Generator().manual_seed(crc32(case.name.encode())))
-        if isinstance(family.field(far), Dense) and (needed := dense_bytes(rig)) > DENSE_LIMIT:
+        needed = dense_bytes(rig[ALPHA].hw, rig[BETA].hw)
+        if isinstance(family.field(far), Dense) and needed > DENSE_LIMIT:
             notes[name] = f"does not fit: {needed / 2**30:.0f} GiB of positions"
             continue
         LOG.info("%s: %s", case.name, name)
@@ -311,11 +313,6 @@ def point_errors(case: AblationCase, depth: Float[Tensor, "h w"]) -> tuple[float
         return math.nan, math.nan
     error = (ours.x - theirs.x).norm(dim=-1)[compared]
     return float(error.mean()), float((error <= 1).sum() / has_truth.sum())
-
-
-def dense_bytes(rig: Rig) -> float:
-    """What explicit positions of the dense field take."""
-    return math.prod(rig[ALPHA].hw) / 4 * math.prod(rig[BETA].hw) * 8
 
 
 def markdown(rows: Sequence[AblationRow]) -> str:
