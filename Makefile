@@ -29,7 +29,7 @@ help:
 	@echo "make fuzz       read 6,000 damaged files, each in a process of its own; the table of docs/fuzzing.md"
 	@echo "make kills      end commands with SIGKILL some 100 times, continue and compare; the table of docs/kills.md"
 	@echo "make transformations  torch's transformations of every operator; the table of docs/transformations.md"
-	@echo "make train      train on the images at hand; ARGS=... goes to 'pat train'"
+	@echo "make train      train on the images at hand; ARGS=... goes to 'pat lab train'"
 	@echo "make synthesis  adds Blender to the environment (some 400 MB), to render scenes"
 	@echo "make notebooks  run the notebooks and keep what they put out"
 	@echo "make docs       the documentation as a site, in out/site"
@@ -132,7 +132,7 @@ wheel:
 	@$(PYTHON) tests/wheel/run.py --python $(or $(PYTHONS),$(PYTHON)) $(ARGS)
 
 train: $(READY)
-	@$(BIN)/pat train $(ARGS)
+	@$(BIN)/pat lab train $(ARGS)
 
 # An environment that works is kept and brought up to date; one that does not is made anew. torch goes first, alone
 # and by its exact version, so that nothing else chooses a build of it.

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
-import tyro
 from torch.nn.functional import interpolate
-from tyro.conf import UseAppendAction
 
 from arraygeom.runtime.atomic import write_text
+from pat.app.cli.parser import Option, script
 from pat.media.images import read_image, write_image
 
 
@@ -19,7 +19,7 @@ class Readme:
 
     document: Path = Path("docs/results.md")
     """The document to bring up to date."""
-    block: UseAppendAction[tuple[str, ...]] = ()
+    block: Annotated[tuple[str, ...], Option(repeat=True)] = ()
     """NAME=FILE, once for each block."""
     image: tuple[Path, Path] | None = None
     """An image to take over at 3/4 of its size, and the name to give it."""
@@ -56,4 +56,4 @@ def without_images(text: str) -> str:
 
 
 if __name__ == "__main__":
-    tyro.cli(Readme).run()
+    script(Readme).run()

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
-from tyro.conf import Positional, arg
-
 from pat.app.cli.main import main
-from pat.app.cli.options import MaybeOut, MaybePath, Memory, Out, Weights, progress, say, working, writable
+from pat.app.cli.options import MaybeOut, Memory, Out, Weights, progress, say, working, writable
+from pat.app.cli.parser import Option
 from pat.lab.data.windows import scene_folders
 from pat.sensors import seed_for
 from pat.support.schema import read_yaml
@@ -77,13 +76,13 @@ class SystemsRun:
     Example: python -m experiments systems run fast-slow --out out/fast-slow
     """
 
-    name: Positional[str]
+    name: Annotated[str, Option(positional=True)]
     """One of the names that `python -m experiments systems list` prints."""
     full: bool = False
     """At the full size of the paper's cameras; by default reduced, minutes on two cores."""
     scene: Literal["layered", "rendered"] = "layered"
     """Photographs on planes; or a still life (visible-nir: landscape) rendered by Blender, as one sees it."""
-    recording: MaybePath = None
+    recording: Path | None = None
     """For fast-slow: the paper's frames, not a rendered scene: a folder with pillow_1 and the matrices."""
     out: MaybeOut = None
     """Folder for the results; by default out/systems/NAME."""
@@ -117,10 +116,10 @@ class Systems:
 class Record:
     """Record rendered scenes as their cameras would: of each scene images and a rig, for `pat fuse`."""
 
-    folder: Annotated[Positional[Path], arg(metavar="FOLDER", help="Folder written by `pat render`.")]
+    folder: Annotated[Path, Option("FOLDER", "Folder written by `pat lab render`.", positional=True)]
     out: Out = Path("out/recorded")
     """Folder for a folder of each scene."""
-    sensors: MaybePath = None
+    sensors: Path | None = None
     """File (YAML) with a list of steps for each camera, instead of those that follow from their responses."""
     seed: int = 0
     """Of the noise."""

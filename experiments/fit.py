@@ -13,13 +13,13 @@ from statistics import fmean
 from typing import Any
 
 import torch
-import tyro
 import yaml
 from torch import Tensor, nn
 from torch.optim import Adam
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from arraygeom.runtime.atomic import write_text
+from pat.app.cli.parser import parse
 from pat.lab.training.checkpoints import collect, newest_checkpoint, restore, write_checkpoint
 from pat.support.locks import folder_lock
 from pat.support.schema import from_document, read_yaml, to_document
@@ -108,7 +108,7 @@ def command(train: Callable[[Any], Path], recipe: type[Recipe], prog: str) -> No
     arguments = sys.argv[1:]
     try:
         base = read_recipe(recipe, arguments.pop(0)) if arguments and arguments[0][:1] != "-" else None
-        config = tyro.cli(recipe, prog=prog + " [RECIPE.yaml]", default=base, args=arguments)
+        config = parse(recipe, arguments, prog=prog + " [RECIPE.yaml]", base=base)
         print(train(config))
     except (ValueError, OSError) as error:
         sys.exit(f"{prog}: {error}")

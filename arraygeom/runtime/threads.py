@@ -7,29 +7,18 @@ processes.
 
 from __future__ import annotations
 
-import math
 import os
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from contextvars import ContextVar
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any
 
 import torch
-from torch import Tensor
-from torch.overrides import TorchFunctionMode
 
 from .tracing import followed
-
-WORTH_STRIPS = 10**8
-"""Multiplications of a convolution from which on strips are worth their while: some milliseconds."""
-STRIPS = 2
-"""Strips for each thread: other processes may take one's core."""
-
-_SLEEPING = os.environ.get("OMP_WAIT_POLICY", "").upper() == "PASSIVE"
-"""Whether torch's own threads sleep, too, while they wait, as where a command loads it."""
 
 _ALLOWED: ContextVar[int | None] = ContextVar("threads", default=None)
 
@@ -59,52 +48,6 @@ def torch_in_one_thread() -> Iterator[None]:
             yield
         finally:
             _ALLOWED.reset(allowed)
-
-
-@contextmanager
-def convolutions_in_parallel() -> Iterator[None]:
-    """Within `torch_in_one_thread`: compute convolutions on all `threads`.
-
-    Those without gradients in strips of rows by the pool's threads, which sleep where they wait; others by
-    torch's.
-    """
-    with _InStrips() if threads() > 1 else nullcontext():
-        yield
-
-
-class _InStrips(TorchFunctionMode):
-    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        if func is not torch.conv2d or kwargs or len(args) != 7:
-            return func(*args, **(kwargs or {}))
-        if _SLEEPING or torch.is_grad_enabled() or torch.is_autocast_enabled("cpu"):
-            with _torch_threads(threads()):
-                return func(*args)
-        return _convolved(*args)
-
-
-def _convolved(
-    x: Tensor, weight: Tensor, bias: Any, stride: Any, padding: Any, dilation: Any, groups: int
-) -> Tensor:
-    """`torch.conv2d` but for rounding; of one large image in strips of rows, each with the rows around it."""
-    further = bias, stride, padding, dilation, groups
-    plain = x.device.type == "cpu" and tuple(stride) == (1, 1) and not isinstance(padding, str)
-    if not plain or len(x) != 1 or weight[0].numel() * len(weight) * x[0, 0].numel() < WORTH_STRIPS:
-        return torch.conv2d(x, weight, *further)
-    reach, above = dilation[0] * (weight.shape[2] - 1), padding[0]
-    width = x.shape[3] + 2 * padding[1] - dilation[1] * (weight.shape[3] - 1)
-    order = torch.contiguous_format if x.is_contiguous() and weight.is_contiguous() else torch.channels_last
-    shape = 1, len(weight), x.shape[2] + 2 * above - reach, width
-    out = torch.empty(shape, dtype=x.dtype, memory_format=order)
-    rows = math.ceil(out.shape[2] / (STRIPS * threads()))
-
-    def strip(top: int) -> None:
-        bottom = min(top + rows, out.shape[2])
-        first = max(top - above, 0)
-        convolved = torch.conv2d(x[:, :, first : max(bottom - above + reach, first + 1)], weight, *further)
-        out[:, :, top:bottom] = convolved[:, :, top - first : bottom - first]
-
-    in_parallel([partial(strip, top) for top in range(0, out.shape[2], rows)])
-    return out
 
 
 def in_parallel(tasks: Sequence[Callable[[], Any]], *, most: int | None = None) -> list[Any]:

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from arraygeom import Rig, View, intrinsics
+from arraygeom import Link, Rig, View, intrinsics
 from arraygeom.runtime.progress import part, stage
 from arraygeom.runtime.text import OPEN
 from arraygeom.runtime.threads import torch_in_one_thread
@@ -121,6 +121,13 @@ def rig_from_images(
     if not all(explanation.has_lines for explanation in explained.values()):
         rig = rig.replace(name=OPEN)
     return UncalibratedRig(rig, fits, distance, by_focal, explained, matched)
+
+
+def link_of_points(rig: Rig, pair: tuple[str, str], points: PointMatches) -> Link:
+    """F and a map of a pair by its points: the homography that explains them all, if one does."""
+    link = fit_link(points, fit_fundamental(points), within=AGREE).link
+    explained = explain(points, rig.replace(links={pair: link}).pair(*pair))
+    return link if explained.has_lines else link.replace(H=explained.H)
 
 
 def _fundamental(

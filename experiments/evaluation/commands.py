@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar
 
-from tyro.conf import arg
-
 from arraygeom.runtime.atomic import write_text
 from experiments.names import refuse_unknown
-from pat.app.cli.options import MaybePath, Out, Weights, progress, say, writable
+from pat.app.cli.options import Out, Weights, progress, say, writable
+from pat.app.cli.parser import Option
 from pat.fusion.fuse import FuseSettings
 from pat.lab import commands as research
 from pat.lab.data.pairs import StereoPair, middlebury_pairs
@@ -70,7 +69,7 @@ class Pairs(research.StereoSets):
 
 @dataclass
 class Evaluate(Pairs, research.Evaluate):
-    """As `pat evaluate`, by the paper's protocols, of one half of the pairs, with controls, without a rig.
+    """As `pat lab evaluate`, by the paper's protocols, of one half of the pairs, with controls, rigless.
 
     Example: python -m experiments evaluate --middlebury data/middlebury --half report --controls
     """
@@ -151,7 +150,7 @@ class Certainty(Pairs):
     """Pairs that take part: it is fitted to tune."""
     conditions: tuple[str, ...] = ()
     """Of the conditions, by name; those on which it was fitted if none is given."""
-    fit: MaybePath = None
+    fit: Path | None = None
     """Fit to these pairs, and write that here."""
     choices: tuple[Path, ...] = ()
     """Files of choices trained without some pairs: a pair is judged by one that has not seen it."""
@@ -202,7 +201,7 @@ class OnScenes:
         if not isinstance(network, Comparing):
             raise ValueError(
                 f"--weights {self.weights}: "
-                "this network matches without attention, too: `pat ablate` takes it"
+                "this network matches without attention, too: `pat lab ablate` takes it"
             )
         if network.betas not in (1, 3):
             wanted = "give some for one beta in colour, or for three with a band each"
@@ -230,7 +229,7 @@ class Sweeps(OnScenes):
 
     sweeps: tuple[str, ...] = ()
     """Of rotation, "principal point", baseline, "focal ratio" and ahead; all by default."""
-    hw: Annotated[tuple[int, int], arg(metavar="H W")] = (96, 128)
+    hw: Annotated[tuple[int, int], Option("H W")] = (96, 128)
     """Height and width of both images."""
 
     def run(self) -> None:
@@ -248,7 +247,7 @@ class Sweeps(OnScenes):
 class Fields(OnScenes):
     """Every field of the toolkit, with time and memory: unrectified, rectified, the same with F alone."""
 
-    middlebury: MaybePath = None
+    middlebury: Path | None = None
     """Folder of Middlebury's pairs with true disparity; those of the report half."""
 
     def run(self) -> None:

@@ -11,7 +11,7 @@ from arraygeom import HomographyDisplacement
 from arraygeom.runtime.atomic import write_text
 from experiments.showcase import FAST, SCENE, SLOW, FastSlowArray, bright_gain, fast_and_slow_array
 from experiments.system import SystemResult, files_of, flicker, fused_frames
-from pat.app.cli.fuse import with_sensor
+from pat.app.cli.fusing import with_sensor
 from pat.fusion.frame import Frame
 from pat.fusion.fuse import FuseSettings
 from pat.fusion.results import save_frame

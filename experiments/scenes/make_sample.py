@@ -7,10 +7,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import torch
-import tyro
 
 from arraygeom import Camera, Pose, Rig, Sensor, intrinsics, rotation_from_vector
 from arraygeom.pair import depth_range
+from pat.app.cli.parser import script
 from pat.app.sample_array import ALPHA, BETA, SAMPLE
 from pat.lab.synthesis.blender import RenderSettings, render
 from pat.media.colour import luminance, srgb_from_linear
@@ -60,4 +60,4 @@ def main(out: Path = SAMPLE, seed: int = 2, samples: int = 64) -> None:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    script(main)

@@ -1,4 +1,4 @@
-"""Many frames, and sequences, from folders to a folder: `pat fuse` with more than one image a camera.
+"""Many frames, and sequences, from folders to a folder: `pat batch` and `pat sequence`.
 
 Every frame is a task of its own, whose files are swapped in with the list of them (`write_together`);
 `settings.yaml` beside the images says what they were made with, and a job is resumed with the same settings
@@ -102,7 +102,7 @@ class Batch:
         if not self.sequence and len({len(files) for files in self.files.values()}) > 1:
             counts = ", ".join(f"{len(files)} of '{name}'" for name, files in self.files.items())
             raise ValueError(
-                f"frames need as many images of each camera, got {counts}; or is it a --sequence?"
+                f"frames need as many images of each camera, got {counts}; or is it for `pat sequence`?"
             )
 
     @cached_property
@@ -254,7 +254,7 @@ class Batch:
             return KeyColour(**read_tensors(file)[0]) if file.exists() else None
         except ValueError as error:
             image = self.files[self.alpha][key.alpha]
-            raise ValueError(f"{image}: its colour, {error}: fuse again without --resume") from None
+            raise ValueError(f"{image}: its colour, {error}: begin again without --resume") from None
 
     def fuse_key(self, key: KeyFrame) -> None:
         """Write the colour of a key frame."""

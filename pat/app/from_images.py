@@ -12,17 +12,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.linalg import LinAlgError
 from torch.nn.functional import interpolate
 
-from arraygeom import Link, Rig, Sensor
+from arraygeom import LensView, Link, Rig, Sensor, View
 from arraygeom.io.xmp import named_by_band, rig_of_images, states_cameras
 from arraygeom.runtime.progress import log_step, part, stage
 from arraygeom.runtime.text import ASSUMED, OPEN, UNSCALED
 from arraygeom.undistortion import pixels_between
 from calib.images.focal_length import common_focal_length
-from calib.images.from_images import UncalibratedRig, rig_from_images
+from calib.images.from_images import UncalibratedRig, link_of_points, rig_from_images
 from calib.images.known_intrinsics import centres_found
 from calib.images.lenses import describe_lenses
 from calib.images.self_calibration import RefinedPair, joined, refined_by_depth, self_calibrated
@@ -128,7 +130,12 @@ def array_from_images(
         sensors = {name: Sensor({1: "mono", 3: "rgb"}.get(len(images[name]))) for name in names}
         recorded = rig = _with_sensors(rig, sensors)
     else:
-        rig, names = _translated_rig(tagged, images, alpha, note)
+        try:
+            rig, names = _translated_rig(tagged, images, alpha, note)
+        except (ValueError, LinAlgError) as error:
+            why = "too little parallax" if isinstance(error, LinAlgError) else str(error).partition(":")[0]
+            note(f"no depth ({why}): maps between the bands by matched points")
+            rig, names = _mapped_rig(tagged, images, alpha, note)
         recorded = _with_sensors(rig, {name: tagged[name].sensor for name in names})
     images = {name: images[name] for name in names}
     weights = weights or _weights_of(images, alpha)
@@ -236,6 +243,36 @@ def _translated_rig(tagged: Rig, images: Images, alpha: str, note: Say) -> tuple
     rig, names = developed_rig(tagged, images), [alpha, *translated.betas(alpha)]
     cameras = {name: rig[name].replace(cam_from_world=translated[name].cam_from_world) for name in names}
     return Rig(cameras, depth=translated.depth, name=UNSCALED), names
+
+
+def _mapped_rig(tagged: Rig, images: Images, alpha: str, note: Say) -> tuple[Rig, list[str]]:
+    """The cameras of tags without poses: their lenses, and F and a homography by points, where those match.
+
+    A scene without parallax, as from a drone, leaves translations open and needs none.
+    """
+    straight, pinhole = without_lenses(Rig({name: tagged[name] for name in images}), images)
+    factors = {name: min(MATCHED / max(image.shape[-2:]), 1.0) for name, image in pinhole.items()}
+    focal = {name: factors[name] * float(straight[name].K[0, 0]) for name in images}
+    reduced = {name: scaled(image, factors[name]) for name, image in pinhole.items()}
+    found = rig_from_images(reduced, focal=focal, alpha=alpha)
+    lensless = Rig({name: View(hw=found.rig[name].hw) for name in images})
+    fitted = {pair: link_of_points(lensless, pair, points) for pair, points in found.matches.items()}
+    links = resized_rig(lensless.replace(links=fitted), pinhole).links
+    names = [alpha, *(name for name in images if (alpha, name) in links)]
+    if len(names) < 2:
+        raise ValueError(f"no image shows enough of what '{alpha}' shows: choose another with --alpha NAME")
+    for name in names[1:]:
+        note(f"{alpha} > {name}: {found.describe(alpha, name)}")
+    for name in images.keys() - {*names}:
+        note(f"{name}: left out, too little in common with {alpha}")
+    cameras = {name: developed_rig(tagged, images)[name] for name in names}
+    to_tags = {name: cameras[name].K @ torch.linalg.inv(straight[name].K) for name in names}
+    views = {
+        name: LensView(hw=camera.hw, K=camera.K, distortion=camera.distortion, sensor=camera.sensor)
+        for name, camera in cameras.items()
+    }
+    own = {(alpha, name): links[alpha, name].transformed(to_tags[alpha], to_tags[name]) for name in names[1:]}
+    return Rig(views, links=own, name=found.rig.name), names
 
 
 @stage()

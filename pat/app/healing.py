@@ -89,7 +89,7 @@ def healed_rig(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> Healed | N
     if refined.depth is not None:
         text += f"; depth changes by {refined.depth.change:.0%} (median), and is rough"
     healed = rig.replace(cameras=cameras, depth=_depth_range(refined.rig, pairs))
-    return Healed(healed, f"{text} (--no-align leaves the rig as it is)")
+    return Healed(healed, f"{text} (--misfit warn leaves the rig as it is)")
 
 
 def _depth_range(rig: Rig, pairs: Pairs) -> tuple[float, float] | None:

@@ -46,7 +46,7 @@ def matched_frames(files: Files) -> dict[str, list[Path]]:
     if len({len(paths) for paths in files_of.values()}) > 1:
         counts = ", ".join(f"{len(paths)} of '{name}'" for name, paths in files_of.items())
         raise ValueError(
-            f"frames need as many images of each camera, got {counts}; or is it for `pat fuse --sequence`?"
+            f"frames need as many images of each camera, got {counts}; or is it for `pat sequence`?"
         )
     warn(f"no name or number relates the frames ({spans}): taken in order", MissingFramesWarning)
     return files_of

@@ -17,7 +17,6 @@ from torch import Tensor
 from arraygeom import sample
 from arraygeom.pixels import HW
 from arraygeom.runtime.chunks import chunked
-from arraygeom.runtime.threads import convolutions_in_parallel
 from arraygeom.runtime.warned import warn
 
 from ..matching.radiometry import Response
@@ -25,6 +24,7 @@ from ..networks.bm3d import Observation, seen_by_another, without_noise
 from ..networks.weights import load_denoiser
 from ..sensors import NoiseLevel, generator_for
 from ..sensors.steps import normal
+from ..support.convolutions import convolutions_in_parallel
 from ..support.settings import physics, size, tuned
 from .frame import Frame
 from .non_local_means import averaged_with_alike

@@ -15,11 +15,11 @@ from torch import Tensor, nn
 
 from arraygeom import pixel_grid
 from arraygeom.runtime.chunks import Box, Tile, area, assembled, sides_by_work, tiles_of, whole
-from arraygeom.runtime.threads import convolutions_in_parallel
 
 from ..matching.inputs import Inputs
 from ..matching.matches import Matches
 from ..networks.protocol import FusionNetwork, matched_for
+from ..support.convolutions import convolutions_in_parallel
 from ..support.tensor_files import read_tensors, write_tensors
 from .back_projection import back_projected
 from .depth import certain, measured_depth

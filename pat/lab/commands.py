@@ -8,29 +8,28 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
-from tyro.conf import Fixed, Positional, arg
-
 from ..app.cli import options
-from ..app.cli.options import FieldName, MaybePath, Out, Weights, optional, say, writable
+from ..app.cli.options import Address, FieldName, Out, Weights, say, writable
+from ..app.cli.parser import Option
 
 if TYPE_CHECKING:
     from .data.pairs import StereoPair
     from .evaluation.stereo import StereoRow
 
-RenderedFolder = Annotated[Positional[Path], arg(metavar="FOLDER", help="Folder written by `pat render`.")]
+RenderedFolder = Annotated[Path, Option("FOLDER", "Folder written by `pat lab render`.", positional=True)]
 
 
 @dataclass
 class StereoSets:
     """Stereo pairs by data set, the network that fuses them, and where results go."""
 
-    kitti: MaybePath = None
+    kitti: Path | None = None
     """Folder of KITTI pairs: image_2 / image_3, or left.png / right.png."""
-    middlebury: MaybePath = None
+    middlebury: Path | None = None
     """Folder of Middlebury's 2001 to 2006 collections."""
-    flickr1024: MaybePath = None
+    flickr1024: Path | None = None
     """Folder of Flickr1024 pairs: 0001_L.png / 0001_R.png."""
-    folder: MaybePath = None
+    folder: Path | None = None
     """Folder of other pairs, named in any of these ways."""
     out: Out = Path("out/evaluate")
     """Folder for what is written."""
@@ -52,7 +51,9 @@ class Evaluate(StereoSets):
     """Compare alpha alone, the classical baseline and the fusion on stereo pairs: PSNR, SSIM, images.
 
     The left image made grey is alpha, the right one, reduced, is beta, the left one in colour is the ground
-    truth. Example: pat evaluate --kitti data/kitti --middlebury data/middlebury
+    truth.
+
+    Example: pat lab evaluate --kitti data/kitti --middlebury data/middlebury
     """
 
     rates: tuple[int, ...] = (2, 4)
@@ -96,17 +97,19 @@ class Ablate:
     """What calibration is worth: families of receptive fields compared by one network.
 
     On layered scenes with exact positions, of unrectified rigs with focal lengths 1 to 3 times beta's; or on
-    scenes of your own rig. Example: pat ablate --rendered scenes --weights runs/mine/best.safetensors
+    scenes of your own rig.
+
+    Example: pat lab ablate --rendered scenes --weights runs/mine/best.safetensors
     """
 
     weights: Weights = "pat-supervised"
     photos: tuple[Path, ...] = ()
     """Folders of photographs; those that scikit-image ships if none is given."""
-    rendered: MaybePath = None
-    """Folder of scenes written by `pat render`: their first camera is alpha, their second beta."""
+    rendered: Path | None = None
+    """Folder of scenes written by `pat lab render`: their first camera is alpha, their second beta."""
     scenes: int = 6
     """Number of scenes."""
-    hw: Annotated[tuple[int, int], arg(metavar="H W")] = (240, 320)
+    hw: Annotated[tuple[int, int], Option("H W")] = (240, 320)
     """Height and width of both images. The family `dense` compares each pixel with each: it takes longer than
     all others together, and is left out where that does not fit into 2 GiB, as at 240 x 320."""
     seed: int = 0
@@ -148,7 +151,7 @@ class DataInfo:
     folder: RenderedFolder
 
     def run(self) -> None:
-        """Print the summary. Raises ValueError for a folder that `pat render` did not write."""
+        """Print the summary. Raises ValueError for a folder that `pat lab render` did not write."""
         from .farm.job import summarise
 
         print(summarise(self.folder))
@@ -164,11 +167,14 @@ class Data:
 class Render:
     """Render many scenes of a rig for training: workers, retries, resuming, clusters.
 
-    Example: pat render config.yaml --scenes 900 --out data/ --workers 2. The same command again renders what
+
+    Example: pat lab render config.yaml --scenes 900 --out data/ --workers 2
+
+    The same command again renders what
     is missing. The file has at least `rig: rig.yaml`; see `pat.lab.farm.job.RenderConfig`.
     """
 
-    config: Annotated[Positional[Path], arg(metavar="CONFIG")]
+    config: Annotated[Path, Option("CONFIG", positional=True)]
     """What to render (YAML): rig, seed, backend and its settings."""
     scenes: int
     """Number of scenes there should be in the end."""
@@ -176,11 +182,11 @@ class Render:
     """Folder of the scenes."""
     workers: int = 1
     """Processes on this machine."""
-    shard: Annotated[str, arg(metavar="I/N")] = "1/1"
+    shard: Annotated[str, Option("I/N")] = "1/1"
     """Only every N-th scene from the I-th on, for batch systems."""
-    scheduler: Annotated[str | None, optional("ADDRESS")] = None
+    scheduler: Address = None
     """Address of a Dask scheduler whose workers render the scenes, such as tcp://host:8786."""
-    generator: Annotated[str | None, optional("MODULE:FUNCTION")] = None
+    generator: Annotated[str | None, Option("MODULE:FUNCTION")] = None
     """The file's `blender.generator`, if it is code of your own: the file alone does not run it."""
 
     def run(self) -> None:
@@ -211,21 +217,18 @@ class Render:
 class Train:
     """Train weights by a recipe, on scenes made from photographs during training.
 
-    Example: pat train mono-colour-small --photos ~/images --out runs/mine --minutes 60
+
+    Example: pat lab train mono-colour-small --photos ~/images --out runs/mine --minutes 60
     """
 
-    spellings: ClassVar[Mapping[str, str]] = {"-o": "--out"}
-
-    recipe: Positional[str] = "mono-colour"
-    """A recipe of the package, or a YAML file."""
-    config: Fixed[Any] = None
+    config: Any
 
     @classmethod
-    def parse(cls, arguments: list[str]) -> Train:
+    def parse(cls, arguments: list[str], prog: str) -> Train:
         """The command from its arguments; its options are those of the recipe."""
         from .training.config import command_line
 
-        return cls(config=command_line(arguments))
+        return cls(config=command_line(arguments, prog))
 
     def run(self) -> None:
         """Train, or continue a run that stopped. Raises ValueError for a recipe that its data do not suit."""
@@ -239,7 +242,9 @@ class Settings:
     """List the numbers that matching, fusion and networks were given: value, kind, and where each is from.
 
     Kinds: *physics* follows from what is measured, *size* says how much is done at a time, *tuned* was
-    chosen. Example: pat settings --kind tuned
+    chosen.
+
+    Example: pat lab settings --kind tuned
     """
 
     kind: Literal["physics", "size", "tuned", "all"] = "all"
@@ -263,10 +268,11 @@ class Import:
     """Convert a checkpoint of the paper's authors (best.pth.tar) to a weights file for `--weights`.
 
     The file is read as tensors and numbers; nothing in it is run.
-    Example: pat weights import log_2inputs/x4/best.pth.tar --out pat-authors.safetensors
+
+    Example: pat lab weights import log_2inputs/x4/best.pth.tar --out pat-authors.safetensors
     """
 
-    checkpoint: Annotated[Positional[Path], arg(metavar="FILE", help="Checkpoint, for any number of inputs.")]
+    checkpoint: Annotated[Path, Option("FILE", "Checkpoint, for any number of inputs.", positional=True)]
     out: Out = Path("pat-authors.safetensors")
     """Weights file to write."""
 

@@ -24,9 +24,10 @@ from torch.nn.functional import pad, pixel_shuffle
 
 from arraygeom import Segments
 from arraygeom.runtime.chunks import spans
-from arraygeom.runtime.threads import convolutions_in_parallel, in_parallel
+from arraygeom.runtime.threads import in_parallel
 
 from ..support.blocks import UNet
+from ..support.convolutions import convolutions_in_parallel
 from ..support.settings import size
 from ..support.tensor_files import with_weights
 from . import choice_numba as kernels

@@ -13,7 +13,6 @@ import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
-from ..support import eight_bits
 from ..support.blocks import in_bfloat16
 from ..support.schema import from_document
 from ..support.tensor_files import DAMAGED, not_whole, undamaged, write_tensors
@@ -35,7 +34,7 @@ DENOISERS = {"LowLightNetwork": (LowLightNetwork, DenoiserConfig)}
 LARGEST, MOST_ENTRIES = 1024, 16
 """Of the numbers in a configuration, and of a list of them. The largest shipped are 48 and 4."""
 
-Precision = Literal["float32", "bfloat16", "int8"]
+Precision = Literal["float32", "bfloat16"]
 
 
 def save_weights(
@@ -59,8 +58,7 @@ def load_weights(name: str | Path, *, precision: Precision = "float32") -> Netwo
 
     With `precision` "bfloat16" its convolutions are in that (attention and matching never are): they take
     less than half the time on processors that multiply it (AVX-512 BF16, AMX), and the image's PSNR changes
-    by .003 dB. Then parts of a frame are equal to the whole to 1e-3 only. With "int8" those of a network
-    whose weights state ranges for it are in that, on the CPU and without gradients: see docs/performance.md.
+    by .003 dB. Then parts of a frame are equal to the whole to 1e-3 only.
 
     Raises FileNotFoundError for neither, ValueError for a file that is not of this format or does not fit,
     for another precision, and for a processor that has not this one.
@@ -86,8 +84,7 @@ def new_network(config: Any, start: Path | None = None) -> Network:
                 f"the recipe is for a {type(network).__name__} of {config}: give its own recipe, "
                 "or leave `start` out"
             )
-        state = weights.state_dict()
-        network.load_state_dict({name: state[name] for name in network.state_dict()})  # without ranges
+        network.load_state_dict(weights.state_dict())
     return network
 
 
@@ -100,10 +97,7 @@ def set_precision(network: nn.Module, precision: Precision, *, compiled: bool = 
     """Let convolutions compute in this precision, and compile them by torch.compile.
 
     Not attention, whose search segments are functions that torch.compile would break at.
-    Raises ValueError for "int8" if the processor cannot, or the weights have no ranges.
     """
-    if precision == "int8":
-        eight_bits.round_to_eight_bits(network)
     inner = network.single if isinstance(network, BandwisePAT) else network
     for module in inner.children():
         if isinstance(module, (AttentionEngine, nn.ModuleList)):
@@ -132,7 +126,7 @@ def _load(path: Path, networks: Mapping[str, tuple[Any, Any]]) -> Any:
         if _is_of_pytorch(path):
             raise ValueError(
                 f"{path}: a checkpoint of PyTorch's: "
-                "`pat weights import` makes weights of one of the paper's authors"
+                "`pat lab weights import` makes weights of one of the paper's authors"
             ) from None
         raise ValueError(f"{path}: {not_whole(error)}") from None
     if not undamaged(state, metadata):
@@ -156,12 +150,10 @@ def _is_of_pytorch(path: Path) -> bool:
 
 
 def misfit(network: nn.Module, state: Mapping[str, Tensor]) -> str:
-    """The first tensor missing, too many, or of another shape than the network's; empty if all fit. Ranges of
-    convolutions in 8 bits may be missing."""
+    """The first tensor missing, too many, or of another shape than the network's; empty if all fit."""
     wanted_shapes, given_shapes = (
         {k: tuple(v.shape) for k, v in s.items()} for s in (network.state_dict(), state)
     )
-    wanted_shapes |= {name: (2,) for name in eight_bits.names(network) if name in given_shapes}
     for name in [*wanted_shapes, *given_shapes]:
         if wanted_shapes.get(name) != given_shapes.get(name):
             return f"{name} is {given_shapes.get(name, 'missing')}, wanted {wanted_shapes.get(name, 'none')}"

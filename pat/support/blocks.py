@@ -13,9 +13,9 @@ from torch import Tensor, nn
 from torch.nn.functional import pixel_unshuffle
 from torch.utils._pytree import tree_map
 
+from arraygeom.fields.protocol import compilable
 from arraygeom.runtime.chunks import chunked
 
-from .eight_bits import Conv2d, plain
 from .unshuffle_numba import unshuffle
 
 ROWS = 64
@@ -27,8 +27,8 @@ class ResidualBlock(nn.Module):
 
     def __init__(self, dim: int, *, dilation: int = 1, bias: bool = True) -> None:
         super().__init__()
-        self.first = Conv2d(dim, dim, 3, padding=dilation, dilation=dilation, bias=bias)
-        self.second = Conv2d(dim, dim, 3, padding=1, bias=bias)
+        self.first = nn.Conv2d(dim, dim, 3, padding=dilation, dilation=dilation, bias=bias)
+        self.second = nn.Conv2d(dim, dim, 3, padding=1, bias=bias)
         self.act = nn.LeakyReLU(0.1, inplace=True)
 
     def forward(self, x: Float[Tensor, "b d h w"]) -> Float[Tensor, "b d h w"]:
@@ -42,10 +42,10 @@ class ResidualASPP(nn.Module):
     def __init__(self, dim: int, dilations: tuple[int, ...] = (1, 4, 8)) -> None:
         super().__init__()
         self.groups = nn.ModuleList(
-            nn.ModuleList(Conv2d(dim, dim, 3, padding=d, dilation=d, bias=False) for d in dilations)
+            nn.ModuleList(nn.Conv2d(dim, dim, 3, padding=d, dilation=d, bias=False) for d in dilations)
             for _ in range(3)
         )
-        self.fuse = nn.ModuleList(Conv2d(dim * len(dilations), dim, 1, bias=False) for _ in range(3))
+        self.fuse = nn.ModuleList(nn.Conv2d(dim * len(dilations), dim, 1, bias=False) for _ in range(3))
         self.act = nn.LeakyReLU(0.1, inplace=True)
 
     def forward(self, x: Float[Tensor, "b d h w"]) -> Float[Tensor, "b d h w"]:
@@ -61,7 +61,7 @@ class ResidualASPP(nn.Module):
 def conv(inputs: int, outputs: int, *, stride: int = 1) -> nn.Sequential:
     """A 3x3 convolution and its activation."""
     return nn.Sequential(
-        Conv2d(inputs, outputs, 3, stride=stride, padding=1), nn.LeakyReLU(0.1, inplace=True)
+        nn.Conv2d(inputs, outputs, 3, stride=stride, padding=1), nn.LeakyReLU(0.1, inplace=True)
     )
 
 
@@ -87,6 +87,11 @@ def stacked(*parts: Float[Tensor, "b _ _ _"]) -> Float[Tensor, "b d h w"]:
     return out.movedim(-1, 1)
 
 
+def plain(x: Tensor) -> bool:
+    """Whether compiled loops of float32 can take a tensor: nothing asks for its gradient."""
+    return x.dtype == torch.float32 and compilable(x) and not x.requires_grad
+
+
 def enlarge(x: Float[Tensor, "b d h w"], factor: int = 2) -> Float[Tensor, "b d h*{factor} w*{factor}"]:
     """Bilinear, by the pixel-area convention c' = (c + 0.5) factor - 0.5."""
     return nn.functional.interpolate(x, scale_factor=factor, mode="bilinear", align_corners=False)
@@ -102,9 +107,9 @@ class UNet(nn.Module):
         self.first = nn.Sequential(conv(inputs, a), *_residual(a, blocks))
         self.second = nn.Sequential(conv(a, b, stride=2), *_residual(b, blocks))
         self.third = nn.Sequential(conv(b, c, stride=2), *(ResidualBlock(c, dilation=d) for d in dilations))
-        self.up_b, self.up_a = Conv2d(c, b, 1), Conv2d(b, a, 1)
+        self.up_b, self.up_a = nn.Conv2d(c, b, 1), nn.Conv2d(b, a, 1)
         self.back_b, self.back_a = (_in_turn(_residual(n, blocks)) for n in (b, a))
-        self.last = Conv2d(a, outputs, 3, padding=1)
+        self.last = nn.Conv2d(a, outputs, 3, padding=1)
 
     def forward(self, x: Float[Tensor, "b i h w"]) -> Float[Tensor, "b o h w"]:
         """The same size; sides are multiples of 4."""

@@ -7,21 +7,21 @@ is missing. Torch is imported only where tasks run.
 
 from __future__ import annotations
 
-import ctypes
+import faulthandler
 import math
 import os
 import re
 import signal
-import sys
 import threading
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context, parent_process
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Literal, NamedTuple, TypeVar
 
 from rich.console import Console
 from rich.progress import (
@@ -201,21 +201,30 @@ TRIES = 3
 
 
 def _in_processes(tasks: Sequence[Task], workers: Workers) -> Iterator[TaskOutcome]:
-    """Outcomes as they come. Each process has a thread that waits for it, and with which it would die."""
-    thread_data, processes, before = threading.local(), [], dict(os.environ)
-    fatal: list[JobError] = []
+    """Outcomes as they come. Each process has a thread that waits for it, so that the task is known with
+    which it dies."""
+    slots, before, others = threading.local(), dict(os.environ), {*active_children()}
+    ended: list[JobError] = []
 
     def made(task: Task) -> TaskOutcome:
-        if fatal:  # threads may come to many tasks before the job's own thread hears of it
-            raise fatal[0]
-        if not hasattr(thread_data, "process"):
-            thread_data.process = _Process(workers)
-            processes.append(thread_data.process)
-        try:
-            return thread_data.process.made(task)
-        except JobError as error:
-            fatal.append(error)
-            raise
+        error = ""
+        for _ in range(TRIES):
+            if ended:  # threads may come to many tasks before the job's own thread hears of it
+                raise ended[0]
+            if not hasattr(slots, "process"):
+                slots.process = ProcessPoolExecutor(1, get_context("spawn"), initializer=_begin)
+            begin = time.monotonic()
+            try:
+                arguments = task, workers.threads, workers.timeout
+                return slots.process.submit(attempt_on_worker, *arguments).result()
+            except BrokenProcessPool:
+                del slots.process
+                long = workers.timeout is not None and time.monotonic() - begin >= workers.timeout
+                error = f"took longer than {workers.timeout:g} s" if long else "its process died"
+            except JobError as failure:
+                ended.append(failure)
+                raise
+        return TaskOutcome(task.makes, error)
 
     os.environ.update(ENVIRONMENT)
     threads = ThreadPoolExecutor(workers.count)
@@ -223,89 +232,28 @@ def _in_processes(tasks: Sequence[Task], workers: Workers) -> Iterator[TaskOutco
         for future in as_completed([threads.submit(made, task) for task in tasks]):
             yield future.result()
     finally:
+        ended.append(JobError("the job has ended"))
         threads.shutdown(wait=False, cancel_futures=True)
-        for process in processes:
-            process.end(for_good=True)
+        for process in {*active_children()} - others:
+            process.kill()
+            process.join()
         for name in ENVIRONMENT.keys() - before.keys():
             del os.environ[name]
         os.environ.update(before)
 
 
-class _Process:
-    """A process that runs one task after another; another one takes its place when it dies."""
-
-    def __init__(self, workers: Workers):
-        self.workers, self.over = workers, False
-        self.process: Any = None
-        self.pipe: Any = None
-
-    def made(self, task: Task) -> TaskOutcome:
-        """The outcome of a task. Raises the JobError of one that stops the job."""
-        error = ""
-        for _ in range(TRIES):
-            if self.over:
-                break
-            try:
-                outcome = self._answer(task)
-            except (EOFError, OSError):
-                died, self.process = self.process, None
-                if died is not None:
-                    died.join()
-                    code = died.exitcode
-                    how = signal.Signals(-code).name if code < 0 else f"exit status {code}"
-                    error = f"its process died ({how})"
-                continue
-            if outcome is None:
-                self.end()
-                error = f"took longer than {self.workers.timeout:g} s"
-            elif isinstance(outcome, JobError):
-                raise outcome
-            else:
-                return outcome
-        return TaskOutcome(task.makes, error)
-
-    def _answer(self, task: Task) -> TaskOutcome | JobError | None:
-        """The answer of the process; None if there is none in time. Raises EOFError or OSError if it dies."""
-        if self.process is None:
-            spawn = get_context("spawn")
-            self.pipe, theirs = spawn.Pipe()
-            arguments = theirs, self.workers.threads, os.getpid()
-            self.process = spawn.Process(target=_serve, args=arguments, daemon=True)
-            self.process.start()
-            theirs.close()
-        self.pipe.send(task)
-        return self.pipe.recv() if self.pipe.poll(self.workers.timeout) else None
-
-    def end(self, *, for_good: bool = False) -> None:
-        """End the process at once."""
-        self.over |= for_good
-        if self.process is not None:
-            self.process.kill()
-            self.process.join()
-            self.process = None
-
-
-def _serve(pipe: Any, threads: int, parent: int) -> None:
-    """Run tasks that come through a pipe, until its other end is closed."""
+def _begin() -> None:
+    """Let a process leave interruptions to the one that started it, and end with that one."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    while os.getppid() == parent:
-        try:
-            task = pipe.recv()
-        except EOFError:
-            return
-        try:
-            answer: TaskOutcome | JobError = attempt_on_worker(task, threads)
-        except JobError as error:
-            answer = error
-        except Exception as error:
-            answer = TaskOutcome(task.makes, f"{type(error).__name__}: {error}")
-        pipe.send(answer)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
-PR_SET_PDEATHSIG = 1
-"""Option of Linux's prctl: the signal that a process gets when the thread that started it ends."""
+def _end_with_parent() -> None:
+    if (parent := parent_process()) is not None:
+        parent.join()
+        os._exit(1)
+
+
 AHEAD = 4
 """Tasks submitted for each Dask worker at once, so that none of them waits for the next."""
 
@@ -380,12 +328,25 @@ def attempt(task: Task, threads: int) -> TaskOutcome:
     return TaskOutcome(task.makes, error, (*caught_warnings, *raised))
 
 
-def attempt_on_worker(task: Task, threads: int) -> TaskOutcome:
-    """`attempt` in a process that does nothing else."""
+def attempt_on_worker(task: Task, threads: int, timeout: float | None = None) -> TaskOutcome:
+    """`attempt` in a process that does nothing else, and that ends if it takes longer than `timeout` seconds.
+
+    Errors that `attempt` does not expect become the outcome, too.
+    """
     from .memory import keep_freed
 
     keep_freed()
-    return attempt(task, threads)
+    with open(os.devnull, "w") as quiet:
+        if timeout is not None:
+            faulthandler.dump_traceback_later(timeout, exit=True, file=quiet)
+        try:
+            return attempt(task, threads)
+        except JobError:
+            raise
+        except Exception as error:
+            return TaskOutcome(task.makes, f"{type(error).__name__}: {error}")
+        finally:
+            faulthandler.cancel_dump_traceback_later()
 
 
 def cores() -> int:

@@ -24,8 +24,8 @@ def folder_lock(folder: Path) -> Iterator[None]:
     """Make the folder, and keep other commands out until the block ends; if left empty it is removed again.
 
     The lock is a file locked by the system, and process and host are in another beside it: that of a process
-    of this host which is gone counts for nothing. Raises ValueError for a folder that another command holds,
-    or that cannot be written to.
+    of this host, or of a container on it, which is gone counts for nothing. Raises ValueError for a folder
+    that another command holds, or that cannot be written to.
     """
     made = _make(folder)
     try:
@@ -66,17 +66,24 @@ def _locked(folder: Path) -> BaseFileLock:
         raise _in_use(folder, entries_of(owner_file), "wait for it") from None
     except OSError as error:
         raise _unusable(folder, error) from None
-    owner = entries_of(owner_file)
-    if owner.get("host", socket.gethostname()) != socket.gethostname():
+    owner, ours = entries_of(owner_file), {"pid": os.getpid(), "host": socket.gethostname(), "boot": _boot()}
+    if owner.get("host", ours["host"]) != ours["host"] and owner.get("boot") != (ours["boot"] or "unknown"):
         lock.release()
         raise _in_use(folder, owner, f"wait for it, or remove {owner_file} if it has ended")
     try:
-        ours = {"pid": os.getpid(), "host": socket.gethostname()}
         owner_file.write_text(json.dumps(ours), encoding="utf-8")
     except OSError as error:
         lock.release()
         raise _unusable(folder, error) from None
     return lock
+
+
+def _boot() -> str:
+    """This start of the system, the same in all its containers, whose locks it knows; empty if unknown."""
+    try:
+        return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    except OSError:
+        return ""
 
 
 def _in_use(folder: Path, owner: dict[str, object], advice: str) -> ValueError:

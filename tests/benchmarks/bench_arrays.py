@@ -1,6 +1,6 @@
 """Several colour betas about a mono alpha: rendered scenes of five cameras, fused with one, two, four betas.
 
-    pat render arrays.yaml --scenes 4 --out arrays      # for each generator, with the rig that `--rig FILE`
+    pat lab render arrays.yaml --scenes 4 --out arrays  # for each generator, with the rig that `--rig FILE`
     # writes, seed 1, preset fast: abstract, photographs (of City100), experiments.scenes:still_life
     python -m tests.benchmarks.bench_arrays arrays/* --out tests/benchmarks/RESULTS_arrays.md
 
@@ -12,13 +12,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
-import tyro
-from tyro.conf import Positional
 
 from arraygeom import Rig
 from pat import FuseSettings, fuse, load_weights
+from pat.app.cli.parser import Option, script
 from pat.lab.data.windows import read_view, reduced, scene_folders, scene_rig
 from pat.lab.evaluation.tables import markdown_header, markdown_row
 from pat.media.colour import luminance, srgb_image
@@ -80,7 +80,9 @@ def table(folders: Sequence[Path]) -> Iterator[str]:
 
 
 def main(
-    folders: Positional[tuple[Path, ...]] = (), out: Path | None = None, rig: Path | None = None
+    folders: Annotated[tuple[Path, ...], Option(positional=True)] = (),
+    out: Path | None = None,
+    rig: Path | None = None,
 ) -> None:
     """Print the table of folders of scenes; or write the rig to render to the file `rig`, and end."""
     if rig:
@@ -89,4 +91,4 @@ def main(
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    script(main)

@@ -24,12 +24,12 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import torch
-import tyro
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from arraygeom.runtime.atomic import write_text
 from arraygeom.segments import Segments
+from pat.app.cli.parser import script
 from pat.attention import attend
 from pat.lab.evaluation.tables import markdown_header, markdown_row
 from pat.support.memory import peak_memory
@@ -392,4 +392,4 @@ def write(path: Path, lines: list[str], end: str) -> None:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    script(main)

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
-import tyro
 
 from arraygeom import Camera, Rig
 from arraygeom.io import read_rig
@@ -24,6 +23,7 @@ from calib.boards.rig import Calibration, calibrate
 from calib.boards.solve import adjust, calibrate_single
 from calib.boards.target import parse_board
 from calib.boards.validation import epipolar_errors
+from pat.app.cli.parser import script
 from pat.lab.evaluation.tables import markdown_header, markdown_row
 from tests.benchmarks.printed import DATA, print_tables
 from tests.calib.board_scenes import errors_of, pose_errors
@@ -192,4 +192,4 @@ def main(
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    script(main)

@@ -20,13 +20,13 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
-import tyro
 
 from arraygeom import Distortion, Rig
 from calib.images.depth_change import observed_depths
 from calib.images.hypotheses import swap
 from calib.images.matches import match_cameras
 from calib.images.refinement import refine_matches
+from pat.app.cli.parser import script
 from pat.lab.evaluation.tables import markdown_row
 from tests.benchmarks.printed import DATA, head, print_tables, reproducible
 from tests.calib.real import RealPair, bumblebee, syntim
@@ -169,4 +169,4 @@ def main(
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    script(main)

@@ -22,10 +22,10 @@ from pathlib import Path
 from statistics import median, quantiles
 from typing import Any
 
-import tyro
 from selenium import webdriver
 from selenium.common.exceptions import WebDriverException
 
+from pat.app.cli.parser import script
 from pat.app.sample_array import load_sample
 from pat.lab.evaluation.tables import markdown_header, markdown_row
 from tests.benchmarks.bench_job import PAT, ROOT
@@ -151,4 +151,4 @@ def main(points: int = 40, out: Path | None = None) -> None:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    script(main)

@@ -14,7 +14,6 @@ from collections.abc import Iterator
 from itertools import chain, pairwise
 from pathlib import Path
 
-import tyro
 from torch.nn.functional import interpolate
 
 from arraygeom import Camera
@@ -22,6 +21,7 @@ from arraygeom.io import read_rig
 from calib.images.focal_length import fit_focal_length
 from calib.images.from_images import rig_from_images
 from calib.images.self_calibration import FOCAL_SHARE
+from pat.app.cli.parser import script
 from pat.app.from_images import MATCHED, resized_rig, scaled
 from pat.lab.evaluation.tables import markdown_header, markdown_row
 from tests.benchmarks.printed import DATA, print_tables, reproducible
@@ -97,4 +97,4 @@ def main(data: Path = DATA, out: Path | None = None) -> None:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    script(main)

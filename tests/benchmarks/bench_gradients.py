@@ -16,14 +16,14 @@ from __future__ import annotations
 
 import math
 from itertools import product
+from typing import Annotated
 
 import torch
-import tyro
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
-from tyro.conf import Positional
 
 from pat import FuseSettings, fuse, load_weights
+from pat.app.cli.parser import Option, script
 from tests.benchmarks.printed import head
 from tests.pat.fusion.recovering import jacobian, recovered
 from tests.pat.layered_array import load_sample, middle_of_sample
@@ -77,7 +77,7 @@ def _by_squares(slopes: Tensor, changes: Tensor, likely: Tensor) -> tuple[Tensor
     return (slope * change).sum() / slope.square().sum(), torch.corrcoef(torch.stack([slope, change]))[0, 1]
 
 
-def main(degrees: Positional[tuple[float, ...]] = (0, 0.1, 0.3)) -> None:
+def main(degrees: Annotated[tuple[float, ...], Option(positional=True)] = (0, 0.1, 0.3)) -> None:
     """Print the tables."""
     depth = "inverse depth, gradient | difference | regression | correlation"
     print(head(f"degrees | motion | error, gradient | difference | {depth}"))
@@ -93,4 +93,4 @@ def main(degrees: Positional[tuple[float, ...]] = (0, 0.1, 0.3)) -> None:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    script(main)

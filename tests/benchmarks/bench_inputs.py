@@ -16,10 +16,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import cv2
-import tyro
 
 from experiments.peaks import with_peak
 from pat.app.cli.main import main as pat
+from pat.app.cli.parser import script
 from pat.lab.evaluation.tables import markdown_row
 
 from .input_kinds import Kind, kinds
@@ -92,4 +92,4 @@ def main(data: Path = DATA, only: str = "") -> None:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    script(main)

@@ -25,8 +25,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-import tyro
-
+from pat.app.cli.parser import script
 from tests.processes import ROOT, dask_cluster
 
 from .job_parts import STAGES
@@ -144,7 +143,7 @@ def first_second(work: Path, runs: int, root: Path) -> list[list[str]]:
     cache, demo = Path(tempfile.mkdtemp(dir=work)), [*PAT, "demo", "--out", str(work / "demo")]
     parts = {
         "pat --help": [run([*PAT, "--help"], cache, root) for _ in range(runs)],
-        "pat train --help": [run([*PAT, "train", "--help"], cache, root) for _ in range(runs)],
+        "pat lab train --help": [run([*PAT, "lab", "train", "--help"], cache, root) for _ in range(runs)],
         "pat demo, nothing compiled": [run(demo, Path(tempfile.mkdtemp(dir=work)), root)],
         "pat warm-up, nothing compiled": [run([*PAT, "warm-up"], cache, root)],
         "pat demo after pat warm-up": [run(demo, cache, root)],
@@ -169,7 +168,7 @@ def many_frames(case: Case, folder: Path, work: Path, one: float, root: Path) ->
     images = [word for name in names for word in ("--image", f"{name}={work / f'frames{case.wh[0]}' / name}")]
     workers = len(os.sched_getaffinity(0))
     out = tempfile.mkdtemp(dir=work)
-    command = [*PAT, "fuse", str(folder / "rig.yaml"), "--alpha", "mono", *images, "--out", out]
+    command = [*PAT, "batch", str(folder / "rig.yaml"), "--alpha", "mono", *images, "--out", out]
     cache = work / ("warm" if root == ROOT else "old")
     found = run([*command, "--workers", str(workers)], cache, root)
     same = f"{60 / one:.1f}"
@@ -275,4 +274,4 @@ def shown(columns: Sequence[str], cells: list[str]) -> list[str]:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    script(main)

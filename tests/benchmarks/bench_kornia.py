@@ -21,12 +21,12 @@ from types import FrameType
 
 import kornia.geometry
 import torch
-import tyro
 from torch import Tensor
 
 from arraygeom import Camera, Distortion, Pose, Rig, relative_pose
 from docs.update_readme import write_block
 from pat import fuse
+from pat.app.cli.parser import script
 from pat.lab.evaluation.tables import markdown_table
 from pat.networks.guided import GuidedPAT
 from tests.arraygeom.rigs import random_rig
@@ -170,4 +170,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    script(main)

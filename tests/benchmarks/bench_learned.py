@@ -22,13 +22,13 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-import tyro
 from torch import Generator, Tensor
 
 from arraygeom import Camera, Pose, Rig, intrinsics, pixel_grid, rotation_from_vector
 from experiments.evaluation.certainty import Reliability
 from experiments.evaluation.halves import of_half
 from pat import fuse
+from pat.app.cli.parser import script
 from pat.fusion.frame import Frame
 from pat.fusion.steps import hw_at_alphas_resolution
 from pat.lab.data.pairs import middlebury_pairs
@@ -211,4 +211,4 @@ def main(
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    script(main)

@@ -22,7 +22,6 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import torch
-import tyro
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -31,6 +30,7 @@ from arraygeom.kornia_models import to_kornia_model
 from arraygeom.lenses import PolynomialFisheye
 from arraygeom.lenses.model import LensModel
 from docs.update_readme import write_block
+from pat.app.cli.parser import script
 from pat.lab.evaluation.tables import markdown_table
 from tests.benchmarks.printed import DOCS, timed
 
@@ -419,4 +419,4 @@ def main(lenses: int = 1000, write: bool = False) -> None:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    script(main)

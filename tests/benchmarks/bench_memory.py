@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-import tyro
+from pat.app.cli.parser import script
 
 from .bench_job import PARTS, PAT, run, shown, table
 
@@ -138,4 +138,4 @@ def order(line: str) -> int:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    script(main)

@@ -20,7 +20,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-import tyro
 from torch import Tensor
 
 from arraygeom import Camera, Distortion, Pose, Rig, rotation_from_vector
@@ -31,6 +30,7 @@ from calib.images.doctor import Diagnosis, diagnose_matches
 from calib.images.hypotheses import TRANSPOSE, on_cameras, on_pixels, rotated_view, swap
 from calib.images.matches import match_cameras, seen_depths
 from calib.images.residuals import median_off
+from pat.app.cli.parser import script
 from pat.lab.evaluation.tables import markdown_header, markdown_row
 from tests.benchmarks.bench_drift import drifted, error
 from tests.benchmarks.printed import DATA, print_tables, reproducible
@@ -272,4 +272,4 @@ def main(
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    script(main)

@@ -22,7 +22,6 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import torch
-import tyro
 from jaxtyping import Float
 
 from arraygeom import Camera, Distortion, Pose, Rig
@@ -32,6 +31,7 @@ from calib.boards.photos import FrameKey
 from calib.boards.rig import calibrate
 from calib.boards.target import parse_board
 from calib.boards.validation import FOLDS, epipolar_errors
+from pat.app.cli.parser import script
 from pat.lab.evaluation.tables import markdown_row
 from tests.benchmarks.printed import DATA, head, print_tables, reproducible
 from tests.calib.rendered import BOARD
@@ -183,4 +183,4 @@ def main(data: Path = DATA, boards: Path = Path("out/boards"), out: Path | None 
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    script(main)

@@ -19,7 +19,6 @@ import cv2
 import kornia.geometry as kg
 import numpy as np
 import torch
-import tyro
 from kornia.geometry.depth import warp_frame_depth
 from scipy.optimize import least_squares
 from torch import Tensor
@@ -41,6 +40,7 @@ from arraygeom import (
 )
 from arraygeom.lenses import FlatPort, RollingShutter
 from docs.update_readme import write_block
+from pat.app.cli.parser import script
 from pat.lab.evaluation.tables import markdown_table
 from tests.benchmarks.bench_kornia import gradient_error
 from tests.benchmarks.printed import DOCS, timed
@@ -281,4 +281,4 @@ def main(write: bool = False) -> None:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    script(main)

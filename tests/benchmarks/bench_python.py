@@ -16,8 +16,7 @@ from itertools import product
 from pathlib import Path
 from statistics import median
 
-import tyro
-
+from pat.app.cli.parser import script
 from pat.lab.evaluation.tables import markdown_row, markdown_table
 
 FRAME = """
@@ -78,4 +77,4 @@ def seconds(folder: Path, policy: dict[str, str], script: str) -> float:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    script(main)

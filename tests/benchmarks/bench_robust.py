@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import tyro
 from rich.progress import track
 
 from arraygeom import Rig
 from calib.boards.detect import BoardViews, Detection
 from calib.boards.rig import Calibration, calibrate
+from pat.app.cli.parser import script
 from pat.lab.evaluation.tables import markdown_row
 from tests.benchmarks.printed import head, print_tables, reproducible
 from tests.calib.board_scenes import BOARD, board_poses, errors_of, four_cameras, see
@@ -95,4 +95,4 @@ def main(
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    script(main)

@@ -13,13 +13,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-import tyro
 
 from calib.boards.bundle import BundleProblem, Solved, intrinsic_values
 from calib.boards.detect import collect_folder
 from calib.boards.rig import Calibration, calibrate
 from calib.boards.solve import readjusted
 from calib.boards.target import parse_board
+from pat.app.cli.parser import script
 from pat.lab.evaluation.tables import markdown_row
 from tests.benchmarks.printed import DATA, head, print_tables, reproducible
 
@@ -90,4 +90,4 @@ def main(data: Path = DATA, out: Path | None = None) -> None:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    script(main)

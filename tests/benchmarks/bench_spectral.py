@@ -15,11 +15,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import tyro
 from torch import Generator, Tensor
 
 from arraygeom import Rig
 from pat import fuse
+from pat.app.cli.parser import script
 from pat.fusion.classical import classical, classical_baseline
 from pat.lab.evaluation.ablation import recorded
 from pat.lab.evaluation.tables import markdown_header, markdown_row
@@ -121,4 +121,4 @@ def main(
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    script(main)

@@ -15,7 +15,6 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-import tyro
 
 from calib.boards.poses import StartDeviations
 from calib.boards.rig import Calibration
@@ -23,6 +22,7 @@ from calib.boards.uncertainty import baseline_deviation, rig_covariance
 from calib.images.matches import PointMatches, match_cameras
 from calib.images.residuals import line_distances
 from experiments.alignment import nine_band_calibration
+from pat.app.cli.parser import script
 from pat.lab.evaluation.tables import markdown_row
 from pat.media.images import read_image
 from tests.benchmarks.printed import DATA, head, print_tables, reproducible
@@ -76,4 +76,4 @@ def main(data: Path = DATA, out: Path | None = None) -> None:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    script(main)

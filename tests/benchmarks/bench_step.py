@@ -13,11 +13,11 @@ from collections.abc import Callable
 from statistics import median
 
 import torch
-import tyro
 from torch import Tensor
 
 from arraygeom import Pair, Positions, Rectified, View
 from arraygeom.fields.grid import FieldOnGrid
+from pat.app.cli.parser import script
 from pat.matching.inputs import Inputs
 from pat.networks.configs import PATConfig
 from pat.networks.paper import PAT
@@ -102,4 +102,4 @@ def _listed(xy: Tensor, pixels: Tensor) -> Positions:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    script(main)

@@ -13,9 +13,9 @@ from itertools import count, islice
 from statistics import median
 
 import torch
-import tyro
 
 from arraygeom.fields import named_field
+from pat.app.cli.parser import script
 from pat.lab.evaluation.ablation import sample_photographs
 from pat.lab.training.config import TrainConfig, load_config
 from pat.lab.training.losses import Objective
@@ -77,4 +77,4 @@ def main(repeats: int = 3, names: tuple[str, ...] = ("mono-colour", "mono-colour
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    script(main)

@@ -17,20 +17,19 @@ from itertools import pairwise
 from pathlib import Path
 from statistics import fmean
 from types import MethodType
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 import torch
-import tyro
 from jaxtyping import Bool, Float
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, one_hot
-from tyro.conf import Positional
 
 from experiments.evaluation.conditions import regions_of
 from experiments.evaluation.halves import of_half
 from pat import load_weights
+from pat.app.cli.parser import Option, script
 from pat.fusion.classical import classical_fusion
 from pat.lab.data.pairs import PAPER_DISPARITY, StereoPair, middlebury_pairs
 from pat.lab.evaluation.protocols import MonoColourTask, mono_colour_task, rectified_fusion
@@ -156,11 +155,15 @@ def by_distances(found: dict[int, list[Unseen]]) -> Iterator[str]:
             yield markdown_row([label, str(len(rows)), *means, f"{min(gains):.1f} dB"])
 
 
-def main(data: Positional[Path], half: Literal["tune", "report"] = "report", out: Path | None = None) -> None:
+def main(
+    data: Annotated[Path, Option(positional=True)],
+    half: Literal["tune", "report"] = "report",
+    out: Path | None = None,
+) -> None:
     """Print the tables of the pairs of one half."""
     pairs = list(of_half(middlebury_pairs(data / "middlebury"), half))
     print_tables("Colour where beta does not see", tables(pairs), out)
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    script(main)

@@ -6,9 +6,9 @@ python -m tests.benchmarks.bench_weights
 from __future__ import annotations
 
 import torch
-import tyro
 from torch.utils.flop_counter import FlopCounterMode
 
+from pat.app.cli.parser import script
 from pat.lab.evaluation.protocols import rectified_fusion
 from pat.lab.evaluation.tables import markdown_row
 from pat.networks.weights import SHIPPED, load_weights
@@ -39,4 +39,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    script(main)

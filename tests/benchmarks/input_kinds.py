@@ -102,7 +102,7 @@ def kinds(data: Path) -> Iterator[Kind]:
     yield Kind("no rig, small alpha", partial(pair, table, beside, alpha_side=200))
     yield Kind("no rig, --focal", partial(pair, cloth, cloth_beside, more=["--focal", "alpha=900"]))
     yield Kind("no rig, --max-memory", partial(pair, table, beside, more=["--max-memory", "900MiB"]))
-    yield Kind("no rig, --points", partial(pair, cloth, cloth_beside, more=["--points"]))
+    yield Kind("no rig, points", partial(pair, cloth, cloth_beside, more=["--extras", "page,points"]))
     yield Kind("no rig, turned by EXIF", partial(turned, cloth, cloth_beside))
     yield Kind("no rig, noise", partial(noisy, table, beside, ["--noise", "estimate"]))
     yield Kind("no rig, dark", partial(dark, table, beside))
@@ -126,9 +126,7 @@ def kinds(data: Path) -> Iterator[Kind]:
     yield Kind("rig turned by a degree", partial(kitti, data, 1.0, 1.0))
     yield Kind("rig, baseline's sign wrong", partial(kitti, data, 0.0, -1.0), 3)
     yield Kind("rig, light field of nine", partial(light_field, data, ()))
-    yield Kind(
-        "rig, light field, bits and tif", partial(light_field, data, ["--bits", "16", "--kind", "tif"])
-    )
+    yield Kind("rig, light field, bits and tif", partial(light_field, data, ["--format", "tif16"]))
     yield Kind("rig of another size", partial(other_size, data), 2, False)
 
 

@@ -10,8 +10,8 @@ import sys
 from pathlib import Path
 
 import pytest
-import tyro
 
+from pat.app.cli.parser import script
 from tests.benchmarks.bench_job import STAGE_NAMES, Case, fuse_arguments
 
 BENCHES = sorted(path.stem for path in Path(__file__).parent.glob("bench_*.py"))
@@ -24,7 +24,7 @@ def test_a_benchmark_begins(name, capsys):
     module = importlib.import_module(f"tests.benchmarks.{name}")
     begin = next(found for found in ("Args", "main") if hasattr(module, found))
     with pytest.raises(SystemExit) as ended:
-        tyro.cli(getattr(module, begin), args=["--help"])
+        script(getattr(module, begin), ["--help"])
     assert ended.value.code == 0
     assert "usage" in capsys.readouterr().out
 

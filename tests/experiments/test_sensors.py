@@ -198,7 +198,7 @@ def rendered(tmp_path_factory):
 
 
 def test_rendered_scenes_are_recorded_by_their_responses_for_fusion(rendered, tmp_path, capsys):
-    main(["data", "info", str(rendered)])
+    main(["lab", "data", "info", str(rendered)])
     assert "2 scenes of mono 64x48, colour 64x48" in capsys.readouterr().out
     main(["record", str(rendered), "--out", str(tmp_path)], group=Experiments)
     assert {path.name for path in tmp_path.iterdir()} == {"000000", "000001"}

@@ -21,9 +21,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
-import tyro
 
 from docs.update_readme import write_block
+from pat.app.cli.parser import script
 
 from .cases import KINDS, Check, Seed, damaged, placed
 from .sandbox import Outcome, ended
@@ -121,4 +121,4 @@ def table_rows(kind: str, cases: list[Case]) -> list[str]:
 
 
 if __name__ == "__main__":
-    sys.exit(tyro.cli(Fuzz).run())
+    sys.exit(script(Fuzz).run())

@@ -60,7 +60,7 @@ def conversion_job(folder: Path) -> Job:
 
 def frame_job(folder: Path) -> Job:
     """One frame, over the results of another one."""
-    options = ["--no-report", "--points", "--threads", "1"]
+    options = ["--extras", "points"]
 
     def arguments(i: int) -> Arguments:
         images = _images(folder, f"fast_{i}.png", "slow_0.png")
@@ -75,7 +75,7 @@ def batch_job(folder: Path, *more: str, name: str = "batch") -> Job:
     further = more or ("--threads", "1")
 
     def arguments(out: Path) -> list[str]:
-        return [*_fuse(folder), *_images(folder, "", "many"), "--out", str(out), *further]
+        return [*_fuse(folder, "batch"), *_images(folder, "", "many"), "--out", str(out), *further]
 
     return Job(name, arguments, _frames_of, _frames_mixed, again=("--resume",), kept=_times)
 
@@ -84,13 +84,13 @@ def sequence_job(folder: Path) -> Job:
     """A sequence: key frames, frames, and a video, which is not compared."""
 
     def arguments(out: Path) -> list[str]:
-        further = ["--sequence", "--speed", "300", "--threads", "1"]
-        return [*_fuse(folder), *_images(folder, "", ""), "--out", str(out), *further]
+        further = ["--speed", "300", "--threads", "1"]
+        return [*_fuse(folder, "sequence"), *_images(folder, "", ""), "--out", str(out), *further]
 
     return Job("sequence", arguments, _frames_of, _frames_mixed, again=("--resume",), kept=_times)
 
 
-def _fuse(folder: Path) -> list[str]:
+def _fuse(folder: Path, command: str = "fuse") -> list[str]:
     """The common part of commands that fuse; makes what they need."""
     if not (folder / "fusion" / "rig.yaml").exists():
         torch.manual_seed(0)
@@ -104,7 +104,7 @@ def _fuse(folder: Path) -> list[str]:
         moving.rig(0.003).save(folder / "fusion" / "rig.yaml")
     made = folder / "fusion"
     weights = str(made / "tiny.safetensors")
-    return ["fuse", str(made / "rig.yaml"), "--alpha", "fast", "--weights", weights, "--no-align"]
+    return [command, str(made / "rig.yaml"), "--alpha", "fast", "--weights", weights, "--misfit", "warn"]
 
 
 def _images(folder: Path, fast: str, slow: str) -> list[str]:
@@ -138,7 +138,7 @@ def training_job(folder: Path) -> Job:
 
     def arguments(out: Path) -> list[str]:
         save_config(replace(base, out=out, cache=out.with_suffix(".npz")), out.with_suffix(".yaml"))
-        return ["train", str(out.with_suffix(".yaml"))]
+        return ["lab", "train", str(out.with_suffix(".yaml"))]
 
     return Job("training", arguments, _run_of, _run_faults)
 
@@ -201,7 +201,7 @@ def rendering_job(folder: Path, backend: str = "layered", scenes: int = 4) -> Jo
     config.write_text(yaml.safe_dump({"rig": "scene.yaml", "seed": 1, **settings[backend]}))
 
     def arguments(out: Path) -> list[str]:
-        return ["render", str(config), "--out", str(out), "--scenes", str(scenes), "--workers", "2"]
+        return ["lab", "render", str(config), "--out", str(out), "--scenes", str(scenes), "--workers", "2"]
 
     def compared(out: Path) -> dict[str, bytes]:
         made = files_of(out / "scenes")

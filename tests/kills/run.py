@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-import tyro
 
 from docs.update_readme import write_block
+from pat.app.cli.parser import script
 
 from .jobs import all_jobs
 from .killing import Job, Killed, killed, reference, scheduler_killed
@@ -107,4 +107,4 @@ def row(name: str, found: dict[str, Killed]) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(tyro.cli(Kills).run())
+    sys.exit(script(Kills).run())

@@ -17,11 +17,11 @@ from functools import partial
 from pathlib import Path
 
 import torch
-import tyro
 from torch import Tensor
 from torch.func import grad, hessian, jacfwd, jacrev, jvp, vjp, vmap
 
 from docs.update_readme import write_block
+from pat.app.cli.parser import script
 
 from .operators import OPERATORS, Operator
 
@@ -161,4 +161,4 @@ class Table:
 
 
 if __name__ == "__main__":
-    sys.exit(tyro.cli(Table).run())
+    sys.exit(script(Table).run())

@@ -6,12 +6,13 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from . import options
-from .fuse import files_by_camera, named_images
-from .known import Known
-from .options import FIRST, Out, say
+from .fusing import files_by_camera, named_images
+from .known import Around, Known
+from .options import Out, say
+from .parser import Option, UsageError
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -21,19 +22,27 @@ if TYPE_CHECKING:
     from ...fusion.align import Aligned
 
 
+EXTRAS = "page", "npy", "tif", "separate", "none"
+
+
 @dataclass
-class Align(Known):
+class Align(Around, Known):
     """Align an array's images: every camera's own values at the pixels of one, with masks; no fused image.
 
-    Without a rig: pat align IMG_0000_*.TIF
-    With one: pat align rig.yaml --alpha mono --image mono=a.png --image nir=b.tif --depth 2 20 --out out/
+    Examples:
+        pat align IMG_0000_*.TIF
+        pat align rig.yaml --alpha mono --image mono=a.png --image nir=b.tif --depth 2 20 --out out/
 
     Values keep their recorded type and bits. Without a rig it is found from the tags of the images, or from
     the images, and written to found_rig.yaml beside the result. With folders, or quoted patterns, frames are
     aligned one by one, matched by names or by the numbers or times in them.
     """
 
-    spellings: ClassVar[Mapping[str, str]] = {"--rig": FIRST, "--to": "--alpha"}
+    headings: ClassVar[Mapping[str, str]] = {
+        "the rig, and where to search": "misfit around response match_levels noise",
+        "the aligned images": "interpolation confidence fill extras",
+        "the machine": "max_memory",
+    }
 
     out: Out = Path("out")
     """Folder for aligned.tif (all bands, with names and wavelengths), NAME_visibility.png (255 seen, 128
@@ -45,18 +54,19 @@ class Align(Known):
     """Confidence, 0 to 1, from which a camera counts as seeing a point: lower keeps more, more mistakes."""
     fill: Literal["none", "propagate"] = "none"
     """Pixels a camera does not see: none leaves them without a value, propagate takes the nearest seen."""
-    separate: bool = False
-    """Write a file of each camera, NAME.tif, instead of one of all bands."""
-    positions: Literal["npy", "tif", "none"] = "npy"
-    """Format of the sub-pixel positions of alpha's pixels in each camera's image (x, y)."""
-    correct: bool = True
-    """Find how far the other cameras lie off their search segments, and put that right."""
+    extras: Annotated[str, Option("NAME[,NAME]")] = "page,npy"
+    """What is written beside the images: page (index.html, of a single frame); the sub-pixel positions (x, y)
+    of alpha's pixels in each camera's image, as npy or tif; none. And separate: a file of each camera,
+    NAME.tif, instead of one of all bands."""
 
     def run(self) -> None:
         """Align one frame or several, with the rig that is given or one that is found."""
         image, with_rig = named_images(self.given, self.image, "align")
         options.writable(self.out, folder=True)
         self.settings()
+        extras = self._extras = {*self.extras.split(",")}
+        if unknown := extras - {*EXTRAS}:
+            raise UsageError("--extras", f"some of {', '.join(EXTRAS)}", min(unknown))
         with self.judged():
             for frame in self._frames_with_rig(image) if with_rig else self._frames_without():
                 self._align(frame)
@@ -84,7 +94,7 @@ class Align(Known):
         from ..from_images import camera_names
 
         if self.depth:
-            raise ValueError("--depth: needs a rig: give one with --rig RIG")
+            raise UsageError("--depth", "a rig: give one with --rig RIG")
         files = matched_frames({name: find_images(path) for name, path in camera_names(self.given).items()})
         array = self.found_array(files)
         files = {name: files[name] for name in array.rig.names}
@@ -115,17 +125,18 @@ class Align(Known):
         options.say_when_compiling()
         with folder_lock(self.out):
             if frame.name:
-                self.refuse_several()
+                self._refuse_several()
             sweep(self.out)
-            refuse_to_replace(self.out, frame.recorded.names, separate=self.separate, name=frame.name)
+            separate = "separate" in self._extras
+            refuse_to_replace(self.out, frame.recorded.names, separate=separate, name=frame.name)
             aligned = self._aligned(frame)
-            shown = self.report and not frame.name
+            shown = "page" in self._extras and not frame.name
             page = self._page(aligned, frame, time.monotonic() - begin) if shown else None
             written = save_aligned(
                 aligned,
                 self.out,
-                separate=self.separate,
-                positions=self.positions,
+                separate=separate,
+                positions="tif" if "tif" in self._extras else "npy" if "npy" in self._extras else "none",
                 name=frame.name,
                 keep=frame.files.values(),
                 pages={} if page is None else {"index.html": page},
@@ -137,18 +148,22 @@ class Align(Known):
         print((self.out / f"{prefix}visibility.txt").read_text(), end="")
         say(f"written to {self.out}: {', '.join(path.name for path in written)}")
 
+    def _refuse_several(self) -> None:
+        """Raise UsageError if something is known, which is of a single frame."""
+        if self.around is not None:
+            raise UsageError("--around", "a single frame: give one image of each camera")
+
     def _aligned(self, frame: _Frame) -> Aligned:
         """The frame aligned, with the plan and a bar on the terminal."""
         from ...fusion.aligned_files import RecordedFiles
         from ..front import align
 
-        rig, field = self.with_known(frame.rig, frame.alpha, frame.files, options.field_named(self.field))
+        rig, field = self.with_known(frame.rig, frame.alpha, frame.files, None)
         with options.working_by_plan(f"aligning {frame.name}".strip()) as announce:
             return align(
                 frame.images,
                 rig,
                 alpha=frame.alpha,
-                network=self.weights,
                 settings=replace(self.settings(align=self.correct), field=field),
                 recorded=RecordedFiles(frame.recorded, frame.files),
                 interpolation=self.interpolation,
@@ -164,8 +179,7 @@ class Align(Known):
         from ..report import Facts
 
         texts = [str(message) for message in options.WARNED]
-        weights = () if self.weights is None else (f"weights: {self.weights}",)
-        facts = Facts((*weights, *self._notes, *frame.notes), texts, seconds)
+        facts = Facts((*self._notes, *frame.notes), texts, seconds)
         return aligned_page(aligned, frame.recorded, facts)
 
 

@@ -6,12 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from tyro.conf import Positional, UseAppendAction, arg
-
 from calib.boards import Lens
 
 from . import options
 from .options import Depth, Out, say
+from .parser import Option
 
 if TYPE_CHECKING:
     from calib.boards.poses import StartDeviations
@@ -21,7 +20,7 @@ BOARDS = (
     "(inner corners), circles:7x5:20mm, acircles:4x11:20mm, aprilgrid:6x6:88mm:0.3 (tags, space between "
     "them), or Kalibr's target file."
 )
-BoardName = Annotated[str, arg(metavar="BOARD", help=BOARDS)]
+BoardName = Annotated[str, Option("BOARD", BOARDS, positional=True)]
 
 
 @dataclass
@@ -29,26 +28,28 @@ class Calibrate:
     """Calibrate a rig from photographs of a board, with a report of how good it is.
 
     A folder for each camera, or file names like left01.jpg, right01.jpg; images of one moment have the same
-    number. Example: pat calibrate photos/ --board charuco:8x6:30mm -o rig.yaml
+    number.
+
+    Example: pat calibrate photos/ --board charuco:8x6:30mm -o rig.yaml
     """
 
-    photos: Annotated[Positional[Path], arg(metavar="FOLDER")]
+    photos: Annotated[Path, Option("FOLDER", positional=True)]
     """Folder with the images (or videos) of all cameras."""
-    board: UseAppendAction[
-        Annotated[tuple[str, ...], arg(metavar="BOARD", help=f"Once for each board in the images: {BOARDS}")]
+    board: Annotated[
+        tuple[str, ...], Option("BOARD", f"Once for each board in the images: {BOARDS}", repeat=True)
     ] = ()
     out: Out = Path("rig.yaml")
     """The rig file; its report (.html) and covariance (.covariance.json) are written beside it."""
-    camera: UseAppendAction[Annotated[tuple[str, ...], arg(metavar="NAME=PATTERN")]] = ()
+    camera: Annotated[tuple[str, ...], Option("NAME=PATTERN", repeat=True)] = ()
     """Once a camera, such as left='left*.jpg', where names of folders and files do not show the camera."""
     lens: Literal["auto", Lens] = "brown-conrady"
     """Lens model; from kannala-brandt on, they are for fisheyes. auto compares the first five, on held-out
     frames, and takes the best supported."""
     depth: Depth = None
     """Near and far bounds in metres of the scenes to come, written into the rig."""
-    start: Annotated[Path | None, options.optional("RIG")] = None
+    start: Annotated[Path | None, Option("RIG")] = None
     """A rig known roughly, such as measured positions, nominal focal lengths: one image a camera will do."""
-    deviation: UseAppendAction[Annotated[tuple[str, ...], arg(metavar="NAME=VALUE")]] = ()
+    deviation: Annotated[tuple[str, ...], Option("NAME=VALUE", repeat=True)] = ()
     """How well the start is known: position=0.0005 (m), rotation=3 (degrees), focal=0.02 (share of the focal
     length), centre=0.01 (share of the width); these are the defaults."""
     watch: bool = False
@@ -103,14 +104,15 @@ class Calibrate:
 class PrintBoard:
     """Make a calibration board to print at its true size.
 
+
     Example: pat board charuco:8x6:30mm -o board.pdf
     """
 
-    board: Positional[BoardName]
+    board: BoardName
     out: Out = Path("board.pdf")
     """File to write, ending in .pdf or .svg."""
     paper: Annotated[
-        Literal["A4", "letter", "A3", "A2", "A1", "A0"] | None, options.optional("{A4,letter,A3,A2,A1,A0}")
+        Literal["A4", "letter", "A3", "A2", "A1", "A0"] | None, Option("{A4,letter,A3,A2,A1,A0}")
     ] = None
     """Sheet to centre the board on; without it the page is as large as the board with its margin."""
 

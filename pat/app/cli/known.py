@@ -1,4 +1,4 @@
-"""The options that `pat fuse` and `pat align` share."""
+"""The options that `pat fuse`, `pat batch`, `pat sequence` and `pat align` share."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
-from tyro.conf import Positional, UseAppendAction, arg
-
+from ...media.suffixes import IMAGE_SUFFIXES
 from . import options
-from .options import WEIGHTS_HELP, Depth, FieldName, Images, Memory, optional, say
+from .options import Depth, Images, Memory, Name, say
+from .parser import Option, UsageError
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from ..from_images import ImageArray
 
 MATCHES_HELP = "Matched points to use: CSV (x0,y0,x1,y1 a line, of two images in order) or a COLMAP database."
-MatchesFile = Annotated[Path | None, arg(metavar="FILE", help=MATCHES_HELP, help_behavior_hint="")]
+MatchesFile = Annotated[Path | None, Option("FILE", MATCHES_HELP)]
 
 NOISE = "NAME=ELECTRONS[,READ]|estimate|none"
 OUT_OF_RANGE = 0.9
@@ -34,51 +34,42 @@ OFF_LINES = 5.0
 
 @dataclass
 class Known:
-    """What `pat fuse` and `pat align` both get: an array, ways to match its images, facts of the scene."""
+    """An array, facts of the scene, and ways to match its images."""
 
-    given: Annotated[Positional[tuple[Path, ...]], arg(metavar="RIG|IMAGE IMAGE")] = ()
+    given: Annotated[tuple[Path, ...], Option("RIG|IMAGE IMAGE ...", positional=True)] = ()
     """Rig file of any known format (also: --rig RIG); or, without, image, folder or video of each camera."""
-    alpha: Annotated[str | None, optional("NAME")] = None
-    """The camera whose view is wanted; without a rig, by default the largest grey image. Align: also --to."""
+    alpha: Name = None
+    """The camera whose view is wanted; without a rig, by default the largest grey image."""
     image: Images = ()
     """With a rig: an image of each camera, once each; or NAME=FOLDER, or NAME=PATTERN."""
     depth: Depth = None
     """Near and far bounds in metres, instead of the rig's; far may be inf."""
-    depth_map: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """Depth of alpha's pixels, of one frame: PFM, TIFF or 16-bit PNG; matches are searched around it."""
-    depth_scale: Annotated[float | None, arg(metavar="METRES", help_behavior_hint="")] = None
-    """Metres of one unit of --depth-map; by default 1 of floats, and .001 of whole numbers."""
-    depth_tolerance: float = 0.05
-    """By what share --depth-map may be off; 0 takes it as it is."""
-    matches: MatchesFile = None
-    weights: Annotated[str | None, arg(metavar="NAME|FILE", help=WEIGHTS_HELP, help_behavior_hint="")] = None
-    field: FieldName = "auto"
-    max_memory: Memory = None
-    """Memory limit of the whole process, such as 4GiB; larger frames are done in tiles."""
-    normalise_radiometry: bool = False
-    """First bring each beta to alpha's mean, contrast (other exposures, filters). Also: --match-levels."""
-    response: Annotated[str, arg(metavar="fit|rec601|R,G,B")] = "fit"
+    misfit: Literal["correct", "warn", "refuse"] = "correct"
+    """If the rig does not fit the images: correct how far the cameras lie off their search segments, and warn
+    where the images still do not fit; warn alone; or refuse: correct, and write nothing where they still do
+    not fit."""
+    response: Annotated[str, Option("fit|rec601|R,G,B")] = "fit"
     """How a mono alpha weighs red, green and blue; fit: found from matches, with gain and gamma."""
-    noise: UseAppendAction[Annotated[tuple[str, ...], arg(metavar=NOISE)]] = ()
+    match_levels: bool = False
+    """First bring each beta to alpha's mean and contrast (other exposures, filters)."""
+    noise: Annotated[tuple[str, ...], Option(NOISE, repeat=True)] = ()
     """Low light: a camera's electrons at white and read noise in electrons, or estimate: views are denoised.
     A frame is by default fused so where an image shows noise plainly."""
-    strict: bool = False
-    """Write nothing, instead of warning, where the confidence says that the rig does not fit the images."""
-    report: bool = True
-    """Of a single frame, also write index.html: a page that shows images, confidence and depth."""
+    max_memory: Memory = None
+    """Memory limit of the whole process, such as 4GiB; larger frames are done in tiles."""
+
+    @property
+    def correct(self) -> bool:
+        """Whether the rig is corrected where it does not fit."""
+        return self.misfit != "warn"
 
     def settings(self, *, noise_by_default: bool = False, **further: Any) -> FuseSettings:
         """How frames are fused. Raises ValueError for options that are none."""
         from ...fusion.fuse import FuseSettings
 
-        of_map = [n for n in ("depth_scale", "depth_tolerance") if getattr(self, n) != getattr(Known, n)]
-        if self.depth_map is None and of_map:
-            named = ", ".join(f"--{name.replace('_', '-')}" for name in of_map)
-            raise ValueError(f"{named}: needs --depth-map")
         return FuseSettings(
-            field=options.field_named(self.field),
             max_memory=self.max_memory,
-            match_levels=self.normalise_radiometry,
+            match_levels=self.match_levels,
             response=options.response_of(self.response),
             noise=options.noise_of(self.noise, by_default=noise_by_default),
             **further,
@@ -92,15 +83,72 @@ class Known:
 
         self._notes: list[str] = []
         try:
-            with limited(self.settings().limit), confidence_checked(strict=self.strict):
+            with limited(self.settings().limit), confidence_checked(strict=self.misfit == "refuse"):
                 yield
         except Exception as error:
             if not isinstance(error.__cause__ or error, LowConfidenceWarning):
                 raise
-            say(f"pat: {error}; not written (--strict)", style="red")
+            say(f"pat: {error}; not written (--misfit refuse)", style="red")
             sys.exit(LowConfidenceWarning.exit_status)
         if any(isinstance(message, LowConfidenceWarning) for message in options.WARNED):
             sys.exit(LowConfidenceWarning.exit_status)
+
+    def found_array(
+        self,
+        files: Mapping[str, Sequence[Path]],
+        *,
+        weights: str | None = None,
+        focal: Mapping[str, float] = {},
+    ) -> ImageArray:
+        """The array that each camera's first image says, whose levels are then taken."""
+        from ..from_images import array_from_images
+
+        first = {name: paths[0] for name, paths in files.items()}
+        options.say_when_compiling()
+        with options.working("finding the rig"):
+            array = array_from_images(first, alpha=self.alpha, weights=weights, focal=focal, say=say)
+        if weights is None:
+            say(f"weights: {array.weights} (--weights NAME takes others)")
+        self.match_levels |= array.match_levels
+        return array
+
+    def note(self, line: str) -> None:
+        """Say a line, and keep it for the page."""
+        say(line)
+        self._notes.append(line)
+
+
+class KnownFile(NamedTuple):
+    """What `--around FILE[,scale=METRES][,tolerance=SHARE]` says."""
+
+    path: Path
+    scale: float | None = None
+    tolerance: float = 0.05
+
+    @classmethod
+    def parse(cls, text: str) -> KnownFile:
+        """The parts of the option's text. Raises UsageError for others."""
+        path, *parts = text.split(",")
+        numbers = options.numbers_by_name(parts, "--around")
+        if unknown := numbers.keys() - {"scale", "tolerance"}:
+            raise UsageError("--around", "FILE[,scale=METRES][,tolerance=SHARE]", min(unknown))
+        return cls(Path(path), **numbers)
+
+    @property
+    def is_depth(self) -> bool:
+        """Whether it is a depth map; else matched points."""
+        return self.path.suffix.lower() in IMAGE_SUFFIXES | {".pfm"}
+
+
+@dataclass
+class Around:
+    """An option for what is known of one frame."""
+
+    around: Annotated[str | None, Option("FILE")] = None
+    """Search around what is known: a depth map of alpha's pixels (PFM, TIFF, 16-bit PNG), or matched points
+    (CSV with x0,y0,x1,y1 a line, of two images in order; a COLMAP database). For a depth map,
+    FILE,scale=METRES says the metres of one unit (by default 1 of floats, and .001 of whole numbers),
+    FILE,tolerance=SHARE by what share it may be off (by default .05; 0 takes it as it is)."""
 
     def with_known(
         self, rig: Rig, alpha: str, files: Mapping[str, str | Path], field: ReceptiveField | None
@@ -111,90 +159,67 @@ class Known:
         """
         from arraygeom.rig import with_pixels
 
-        if self.depth_map is None:
-            if self.matches is None:
-                return rig, field
+        if self.around is None:
+            return rig, field
+        known = KnownFile.parse(self.around)
+        if not known.is_depth:
             rig = with_pixels(rig)
-            return rig, self._around_matches(rig, alpha, files, field)
-        if self.matches is not None or field is not None:
-            raise ValueError("--depth-map, --matches, --field: each excludes the others: give one of them")
-        return rig, self._around_depth(rig, alpha)
+            return rig, _around_matches(known.path, rig, alpha, files, field)
+        if field is not None:
+            raise UsageError("--field", "no other field beside the depth map of --around")
+        return rig, _around_depth(known, rig, alpha)
 
-    def found_array(self, files: Mapping[str, Sequence[Path]], focal: Mapping[str, float] = {}) -> ImageArray:
-        """The array that each camera's first image says, whose weights and levels are then taken."""
-        from ..from_images import array_from_images
 
-        first = {name: paths[0] for name, paths in files.items()}
-        options.say_when_compiling()
-        with options.working("finding the rig"):
-            array = array_from_images(first, alpha=self.alpha, weights=self.weights, focal=focal, say=say)
-        if self.weights is None:
-            say(f"weights: {array.weights} (--weights NAME takes others)")
-        self.weights = array.weights
-        self.normalise_radiometry |= array.match_levels
-        return array
+def _around_depth(known: KnownFile, rig: Rig, alpha: str) -> ReceptiveField:
+    """The field around the depth map. Raises ValueError for depths outside the rig's range."""
+    import torch
 
-    def note(self, line: str) -> None:
-        """Say a line, and keep it for the page."""
-        say(line)
-        self._notes.append(line)
+    from arraygeom import Camera
+    from arraygeom.fields import AroundDepth
+    from arraygeom.runtime.text import length_unit
 
-    def refuse_several(self) -> None:
-        """Raise ValueError if something is known, which is of a single frame."""
-        if self.depth_map is not None or self.matches is not None:
-            raise ValueError("--depth-map, --matches: for a single frame only: give one image of each camera")
+    from ...media.depth_maps import read_depth
 
-    def _around_depth(self, rig: Rig, alpha: str) -> ReceptiveField:
-        """The field around the depth map. Raises ValueError for depths outside the rig's range."""
-        import torch
+    view = rig[alpha]
+    if not isinstance(view, Camera) or rig.depth is None:
+        raise UsageError("--around", "a calibrated rig for a depth map: give --rig RIG and --depth NEAR FAR")
+    depth = read_depth(known.path, hw=view.hw, scale=known.scale)
+    near, far = (float(bound) for bound in rig.depth)
+    finite = depth[depth.isfinite()]
+    if float(((finite < near) | (finite > far)).float().mean()) > OUT_OF_RANGE:
+        some = finite[:: len(finite) // 100_000 + 1]  # torch takes quantiles of 2^24 numbers at most
+        low, high = some.quantile(torch.tensor([0.05, 0.95])).tolist()
+        raise ValueError(
+            f"{known.path}: holds {low:.3g} to {high:.3g} m, the rig's depth range is {near:g} to "
+            f"{far:g} {length_unit(rig)}: state its unit with --around FILE,scale=METRES, or another range "
+            "with --depth"
+        )
+    return AroundDepth(depth, known.tolerance, view)
 
-        from arraygeom import Camera
-        from arraygeom.fields import AroundDepth
-        from arraygeom.runtime.text import length_unit
 
-        from ...media.depth_maps import read_depth
+def _around_matches(
+    path: Path, rig: Rig, alpha: str, files: Mapping[str, str | Path], field: ReceptiveField | None
+) -> Mapping[str, ReceptiveField | None]:
+    """Each beta's field: around its matches with alpha, if it has some. Raises as `_check_matches`."""
+    from arraygeom import LensView
+    from arraygeom.fields import AroundMatches
+    from arraygeom.io.point_matches import read_matches
 
-        view = rig[alpha]
-        if not isinstance(view, Camera) or rig.depth is None:
-            raise ValueError("--depth-map: needs a calibrated rig: give --rig RIG and --depth NEAR FAR")
-        assert self.depth_map is not None
-        depth = read_depth(self.depth_map, hw=view.hw, scale=self.depth_scale)
-        near, far = (float(bound) for bound in rig.depth)
-        finite = depth[depth.isfinite()]
-        if float(((finite < near) | (finite > far)).float().mean()) > OUT_OF_RANGE:
-            some = finite[:: len(finite) // 100_000 + 1]  # torch takes quantiles of 2^24 numbers at most
-            low, high = some.quantile(torch.tensor([0.05, 0.95])).tolist()
-            raise ValueError(
-                f"{self.depth_map}: holds {low:.3g} to {high:.3g} m, the rig's depth range is {near:g} to "
-                f"{far:g} {length_unit(rig)}: state its unit with --depth-scale, or another range with "
-                "--depth"
-            )
-        return AroundDepth(depth, self.depth_tolerance, view)
-
-    def _around_matches(
-        self, rig: Rig, alpha: str, files: Mapping[str, str | Path], field: ReceptiveField | None
-    ) -> Mapping[str, ReceptiveField | None]:
-        """Each beta's field: around its matches with alpha, if it has some. Raises as `_check_matches`."""
-        from arraygeom import LensView
-        from arraygeom.fields import AroundMatches
-        from arraygeom.io.point_matches import read_matches
-
-        assert self.matches is not None
-        fields = dict.fromkeys(rig.betas(alpha), field)
-        matches = read_matches(self.matches, files, {name: rig[name].hw for name in files})
-        for names, points in matches.items():
-            if alpha not in names:
-                continue
-            (a, b) = (names, points) if names[0] == alpha else (names[::-1], points[::-1])
-            alpha_view, beta_view = rig[a[0]], rig[a[1]]
-            assert isinstance(alpha_view, LensView)
-            assert isinstance(beta_view, LensView)
-            if rig.pair(*a).calibrated:
-                _check_matches(self.matches, a, rig.pair(*a), *b)
-            fields[a[1]] = AroundMatches.from_points(
-                *b, alpha_view.hw, views=(alpha_view, beta_view), field=field
-            )
-        return fields
+    fields = dict.fromkeys(rig.betas(alpha), field)
+    matches = read_matches(path, files, {name: rig[name].hw for name in files})
+    for names, points in matches.items():
+        if alpha not in names:
+            continue
+        (a, b) = (names, points) if names[0] == alpha else (names[::-1], points[::-1])
+        alpha_view, beta_view = rig[a[0]], rig[a[1]]
+        assert isinstance(alpha_view, LensView)
+        assert isinstance(beta_view, LensView)
+        if rig.pair(*a).calibrated:
+            _check_matches(path, a, rig.pair(*a), *b)
+        fields[a[1]] = AroundMatches.from_points(
+            *b, alpha_view.hw, views=(alpha_view, beta_view), field=field
+        )
+    return fields
 
 
 def _check_matches(file: Path, names: tuple[str, str], pair: Pair, x: Tensor, x_beta: Tensor) -> None:

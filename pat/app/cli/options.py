@@ -9,18 +9,15 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
-from itertools import takewhile
 from pathlib import Path
 from tempfile import TemporaryFile
 from threading import Lock
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
-from tyro.conf import Positional, UseAppendAction, arg
-
-from ...media.suffixes import IMAGE_SUFFIXES, VIDEO_SUFFIXES
 from ...support.folders import printable
+from .parser import Option, UsageError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -42,7 +39,7 @@ FIELD_HELP = (
     f"Receptive field in the other cameras: {', '.join(FIELD_NAMES)}, or MODULE:OBJECT for your own; "
 )
 FIELD_HELP += "auto takes what the rig allows."
-FieldName = Annotated[str, arg(metavar="NAME|MODULE:OBJECT", help=FIELD_HELP)]
+FieldName = Annotated[str, Option("NAME", FIELD_HELP)]
 
 
 def response_of(text: str) -> Any:
@@ -93,67 +90,32 @@ def noise_of(texts: Iterable[str], *, by_default: bool = False) -> Any:
     return dict(_once("--noise", levels))
 
 
-def optional(metavar: str) -> Any:
-    """Marks an option that may be left out."""
-    return arg(metavar=metavar, help_behavior_hint="")
-
-
-RigFile = Annotated[
-    Positional[Path], arg(metavar="RIG", help="Rig file of any known format; also: --rig RIG.")
-]
-Images = UseAppendAction[Annotated[tuple[str, ...], arg(metavar="NAME=FILE")]]
-Numbers = UseAppendAction[Annotated[tuple[str, ...], arg(metavar="NAME=NUMBER")]]
-Out = Annotated[Path, arg(metavar="PATH", aliases=["-o"])]
-MaybeOut = Annotated[Path | None, arg(metavar="PATH", aliases=["-o"], help_behavior_hint="")]
-MaybePath = Annotated[Path | None, optional("PATH")]
-Depth = Annotated[tuple[float, float] | None, optional("NEAR FAR")]
-Memory = Annotated[str | None, optional("SIZE")]
+RigFile = Annotated[Path, Option("RIG", "Rig file of any known format; also: --rig RIG.", positional=True)]
+Images = Annotated[tuple[str, ...], Option("NAME=FILE", repeat=True)]
+Numbers = Annotated[tuple[str, ...], Option("NAME=NUMBER", repeat=True)]
+Name = Annotated[str | None, Option("NAME")]
+Out = Annotated[Path, Option("PATH", short="-o")]
+MaybeOut = Annotated[Path | None, Option("PATH", short="-o")]
+Depth = Annotated[tuple[float, float] | None, Option("NEAR FAR")]
+Memory = Annotated[str | None, Option("SIZE")]
 WEIGHTS_HELP = f"Weights: {', '.join(WEIGHT_NAMES)}, or a file."
-Weights = Annotated[str, arg(metavar="NAME|FILE", help=WEIGHTS_HELP)]
+Weights = Annotated[str, Option("NAME|FILE", WEIGHTS_HELP)]
+Address = Annotated[str | None, Option("ADDRESS")]
 
-FIRST, LAST = "first", "last"
 
-
-def respelled(arguments: Iterable[str], command: Any) -> list[str]:
-    """The arguments with the other `spellings` of a command's options replaced.
-
-    FIRST and LAST stand for the first and the last positional argument, whose value follows the option: a rig
-    may always be given so. Images that are positional arguments may stand anywhere.
-    """
-    options = getattr(command, "__dataclass_fields__", {})
-    spellings = ({"--rig": FIRST} if "rig" in options else {}) | getattr(command, "spellings", {})
-    words = iter(arguments)
-    first: list[str] = []
-    rest: list[str] = []
-    last: list[str] = []
-    for word in words:
+def rig_first(arguments: Sequence[str], command: Any) -> list[str]:
+    """The arguments with the rig of `--rig RIG` in front, where it stands without the option."""
+    words = list(arguments)
+    if not {"rig", "given", "source"} & {*getattr(command, "__dataclass_fields__", {})}:
+        return words
+    for i, word in enumerate(words):
         option, equals, value = word.partition("=")
-        new = spellings.get(option.replace("_", "-") if option.startswith("--") else option)
-        if new not in (FIRST, LAST):
-            rest.append(f"{new}{equals}{value}" if new else word)
-            continue
-        value = value if equals else next(words, "")
-        if not value:
-            raise ValueError(f"{option}: give a file")
-        (first if new == FIRST else last).append(value)
-    if "given" in options:
-        rest = _images_first(rest)
-    return [*first, *rest, *last]
-
-
-def _images_first(words: Sequence[str]) -> list[str]:
-    """Words of a command line with the image files that stand between options moved before those."""
-    leading = len(list(takewhile(lambda word: not word.startswith("-"), words)))
-    files = {
-        i
-        for i in range(leading + 1, len(words))
-        if Path(words[i]).suffix.lower() in IMAGE_SUFFIXES | VIDEO_SUFFIXES
-        and not words[i].startswith("-")
-        and "=" not in words[i]
-        and words[i - 1] not in ("-o", "--out", "--alpha", "--weights", "--image", "--depth-map", "--matches")
-    }
-    others = [word for i, word in enumerate(words) if i >= leading and i not in files]
-    return [*words[:leading], *(words[i] for i in sorted(files)), *others]
+        if option == "--rig":
+            value = value if equals else "".join(words[i + 1 : i + 2])
+            if not value:
+                raise UsageError("--rig", "a rig file")
+            return [value, *words[:i], *words[i + (1 if equals else 2) :]]
+    return words
 
 
 def writable(out: Path, *, folder: bool = False, option: str = "--out") -> Path:
@@ -342,7 +304,8 @@ def warn(message: Warning | str, *_: Any, **__: Any) -> None:
 
 def say(text: object, style: str | None = None) -> None:
     """Print a line on standard error."""
-    console().print(printable(f"{text}"), style=style, markup=False, emoji=False, soft_wrap=True)
+    with suppress(OSError):  # the work goes on where nothing can be said, as on a full disk
+        console().print(printable(f"{text}"), style=style, markup=False, emoji=False, soft_wrap=True)
 
 
 def progress(title: str) -> Callable[[Iterable[T], int], Iterable[T]]:
@@ -406,8 +369,6 @@ def say_when_compiling() -> None:
     """Say once, in one line, that kernels are compiled, before they are: that takes some seconds."""
     from numba.core import event
 
-    from arraygeom.runtime.compiled import COMPILED
-
     first = Lock()
 
     class Compiling(event.Listener):
@@ -418,7 +379,7 @@ def say_when_compiling() -> None:
         def on_end(self, event: object) -> None:
             pass
 
-    event.register(COMPILED, Compiling())
+    event.register("numba:compile", Compiling())
 
 
 def print_json(document: Any) -> None:

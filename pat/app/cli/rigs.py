@@ -11,24 +11,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
-from tyro.conf import Positional, arg
-
 from . import options
 from .known import MatchesFile
 from .options import (
-    FIRST,
-    LAST,
     Depth,
     FieldName,
     Images,
     MaybeOut,
+    Name,
     Numbers,
     Out,
     RigFile,
     load_rig,
-    optional,
     say,
 )
+from .parser import Option
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -44,7 +41,7 @@ class Show:
     """Draw a rig, search segments of some alpha pixels, and how far matched points lie from their lines."""
 
     rig: RigFile
-    alpha: Annotated[str | None, optional("NAME")] = None
+    alpha: Name = None
     """The camera whose pixels are chosen; by default the first."""
     image: Images = ()
     """Images to draw on, if wanted; with two or more, points are matched in them."""
@@ -128,18 +125,19 @@ def _twelve_pixels(hw: tuple[int, int]) -> Tensor:
 class Explore:
     """Explore receptive fields in the browser: point at a pixel of alpha, see its segments, move the rig.
 
+
     Example: pat explore rig.yaml --image mono=a.png --image colour=b.png
     """
 
     rig: RigFile
     image: Images = ()
     """An image of each camera, once each; without any a checkered room is shown."""
-    alpha: Annotated[str | None, optional("NAME")] = None
+    alpha: Name = None
     """The camera to point in; by default the first with an image."""
     field: FieldName = "auto"
-    weights: Annotated[str | None, arg(metavar="NAME|FILE", help_behavior_hint="")] = None
+    weights: Annotated[str | None, Option("NAME|FILE")] = None
     """A network of the paper whose attention to show, as pat-supervised; else correlations of windows."""
-    save: Annotated[Path | None, optional("FILE.html")] = None
+    save: Annotated[Path | None, Option("FILE.html")] = None
     """Write a page of one file that needs no server, and end."""
     port: int = 0
     """Port on localhost; 0 takes a free one."""
@@ -178,7 +176,7 @@ class Info:
     rig: RigFile
     depth: Depth = None
     """Near and far bounds in metres, instead of the rig's."""
-    alpha: Annotated[str | None, optional("NAME")] = None
+    alpha: Name = None
     """Only pairs with this alpha, the 50 nearest; by default all, and of over 12 cameras the first's."""
     json: bool = False
     """Print JSON instead of tables."""
@@ -250,21 +248,19 @@ def _two(values: tuple[float, float] | None, between: str = ", ") -> str:
 class Convert:
     """Convert a rig file from one format to another."""
 
-    spellings: ClassVar[Mapping[str, str]] = {"--rig": FIRST, "--out": LAST, "-o": LAST}
-
-    source: Annotated[Positional[Path], arg(metavar="RIG")]
+    source: Annotated[Path, Option("RIG", positional=True)]
     """Rig file, or folder where the format is one; also: --rig RIG."""
-    target: Annotated[Positional[Path], arg(metavar="OUT")]
-    """File or folder to write; also: --out OUT."""
-    read_as: Annotated[str | None, optional("FORMAT")] = None
+    target: Annotated[Path, Option("OUT", positional=True)]
+    """File or folder to write."""
+    read_as: Annotated[str | None, Option("FORMAT")] = None
     """Format of the source; by default recognised."""
-    size: Annotated[tuple[int, int] | None, optional("W H")] = None
+    size: Annotated[tuple[int, int] | None, Option("W H")] = None
     """Of the images, pixels: for files that state none, or several."""
-    lens: Annotated[str | None, optional("MODEL")] = None
+    lens: Annotated[str | None, Option("MODEL")] = None
     """Lens model of the coefficients, as brown-conrady or kannala-brandt: for files that do not say."""
     refit: bool = False
     """Fit lenses anew that end within their image, as at a pole: brown-conrady's k1 k2 p1 p2 k3."""
-    write_as: Annotated[str, arg(metavar="FORMAT")] = "native"
+    write_as: Annotated[str, Option("FORMAT")] = "native"
     """Format of the target."""
 
     def run(self) -> None:
@@ -295,17 +291,16 @@ class Doctor:
     OpenGL axes, left-handed systems, order of angles and quaternions, radians taken for degrees, units,
     cameras swapped, images resized, zoomed, cropped, rotated or mirrored without the rig, x and y exchanged,
     distortion ignored, applied twice or with the wrong sign.
+
     Example: pat rig doctor rig.yaml --image mono=a.png --image colour=b.png --out better.yaml
     """
-
-    spellings: ClassVar[Mapping[str, str]] = {"--fix": "--out"}
 
     rig: RigFile
     image: Images
     """An image of each of two or more cameras."""
     matches: MatchesFile = None
     out: MaybeOut = None
-    """Rig file to write if a mistake is found: the repaired rig. Also: --fix. A former file is kept as
+    """Rig file to write if a mistake is found: the repaired rig. A former file is kept as
     NAME.old. Exit status 4, and nothing is written, if several mistakes with different repairs explain the
     images as well."""
     json: bool = False
@@ -355,7 +350,9 @@ class Refine:
 
     No rig is written unless held-out points come nearer to their epipolar lines, the changes agree with their
     standard deviations, and depth does not become less certain. What happens to depth is printed and written
-    into the file. Example: pat rig refine rig.yaml --image mono=a.png --image colour=b.png --out better.yaml
+    into the file.
+
+    Example: pat rig refine rig.yaml --image mono=a.png --image colour=b.png --out better.yaml
     """
 
     rig: RigFile
@@ -367,7 +364,7 @@ class Refine:
     free: tuple[str, ...] = ("rotation", "centre")
     """Free parameters: rotation, translation, focal, centre (principal_point), distortion; or
     CAMERA.rotation. By default, focal and translation too if that brings held-out points nearer."""
-    sigma: Annotated[tuple[str, ...], arg(metavar="KIND=NUMBER")] = ()
+    sigma: Annotated[tuple[str, ...], Option("KIND=NUMBER")] = ()
     """Standard deviation of a parameter before refinement: degrees, pixels; translation, focal relative."""
     photometric: bool = True
     """Also minimise the fusion's own error, after that of the points."""
@@ -427,6 +424,7 @@ class Refine:
 class RigFromImages:
     """Make a rig from images alone: fundamental matrices and rough homographies, good enough to fuse with.
 
+
     Example: pat rig start --image mono=a.png --image colour=b.png --focal mono=800 --out rig.yaml
     """
 
@@ -462,12 +460,13 @@ class RigDiff:
 
     A motion of the whole rig is no difference. What is more than both calibrations' errors follows from the
     covariance files that `pat calibrate` writes beside its rigs.
+
     Example: pat rig diff may.yaml october.yaml --out diff.png
     """
 
-    first: Annotated[Positional[Path], arg(metavar="A")]
+    first: Annotated[Path, Option("A", positional=True)]
     """Rig file."""
-    second: Annotated[Positional[Path], arg(metavar="B")]
+    second: Annotated[Path, Option("B", positional=True)]
     """Rig file of the same cameras."""
     depth: Depth = None
     """Near and far bounds in metres between which rigs are compared, instead of the first one's."""

@@ -20,7 +20,7 @@ from arraygeom.sampling import sample
 from arraygeom.undistortion import pinhole_view, resampled
 from pat.lab.synthesis.rendered import RENDER_FILE, Rendered, is_rendered
 
-AGAIN = "remove it and run 'pat render' again"
+AGAIN = "remove it and run 'pat lab render' again"
 
 
 def scene_folders(root: str | Path) -> list[Path]:
@@ -36,7 +36,7 @@ def scene_folders(root: str | Path) -> list[Path]:
     inside = root / "scenes" if (root / "scenes").is_dir() else root
     folders = sorted(f for f in inside.iterdir() if f.is_dir() and not f.name.startswith("."))
     if not any(is_rendered(f) for f in folders):
-        make = f"make some with 'pat render CONFIG --scenes N --out {root}'"
+        make = f"make some with 'pat lab render CONFIG --scenes N --out {root}'"
         raise ValueError(f"{root}: holds no rendered scene: {make}")
     if broken := next((f for f in folders if not is_rendered(f)), None):
         raise ValueError(f"{broken}: is not a whole scene (no {RENDER_FILE}): {AGAIN}")

@@ -60,7 +60,7 @@ class RetryLimits:
 
 @dataclass(frozen=True, kw_only=True)
 class RenderConfig:
-    """A file for `pat render`:
+    """A file for `pat lab render`:
 
         rig: rig.yaml            # beside this file
         seed: 1

@@ -7,10 +7,9 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-import tyro
-
+from pat.app.cli.parser import Option, parse
 from pat.lab.synthesis.rig_distribution import RigDistribution
 from pat.networks.configs import CONFIGS, BandwisePATConfig, GuidedPATConfig, PATConfig
 from pat.support.schema import from_document, near, parse_yaml, to_document
@@ -61,7 +60,7 @@ class TrainConfig:
 
     photos: tuple[Path, ...] = ()
     """Folders of photographs: the textures of layered scenes."""
-    out: Path = Path("runs/mono-colour")
+    out: Annotated[Path, Option("PATH", short="-o")] = Path("runs/mono-colour")
     """Folder for weights, checkpoints, figures and images."""
     start: Path | None = None
     """File of weights to start from."""
@@ -107,7 +106,7 @@ class TrainConfig:
     rendered: float = 0.0
     """Share of the batches made of rendered scenes instead of layered ones."""
     rendered_from: tuple[Path, ...] = ()
-    """Folders of rendered scenes, output of `pat render`."""
+    """Folders of rendered scenes, output of `pat lab render`."""
     pairs: float = 0.0
     """Share of the batches made of stereo pairs."""
     pairs_from: tuple[Path, ...] = ()
@@ -227,7 +226,7 @@ def save_config(config: TrainConfig, path: Path) -> None:
     write_text(path, text)
 
 
-def command_line(arguments: list[str]) -> TrainConfig:
+def command_line(arguments: list[str], prog: str = "pat lab train") -> TrainConfig:
     """`[RECIPE] [--name value ...]`: a recipe by name or file, and overrides of its values."""
     base = TrainConfig()
     if arguments and not arguments[0].startswith("-"):
@@ -237,18 +236,13 @@ def command_line(arguments: list[str]) -> TrainConfig:
                 f"field: {base.field} is code, which a recipe alone does not run: if you trust it, "
                 f"add --field {base.field}"
             )
-    return tyro.cli(
-        TrainConfig,
-        prog="pat train [RECIPE]",
-        description=(
-            "Train weights on scenes made from photographs while training. RECIPE is a YAML file or one of "
-            f"{', '.join(recipes())}; the options below change it. The same command again continues a run "
-            "that stopped. On N processors: torchrun --nproc_per_node N -m pat train RECIPE --groups N"
-        ),
-        default=base,
-        args=arguments,
-        config=(tyro.conf.AvoidSubcommands, tyro.conf.DisallowNone),
+    description = (
+        "Train weights on scenes made from photographs while training. RECIPE is a YAML file or one of\n"
+        f"{', '.join(recipes())}; the options below change it.\n\n"
+        "The same command again continues a run that stopped. On N processors:\n"
+        "torchrun --nproc_per_node N -m pat lab train RECIPE --groups N"
     )
+    return parse(TrainConfig, arguments, prog=f"{prog} [RECIPE]", base=base, description=description)
 
 
 def difference(config: TrainConfig, other: TrainConfig) -> str | None:

@@ -1,7 +1,7 @@
 """Rendered scenes as training samples: a random window of any camera as alpha, of any others as betas.
 
-Folders hold the output of `pat render`. Scenes may differ in their rigs and image sizes; images of cameras
-with a lens model are undistorted as `pat fuse` does it.
+Folders hold the output of `pat lab render`. Scenes may differ in their rigs and image sizes; images of
+cameras with a lens model are undistorted as `pat fuse` does it.
 """
 
 from __future__ import annotations

@@ -50,7 +50,7 @@ def test_rig_files_that_would_grow_are_refused_at_once(head, attack, tmp_path):
 
 @pytest.mark.parametrize("attack", [bomb(), "[" * 100_000, "seed: 1\nsteps: 5\nseed: 2"])
 def test_recipes_and_other_documents_too(attack, tmp_path):
-    pytest.importorskip("tyro", reason="pat needs more than arraygeom does")
+    pytest.importorskip("rich", reason="pat needs more than arraygeom does")
     from pat.lab.training.config import parse_config
     from pat.support.schema import read_yaml
 

@@ -276,7 +276,7 @@ def test_command_line(tmp_path, capsys):
     each(posed(Pose.inverse))(rig).save(tmp_path / "rig.yaml")
 
     def doctor(name, fixed, *more):
-        main(["rig", "doctor", str(tmp_path / name), *files, "--fix", str(tmp_path / fixed), *more])
+        main(["rig", "doctor", str(tmp_path / name), *files, "--out", str(tmp_path / fixed), *more])
 
     doctor("rig.yaml", "fixed.yaml")
     said = capsys.readouterr().out

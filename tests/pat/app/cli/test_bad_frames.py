@@ -1,4 +1,4 @@
-"""`pat fuse` of several frames, one of which cannot be read: it stops there or skips it, and is resumed."""
+"""`pat batch` of several frames, one of which cannot be read: it stops there or skips it, and is resumed."""
 
 import pytest
 
@@ -35,7 +35,7 @@ def fuse(folder, *options):
     given = ["--rig", str(folder / "rig.yaml"), "--alpha", "mono", *images, "--out", str(folder / "out")]
     status = 0
     try:
-        main(["fuse", *given, *options])
+        main(["batch", *given, *options])
     except SystemExit as ended:
         status = ended.code
     return status, sorted(p.name.partition("_")[0] for p in (folder / "out").glob("*_fused.png"))
@@ -44,7 +44,7 @@ def fuse(folder, *options):
 def test_a_frame_that_cannot_be_read_is_skipped_and_made_when_it_is_put_right(frames, capsys):
     bad = frames / "mono" / "1.png"
     whole = cut_in_half(bad)
-    assert fuse("skip", "--on-error", network=frames) == (1, ["0", "2"])
+    assert fuse(frames, "--on-error", "skip") == (1, ["0", "2"])
     assert "skipped 1_fused.png: mono: " in " ".join(capsys.readouterr().err.split())
     bad.write_bytes(whole)
     kept = {p: p.stat().st_mtime_ns for p in (frames / "out").glob("*_fused.png")}
@@ -54,6 +54,6 @@ def test_a_frame_that_cannot_be_read_is_skipped_and_made_when_it_is_put_right(fr
 
 def test_a_frame_that_cannot_be_read_stops_the_command(frames):
     cut_in_half(frames / "mono" / "1.png")
-    status, made = fuse("stop", "--on-error", network=frames)
+    status, made = fuse(frames, "--on-error", "stop")
     assert status != 0
     assert made == ["0"]

@@ -18,9 +18,12 @@ from arraygeom import Camera, Pose, Rig, Sensor, intrinsics
 from arraygeom.io import write_rig
 from arraygeom.lenses import Equirectangular
 from arraygeom.runtime.text import UNSCALED
+from pat.app.cli.align import Align
 from pat.app.cli.fuse import Fuse
-from pat.app.cli.main import Pat, command_paths, main
-from pat.app.cli.options import read_frames, read_images, respelled
+from pat.app.cli.main import Pat, command_named, command_paths, main
+from pat.app.cli.options import read_frames, read_images, rig_first
+from pat.app.cli.parser import _entries, parse
+from pat.app.cli.sequence import FuseSequence
 from pat.app.sample_array import SAMPLE, load_motorcycle, load_sample
 from pat.media.colour import linear_from_srgb
 from pat.media.depth_maps import VERTEX, read_depth
@@ -78,7 +81,7 @@ def test_points_of_a_whole_sphere_are_on_its_rays(tmp_path):
     rig.save(tmp_path / "rig.yaml")
     for name, image in recorded(rig)[0].items():
         write_image(tmp_path / f"{name}.png", image)
-    main(arguments(tmp_path, extra=["--points"]))
+    main(arguments(tmp_path, extra=["--extras", "points"]))
     depth = read_depth(tmp_path / "out" / "depth.tif")
     cloud = (tmp_path / "out" / "points.ply").read_bytes().partition(b"end_header\n")[2]
     X = torch.from_numpy(np.frombuffer(cloud, VERTEX)["X"].copy())
@@ -321,47 +324,38 @@ def test_a_camera_given_twice_is_refused_everywhere(command, small, refusal):
 
 def test_other_names_given_twice(small, refusal):
     twice = ["--frame-rate", "mono=30", "--frame-rate", "mono=25"]
-    assert "--frame-rate: 'mono' is given twice" in refusal(*arguments(small), *twice)
+    sequence = ["sequence", *arguments(small)[1:]]
+    assert "--frame-rate: 'mono' is given twice" in refusal(*sequence, *twice)
     sigma = "rig refine --rig {} -o x.yaml --image a=b --sigma focal=1 focal=2"
     assert "no such rig file" in refusal(*sigma.format("r.yaml").split())
     assert "--sigma: 'focal' is given twice" in refusal(*sigma.format(small / "rig.yaml").split())
-    assert "'mono' is not NAME=NUMBER" in refusal(*arguments(small), "--time-offset", "mono")
+    assert "'mono' is not NAME=NUMBER" in refusal(*sequence, "--time-offset", "mono")
     assert "'mono=' is not NAME=FILE" in refusal(*arguments(small), "--image", "mono=")
 
 
 def test_what_train_refuses_is_one_line_too(refusal):
-    said = refusal("train", "mono-colour", "--steps", "0")
-    assert said == "pat: steps must be at least 1, got 0 (`pat train --help` explains)"
-    assert refusal("train", "--stepps", "5").startswith("pat: unknown here: --stepps, 5; did you mean")
+    said = refusal("lab", "train", "mono-colour", "--steps", "0")
+    assert said == "pat: steps must be at least 1, got 0"
+    assert "'--steps'" in refusal("lab", "train", "--stepps", "5")
 
 
-def test_what_only_sequences_have_is_refused_of_frames(small, refusal):
-    timed = ["--frame-rate", "mono=30", "--time-offset", "mono=0", "--speed", "0"]
-    said = "--frame-rate, --time-offset, --speed: for a --sequence only: give that, or leave out"
-    assert said in refusal(*arguments(small), *timed)
-    files = small / "mono.png", small / "colour.png"
-    assert "--speed: for a --sequence only" in refusal("fuse", *files, "--speed", "3")
-
-
-@pytest.mark.parametrize("options", [["--bits", "32", "--kind", "tif"], ["--kind", "exr"]])
-def test_a_video_of_frames_of_32_bits_is_said_to_be_none(small, capsys, monkeypatch, options):
+@pytest.mark.parametrize("kind", ["tif32", "exr"])
+def test_a_video_of_frames_of_32_bits_is_said_to_be_none(small, capsys, monkeypatch, kind):
     monkeypatch.setattr("pat.media.images.exr_writer", lambda path: None)
-    monkeypatch.setattr(Fuse, "_many", lambda *_: None)
-    main([*arguments(small), "--sequence", "--video", "10", *options])
+    monkeypatch.setattr(FuseSequence, "_many", lambda *_: None)
+    main(["sequence", *arguments(small)[1:], "--video", "10", "--format", kind])
     assert "--video: of frames of 32 bits there is none" in " ".join(capsys.readouterr().err.split())
 
 
-def test_what_several_frames_do_not_have_is_refused_before_a_rig_is_looked_for(small, refusal, monkeypatch):
+def test_several_frames_are_refused_before_a_rig_is_looked_for(small, refusal, monkeypatch):
     monkeypatch.setattr("pat.app.from_images.array_from_images", None)
     for name in ("mono", "colour"):
         (small / f"{name}s").mkdir()
         for i in range(2):
             shutil.copy(small / f"{name}.png", small / f"{name}s" / f"{i}.png")
     folders = {name: small / f"{name}s" for name in ("mono", "colour")}
-    single = ["--exposure", "auto", "--points"]
     for several in (arguments(small, **folders), ["fuse", *map(str, folders.values())]):
-        said = refusal(*several, *single)
-        assert said == "pat: --points, --exposure auto: for a single frame only: leave out for several"
+        assert "`pat batch`" in refusal(*several)
 
 
 def test_a_file_that_is_missing_or_a_video_is_named(small, refusal):
@@ -380,38 +374,40 @@ def test_a_rig_is_an_argument_or_an_option_and_o_is_out_everywhere(small, capsys
     for given in (["--rig", rig], [f"--rig={rig}"]):
         main(["rig", "info", *given])
         assert capsys.readouterr().out == as_argument
-    assert "--rig: give a file" in refusal("rig", "info", "--rig")
-    for option in ("-o", "--out"):
-        main(["rig", "convert", "--rig", rig, option, str(small / f"{option}.yaml"), "--write-as", "kalibr"])
-    assert (small / "-o.yaml").read_text() == (small / "--out.yaml").read_text()
+    assert "--rig" in refusal("rig", "info", "--rig")
+    main(["rig", "convert", "--rig", rig, str(small / "chain.yaml"), "--write-as", "kalibr"])
+    assert (small / "chain.yaml").is_file()
     main(["show", "--rig", rig, "-o", str(small / "drawn")])
     assert (small / "drawn" / "rig.png").is_file()
-    first, second = small / "first", small / "second"
-    fuse = ["fuse", *arguments(small)[3:]]
-    main([*fuse[:1], rig, *fuse[1:], "-o", str(first), "--match-levels", "--no-carry"])
-    main([*fuse, "--rig", rig, "-o", str(second), "--normalise-radiometry", "--no-propagate"])
-    assert (first / "fused.png").read_bytes() == (second / "fused.png").read_bytes()
 
 
 def test_images_stand_anywhere_among_the_options_of_fuse():
     given = ["rig.yaml", "--alpha", "mono", "a.png", "--depth", "1", "9", "b.tif", "--image", "c=c.png"]
-    given += ["-o", "out.png"]
-    others = ["--alpha", "mono", "--depth", "1", "9", "--image", "c=c.png", "-o", "out.png"]
-    assert respelled(given, Fuse) == ["rig.yaml", "a.png", "b.tif", *others]
+    made = parse(Fuse, [*given, "-o", "out.png"])
+    assert list(map(str, made.given)) == ["rig.yaml", "a.png", "b.tif"]
+    assert (made.alpha, made.depth, made.image) == ("mono", (1.0, 9.0), ("c=c.png",))
     of_colmap = ["sparse", "--alpha", "DSC_0001.JPG", "--image", "DSC_0001.JPG=a.jpg"]
-    assert respelled(of_colmap, Fuse) == of_colmap  # whose cameras are called as their images are
-    assert respelled(given[3:], Fuse) == ["a.png", "b.tif", *others[2:]]
+    assert list(map(str, parse(Fuse, of_colmap).given)) == ["sparse"]  # cameras called as images
+    assert rig_first(["a.png", "--rig", "r.yaml", "b.png"], Fuse) == ["r.yaml", "a.png", "b.png"]
 
 
 def test_writers_take_o_and_out():
-    """Every command with an option --out takes -o; all but those that write nothing have it."""
-    nothing = {("explore",), ("settings",), ("rig", "info"), ("data", "info"), ("warm-up",)}
+    """Every command but those that write nothing has an option --out, also called -o."""
+    nothing = {("explore",), ("rig", "info"), ("warm-up",), ("rig", "convert")}
+    nothing |= {("lab", "settings"), ("lab", "data", "info"), ("lab", "train")}
     for path in command_paths():
-        command = functools.reduce(lambda group, word: group.commands[word], path, Pat)
-        spellings = getattr(command, "spellings", {})
-        known = {"-o", "--out"} <= set(spellings) or spellings.get("-o") == "--out"
+        command = functools.reduce(command_named, path, Pat)
         hint = typing.get_type_hints(command, include_extras=True).get("out")
-        assert path in nothing or known or "-o" in typing.get_args(hint)[-1].aliases, path
+        assert path in nothing or typing.get_args(hint)[-1].short == "-o", path
+
+
+@pytest.mark.parametrize(("command", "most"), [(Fuse, 18), (Align, 14)])
+def test_a_command_has_few_options(command, most):
+    options = [entry for entry in _entries(command, None) if not entry.option.positional]
+    assert len(options) <= most
+    known = {name for names in command.headings.values() for name in names.split()}
+    assert known <= {entry.name for entry in options}
+    assert len(options) - len(known) <= 5, "those that matter stand first"
 
 
 def test_json_is_valid_where_the_rig_sees_to_infinity(small, capsys):
@@ -458,7 +454,7 @@ def wrong(small) -> None:
 def test_a_rig_that_does_not_fit_ends_with_status_3_and_strict_writes_nothing(tmp_path, capsys):
     small = cut_sample(tmp_path, (240, 320))
     wrong(small)
-    for extra, written in ((["--no-report"], True), (["--strict"], False)):
+    for extra, written in ((["--extras", "none"], True), (["--misfit", "refuse"], False)):
         shutil.rmtree(small / "out", ignore_errors=True)
         with pytest.raises(SystemExit) as stop:
             main(arguments(small, extra=extra))
@@ -486,7 +482,7 @@ def test_bands_are_listed_with_their_files(small, capsys):
     Rig(cameras, depth=rig.depth).save(small / "rig.yaml")
     for name, band in zip(("red", "nir"), read_image(small / "colour.png")):
         write_image(small / f"{name}.png", band[None] * (0.5 if name == "nir" else 1))
-    given = f"{images(small, *cameras)} --alpha mono --no-report"
+    given = f"{images(small, *cameras)} --alpha mono --extras none"
     pat(f"fuse {small / 'rig.yaml'} {given} -o {small / 'out'}")
     said = " ".join(capsys.readouterr().err.split())
     assert "weights: mono-spectral (--weights NAME takes others)" in said
@@ -525,7 +521,7 @@ def test_a_bad_out_is_found_before_the_fusion(small, refusal, monkeypatch):
     (small / "out").write_text("a file")
     assert "out: cannot write there (" in refusal(*arguments(small))
     folders = arguments(small, mono=f"{small}/mon*.png", extra=["--out", "/proc/out"])
-    assert "/proc/out: cannot write there (/proc/out: " in refusal(*folders)
+    assert "/proc/out: cannot write there (/proc/out: " in refusal("batch", *folders[1:])
     assert (small / "out").read_text() == "a file"
 
 
@@ -546,14 +542,14 @@ def test_images_that_results_would_replace_are_refused(small, name, refusal, mon
         (["rig", "start", "--image", "mono=a.png"], "folder", "is a folder: name a file"),
         (["calibrate", "photos", "--board", "charuco:8x6:30mm"], "file/rig.yaml", "file is a file, so"),
         (["calibrate", "photos", "--board", "charuco:8x6:30mm"], "/proc/rig.yaml", "/proc cannot be written"),
-        (["evaluate", "--kitti", "kitti"], "file", "is a file: name a folder"),
+        (["lab", "evaluate", "--kitti", "kitti"], "file", "is a file: name a folder"),
         (["rig", "doctor", "rig.yaml", "--image", "mono=a.png"], "folder", "is a folder: name a file"),
         (["rig", "show", "rig.yaml"], "file", "is a file: name a folder"),
         (["demo"], "file", "is a file: name a folder"),
-        (["ablate", "--scenes", "1"], "file", "is a file: name a folder"),
+        (["lab", "ablate", "--scenes", "1"], "file", "is a file: name a folder"),
         (["board", "charuco:8x6:30mm"], "folder", "is a folder: name a file"),
         (["rig", "diff", "rig.yaml", "rig.yaml"], "picture.foo", "end its name in .png, .pdf or .svg"),
-        (["ablate", "--rendered", "scenes", "--scenes", "1"], "new", "--scenes: of layered scenes"),
+        (["lab", "ablate", "--rendered", "scenes", "--scenes", "1"], "new", "--scenes: of layered scenes"),
     ],
 )
 def test_a_bad_out_is_found_before_the_work(command, out, text, tmp_path, monkeypatch, refusal):

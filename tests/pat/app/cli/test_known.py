@@ -1,7 +1,6 @@
-"""`--depth-map` and `--matches` of fuse, align and the rig commands, on a wall with a post before it."""
+"""`--around` of fuse, align and the rig commands, on a wall with a post before it."""
 
 import re
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -13,8 +12,7 @@ from torch.nn.functional import interpolate
 from arraygeom import Rig
 from pat import FuseSettings
 from pat import align as aligned
-from pat.app.cli.fuse import Fuse
-from pat.app.cli.known import Known
+from pat.app.cli.known import Around
 from pat.fusion.align import OCCLUDED
 from pat.media.images import read_image, write_image
 from tests.arraygeom.rigs import parallel_rig
@@ -62,10 +60,10 @@ def depth_of(folder):
     return tifffile.imread(folder / "out" / "depth.tif")[:, 40:]
 
 
-@pytest.mark.parametrize("file", ["depth.tif", "depth.png --depth-scale 0.0002"])
+@pytest.mark.parametrize("file", ["depth.tif", "depth.png,scale=0.0002"])
 def test_a_depth_map_is_taken_as_it_is(folder, file):
     """Whatever the images show: beta's is of something else."""
-    options = f"--depth-map {{}}/{file} --depth-tolerance 0 --no-align --response rec601"
+    options = f"--around {{}}/{file},tolerance=0 --misfit warn --response rec601"
     run(folder, "fuse", options, colour="blind.png")
     found, true = depth_of(folder), tifffile.imread(folder / "depth.tif")[:, 40:]
     known = np.isfinite(found)
@@ -91,16 +89,16 @@ def test_what_a_field_of_ones_own_raises_is_a_line(folder, tmp_path, monkeypatch
     (tmp_path / "fields_of_mine.py").write_text("def slanted(pair, x):\n    return x + 'pixels'\n")
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(SystemExit):
-        run(folder, "align", "--field fields_of_mine:slanted")
+        run(folder, "fuse", "--field fields_of_mine:slanted")
     last = capsys.readouterr().err.splitlines()[-1]
     assert last.startswith("pat: TypeError: ")
     assert last.endswith("'str', raised by the field slanted (--debug shows where)")
     with pytest.raises(TypeError, match="str"):
-        run(folder, "align", "--field fields_of_mine:slanted --debug")
+        run(folder, "fuse", "--field fields_of_mine:slanted --debug")
 
 
 def test_matches_guide_the_search(folder):
-    run(folder, "align", "--matches {}/matches.csv")
+    run(folder, "align", "--around {}/matches.csv")
     inner = depth_of(folder)
     assert np.nanmedian(np.abs(inner - tifffile.imread(folder / "depth.tif")[:, 40:])) < 0.05
 
@@ -120,27 +118,27 @@ def test_matches_off_the_lines_of_the_rig_are_said(folder, capsys):
     rows = np.loadtxt(folder / "matches.csv", delimiter=",")
     rows[:, 3] = H - 1 - rows[:, 3]
     np.savetxt(folder / "rows.csv", rows, delimiter=",")
-    run(folder, "align", "--matches {}/rows.csv")
+    run(folder, "align", "--around {}/rows.csv")
     assert re.search(
         r"rows.csv: matches of 'mono' and 'colour' lie \d+ px .*x before y", capsys.readouterr().err
     )
-    run(folder, "align", "--matches {}/matches.csv")
+    run(folder, "align", "--around {}/matches.csv")
     assert "matches of" not in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
-        ("--depth-map {}/depth.tif --matches {}/matches.csv", "each excludes the others"),
-        ("--depth-map {}/depth.png --depth-scale 1", "holds 1e+04 to 2e+04 m, the rig's"),
-        ("--depth-map {}/mono.png", "8 bits, too few"),
-        ("--depth-map {}/none.png", "no such depth map"),
-        ("--depth-scale 1", "--depth-scale: needs --depth-map"),
-        ("--depth-tolerance 0", "--depth-tolerance: needs --depth-map"),
-        ("--matches {}/mono.png", "neither CSV nor a COLMAP database"),
-        ("--depth-map {}/depth.tif --depth-tolerance -1", "tolerance is -1.0"),
-        ("--matches {}/exchanged.csv", "behind the cameras by the rig: are its columns in the order"),
-        ("--threads 0", "--workers and --threads are 1 or more"),
+        ("--around {}/depth.tif --field line", "--field"),
+        ("--around {}/depth.png,scale=1", "holds 1e+04 to 2e+04 m, the rig's"),
+        ("--around {}/mono.png", "8 bits, too few"),
+        ("--around {}/none.png", "no such depth map"),
+        ("--around {}/depth.tif,unit=1", "--around"),
+        ("--around {}/depth.tif,scale=one", "--around"),
+        ("--around {}/rig.yaml", "rig.yaml"),
+        ("--around {}/depth.tif,tolerance=-1", "tolerance is -1.0"),
+        ("--around {}/exchanged.csv", "behind the cameras by the rig: are its columns in the order"),
+        ("--extras pages", "--extras"),
     ],
 )
 def test_bad_input_is_one_line(folder, options, expected, capsys):
@@ -150,22 +148,9 @@ def test_bad_input_is_one_line(folder, options, expected, capsys):
     assert expected in capsys.readouterr().err.splitlines()[-1]
 
 
-def test_options_of_many_frames_are_said_to_do_nothing_for_one(folder, capsys):
-    """They were ignored without a word."""
-    images = {"mono": [folder / "mono.png"], "colour": [folder / "colour.png"]}
-    Fuse(workers=2, on_error="skip", propagate=False, video=10)._frames(images)
-    said = capsys.readouterr().err
-    assert "--workers, --on-error skip: for many frames, and each camera has one image" in said
-    assert "--video, --no-propagate: for a --sequence only: of no effect" in said
-    Fuse(sequence=True, video=10)._frames(images)
-    assert "--sequence: for many frames" in capsys.readouterr().err
-    Fuse(workers=2, on_error="skip")._frames({name: 2 * files for name, files in images.items()})
-    assert "for many frames" not in capsys.readouterr().err
-
-
 def test_a_large_depth_map_in_another_unit_is_told_what_it_holds(folder, monkeypatch):
     """Torch's quantiles are of 2^24 numbers at most: of larger maps its words were the message."""
     monkeypatch.setattr("pat.media.depth_maps.read_depth", lambda *_, **__: torch.full((4097, 4097), 1e4))
     rig = Rig.load(folder / "rig.yaml")
     with pytest.raises(ValueError, match=r"holds 1e\+04 to 1e\+04 m, the rig's depth range"):
-        Known(depth_map=Path("large.tif")).with_known(rig, rig.names[0], {}, None)
+        Around(around="large.tif").with_known(rig, rig.names[0], {}, None)

@@ -23,9 +23,9 @@ def run(*words: str, then: str = "") -> subprocess.CompletedProcess:
 
 
 @pytest.mark.parametrize(
-    "words", [(), ("rig",), ("fuse", "--help"), ("train", "--help"), ("--tyro-print-completion", "bash")]
+    "words", [(), ("rig",), ("help",), ("help", "fuse"), ("fuse", "--help"), ("lab", "train", "--help")]
 )
-def test_help_and_completion_import_no_torch(words):
+def test_help_imports_no_torch(words):
     code = f"""
 import sys
 from pat.app.cli.main import Pat, command_paths, main
@@ -33,6 +33,7 @@ from pat.app.cli.options import FIELD_NAMES, WEIGHT_NAMES, field_named
 try: main({list(words)})
 except SystemExit as stop: assert not stop.code
 assert not {{"torch", "numpy", "scipy", "numba", "arraygeom", "rich"}} & set(sys.modules), sys.modules
+assert "lab" in {list(words)} or "pat.lab" not in sys.modules
 """
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert done.stderr == ""
@@ -48,7 +49,8 @@ def test_every_command_has_help_that_reads_well(path, capsys):
     first = next(line for line in text.splitlines() if line and not line.startswith(("usage", " ")))
     assert text.count(first) == 1
     assert "{None}" not in text
-    assert path == ("train",) or "(default: None)" not in text
+    assert "(default: None)" not in text
+    assert "(default: )" not in text
 
 
 def test_names_are_those_of_the_package():
@@ -61,12 +63,12 @@ def test_names_are_those_of_the_package():
     assert field_named("auto") is None
 
 
-def test_help_lists_users_tools_before_authors_tools(capsys):
+def test_help_lists_every_command(capsys):
     with pytest.raises(SystemExit):
         main([])
     text = capsys.readouterr().out
     lines = [line.split()[0] for line in text.splitlines() if line.startswith("  ")]
-    assert lines == [*Pat.users, *Pat.research]
+    assert lines == [*Pat.commands]
     assert all(len(line) <= 120 for line in text.splitlines())
 
 
@@ -78,14 +80,14 @@ def test_the_version_is_printed(words, capsys):
 
 
 REFUSED = {
-    "fuse --depth 2": "--depth: wanted FLOAT FLOAT, got '2'",
-    "fuse --bits 7": "--bits: '7' is not one of '8', '16', '32'",
-    "fuse --wieghts x": "unknown here: --wieghts, x; did you mean --weights?",
-    "fuse --workers x": "--workers: 'x' is not a whole number",
-    "fuse --alpha": "--alpha: give a value",
-    "fuse r --image a=A b=B": "b=B: write the option before each, as in --image a=A --image b=B",
-    "evaluate --rates x": "--rates: 'x' does not fit",
-    "rig convert a": "OUT is missing: File or folder to write; also: --out OUT.",
+    "fuse --depth 2": "--depth",
+    "fuse --format jpg": "--format",
+    "fuse --wieghts x": "--weights",
+    "batch --workers x": "--workers",
+    "fuse --alpha": "--alpha",
+    "rig info r a=A": "--image",
+    "lab evaluate --rates x": "--rates",
+    "rig convert a": "OUT",
 }
 
 
@@ -93,8 +95,10 @@ REFUSED = {
 def test_what_the_parser_refuses_is_one_line(line, refusal):
     """Boxes of ten lines."""
     words = line.split()
-    path = " ".join(words[:2] if words[0] == "rig" else words[:1])
-    assert refusal(*words) == f"pat: {REFUSED[line]} (`pat {path} --help` explains)"
+    path = " ".join(words[:2] if words[0] in ("rig", "lab") else words[:1])
+    said = refusal(*words)
+    assert REFUSED[line] in said
+    assert said.endswith(f"(`pat {path} --help` explains)")
 
 
 @pytest.mark.parametrize(
@@ -136,9 +140,10 @@ def test_a_first_file_that_is_no_image_is_said_to_be_none(command, others, refus
 
 
 def test_commands_that_do_not_exist(refusal):
-    assert refusal("fues") == "pat: no command 'pat fues'; did you mean 'fuse'?"
-    assert refusal("rig", "docter") == "pat: no command 'pat rig docter'; did you mean 'doctor'?"
-    assert "known here: fuse, align" in refusal("--precision")
+    assert "'fuse'" in refusal("fues")
+    assert "'doctor'" in refusal("rig", "docter")
+    assert "fuse, batch" in refusal("--precision")
+    assert "`pat lab train`" in refusal("train")
 
 
 def test_a_closed_pipe_is_quiet():
@@ -154,7 +159,7 @@ def test_an_interruption_while_pat_is_imported_is_one_line():
 import builtins, runpy, sys
 ordinary = builtins.__import__
 def interrupted(name, *args, **kwargs):
-    if name == "tyro":
+    if name == "argparse":
         raise KeyboardInterrupt
     return ordinary(name, *args, **kwargs)
 builtins.__import__ = interrupted

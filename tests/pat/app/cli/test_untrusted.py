@@ -1,5 +1,9 @@
 """Files of strangers: no code of theirs runs, and their texts reach neither terminal nor page unescaped."""
 
+import subprocess
+import sys
+from pathlib import Path
+
 import pytest
 import yaml
 
@@ -54,3 +58,22 @@ def test_names_are_no_parts_of_a_page():
     assert page.count('class="layer"') == len(names)
     assert page.count("<li>note") == 1
     assert '<script>"' not in page
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="/dev/full is Linux's")
+@pytest.mark.parametrize("streams", [">&-", "2>&-", "<&- >&- 2>&-", "2>/dev/full"])
+def test_work_is_done_where_nothing_can_be_said(streams, tmp_path):
+    Rig({"a": View(hw=(4, 4))}).save(tmp_path / "rig.yaml")
+    command = f"{sys.executable} -m pat rig convert {tmp_path}/rig.yaml {tmp_path}/new.yaml {streams}"
+    assert subprocess.run(command, shell=True, cwd=Path(__file__).parents[4]).returncode == 0
+    assert Rig.load(tmp_path / "new.yaml").names == ("a",)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="/dev/full is Linux's")
+def test_a_full_disk_for_what_is_printed_is_one_line(tmp_path):
+    Rig({"a": View(hw=(4, 4))}).save(tmp_path / "rig.yaml")
+    command = f"{sys.executable} -m pat rig info {tmp_path}/rig.yaml > /dev/full"
+    ended = subprocess.run(command, shell=True, cwd=Path(__file__).parents[4], capture_output=True, text=True)
+    assert ended.returncode == 2
+    assert ended.stderr.count("No space left") == 1
+    assert "Traceback" not in ended.stderr

@@ -4,6 +4,7 @@ import io
 import re
 import shutil
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
@@ -16,7 +17,7 @@ from torch.nn.functional import avg_pool2d
 from arraygeom import Camera, Pose, Rig, Sensor, View
 from experiments.evaluation.paper import with_found_rig
 from pat import FuseSettings, fuse, load_weights
-from pat.app.cli.fuse import Fuse
+from pat.app.cli.sequence import FuseSequence
 from pat.app.from_images import ImageArray, array_from_images, camera_names, found_rig
 from pat.app.sample_array import load_sample
 from pat.fusion.frame import Frame
@@ -111,7 +112,7 @@ def test_the_rig_that_is_written_is_of_the_files_as_they_were_recorded(folder, t
     given = {name: read_image(folder / f"{name}.png") for name in rig.names}
     found = ImageArray(rig, raw, given, "mono", "mono-colour-small", False, ())
     monkeypatch.setattr("pat.app.from_images.array_from_images", lambda *a, **k: found)
-    pat(f"fuse {folder / 'mono.png'} {folder / 'colour.png'} --no-report -o {tmp_path}")
+    pat(f"fuse {folder / 'mono.png'} {folder / 'colour.png'} --extras none -o {tmp_path}")
     assert Rig.load(tmp_path / "found_rig.yaml")["colour"].sensor == raw["colour"].sensor
 
 
@@ -148,7 +149,7 @@ def test_a_rig_of_ones_own_beside_the_result_is_kept(folder, tmp_path):
 def test_exr_is_refused_before_anything_is_read(monkeypatch, refusal, tmp_path):
     """It was refused once all was fused."""
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
-    given = ["fuse", "no.png", "nothing.png", "--kind", "exr", "--bits", "32", "-o", str(tmp_path / "out")]
+    given = ["fuse", "no.png", "nothing.png", "--format", "exr", "-o", str(tmp_path / "out")]
     assert "writing EXR needs" in refusal(*given)
 
 
@@ -182,8 +183,8 @@ def test_what_cannot_be_fused_is_one_line_and_leaves_nothing(folder, tmp_path, r
     for options, said in {
         "--alpha tele": "no camera 'tele'; the images' names are mono, colour",
         "--noise mono=-5": "must be 1 or more, such as 200, got -5",
-        "--noise tele=100": "--noise: no camera 'tele'",
-        "--depth 1 2": "--depth: needs a rig",
+        "--noise tele=100": "--noise",
+        "--depth 1 2": "--depth",
     }.items():
         assert said in refusal("fuse", mono, colour, *options.split(), *out)
     assert not (tmp_path / "out").exists()
@@ -203,8 +204,8 @@ def test_what_does_not_go_with_a_rig_or_with_many_frames_is_refused(folder, tmp_
     stray = tmp_path / "mono" / "0.png", folder / "colour.png"
     assert "0.png: no camera of the rig has its name: give --image NAME=" in refusal("fuse", *given, *stray)
     named = [word for path in in_folders for word in ("--image", f"{path.name}={path}")]
-    said = refusal("fuse", *given, *named, "--points", "--classical")
-    assert "--points, --classical: for a single frame only" in said
+    for names in (named, in_folders):
+        assert "`pat batch`" in refusal("fuse", *(given if names is named else given[3:]), *names)
     assert not (tmp_path / "out").exists()
 
 
@@ -218,7 +219,7 @@ def two_frames_each(folder, into):
 
 
 def test_a_found_rig_is_written_for_a_sequence_that_needs_more(folder, tmp_path, refusal):
-    given = ["fuse", *two_frames_each(folder, tmp_path), "--sequence", "-o", tmp_path / "out"]
+    given = ["sequence", *two_frames_each(folder, tmp_path), "-o", tmp_path / "out"]
     assert "the frame rate of 'mono' is not known" in refusal(*given)
     assert set(Rig.load(tmp_path / "out" / "found_rig.yaml").names) == {"mono", "colour"}
     (tmp_path / "out" / "found_rig.yaml").write_text("another job's")
@@ -257,7 +258,14 @@ def test_the_rate_that_is_asked_for_is_that_of_the_video(
     monkeypatch.setattr("pat.app.batch.Batch.run", lambda *_, video, **__: rates.append(video) or JobReport())
     files = {name: [tmp_path / f"{name}{i}.png" for i in range(2)] for name in ("mono", "colour")}
     (tmp_path / "fused.mp4").write_bytes(b"of a former sequence")
-    Fuse(out=tmp_path, bits=8, **options)._without_rig_from(files, {"mono": 12.0, "colour": 24.0})
+    monkeypatch.setattr(
+        "pat.app.from_images.frames_of_videos", lambda *_: (files, {"mono": 12.0, "colour": 24.0})
+    )
+    monkeypatch.setattr("pat.media.images.has_many_bits", lambda path: False)
+    command = FuseSequence(given=(Path("mono.mp4"), Path("colour.mp4")), out=tmp_path, **options)
+    with monkeypatch.context() as patched:
+        patched.setattr("pat.app.cli.fusing.named_images", lambda *_: ((), False))
+        command.run()
     assert rates == [rate]
     assert ("fused.mp4" in capsys.readouterr().err) == (rate is not None)
 
@@ -310,7 +318,7 @@ def test_a_wrong_rig_is_refused_before_the_work_with_the_doctors_verdict(
     rig.replace(cameras=wrong).save(tmp_path / "wrong.yaml")
     files = images(folder, *rig.names)
     with pytest.raises(SystemExit) as stop:
-        pat(f"fuse {tmp_path / 'wrong.yaml'} --alpha mono {files} --strict -o {tmp_path / 'out'}")
+        pat(f"fuse {tmp_path / 'wrong.yaml'} --alpha mono {files} --misfit refuse -o {tmp_path / 'out'}")
     assert stop.value.code == 3
     text = " ".join(capsys.readouterr().err.split())
     assert "behind the cameras or outside the depth range" in text

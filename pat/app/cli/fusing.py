@@ -1,0 +1,273 @@
+"""Options that `pat fuse`, `pat batch` and `pat sequence` share, and an array's images with their rig."""
+
+from __future__ import annotations
+
+import filecmp
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from itertools import combinations
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+
+from ...media.suffixes import IMAGE_SUFFIXES, VIDEO_SUFFIXES
+from . import options
+from .known import Known
+from .options import WEIGHTS_HELP, FieldName, Numbers, Out, say
+from .parser import Option, UsageError
+
+if TYPE_CHECKING:
+    from arraygeom import Rig
+
+    from ...fusion.fuse import FuseSettings
+    from ...fusion.views import ViewFiles
+    from ..from_images import ImageArray
+
+Format = Literal["png", "png8", "png16", "tif", "tif8", "tif16", "tif32", "exr"]
+Files = dict[str, list[Path]]
+
+
+class Recordings(NamedTuple):
+    """An array's files by camera, in the order of frames; its rig as they were recorded, and alpha. Where the
+    rig was found from the first images: what was found, and frames a second of videos."""
+
+    rig: Rig
+    files: Files
+    alpha: str
+    found: ImageArray | None = None
+    rates: Mapping[str, float] = {}
+
+    @property
+    def first(self) -> dict[str, Path]:
+        """The first file of each camera."""
+        return {name: paths[0] for name, paths in self.files.items()}
+
+
+@dataclass
+class Fusing(Known):
+    """Images of an array, and how they are fused."""
+
+    focal: Numbers = ()
+    """Without a rig: the focal length in pixels of a camera whose file does not state it."""
+    out: Out = Path("out")
+    """Folder for the results."""
+    weights: Annotated[str | None, Option("NAME|FILE", WEIGHTS_HELP)] = None
+    field: FieldName = "auto"
+    luminance: Literal["alpha", "recorded", "mix", "beta"] = "alpha"
+    """Whose brightness the fused image has: alpha's, denoised where it is noisy, or as recorded; beta's, in
+    alpha's detail, suits a near infrared alpha; or a mix."""
+    format: Format = "png"
+    """Format of the fused image and bits a channel: by default 16 if an image has more than 8; tif32 and exr
+    hold linear light as floats."""
+
+    @property
+    def kind(self) -> Literal["png", "tif", "exr"]:
+        """The format without bits."""
+        return self.format[:3]  # type: ignore[return-value]
+
+    def fuse_settings(self, **further: Any) -> FuseSettings:
+        """How frames are fused. Raises ValueError for options that are none."""
+        return self.settings(
+            field=options.field_named(self.field),
+            align=self.correct,
+            keep_alpha=self.luminance == "recorded",
+            luminance="alpha" if self.luminance == "recorded" else self.luminance,
+            **further,
+        )
+
+    def frames(self, files: Files) -> Files:
+        """The files of the frames that are fused. Raises ValueError for others."""
+        from ...fusion.frame_matching import matched_frames
+
+        return matched_frames(files)
+
+    def timed(self, rig: Rig) -> Rig:
+        """The rig with what the command line says of its clocks."""
+        return rig
+
+    def named(self, command: str) -> tuple[tuple[str, ...], bool]:
+        """The images NAME=FILE of a rig's cameras, and whether there is a rig. Raises as `named_images`, and
+        ImportError for a format that cannot be written."""
+        if self.kind == "exr":
+            from ...media.images import exr_writer
+
+            exr_writer(self.out)
+        return named_images(self.given, self.image, command)
+
+    @contextmanager
+    def recordings(self, image: Sequence[str], *, with_rig: bool) -> Iterator[Recordings]:
+        """The images (of `named`) with the rig that is given, or with one that is found; weights are chosen.
+
+        Raises ValueError for options that do not go together, before images are read.
+        """
+        self.fuse_settings()
+        if with_rig:
+            yield self._with_rig(image)
+            return
+        with TemporaryDirectory() as folder:
+            yield self._without_rig(Path(folder))
+
+    def _with_rig(self, image: Sequence[str]) -> Recordings:
+        """The images of the rig that is given."""
+        if self.focal:
+            raise UsageError("--focal", "no rig, which states focal lengths: leave it out")
+        rig = self.timed(options.load_rig_or_say_no_image(self.given[0], self.depth))
+        alpha, files = files_by_camera(rig, self.alpha, self.given, image)
+        files = self._checked(files)
+        self._choose_weights(rig, alpha, {name: paths[0] for name, paths in files.items()})
+        return Recordings(rig, files, alpha)
+
+    def _without_rig(self, folder: Path) -> Recordings:
+        """The images with the rig that is found from the first ones; frames of videos go to a folder."""
+        from ...support.locks import folder_lock
+        from ..batch import find_images
+        from ..from_images import camera_names, frames_of_videos
+
+        if self.depth:
+            raise UsageError("--depth", "a rig: give one with --rig RIG")
+        with folder_lock(self.out):  # finding the rig takes long: what cannot be written to is refused before
+            pass
+        cameras = camera_names(self.given)
+        focal = options.numbers_by_name(self.focal, "--focal")
+        noise = options.noise_of(self.noise)
+        for option, named in {"--focal": focal, "--noise": noise if isinstance(noise, dict) else {}}.items():
+            if unknown := named.keys() - cameras.keys():
+                raise UsageError(option, f"a name of the images, {', '.join(cameras)}", min(unknown))
+        videos = [path for path in cameras.values() if path.suffix.lower() in VIDEO_SUFFIXES]
+        if videos and (others := [path for path in cameras.values() if path not in videos]):
+            raise ValueError(f"{videos[0]} is a video and {others[0]} is not: give images alone, or videos")
+        files: Files
+        rates: Mapping[str, float] = {}
+        if videos:
+            self.refuse_videos(videos)
+            files, rates = frames_of_videos(cameras, folder)
+        else:
+            files = {name: find_images(path) for name, path in cameras.items()}
+            refuse_same(files)
+        files = self._checked(files)
+        array = self.found_array(files, weights=self.weights, focal=focal)
+        self.weights = array.weights
+        return Recordings(array.recorded, {n: files[n] for n in array.rig.names}, array.alpha, array, rates)
+
+    def known_files(self) -> list[Path]:
+        """Further files that are given."""
+        return []
+
+    def refuse_videos(self, videos: Sequence[Path]) -> None:
+        """Raise UsageError for videos, but in a sequence."""
+        raise UsageError(f"{videos[0]}", "images; `pat sequence` takes videos")
+
+    def _checked(self, files: Files) -> Files:
+        """The files of the frames. Raises ValueError for files where results would go."""
+        from ...fusion.results import check_no_result
+        from ...media.images import has_many_bits
+
+        images = (path for paths in files.values() for path in paths)
+        check_no_result([*self.given, *self.known_files(), *images], self.out)
+        files = self.frames(files)
+        deep = any(has_many_bits(paths[0]) for paths in files.values())
+        stated = self.format.removeprefix(self.kind)
+        self.bits = int(stated) if stated else 32 if self.kind == "exr" else 16 if deep else 8
+        return files
+
+    def _choose_weights(self, rig: Rig, alpha: str, files: Mapping[str, Path]) -> None:
+        """The weights for any bands, unless asked otherwise, where no beta is meant to be in colour and they
+        do not have three bands in all."""
+        from ...fusion.views import ViewFiles
+        from ...networks.weights import weights_for
+
+        betas = [name for name in files if name != alpha]
+        if self.weights or any(rig[name].sensor.response == "rgb" for name in betas):
+            return
+        views = ViewFiles(rig, files, alpha=alpha)
+        bands = [len(views[name]) for name in betas]
+        if 3 not in bands and sum(bands) != 3:
+            self.weights = weights_for(bands)
+            say(f"weights: {self.weights} (--weights NAME takes others)")
+
+    def healed(self, views: ViewFiles) -> Rig:
+        """The rig of views, or the one that these healed, which is written beside the results."""
+        from arraygeom.io.native import write
+        from arraygeom.runtime.together import write_listed
+
+        from ...fusion.results import HEALED_RIG
+        from ..healing import checked_rig
+
+        with options.working("comparing the rig with the images"):
+            healed = checked_rig(views, heal=self.correct)
+        if healed is None:
+            return views.rig
+        self.note(healed.text)
+        path = self.out / HEALED_RIG
+        if path.resolve() == self.given[0].resolve():
+            self.note(f"the healed rig is not written: {path} is the one that was given: give another --out")
+        else:
+            write_listed(path, write(healed.rig))
+            self.note(f"the healed rig: {path}")
+        return healed.rig
+
+
+def with_sensor(rig: Rig, name: str, **changes: float) -> Rig:
+    """The rig with some entries of a camera's sensor changed."""
+    return rig.with_camera(name, rig[name].replace(sensor=replace(rig[name].sensor, **changes)))
+
+
+def named_images(paths: Sequence[Path], image: Sequence[str], command: str) -> tuple[tuple[str, ...], bool]:
+    """The images NAME=FILE of a rig's cameras, and whether the first argument is a rig. Imports no torch.
+
+    Images that follow a rig are of the cameras that their names say. Raises ValueError for arguments that do
+    not go together, FileNotFoundError for files that do not exist.
+    """
+    if paths and (image or is_rig_file(paths[0])):
+        named = (*image, *(f"{path.stem}={path}" for path in paths[1:]))
+        if not named:
+            raise ValueError(
+                f"{paths[0]}: {options.NO_IMAGE}; if it is a rig, give --image NAME=FILE for each camera"
+            )
+        options.files_by_name(named)
+        options.refuse_missing(paths[0], rig=True)
+        return named, True
+    if image:
+        files = " ".join(text.partition("=")[2] or text for text in image)
+        raise ValueError(f"--image needs a rig: give --rig RIG, or the images alone: `pat {command} {files}`")
+    if len(paths) < 2:
+        raise ValueError(
+            f"give two images or more, as `pat {command} mono.png colour.png`; "
+            "or a rig, --alpha and each --image"
+        )
+    for path in paths:
+        options.refuse_missing(path, rig=False)
+    return (), False
+
+
+def files_by_camera(
+    rig: Rig, alpha: str | None, paths: Sequence[Path], image: Sequence[str]
+) -> tuple[str, dict[str, list[Path]]]:
+    """Alpha's name, and the image files of each camera of a rig. Raises ValueError without alpha, for names
+    that the rig lacks, and for one image given twice."""
+    from ..batch import find_images
+
+    if alpha is None:
+        raise ValueError(f"--alpha: give the camera whose view is wanted, one of {', '.join(rig.names)}")
+    files = options.files_by_name(image)
+    if unknown := [path for path in paths[1:] if path.stem not in rig.names]:
+        raise ValueError(f"{unknown[0]}: no camera of the rig has its name: give --image NAME={unknown[0]}")
+    files_of = {rig.require(name): find_images(path, name=name) for name, path in files.items()}
+    refuse_same(files_of)
+    return rig.require(alpha), files_of
+
+
+def refuse_same(files: Mapping[str, Sequence[Path]]) -> None:
+    """Raise ValueError if the first files of two cameras hold the same."""
+    for (a, (first, *_)), (b, (second, *_)) in combinations(files.items(), 2):
+        if first.is_file() and second.is_file() and filecmp.cmp(first, second, shallow=False):
+            raise ValueError(
+                f"the images of '{a}' and '{b}' are the same image, {second}: give each camera its own"
+            )
+
+
+def is_rig_file(path: Path) -> bool:
+    """Whether a file is meant as a rig: neither folder nor pattern, nor named as images and videos are."""
+    suffixes = IMAGE_SUFFIXES | VIDEO_SUFFIXES
+    return not (any(c in path.name for c in "*?[") or path.suffix.lower() in suffixes or path.is_dir())

@@ -1,0 +1,256 @@
+"""Command lines from dataclasses and functions: an option for each field, of its type, with its docstring.
+
+A field's `Annotated` type may hold an `Option`; a class's `headings` say which fields stand under which
+heading of its help, the others coming first. Imports nothing that takes long.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import dataclasses
+import inspect
+import sys
+import textwrap
+import types
+import typing
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, is_dataclass, replace
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NoReturn, TypeVar
+
+from ...support.schema import near
+
+T = TypeVar("T")
+WIDTH = 110
+MISSING = dataclasses.MISSING
+
+
+class UsageError(ValueError):
+    """A command line that cannot be run: the option, what it expects, and what came instead, if anything."""
+
+    def __init__(self, option: str, expected: str, got: object = None) -> None:
+        self.option, self.expected, self.got = option, expected, got
+        super().__init__(f"{option}: expected {expected}" + (f", got {got}" if got is not None else ""))
+
+
+@dataclass(frozen=True)
+class Option:
+    """What the type of a field does not say: the name of its value, help instead of the docstring's, a short
+    name; whether it is an argument without a name, and whether the option is given once for each value."""
+
+    metavar: str | None = None
+    help: str | None = None
+    short: str | None = None
+    positional: bool = False
+    repeat: bool = False
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        option, _, said = message.removeprefix("argument ").partition(": ")
+        if option.startswith("the following"):
+            option, said = said, "a value, got none"
+        raise UsageError(option, said.removeprefix("expected "))
+
+
+def parse(
+    kind: Callable[..., T],
+    arguments: Sequence[str] | None = None,
+    *,
+    prog: str = "",
+    base: Any = None,
+    description: str = "",
+) -> T:
+    """What a class or function makes of a command line; `base`, of that class, holds the defaults.
+
+    Raises UsageError for what does not fit; `--help` prints and exits.
+    """
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    parser = _Parser(
+        prog=prog or None,
+        description=(description or inspect.getdoc(kind) or "").replace("%", "%%"),
+        formatter_class=partial(argparse.RawDescriptionHelpFormatter, max_help_position=34, width=WIDTH),
+        allow_abbrev=False,
+        add_help=False,
+    )
+    headings: Mapping[str, str] = getattr(kind, "headings", {})
+    heading_of = {name: title for title, names in headings.items() for name in names.split()}
+    groups = {title: parser.add_argument_group(title) for title in ("arguments", "options", *headings)}
+    groups["options"].add_argument("-h", "--help", action="help", help="Print this help.")
+    entries = list(_entries(kind, base))
+    for entry in entries:
+        title = "arguments" if entry.option.positional else heading_of.get(entry.name, "options")
+        entry.add_to(groups[title])
+    values = [entry.metavar for entry in entries if entry.option.positional]
+    parser.usage = " ".join([parser.prog, *values, "[options]"]).replace("%", "%%")
+    known, rest = parser.parse_known_intermixed_args(words)
+    if rest:
+        raise _unknown(rest[0], [f"--{entry.dashed}" for entry in entries if not entry.option.positional])
+    given = {name: value for name, value in vars(known).items() if value is not argparse.SUPPRESS}
+    return _changed(base, given) if base is not None else kind(**given)
+
+
+def script(kind: Callable[..., T], arguments: Sequence[str] | None = None, *, prog: str = "") -> T:
+    """`parse` for a script of its own: what does not fit ends it in one line."""
+    try:
+        return parse(kind, arguments, prog=prog)
+    except UsageError as error:
+        sys.exit(f"{error}")
+
+
+def _unknown(word: str, options: list[str]) -> UsageError:
+    if word.startswith("-"):
+        return UsageError(word.partition("=")[0], f"no such option{near(word, options)}")
+    advice = ": write the option before each, as in --image a=A --image b=B" if "=" in word else ""
+    return UsageError(word, f"an option before it{advice}")
+
+
+def _changed(base: Any, given: Mapping[str, Any]) -> Any:
+    """A dataclass with some entries changed, by their dotted names."""
+    own = {name: value for name, value in given.items() if "." not in name}
+    for part in {name.partition(".")[0] for name in given if "." in name}:
+        inner = {n.partition(".")[2]: v for n, v in given.items() if n.startswith(f"{part}.")}
+        own[part] = _changed(getattr(base, part), inner)
+    return replace(base, **own)
+
+
+@dataclass
+class _Entry:
+    """A field or parameter as an option."""
+
+    name: str
+    kind: Any
+    default: Any
+    doc: str
+    option: Option = Option()
+
+    def __post_init__(self) -> None:
+        while typing.get_origin(self.kind) is typing.Annotated:
+            self.kind, *more = typing.get_args(self.kind)
+            self.option = next((entry for entry in more if isinstance(entry, Option)), self.option)
+        if typing.get_origin(self.kind) in (typing.Union, types.UnionType):
+            kinds = [kind for kind in typing.get_args(self.kind) if kind is not type(None)]
+            self.kind = kinds[0] if len(kinds) == 1 else str
+            self.__post_init__()
+
+    @property
+    def dashed(self) -> str:
+        return self.name.replace("_", "-")
+
+    @property
+    def negated(self) -> str:
+        """The option that says no, such as --no-report and --recording.no-ideal."""
+        before, dot, last = self.dashed.rpartition(".")
+        return f"--{before}{dot}no-{last}"
+
+    @property
+    def metavar(self) -> str:
+        return self.option.metavar or self.dashed.upper()
+
+    @property
+    def help(self) -> str:
+        """The help, with the default where that says something."""
+        text = " ".join((self.option.help or self.doc).split())
+        value = self.default
+        if value not in (None, (), "", MISSING) and not isinstance(value, bool) and "default" not in text:
+            shown = " ".join(map(str, value)) if isinstance(value, tuple) else value
+            text = f"{text.rstrip('.')} (default: {shown})." if text else f"Default: {shown}."
+        return text.replace("%", "%%")
+
+    def add_to(self, group: Any) -> None:
+        """Add the option to a parser's group."""
+        how: dict[str, Any] = {"default": argparse.SUPPRESS, "help": self.help}
+        how |= {} if self.option.positional else {"dest": self.name}
+        flag, members = f"--{self.dashed}", typing.get_args(self.kind)
+        if self.kind is bool:
+            off = self.default is True
+            group.add_argument(self.negated if off else flag, action=f"store_{not off}".lower(), **how)
+            return
+        several = typing.get_origin(self.kind) is tuple
+        convert, metavar = _conversion(members[0] if several else self.kind)
+        how |= {"type": convert, "metavar": self.option.metavar or metavar}
+        if several and self.option.repeat:
+            how |= {"action": _Append}
+        elif several and members[1:] == (...,):
+            how |= {"action": _Tuple, "nargs": "*"}
+        elif several:
+            names = tuple((self.option.metavar or " ".join([metavar] * len(members))).split())
+            how |= {"action": _Tuple, "nargs": len(members), "metavar": names}
+        required = self.default is MISSING
+        if self.option.positional:
+            group.add_argument(self.name, **how, **({} if several or required else {"nargs": "?"}))
+        else:
+            short = [self.option.short] if self.option.short else []
+            group.add_argument(flag, *short, required=required, **how)
+
+
+class _Tuple(argparse.Action):
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: Any = None) -> None:
+        setattr(namespace, self.dest, tuple(values))
+
+
+class _Append(argparse.Action):
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: Any = None) -> None:
+        setattr(namespace, self.dest, (*getattr(namespace, self.dest, ()), values))
+
+
+def _conversion(kind: Any) -> tuple[Callable[[str], Any], str]:
+    """How a text becomes a value of a type, and what such a value is called."""
+    if typing.get_origin(kind) is typing.Literal:
+        choices = {str(choice): choice for choice in typing.get_args(kind)}
+        return partial(_chosen, choices), f"{{{','.join(choices)}}}"
+    plain: dict[Any, tuple[Callable[[str], Any], str]] = {
+        int: (partial(_number, int, "a whole number"), "N"),
+        float: (partial(_number, float, "a number"), "NUMBER"),
+        Path: (Path, "PATH"),
+    }
+    return plain.get(kind, (str, "TEXT"))
+
+
+def _chosen(choices: Mapping[str, Any], text: str) -> Any:
+    if text not in choices:
+        raise argparse.ArgumentTypeError(f"expected one of {', '.join(choices)}, got '{text}'")
+    return choices[text]
+
+
+def _number(kind: Callable[[str], Any], name: str, text: str) -> Any:
+    try:
+        return kind(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected {name}, got '{text}'") from None
+
+
+def _entries(kind: Any, base: Any, before: str = "") -> Iterator[_Entry]:
+    """The options of a class or function, those of dataclasses in it by dotted names."""
+    hints = typing.get_type_hints(kind, include_extras=True)
+    if not is_dataclass(kind):
+        for name, parameter in inspect.signature(kind).parameters.items():
+            default = MISSING if parameter.default is parameter.empty else parameter.default
+            yield _Entry(name, hints[name], default, "")
+        return
+    docs = field_docs(kind)
+    for field in dataclasses.fields(kind):
+        made = field.default_factory
+        default = field.default if made is MISSING else made()
+        default = default if base is None else getattr(base, field.name)
+        if is_dataclass(default) and not isinstance(default, type):
+            yield from _entries(type(default), default, f"{before}{field.name}.")
+        elif field.init:
+            yield _Entry(before + field.name, hints[field.name], default, docs.get(field.name, ""))
+
+
+def field_docs(kind: Any) -> dict[str, str]:
+    """The docstrings that follow a dataclass's fields, and those of the classes it is made from."""
+    docs: dict[str, str] = {}
+    for parent in reversed(kind.__mro__):
+        if parent is object:
+            continue
+        (body,) = ast.parse(textwrap.dedent(inspect.getsource(parent))).body
+        statements = typing.cast(ast.ClassDef, body).body
+        for field, text in pairwise(statements):
+            if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
+                docs[ast.unparse(field.target)] = str(getattr(text.value, "value", ""))
+    return docs
