@@ -21,7 +21,20 @@ from arraygeom.runtime.threads import torch_in_one_thread
 
 from .depth_change import relative_change
 from .evidence import SCALES, DriftEvidence, FitStatistics, fit_statistics, observations
-from .hypotheses import SHIFTS, TURNS, Hypothesis, from_degrees, hypotheses, ignored_lens, in_degrees
+from .hypotheses import (
+    SHIFTS,
+    TURNS,
+    Hypothesis,
+    focal_length_of,
+    from_degrees,
+    hypotheses,
+    ignored_lens,
+    implausible,
+    in_degrees,
+    is_plausible,
+    is_short,
+    zoomed,
+)
 from .matches import (
     Images,
     Pairs,
@@ -32,7 +45,7 @@ from .matches import (
     image_sizes,
     match_cameras,
 )
-from .parameters import SIGMA
+from .parameters import LARGEST_CHANGE, SIGMA
 from .residuals import image_parts, line_distances, related, within_lenses
 
 LOG = logging.getLogger(__name__)
@@ -41,6 +54,12 @@ MOST = 250
 """Largest number of matches used of a pair."""
 HEALTHY_MISFIT = 0.2
 """A rig with a smaller misfit than this, in pixels, is healthy."""
+USUAL_MISFIT = 0.0015
+"""And so is one with a smaller misfit than this share of the image's longer side that no mistake explains."""
+FOCAL_SHARES, FOCAL_SHARE = (0.3, 3.0), 1.2
+"""Focal lengths that are tried, as shares of the image's longer side; of equal ones that nearest to this."""
+OF_SIZES = ("resized", "focal length")
+"""Mistakes that an image's size shows, though lines may not."""
 EQUAL = (1.4, 0.03)
 """Explanations are equal whose misfit is less than 1.4 times the best one's plus 0.03 px."""
 LARGEST_REMAINDER = (0.33, 0.2)
@@ -91,8 +110,13 @@ class Diagnosis:
         others = "; or: ".join(hypothesis.words for hypothesis in self.equal)
         if self.named.kind != "nothing":
             return f"likely mistake: {self.named.words}" + (f"; or: {others}" if others else "")
-        if self.healthy:
+        if self.healthy and self.before.misfit < HEALTHY_MISFIT:
             return "nothing wrong: the points lie on their lines to the accuracy of their positions"
+        if self.healthy:
+            return (
+                f"healthy: none of the usual mistakes, and {self.before.misfit:.2f} px off these images, as "
+                "factory calibrations are; `pat rig refine` may bring the lines nearer"
+            )
         if self.before.misfit < HEALTHY_MISFIT:  # of the rig's own oddities, where lines say nothing
             words = (
                 "none of the usual mistakes: the points lie on their lines, but behind the cameras, outside "
@@ -135,6 +159,7 @@ class Diagnosis:
             "as_good": [{"mistake": h.kind, "words": h.words} for h in self.equal],
             "healthy": self.healthy,
             "matches": self.matches,
+            "beyond_lenses": self.beyond,
             "depth": self.depth,
             "before": _rounded(self.before),
             "after": _rounded(self.after),
@@ -171,19 +196,29 @@ def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnos
     tried = hypotheses(rig, sizes)
     if fits:
         tried += [*_ignored_lens(rig, pairs), *_degrees(rig, pairs), *_depth_range(rig, pairs)]
+        tried += _zoomed(rig, pairs)
     LOG.info("trying %d mistakes on %d pairs", len(tried), len(pairs))
     fit, inliers, noise = fit_statistics(tried, pairs)
     misfit = {h: f.penalised_misfit for h, f in fit.items()}
     given = named = tried[0]
     table = sorted(tried if fits else tried[1:], key=lambda h: misfit[h])
-    healthy = fits and misfit[given] < HEALTHY_MISFIT
+    odd = implausible(rig) if fits else []
+    by_size = [h for h in table if odd and h.kind in OF_SIZES and is_plausible(h.rig, odd)]
+    by_size = [h for h in by_size if misfit[h] <= EQUAL[0] * misfit[given] + EQUAL[1]]
+    healthy = fits and misfit[given] < HEALTHY_MISFIT and not by_size
     as_good: list[Hypothesis] = []
     if not fits:
         as_good = [h for h in table if misfit[h] <= EQUAL[0] * misfit[table[0]] + EQUAL[1]]
         named = min(as_good, key=tried.index)
     elif not healthy:
-        LOG.info("comparing the mistakes that leave least with a drift")
-        named, as_good = _by_evidence(misfit, table, pairs, inliers, noise, mirrored=fit[given].handed < 0.5)
+        if not misfit[given] < HEALTHY_MISFIT:
+            LOG.info("comparing the mistakes that leave least with a drift")
+            mirrored = fit[given].handed < 0.5
+            named, as_good = _by_evidence(misfit, table, pairs, inliers, noise, mirrored=mirrored)
+        if named is given and by_size:
+            named, as_good = min(by_size, key=lambda h: _far_from_range(h, fit[h].depth)), by_size
+        usual = USUAL_MISFIT * max(max(hw) for hw in sizes.values())
+        healthy = named is given and not as_good and misfit[given] < usual
     equal = {h.kind: h for h in reversed(as_good) if h.kind != named.kind}
     others = (h for h in as_good if h is not named)
     return Diagnosis(
@@ -278,6 +313,35 @@ def _ignored_lens(rig: Rig, pairs: Pairs) -> list[Hypothesis]:
         k1, step = candidates[best], candidates[1] - candidates[0]
         lowest, highest = k1 - step, k1 + step
     return [ignored_lens(rig, bare, k1)]
+
+
+def _far_from_range(hypothesis: Hypothesis, depth: float) -> float:
+    """By what factor, as a logarithm, the points' median depth is from the middle of the depth range."""
+    if hypothesis.rig.depth is None or not (depth > 0 and float(hypothesis.rig.depth[0]) > 0):
+        return 0.0
+    near, far = (float(bound) for bound in hypothesis.rig.depth)
+    return abs(math.log(depth) - math.log(near * min(far, 100 * near)) / 2)
+
+
+def _zoomed(rig: Rig, pairs: Pairs) -> list[Hypothesis]:
+    """The focal lengths that fit best: of one camera, or of all that cannot be in pixels."""
+    names = [name for name in cameras_of(rig, pairs) if isinstance(rig[name], Camera)]
+    short = [name for name in names if is_short(rig[name])]
+    found = []
+    for group in [short] if short else [[name] for name in names]:
+        length, side = focal_length_of(rig[group[0]]), max(rig[group[0]].hw)
+        low, high = (math.log(share * side / length) for share in FOCAL_SHARES)
+        for _ in range(3):
+            factors = torch.linspace(low, high, 25, dtype=torch.float64).exp().tolist()
+            off = observations([zoomed(rig, group, factor).rig for factor in factors], pairs).off
+            off = off.abs().median(1).values
+            equal = [f for f, o in zip(factors, off) if o <= EQUAL[0] * off.min() + EQUAL[1]]
+            best = min(equal, key=lambda f: abs(math.log(f * length / (FOCAL_SHARE * side))))
+            step = (high - low) / 24
+            low, high = math.log(best) - step, math.log(best) + step
+        if abs(math.log(best)) > LARGEST_CHANGE * SIGMA["focal"]:
+            found.append(zoomed(rig, group, best))
+    return found
 
 
 def _degrees(rig: Rig, pairs: Pairs) -> list[Hypothesis]:

@@ -89,7 +89,7 @@ class FitStatistics(NamedTuple):
         if not math.isnan(self.front):
             parts.append(f"{self.front:.0%} in front")
         if not math.isnan(self.inside):
-            parts.append(f"{self.inside:.0%} within the depth range")
+            parts.append(f"{self.inside:.0%} within twice the depth range")
         if not math.isnan(self.depth):
             parts.append(f"median depth {self.depth:.3g} {unit}")
         if self.handed < 0.5:

@@ -13,6 +13,7 @@ from itertools import combinations
 
 import torch
 from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from arraygeom import Camera, Distortion, LensView, Pose, Rig, View, resize_matrix, rotation_from_vector
@@ -30,8 +31,11 @@ UNITS = {
 }
 SHIFTS = {"half-pixel shift": 0.5, "one-pixel shift": 1.0}
 """A drift of a calibrated camera's principal point does the same."""
-OFF_CENTRE = 0.05
-"""Principal points within this of the middle of the image, as a share of its longer side, are plausible."""
+OFF_CENTRE, FAR_OFF = 0.05, 0.15
+"""Principal points within this of the middle of the image, as a share of its longer side, are plausible, and
+beyond the second are not."""
+SHORTEST_FOCAL = 0.2
+"""Focal lengths are not shorter, as a share of the image's longer side: they are in another unit."""
 TRANSPOSE = torch.eye(3, dtype=torch.float64)[[1, 0, 2]]
 """Exchanges x and y."""
 OPENGL = Pose(torch.diag(torch.tensor([1, -1, -1], dtype=torch.float64)), torch.zeros(3, dtype=torch.float64))
@@ -100,6 +104,28 @@ def _beyond_drift(K: Tensor, changed_K: Tensor) -> bool:
     return bool(torch.maximum(focal, centre) > LARGEST_CHANGE)
 
 
+def implausible(rig: Rig) -> list[str]:
+    """The cameras whose principal point or focal length no image of their size has."""
+    views = [(name, view) for name, view in rig.cameras.items() if isinstance(view, LensView)]
+    return [name for name, view in views if _centre_offset(view) > FAR_OFF or is_short(view)]
+
+
+def is_plausible(rig: Rig, names: Sequence[str]) -> bool:
+    """Whether these cameras' principal points and focal lengths are usual ones of their images."""
+    views = [view for name in names if isinstance(view := rig[name], LensView)]
+    return all(_centre_offset(view) <= OFF_CENTRE and not is_short(view) for view in views)
+
+
+def is_short(view: LensView) -> bool:
+    """Whether the focal length is too short to be in pixels of such an image."""
+    return focal_length_of(view) < SHORTEST_FOCAL * max(view.hw)
+
+
+def focal_length_of(view: LensView) -> float:
+    """The mean focal length, pixels, also of images that were rotated or mirrored."""
+    return float(view.K[:2, :2].det().abs().sqrt())
+
+
 def _centre_offset(view: LensView) -> float:
     """Of the principal point from the middle of the image, as a share of its longer side."""
     middle = view.K.new_tensor([view.hw[1] - 1, view.hw[0] - 1]) / 2
@@ -124,6 +150,21 @@ def from_degrees(R: Float[Tensor, "3 3"], turns: Int[Tensor, "*b"]) -> Float[Ten
     angle = vector.norm()
     whole = torch.deg2rad(angle + 2 * math.pi * turns)[..., None]
     return rotation_from_vector(vector / angle.clamp(min=1e-12) * whole)
+
+
+def zoomed(rig: Rig, names: Sequence[str], factor: float) -> Hypothesis:
+    """The focal lengths of these cameras are `factor` times as long: in another unit, or by another zoom."""
+    who = ", ".join(map(repr, names))
+    short = all(is_short(rig[name]) for name in names)
+    words = f"focal length of {who} in millimetres" if short else f"image of {who} zoomed or cropped"
+
+    def change(camera: Camera) -> Camera:
+        K = camera.K.clone()
+        K[:2, :2] *= factor
+        return camera.replace(K=K)
+
+    words += f": about {focal_length_of(rig[names[0]]) * factor:.0f} px"
+    return Hypothesis("focal length", words, on_cameras(rig, names, change), approximate=True)
 
 
 def in_degrees(rig: Rig, turns: Mapping[str, int]) -> Hypothesis:
@@ -186,10 +227,31 @@ def _same_size(A: Tensor) -> Change:
     return partial(on_pixels, change=lambda _, view: (A, view.hw))
 
 
+def _partly_scaled(A: Float[Tensor, "3 3"], columns: slice, camera: Camera) -> Camera:
+    """The camera with these columns of K for pixels x' ~ A x."""
+    K = camera.K.clone()
+    K[:2, columns] = (A.to(K) @ K)[:2, columns]
+    return camera.replace(K=K)
+
+
 def _opposite_lens(camera: Camera) -> Camera:
     lens = camera.distortion
     assert lens is not None
     return camera.replace(distortion=lens.with_coefficients(-lens.coefficients))
+
+
+def _mirrored(axis: str, rotated: bool, pose: Pose) -> Pose:
+    """The pose with an axis the other way, in the translation or in the rotation, too."""
+    S = torch.ones(3).to(pose.t)
+    S["xyz".index(axis)] = -1
+    return Pose(S[:, None] * pose.R * S if rotated else pose.R, S * pose.t)
+
+
+def _reversed_angles(order: str, pose: Pose) -> Pose:
+    """The pose whose rotation is by the same angles about the axes in the opposite order."""
+    angles = Rotation.from_matrix(pose.R.detach().cpu().numpy()).as_euler(order.upper())
+    R = Rotation.from_euler(order[::-1].upper(), angles[::-1]).as_matrix()
+    return Pose(torch.from_numpy(R).to(pose.R), pose.t)
 
 
 POSES: dict[tuple[str, str], Callable[[Pose], Pose]] = {
@@ -207,6 +269,33 @@ POSES: dict[tuple[str, str], Callable[[Pose], Pose]] = {
     ("degrees and radians", "rotation of {} in radians, taken for degrees"): lambda pose: Pose(
         rotation_from_vector(torch.rad2deg(rotation_vector(pose.R))), pose.t
     ),
+    ("OpenGL axes", "pose of {} is world from camera in OpenGL's axes, as of NeRF files"): lambda pose: (
+        OPENGL @ pose.inverse()
+    ),
+    ("frame of t", "t of {} is along the axes of the other frame (R t is meant)"): lambda pose: Pose(
+        pose.R, (pose.R @ pose.t[..., None])[..., 0]
+    ),
+    ("frame of t", "t of {} is along the axes of the other frame (the inverse of R, times t)"): lambda pose: (
+        Pose(pose.R, (pose.R.mT @ pose.t[..., None])[..., 0])
+    ),
+    **{
+        ("sign of t", f"{axis} of the translation of {{}} with the wrong sign"): partial(
+            _mirrored, axis, False
+        )
+        for axis in "xyz"
+    },
+    **{
+        ("left-handed", f"pose of {{}} in a left-handed system ({axis} the other way)"): partial(
+            _mirrored, axis, True
+        )
+        for axis in "xyz"
+    },
+    **{
+        ("order of angles", f"Euler angles of {{}} about {order}, applied in the opposite order"): partial(
+            _reversed_angles, order
+        )
+        for order in ("xyz", "zyx", "yxz", "zxy", "xzy", "yzx")
+    },
 }
 """Mistakes in a pose, and what undoes them."""
 EXCHANGED = {
@@ -251,6 +340,10 @@ def _of_numbers(rig: Rig, names: Sequence[str]) -> Iterator[Hypothesis]:
         A[:2, 2] = 0.5 * factor - 0.5
         words = f"K of {{}} is for images {1 / factor:.3g} times as large"
         yield from _of_groups(rig, every, "resized", {words: _same_size(A)})
+        for what, columns in (("principal point", slice(2, 3)), ("focal lengths", slice(0, 2))):
+            words = f"{what} of {{}} for images {1 / factor:.3g} times as large"
+            undo: Change = partial(on_cameras, change=partial(_partly_scaled, A, columns))
+            yield from _of_groups(rig, _groups(calibrated), "resized", {words: undo})
     curved = [name for name in calibrated if rig[name].distortion is not None]
     yield from _of_groups(rig, _groups(curved), "distortion", CURVED)
     lenses = [name for name in curved if isinstance(rig[name].distortion, Distortion)]

@@ -58,8 +58,8 @@ def checked_rig(views: ViewFiles, *, heal: bool) -> Healed | None:
     if misfit is None:
         return None
     wrong = misfit.mistaken or misfit.outside > OUTSIDE
-    if heal and not misfit.outside > OUTSIDE and (healed := healed_rig(views.rig, images, views.alpha)):
-        return healed._replace(text=f"{healed.text}; {misfit.text}") if misfit.mistaken else healed
+    if heal and not wrong and (healed := healed_rig(views.rig, images, views.alpha)):
+        return healed
     warn(misfit.text, LowConfidenceWarning if wrong else UserWarning)
     return None
 

@@ -287,9 +287,10 @@ class Convert:
 class Doctor:
     """Find the usual mistakes in a rig, by features matched between one image of each camera.
 
-    Half-pixel and one-pixel shifts, R transposed, pose inverted, the centre given as t, OpenGL axes, order of
-    quaternions, radians taken for degrees, units, cameras swapped, images resized, cropped, rotated or
-    mirrored without the rig, x and y exchanged, distortion ignored, applied twice or with the wrong sign.
+    Half-pixel and one-pixel shifts, R transposed, pose inverted, the centre given as t, t in the other frame,
+    OpenGL axes, left-handed systems, order of angles and quaternions, radians taken for degrees, units,
+    cameras swapped, images resized, zoomed, cropped, rotated or mirrored without the rig, x and y exchanged,
+    distortion ignored, applied twice or with the wrong sign.
 
     Example: pat rig doctor rig.yaml --image mono=a.png --image colour=b.png --out better.yaml
     """

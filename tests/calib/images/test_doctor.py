@@ -7,6 +7,7 @@ import re
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from arraygeom import Camera, Distortion, Link, Pose, Rig, View, triangulate
 from arraygeom.lenses import PolynomialFisheye
@@ -41,6 +42,19 @@ def posed(change):
     return lambda c: c.replace(cam_from_world=change(c.cam_from_world))
 
 
+def angles_reversed(pose):
+    angles = Rotation.from_matrix(pose.R.numpy()).as_euler("XYZ")
+    return Pose(torch.from_numpy(Rotation.from_euler("ZYX", angles[::-1]).as_matrix()), pose.t)
+
+
+def with_numbers(camera, *, focal=1.0, centre=1.0):
+    K = camera.K.clone()
+    K[:2, :2] *= focal
+    K[:2, 2] = (K[:2, 2] + 0.5) * centre - 0.5
+    return camera.replace(K=K)
+
+
+FLIP = torch.diag(vector(1, -1, 1))
 MISTAKES = {
     "sign of t": one(posed(lambda p: Pose(p.R, -p.t))),
     "half-pixel shift": one(shifted(0.5)),
@@ -54,6 +68,10 @@ MISTAKES = {
     "cameras swapped": lambda rig: swap(rig, *rig.names),
     "units": each(posed(lambda p: Pose(p.R, 1000 * p.t))),
     "x and y exchanged": each(lambda c: c.replace(K=TRANSPOSE @ c.K @ TRANSPOSE)),
+    "frame of t": one(posed(lambda p: Pose(p.R, p.R @ p.t))),
+    "order of angles": each(posed(angles_reversed)),
+    "left-handed": each(posed(lambda p: Pose(FLIP @ p.R @ FLIP, FLIP @ p.t))),
+    "focal length": each(lambda c: with_numbers(c, focal=0.02)),
     "resized": one(lambda c: c.resize((c.hw[0] // 2, c.hw[1] // 2)).replace(hw=c.hw)),
     "rotated or mirrored": lambda rig: rig.rot90("second", 2),
 }
@@ -321,6 +339,47 @@ def test_a_rig_without_a_depth_range_is_told_one():
     assert 0.8 * near < found.depth[0] < found.depth[1] < 1.3 * far
     assert f"--depth {found.depth[0]:.3g} {found.depth[1]:.3g}" in found.as_text()
     assert json.loads(found.as_json())["depth"] == list(found.depth)
+
+
+ONE_PART = {
+    "principal point": each(lambda c: with_numbers(c, centre=0.5)),
+    "principal point of one": one(lambda c: with_numbers(c, centre=0.5)),
+    "focal lengths": each(lambda c: with_numbers(c, focal=0.5)),
+    "zoomed": one(lambda c: with_numbers(c, focal=0.7)),
+    "x of the translation": one(posed(lambda p: Pose(p.R, p.t * vector(-1, 1, 1)))),
+    "NeRF": each(posed(lambda p: p.inverse() @ Pose(OPENGL, torch.zeros(3).double()))),
+}
+
+
+@pytest.mark.parametrize("part", ONE_PART)
+def test_mistakes_in_a_part_of_the_numbers_are_named(part):
+    rig = same_size(unlike_pair())
+    found = diagnose_matches(ONE_PART[part](rig), sizes(rig), seen_points(rig))
+    assert part.removesuffix(" of one") in found.named.words, found.verdict
+    assert found.after.depth == pytest.approx(
+        diagnose_matches(rig, sizes(rig), seen_points(rig)).before.depth, rel=0.02
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "kind"), [({"focal": 0.5, "centre": 0.5}, "resized"), ({"focal": 0.01}, "focal length")]
+)
+def test_what_lines_cannot_see_the_size_of_the_image_can(change, kind):
+    """Rectified pairs: they were healthy."""
+    rig = rectified_pair()
+    found = diagnose_matches(each(lambda c: with_numbers(c, **change))(rig), sizes(rig), seen_points(rig))
+    assert found.named.kind == kind
+    assert not found.healthy
+
+
+def test_a_factory_calibration_is_healthy():
+    """One of 1.3 px by OpenCV had drifted; so small a share of an image is what factories reach."""
+    rig = unlike_pair()
+    some = rig.perturbed({"second.rotation": vector(0.0008, -0.0005, 0.0008)})
+    found = diagnose_matches(some, sizes(rig), seen_points(rig))
+    assert 0.2 < found.before.misfit < 0.48
+    assert found.healthy
+    assert "refine" in found.verdict
 
 
 def test_points_beyond_the_end_of_a_lens_count_for_nobody():
