@@ -220,7 +220,7 @@ def matched_colours(
     alike = likeness(unlike) if sees_luma else torch.ones_like(unlike)
     if bands == 1:  # which may be unlike alpha
         alike = torch.lerp(torch.ones_like(alike), alike, statistics.explained.to(alike))
-    weight = match_weight(alike, matches, valid, sees_luma=sees_luma)
+    weight = match_weight(alike, matches, valid)
     if bands > 1:
         power = SETTINGS.saturation if sees_luma else 0.0
         colour, bright = _scaled_to_alpha(values - luma, luma, alpha, weight, power)
@@ -272,16 +272,13 @@ def _scaled_to_alpha(
 
 
 def match_weight(
-    alike: Float[Tensor, "b 1 h w"], matches: BetaMatches, valid: Tensor, *, sees_luma: bool = True
+    alike: Float[Tensor, "b 1 h w"], matches: BetaMatches, valid: Tensor
 ) -> Float[Tensor, "b 1 h w"]:
     """Weight of a match's colours, 0 to 1.
 
     The photometric likeness, halved where the left-right check fails. Where certainty is known, the geometric
-    mean of that and of the probability that the match is right, given the likeness; of an alpha that does not
-    see luma the confidence alone.
+    mean of that and of the probability that the match is right, given the likeness.
     """
-    if not sees_luma:
-        return matches.confidence * valid
     checked = alike * (1 + is_consistent(matches.facts)) / 2
     if matches.certainty is None:
         return checked * valid
