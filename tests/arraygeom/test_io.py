@@ -330,7 +330,9 @@ def test_quaternions_of_rotations_by_180_degrees(tmp_path):
         assert_same(rig[name], one)
 
 
-@pytest.mark.parametrize("name", ["two\nlines", "tab\tbed", "sep\u2028arated", "\x1b[2J", "a\ud800", "\u202eb"])
+@pytest.mark.parametrize(
+    "name", ["two\nlines", "tab\tbed", "sep\u2028arated", "\x1b[2J", "a\ud800", "\u202eb"]
+)
 def test_names_that_cannot_be_printed_are_refused(name, tmp_path):
     """They would end a line of a file, or a terminal would do as they say."""
     with pytest.raises(ValueError, match=re.escape(ascii(name))):
