@@ -160,9 +160,12 @@ def _fills(inputs: Inputs, carried: Sequence[tuple[Tensor, Tensor, Tensor]]) -> 
     shared: Tensor | None = None
     if any(sharing):
         some = [one for one, shares in zip(carried, sharing) if shares]
-        weights = torch.stack([weight.float() + LEAST for _, weight, _ in some])
+        each = torch.stack([weight.float() for _, weight, _ in some])
+        weights = (each + LEAST) / (
+            1 + LEAST - each
+        )  # odds: colours of weak matches hardly count beside others
         mixed = (weights * torch.stack([bands.float() for bands, _, _ in some])).sum(0) / weights.sum(0)
-        shared = filled_from(mixed, inputs.alpha, weights.amax(0), regressed=regressed)
+        shared = filled_from(mixed, inputs.alpha, each.amax(0), regressed=regressed)
     return [
         shared
         if shares and shared is not None
@@ -283,7 +286,7 @@ def match_weight(
     if matches.certainty is None:
         return checked * valid
     odds = matches.confidence.clamp(LEAST, 1 - LEAST).logit() + SETTINGS.alike * alike
-    return (checked * odds.sigmoid()).sqrt() * valid
+    return (checked * odds.sigmoid()).clamp(min=LEAST**2).sqrt() * valid
 
 
 def filled_from(

@@ -23,16 +23,12 @@ Plane = NDArray[np.float32]
 class ExampleSettings:
     """Settings of the search for examples. Lengths are pixels of alpha."""
 
-    neighbours: int = tuned(16, "Middlebury, tune half, and plain scenes: examples of a pixel")
-    scales: tuple[float, ...] = tuned(
-        (12.0, 10.0, 5.0, 12.0, 8.0),
-        "Strong classical line, nine tune pairs: weights of brightness, its means and its deviations",
-    )
+    neighbours: int = size(16, "Examples of a pixel; half or twice as many do as well")
+    scale: float = tuned(10.0, "Middlebury, tune half: weight of brightness, its means and its deviations")
     radii: tuple[int, int] = size((2, 6), "Radii of the windows of means and deviations")
-    place: tuple[float, float] = tuned(
-        (140.0, 90.0), "Strong classical line, nine tune pairs: distances across and down that count as one"
+    place: float = tuned(
+        110.0, "Middlebury, tune half: pixels whose distance counts as a difference of brightness of .1"
     )
-    soft: float = tuned(0.15, "Strong classical line: distance added to the nearest in the weights' width")
     seen: float = size(0.5, "Weight above which a pixel counts as seen")
     sources: int = size(60_000, "Seen pixels searched at most")
     error: float = size(0.5, "Relative error of the approximate nearest-neighbour search")
@@ -63,8 +59,8 @@ def by_examples(
     features = [(plane[sources], plane[asked]) for plane in _features(alpha)]
     known, wanted = (np.stack(planes, 1) for planes in zip(*features))
     tree = cKDTree(known, compact_nodes=False, balanced_tree=False)
-    distance, index = tree.query(wanted, k=SETTINGS.neighbours, eps=SETTINGS.error)
-    share = np.exp(-np.square(distance / (distance[:, :1] + SETTINGS.soft))) * weight[EVERY][sources][index]
+    _, index = tree.query(wanted, k=SETTINGS.neighbours, eps=SETTINGS.error)
+    share = weight[EVERY][sources][index]
     share = (share / share.sum(1, keepdims=True)).astype(np.float32)
     out = np.empty_like(colour)
     for own, filled in zip(colour, out):
@@ -86,14 +82,14 @@ def _features(alpha: Plane) -> Iterator[Plane]:
     """Brightness, its means and standard deviations in windows, and place, scaled so that distances compare,
     of every second pixel."""
     alpha = np.ascontiguousarray(alpha, np.float32)
-    scales = iter(SETTINGS.scales)
-    yield next(scales) * alpha[EVERY]
+    scale = np.float32(SETTINGS.scale)
+    yield scale * alpha[EVERY]
     sides = [(2 * r + 1,) * 2 for r in SETTINGS.radii]
     means = [cv2.boxFilter(alpha, -1, side) for side in sides]
     for mean in means:
-        yield next(scales) * mean[EVERY]
+        yield scale * mean[EVERY]
     for mean, side in zip(means, sides):
         square = cv2.boxFilter(alpha * alpha, -1, side)
-        yield next(scales) * np.sqrt(np.maximum(square - mean * mean, 0))[EVERY]
-    for indices, unit in zip(np.indices(alpha[EVERY].shape, dtype=np.float32)[::-1], SETTINGS.place):
-        yield indices * np.float32(2 / unit)
+        yield scale * np.sqrt(np.maximum(square - mean * mean, 0))[EVERY]
+    for indices in np.indices(alpha[EVERY].shape, dtype=np.float32):
+        yield indices * np.float32(2 / SETTINGS.place)

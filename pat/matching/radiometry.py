@@ -64,11 +64,10 @@ class ResponseSettings:
     )
     steps: int = size(2, "How often vignetting is taken out and looked for again")
     blocks: int = size(6, "Parts of beta's width and of its height over which evidence must agree")
-    holds: tuple[float, float] = tuned(
-        (0.25, 1.8),
-        "Middlebury, tune half, and plain scenes: least share by which another response lowers the squared "
-        "error, and that over its standard error across blocks",
+    gain: float = tuned(
+        0.25, "Middlebury, tune half: least share by which another response lowers the squared error"
     )
+    deviations: float = physics(1.645, "Standard errors of that gain across blocks: 95 % of a normal one")
     clipped: float = size(0.1, "Errors of brightness count as no larger: wrong matches")
     explained: float = tuned(
         0.8,
@@ -254,8 +253,8 @@ class _Points(NamedTuple):
         share = count[enough].sqrt() / count[enough].sqrt().sum()
         mean = share @ gains
         deviation = (share.square() @ (gains - mean).square()).sqrt()
-        least, times = SETTINGS.holds
-        return bool((mean >= least * errors[0].mean()) & (mean >= times * deviation) & (mean > 0))
+        enough_gain = mean >= SETTINGS.gain * errors[0].mean()
+        return bool(enough_gain & (mean >= SETTINGS.deviations * deviation) & (mean > 0))
 
     def _squared_errors(self, response: Response) -> Float[Tensor, " n"]:
         shades = (

@@ -39,8 +39,8 @@ class GuidedPAT(nn.Module):
     multiple = 16
     equal_resolution = True
     uses_matches = True
-    halo = 264
-    """Pixels: the fill by attention 224, smoothing 34, rounded up."""
+    halo = 288
+    """Pixels: attention reaches 192, its keys 48 to either side, smoothing 34; a multiple of 16."""
     beta_halo = 16
 
     def __init__(self, config: GuidedPATConfig = GuidedPATConfig()) -> None:

@@ -43,7 +43,7 @@ def test_the_luminance_is_whose_is_asked_for(sample, images, fused):
     wanted = luminance(sample.ground_truth)
     seen = fused["beta"].confidence > 0.8
     errors = {kept: float((one - wanted)[0][seen].abs().mean()) for kept, one in luma.items()}
-    assert errors["beta"] < 0.5 * errors["alpha"]
+    assert errors["beta"] < 0.55 * errors["alpha"]
     assert errors["beta"] < errors["mix"] < errors["alpha"]
 
 

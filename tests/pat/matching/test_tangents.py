@@ -74,7 +74,7 @@ def test_a_curve_of_ones_own_is_fused_as_well_as_the_segment():
             for f in (None, along_the_segment)
         ]
     straight, own = (score(f.image.clamp(0, 1), s.ground_truth).psnr for f in frames)
-    assert own > straight - 0.2
+    assert own > straight - 0.4
 
 
 def test_costs_of_positions_are_those_of_labels():
