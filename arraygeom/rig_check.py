@@ -68,9 +68,14 @@ def unit_oddity(rig: Rig) -> str | None:
 
 
 def lens_end(name: str, camera: LensView) -> str | None:
-    """The sentence on a lens model that ends within its image; None if it covers it."""
+    """The sentence on a lens model that ends within its image; None if it covers it.
+
+    Camera models state themselves where they end (a pole, the rim of a fisheye's circle), which is no mistake
+    unless they cover nothing.
+    """
     covered = coverage(camera)
-    if camera.distortion is None or covered.share >= COVERED:
+    stated = covered.share > 0 and not isinstance(camera.distortion, Distortion)
+    if camera.distortion is None or stated or covered.share >= COVERED:
         return None
     refit = ": check the coefficients"
     if isinstance(camera.distortion, Distortion) and camera.distortion.model == BROWN_CONRADY:

@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from arraygeom.runtime.atomic import alone
+
 ROOT = Path(__file__).parents[1]
 WITHOUT = """
 import sys, warnings
@@ -19,17 +21,31 @@ for package in (arraygeom, calib, pat):
         if not module.name.startswith(("pat.lab.synthesis.blender", "pat.attention.gpu")):
             importlib.import_module(module.name)
 """
+WAIT = """
+from pathlib import Path
+from arraygeom.runtime.atomic import alone
+with alone(Path(sys.argv[1]), 1e6):
+    pass
+"""
 FUSE = "from pat.app.cli.main import main; main(sys.argv[1:])"
 
 
 def run(code, *words):
     command = [sys.executable, "-c", WITHOUT + code, *map(str, words)]
-    done = subprocess.run(command, cwd=ROOT, env=os.environ, capture_output=True, text=True)
+    done = subprocess.run(command, cwd=ROOT, env=os.environ, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stderr[-3000:]
 
 
 def test_every_module_is_imported_without_what_only_posix_has():
     run(IMPORT_ALL)
+
+
+def test_what_a_lock_of_the_system_left_is_not_waited_for(tmp_path):
+    """Of each compiled kernel, where another system's or Python's processes use the same folder."""
+    with alone(tmp_path / "kernel.lock", 1):
+        pass
+    (tmp_path / "kernel.lock").touch()
+    run(WAIT, tmp_path / "kernel.lock")
 
 
 def test_images_are_fused_without_what_only_posix_has(tmp_path):

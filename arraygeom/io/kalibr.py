@@ -41,7 +41,7 @@ AGAIN = "calibrate again with --models pinhole-radtan, or ds-none for wide angle
 def recognises(path: Path, head: str) -> bool:
     if path.is_dir():
         return bool(_sensors(path))
-    return "T_BS" in head or (re.search(r"^cam\d+:", head, re.M) is not None and "intrinsics" in head)
+    return "T_BS" in head or re.search(r"(?ms)^cam\d+:.*(camera_model|intrinsics)", head) is not None
 
 
 def read(source: RigSource) -> Rig:

@@ -71,10 +71,16 @@ def write_text(path: str | Path, text: str) -> None:
 @contextmanager
 def alone(lock: Path, longest: float) -> Iterator[None]:
     """A block that one process is in at a time, or one that has waited so many seconds for the others, or
-    that cannot lock the file. The system unlocks what a process that ended had locked."""
-    from filelock import FileLock
+    that cannot lock the file. The system unlocks what a process that ended had locked.
+
+    Where Python cannot ask the system for locks, a file of another name is there while a process is in the
+    block: the system's locks leave theirs, and would be waited for.
+    """
+    from filelock import FileLock, SoftFileLock
 
     lock_file = FileLock(lock, timeout=longest)
+    if isinstance(lock_file, SoftFileLock):
+        lock_file = SoftFileLock(lock.with_suffix(".soft"), timeout=longest)
     with suppress(OSError):  # waited long, or no locks on this drive
         lock_file.acquire(poll_interval=0.01)
     try:

@@ -283,7 +283,7 @@ def test_write_then_read(format, tmp_path):
         assert_same(one, two)
 
 
-NAMES = ["a b", "1e3", 'q"', "q'", "back\\slash", "tab\tbed", "é漢", "sub/im.png", "x: #y", "%p", "true", "1"]
+NAMES = ["a b", "1e3", 'q"', "q'", "back\\slash", "é漢", "sub/im.png", "x: #y", "%p", "true", "1"]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -330,6 +330,20 @@ def test_quaternions_of_rotations_by_180_degrees(tmp_path):
         assert_same(rig[name], one)
 
 
+@pytest.mark.parametrize(
+    "name", ["two\nlines", "tab\tbed", "sep\u2028arated", "\x1b[2J", "a\ud800", "\u202eb"]
+)
+def test_names_that_cannot_be_printed_are_refused(name, tmp_path):
+    """They would end a line of a file, or a terminal would do as they say."""
+    with pytest.raises(ValueError, match=re.escape(ascii(name))):
+        Rig({"a": camera(1), name: camera(2)})
+    write_rig(Rig({"a b": camera(1)}), tmp_path / "rig.yaml")
+    text = (tmp_path / "rig.yaml").read_text()
+    (tmp_path / "rig.yaml").write_text(text.replace("a b", json.dumps(name)))
+    with pytest.raises(RigFileError):
+        read_rig(tmp_path / "rig.yaml")
+
+
 def test_what_a_format_cannot_hold_is_refused(tmp_path):
     path, tilted = tmp_path / "x", camera(1, LENSES[5])
     three = Rig({str(i): camera(i) for i in range(3)})
@@ -343,7 +357,7 @@ def test_what_a_format_cannot_hold_is_refused(tmp_path):
     for format in set(WRITERS) - {"native"}:
         with pytest.raises(ValueError, match=r"'m'.* mirrored"):
             write_rig(Rig({"m": mirrored}), path, format=format)
-    for name in ("two\nlines", "", " a", "a ", "sep\u2028arated"):
+    for name in ("", " a", "a "):
         with pytest.raises(ValueError, match="one line"):
             write_rig(Rig({name: camera(1)}), path, format="colmap")
     with pytest.raises(ValueError, match="'u'"):

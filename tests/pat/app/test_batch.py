@@ -399,10 +399,10 @@ def test_settings_reach_the_fusion_of_frames_and_of_sequences(material, tmp_path
         given.append(further)
         return Frame(torch.zeros(3, 1, 1), *torch.zeros(3, 1, 1))
 
-    monkeypatch.setattr("pat.app.batch.fuse", fuse)
+    monkeypatch.setattr("pat.app.batch.fuse_frame", fuse)
     job = batch(material, tmp_path, field=Epipolar(), keep_alpha=True, luminance="mix", max_memory="2GiB")
     job._frame(0)
-    assert given == [{"alpha": "fast", "settings": job.settings}]
+    assert [(how["alpha"], how["settings"]) for how in given] == [("fast", job.settings)]
     assert replace(job, sequence=True).fusion.settings == job.settings
 
 

@@ -51,15 +51,16 @@ def test_a_frame_heals_its_own_rig_and_says_so(material, capsys):
     assert not (folder / "right" / "healed_rig.yaml").exists()
 
 
-def test_a_rig_of_the_same_name_as_the_healed_one_is_kept(material, capsys):
+def test_a_rig_where_the_healed_one_would_go_is_refused_and_kept(material, capsys):
     folder, _ = material
     given = folder / "same" / "healed_rig.yaml"
     given.parent.mkdir()
     given.write_text((folder / "rough.yaml").read_text())
     before = given.read_text()
-    fused(folder, "same/healed_rig.yaml", "same")
+    with pytest.raises(SystemExit):
+        fused(folder, "same/healed_rig.yaml", "same")
     assert given.read_text() == before
-    assert "the healed rig is not written" in " ".join(capsys.readouterr().err.split())
+    assert "healed_rig.yaml" in capsys.readouterr().err
 
 
 def test_a_healed_rig_is_of_the_files_as_they_were_recorded(material):

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from arraygeom import Dense, Rig, Sensor, View
+from pat import FuseSettings, fuse
 from pat.app.cli.options import response_of
 from pat.fusion.corrections import Corrections
-from pat.fusion.fuse import fuse
 from pat.fusion.views import read_view
 from pat.matching.radiometry import Response
 from pat.media.images import write_image
@@ -75,9 +75,9 @@ def test_a_dense_field_that_does_not_fit_is_refused_before_the_work():
     """640x400 was killed at 22 GB, whatever the limit."""
     wide = Rig({name: View(hw=(400, 640)) for name in ("mono", "colour")})
     images = {"mono": torch.rand(1, 400, 640), "colour": torch.rand(3, 400, 640)}
-    for further in ({}, {"max_memory": "4GiB"}):
+    for settings in (FuseSettings(field=Dense()), FuseSettings(field=Dense(), max_memory="4GiB")):
         with pytest.raises(ValueError, match=r"dense field .*GiB"):
-            fuse(load_weights("mono-colour"), wide, images, alpha="mono", field=Dense(), **further)
+            fuse(images, wide, alpha="mono", network=load_weights("mono-colour"), settings=settings)
 
 
 @pytest.mark.parametrize("text", ["1,1,1", "0.1,0.1,0.1", "30,59,11", "nan,1,0"])

@@ -9,9 +9,12 @@ import pytest
 import tifffile
 import torch
 from PIL import Image
+from torch.nn.functional import avg_pool2d
 
 from arraygeom import Rig
 from pat.app.from_images import _tagged_rig, array_from_images, camera_names
+from pat.app.sample_array import load_sample
+from pat.media.images import write_image
 from pat.media.profiles import srgb_profile
 from tests.arraygeom.test_xmp import FISHEYE, PERSPECTIVE, image_of
 from tests.calib.scenes import texture
@@ -214,12 +217,23 @@ def test_bad_input_is_one_line(folder, tmp_path, refusal, options, message):  # 
     assert message in refusal(*command.split(), *options.format(folder).split())
 
 
-def test_without_a_rig_the_files_rig_is_written(folder, counts, capsys):  # noqa: F811
+def test_without_a_rig_the_files_rig_is_written(tmp_path, capsys):
     """Its sensors are those of the files: it serves for the next frame."""
+    files = {name: tmp_path / f"{name}.png" for name in ("mono", "colour")}
+    for name, path in files.items():
+        write_image(path, avg_pool2d(load_sample().images[name], 2))
+    pat(f"align {files['mono']} {files['colour']} -o {tmp_path / 'found'} --extras npy")
+    assert "weights: mono-colour (--weights NAME takes others)" in capsys.readouterr().err
+    rig = Rig.load(tmp_path / "found" / "found_rig.yaml")
+    assert {name: rig[name].sensor.response for name in rig.names} == {"mono": "mono", "colour": "rgb"}
+
+
+def test_a_rig_whose_lines_are_open_is_not_written(folder, counts):  # noqa: F811
+    """On the post are too few points: the wall's plane explains the others."""
     out = counts / "found"
     pat(f"align {counts / 'mono.png'} {counts / 'colour.png'} -o {out} --extras npy")
-    assert "weights: mono-colour (--weights NAME takes others)" in capsys.readouterr().err
-    assert set(Rig.load(out / "found_rig.yaml").names) == {"mono", "colour"}
+    assert (out / "aligned.tif").exists()
+    assert not (out / "found_rig.yaml").exists()
 
 
 def test_frames_are_matched_by_their_names(folder, counts):  # noqa: F811

@@ -334,7 +334,7 @@ def test_other_names_given_twice(small, refusal):
 
 
 def test_what_train_refuses_is_one_line_too(refusal):
-    said = refusal("lab", "train", "mono-colour", "--steps", "0")
+    said = refusal("lab", "train", "pat-supervised", "--steps", "0")
     assert said == "pat: steps must be at least 1, got 0"
     assert "'--steps'" in refusal("lab", "train", "--stepps", "5")
 

@@ -17,10 +17,10 @@ EVIL = "open('ran', 'w')\nfield = scene = None\n"
 @pytest.mark.parametrize(
     ("entries", "command"),
     [
-        ({"field": "evilmod:field"}, ["train", "recipe.yaml"]),
+        ({"field": "evilmod:field"}, ["lab", "train", "recipe.yaml"]),
         (
             {"rig": "rig.yaml", "backend": "blender", "blender": {"generator": "evilmod:scene"}},
-            ["render", "recipe.yaml", "--scenes", "1", "--out", "out"],
+            ["lab", "render", "recipe.yaml", "--scenes", "1", "--out", "out"],
         ),
     ],
 )

@@ -118,8 +118,9 @@ def test_fields_of_ones_own_and_networks_are_chosen():
     assert view.answer["betas"]["b"]["samples"] == explore(rig).answer["betas"]["b"]["samples"]
     assert "ZeroDivisionError: of its own" in view.answer["betas"]["b"]["second"]["problem"]
     assert "'failing'" in change(view, field="failing", second="none")["betas"]["b"]["problem"]
-    assert "nothing" in change(view, field="nothing")["betas"]["b"]["problem"]
-    assert "paper's network" in change(view, field="auto", weights="mono-colour")["betas"]["b"]["problem"]
+    assert "nothing" in change(view, field="nothing")["error"]
+    colour = explore(rig, weights="mono-colour").answer
+    assert "paper's network" in colour["betas"]["b"]["problem"]
 
 
 def test_a_networks_weights_are_its_attention():

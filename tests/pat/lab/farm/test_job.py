@@ -153,7 +153,7 @@ def test_refused_scenes_are_named_and_the_others_made(config, tmp_path, capfd):
         ({"layered": {"photos": ["images"]}}, "images: no such file or folder"),
         ({"blender": {"generator": "photographs"}}, "the generator 'photographs' needs a folder `photos`"),
         ({"blender": {"generator": "still-life"}}, "blender: no generator is called 'still-life': use abs"),
-        ({"backend": "blender", "blender": {"generator": "os:no"}}, "generator 'os:no' cannot be imported"),
+        ({"backend": "blender", "blender": {"generator": "os:no"}}, "blender.generator: os:no is code"),
         ({"blender": {"settings": {"sample": 3}}}, "settings.sample: unknown key; did you mean 'samples'?"),
     ],
 )
@@ -170,6 +170,9 @@ def test_other_mistakes_are_one_line(config, tmp_path, refusal):
     assert "no.yaml: no such file" in refusal("lab", "render", tmp_path / "no.yaml", *two)
     assert "is not i/n" in refusal("lab", "render", config, *two, "--shard", "3/2")
     assert "at least one scene" in refusal("lab", "render", config, "--scenes", 0, "--out", out)
+    write(config, backend="blender", blender={"generator": "os:no"})
+    assert "os:no' cannot be imported" in refusal("lab", "render", config, *two, "--generator", "os:no")
+    write(config)
     (tmp_path / "rig.yaml").write_text("cameras: {mono: {size: [8, 8]}}")
     said = refusal("lab", "render", config, *two)
     assert "camera 'mono' is not calibrated: rendering needs its K, R and t" in said

@@ -169,17 +169,17 @@ def test_two_processes_are_as_one(run, folder, whole, monkeypatch):
 
 
 def test_forty_steps_learn(folder):
-    """From nothing, on scenes of three photographs: better on the fourth, and more of it matched."""
-    config = short_run(
-        folder, out=folder / "learns", steps=40, batch=1, groups=1, rate=3e-3, validate=20, save=50
-    )
+    """From nothing, supervised by geometry, on scenes of three photographs: better on the fourth, and clearly
+    more of it matched."""
+    how = {"steps": 40, "batch": 1, "groups": 1, "validate": 20, "save": 50, "attention": 1.0}
+    config = short_run(folder, out=folder / "learns", network=replace(SMALL, normalised=True), **how)
     train(config)
     before = validation(new_network(config.network).eval(), list(scenes(config)[1](8)))
     log = [json.loads(line) for line in (config.out / "log.jsonl").read_text().splitlines()]
     assert log[-1]["step"] == 40
     after = max(log, key=lambda line: line["psnr"])
     assert after["psnr"] > before["psnr"] + 0.05
-    assert after["matched"] >= round(before["matched"], 4)
+    assert after["matched"] > before["matched"] + 0.05
 
 
 def test_groups_must_be_shared_evenly():
