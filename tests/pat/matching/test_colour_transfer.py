@@ -174,10 +174,11 @@ def test_without_certainty_weight_is_the_likeness_halved_where_the_check_fails()
     torch.testing.assert_close(halved.weight, halved.likeness / 2)
 
 
-def test_of_an_alpha_that_sees_something_else_weight_is_the_confidence():
+def test_brightness_says_nothing_of_a_match_if_alpha_sees_something_else():
     found = certain(*with_other_patch(), 0.7, sees_luma=False)
-    torch.testing.assert_close(found.weight, torch.full_like(found.weight, 0.7))
     assert (found.likeness == 1).all()
+    right = (torch.tensor(0.7).logit() + SETTINGS.alike).sigmoid().sqrt()
+    torch.testing.assert_close(found.weight, right.expand_as(found.weight))
 
 
 @pytest.mark.parametrize("certainty", [0.0, 1.0])
