@@ -8,12 +8,14 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --no-input -
 
 DATA ?= ../shared/data
 
-.PHONY: help env synthesis demo showcase readme conditions certainty without-rig alignment paper-network test test-long check format bench bench-job train notebooks docs drawings wheel fuzz kills transformations
+.PHONY: help env synthesis demo showcase readme pairs stages conditions certainty without-rig alignment paper-network test test-long check format bench bench-job train notebooks docs drawings wheel fuzz kills transformations
 
 help:
 	@echo "make demo       fuse the sample array into out/demo"
 	@echo "make showcase   fuse real images from DATA=$(DATA) into out/showcase"
 	@echo "make readme     run both and put what they print into docs/results.md"
+	@echo "make pairs      measure stereo pairs, ideal, into docs/results.md; two minutes"
+	@echo "make stages     measure each stage of the fusion left out, on the tune half, into out/stages; ten minutes"
 	@echo "make conditions measure other responses, low light and misalignment into docs/results.md; half an hour"
 	@echo "make certainty  measure how well stated confidence holds into docs/weights.md; ten minutes"
 	@echo "make alignment  measure how well bands are aligned into docs/results.md; ten minutes"
@@ -52,6 +54,13 @@ readme: demo showcase
 	@echo "== bringing docs/results.md and docs/demo.jpg up to date"
 	@$(BIN)/python -m docs.update_readme --document docs/results.md --block demo=out/demo/demo.md --block showcase=out/showcase/showcase.md \
 		--image out/demo/demo.png docs/demo.jpg
+
+pairs: $(READY)
+	@$(BIN)/python -m experiments evaluate --middlebury $(DATA)/middlebury --rates 2 4 --half report --out out/pairs
+	@$(BIN)/python -m docs.update_readme --document docs/results.md --block pairs=out/pairs/scores.md
+
+stages: $(READY)
+	@$(BIN)/python -m experiments stages --middlebury $(DATA)/middlebury --out out/stages
 
 conditions: $(READY)
 	@$(BIN)/python -m experiments conditions --middlebury $(DATA)/middlebury --half report --out out/conditions
