@@ -1,4 +1,4 @@
-"""Whether two views are equally bright: what matches, colours and motion are judged by."""
+"""Photometric similarity of two views, by which matches, colours and motion are weighed."""
 
 from __future__ import annotations
 
