@@ -74,7 +74,7 @@ class Curved:
         pair.cameras  # noqa: B018  (raises for an uncalibrated pair, before the depth range is asked for)
         near, far = Epipolar(self.near, self.far).bounds(pair)
         x = floating(x)
-        curve = RayCurve.of(pair, near, far, x, self.bounds)
+        curve = RayCurve.from_pixels(pair, near, far, x, self.bounds)
         if curve.compilable and curve.valid.numel() > FEW:
             return curve.positions(self.nodes, self.samples)
         even = torch.linspace(0, 1, self.nodes, dtype=x.dtype, device=x.device).expand(*x.shape[:-1], -1)
@@ -120,7 +120,7 @@ class ThroughLenses:
             ValueError: for a batch of rigs with lenses, views without a pinhole equivalent, or an invalid
                 result of the field.
         """
-        alpha, beta = (_Straight.of(view) for view in (pair.alpha, pair.beta))
+        alpha, beta = (_Straight.from_view(view) for view in (pair.alpha, pair.beta))
         link = None if pair.link is None else pair.link.transformed(alpha.A, beta.A)
         straight = dataclasses.replace(pair, alpha=alpha.pinhole, beta=beta.pinhole, link=link)
         there, valid = alpha.undistort(floating(x))
@@ -140,7 +140,7 @@ class _Straight(NamedTuple):
     A: Tensor
 
     @classmethod
-    def of(cls, view: View) -> _Straight:
+    def from_view(cls, view: View) -> _Straight:
         """Build it from a view; a view without a lens is its own equivalent."""
         if not isinstance(view, LensView) or view.distortion is None:
             return cls(view, view, torch.eye(3, dtype=torch.float64))
@@ -198,7 +198,7 @@ class RayCurve(NamedTuple):
     inverse: tuple[Tensor, Tensor]
 
     @classmethod
-    def of(cls, pair: Pair, near: Tensor, far: Tensor, x: Tensor, bounds: str = "depth") -> RayCurve:
+    def from_pixels(cls, pair: Pair, near: Tensor, far: Tensor, x: Tensor, bounds: str = "depth") -> RayCurve:
         """Build the curves of alpha's pixels x (*n, 2), near to far, as far as beta's image may show them.
 
         Args:
@@ -265,7 +265,11 @@ class RayCurve(NamedTuple):
         ends = (t.detach().double().reshape(n, 3).contiguous().numpy() for t in (self.first, self.last))
         double = like.new_empty(0, dtype=torch.float64)
         fractions = (torch.linspace(0, 1, nodes, dtype=torch.float64), sample_fractions(samples, like=double))
-        given = (*ends, self.valid.reshape(n).contiguous().numpy(), LensNumbers.of(self.beta, wide=self.wide))
+        given = (
+            *ends,
+            self.valid.reshape(n).contiguous().numpy(),
+            LensNumbers.from_camera(self.beta, wide=self.wide),
+        )
         rest = (*(t.numpy() for t in fractions), self.beta.hw, xy, mask)
         in_parallel([partial(curved_positions, *span, *given, *rest) for span in spans(n, PIECE)])
         axes = self.valid.shape
@@ -358,7 +362,7 @@ class LensNumbers(NamedTuple):
     wide: bool
 
     @classmethod
-    def of(cls, camera: Camera, *, wide: bool) -> LensNumbers:
+    def from_camera(cls, camera: Camera, *, wide: bool) -> LensNumbers:
         """Read the numbers of one camera."""
         K, lens = camera.K.detach().double().numpy(), camera.distortion
         if lens is None:

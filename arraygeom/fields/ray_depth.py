@@ -56,7 +56,7 @@ def ray_depth(
     def of(x: Tensor, x_beta: Tensor, deviation: Tensor) -> tuple[Tensor, ...]:
         finite = x.isfinite().all(-1) & x_beta.isfinite().all(-1)
         x, x_beta = (torch.where(finite[:, None], p, 0.0) for p in (x, x_beta))
-        curve = RayCurve.of(pair, near, far, x, bounds)
+        curve = RayCurve.from_pixels(pair, near, far, x, bounds)
         low, high = torch.zeros_like(x[:, :1]), torch.ones_like(x[:, :1])
         for count in (NODES, FINER, FINER, FINER):
             fraction = torch.lerp(low, high, torch.linspace(0, 1, count).to(x))
