@@ -67,8 +67,9 @@ class Hypothesis:
 
 
 def hypotheses(rig: Rig, sizes: Mapping[str, HW]) -> list[Hypothesis]:
-    """List the rig as given, and all single mistakes plausible in a rig whose images have these sizes.
+    """List the rig as given, and the single mistakes plausible in a rig whose images have these sizes.
 
+    Mistakes whose repair must be estimated from points are left out (`ignored_lens`, `zoomed`, `in_degrees`).
     Where images do not have the sizes that the rig states, only mistakes that explain the sizes are listed.
 
     Returns:
