@@ -81,7 +81,16 @@ class KeyColour(NamedTuple):
 class SequenceFusion:
     """A sequence to fuse: the `colour` of its key frames, and any `frame`.
 
-    The attributes are the arguments of `fuse_sequence`.
+    Attributes:
+        network: network as of `fuse`.
+        rig: cameras with `frame_rate` and `time_offset`.
+        frames: frames by camera name, in the order of time; cached.
+        alpha: camera whose frames are wanted.
+        speed: largest speed of motion, pixels of alpha a second; None for a quarter of the motion seen.
+        settings: settings of fusion.
+
+    Raises:
+        ValueError: for a negative speed.
     """
 
     network: FusionNetwork
