@@ -23,11 +23,18 @@ Plane = NDArray[np.float32]
 class ExampleSettings:
     """Settings of the search for examples. Lengths are pixels of alpha."""
 
-    neighbours: int = size(16, "Examples of a pixel; half or twice as many do as well")
-    scale: float = tuned(10.0, "Middlebury, tune half: weight of brightness, its means and its deviations")
+    neighbours: int = size(8, "Examples of a pixel; half or twice as many do as well")
+    brightness: float = tuned(12.0, "Middlebury, tune half: weight of brightness")
+    means: tuple[float, float] = tuned((10.0, 5.0), "Middlebury, tune half: weights of its local means")
+    deviations: tuple[float, float] = tuned(
+        (12.0, 8.0), "Middlebury, tune half: weights of its local standard deviations"
+    )
     radii: tuple[int, int] = size((2, 6), "Radii of the windows of means and deviations")
-    place: float = tuned(
-        110.0, "Middlebury, tune half: pixels whose distance counts as a difference of brightness of .1"
+    place: tuple[float, float] = tuned(
+        (90.0, 140.0), "Middlebury, tune half: rows and columns that count as much as a feature of 1"
+    )
+    softness: float = tuned(
+        0.15, "Middlebury, tune half: added to the distance at which weights fall to 1 / e"
     )
     seen: float = size(0.5, "Weight above which a pixel counts as seen")
     sources: int = size(60_000, "Seen pixels searched at most")
@@ -59,8 +66,8 @@ def by_examples(
     features = [(plane[sources], plane[asked]) for plane in _features(alpha)]
     known, wanted = (np.stack(planes, 1) for planes in zip(*features))
     tree = cKDTree(known, compact_nodes=False, balanced_tree=False)
-    _, index = tree.query(wanted, k=SETTINGS.neighbours, eps=SETTINGS.error)
-    share = weight[EVERY][sources][index]
+    far, index = tree.query(wanted, k=SETTINGS.neighbours, eps=SETTINGS.error)
+    share = weight[EVERY][sources][index] * np.exp(-np.square(far / (far[:, :1] + SETTINGS.softness)))
     share = (share / share.sum(1, keepdims=True)).astype(np.float32)
     out = np.empty_like(colour)
     for own, filled in zip(colour, out):
@@ -82,14 +89,11 @@ def _features(alpha: Plane) -> Iterator[Plane]:
     """Brightness, its means and standard deviations in windows, and place, scaled so that distances compare,
     of every second pixel."""
     alpha = np.ascontiguousarray(alpha, np.float32)
-    scale = np.float32(SETTINGS.scale)
-    yield scale * alpha[EVERY]
-    sides = [(2 * r + 1,) * 2 for r in SETTINGS.radii]
-    means = [cv2.boxFilter(alpha, -1, side) for side in sides]
-    for mean in means:
-        yield scale * mean[EVERY]
-    for mean, side in zip(means, sides):
-        square = cv2.boxFilter(alpha * alpha, -1, side)
-        yield scale * np.sqrt(np.maximum(square - mean * mean, 0))[EVERY]
-    for indices in np.indices(alpha[EVERY].shape, dtype=np.float32):
-        yield indices * np.float32(2 / SETTINGS.place)
+    yield SETTINGS.brightness * alpha[EVERY]
+    for radius, of_mean, of_deviation in zip(SETTINGS.radii, SETTINGS.means, SETTINGS.deviations):
+        side = (2 * radius + 1,) * 2
+        mean, square = cv2.boxFilter(alpha, -1, side), cv2.boxFilter(alpha * alpha, -1, side)
+        yield of_mean * mean[EVERY]
+        yield of_deviation * np.sqrt(np.maximum(square - mean * mean, 0))[EVERY]
+    for indices, pixels in zip(np.indices(alpha[EVERY].shape, dtype=np.float32), SETTINGS.place):
+        yield indices * np.float32(2 / pixels)
