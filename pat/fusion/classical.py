@@ -18,11 +18,11 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from arraygeom import Camera, Pair, Rig
 
-from ..matching.examples import by_examples
 from ..matching.filters import filled
 from ..media.colour import from_luma_chroma, luminance, luminance_of, to_bytes
 from ..media.figures import reduced
@@ -45,6 +45,8 @@ REGRESSION_RADIUS, REGRESSION_FLOOR = 3, 3e-3
 """Window and regulariser (variance of luminance) of the regression of colour on luminance."""
 
 
+EXAMPLES = 8
+"""Seen pixels whose colours an unseen one takes, in the mean."""
 SEEN = 0.5
 """Weight above which a pixel counts as seen; unseen ones weigh `UNSEEN` in the last smoothing."""
 UNSEEN = 0.2
@@ -312,7 +314,7 @@ def _blended(values: Image, weight: Image, mono: Image, guide: NDArray[np.uint8]
     """Values (h, w, c), replaced where their weight is low by those of alike and of connected pixels."""
     planes = np.ascontiguousarray(values.transpose(2, 0, 1), np.float32)
     seen = weight > SEEN
-    examples = by_examples(planes, mono, weight)
+    examples = _by_examples(planes, seen, mono)
     connected = filled(planes, weight + 1e-4, guide, COLOUR_FILL)
     alike = np.where(seen, (connected + examples) / 2, examples)
     start = weight * planes + (1 - weight) * alike
@@ -320,6 +322,26 @@ def _blended(values: Image, weight: Image, mono: Image, guide: NDArray[np.uint8]
     share = np.where(seen, weight, 0)
     joined = share * start + (1 - share) * smooth
     return np.ascontiguousarray(joined.transpose(1, 2, 0), np.float32)
+
+
+def _by_examples(values: Image, seen: NDArray[np.bool_], mono: Image) -> Image:
+    """Values (c, h, w), unseen ones the mean of the seen ones nearest in luminance, texture and place."""
+    columns, rows = _grid(mono.shape)
+    texture = [np.sqrt(np.maximum(_mean(mono * mono, r) - _mean(mono, r) ** 2, 0)) for r in (2, 6)]
+    what = [mono * 12, _mean(mono, 2) * 10, _mean(mono, 6) * 5, texture[0] * 12, texture[1] * 8]
+    features = np.stack([*what, rows / 90, columns / 140], -1)
+    sources, asked, out = np.zeros_like(seen), ~seen, values.copy()
+    sources[::2, ::2] = seen[::2, ::2]
+    if sources.sum() < EXAMPLES or not asked.any():
+        return out
+    distance, index = cKDTree(features[sources]).query(features[asked], k=EXAMPLES)
+    weight = np.exp(-np.square(distance / (distance[:, :1] + 0.15)))
+    out[:, asked] = (values[:, sources][:, index] * weight).sum(-1) / weight.sum(-1)
+    return out
+
+
+def _mean(plane: Image, radius: int) -> Image:
+    return cv2.boxFilter(plane, -1, (2 * radius + 1,) * 2)
 
 
 def _recoloured(alpha: Float[Tensor, "1 h w"], chroma: Image) -> Float[Tensor, "3 h w"]:

@@ -23,18 +23,11 @@ Plane = NDArray[np.float32]
 class ExampleSettings:
     """Settings of the search for examples. Lengths are pixels of alpha."""
 
-    neighbours: int = size(8, "Examples of a pixel; half or twice as many do as well")
-    brightness: float = tuned(12.0, "Middlebury, tune half: weight of brightness")
-    means: tuple[float, float] = tuned((10.0, 5.0), "Middlebury, tune half: weights of its local means")
-    deviations: tuple[float, float] = tuned(
-        (12.0, 8.0), "Middlebury, tune half: weights of its local standard deviations"
-    )
-    radii: tuple[int, int] = size((2, 6), "Radii of the windows of means and deviations")
-    place: tuple[float, float] = tuned(
-        (90.0, 140.0), "Middlebury, tune half: rows and columns that count as much as a feature of 1"
-    )
-    softness: float = tuned(
-        0.15, "Middlebury, tune half: added to the distance at which weights fall to 1 / e"
+    neighbours: int = size(5, "Examples of a pixel; half or twice as many do as well")
+    scale: float = tuned(12.0, "Middlebury, tune half: weight of brightness, its mean and its deviations")
+    radii: tuple[int, int] = size((2, 6), "Radii of the windows of deviations, and of the mean the first")
+    place: float = tuned(
+        130.0, "Middlebury, tune half: pixels whose distance counts as much as a feature that differs by 1"
     )
     seen: float = size(0.5, "Weight above which a pixel counts as seen")
     sources: int = size(60_000, "Seen pixels searched at most")
@@ -66,8 +59,8 @@ def by_examples(
     features = [(plane[sources], plane[asked]) for plane in _features(alpha)]
     known, wanted = (np.stack(planes, 1) for planes in zip(*features))
     tree = cKDTree(known, compact_nodes=False, balanced_tree=False)
-    far, index = tree.query(wanted, k=SETTINGS.neighbours, eps=SETTINGS.error)
-    share = weight[EVERY][sources][index] * np.exp(-np.square(far / (far[:, :1] + SETTINGS.softness)))
+    _, index = tree.query(wanted, k=SETTINGS.neighbours, eps=SETTINGS.error)
+    share = weight[EVERY][sources][index]
     share = (share / share.sum(1, keepdims=True)).astype(np.float32)
     out = np.empty_like(colour)
     for own, filled in zip(colour, out):
@@ -86,14 +79,15 @@ def _between(plane: Plane, hw: tuple[int, int]) -> Plane:
 
 
 def _features(alpha: Plane) -> Iterator[Plane]:
-    """Brightness, its means and standard deviations in windows, and place, scaled so that distances compare,
+    """Brightness, its mean and standard deviations in windows, and place, scaled so that distances compare,
     of every second pixel."""
     alpha = np.ascontiguousarray(alpha, np.float32)
-    yield SETTINGS.brightness * alpha[EVERY]
-    for radius, of_mean, of_deviation in zip(SETTINGS.radii, SETTINGS.means, SETTINGS.deviations):
-        side = (2 * radius + 1,) * 2
-        mean, square = cv2.boxFilter(alpha, -1, side), cv2.boxFilter(alpha * alpha, -1, side)
-        yield of_mean * mean[EVERY]
-        yield of_deviation * np.sqrt(np.maximum(square - mean * mean, 0))[EVERY]
-    for indices, pixels in zip(np.indices(alpha[EVERY].shape, dtype=np.float32), SETTINGS.place):
-        yield indices * np.float32(2 / pixels)
+    scale = np.float32(SETTINGS.scale)
+    sides = [(2 * radius + 1,) * 2 for radius in SETTINGS.radii]
+    means, squares = ([cv2.boxFilter(plane, -1, s) for s in sides] for plane in (alpha, alpha * alpha))
+    yield scale * alpha[EVERY]
+    yield scale * means[0][EVERY]
+    for mean, square in zip(means, squares):
+        yield scale * np.sqrt(np.maximum(square - mean * mean, 0))[EVERY]
+    for indices in np.indices(alpha[EVERY].shape, dtype=np.float32):
+        yield indices * np.float32(2 / SETTINGS.place)
