@@ -48,7 +48,7 @@ def oddities(rig: Rig) -> tuple[str, ...]:
 
 
 def unit_oddity(rig: Rig) -> str | None:
-    """Sentence on baselines that suggest another unit than metres; None if they do not."""
+    """Return a sentence on baselines that suggest another unit than metres; None if they do not."""
     centres = [camera.centre for camera in rig.cameras.values() if isinstance(camera, Camera)]
     if len(centres) < 2 or length_unit(rig) != "m":
         return None
@@ -69,7 +69,7 @@ def unit_oddity(rig: Rig) -> str | None:
 
 
 def lens_end(name: str, camera: LensView) -> str | None:
-    """Sentence on a lens model that ends within its image; None if it covers the image.
+    """Return a sentence on a lens model that ends within its image; None if it covers the image.
 
     Camera models state themselves where they end (a pole, the rim of a fisheye's circle), which is no mistake
     unless they cover nothing.
@@ -220,7 +220,7 @@ def _of_baseline(rig: Rig, a: str, b: str) -> Iterator[str]:
 
 
 def _of_sides(rig: Rig) -> Iterator[str]:
-    """Sentence on cameras called left and right that are the other way round."""
+    """Return a sentence on cameras called left and right that are the other way round."""
     left, right = rig.cameras.get("left"), rig.cameras.get("right")
     if (
         isinstance(left, Camera)

@@ -124,7 +124,7 @@ class BundleProblem:
         return residuals
 
     def rms(self) -> float:
-        """Root mean square length of all residuals, pixels: OpenCV's reprojection error."""
+        """Return the root mean square length of all residuals, pixels: OpenCV's reprojection error."""
         lengths = np.concatenate([(r**2).sum(-1) for r in self.residuals.values()])
         return float(np.sqrt(lengths.mean()))
 

@@ -79,7 +79,7 @@ class StartDeviations:
                 raise ValueError(f"the start's deviation {name}={value:g} is not a positive number")
 
     @classmethod
-    def of(cls, deviations: Mapping[str, float]) -> StartDeviations:
+    def from_numbers(cls, deviations: Mapping[str, float]) -> StartDeviations:
         """Make deviations from values by name; the others keep their defaults.
 
         Raises:

@@ -62,7 +62,7 @@ def attend(
     bias: Tensor | None = None,
     backend: Backend = "auto",
 ) -> Float[Tensor, "b dv ha wa"]:
-    """For each alpha pixel, the values at its samples in beta, weighted by softmax(query . key).
+    """Compute for each alpha pixel the values at its samples in beta, weighted by softmax(query . key).
 
     The scores are plain inner products (the paper's). The output is channels-last in memory.
 

@@ -130,7 +130,7 @@ def demosaiced(raw: Float[Tensor, "1 h w"], pattern: str) -> Float[Tensor, "3 h 
 
 
 def light_of(sensor: Sensor, like: Sensor) -> float:
-    """Value that `sensor` records (1 is white), in grey or green, for light of value 1 on `like`'s scale."""
+    """Return the value that `sensor` records (1 is white), in grey or green, for 1 on `like`'s scale."""
     return 1 / _light(sensor, like)[1]
 
 

@@ -408,5 +408,5 @@ def attempt_on_worker(task: Task, threads: int, timeout: float | None = None) ->
 
 
 def cores() -> int:
-    """Number of CPU cores that this process may use."""
+    """Return the number of CPU cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

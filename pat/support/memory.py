@@ -119,13 +119,13 @@ def _return_near(most: float, done: Event) -> None:
 
 
 def resident() -> float:
-    """Resident memory of this process in bytes; 0 where the system does not report it (Linux does)."""
+    """Return the resident memory of this process in bytes; 0 if the system does not report it."""
     pages = _text(Path("/proc/self/statm")).split()[1:2]
     return float(pages[0]) * os.sysconf("SC_PAGE_SIZE") if pages else 0.0
 
 
 def how_many_fit(nbytes: float) -> int | None:
-    """Number of tasks of `nbytes` bytes each that may run at once under `limited`, at least 1; None without a
+    """Return how many tasks of `nbytes` bytes may run at once under `limited`, at least 1; None without a
     limit."""
     limit = _LIMIT.get()
     if limit is None:
@@ -137,7 +137,7 @@ def how_many_fit(nbytes: float) -> int | None:
 
 
 def peak_memory(pid: int | str = "self") -> float | None:
-    """Peak resident memory of a process in bytes; None where the system does not report it (Linux does)."""
+    """Return the peak resident memory of a process in bytes; None if the system does not report it."""
     line = re.search(r"VmHWM:\s+(\d+) kB", _text(Path(f"/proc/{pid}/status")))
     return None if line is None else float(line[1]) * 2**10
 

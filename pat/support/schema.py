@@ -220,7 +220,7 @@ def _below(entry: str, key: object) -> str:
 
 
 def near(name: object, choices: Iterable[object]) -> str:
-    """Ending of a message about an unknown name: the most similar choice, or all choices.
+    """Return the ending of a message about an unknown name: the most similar choice, or all choices.
 
     >>> near("nois", ["noise", "clip"])
     "; did you mean 'noise'?"

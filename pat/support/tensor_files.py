@@ -78,7 +78,7 @@ def with_weights(network: Network, path: Path) -> Network:
 
 
 def not_whole(error: Exception) -> str:
-    """Message for a file that safetensors refuses with `error`."""
+    """Return the message for a file that safetensors refuses with `error`."""
     return f"not a safetensors file ({' '.join(str(error).split())}); was it copied whole?"
 
 
@@ -88,7 +88,7 @@ DIGEST = "digest"
 
 
 def digest(tensors: Mapping[str, Tensor]) -> str:
-    """Digest of the names, types, shapes and bytes of tensors, as 32 hexadecimal digits.
+    """Return a digest of the names, types, shapes and bytes of tensors, as 32 hexadecimal digits.
 
     A safetensors file with one changed bit is still valid; this finds it.
     """
@@ -100,5 +100,5 @@ def digest(tensors: Mapping[str, Tensor]) -> str:
 
 
 def undamaged(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> bool:
-    """True if tensors match the digest in their metadata, or the metadata has none (older files)."""
+    """Return True if tensors match the digest in their metadata, or the metadata has none (older files)."""
     return DIGEST not in metadata or metadata[DIGEST] == digest(tensors)

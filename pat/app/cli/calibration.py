@@ -89,7 +89,7 @@ class Calibrate:
 
         if self.deviation and self.start is None:
             raise ValueError("--deviation needs --start: give the rig whose positions it is about")
-        return StartDeviations.of(options.numbers_by_name(self.deviation, "--deviation"))
+        return StartDeviations.from_numbers(options.numbers_by_name(self.deviation, "--deviation"))
 
     def _watch(self, patterns: dict[str, str]) -> None:
         from calib.boards.run import watch
