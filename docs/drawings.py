@@ -55,9 +55,9 @@ WIDE, GAP = 902, 8
 
 
 def dark_cat() -> tuple[Rig, dict[str, Tensor]]:
-    """A photograph on a wall (scikit-image's cat, CC0) as two cameras record it: mono in the dark, and colour.
+    """Return two cameras and their images of a photograph on a wall: mono in the dark, and colour.
 
-    It is flat: the figure of it shows no depth.
+    The photograph is scikit-image's cat (CC0). It is flat: its figure shows no depth.
     """
     photo = torch.from_numpy(chelsea().copy()).movedim(-1, 0) / 255
     generator, hw = Generator().manual_seed(0), (photo.shape[1], photo.shape[2])
@@ -97,8 +97,8 @@ def table() -> Image.Image:
 
 
 def two_in_one_out(words: dict[str, Tensor], depth: Tensor | None = None) -> Image.Image:
-    """Two images above each other, beside them a large one, and in its corner depth; the words are on them."""
-    first, second, fused = words.values()
+    """Draw two images above each other, a large one beside them, depth in its corner, words on all."""
+    first, _, fused = words.values()
     high = round(WIDE * fused.shape[-2] / fused.shape[-1])
     above = (high - GAP) // 2
     beside = round(above * first.shape[-1] / first.shape[-2])

@@ -1,4 +1,4 @@
-"""Keeps the figures of the documentation those that commands print: reports hold them, other pages quote rows."""
+"""Figures of the documentation as commands print them: reports hold them, other pages quote their rows."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from pat.app.cli.parser import Option, script
 from pat.media.images import read_image, write_image
 
 QUOTE = re.compile(r"<!-- from (\S+): ([^\n]+?)(?: \| ([^\n]+?))? -->\n.*?<!-- end -->", re.S)
-"""A place for rows of a report: the report's path from the page, the first cells of the rows, and, after a bar,
-the heads of the columns if not all are wanted; between semicolons."""
+"""A place for rows of a report: its path from the page, first cells of the rows, and, after a bar, heads of
+columns if not all are wanted; between semicolons."""
 
 
 @dataclass
@@ -46,7 +46,7 @@ class Readme:
 
 
 def with_block(text: str, name: str, content: str) -> str:
-    """The text with a block's content replaced. Raises ValueError if its marks are not there once, in order."""
+    """Return the text with a block replaced. Raises ValueError if its marks are not there once, in order."""
     begin, end = (f"<!-- {name}:{which} -->" for which in ("begin", "end"))
     if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
         raise ValueError(f"the document needs one {begin} and, after it, one {end}")
@@ -79,7 +79,7 @@ def quoting(page: Path) -> str:
 
 
 def quoted(report: str, wanted: Sequence[str], columns: Sequence[str] | None = None) -> Iterator[str]:
-    """The tables of a report that have wanted rows and columns, cut to these, below the dates of their making."""
+    """Yield the tables of a report that have wanted rows and columns, cut to these, below their dates."""
     date_line = ""
     for part in re.findall(r"^\*Printed [^*]+\*|(?:^\|.*\n?)+", report, re.M):
         if part.startswith("*"):

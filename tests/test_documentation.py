@@ -124,7 +124,7 @@ def test_commands_in_the_pages_exist():
 
 
 def test_options_in_the_pages_exist():
-    """Every option that a page shows with a `pat` command is in that command's --help; not a recipe's parts."""
+    """Every option that a page shows with a `pat` command is in its --help; not a recipe's parts."""
     unknown = []
     for page in [*PAGES, ROOT / "README.md"]:
         shown = [*blocks(page, "text"), *blocks(page, ""), *re.findall(r"`(pat [^`]+)`", page.read_text())]
@@ -174,7 +174,7 @@ def test_names_of_the_packages_in_the_pages_are_there(page):
 FIGURE = re.compile(
     r"(?<![\w./-])[.\d][\d.,]*\s*(%|dB|ms|s|seconds?|minutes?|hours?|[kMG]i?B|GiB|px|fps|points?|pixels?)(?![\w-])"
 )
-"""A number with a unit of something measured. Sizes in metres, degrees, millimetres are of cameras and scenes."""
+"""A number with a unit of what is measured. Metres, degrees and millimetres are of cameras and scenes."""
 BLOCK = re.compile(r"<!-- ([\w-]+):begin -->.*?<!-- \1:end -->", re.S)
 
 

@@ -27,7 +27,8 @@ def test_lines_that_are_images_go():
     assert without_images("a\n![p](p.png)\nb ![q](q.png)\n") == "a\nb ![q](q.png)\n"
 
 
-REPORT = "*Printed on 2026-01-02.*\n\n| a | b | c |\n|---|---|---|\n| x | 1 | 2 |\n| y | 3 | 4 |\n\n| d |\n|---|\n| z |\n"
+TABLE = "| a | b | c |\n|---|---|---|\n| x | 1 | 2 |\n| y | 3 | 4 |\n"
+REPORT = f"*Printed on 2026-01-02.*\n\n{TABLE}\n| d |\n|---|\n| z |\n"
 
 
 def test_rows_and_columns_are_quoted_with_their_date():

@@ -11,7 +11,7 @@ from typing import Any
 
 
 def install_line(module: str, extra: str) -> str:
-    """The shell line that installs an optional module, for those with a checkout and for those without.
+    """Return the shell line that installs an optional module, with a checkout and without.
 
     It names the module's own package: arraygeom-pat is on no index.
     """

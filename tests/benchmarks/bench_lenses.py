@@ -1,4 +1,4 @@
-"""Lens models beside OpenCV, kornia, pycolmap: wrong answers, error, derivatives, vmap, time; docs/reports/lenses.md.
+"""Lens models beside OpenCV, kornia, pycolmap: answers, derivatives, vmap, time; docs/reports/lenses.md.
 
     python -m tests.benchmarks.bench_lenses [--lenses 1000] [--write]
 

@@ -55,7 +55,7 @@ def step(
 
 
 def main(steps: int = 3, profile: bool = False, write: bool = False) -> None:
-    """Print the table, and put it into docs/reports/paper.md if asked; `profile`: the longest operators too."""
+    """Print the table, and write it to docs/reports/paper.md; with `profile` the longest operators too."""
     torch.set_num_threads(1)
     torch.manual_seed(0)
     network = PAT(PAPER)

@@ -1,4 +1,4 @@
-"""Damaged files of every kind, each in its own process with 4 GiB and 10 s; the table of docs/reports/fuzzing.md.
+"""Damaged files of every kind, each in a process with 4 GiB and 10 s; for docs/reports/fuzzing.md.
 
     python -m tests.fuzz.run [--only rig] [--share 0.1] [--out docs/reports/fuzzing.md]
 

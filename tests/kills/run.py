@@ -1,4 +1,4 @@
-"""Commands killed at random, inside writes, with their workers and schedulers; the table of docs/reports/kills.md.
+"""Commands killed at random, inside writes, with workers and schedulers; for docs/reports/kills.md.
 
     python -m tests.kills.run [--only fuse] [--share 0.5] [--out docs/reports/kills.md]
 
