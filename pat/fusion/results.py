@@ -39,7 +39,7 @@ MOST = 65535
 ImageFormat = Literal["png", "tif", "exr"]
 
 FOUND_RIG = "found_rig.yaml"
-"""Name of the file of a rig estimated from images. Not rig.yaml, which may be a user's."""
+"""The rig that was found from images. Not rig.yaml, which may be one that somebody wrote."""
 HEALED_RIG = "healed_rig.yaml"
 """Name of the file of a given rig as corrected to its images."""
 RESULT = re.compile(

@@ -26,8 +26,8 @@ from .frame import Frame
 from .inputs import FrameInputs
 
 MAX_HALO = 256
-"""Widest halo, pixels: points farther off change an image of KITTI's by 7e-6 with trained weights (at 240
-pixels 5e-5, at 224 2e-4), however far their convolutions reach."""
+"""The widest halo, pixels: what is farther off changes an image of KITTI's by 7e-6 with trained weights (at
+240 pixels 5e-5, at 224 2e-4), however far their convolutions reach."""
 LIBRARIES = 0.46 * 2**30
 """What Python, torch and the compiled loops take, bytes (430 MiB were measured)."""
 SLACK = 1.05
