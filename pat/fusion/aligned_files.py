@@ -71,10 +71,14 @@ def save_aligned(
 
     One file a camera, NAME.tif, if `separate`, or if their types differ: values keep theirs. With a `name`
     the files are name_aligned.tif and so on. `pages` are further text files. All are swapped in together, and
-    those of a former alignment of this name are gone (`write_together`). Returns what was written.
+    those of a former alignment of this name are removed (`write_together`).
 
-    Raises ValueError for two files of one name, and rather than write over a file of `keep`, such as the
-    images; FileExistsError for files in the way that no run wrote.
+    Returns:
+        Paths of the files, sorted.
+
+    Raises:
+        ValueError: for two files of one name, and rather than overwrite a file of `keep`, such as the images.
+        FileExistsError: for files in the way that no run wrote.
     """
     prefix = f"{name}_" if name else ""
     files = _files(aligned, separate, positions)
