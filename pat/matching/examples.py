@@ -1,4 +1,4 @@
-"""Colour of unseen pixels by example: that of the seen pixels most alike in brightness, texture and place.
+"""Colour of unseen pixels by example: that of the seen pixels most similar in brightness, texture and place.
 
 Nearest neighbours among alpha's own seen pixels (Welsh et al. 2002 colour a grey image so, by another one).
 """
@@ -24,11 +24,10 @@ class ExampleSettings:
     """Settings of the search for examples. Lengths are pixels of alpha."""
 
     neighbours: int = size(5, "Examples of a pixel; half or twice as many do as well")
-    scale: float = tuned(12.0, "Middlebury, tune half: weight of brightness, its means and its deviations")
     radii: tuple[int, int] = size((2, 6), "Radii of the windows of means and deviations")
     place: tuple[float, float] = tuned(
-        (100.0, 150.0),
-        "Middlebury, tune half: pixels whose distance counts as much as a feature that differs by 1, across "
+        (1200.0, 1800.0),
+        "Middlebury, tune half: pixels whose distance counts as much as black beside white, across "
         "the searched segments and along them: what is occluded is long across",
     )
     seen: float = size(0.5, "Weight above which a pixel counts as seen")
@@ -38,7 +37,7 @@ class ExampleSettings:
 
 SETTINGS = ExampleSettings()
 EVERY = (slice(None, None, 2),) * 2
-"""Size: every second pixel is looked up."""
+"""Size: every second pixel is searched for."""
 
 
 def by_examples(
@@ -47,12 +46,18 @@ def by_examples(
     weight: Float[NDArray, "h w"],
     directions: Float[NDArray, "2 2"],
 ) -> Float[NDArray, "c h w"]:
-    """Colour with the pixels of low weight replaced by the mean of their nearest seen pixels.
+    """Replace the colour of pixels of low weight by the mean of their nearest seen pixels.
 
-    `weight` (0 to 1) is how far a pixel's colour is its own. Every second pixel in each direction is looked
-    up among such pixels, and what is between them is interpolated. Where fewer are seen than a mean takes,
-    colour is returned as it is. `directions` is the mean outer product of the unit vectors (x, y) along the
-    segments that were searched.
+    Every second pixel in each direction is searched for among such pixels, and pixels between them are
+    interpolated.
+
+    Args:
+        weight: 0 to 1; a pixel counts as seen above a half.
+        directions: mean outer product of the unit vectors (x, y) along the segments that were searched;
+            examples count as nearer along these.
+
+    Returns:
+        Colour at all pixels; as given where fewer are seen than a mean takes.
     """
     seen = weight > SETTINGS.seen
     near = cv2.dilate((~seen).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
@@ -77,7 +82,7 @@ def by_examples(
 
 
 def _between(plane: Plane, hw: tuple[int, int]) -> Plane:
-    """A plane of every second pixel, from the first, at all pixels, by linear interpolation."""
+    """Enlarge a plane of every second pixel, from the first, to all pixels, by linear interpolation."""
     back = np.array([[0.5, 0, 0], [0, 0.5, 0]], np.float32)
     how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     between: Plane = cv2.warpAffine(plane, back, (hw[1], hw[0]), flags=how, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[assignment]
@@ -85,16 +90,17 @@ def _between(plane: Plane, hw: tuple[int, int]) -> Plane:
 
 
 def _features(alpha: Plane, directions: Float[NDArray, "2 2"]) -> Iterator[Plane]:
-    """Brightness, its means and standard deviations in windows, and place, scaled so that distances compare,
-    of every second pixel."""
+    """Yield brightness, its means and standard deviations in windows, and place, of every second pixel.
+
+    They are scaled so that distances compare.
+    """
     alpha = np.ascontiguousarray(alpha, np.float32)
-    scale = np.float32(SETTINGS.scale)
-    yield scale * alpha[EVERY]
+    yield alpha[EVERY]
     for radius in SETTINGS.radii:
         side = (2 * radius + 1,) * 2
         mean, square = cv2.boxFilter(alpha, -1, side), cv2.boxFilter(alpha * alpha, -1, side)
-        yield scale * mean[EVERY]
-        yield scale * np.sqrt(np.maximum(square - mean * mean, 0))[EVERY]
+        yield mean[EVERY]
+        yield np.sqrt(np.maximum(square - mean * mean, 0))[EVERY]
     across, along = (1 / pixels**2 for pixels in SETTINGS.place)
     metric = across * np.eye(2) + (along - across) * directions
     rows, columns = 2 * np.indices(alpha[EVERY].shape, dtype=np.float32)

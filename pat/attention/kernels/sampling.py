@@ -144,7 +144,12 @@ def _find_pixels(n, first, geometry, here):
 
 
 class Course(NamedTuple):
-    """Main direction of a pixel's samples: along y (`steep`) or x, backward or forward."""
+    """Main direction of a pixel's samples.
+
+    Attributes:
+        steep: True along y, False along x.
+        backward: True if the coordinate falls.
+    """
 
     steep: Any
     backward: Any
