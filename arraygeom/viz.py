@@ -274,7 +274,7 @@ def draw_residuals(
     Left, each distance drawn across its line and enlarged so that the median is 2 % of the width; right,
     their histogram, with the median. Pixels of undistorted images.
     """
-    with needs("plots", "drawing"):
+    with needs("drawing"):
         from matplotlib.collections import LineCollection
     line = epipolar_lines(pair.fundamental.to(x_alpha.dtype), x_alpha)
     distance = epipolar_distance(pair.fundamental.to(x_alpha.dtype), x_alpha, x_beta)
@@ -308,7 +308,7 @@ def draw_residuals(
 
 def new_figure(**options: Any) -> Figure:
     """A matplotlib figure outside pyplot. Raises ImportError where matplotlib is not installed."""
-    with needs("plots", "drawing"):
+    with needs("drawing"):
         from matplotlib.figure import Figure
     return Figure(**options)
 

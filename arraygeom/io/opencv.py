@@ -156,7 +156,7 @@ def _named(folder: Path, kind: str) -> Path | None:
 def _nodes(source: RigSource) -> dict[str, Any]:
     """The outermost entries by name. Raises RigFileError for a file that OpenCV cannot read."""
     text = source.text(LARGEST_TEXT)
-    with needs("calibration", "reading OpenCV's files"):
+    with needs("reading OpenCV's files"):
         import cv2
     _check_nesting(source, text)
     try:

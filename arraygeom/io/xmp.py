@@ -377,7 +377,7 @@ def image_tags(path: Path) -> ImageTags | None:
     xmp = _xmp(path.read_bytes())
     if not xmp:
         return None
-    with needs("calibration", "reading images' tags"):
+    with needs("reading images' tags"):
         from PIL import Image
     try:
         with Image.open(path, formats=("TIFF", "JPEG")) as image:

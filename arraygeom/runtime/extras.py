@@ -9,15 +9,28 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+PACKAGES = {
+    "PIL": "pillow",
+    "cv2": "opencv-contrib-python-headless",
+    "skimage": "scikit-image",
+    "yaml": "PyYAML",
+}
+"""Packages that are called otherwise than their modules."""
+
+
+def install(module: str) -> str:
+    """The command that installs the package of a module, be this project a checkout or installed."""
+    return f"pip install {PACKAGES.get(module, module.replace('_', '-'))}"
+
 
 @contextmanager
-def needs(extra: str, purpose: str) -> Iterator[None]:
-    """Around an optional module's import: raises ImportError in one line that names the extra to install."""
+def needs(purpose: str) -> Iterator[None]:
+    """Around an optional module's import: raises ImportError in one line that says what to install."""
     try:
         yield
     except ImportError as error:
         module = (error.name or str(error)).partition(".")[0]
-        raise ImportError(f"{purpose} needs {module}: pip install 'arraygeom-pat[{extra}]'") from error
+        raise ImportError(f"{purpose} needs {module}: {install(module)}", name=error.name) from error
 
 
 def imported(name: str, what: str) -> Any:

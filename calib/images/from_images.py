@@ -18,16 +18,18 @@ from arraygeom.runtime.progress import part, stage
 from arraygeom.runtime.text import OPEN
 from arraygeom.runtime.threads import torch_in_one_thread
 
-from .explanations import Explanation, explain
+from .explanations import Explanation, explain, registration
 from .lenses import describe_lenses
 from .matches import (
     AGREE,
+    ENOUGH,
     MATCHING_SHARE,
     FittedLink,
     Pairs,
     PointMatches,
     agreeing_pairs,
     fit_fundamental,
+    fit_homography,
     fit_link,
     image_sizes,
     line_distance,
@@ -87,15 +89,20 @@ def rig_from_images(
     essential matrix is fitted too, with five degrees of freedom instead of seven: it is used where it fits
     held-out points better. All F are then fitted jointly, with lenses, and accepted on the same condition.
     Points that one homography explains leave the lines open (`Explanation`): that homography is then the map.
-    `matches` of pairs of images are taken in place of those that would be found. Raises ValueError, one line:
-    as `match_cameras`, too few points, a focal length of no camera.
+    `matches` of pairs of images are taken in place of those that would be found; of fewer than 20 points a
+    homography alone (`fit_homography`). Raises ValueError, one line: as `match_cameras`, too few points, a
+    focal length of no camera.
     """
     focal = dict(focal or {})
     for name, length in focal.items():
         if name not in images or not 0 < length < math.inf:
-            raise ValueError(f"--focal: '{name}={length:g}' is no camera with an image, or not positive")
+            raise ValueError(f"focal: '{name}={length:g}' is no camera with an image, or not positive")
     sizes = image_sizes(images)
     K = {name: intrinsics(length, sizes[name]) for name, length in focal.items()}
+    if matches is not None and alpha is not None:
+        matches = dict(_of_alpha(names, points, alpha) for names, points in matches.items() if alpha in names)
+    if matches and all(len(points.alpha) < ENOUGH for points in matches.values()):
+        return _registered(Rig({name: View(hw=hw) for name, hw in sizes.items()}), matches)
     with part(0, MATCHING_SHARE):
         matched = match_cameras(images, alpha=alpha) if matches is None else agreeing_pairs(matches)
     distance, by_focal, links = {}, {}, {}
@@ -123,11 +130,30 @@ def rig_from_images(
     return UncalibratedRig(rig, fits, distance, by_focal, explained, matched)
 
 
+def _of_alpha(
+    names: tuple[str, str], points: PointMatches, alpha: str
+) -> tuple[tuple[str, str], PointMatches]:
+    """A pair's names and points, those of alpha first."""
+    return (names, points) if names[0] == alpha else (names[::-1], PointMatches(*points[::-1]))
+
+
+def _registered(rig: Rig, matches: Pairs) -> UncalibratedRig:
+    """The rig of views whose images a homography by a few points registers."""
+    links = {names: Link.from_homography(fit_homography(points)) for names, points in matches.items()}
+    explained = {names: registration(links[names].H, points) for names, points in matches.items()}
+    fits = {names: FittedLink(link, matches[names], 0.0) for names, link in links.items()}
+    rig = rig.replace(links=links, name=OPEN)
+    return UncalibratedRig(rig, fits, {}, dict.fromkeys(links, False), explained, dict(matches))
+
+
 def link_of_points(rig: Rig, pair: tuple[str, str], points: PointMatches) -> Link:
-    """F and a map of a pair by its points: the homography that explains them all, if one does."""
+    """F and a map of a pair by its points; or the homography alone that explains them all, if one does, and
+    of few points."""
+    if len(points.alpha) < ENOUGH:
+        return Link.from_homography(fit_homography(points))
     link = fit_link(points, fit_fundamental(points), within=AGREE).link
     explained = explain(points, rig.replace(links={pair: link}).pair(*pair))
-    return link if explained.has_lines else link.replace(H=explained.H)
+    return link if explained.has_lines else Link.from_homography(explained.H)
 
 
 def _fundamental(

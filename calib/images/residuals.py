@@ -177,15 +177,17 @@ def lines_basis(pair: Pair, matches: PointMatches) -> Float[Tensor, "n 8"]:
 
 
 def related(rig: Rig, pairs: Pairs) -> dict[tuple[str, str], PointMatches]:
-    """Those of the pairs the rig relates: calibrated ones and those with an F. Raises ValueError if none."""
+    """Those of the pairs whose lines the rig knows: calibrated ones not at one place, and those with an F.
+    Raises ValueError if none."""
     relations = {
         names: m
         for names, m in pairs.items()
-        if (pair := rig.pair(*names)).calibrated or pair.link is not None
+        if ((pair := rig.pair(*names)).calibrated or pair.link is not None) and not pair.at_one_place
     }
     if not relations:
         raise ValueError(
-            "the rig does not relate these cameras: calibrate them, or make a rig with `pat rig start`"
+            "the rig knows no lines between these cameras, or they are at one place: calibrate them, or make "
+            "a rig with `pat rig start`"
         )
     return relations
 

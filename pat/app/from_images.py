@@ -18,7 +18,8 @@ from torch import Tensor
 from torch.linalg import LinAlgError
 from torch.nn.functional import interpolate
 
-from arraygeom import LensView, Link, Rig, Sensor, View
+from arraygeom import LensView, Link, Pair, Rig, Sensor, View, apply_homography, resize_matrix
+from arraygeom.io.point_matches import read_matches
 from arraygeom.io.xmp import named_by_band, rig_of_images, states_cameras
 from arraygeom.runtime.progress import log_step, part, stage
 from arraygeom.runtime.text import ASSUMED, OPEN, UNSCALED
@@ -27,6 +28,7 @@ from calib.images.focal_length import common_focal_length
 from calib.images.from_images import UncalibratedRig, link_of_points, rig_from_images
 from calib.images.known_intrinsics import centres_found
 from calib.images.lenses import describe_lenses
+from calib.images.matches import Pairs, PointMatches, undistort_matches
 from calib.images.self_calibration import RefinedPair, joined, refined_by_depth, self_calibrated
 
 from ..fusion.dense_matches import MatchedDepth, matched_depth
@@ -88,13 +90,15 @@ def array_from_images(
     alpha: str | None = None,
     weights: str | None = None,
     focal: Mapping[str, float] | None = None,
+    matches: str | Path | None = None,
     say: Say = lambda line: None,
 ) -> ImageArray:
     """The array of one image a camera. `say` is called with each line of what is found, as it is found.
 
-    `focal`: focal lengths in pixels by camera, instead of those in the files' tags. Raises ValueError, one
-    line: fewer than two images, an image of one colour, images that do not show the same things, a focal
-    length of no camera.
+    `focal`: focal lengths in pixels by camera, instead of those in the files' tags. `matches`: a file of
+    matched points (`read_matches`) by which the rig is found, instead of what the images have in common.
+    Raises ValueError, one line: fewer than two images, an image of one colour, images that do not show the
+    same things, a focal length of no camera.
     """
     sources, focal = by_camera(sources), focal or {}
     files = {name: Path(path) for name, path in sources.items() if isinstance(path, str | Path)}
@@ -117,6 +121,15 @@ def array_from_images(
         raise ValueError("focal: the images' tags state the focal lengths: leave it out")
     for name in files:
         images[name] = read_image(files[name], name=name)
+    sizes = {name: image.shape[-2:] for name, image in images.items()}
+    given = (
+        None
+        if matches is None
+        else {
+            pair: PointMatches(*points)
+            for pair, points in read_matches(matches, {n: files.get(n, n) for n in sources}, sizes).items()
+        }
+    )
     images = {name: _textured(f"{name}: {files.get(name, 'the image')}", images[name]) for name in sources}
     alpha = _chosen_alpha(images, alpha, note)
     if tagged is not None:
@@ -126,16 +139,18 @@ def array_from_images(
     if tagged is None:
         lengths = _focal_lengths(images, files, focal, note)
         bands = load_weights(weights or _weights_of(images, alpha)).bands
-        rig, names = found_rig(images, alpha, lengths, bands, note)
+        rig, names = found_rig(images, alpha, lengths, bands, note, given)
         sensors = {name: Sensor({1: "mono", 3: "rgb"}.get(len(images[name]))) for name in names}
         recorded = rig = _with_sensors(rig, sensors)
     else:
         try:
+            if given is not None:
+                raise ValueError("matches are given")
             rig, names = _translated_rig(tagged, images, alpha, note)
         except (ValueError, LinAlgError) as error:
             why = "too little parallax" if isinstance(error, LinAlgError) else str(error).partition(":")[0]
             note(f"no depth ({why}): maps between the bands by matched points")
-            rig, names = _mapped_rig(tagged, images, alpha, note)
+            rig, names = _mapped_rig(tagged, images, alpha, note, given)
         recorded = _with_sensors(rig, {name: tagged[name].sensor for name in names})
     images = {name: images[name] for name in names}
     weights = weights or _weights_of(images, alpha)
@@ -245,7 +260,9 @@ def _translated_rig(tagged: Rig, images: Images, alpha: str, note: Say) -> tuple
     return Rig(cameras, depth=translated.depth, name=UNSCALED), names
 
 
-def _mapped_rig(tagged: Rig, images: Images, alpha: str, note: Say) -> tuple[Rig, list[str]]:
+def _mapped_rig(
+    tagged: Rig, images: Images, alpha: str, note: Say, given: Pairs | None = None
+) -> tuple[Rig, list[str]]:
     """The cameras of tags without poses: their lenses, and F and a homography by points, where those match.
 
     A scene without parallax, as from a drone, leaves translations open and needs none.
@@ -254,13 +271,25 @@ def _mapped_rig(tagged: Rig, images: Images, alpha: str, note: Say) -> tuple[Rig
     factors = {name: min(MATCHED / max(image.shape[-2:]), 1.0) for name, image in pinhole.items()}
     focal = {name: factors[name] * float(straight[name].K[0, 0]) for name in images}
     reduced = {name: scaled(image, factors[name]) for name, image in pinhole.items()}
-    found = rig_from_images(reduced, focal=focal, alpha=alpha)
+    if given is not None:
+        given = {
+            (a, b): undistort_matches(Pair(tagged[a], tagged[b]), points) for (a, b), points in given.items()
+        }
+        to_straight = {name: straight[name].K @ torch.linalg.inv(tagged[name].K) for name in images}
+        given = _moved(
+            given,
+            {
+                n: resize_matrix(images[n].shape[-2:], reduced[n].shape[-2:]) @ A
+                for n, A in to_straight.items()
+            },
+        )
+    found = rig_from_images(reduced, focal=focal, alpha=alpha, matches=given)
     lensless = Rig({name: View(hw=found.rig[name].hw) for name in images})
     fitted = {pair: link_of_points(lensless, pair, points) for pair, points in found.matches.items()}
     links = resized_rig(lensless.replace(links=fitted), pinhole).links
     names = [alpha, *(name for name in images if (alpha, name) in links)]
     if len(names) < 2:
-        raise ValueError(f"no image shows enough of what '{alpha}' shows: choose another with --alpha NAME")
+        raise ValueError(f"no image shows enough of what '{alpha}' shows: choose another alpha")
     for name in names[1:]:
         note(f"{alpha} > {name}: {found.describe(alpha, name)}")
     for name in images.keys() - {*names}:
@@ -277,11 +306,17 @@ def _mapped_rig(tagged: Rig, images: Images, alpha: str, note: Say) -> tuple[Rig
 
 @stage()
 def found_rig(
-    images: Images, alpha: str, focal: Mapping[str, float], bands: int | None, note: Say
+    images: Images,
+    alpha: str,
+    focal: Mapping[str, float],
+    bands: int | None,
+    note: Say,
+    given: Pairs | None = None,
 ) -> tuple[Rig, list[str]]:
     """The rig of the cameras of images, and which of them it relates to alpha; alpha comes first in both.
 
     A beta of `bands` is compared with alpha by its luma, others by the combination of bands most like alpha.
+    `given` matches between the images take the place of what would be found.
 
     Calibrated, up to a scale, where points matched between alpha and a beta have parallax; else known by F
     alone.
@@ -289,13 +324,14 @@ def found_rig(
     factors = {name: min(MATCHED / max(image.shape[-2:]), 1.0) for name, image in images.items()}
     reduced = {name: scaled(image, factors[name]) for name, image in images.items()}
     lengths = {name: length * factors[name] for name, length in focal.items()}
+    if given is not None:
+        resized = {name: resize_matrix(images[name].shape[-2:], reduced[name].shape[-2:]) for name in images}
+        given = _moved(given, resized)
     with part(0, LINES):
-        uncalibrated = rig_from_images(reduced, focal=lengths, alpha=alpha)
+        uncalibrated = rig_from_images(reduced, focal=lengths, alpha=alpha, matches=given)
     betas = [name for name in images if (alpha, name) in uncalibrated.rig.links]
     if not betas:
-        raise ValueError(
-            f"no image shows enough of what '{alpha}' shows: choose another alpha with --alpha NAME"
-        )
+        raise ValueError(f"no image shows enough of what '{alpha}' shows: choose another alpha")
     for name in images.keys() - {alpha, *betas}:
         note(f"{name}: left out, too little in common with {alpha}")
     with_lines = [name for name in betas if uncalibrated.explained[alpha, name].has_lines]
@@ -306,7 +342,7 @@ def found_rig(
             f"{name}: focal length {length / factors[name]:.0f} pixels +- {deviation:.0%}, by matched points"
         )
     lengths |= {name: length for name, (length, _) in observed.items()}
-    rig = _calibrated(uncalibrated, reduced, alpha, betas, lengths, bands, note)
+    rig = _calibrated(uncalibrated, reduced, alpha, betas, lengths, bands, note, dense=given is None)
     if rig.name == UNSCALED and known != {alpha, *betas}:
         rig = rig.replace(name=ASSUMED)
     return resized_rig(rig, images), [alpha, *betas]
@@ -339,8 +375,11 @@ def _calibrated(
     focal: Mapping[str, float],
     bands: int | None,
     note: Say,
+    *,
+    dense: bool,
 ) -> Rig:
-    """The rig of alpha and these betas: calibrated, each pair refined by dense matches at reduced size.
+    """The rig of alpha and these betas: calibrated, each pair refined by dense matches at reduced size; or
+    not, unless several have to be of one scale.
 
     A pair whose lines no poses fit as well as F alone keeps F's, with the nearest poses for rough depths; one
     without parallax has F alone. Each is said in a line.
@@ -356,7 +395,7 @@ def _calibrated(
         if pair is None:
             continue
         pairs[name] = pair
-        if pair.exact or len(betas) > 1:
+        if (pair.exact and dense) or len(betas) > 1:
             pairs[name], depths[name] = _refined(pair, images, bands, links)
         if pairs[name] is not pair:
             points, distance = pairs[name].points, pairs[name].distance
@@ -428,6 +467,16 @@ def _relative_scale(first: MatchedDepth, other: MatchedDepth) -> float:
     return float((first.depth[both] / other.depth[both]).median()) if both.any() else 1.0
 
 
+def _moved(pairs: Pairs, maps: Mapping[str, Tensor]) -> dict[tuple[str, str], PointMatches]:
+    """The matches in images whose pixels are A x of the old ones, A by camera."""
+    return {
+        (a, b): PointMatches(
+            apply_homography(maps[a], points.alpha).x, apply_homography(maps[b], points.beta).x
+        )
+        for (a, b), points in pairs.items()
+    }
+
+
 def resized_rig(rig: Rig, images: Images) -> Rig:
     """The rig whose cameras are of the images' sizes."""
     for name in rig.names:
@@ -455,7 +504,7 @@ def _chosen_alpha(images: Images, alpha: str | None, note: Say) -> str:
     """Alpha: as asked, or the largest grey image, or the largest of all."""
     if alpha is not None:
         if alpha not in images:
-            raise ValueError(f"--alpha: no camera '{alpha}'; the images' names are {', '.join(images)}")
+            raise ValueError(f"alpha: no camera '{alpha}'; the images' names are {', '.join(images)}")
         return alpha
     grey = [name for name, image in images.items() if len(image) == 1]
     chosen = max(grey or images, key=lambda name: math.prod(images[name].shape[-2:]))

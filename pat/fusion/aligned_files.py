@@ -85,7 +85,7 @@ def save_aligned(
         if count[file.casefold()] > 1:
             raise ValueError(f"{out / file}: two results would have this name: rename the camera")
         if (out / file).resolve() in kept:
-            raise ValueError(f"{out / file}: is one of the images: give another --out")
+            raise ValueError(f"{out / file}: is one of the images: give another folder")
     with write_together(out, group=f"{prefix}aligned", last=f"{prefix}visibility.txt") as folder:
         for file, write, *parts in files:
             write(folder / file, *parts)

@@ -70,7 +70,7 @@ def check_no_result(inputs: Iterable[Path], out: Path) -> None:
     """Raise ValueError for a file that is called as a result and lies where those go."""
     for path in inputs:
         if path.resolve().parent == out.resolve() and RESULT.fullmatch(path.name):
-            raise ValueError(f"{path}: is called as a result, which would go there: give another --out")
+            raise ValueError(f"{path}: is called as a result, which would go there: give another folder")
 
 
 def save_frame(

@@ -22,6 +22,7 @@ from torch import Tensor
 
 from arraygeom.runtime.atomic import write_atomically
 from arraygeom.runtime.chunks import ROWS, spans
+from arraygeom.runtime.extras import install
 from arraygeom.runtime.image_bytes import (
     JPEG,
     MINISBLACK,
@@ -184,7 +185,7 @@ def has_many_bits(path: Path) -> bool:
 
 def _png_of_heif(path: Path, label: str, hw: HW | None) -> bytes:
     """The image of a HEIC or HEIF file, upright, as a PNG file; its size is compared before it is decoded."""
-    pillow_heif = _of_extra("pillow_heif", "heic", f"{label}: reading HEIC", ", or save it as PNG")
+    pillow_heif = _optional("pillow_heif", f"{label}: reading HEIC", ", or save it as PNG")
     problem = f"{label}: not a HEIC image that can be read (%s): save it as PNG"
     try:
         stored = pillow_heif.open_heif(path, convert_hdr_to_8bit=True)
@@ -200,7 +201,7 @@ def _png_of_heif(path: Path, label: str, hw: HW | None) -> bytes:
 
 def _png_of_raw(path: Path, label: str) -> bytes:
     """A camera's raw file as PNG: developed to sRGB in 16 bits with the camera's white balance, upright."""
-    rawpy = _of_extra("rawpy", "raw", f"{label}: reading raw files", ", or save it as TIFF")
+    rawpy = _optional("rawpy", f"{label}: reading raw files", ", or save it as TIFF")
     how = {"use_camera_wb": True, "no_auto_bright": True, "output_bps": 16, "gamma": (2.4, 12.92)}
     try:
         with rawpy.imread(str(path)) as raw:
@@ -385,17 +386,15 @@ def _counts(planes: NDArray, label: str, bits: int | None, white: int) -> NDArra
 
 def exr_writer(path: Path) -> Any:
     """The package OpenEXR, to write to `path`. Raises ValueError where it is not installed."""
-    return _of_extra("OpenEXR", "synthesis", f"{path}: writing EXR")
+    return _optional("OpenEXR", f"{path}: writing EXR")
 
 
-def _of_extra(module: str, extra: str, purpose: str, advice: str = "") -> Any:
+def _optional(module: str, purpose: str, advice: str = "") -> Any:
     """An optional module. Raises ValueError, which says what to install, or to do, where there is none."""
     try:
         return import_module(module)
     except ImportError:
-        package = module.replace("_", "-")
-        install = f"pip install 'arraygeom-pat[{extra}]'"
-        raise ValueError(f"{purpose} needs the package {package}: {install}{advice}") from None
+        raise ValueError(f"{purpose} needs the module {module}: {install(module)}{advice}") from None
 
 
 def _write_exr(path: Path, planes: NDArray, bits: int) -> None:

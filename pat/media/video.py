@@ -55,7 +55,7 @@ def check_video(rate: float) -> None:
 
     ImportError without the extra `video`, ValueError for a rate that players do not show.
     """
-    with needs("video", "writing video"):
+    with needs("writing video"):
         import av  # noqa: F401
     if not 1e-3 <= rate <= 1e3:
         raise ValueError(f"a video of {rate:g} frames a second: give .001 to 1000")

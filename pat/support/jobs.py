@@ -265,7 +265,7 @@ def _on_dask(tasks: Sequence[Task], workers: Workers) -> Iterator[TaskOutcome]:
     """
     if not tasks:
         return
-    with needs("cluster", "a scheduler"):
+    with needs("a scheduler"):
         from distributed import Client, as_completed
     try:
         client = Client(workers.scheduler, timeout=20)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from . import options
 from .fusing import files_by_camera, named_images
-from .known import Around, Known
+from .known import Around
 from .options import Out, say
 from .parser import Option, UsageError
 
@@ -26,7 +26,7 @@ EXTRAS = "page", "npy", "tif", "separate", "none"
 
 
 @dataclass
-class Align(Around, Known):
+class Align(Around):
     """Align an array's images: every camera's own values at the pixels of one, with masks; no fused image.
 
     Examples:
@@ -58,6 +58,11 @@ class Align(Around, Known):
     """What is written beside the images: page (index.html, of a single frame); the sub-pixel positions (x, y)
     of alpha's pixels in each camera's image, as npy or tif; none. And separate: a file of each camera,
     NAME.tif, instead of one of all bands."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0 <= self.confidence <= 1:
+            raise UsageError("--confidence", "a number from 0 to 1", f"{self.confidence:g}")
 
     def run(self) -> None:
         """Align one frame or several, with the rig that is given or one that is found."""

@@ -11,6 +11,8 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any, ClassVar, NoReturn
 
+from arraygeom.runtime.extras import install
+
 from ...support.folders import error_text
 from ...support.schema import near
 from . import align, batch, calibration, demo, fuse, rigs, sequence
@@ -89,6 +91,7 @@ def main(arguments: list[str] | None = None, *, group: Any = Pat, prog: str = "p
 
 def _run(arguments: list[str], group: Any, prog: str, *, debug: bool) -> None:
     """Run the command; whatever it raises becomes one line and an exit status."""
+    command = None
     try:
         with warnings.catch_warnings():
             warnings.showwarning = warn
@@ -105,9 +108,9 @@ def _run(arguments: list[str], group: Any, prog: str, *, debug: bool) -> None:
     except OSError as error:
         _fail(error, error_text(error), debug)
     except (ValueError, FloatingPointError) as error:
-        _fail(error, f"{error}", debug)
+        _fail(error, _as_option(f"{error}", command), debug)
     except ImportError as error:
-        remedy = "" if "pip install" in f"{error}" else ": pip install 'arraygeom-pat[all]'"
+        remedy = "" if "pip install" in f"{error}" or not error.name else f": {install(error.name)}"
         _fail(error, f"{error}{remedy}", debug)
     except MemoryError as error:
         _fail(error, "out of memory: give smaller images, or --max-memory where there is one", debug)
@@ -117,6 +120,13 @@ def _run(arguments: list[str], group: Any, prog: str, *, debug: bool) -> None:
             raise
         said = ", ".join([f"{type(error).__name__}: {error}", *notes])
         _fail(error, f"{said} (--debug shows where)", debug)
+
+
+def _as_option(text: str, command: Any) -> str:
+    """A message that begins with an argument of Python's, as "alpha: ...", with the command's option."""
+    name = text.partition(":")[0]
+    options = {*getattr(command, "__dataclass_fields__", {})} - {"rig", "given", "source", "target"}
+    return f"--{name.replace('_', '-')}{text[len(name) :]}" if name in options else text
 
 
 def _fail(error: BaseException, text: str, debug: bool) -> NoReturn:

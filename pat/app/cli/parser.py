@@ -39,11 +39,13 @@ class UsageError(ValueError):
 @dataclass(frozen=True)
 class Option:
     """What the type of a field does not say: the name of its value, help instead of the docstring's, a short
-    name; whether it is an argument without a name, and whether the option is given once for each value."""
+    name, and further ones; whether it is an argument without a name, and whether the option is given once for
+    each value."""
 
     metavar: str | None = None
     help: str | None = None
     short: str | None = None
+    also: tuple[str, ...] = ()
     positional: bool = False
     repeat: bool = False
 
@@ -183,8 +185,8 @@ class _Entry:
         if self.option.positional:
             group.add_argument(self.name, **how, **({} if several or required else {"nargs": "?"}))
         else:
-            short = [self.option.short] if self.option.short else []
-            group.add_argument(flag, *short, required=required, **how)
+            names = (flag, *([self.option.short] if self.option.short else []), *self.option.also)
+            group.add_argument(*names, required=required, **how)
 
 
 class _Tuple(argparse.Action):

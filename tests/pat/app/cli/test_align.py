@@ -205,7 +205,7 @@ def test_translations_that_will_be_found_are_not_asked_for(capture):
         ("--around {}/small.tif", "small.tif: is 80x48, alpha's image is 160x96"),
         ("--around {}/depth.png,scale=1", "state its unit with --around"),
         ("--around {}/far.csv", "outside"),
-        ("--confidence 2", "the least confidence is 2: give a number from 0 to 1"),
+        ("--confidence 2", "--confidence"),
         ("--alpha nir", "no camera 'nir'"),
     ],
 )

@@ -113,6 +113,38 @@ def test_rig_commands_take_matches(folder, capsys):
     pat(f"rig refine {folder / 'rig.yaml'} {given} -o {folder / 'refined.yaml'} --no-photometric")
 
 
+@pytest.mark.parametrize("alpha", ["mono", "blind"])
+def test_matches_find_the_rig_of_images_that_do_not_match(folder, tmp_path, alpha, capsys):
+    """The rig was sought in the images alone, and refused."""
+    files = f"{folder / 'mono.png'} {folder / 'blind.png'}"
+    pat(f"align {files} --matches {folder / 'matches.csv'} --alpha {alpha} -o {tmp_path} --extras npy")
+    assert "204 " in capsys.readouterr().err
+    other = {"mono": "blind", "blind": "mono"}[alpha]
+    positions = np.load(tmp_path / f"{other}_positions.npy")
+    off = np.nanmedian((positions - np.stack(np.meshgrid(np.arange(W), np.arange(H)), -1))[:, 40:-40], (0, 1))
+    assert off == pytest.approx([-FAR if alpha == "mono" else FAR, 0], abs=2)
+
+
+def test_ten_matches_lay_one_image_on_the_other(folder, tmp_path, capsys):
+    rows = np.loadtxt(folder / "matches.csv", delimiter=",")
+    np.savetxt(tmp_path / "ten.csv", rows[rows[:, 0] - rows[:, 2] == FAR][::19], delimiter=",")
+    files = f"{folder / 'mono.png'} {folder / 'blind.png'}"
+    pat(f"fuse {files} --matches {tmp_path / 'ten.csv'} --alpha mono -o {tmp_path / 'out'} --extras none")
+    assert not (tmp_path / "out" / "depth.tif").exists()
+    assert not (tmp_path / "out" / "found_rig.yaml").exists()
+    pat(
+        f"rig start --image mono={folder / 'mono.png'} --image blind={folder / 'blind.png'} "
+        f"--matches {tmp_path / 'ten.csv'} -o {tmp_path / 'rig.yaml'}"
+    )
+    assert Rig.load(tmp_path / "rig.yaml").pair("mono", "blind").at_one_place
+
+
+def test_a_depth_map_without_a_rig_is_refused_before_the_work(folder, tmp_path, refusal, monkeypatch):
+    monkeypatch.setattr("pat.app.from_images.array_from_images", None)
+    files = folder / "mono.png", folder / "colour.png"
+    assert "--around" in refusal("align", *files, "--depth-map", folder / "depth.tif", "-o", tmp_path)
+
+
 def test_matches_off_the_lines_of_the_rig_are_said(folder, capsys):
     """Those of another image were taken without a word; here beta's rows are counted from below."""
     rows = np.loadtxt(folder / "matches.csv", delimiter=",")
@@ -132,7 +164,7 @@ def test_matches_off_the_lines_of_the_rig_are_said(folder, capsys):
         ("--around {}/depth.tif --field line", "--field"),
         ("--around {}/depth.png,scale=1", "holds 1e+04 to 2e+04 m, the rig's"),
         ("--around {}/mono.png", "8 bits, too few"),
-        ("--around {}/none.png", "no such depth map"),
+        ("--around {}/none.png", "none.png"),
         ("--around {}/depth.tif,unit=1", "--around"),
         ("--around {}/depth.tif,scale=one", "--around"),
         ("--around {}/rig.yaml", "rig.yaml"),
