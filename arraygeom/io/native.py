@@ -291,6 +291,7 @@ def _camera_named(entry: Entry, cameras: Mapping[str, View]) -> str:
 def _check_keys(entry: Entry, allowed: tuple[str, ...]) -> None:
     if not isinstance(entry.value, dict):
         raise entry.fail(f"wanted a mapping with keys {', '.join(allowed)}")
+    entry.use()
     for key in entry.value:
         if key not in allowed:
             near = difflib.get_close_matches(str(key), allowed, 1)

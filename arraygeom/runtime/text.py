@@ -15,6 +15,8 @@ ASSUMED = f"{UNSCALED}; focal lengths are assumed, and the proportions of depth 
 """The name of one whose focal lengths nobody stated: an interval of its depths would be a guess."""
 OPEN = "found from images that leave lines and depth open: of these images alone"
 """The name of a rig whose cameras one homography relates as well as any lines."""
+REGISTERED = "registered by a homography each: for scenes about as far away as those of these images"
+"""The name of one that several captures agree on."""
 
 
 def length_unit(rig: Any) -> str:

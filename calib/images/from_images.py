@@ -99,12 +99,11 @@ def rig_from_images(
             raise ValueError(f"focal: '{name}={length:g}' is no camera with an image, or not positive")
     sizes = image_sizes(images)
     K = {name: intrinsics(length, sizes[name]) for name, length in focal.items()}
-    if matches is not None and alpha is not None:
-        matches = dict(_of_alpha(names, points, alpha) for names, points in matches.items() if alpha in names)
-    if matches and all(len(points.alpha) < ENOUGH for points in matches.values()):
-        return _registered(Rig({name: View(hw=hw) for name, hw in sizes.items()}), matches)
     with part(0, MATCHING_SHARE):
-        matched = match_cameras(images, alpha=alpha) if matches is None else agreeing_pairs(matches)
+        given = None if matches is None else usable_matches(matches, alpha=alpha)
+        matched = match_cameras(images, alpha=alpha) if given is None else given
+    if all(len(points.alpha) < ENOUGH for points in matched.values()):
+        return _registered(Rig({name: View(hw=hw) for name, hw in sizes.items()}), matched)
     distance, by_focal, links = {}, {}, {}
     for names, points in matched.items():
         F, distance[names], by_focal[names] = _fundamental(points, *(K.get(name) for name in names))
@@ -130,30 +129,34 @@ def rig_from_images(
     return UncalibratedRig(rig, fits, distance, by_focal, explained, matched)
 
 
-def _of_alpha(
-    names: tuple[str, str], points: PointMatches, alpha: str
-) -> tuple[tuple[str, str], PointMatches]:
-    """A pair's names and points, those of alpha first."""
-    return (names, points) if names[0] == alpha else (names[::-1], PointMatches(*points[::-1]))
+def usable_matches(matches: Pairs, *, alpha: str | None = None) -> dict[tuple[str, str], PointMatches]:
+    """Matches from elsewhere that agree, of `alpha` and others if it is given, alpha first; or, where no pair
+    has enough for lines, all. Raises ValueError for matches of no use."""
+    if alpha is not None:
+        turned = {(b, a): PointMatches(*points[::-1]) for (a, b), points in matches.items()}
+        matches = {names: points for names, points in {**turned, **matches}.items() if names[0] == alpha}
+    few = matches and all(len(points.alpha) < ENOUGH for points in matches.values())
+    return dict(matches) if few else agreeing_pairs(matches)
 
 
 def _registered(rig: Rig, matches: Pairs) -> UncalibratedRig:
     """The rig of views whose images a homography by a few points registers."""
-    links = {names: Link.from_homography(fit_homography(points)) for names, points in matches.items()}
-    explained = {names: registration(links[names].H, points) for names, points in matches.items()}
+    fitted = {names: link_of_points(rig, names, points) for names, points in matches.items()}
+    links, explained = ({names: parts[i] for names, parts in fitted.items()} for i in (0, 1))
     fits = {names: FittedLink(link, matches[names], 0.0) for names, link in links.items()}
     rig = rig.replace(links=links, name=OPEN)
     return UncalibratedRig(rig, fits, {}, dict.fromkeys(links, False), explained, dict(matches))
 
 
-def link_of_points(rig: Rig, pair: tuple[str, str], points: PointMatches) -> Link:
+def link_of_points(rig: Rig, pair: tuple[str, str], points: PointMatches) -> tuple[Link, Explanation]:
     """F and a map of a pair by its points; or the homography alone that explains them all, if one does, and
-    of few points."""
+    of few points. And the explanation taken."""
     if len(points.alpha) < ENOUGH:
-        return Link.from_homography(fit_homography(points))
+        H = fit_homography(points)
+        return Link.from_homography(H), registration(H, points)
     link = fit_link(points, fit_fundamental(points), within=AGREE).link
     explained = explain(points, rig.replace(links={pair: link}).pair(*pair))
-    return link if explained.has_lines else Link.from_homography(explained.H)
+    return link if explained.has_lines else Link.from_homography(explained.H), explained
 
 
 def _fundamental(

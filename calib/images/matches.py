@@ -34,7 +34,7 @@ ENOUGH = 20
 """Least number of consistent matches for any conclusion."""
 FEWEST = 4
 """Least number of matches, clicked by hand say, that a homography is fitted to."""
-CLICKED, BENT = 2.0, 0.1
+CLICKED, BENT = 2.0, 0.02
 """Standard deviations of such points, pixels, and of how far the homography is from a similarity: shear,
 aspect and perspective across the points' spread."""
 LOCALISED = 1 / 3

@@ -7,7 +7,7 @@ import math
 import os
 import re
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,17 +18,17 @@ from torch import Tensor
 from torch.linalg import LinAlgError
 from torch.nn.functional import interpolate
 
-from arraygeom import LensView, Link, Pair, Rig, Sensor, View, apply_homography, resize_matrix
+from arraygeom import LensView, Link, Rig, Sensor, View, apply_homography, resize_matrix
 from arraygeom.io.point_matches import read_matches
 from arraygeom.io.xmp import named_by_band, rig_of_images, states_cameras
 from arraygeom.runtime.progress import log_step, part, stage
-from arraygeom.runtime.text import ASSUMED, OPEN, UNSCALED
+from arraygeom.runtime.text import ASSUMED, OPEN, REGISTERED, UNSCALED
 from arraygeom.undistortion import pixels_between
 from calib.images.focal_length import common_focal_length
-from calib.images.from_images import UncalibratedRig, link_of_points, rig_from_images
+from calib.images.from_images import UncalibratedRig, link_of_points, rig_from_images, usable_matches
 from calib.images.known_intrinsics import centres_found
 from calib.images.lenses import describe_lenses
-from calib.images.matches import Pairs, PointMatches, undistort_matches
+from calib.images.matches import Pairs, PointMatches, match_cameras, undistort_matches
 from calib.images.self_calibration import RefinedPair, joined, refined_by_depth, self_calibrated
 
 from ..fusion.dense_matches import MatchedDepth, matched_depth
@@ -91,12 +91,14 @@ def array_from_images(
     weights: str | None = None,
     focal: Mapping[str, float] | None = None,
     matches: str | Path | None = None,
+    further: Sequence[Mapping[str, Path]] = (),
     say: Say = lambda line: None,
 ) -> ImageArray:
     """The array of one image a camera. `say` is called with each line of what is found, as it is found.
 
     `focal`: focal lengths in pixels by camera, instead of those in the files' tags. `matches`: a file of
     matched points (`read_matches`) by which the rig is found, instead of what the images have in common.
+    `further` captures of the same cameras count too where tags state these and there is no parallax.
     Raises ValueError, one line: fewer than two images, an image of one colour, images that do not show the
     same things, a focal length of no camera.
     """
@@ -150,7 +152,9 @@ def array_from_images(
         except (ValueError, LinAlgError) as error:
             why = "too little parallax" if isinstance(error, LinAlgError) else str(error).partition(":")[0]
             note(f"no depth ({why}): maps between the bands by matched points")
-            rig, names = _mapped_rig(tagged, images, alpha, note, given)
+            like = tagged[alpha].sensor
+            others = ({n: read_view(tagged, n, one[n], like=like) for n in images} for one in further)
+            rig, names = _mapped_rig(tagged, [images, *others], alpha, note, given)
         recorded = _with_sensors(rig, {name: tagged[name].sensor for name in names})
     images = {name: images[name] for name in names}
     weights = weights or _weights_of(images, alpha)
@@ -261,47 +265,53 @@ def _translated_rig(tagged: Rig, images: Images, alpha: str, note: Say) -> tuple
 
 
 def _mapped_rig(
-    tagged: Rig, images: Images, alpha: str, note: Say, given: Pairs | None = None
+    tagged: Rig, captures: Iterable[Images], alpha: str, note: Say, given: Pairs | None = None
 ) -> tuple[Rig, list[str]]:
-    """The cameras of tags without poses: their lenses, and F and a homography by points, where those match.
+    """The cameras of tags without poses: their lenses, and a homography, or F, by the points of all captures.
 
     A scene without parallax, as from a drone, leaves translations open and needs none.
     """
-    straight, pinhole = without_lenses(Rig({name: tagged[name] for name in images}), images)
-    factors = {name: min(MATCHED / max(image.shape[-2:]), 1.0) for name, image in pinhole.items()}
-    focal = {name: factors[name] * float(straight[name].K[0, 0]) for name in images}
-    reduced = {name: scaled(image, factors[name]) for name, image in pinhole.items()}
-    if given is not None:
-        given = {
-            (a, b): undistort_matches(Pair(tagged[a], tagged[b]), points) for (a, b), points in given.items()
-        }
-        to_straight = {name: straight[name].K @ torch.linalg.inv(tagged[name].K) for name in images}
-        given = _moved(
-            given,
-            {
-                n: resize_matrix(images[n].shape[-2:], reduced[n].shape[-2:]) @ A
-                for n, A in to_straight.items()
-            },
-        )
-    found = rig_from_images(reduced, focal=focal, alpha=alpha, matches=given)
-    lensless = Rig({name: View(hw=found.rig[name].hw) for name in images})
-    fitted = {pair: link_of_points(lensless, pair, points) for pair, points in found.matches.items()}
-    links = resized_rig(lensless.replace(links=fitted), pinhole).links
-    names = [alpha, *(name for name in images if (alpha, name) in links)]
-    if len(names) < 2:
-        raise ValueError(f"no image shows enough of what '{alpha}' shows: choose another alpha")
-    for name in names[1:]:
-        note(f"{alpha} > {name}: {found.describe(alpha, name)}")
-    for name in images.keys() - {*names}:
-        note(f"{name}: left out, too little in common with {alpha}")
+    pools: dict[tuple[str, str], list[PointMatches]] = {}
+    used = 0
+    for images in captures:
+        rig = Rig({name: tagged[name] for name in images})
+        straight, pinhole = without_lenses(rig, images)
+        factors = {name: min(MATCHED / max(image.shape[-2:]), 1.0) for name, image in pinhole.items()}
+        reduced = {name: scaled(image, factors[name]) for name, image in pinhole.items()}
+        sized = resized_rig(straight, reduced)
+        try:
+            if given is None:
+                matched = match_cameras(reduced, alpha=alpha)
+            else:
+                bare = {pair: undistort_matches(rig.pair(*pair), points) for pair, points in given.items()}
+                to_sized = {name: sized[name].K @ torch.linalg.inv(rig[name].K) for name in images}
+                matched = usable_matches(_moved(bare, to_sized), alpha=alpha)
+        except ValueError:
+            if not used:
+                raise
+            continue
+        used += 1
+        for pair, points in matched.items():
+            pools.setdefault(pair, []).append(points)
+    views = Rig({name: View(hw=sized[name].hw) for name in sized.names})
+    links, every = {}, []
+    for pair, parts in pools.items():
+        points = PointMatches(*(torch.cat(side) for side in zip(*parts)))
+        links[pair], explained = link_of_points(views, pair, points)
+        every.append(explained.has_lines)
+        note(f"{alpha} > {pair[1]}: {explained.as_text(focal_lengths=True)}")
+    names = [alpha, *(name for name in sized.names if (alpha, name) in links)]
+    for name in sized.names:
+        if name not in names:
+            note(f"{name}: left out, too little in common with {alpha}")
     cameras = {name: developed_rig(tagged, images)[name] for name in names}
-    to_tags = {name: cameras[name].K @ torch.linalg.inv(straight[name].K) for name in names}
-    views = {
+    to_tags = {name: cameras[name].K @ torch.linalg.inv(sized[name].K) for name in names}
+    lenses = {
         name: LensView(hw=camera.hw, K=camera.K, distortion=camera.distortion, sensor=camera.sensor)
         for name, camera in cameras.items()
     }
-    own = {(alpha, name): links[alpha, name].transformed(to_tags[alpha], to_tags[name]) for name in names[1:]}
-    return Rig(views, links=own, name=found.rig.name), names
+    own = {(a, b): link.transformed(to_tags[a], to_tags[b]) for (a, b), link in links.items()}
+    return Rig(lenses, links=own, name="" if all(every) else REGISTERED if used > 1 else OPEN), names
 
 
 @stage()

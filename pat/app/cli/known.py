@@ -28,6 +28,8 @@ MatchesFile = Annotated[Path | None, Option("FILE", MATCHES_HELP)]
 
 NOISE = "NAME=ELECTRONS[,READ]|estimate|none"
 NEEDS_RIG = "a calibrated rig for a depth map: give --rig RIG and --depth NEAR FAR"
+FRAMES = 5
+"""Captures of a flight that its rig is found from."""
 OUT_OF_RANGE = 0.9
 """Share of a depth map outside the rig's depth range from which its unit must be wrong."""
 OFF_LINES = 5.0
@@ -108,16 +110,26 @@ class Known:
         weights: str | None = None,
         focal: Mapping[str, float] = {},
         matches: Path | None = None,
+        flight: bool = False,
     ) -> ImageArray:
-        """The array that each camera's first image says, or a file of matches between them; its levels are
-        then taken."""
+        """The array that each camera's first image says, or of a flight several, or a file of matches between
+        the first; its levels are then taken."""
         from ..from_images import array_from_images
 
-        first = {name: paths[0] for name, paths in files.items()}
+        count = min(map(len, files.values()))
+        # the first frame, then others all over; of a flight, first and last ones may be of the ground
+        chosen = dict.fromkeys([count // 2 * flight, *(count * i // FRAMES for i in range(FRAMES) if flight)])
+        first, *further = ({name: paths[i] for name, paths in files.items()} for i in chosen)
         options.say_when_compiling()
         with options.working("finding the rig"):
             array = array_from_images(
-                first, alpha=self.alpha, weights=weights, focal=focal, matches=matches, say=say
+                first,
+                alpha=self.alpha,
+                weights=weights,
+                focal=focal,
+                matches=matches,
+                further=further if matches is None else (),
+                say=say,
             )
         if weights is None:
             say(f"weights: {array.weights} (--weights NAME takes others)")

@@ -1,6 +1,7 @@
 """`--around` of fuse, align and the rig commands, on a wall with a post before it."""
 
 import re
+from contextlib import suppress
 
 import cv2
 import numpy as np
@@ -9,7 +10,7 @@ import tifffile
 import torch
 from torch.nn.functional import interpolate
 
-from arraygeom import Rig
+from arraygeom import Rig, epipolar_distance
 from pat import FuseSettings
 from pat import align as aligned
 from pat.app.cli.known import Around
@@ -117,12 +118,14 @@ def test_rig_commands_take_matches(folder, capsys):
 def test_matches_find_the_rig_of_images_that_do_not_match(folder, tmp_path, alpha, capsys):
     """The rig was sought in the images alone, and refused."""
     files = f"{folder / 'mono.png'} {folder / 'blind.png'}"
-    pat(f"align {files} --matches {folder / 'matches.csv'} --alpha {alpha} -o {tmp_path} --extras npy")
+    with suppress(SystemExit):  # as confidence is low
+        pat(f"align {files} --matches {folder / 'matches.csv'} --alpha {alpha} -o {tmp_path} --extras npy")
     assert "204 " in capsys.readouterr().err
-    other = {"mono": "blind", "blind": "mono"}[alpha]
-    positions = np.load(tmp_path / f"{other}_positions.npy")
-    off = np.nanmedian((positions - np.stack(np.meshgrid(np.arange(W), np.arange(H)), -1))[:, 40:-40], (0, 1))
-    assert off == pytest.approx([-FAR if alpha == "mono" else FAR, 0], abs=2)
+    x = torch.from_numpy(np.loadtxt(folder / "matches.csv", delimiter=","))
+    rig = Rig.load(tmp_path / "found_rig.yaml")
+    assert rig.names[0] == alpha
+    F = rig.pair("mono", "blind").fundamental.to(x)
+    assert float(epipolar_distance(F, x[:, :2], x[:, 2:]).abs().median()) < 0.5
 
 
 def test_ten_matches_lay_one_image_on_the_other(folder, tmp_path, capsys):
@@ -183,6 +186,7 @@ def test_bad_input_is_one_line(folder, options, expected, capsys):
 def test_a_large_depth_map_in_another_unit_is_told_what_it_holds(folder, monkeypatch):
     """Torch's quantiles are of 2^24 numbers at most: of larger maps its words were the message."""
     monkeypatch.setattr("pat.media.depth_maps.read_depth", lambda *_, **__: torch.full((4097, 4097), 1e4))
-    rig = Rig.load(folder / "rig.yaml")
+    rig, large = Rig.load(folder / "rig.yaml"), folder / "large.tif"
+    large.touch()
     with pytest.raises(ValueError, match=r"holds 1e\+04 to 1e\+04 m, the rig's depth range"):
-        Around(around="large.tif").with_known(rig, rig.names[0], {}, None)
+        Around(around=str(large)).with_known(rig, rig.names[0], {}, None)
