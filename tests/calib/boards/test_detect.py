@@ -97,6 +97,23 @@ def test_a_part_of_a_charuco_board_is_enough():
     assert 8 <= len(found.ids) < len(board.points)
 
 
+@pytest.mark.parametrize("tilt", [-60.0, 40.0])
+def test_steep_and_wide_views_have_corners(tilt):
+    """OpenCV finds most markers and drops all corners."""
+    board, lens = parse_board("charuco:31x16:49.33mm:38.46mm:4x4_250"), (-0.312, 0.127, 0.0, 0.0, -0.027)
+    wide = camera(574.0, (800, 1280), lens=lens)
+    where = pose(board, (tilt, 0.0, 0.0), 0.95)
+    grey = photograph(wide, where, board, rays=fine_rays(wide))
+    detector = cv2.aruco.CharucoDetector(board.opencv)
+    assert detector.detectBoard(grey)[1] is None or tilt > 0
+    found = detect(grey, board)
+    ground_truth = wide.project(where.apply(torch.from_numpy(board.points[found.ids]))).x.numpy()
+    off = np.linalg.norm(found.x - ground_truth, axis=1)
+    assert len(found.ids) > 150
+    assert np.median(off) < 0.05
+    assert np.quantile(off, 0.99) < 0.5
+
+
 def test_no_board_is_no_board():
     grey = np.random.default_rng(0).integers(0, 255, (240, 320)).astype(np.uint8)
     assert detect(cv2.GaussianBlur(grey, (0, 0), 3), parse_board("charuco:8x6:30mm")) is None
@@ -118,6 +135,14 @@ def test_another_board_is_named(shown, asked, words):
     board = parse_board(asked)
     assert detect(grey, board) is None
     assert words in explain([grey], board)
+
+
+def test_a_board_that_other_images_confirm_is_not_doubted():
+    grey, board = image("charuco:8x6:30mm", depth=0.09)
+    assert detect(grey, board) is None
+    assert "size" in explain([grey], board)
+    for shown in (board, parse_board("chessboard:9x6:25mm")):
+        assert not {"size", "name"} & {*explain([grey], shown, confirmed=True).replace("?", " ").split()}
 
 
 def test_causes_in_the_image_are_named():
