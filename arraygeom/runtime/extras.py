@@ -1,4 +1,4 @@
-"""Modules that only some users need, and those of users."""
+"""Import of optional modules, and of users' own code."""
 
 from __future__ import annotations
 
@@ -15,17 +15,21 @@ PACKAGES = {
     "skimage": "scikit-image",
     "yaml": "PyYAML",
 }
-"""Packages that are called otherwise than their modules."""
+"""Packages whose names differ from those of their modules."""
 
 
 def install(module: str) -> str:
-    """The command that installs the package of a module, be this project a checkout or installed."""
+    """Return the command that installs a module's package, be this project a checkout or installed."""
     return f"pip install {PACKAGES.get(module, module.replace('_', '-'))}"
 
 
 @contextmanager
 def needs(purpose: str) -> Iterator[None]:
-    """Around an optional module's import: raises ImportError in one line that says what to install."""
+    """Context manager for the import of an optional module.
+
+    Raises:
+        ImportError: in one line that says what to install, if the import fails.
+    """
     try:
         yield
     except ImportError as error:
@@ -34,7 +38,17 @@ def needs(purpose: str) -> Iterator[None]:
 
 
 def imported(name: str, what: str) -> Any:
-    """A user's "module:object", looked for from here too. Raises ValueError, which says what it was to be."""
+    """Import a user's "module:object", also from the current folder.
+
+    Args:
+        what: what it is, for messages.
+
+    Returns:
+        The object.
+
+    Raises:
+        ValueError: if it cannot be imported.
+    """
     module, _, attribute = name.partition(":")
     try:
         sys.path.insert(0, str(Path.cwd()))

@@ -42,11 +42,15 @@ from .residuals import median_off, split
 
 
 class UncalibratedRig(NamedTuple):
-    """An uncalibrated rig, with statistics of each of its links.
+    """An uncalibrated rig, with statistics of each of its links by the names (alpha, beta).
 
-    fits: with the points that agree, and how far they are from the rough map. distance: median distance of
-    held-out points from their lines, pixels of beta. by_focal: whether focal lengths were used. explained:
-    what the points determine. matches: all points.
+    Attributes:
+        rig: views related by links; named `OPEN` if the points of some link leave its lines undetermined.
+        fits: links with the points that agree, and the points' distance from the rough map.
+        distance: median distance of held-out points from their lines, pixels of beta.
+        by_focal: True where the given focal lengths were used.
+        explained: what the points determine.
+        matches: all consistent matches.
     """
 
     rig: Rig
@@ -57,12 +61,17 @@ class UncalibratedRig(NamedTuple):
     matches: dict[tuple[str, str], PointMatches]
 
     def as_text(self) -> str:
-        """One line per link, and one on lenses if there are any."""
+        """Return one line per link, and one on lenses if there are any."""
         lines = [f"{a} > {b}: {self.describe(a, b)}" for a, b in self.fits]
         return "\n".join([*lines, *filter(None, [describe_lenses(self.rig)])])
 
     def describe(self, a: str, b: str) -> str:
-        """The explanation taken of a link's points and what it leaves open, and how well its lines fit."""
+        """Return a sentence on a link: its explanation, what that leaves undetermined, and how well its lines
+        fit.
+
+        Raises:
+            KeyError: for cameras without a link.
+        """
         explained = self.explained[a, b].as_text(focal_lengths=self.by_focal[a, b])
         if not self.explained[a, b].has_lines:
             return explained
@@ -82,16 +91,27 @@ def rig_from_images(
     alpha: str | None = None,
     matches: Pairs | None = None,
 ) -> UncalibratedRig:
-    """An uncalibrated rig of the cameras that took these images (C, H, W), good enough to fuse with.
+    """Make an uncalibrated rig of the cameras that took these images, good enough to fuse with.
 
-    F of every two cameras with a common field of view (of `alpha` and each other one, if it is given) by
-    MAGSAC++ (Barath et al. 2020), and a rough map. With rough focal lengths, in pixels, of both cameras an
-    essential matrix is fitted too, with five degrees of freedom instead of seven: it is used where it fits
-    held-out points better. All F are then fitted jointly, with lenses, and accepted on the same condition.
-    Points that one homography explains leave the lines open (`Explanation`): that homography is then the map.
-    `matches` of pairs of images are taken in place of those that would be found; of fewer than 20 points a
-    homography alone (`fit_homography`). Raises ValueError, one line: as `match_cameras`, too few points, a
-    focal length of no camera.
+    For every two cameras with a common field of view, F is fitted by MAGSAC++ (Barath et al. 2020) and a
+    rough map by the points. With the focal lengths of both an essential matrix is fitted too, with five
+    degrees of freedom instead of seven; it is used where it fits held-out points better. All F are then
+    fitted jointly, with lenses, and accepted on the same condition. Points that one homography explains leave
+    the lines undetermined (`Explanation`): that homography is then the map.
+
+    Args:
+        images: one image (C, H, W) in 0..1 per camera, by name.
+        focal: rough focal lengths in pixels by camera; None or missing ones are unknown.
+        alpha: match only this camera with each other one; None for every two cameras.
+        matches: points of pairs of images used instead of matching these; of fewer than 20 points the rig
+            has a homography alone (`fit_homography`).
+
+    Returns:
+        The rig with statistics of its links.
+
+    Raises:
+        ValueError: in one line, for images as of `match_cameras`, too few points, or a focal length that is
+            not positive or of no camera.
     """
     focal = dict(focal or {})
     for name, length in focal.items():
@@ -130,8 +150,18 @@ def rig_from_images(
 
 
 def usable_matches(matches: Pairs, *, alpha: str | None = None) -> dict[tuple[str, str], PointMatches]:
-    """Matches from elsewhere that agree, of `alpha` and others if it is given, alpha first; or, where no pair
-    has enough for lines, all. Raises ValueError for matches of no use."""
+    """Select matches from elsewhere that agree, or, where no pair has enough for lines, all.
+
+    Args:
+        matches: points by pair of cameras.
+        alpha: the camera whose pairs are wanted; None for all.
+
+    Returns:
+        The matches, those of `alpha` first in their pairs.
+
+    Raises:
+        ValueError: for matches of no use.
+    """
     if alpha is not None:
         turned = {(b, a): PointMatches(*points[::-1]) for (a, b), points in matches.items()}
         matches = {names: points for names, points in {**turned, **matches}.items() if names[0] == alpha}
@@ -140,7 +170,7 @@ def usable_matches(matches: Pairs, *, alpha: str | None = None) -> dict[tuple[st
 
 
 def _registered(rig: Rig, matches: Pairs) -> UncalibratedRig:
-    """The rig of views whose images a homography by a few points registers."""
+    """Return the rig of views whose images a homography by a few points registers."""
     fitted = {names: link_of_points(rig, names, points) for names, points in matches.items()}
     links, explained = ({names: parts[i] for names, parts in fitted.items()} for i in (0, 1))
     fits = {names: FittedLink(link, matches[names], 0.0) for names, link in links.items()}
@@ -149,8 +179,15 @@ def _registered(rig: Rig, matches: Pairs) -> UncalibratedRig:
 
 
 def link_of_points(rig: Rig, pair: tuple[str, str], points: PointMatches) -> tuple[Link, Explanation]:
-    """F and a map of a pair by its points; or the homography alone that explains them all, if one does, and
-    of few points. And the explanation taken."""
+    """Fit F and a rough map of a pair to its points.
+
+    Returns:
+        The link, of the homography alone if that explains all points, and for few points; and the
+        explanation taken.
+
+    Raises:
+        ValueError: for points that no F fits, or fewer than `ENOUGH` that agree with it.
+    """
     if len(points.alpha) < ENOUGH:
         H = fit_homography(points)
         return Link.from_homography(H), registration(H, points)
@@ -162,7 +199,11 @@ def link_of_points(rig: Rig, pair: tuple[str, str], points: PointMatches) -> tup
 def _fundamental(
     matches: PointMatches, K: Tensor | None, K_beta: Tensor | None
 ) -> tuple[Tensor, float, bool]:
-    """F of all points; held-out points' median distance if fitted to the rest; whether by focal lengths."""
+    """Fit F to all points, by focal lengths if held-out points are nearer then.
+
+    Returns:
+        F, the median distance of held-out points if fitted to the rest, and True if focal lengths were used.
+    """
     (used,), (held_out,) = (list(pairs.values()) for pairs in split([{("", ""): matches}]))
     fits: dict[bool, Callable[[PointMatches], Tensor]] = {False: fit_fundamental}
     if K is not None and K_beta is not None:

@@ -153,7 +153,7 @@ def _shares(aligned: Aligned) -> str:
 
 
 def _of_sensor(recorded: RecordedFiles | None, name: str) -> dict[str, float]:
-    """What a camera's values are counts of light by, as far as its rig states it."""
+    """Black level, exposure and gain of a camera, as far as its rig states them."""
     if recorded is None:
         return {}
     sensor = recorded.rig[name].sensor

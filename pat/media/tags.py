@@ -1,4 +1,4 @@
-"""What image files record of where, when and by which camera they were taken, for images made of them."""
+"""Tags of image files on where, when and by which camera they were taken, for images made of them."""
 
 from __future__ import annotations
 
@@ -33,14 +33,20 @@ OF_ONE = re.compile(
 
 
 class RecordedTags(NamedTuple):
-    """Tags of an image file: make, model and time by number; EXIF's and GPS's directories; the XMP packet."""
+    """Tags of an image file.
+
+    Attributes:
+        texts: make, model and time, by number.
+        directories: EXIF's and GPS's, values by number.
+        xmp: the XMP packet; empty without.
+    """
 
     texts: dict[int, str]
     directories: dict[int, dict[int, Any]]
     xmp: bytes
 
     def extratags(self, bands: Sequence[str], wavelengths: Sequence[float | None]) -> list[tuple[Any, ...]]:
-        """Entries for tifffile, which writes all but directories."""
+        """List entries for tifffile, which writes all but directories."""
         tags: list[tuple[Any, ...]] = [(tag, "s", 0, text, True) for tag, text in self.texts.items()]
         packet = packet_of_bands(self.xmp, bands, wavelengths) if self.xmp else b""
         return [*tags, (XMP, "B", len(packet), packet, True)] if packet else tags
@@ -55,7 +61,7 @@ class RecordedTags(NamedTuple):
         for tag, values in self.directories.items():
             directory = TiffImagePlugin.ImageFileDirectory_v2(group=tag)
             for number, value in values.items():
-                directory[number] = value
+                directory[number] = TiffImagePlugin.IFDRational(value) if isinstance(value, float) else value
             content += b"\0" * (-len(content) % 4)
             entries.append(struct.pack("<HHII", tag, LONG, 1, len(content)))
             content += directory.tobytes(len(content))
@@ -67,7 +73,7 @@ class RecordedTags(NamedTuple):
 
 
 def recorded_tags(path: Path) -> RecordedTags | None:
-    """The tags of an image file; None if it has none of these, or is damaged."""
+    """Read the tags of an image file; None if it has none of these, or is damaged."""
     try:
         with Image.open(path) as image:
             exif = image.getexif()
@@ -83,9 +89,12 @@ def recorded_tags(path: Path) -> RecordedTags | None:
 
 
 def packet_of_bands(packet: bytes, bands: Sequence[str], wavelengths: Sequence[float | None]) -> bytes:
-    """The XMP packet of an image whose bands are at the pixels of the one that the packet is of.
+    """Adjust an XMP packet for an image of several bands at the pixels of the one that it is from.
 
-    What is of that one alone is left out (vignetting, radiometry); the camera, its pose and its flight stay.
+    Tags of that one alone are left out (vignetting, radiometry); the camera, its pose and its flight stay.
+
+    Returns:
+        The packet; empty for a damaged one.
     """
     for prefix, uri in re.findall(r'xmlns:(\w+)="([^"]+)"', packet.decode(errors="replace")):
         if not re.fullmatch(r"ns\d+", prefix):

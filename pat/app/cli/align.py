@@ -1,4 +1,4 @@
-"""`pat align`: images of an array in, every camera's own values at one camera's pixels out."""
+"""`pat align`: brings every camera's own values to the pixels of one camera."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Align(Around):
     occluded, 0 beyond the edge), NAME_confidence.png, NAME_positions.npy, depth.tif, visibility.txt and
     index.html."""
     interpolation: Literal["nearest", "bilinear", "cubic"] = "bilinear"
-    """Between recorded values; nearest keeps them."""
+    """Interpolation between recorded values; nearest keeps them."""
     confidence: float = 0.5
     """Confidence, 0 to 1, from which a camera counts as seeing a point: lower keeps more, more mistakes."""
     fill: Literal["none", "propagate"] = "none"
@@ -68,7 +68,12 @@ class Align(Around):
             raise UsageError("--confidence", "a number from 0 to 1", f"{self.confidence:g}")
 
     def run(self) -> None:
-        """Align one frame or several, with the rig that is given or one that is found."""
+        """Align one frame or several, with the given rig or one found from the images.
+
+        Raises:
+            UsageError: for invalid options.
+            ValueError: for images or a rig that cannot be used.
+        """
         flight = self._flight()
         image, with_rig = ((), False) if flight else named_images(self.given, self.image, "align")
         options.writable(self.out, folder=True)
@@ -81,7 +86,7 @@ class Align(Around):
                 self._align(frame)
 
     def _flight(self) -> dict[str, list[Path]]:
-        """The files of several captures, in one folder or listed, by band; empty for others."""
+        """Files of several captures, in one folder or listed, by band; empty for others."""
         folders = [path for path in self.given if path.is_dir()]
         listed = all(path.is_file() and path.suffix.lower() in IMAGE_SUFFIXES for path in self.given)
         if self.image or not (len(folders) == len(self.given) == 1 or (listed and len(self.given) > 2)):
@@ -93,7 +98,7 @@ class Align(Around):
         return by_capture(find_images(folders[0]) if folders else self.given)
 
     def _frames_with_rig(self, image: tuple[str, ...]) -> Iterator[_Frame]:
-        """The frames of the rig that is given, which the first one is checked against."""
+        """Frames of the given rig, which is checked against the first one."""
         from ...fusion.frame_matching import matched_frames
         from ...fusion.views import ViewFiles
         from ..healing import checked_rig
@@ -108,7 +113,7 @@ class Align(Around):
             yield _Frame(views.developed, rig, views, one, alpha, name=_name_of(files, alpha, one))
 
     def _frames_without(self, flight: Mapping[str, list[Path]]) -> Iterator[_Frame]:
-        """The frames of the rig that is found from the first one, or from a flight's captures."""
+        """Frames of the rig that is found from the first one, or from a flight's captures."""
         from ...fusion.frame_matching import matched_frames
         from ...fusion.views import ViewFiles
         from ..batch import find_images
@@ -136,7 +141,7 @@ class Align(Around):
             )
 
     def _align(self, frame: _Frame) -> None:
-        """Align a frame, and write and say what comes of it."""
+        """Align a frame, write its files and print the summary."""
         from arraygeom.io.native import write
         from arraygeom.runtime.together import sweep, write_listed
 
@@ -173,12 +178,12 @@ class Align(Around):
         say(f"written to {self.out}: {', '.join(path.name for path in written)}")
 
     def _refuse_several(self) -> None:
-        """Raise UsageError if something is known, which is of a single frame."""
+        """Raise UsageError for --around with several frames."""
         if self.around is not None:
             raise UsageError("--around", "a single frame: give one image of each camera")
 
     def _aligned(self, frame: _Frame) -> Aligned:
-        """The frame aligned, with the plan and a bar on the terminal."""
+        """Align a frame, with the plan and a bar on the terminal."""
         from ...fusion.aligned_files import RecordedFiles
         from ..front import align
 
@@ -198,7 +203,7 @@ class Align(Around):
             )
 
     def _page(self, aligned: Aligned, frame: _Frame, seconds: float) -> str:
-        """The page index.html."""
+        """HTML of index.html."""
         from ..aligned_page import aligned_page
         from ..report import Facts
 
@@ -209,8 +214,11 @@ class Align(Around):
 
 @dataclass(frozen=True)
 class _Frame:
-    """One frame to align: the rig of its developed images, that of its files, and those; `rig_found` says
-    that the rig was found from the images. The name goes in front of the files'; empty for a single frame."""
+    """One frame to align: rig of its developed images, rig of its files, and both.
+
+    `rig_found` is True if the rig was found from the images. The name is a prefix of output files; empty for
+    a single frame.
+    """
 
     rig: Rig
     recorded: Rig
@@ -223,5 +231,5 @@ class _Frame:
 
 
 def _name_of(files: Mapping[str, Sequence[Path]], alpha: str, one: Mapping[str, Path]) -> str:
-    """The name of a frame among several: that of alpha's file."""
+    """Name of a frame among several: alpha's file without suffix; empty for a single frame."""
     return one[alpha].stem if len(files[alpha]) > 1 else ""

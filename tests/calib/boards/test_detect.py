@@ -102,11 +102,11 @@ def test_steep_and_wide_views_have_corners(tilt):
     """OpenCV finds most markers and drops all corners."""
     board, lens = parse_board("charuco:31x16:49.33mm:38.46mm:4x4_250"), (-0.312, 0.127, 0.0, 0.0, -0.027)
     wide = camera(574.0, (800, 1280), lens=lens)
-    where = pose(board, (tilt, 0.0, 0.0), 0.95)
+    where = pose(board, (tilt, 0.0, 0.0), 0.75)
     grey = photograph(wide, where, board, rays=fine_rays(wide))
     detector = cv2.aruco.CharucoDetector(board.opencv)
-    assert detector.detectBoard(grey)[1] is None or tilt > 0
-    found = detect(grey, board)
+    found, by_opencv = detect(grey, board), detector.detectBoard(grey)[1]
+    assert tilt > 0 or by_opencv is None or len(by_opencv) < len(found.ids) / 2
     ground_truth = wide.project(where.apply(torch.from_numpy(board.points[found.ids]))).x.numpy()
     off = np.linalg.norm(found.x - ground_truth, axis=1)
     assert len(found.ids) > 150
@@ -140,7 +140,7 @@ def test_another_board_is_named(shown, asked, words):
 def test_a_board_that_other_images_confirm_is_not_doubted():
     grey, board = image("charuco:8x6:30mm", depth=0.09)
     assert detect(grey, board) is None
-    assert "size" in explain([grey], board)
+    assert "name" in explain([grey], board)
     for shown in (board, parse_board("chessboard:9x6:25mm")):
         assert not {"size", "name"} & {*explain([grey], shown, confirmed=True).replace("?", " ").split()}
 

@@ -76,7 +76,7 @@ def test_depth_that_points_do_not_determine_stays():
 def test_what_is_kept_is_named_alike_by_any_basis():
     """A name for each combination, whichever of them span what is kept."""
     _, bad = small_drift()
-    problem = RefinementProblem.of(bad, ["rotation", "centre", "focal"], frames=[seen_points(bad)])
+    problem = RefinementProblem.from_frames(bad, ["rotation", "centre", "focal"], frames=[seen_points(bad)])
     solution, g = problem.solve_freely(), torch.Generator().manual_seed(0)
     root = torch.linalg.cholesky(solution.covariance[solution.active][:, solution.active])
     basis = torch.linalg.qr(torch.randn(root.shape, generator=g, dtype=torch.float64)).Q[:, 4:]
@@ -153,7 +153,11 @@ def test_several_frames_hold_a_whole_one_out():
     found = refine_matches(drawn(rig), frames, force=True)
     assert found.held_out[0].points == 100
     assert (
-        sum(len(m.alpha) for m in RefinementProblem.of(rig, ["rotation"], frames=frames).used.values()) == 200
+        sum(
+            len(m.alpha)
+            for m in RefinementProblem.from_frames(rig, ["rotation"], frames=frames).used.values()
+        )
+        == 200
     )
     assert found.accepted
 
@@ -188,7 +192,7 @@ def test_a_refusal_says_what_else_to_free():
     rig = unlike_pair()
     bad, points = rig.perturbed({"second.centre": vector(0, 8, 0)[:2]}), seen_points(rig, count=200)
     for free, advice in ((["rotation"], "free "), (["rotation", "centre"], "")):
-        problem = RefinementProblem.of(bad, free, frames=[points])
+        problem = RefinementProblem.from_frames(bad, free, frames=[points])
         solution = problem.solve()
         refused = problem.report(solution._replace(z=torch.zeros_like(solution.z))).objections[0]
         assert advice in refused
@@ -247,7 +251,9 @@ def test_deviations_are_those_of_repeated_draws():
         g = torch.Generator().manual_seed(seed)
         z = 0.7 * torch.randn(sum(len(u.sigma) for u in parameters), generator=g, dtype=torch.float64)
         bad = apply_change(rig, parameters, -z)
-        fit = RefinementProblem.of(bad, ["right.rotation"], frames=[seen_points(rig, noise=0.2, seed=seed)])
+        fit = RefinementProblem.from_frames(
+            bad, ["right.rotation"], frames=[seen_points(rig, noise=0.2, seed=seed)]
+        )
         found = fit.solve()
         errors.append((found.full[:3] - z[:3]) / found.covariance.diagonal()[:3].sqrt())
     rms = torch.stack(errors).square().mean(0).sqrt()
@@ -302,7 +308,7 @@ def test_a_fundamental_matrix_is_refined():
 def test_photometric_error_is_least_for_the_true_rig():
     rig, images = rectified_pair(), rectified_images()
     rig = rig.replace(depth=(2.5, 6.5))
-    views = {name: PhotometricImage.of(image) for name, image in images.items()}
+    views = {name: PhotometricImage.from_image(image) for name, image in images.items()}
 
     def error(pixels):
         moved = rig.perturbed({"right.centre": vector(0, pixels)})
@@ -348,7 +354,7 @@ def test_photometric_error_alone_refines_a_rig():
     """No point is used: the gradient through attention's segments moves the rig."""
     rig, images = rectified_pair().replace(depth=(2.5, 6.5)), rectified_images()
     bad = rig.perturbed({"right.rotation": vector(0.004, 0, 0.002)})
-    fit = RefinementProblem.of(bad, ["right.rotation"], frames=[match_cameras(images)])
+    fit = RefinementProblem.from_frames(bad, ["right.rotation"], frames=[match_cameras(images)])
     ground_truth = seen_points(rig, near=3.0, far=5.5, noise=0.0)
     before = median_off(fit.rig, ground_truth)
     found, errors = polish(fit, uninformed(fit), [images], attend_with_statistics)
