@@ -9,6 +9,7 @@ import re
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -163,16 +164,9 @@ def array_from_images(
         sensors = {name: Sensor({1: "mono", 3: "rgb"}.get(len(images[name]))) for name in names}
         recorded = rig = _with_sensors(rig, sensors)
     else:
-        try:
-            if given is not None:
-                raise ValueError("matches are given")
-            rig, names = _translated_rig(tagged, images, alpha, note)
-        except (ValueError, LinAlgError) as error:
-            why = "too little parallax" if isinstance(error, LinAlgError) else str(error).partition(":")[0]
-            note(f"no depth ({why}): maps between the bands by matched points")
-            like = tagged[alpha].sensor
-            others = ({n: read_view(tagged, n, one[n], like=like) for n in images} for one in further)
-            rig, names = _mapped_rig(tagged, [images, *others], alpha, note, given)
+        like = tagged[alpha].sensor
+        others = ({n: read_view(tagged, n, one[n], like=like) for n in images} for one in further)
+        rig, names = _rig_of_bands(tagged, images, others, alpha, note, given)
         recorded = _with_sensors(rig, {name: tagged[name].sensor for name in names})
     images = {name: images[name] for name in names}
     weights = weights or _weights_of(images, alpha)
@@ -279,6 +273,31 @@ def _tagged_rig(files: Mapping[str, Path], note: Say) -> Rig | None:
     return rig
 
 
+def _rig_of_bands(
+    tagged: Rig, images: Images, further: Iterable[Images], alpha: str, note: Say, given: Pairs | None
+) -> tuple[Rig, list[str]]:
+    """Rig of tags with translations where images have parallax, else with maps by all captures' points; and
+    the cameras that match, alpha first."""
+    translated, why = None, "matches are given"
+    if given is None:
+        try:
+            translated = _translated_rig(tagged, images, alpha, note)
+            if translated[0].name != OPEN:
+                return translated
+            why = "the cameras' orientations alone explain the points"
+        except LinAlgError:
+            why = "too little parallax"
+        except ValueError as error:
+            why = str(error).partition(":")[0]
+    note(f"no depth ({why}): maps between the bands by matched points")
+    try:
+        return _mapped_rig(tagged, chain([images], further), alpha, note, given)
+    except ValueError:
+        if translated is None:
+            raise
+        return translated
+
+
 @stage()
 def _translated_rig(tagged: Rig, images: Images, alpha: str, note: Say) -> tuple[Rig, list[str]]:
     """Rig of tags with translations and depths from the images, and the cameras that match, alpha first."""
@@ -297,7 +316,7 @@ def _translated_rig(tagged: Rig, images: Images, alpha: str, note: Say) -> tuple
     note(f"depths are multiples of the baseline {alpha} to {translated.betas(alpha)[0]}")
     rig, names = developed_rig(tagged, images), [alpha, *translated.betas(alpha)]
     cameras = {name: rig[name].replace(cam_from_world=translated[name].cam_from_world) for name in names}
-    return Rig(cameras, depth=translated.depth, name=UNSCALED), names
+    return Rig(cameras, depth=translated.depth, name=translated.name or UNSCALED), names
 
 
 def _mapped_rig(
