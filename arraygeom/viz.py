@@ -340,7 +340,7 @@ def draw_residuals(
         ValueError: if neither calibration nor F is known.
         ImportError: without matplotlib.
     """
-    with needs("drawing"):
+    with needs("plots", "drawing"):
         from matplotlib.collections import LineCollection
     line = epipolar_lines(pair.fundamental.to(x_alpha.dtype), x_alpha)
     distance = epipolar_distance(pair.fundamental.to(x_alpha.dtype), x_alpha, x_beta)
@@ -381,7 +381,7 @@ def new_figure(**options: Any) -> Figure:
     Raises:
         ImportError: without matplotlib.
     """
-    with needs("drawing"):
+    with needs("plots", "drawing"):
         from matplotlib.figure import Figure
     return Figure(**options)
 

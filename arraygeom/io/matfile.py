@@ -47,7 +47,7 @@ def load_variables(source: RigSource) -> dict[str, Any]:
         raise source.fail(None, "is empty")
     if data.startswith(b"MATLAB 7.3"):
         raise source.fail(None, "is a version 7.3 .mat file: save it with save(..., '-v7')")
-    with needs("reading .mat files"):
+    with needs("calibration", "reading .mat files"):
         from scipy.io import loadmat
     try:
         loaded = loadmat(BytesIO(data), simplify_cells=True, variable_names=readable_variables(data))

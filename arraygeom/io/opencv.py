@@ -171,7 +171,7 @@ def _nodes(source: RigSource) -> dict[str, Any]:
         RigFileError: for a file that OpenCV cannot read.
     """
     text = source.text(LARGEST_TEXT)
-    with needs("reading OpenCV's files"):
+    with needs("calibration", "reading OpenCV's files"):
         import cv2
     _check_nesting(source, text)
     try:

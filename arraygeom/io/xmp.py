@@ -442,7 +442,7 @@ def image_tags(path: Path) -> ImageTags | None:
     xmp = _xmp(path.read_bytes())
     if not xmp:
         return None
-    with needs("reading images' tags"):
+    with needs("calibration", "reading images' tags"):
         from PIL import Image
     try:
         with Image.open(path, formats=("TIFF", "JPEG")) as image:

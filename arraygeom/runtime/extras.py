@@ -9,32 +9,29 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-PACKAGES = {
-    "PIL": "pillow",
-    "cv2": "opencv-contrib-python-headless",
-    "skimage": "scikit-image",
-    "yaml": "PyYAML",
-}
-"""Packages whose names differ from those of their modules."""
 
+def install_line(module: str, extra: str) -> str:
+    """Return the shell line that installs an optional module, with a checkout and without.
 
-def install(module: str) -> str:
-    """Return the command that installs a module's package, be this project a checkout or installed."""
-    return f"pip install {PACKAGES.get(module, module.replace('_', '-'))}"
+    It names the module's own package: arraygeom-pat is on no index.
+    """
+    packages = {"cv2": "opencv-contrib-python-headless"}
+    package = packages.get(module, module.replace("_", "-"))
+    return f"pip install {package}, or in a checkout: pip install '.[{extra}]'"
 
 
 @contextmanager
-def needs(purpose: str) -> Iterator[None]:
+def needs(extra: str, purpose: str) -> Iterator[None]:
     """Context manager for the import of an optional module.
 
     Raises:
-        ImportError: in one line that says what to install, if the import fails.
+        ImportError: in one line that names the extra to install, if the import fails.
     """
     try:
         yield
     except ImportError as error:
         module = (error.name or str(error)).partition(".")[0]
-        raise ImportError(f"{purpose} needs {module}: {install(module)}", name=error.name) from error
+        raise ImportError(f"{purpose} needs {module}: {install_line(module, extra)}") from error
 
 
 def imported(name: str, what: str) -> Any:

@@ -194,11 +194,12 @@ def _charuco(grey: Grey, board: Charuco) -> Detection | None:
 def _between_markers(seen: Mapping[int, np.ndarray], board: Charuco) -> Detection:
     """Return the corners between two markers, by the homography of these two alone, if it fits them."""
     layout = board.opencv
-    squares = {int(n): p[:, :2] for n, p in zip(layout.getIds().reshape(-1), layout.getObjPoints())}
+    points = np.asarray(layout.getObjPoints())[..., :2]
+    squares = dict(zip(np.asarray(layout.getIds()).reshape(-1).tolist(), points))
     known = [n for n in squares if n in seen]
     middles = np.array([squares[n].mean(0) for n in known]).reshape(-1, 2)
     ids, x = [], []
-    for i, corner in enumerate(layout.getChessboardCorners()[:, :2]):
+    for i, corner in enumerate(np.asarray(layout.getChessboardCorners())[:, :2]):
         beside = np.flatnonzero(np.linalg.norm(middles - corner, axis=-1) < board.spacing)
         if len(beside) != 2:
             continue

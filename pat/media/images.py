@@ -22,7 +22,7 @@ from torch import Tensor
 
 from arraygeom.runtime.atomic import write_atomically
 from arraygeom.runtime.chunks import ROWS, spans
-from arraygeom.runtime.extras import install
+from arraygeom.runtime.extras import install_line
 from arraygeom.runtime.image_bytes import (
     JPEG,
     MINISBLACK,
@@ -201,7 +201,7 @@ def has_many_bits(path: Path) -> bool:
 
 def _png_of_heif(path: Path, label: str, hw: HW | None) -> bytes:
     """Convert a HEIC or HEIF file to the bytes of a PNG, upright; its size is compared before decoding."""
-    pillow_heif = _optional("pillow_heif", f"{label}: reading HEIC", ", or save it as PNG")
+    pillow_heif = _of_extra("pillow_heif", "heic", f"{label}: reading HEIC", ", or save it as PNG")
     problem = f"{label}: not a HEIC image that can be read (%s): save it as PNG"
     try:
         stored = pillow_heif.open_heif(path, convert_hdr_to_8bit=True)
@@ -217,7 +217,7 @@ def _png_of_heif(path: Path, label: str, hw: HW | None) -> bytes:
 
 def _png_of_raw(path: Path, label: str) -> bytes:
     """Develop a camera's raw file to the bytes of a PNG: 16-bit sRGB, the camera's white balance, upright."""
-    rawpy = _optional("rawpy", f"{label}: reading raw files", ", or save it as TIFF")
+    rawpy = _of_extra("rawpy", "raw", f"{label}: reading raw files", ", or save it as TIFF")
     how = {"use_camera_wb": True, "no_auto_bright": True, "output_bps": 16, "gamma": (2.4, 12.92)}
     try:
         with rawpy.imread(str(path)) as raw:
@@ -422,17 +422,19 @@ def exr_writer(path: Path) -> Any:
         The module.
 
     Raises:
-        ValueError: naming the package, if it is not installed.
+        ValueError: naming the extra, if it is not installed.
     """
-    return _optional("OpenEXR", f"{path}: writing EXR")
+    return _of_extra("OpenEXR", "synthesis", f"{path}: writing EXR")
 
 
-def _optional(module: str, purpose: str, advice: str = "") -> Any:
+def _of_extra(module: str, extra: str, purpose: str, advice: str = "") -> Any:
     """Import an optional module. Raises ValueError with the command to install it."""
     try:
         return import_module(module)
     except ImportError:
-        raise ValueError(f"{purpose} needs the module {module}: {install(module)}{advice}") from None
+        package = module.replace("_", "-")
+        install = install_line(module, extra)
+        raise ValueError(f"{purpose} needs the package {package}: {install}{advice}") from None
 
 
 def _write_exr(path: Path, planes: NDArray, bits: int) -> None:

@@ -64,7 +64,7 @@ def check_video(rate: float) -> None:
         ImportError: without the extra `video`.
         ValueError: for a rate outside .001 to 1000 frames a second.
     """
-    with needs("writing video"):
+    with needs("video", "writing video"):
         import av  # noqa: F401
     if not 1e-3 <= rate <= 1e3:
         raise ValueError(f"a video of {rate:g} frames a second: give .001 to 1000")

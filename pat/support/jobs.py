@@ -309,7 +309,7 @@ def _on_dask(tasks: Sequence[Task], workers: Workers) -> Iterator[TaskOutcome]:
     """
     if not tasks:
         return
-    with needs("a scheduler"):
+    with needs("cluster", "a scheduler"):
         from distributed import Client, as_completed
     try:
         client = Client(workers.scheduler, timeout=20)

@@ -11,8 +11,6 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any, ClassVar, NoReturn
 
-from arraygeom.runtime.extras import install
-
 from ...support.folders import error_text
 from ...support.schema import near
 from . import align, batch, calibration, demo, fuse, rigs, sequence
@@ -121,7 +119,7 @@ def _run(arguments: list[str], group: Any, prog: str, *, debug: bool) -> None:
     except (ValueError, FloatingPointError) as error:
         _fail(error, _as_option(f"{error}", command), debug)
     except ImportError as error:
-        remedy = "" if "pip install" in f"{error}" or not error.name else f": {install(error.name)}"
+        remedy = "" if "pip install" in f"{error}" else ": in a checkout, pip install '.[all]'"
         _fail(error, f"{error}{remedy}", debug)
     except MemoryError as error:
         _fail(error, "out of memory: give smaller images, or --max-memory where there is one", debug)

@@ -15,7 +15,7 @@ from arraygeom.runtime.extras import needs
 from ...networks.paper import PAT
 from .page import GRID, MODULE, Explorer, opened
 
-with needs("the explorer in a notebook"):
+with needs("explore", "the explorer in a notebook"):
     import anywidget
     import traitlets
 

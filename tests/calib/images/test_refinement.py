@@ -60,7 +60,8 @@ def small_drift() -> tuple[Rig, Rig]:
 
 
 def test_depth_that_points_do_not_determine_stays():
-    """Rotation about the vertical hardly moves a line: what is determined returns, depth stays as it was."""
+    """Rotation about the vertical hardly moves a line: determined parameters return, depth keeps
+    its value."""
     rig, bad = small_drift()
     points = simulated_matches(rig, "narrow", np.random.default_rng(6))
     found = refine_matches(bad, [points])
@@ -174,7 +175,7 @@ def test_what_images_do_not_determine_is_unobservable_and_named():
 
 
 def test_translations_are_freed_where_points_demand_it():
-    """What no turn or shift of principal points explains; where they do, the baseline stays as it is."""
+    """Only points that no turn or shift of principal points explains change the baseline."""
     rig = unlike_pair()
     exact = seen_points(rig, noise=0.0, seed=1)
     moved = rig.perturbed({"second.translation": vector(0, 0.006, 0.012)})
@@ -188,7 +189,7 @@ def test_translations_are_freed_where_points_demand_it():
 
 
 def test_a_refusal_says_what_else_to_free():
-    """A rotation that stands for no shift of the principal point was refused without a word of the latter."""
+    """A rotation that stands in for a shift of the principal point is refused with that hint."""
     rig = unlike_pair()
     bad, points = rig.perturbed({"second.centre": vector(0, 8, 0)[:2]}), seen_points(rig, count=200)
     for free, advice in ((["rotation"], "free "), (["rotation", "centre"], "")):
@@ -209,7 +210,7 @@ def test_a_rig_of_unknown_scale_is_not_refined_in_millimetres():
 
 
 def test_units_of_length_do_not_matter():
-    """Depths and baselines were compared with a millionth of a metre."""
+    """No threshold is in metres."""
     rig, bad = small_drift()
     points = simulated_matches(rig, "narrow", np.random.default_rng(6))
     found = [refine_matches(bad.scaled(factor), [points]) for factor in (1.0, 1e-8, 1e8)]
@@ -242,7 +243,8 @@ def test_held_out_points_reject_a_fit_to_wrong_points():
 
 
 def test_deviations_are_those_of_repeated_draws():
-    """Of rigs that drifted in every parameter, by the prior: the error over the draws is the stated one."""
+    """Rigs that drifted in every parameter, by the prior: the error over the draws is the stated
+    deviation."""
     rig, errors = rectified_pair(), []
     parameters = free_parameters(
         rig, rig.names, free=["right.rotation", "right.translation", "*.focal", "*.centre"]
@@ -437,7 +439,7 @@ def test_depth_that_is_lost_counts_as_changed():
 
 
 def test_poses_do_not_stand_in_for_lenses():
-    """Wrong lenses were explained by other poses, which changed depth; no lens explains a rotation."""
+    """Wrong lenses are not explained by other poses, which would change depth."""
     g = np.random.default_rng([0, 2, 4])
     rig = simulated_rig("wide", 2, g)
     matches = simulated_matches(rig, "wide", g)
@@ -461,7 +463,7 @@ def test_poses_do_not_stand_in_for_lenses():
     ],
 )
 def test_depth_does_not_change_for_nothing(shared_data, name, kind, seed):
-    """Real pairs' depth changed by 2.3 % or more, 4 to 76 times its deviation's fall, and was worse."""
+    """Changes of depth by many times its deviation's fall are refused."""
     (pair,) = syntim(shared_data, (name,))
     matches = match_cameras(pair.images)
     rig = Rig({name: pair.rig[name] for name in pair.images})
