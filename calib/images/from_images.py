@@ -172,7 +172,8 @@ def usable_matches(matches: Pairs, *, alpha: str | None = None) -> dict[tuple[st
 def _registered(rig: Rig, matches: Pairs) -> UncalibratedRig:
     """Return the rig of views whose images a homography by a few points registers."""
     fitted = {names: link_of_points(rig, names, points) for names, points in matches.items()}
-    links, explained = ({names: parts[i] for names, parts in fitted.items()} for i in (0, 1))
+    links = {names: link for names, (link, _) in fitted.items()}
+    explained = {names: explanation for names, (_, explanation) in fitted.items()}
     fits = {names: FittedLink(link, matches[names], 0.0) for names, link in links.items()}
     rig = rig.replace(links=links, name=OPEN)
     return UncalibratedRig(rig, fits, {}, dict.fromkeys(links, False), explained, dict(matches))

@@ -29,7 +29,7 @@ from calib.images.focal_length import common_focal_length
 from calib.images.from_images import UncalibratedRig, link_of_points, rig_from_images, usable_matches
 from calib.images.known_intrinsics import centres_found
 from calib.images.lenses import describe_lenses
-from calib.images.matches import Pairs, PointMatches, match_cameras, undistort_matches
+from calib.images.matches import Pairs, PointMatches, image_sizes, match_cameras, undistort_matches
 from calib.images.self_calibration import RefinedPair, joined, refined_by_depth, self_calibrated
 
 from ..fusion.dense_matches import MatchedDepth, matched_depth
@@ -142,7 +142,7 @@ def array_from_images(
         raise ValueError("focal: the images' tags state the focal lengths: leave it out")
     for name in files:
         images[name] = read_image(files[name], name=name)
-    sizes = {name: image.shape[-2:] for name, image in images.items()}
+    sizes = image_sizes(images)
     given = (
         None
         if matches is None
@@ -399,8 +399,8 @@ def found_rig(
     reduced = {name: scaled(image, factors[name]) for name, image in images.items()}
     lengths = {name: length * factors[name] for name, length in focal.items()}
     if given is not None:
-        resized = {name: resize_matrix(images[name].shape[-2:], reduced[name].shape[-2:]) for name in images}
-        given = _moved(given, resized)
+        old, new = image_sizes(images), image_sizes(reduced)
+        given = _moved(given, {name: resize_matrix(old[name], new[name]) for name in images})
     with part(0, LINES):
         uncalibrated = rig_from_images(reduced, focal=lengths, alpha=alpha, matches=given)
     betas = [name for name in images if (alpha, name) in uncalibrated.rig.links]

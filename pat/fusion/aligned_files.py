@@ -112,7 +112,7 @@ def _files(
 ) -> list[tuple[Any, ...]]:
     """Name of each file of an alignment, the function that writes it, and what that is given."""
     called = file_names(aligned)
-    tags = None if recorded is None else recorded_tags(recorded.files[aligned.alpha])
+    tags = None if recorded is None else recorded_tags(Path(recorded.files[aligned.alpha]))
     facts = {name: [_of_sensor(recorded, name)] * len(view.bands) for name, view in aligned.items()}
     files: list[tuple[Any, ...]] = [("visibility.txt", write_text, _shares(aligned))]
     if np.isfinite(aligned.depth).any():

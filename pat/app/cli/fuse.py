@@ -122,7 +122,7 @@ class Fuse(Around, Fusing):
                 rig, images = found.rig, found.images
             fused, along = self._fused(rig, images, frame)
             fused, gain = self._exposed(fused, found)
-            if found is None and not fused.depth.isfinite().any():
+            if not fused.depth.isfinite().any():
                 self.note(no_depth(rig, alpha))
             further, pages = self._options_of_saving(fused, rig, frame), {}
             if {"page", "classical"} & self._extras:
@@ -235,9 +235,11 @@ class Fuse(Around, Fusing):
 
 def no_depth(rig: Rig, alpha: str) -> str:
     """Say why a fused frame has no depth."""
+    from arraygeom.runtime.text import OPEN
+
     pairs = [rig.pair(alpha, name) for name in rig.betas(alpha)]
-    if all(pair.at_one_place for pair in pairs):
-        return "no depth: the cameras are at one place, registered by a homography"
+    if rig.name == OPEN or all(pair.at_one_place for pair in pairs):
+        return "no depth: a homography registers the images (cameras at one place, or a far or flat scene)"
     by_lines = "the rig knows its cameras by F alone" if not any(p.calibrated for p in pairs) else ""
     return f"no depth: {by_lines or 'the images match nowhere'}"
 
