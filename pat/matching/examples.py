@@ -24,11 +24,10 @@ class ExampleSettings:
     """Settings of the search for examples. Lengths are pixels of alpha."""
 
     neighbours: int = size(5, "Examples of a pixel; half or twice as many do as well")
-    scale: float = tuned(12.0, "Middlebury, tune half: weight of brightness, its means and its deviations")
     radii: tuple[int, int] = size((2, 6), "Radii of the windows of means and deviations")
     place: tuple[float, float] = tuned(
-        (100.0, 150.0),
-        "Middlebury, tune half: pixels whose distance counts as much as a feature that differs by 1, across "
+        (1200.0, 1800.0),
+        "Middlebury, tune half: pixels whose distance counts as much as black beside white, across "
         "the searched segments and along them: what is occluded is long across",
     )
     seen: float = size(0.5, "Weight above which a pixel counts as seen")
@@ -88,13 +87,12 @@ def _features(alpha: Plane, directions: Float[NDArray, "2 2"]) -> Iterator[Plane
     """Brightness, its means and standard deviations in windows, and place, scaled so that distances compare,
     of every second pixel."""
     alpha = np.ascontiguousarray(alpha, np.float32)
-    scale = np.float32(SETTINGS.scale)
-    yield scale * alpha[EVERY]
+    yield alpha[EVERY]
     for radius in SETTINGS.radii:
         side = (2 * radius + 1,) * 2
         mean, square = cv2.boxFilter(alpha, -1, side), cv2.boxFilter(alpha * alpha, -1, side)
-        yield scale * mean[EVERY]
-        yield scale * np.sqrt(np.maximum(square - mean * mean, 0))[EVERY]
+        yield mean[EVERY]
+        yield np.sqrt(np.maximum(square - mean * mean, 0))[EVERY]
     across, along = (1 / pixels**2 for pixels in SETTINGS.place)
     metric = across * np.eye(2) + (along - across) * directions
     rows, columns = 2 * np.indices(alpha[EVERY].shape, dtype=np.float32)
