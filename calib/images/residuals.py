@@ -237,7 +237,7 @@ def lines_basis(pair: Pair, matches: PointMatches) -> Float[Tensor, "n 8"]:
 
 
 def related(rig: Rig, pairs: Pairs) -> dict[tuple[str, str], PointMatches]:
-    """Select those of the pairs whose lines the rig knows: calibrated ones not at one place, those with an F.
+    """Select those of the pairs that the rig relates: calibrated ones and those with an F.
 
     Returns:
         Matches by pair of names.
@@ -248,12 +248,11 @@ def related(rig: Rig, pairs: Pairs) -> dict[tuple[str, str], PointMatches]:
     relations = {
         names: m
         for names, m in pairs.items()
-        if ((pair := rig.pair(*names)).calibrated or pair.link is not None) and not pair.at_one_place
+        if (pair := rig.pair(*names)).calibrated or pair.link is not None
     }
     if not relations:
         raise ValueError(
-            "the rig knows no lines between these cameras, or they are at one place: calibrate them, or make "
-            "a rig with `pat rig start`"
+            "the rig does not relate these cameras: calibrate them, or make a rig with `pat rig start`"
         )
     return relations
 

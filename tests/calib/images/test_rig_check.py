@@ -61,6 +61,14 @@ def test_cameras_at_one_position_are_named():
     )
 
 
+def test_cameras_that_are_at_one_place_are_no_misfit():
+    """Every point was called behind the cameras, and the rotation in radians."""
+    one, image = rectified_pair()["left"], rectified_images()["left"]
+    rig = Rig({"left": one, "right": one.crop(0, 6, (one.hw[0], one.hw[1] - 6))})
+    assert rig.pair("left", "right").at_one_place
+    assert find_misfit(rig, {"left": image, "right": image[..., 6:]}) is None
+
+
 def test_a_depth_range_without_the_scene_is_named_with_the_scenes_depth():
     rig, images = rectified_pair(), rectified_images()
     for depth, units in ((15.0, 20.0), False), ((200.0, 300.0), True):
