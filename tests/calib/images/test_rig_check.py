@@ -8,7 +8,7 @@ import sys
 import pytest
 import torch
 
-from arraygeom import Pose
+from arraygeom import Pose, Rig
 from calib.images import rig_check
 from calib.images.depth_change import share_outside
 from calib.images.matches import PointMatches, match_cameras
