@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 from torch import Tensor
 
 from arraygeom import Link, Pair, Rig, apply_homography, epipolar_distance, epipolar_lines, triangulate
@@ -437,6 +436,8 @@ def fit_homography(matches: PointMatches) -> Float[Tensor, "3 3"]:
     Raises:
         ValueError: for fewer than `FEWEST` points, and for points in one spot.
     """
+    from scipy.optimize import least_squares  # here, as it takes long to import
+
     if len(matches.alpha) < FEWEST:
         raise ValueError(
             f"only {len(matches.alpha)} points are given for two images: give {FEWEST} or more; {ENOUGH} say "
