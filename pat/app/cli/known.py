@@ -151,7 +151,7 @@ class Known:
                 say=say,
             )
         if weights is None:
-            say(f"weights: {array.weights} (--weights NAME takes others)")
+            say(f"network: {array.weights} (--network NAME takes others)")
         self.match_levels |= array.match_levels
         return array
 
