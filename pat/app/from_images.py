@@ -416,7 +416,7 @@ def found_rig(
             f"{name}: focal length {length / factors[name]:.0f} pixels +- {deviation:.0%}, by matched points"
         )
     lengths |= {name: length for name, (length, _) in observed.items()}
-    rig = _calibrated(uncalibrated, reduced, alpha, betas, lengths, bands, note, dense=given is None)
+    rig = _calibrated(uncalibrated, reduced, alpha, betas, lengths, bands, note, given is None)
     if rig.name == UNSCALED and known != {alpha, *betas}:
         rig = rig.replace(name=ASSUMED)
     return resized_rig(rig, images), [alpha, *betas]
@@ -452,7 +452,6 @@ def _calibrated(
     focal: Mapping[str, float],
     bands: int | None,
     note: Say,
-    *,
     dense: bool,
 ) -> Rig:
     """Rig of alpha and these betas, each pair calibrated and refined by dense matches at reduced size; or
