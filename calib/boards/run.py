@@ -25,7 +25,7 @@ from .detect import BoardViews, DetectedImage, Detection, Progress, board_views,
 from .intrinsics import Lens
 from .photos import FrameKey, Grey, Photos, find_photos
 from .poses import StartDeviations
-from .report import by_cameras, html_page, report_html, summary
+from .report import by_cameras, html_page, report_html, summary, verdict
 from .rig import Calibration, calibrate
 from .target import parse_boards
 from .uncertainty import intrinsics_of, rig_covariance
@@ -41,7 +41,7 @@ class CalibrationOutput(NamedTuple):
     """Output of a calibration.
 
     Attributes:
-        messages: summary and notes.
+        messages: verdict, summary and notes.
         written: files written.
     """
 
@@ -93,7 +93,7 @@ def calibrate_photos(
     nominal = None if start is None else Rig.load(start)
     if nominal is not None:
         if lens == "auto":
-            raise ValueError("--lens auto compares lenses on held-out frames: with --start name one")
+            raise ValueError("lens: auto compares lenses on held-out frames: with a start name one")
         named = {name: f"{glob.escape(name)}.*" for name in nominal.names}
         if not patterns and all(any(photos.glob(pattern)) for pattern in named.values()):
             patterns = named  # a file called like each camera
@@ -115,7 +115,10 @@ def calibrate_photos(
         if covariance is not None:
             covariance.save(folder / written[1].name, rig)
         rig.save(folder / out.name)
-    return CalibrationOutput([summary(calibration), *notes], [path for path in written if path.exists()])
+    return CalibrationOutput(
+        [*filter(None, [verdict(calibration)]), summary(calibration), *notes],
+        [path for path in written if path.exists()],
+    )
 
 
 # While images are taken -------------------------------------------------------------------------------------
