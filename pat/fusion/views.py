@@ -34,6 +34,7 @@ from arraygeom.runtime.warned import warn
 from ..media.colour import luminance_of as grey
 from ..media.images import Images, read_image
 from ..media.raw import develop, developed_rig, recorded_bands
+from ..support.memory import check_limit
 
 T = TypeVar("T")
 Fields = Mapping[str, ReceptiveField | None]
@@ -273,11 +274,12 @@ class FilesOfCameras(Mapping[str, T]):
 class ViewFiles(FilesOfCameras[Tensor]):
     """An image file of each camera, read and developed when asked for; kept if it is small (`KEPT`).
 
-    Asking raises as `read_view` does.
+    Asking raises as `read_view` does; making it, as `check_limit` does by alpha's size.
     """
 
     def __init__(self, rig: Rig, files: Mapping[str, str | Path], *, alpha: str) -> None:
         super().__init__(rig, files)
+        check_limit(math.prod(rig[alpha].hw))
         self.alpha, self.like = alpha, rig[alpha].sensor
         self._kept: dict[str, Tensor] = {}
 

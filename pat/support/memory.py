@@ -65,6 +65,26 @@ def give_back() -> None:
             trim(0)
 
 
+LIBRARIES = 0.46 * 2**30
+"""What Python, torch and the compiled loops take, bytes (430 MiB were measured)."""
+SLACK = 1.05
+"""What a process may take over what is counted: freed blocks smaller than a page cannot be returned."""
+LEAST_BYTES, LEAST_MATCHED = 81.0, 110.0
+"""For each pixel of alpha, whatever the network and tiles: its image, its frame, and writing that; or its
+image, field, matches and filling, where networks use matches (plans were from 151)."""
+
+
+def check_limit(pixels: int, limit: float | None = None, each: float = LEAST_BYTES) -> None:
+    """Raise ValueError if no frame of so many pixels is fused within a limit (bytes; by default that of
+    `limited`), as is known before anything is read."""
+    limit = limit or _LIMIT.get() or math.inf
+    if (needed := SLACK * (LIBRARIES + each * pixels)) > limit:
+        raise ValueError(
+            f"max_memory is {limit / 2**20:.0f} MiB; a frame of {pixels / 1e6:.1f} megapixels needs at least "
+            f"{needed / 2**20:.0f} MiB: allow more, or reduce the images"
+        )
+
+
 ROOM = 0.96
 """The part of a limit up to which tasks at once may fill it."""
 _LIMIT: ContextVar[float | None] = ContextVar("limit", default=None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -101,9 +102,13 @@ class Known:
         focal: Mapping[str, float] = {},
     ) -> ImageArray:
         """The array that each camera's first image says, whose levels are then taken."""
+        from ...media.headers import image_header
+        from ...support.memory import check_limit
         from ..from_images import array_from_images
 
         first = {name: paths[0] for name, paths in files.items()}
+        headers = [image_header(path.read_bytes()) for path in first.values()]
+        check_limit(min((math.prod(header.hw) for header in headers if header), default=0))
         options.say_when_compiling()
         with options.working("finding the rig"):
             array = array_from_images(first, alpha=self.alpha, weights=weights, focal=focal, say=say)

@@ -2,6 +2,8 @@
 
 import warnings
 
+import cv2
+import numpy as np
 import pytest
 import torch
 
@@ -78,6 +80,36 @@ def test_a_dense_field_that_does_not_fit_is_refused_before_the_work():
     for settings in (FuseSettings(field=Dense()), FuseSettings(field=Dense(), max_memory="4GiB")):
         with pytest.raises(ValueError, match=r"dense field .*GiB"):
             fuse(images, wide, alpha="mono", network=load_weights("mono-colour"), settings=settings)
+
+
+class Unread(dict):
+    """Images that nobody may ask for."""
+
+    def __getitem__(self, name):
+        raise AssertionError(f"{name} was read")
+
+
+@pytest.mark.parametrize("limit", ["1GiB", "2GiB"])
+def test_a_limit_that_cannot_be_kept_is_known_from_the_sizes(limit, tmp_path, refusal):
+    """24 megapixels were refused once 2.4 GiB were taken."""
+    large = Rig({name: View(hw=(4000, 6000)) for name in ("mono", "colour")})
+    with pytest.raises(ValueError, match=r"max_memory.*24\.0 megapixels"):
+        fuse(
+            Unread(mono=None, colour=None),
+            large,
+            alpha="mono",
+            network=load_weights("mono-colour"),
+            settings=FuseSettings(max_memory=limit),
+        )
+    for name in ("mono", "colour"):
+        cv2.imwrite(str(tmp_path / f"{name}.png"), np.full((4000, 6000), ord(name[0]), np.uint8))
+    large.save(tmp_path / "rig.yaml")
+    files = [str(tmp_path / f"{name}.png") for name in ("mono", "colour")]
+    out = ["--out", str(tmp_path / "out"), "--max-memory", limit]
+    assert "24.0 megapixels" in refusal("fuse", *files, *out)
+    rig_and_files = [str(tmp_path / "rig.yaml"), *files, "--alpha", "mono", *out]
+    for command in ("fuse", "align", "batch"):
+        assert "24.0 megapixels" in refusal(command, *rig_and_files)
 
 
 @pytest.mark.parametrize("text", ["1,1,1", "0.1,0.1,0.1", "30,59,11", "nan,1,0"])
