@@ -22,8 +22,8 @@ from .low_light import shown_noise
 
 LOW_CONFIDENCE, LOW_SHARE = 0.5, 0.25
 """One is warned below this mean confidence, where all views overlap, or where more of it has under a half of
-that. Of ten of Middlebury's pairs with the right rig .66 to .84, up to 17 %; of six with a black third,
-with every other row from elsewhere or in other light, .16 to .48 and from 22 %, but for one (.56 and 14 %)."""
+that. Of ten of Middlebury's pairs with the right rig .66 to .84, up to 17 %; of six with a black third, with
+every other row shifted or in other light, .16 to .48 and from 22 %, but for one (.56 and 14 %)."""
 UNFIT_CONFIDENCE = 0.16
 """The mean below which a rig is taken for wrong.
 

@@ -1,6 +1,7 @@
 """`--around` of fuse, align and the rig commands, on a wall with a post before it."""
 
 import re
+from contextlib import suppress
 
 import cv2
 import numpy as np
@@ -69,6 +70,15 @@ def test_a_depth_map_is_taken_as_it_is(folder, file):
     known = np.isfinite(found)
     assert known.mean() > 0.8
     assert np.abs(found - true)[known].max() < 1e-2
+
+
+def test_a_depth_map_that_matched_points_contradict_is_said(folder, capsys):
+    depth = tifffile.imread(folder / "depth.tif")
+    tifffile.imwrite(folder / "other.tif", np.where(depth == WALL, POST, WALL).astype(np.float32))
+    for file, contradicted in (("depth.tif", False), ("other.tif", True)):
+        with suppress(SystemExit):  # status 3: the images do not match there
+            run(folder, "align", f"--around {{}}/{file}")
+        assert bool(re.search(rf"{file}: \d+% of the points", capsys.readouterr().err)) == contradicted
 
 
 def test_what_the_post_hides_is_occluded(folder):
@@ -153,4 +163,4 @@ def test_a_large_depth_map_in_another_unit_is_told_what_it_holds(folder, monkeyp
     monkeypatch.setattr("pat.media.depth_maps.read_depth", lambda *_, **__: torch.full((4097, 4097), 1e4))
     rig = Rig.load(folder / "rig.yaml")
     with pytest.raises(ValueError, match=r"holds 1e\+04 to 1e\+04 m, the rig's depth range"):
-        Around(around="large.tif").with_known(rig, rig.names[0], {}, None)
+        Around(around="large.tif").with_known({}, rig, rig.names[0], {}, None)
