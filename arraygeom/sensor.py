@@ -36,6 +36,11 @@ class Curve:
 
 PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
 """Colour filter patterns: the first two pixels of the first row, then of the second."""
+RESPONSES = (
+    *("mono", "rgb", "red", "green", "blue", "red edge", "nir", "swir", "thermal"),
+    "luminance of light",  # of developed images: pat.media.raw.LIGHT
+)
+"""Names of spectral responses."""
 CODINGS = ("srgb", "linear")
 
 
@@ -43,7 +48,7 @@ CODINGS = ("srgb", "linear")
 class Sensor:
     """Facts about a camera that geometry does not use.
 
-    `response` is a name ("mono", "rgb", "nir"), a band or a curve. `frame_rate` is in frames a second,
+    `response` is a name (of `RESPONSES`), a band or a curve. `frame_rate` is in frames a second,
     `time_offset` in seconds after the rig's clock. `coding` says how pixel values relate to light:
     "srgb" or "linear". `bayer` is the colour filter pattern from the top left ("RGGB"), for raw images.
 
@@ -70,9 +75,11 @@ class Sensor:
             check_above(0, itself=False, gain=gain)
         check_above(1, whole=True, bits=self.bits)
         check_above(0, black_level=self.black_level)
+        stated = None if isinstance(self.response, Band | Curve) else self.response
         for name, value, allowed in (
             ("coding", self.coding, CODINGS),
             ("bayer", self.bayer, (None, *PATTERNS)),
+            ("response", stated, (None, *RESPONSES)),
         ):
             if value not in allowed:
                 raise ValueError(f"{name} is {value!r}: wanted {' or '.join(repr(v) for v in allowed if v)}")

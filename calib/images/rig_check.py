@@ -89,8 +89,8 @@ def find_misfit(rig: Rig, images: Images) -> Misfit | None:
 def share_unlike(
     rig: Rig, images: Images, alpha: str, depth: Float[Tensor, "h w"], tolerance: float
 ) -> float:
-    """The share of points matched with `alpha`'s image, of observable depth, at which a depth map of its pixels
-    is off by more than a tolerance, relative to depth; NaN for few points."""
+    """The share of points matched with `alpha`'s image, of observable depth, at which a depth map of its
+    pixels is off by more than a tolerance, relative to depth; NaN for few points."""
     if (matched := _matched(rig, {alpha: images[alpha], **images}, LARGEST_SIDE)) is None:
         return math.nan
     rig, pairs = matched

@@ -18,7 +18,7 @@ from calib.images.rig_check import OUTSIDE, find_misfit
 from calib.images.self_calibration import depth_bounds
 
 from ..fusion.checks import LowConfidenceWarning
-from ..fusion.views import ViewFiles
+from ..fusion.views import ViewFiles, check_exposures
 from ..support.settings import size
 from .from_images import MATCHED, resized_rig, scaled
 
@@ -52,6 +52,7 @@ def checked_rig(views: ViewFiles, *, heal: bool) -> Healed | None:
     """
     try:
         images = dict(views)
+        check_exposures(views.rig, images, views.alpha)
         misfit = find_misfit(views.developed, images)
     except (ValueError, OSError):  # of a file or an image: the fusion says so
         return None

@@ -31,7 +31,7 @@ def parse_bytes(amount: float | str) -> float:
         size = float(number) * units[unit]
     except (KeyError, ValueError):
         size = math.nan
-    if math.isnan(size):
+    if not 0 < size < math.inf:
         raise ValueError(f"max_memory is '{amount}'; wanted bytes, or like 4GiB or 500MB")
     return size
 

@@ -1,6 +1,7 @@
 """Data that contradict what is stated of them are named, and only these."""
 
 import warnings
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -10,8 +11,9 @@ import torch
 from arraygeom import Dense, Rig, Sensor, View
 from pat import FuseSettings, fuse
 from pat.app.cli.options import response_of
+from pat.app.sample_array import SAMPLE
 from pat.fusion.corrections import Corrections
-from pat.fusion.views import read_view
+from pat.fusion.views import ViewFiles, Views, read_view
 from pat.matching.radiometry import Response
 from pat.media.images import write_image
 from pat.networks.weights import load_weights
@@ -71,6 +73,45 @@ def test_fourteen_bits_in_sixteen_are_named(tmp_path):
             read_view(rig(), "a", tmp_path / "a.png")
             read_view(rig(bits=16), "a", tmp_path / "a.png")
         assert ["bits: 14" in str(warning.message) for warning in caught] == [True] * named
+
+
+def test_bits_that_the_counts_contradict_are_named(tmp_path):
+    """Cut off where a camera of 12 bits ends, and the rig says 14."""
+    image = (torch.linspace(0, 1.2, 600).reshape(1, 20, 30).clamp(max=1) * 4095 / 65535).double()
+    write_image(tmp_path / "a.png", image, bits=16)
+    for bits, named in ((12, False), (14, True), (16, True)):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            read_view(rig(bits=bits), "a", tmp_path / "a.png")
+        assert any("'bits'" in str(warning.message) for warning in caught) == named
+
+
+@pytest.mark.parametrize("text", ["RGB", "colour", "", 5])
+def test_a_response_is_a_name_that_is_known(text, tmp_path):
+    """RGB, in capitals, was a grey camera."""
+    with pytest.raises((ValueError, TypeError), match="response"):
+        Sensor(response=text)
+    (tmp_path / "rig.yaml").write_text(
+        f"format: arraygeom-rig 1\ncameras:\n  a: {{size: [4, 4], response: {text or repr('')}}}\n"
+    )
+    with pytest.raises(ValueError, match=r"rig\.yaml.*response"):
+        Rig.load(tmp_path / "rig.yaml")
+
+
+def test_exposures_in_another_unit_are_named():
+    """10 and 0.01 seconds: the rig was said not to fit the images."""
+    sample = Rig.load(SAMPLE / "rig.yaml")
+    for exposures, wrong in (((0.01, 0.01), False), ((10.0, 0.01), True), ((0.01, 10.0), True)):
+        stated = sample
+        for name, exposure in zip(sample.names, exposures):
+            sensor = replace(sample[name].sensor, exposure=exposure)
+            stated = stated.with_camera(name, sample[name].replace(sensor=sensor))
+        images = ViewFiles(stated, {n: SAMPLE / f"{n}.png" for n in sample.names}, alpha="mono")
+        if wrong:
+            with pytest.raises(ValueError, match="'exposure'"):
+                Views.of(stated, images, alpha="mono")
+        else:
+            Views.of(stated, images, alpha="mono")
 
 
 def test_a_dense_field_that_does_not_fit_is_refused_before_the_work():
