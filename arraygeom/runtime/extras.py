@@ -1,4 +1,4 @@
-"""Modules that only some users need, and those of users."""
+"""Import of optional modules, and of users' own code."""
 
 from __future__ import annotations
 
@@ -12,7 +12,11 @@ from typing import Any
 
 @contextmanager
 def needs(extra: str, purpose: str) -> Iterator[None]:
-    """Around an optional module's import: raises ImportError in one line that names the extra to install."""
+    """Context manager for the import of an optional module.
+
+    Raises:
+        ImportError: in one line that names the extra to install, if the import fails.
+    """
     try:
         yield
     except ImportError as error:
@@ -21,7 +25,17 @@ def needs(extra: str, purpose: str) -> Iterator[None]:
 
 
 def imported(name: str, what: str) -> Any:
-    """A user's "module:object", looked for from here too. Raises ValueError, which says what it was to be."""
+    """Import a user's "module:object", also from the current folder.
+
+    Args:
+        what: what it is, for messages.
+
+    Returns:
+        The object.
+
+    Raises:
+        ValueError: if it cannot be imported.
+    """
     module, _, attribute = name.partition(":")
     try:
         sys.path.insert(0, str(Path.cwd()))

@@ -1,4 +1,4 @@
-"""How much a TIFF strip in LZW holds: libtiff reports damage in it to a terminal, if at all."""
+"""Length of a TIFF strip in LZW: libtiff reports damage only to a terminal, if at all."""
 
 from __future__ import annotations
 
@@ -11,9 +11,13 @@ CLEAR, END = 256, 257
 
 @compiled(nogil=True, cache=True)
 def lzw_length(data):
-    """Bytes that LZW codes (uint8, the most significant bit first) stand for, up to their end.
+    """Count the bytes that LZW codes stand for, up to their end.
 
-    0 if a code is not in the table, or follows a full one.
+    Args:
+        data: codes (uint8), the most significant bit first.
+
+    Returns:
+        The length; 0 if a code is not in the table, or follows a full one.
     """
     lengths = np.ones(4096, np.int64)
     width, known, before, total, position = 9, END + 1, -1, 0, 0

@@ -51,9 +51,8 @@ def warn_of_confidence(network: FusionNetwork, frame: Frame, inputs: FrameInputs
     overlap = _overlap(inputs).to(frame.confidence.device)
     if not (network.uses_matches and overlap.any()):
         return
-    maps = [
-        one.detach() * overlap for one in (frame.confidence[None] if frame.by_band is None else frame.by_band)
-    ]
+    by_band = frame.confidence[None] if frame.by_band is None else frame.by_band
+    maps = [one.detach() * overlap for one in by_band]
     means = [float(one.sum(dtype=torch.float64) / overlap.sum()) for one in maps]
     mean = statistics.median_low(means)
     confidence = maps[means.index(mean)].float()
@@ -62,9 +61,7 @@ def warn_of_confidence(network: FusionNetwork, frame: Frame, inputs: FrameInputs
         return
     several = " of the median band" if frame.by_band is not None else ""
     unfit = mean < UNFIT_CONFIDENCE
-    why = (
-        "little texture, noise, other light, something in the way, or a rig that `pat rig doctor` finds wrong"
-    )
+    why = "little texture, noise, other light, something in the way, or a rig that `pat rig doctor` names"
     if unfit:
         why = "the rig does not fit the images, or they hardly match: check it with `pat rig doctor`"
     ninths = adaptive_avg_pool2d(confidence[None], 3) / adaptive_avg_pool2d(overlap[None].float(), 3)
@@ -99,7 +96,6 @@ def _overlap(inputs: FrameInputs) -> Bool[Tensor, "h w"]:
     overlap = torch.ones(inputs.hw, dtype=torch.bool)
     for beta in inputs.inputs.betas:
         if beta.field.pixels is not None:
-            overlap = overlap & beta.field.pixels.valid.reshape(beta.field.pixels.valid.shape[-2:])[
-                :h, :w
-            ].to(overlap)
+            valid = beta.field.pixels.valid
+            overlap = overlap.to(valid) & valid.reshape(valid.shape[-2:])[:h, :w]
     return overlap

@@ -137,11 +137,15 @@ def check_dense(views: Views, limit: float | None) -> None:
 
 
 BRIGHTER = 200.0
-"""Times as much light as alpha's image has that no other shows of the same scene."""
+"""Ratio of two images' light above which their stated exposures must be wrong."""
 
 
 def check_exposures(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> None:
-    """Raise ValueError for images so unlike in brightness that their stated exposures must be wrong."""
+    """Check the stated exposures by the developed images' brightness.
+
+    Raises:
+        ValueError: for images so unlike in brightness that their exposures must be wrong.
+    """
     light = {n: float(i[:, ::4, ::4].detach().clamp(min=0).pow(2.2).mean()) for n, i in images.items()}
     for name, one in light.items():
         exposures = rig[alpha].sensor.exposure, rig[name].sensor.exposure

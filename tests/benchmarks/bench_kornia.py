@@ -46,7 +46,7 @@ def value_difference(case: Parity) -> float:
 
 
 def gradient_error(f: Callable[[Tensor], Tensor], at: Tensor) -> float:
-    """Of a directional derivative against central differences, relative to its size."""
+    """Return the error of a directional derivative against central differences, relative to its size."""
     g = torch.Generator().manual_seed(3)
     leaf = at.clone().requires_grad_()
     value = f(leaf)

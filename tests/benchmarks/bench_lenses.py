@@ -155,7 +155,7 @@ def direction(angle: Array) -> Array:
 
 
 def before_fold(family: Family, c: Array, angle: Array) -> NDArray[np.bool_]:
-    """Whether the formula keeps orientation all the way from the axis."""
+    """Return True if the formula keeps orientation all the way from the axis."""
     h, kept = 1e-6, np.ones(len(angle), bool)
     for share in np.linspace(1 / STEPS, 1, STEPS):
         at = share * angle
@@ -336,7 +336,7 @@ def counted(name: str, library: Library, lenses: Drawn) -> list[str]:
 
 
 def milliseconds(library: Library, lenses: Drawn) -> list[str]:
-    """Of 100,000 points through the first lens."""
+    """Return the milliseconds of 100,000 points through the first lens."""
     seen = lenses.X[lenses.seen]
     X = np.resize(seen, (1, 100_000, 3))
     x = np.resize(lenses.asked[:POINTS][lenses.seen[:POINTS]], (1, 100_000, 2))
@@ -346,7 +346,8 @@ def milliseconds(library: Library, lenses: Drawn) -> list[str]:
 
 
 def derivatives(name: str, library: str) -> list[str]:
-    """Whether second derivatives are right (by differences of first ones), and vmap over points, lenses."""
+    """Return True if second derivatives are right (by differences of first ones), and vmap over points and
+    lenses."""
     if library not in ("arraygeom", "kornia"):
         return ["none", "none"]
     rng = np.random.default_rng(1)

@@ -1,4 +1,4 @@
-"""What benchmarks share: how work is timed, and tables that are printed while they grow."""
+"""Timing of work for benchmarks, and tables that are printed while they grow."""
 
 from __future__ import annotations
 

@@ -76,7 +76,7 @@ def test_fourteen_bits_in_sixteen_are_named(tmp_path):
 
 
 def test_bits_that_the_counts_contradict_are_named(tmp_path):
-    """Cut off where a camera of 12 bits ends, and the rig says 14."""
+    """Values cut off where a camera of 12 bits ends contradict 14 stated bits."""
     image = (torch.linspace(0, 1.2, 600).reshape(1, 20, 30).clamp(max=1) * 4095 / 65535).double()
     write_image(tmp_path / "a.png", image, bits=16)
     for bits, named in ((12, False), (14, True), (16, True)):
@@ -88,7 +88,7 @@ def test_bits_that_the_counts_contradict_are_named(tmp_path):
 
 @pytest.mark.parametrize("text", ["RGB", "colour", "", 5])
 def test_a_response_is_a_name_that_is_known(text, tmp_path):
-    """RGB, in capitals, was a grey camera."""
+    """RGB, in capitals, is refused, not taken for one band."""
     with pytest.raises((ValueError, TypeError), match="response"):
         Sensor(response=text)
     (tmp_path / "rig.yaml").write_text(
@@ -99,7 +99,7 @@ def test_a_response_is_a_name_that_is_known(text, tmp_path):
 
 
 def test_exposures_in_another_unit_are_named():
-    """10 and 0.01 seconds: the rig was said not to fit the images."""
+    """Exposures of 10 and 0.01 seconds for images of equal brightness are refused by name."""
     sample = Rig.load(SAMPLE / "rig.yaml")
     for exposures, wrong in (((0.01, 0.01), False), ((10.0, 0.01), True), ((0.01, 10.0), True)):
         stated = sample
@@ -115,7 +115,7 @@ def test_exposures_in_another_unit_are_named():
 
 
 def test_a_dense_field_that_does_not_fit_is_refused_before_the_work():
-    """640x400 was killed at 22 GB, whatever the limit."""
+    """Also without a limit: 640x400 would take 22 GB."""
     wide = Rig({name: View(hw=(400, 640)) for name in ("mono", "colour")})
     images = {"mono": torch.rand(1, 400, 640), "colour": torch.rand(3, 400, 640)}
     for settings in (FuseSettings(field=Dense()), FuseSettings(field=Dense(), max_memory="4GiB")):
@@ -132,7 +132,7 @@ class Unread(dict):
 
 @pytest.mark.parametrize("limit", ["1GiB", "2GiB"])
 def test_a_limit_that_cannot_be_kept_is_known_from_the_sizes(limit, tmp_path, refusal):
-    """24 megapixels were refused once 2.4 GiB were taken."""
+    """Nothing is read before 24 megapixels are refused."""
     large = Rig({name: View(hw=(4000, 6000)) for name in ("mono", "colour")})
     with pytest.raises(ValueError, match=r"max_memory.*24\.0 megapixels"):
         fuse(

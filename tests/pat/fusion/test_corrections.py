@@ -1,4 +1,4 @@
-"""What fuse finds and puts right by itself: another response, a beta off its search segments."""
+"""Corrections that fuse estimates and makes by itself: another response, a beta off its search segments."""
 
 import math
 from dataclasses import replace
@@ -143,7 +143,7 @@ def test_corrections_of_other_betas_are_refused(sample, network, images):
 
 
 def test_betas_without_names_are_corrected_too(middle, network):
-    """What was found was forgotten, and what was given ended in an IndexError."""
+    """Corrections are kept by number, and can be given."""
     sample, images, _ = middle
     frame, _ = prepared(network, Views.of(with_beta_rotated(sample.rig, 0.3), images, alpha=ALPHA), [])
     named = find_corrections(network, frame, "fit", align=True)
