@@ -10,6 +10,16 @@ from pathlib import Path
 from typing import Any
 
 
+def install_line(module: str, extra: str) -> str:
+    """Return the shell line that installs an optional module, with a checkout and without.
+
+    It names the module's own package: arraygeom-pat is on no index.
+    """
+    packages = {"cv2": "opencv-contrib-python-headless"}
+    package = packages.get(module, module.replace("_", "-"))
+    return f"pip install {package}, or in a checkout: pip install '.[{extra}]'"
+
+
 @contextmanager
 def needs(extra: str, purpose: str) -> Iterator[None]:
     """Context manager for the import of an optional module.
@@ -21,7 +31,7 @@ def needs(extra: str, purpose: str) -> Iterator[None]:
         yield
     except ImportError as error:
         module = (error.name or str(error)).partition(".")[0]
-        raise ImportError(f"{purpose} needs {module}: pip install 'arraygeom-pat[{extra}]'") from error
+        raise ImportError(f"{purpose} needs {module}: {install_line(module, extra)}") from error
 
 
 def imported(name: str, what: str) -> Any:

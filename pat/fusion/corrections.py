@@ -52,6 +52,11 @@ class PrePassSettings:
         0.1, "First value tried: by how much a match must be better than others, as of `BetaMatches.facts`"
     )
     passes: int = size(3, "Pre-passes at most: matches are better where what was found is put right")
+    matched: float = tuned(
+        0.3,
+        "Share of alpha's pixels reliably matched, below which vignetting is not looked for, and less of its "
+        "variance need be explained: Middlebury's tune half has .55 at least, plain scenes .26 at most",
+    )
     settled: float = size(0.25, "Pixels by which the largest displacement changes, up to which passes end")
 
 
@@ -239,4 +244,8 @@ def _fitted(frame: FrameInputs, matches: list[_Matches]) -> Response:
     colour = [(m, m.weight > 0) for m in matches if len(m.before) == 3]
     points = [of_beta.before[:, counts] for of_beta, counts in colour]
     places = [of_beta.place[counts] for of_beta, counts in colour]
-    return fit(torch.cat(points, 1), torch.cat([soft[counts] for _, counts in colour]), torch.cat(places))
+    alphas = torch.cat([soft[counts] for _, counts in colour])
+    matched = float(torch.stack([counts for _, counts in colour]).any(0).double().mean())
+    enough = min(matched / SETTINGS.matched, 1.0)
+    found = fit(torch.cat(points, 1), alphas, torch.cat(places), vignetting=enough == 1)
+    return found._replace(explained=min(found.explained / max(enough, 1e-9), 1.0))

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from arraygeom import Segments
 from arraygeom.runtime.chunks import chunked
 
 from ..media.colour import to_bytes
@@ -67,6 +68,8 @@ class ColourTransferSettings:
 SETTINGS = ColourTransferSettings()
 LEAST = 1e-3
 """Size: the least weight of a pixel in a fill."""
+DIRECTIONS = 8
+"""Size: every eighth segment in rows and columns tells the directions of all."""
 
 
 class MatchStatistics(NamedTuple):
@@ -156,7 +159,7 @@ def _fills(inputs: Inputs, carried: Sequence[tuple[Tensor, Tensor, Tensor]]) -> 
     """The fills of each beta, from its bands and their weight, over the whole frame: pieces of one would find
     other examples, and their borders would show. Betas that stand in for each other share theirs."""
     sharing = [inputs.can_agree and inputs.shows_all_bands(beta) for beta in inputs.betas]
-    regressed = inputs.bands is None
+    regressed, of_betas = inputs.bands is None, [directions_of(beta.field.straight) for beta in inputs.betas]
     shared: Tensor | None = None
     if any(sharing):
         some = [one for one, shares in zip(carried, sharing) if shares]
@@ -165,13 +168,23 @@ def _fills(inputs: Inputs, carried: Sequence[tuple[Tensor, Tensor, Tensor]]) -> 
             1 + LEAST - each
         )  # odds: colours of weak matches hardly count beside others
         mixed = (weights * torch.stack([bands.float() for bands, _, _ in some])).sum(0) / weights.sum(0)
-        shared = filled_from(mixed, inputs.alpha, each.amax(0), regressed=regressed)
+        mean = np.mean([one for one, shares in zip(of_betas, sharing) if shares], 0)
+        shared = filled_from(mixed, inputs.alpha, each.amax(0), mean, regressed=regressed)
     return [
         shared
         if shares and shared is not None
-        else filled_from(one[0], inputs.alpha, one[1], regressed=regressed)
-        for one, shares in zip(carried, sharing)
+        else filled_from(one[0], inputs.alpha, one[1], directions, regressed=regressed)
+        for one, shares, directions in zip(carried, sharing, of_betas)
     ]
+
+
+def directions_of(segments: Segments) -> Float[NDArray, "2 2"]:
+    """The mean outer product of the unit vectors along valid segments; half the identity without any."""
+    some = (segments.end - segments.start)[..., ::DIRECTIONS, ::DIRECTIONS, :].detach().double()
+    some = some[segments.valid[..., ::DIRECTIONS, ::DIRECTIONS]]
+    units = some[some.norm(dim=-1) > LEAST].cpu().numpy()
+    units = units / np.linalg.norm(units, axis=-1, keepdims=True)
+    return units.T @ units / len(units) if len(units) else np.eye(2) / 2
 
 
 def _statistics_of_frame(inputs: Inputs, matches: Matches) -> list[MatchStatistics]:
@@ -290,16 +303,18 @@ def filled_from(
     colour: Float[Tensor, "b c h w"],
     alpha: Float[Tensor, "b 1 h w"],
     weight: Float[Tensor, "b 1 h w"],
+    directions: Float[NDArray, "2 2"],
     *,
     regressed: bool = False,
 ) -> Float[Tensor, "b fills c h w"]:
     """Colours of pixels that beta does not see, by nearest examples; if `regressed` after the regression on
-    brightness over what is connected in alpha, above which the examples are."""
+    brightness over what is connected in alpha, above which the examples are; `directions` as of
+    `directions_of`."""
     planes = zip(numpy_of(colour), numpy_of(alpha[:, 0]), numpy_of(weight[:, 0]), to_bytes(alpha[:, 0]))
     fills = []
     for bands, brightness, w, guide in planes:
         base = [_diffused(bands, brightness, w + LEAST, guide)] if regressed else []
-        nearest = by_examples(bands - sum(base), brightness, w) + sum(base)
+        nearest = by_examples(bands - sum(base), brightness, w, directions) + sum(base)
         fills.append(np.stack([*base, nearest]))
     return torch.from_numpy(np.stack(fills)).to(alpha)
 

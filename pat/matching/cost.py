@@ -24,7 +24,7 @@ class CensusSettings:
     brightness: float = tuned(30.0, "Source not recorded: what a difference of 1 in brightness costs")
     truncated: float = tuned(20.0, "Source not recorded: what brightness costs at most")
     unseen: int = physics(24, "About half of the bits: a label beyond beta's edge, where the point may be")
-    nowhere: int = physics(80, "More than any other cost, 48 + `truncated`: of a label that is not on beta")
+    nowhere: int = physics(80, "More than any other cost: of a label that is not on beta")
 
 
 SETTINGS = CensusSettings()

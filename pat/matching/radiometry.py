@@ -183,11 +183,14 @@ def fit(
     bands: Float[Tensor, "3 n"],
     alpha: Float[Tensor, " n"],
     where: Float[Tensor, "n 2"] | None = None,
+    *,
+    vignetting: bool = True,
 ) -> Response:
     """The most probable response, by points: weights, gain, gamma and vignetting are each as usual or not.
 
     `where` are the points in beta, in its width and height, from its middle: with them vignetting is found
-    too. Rec. 601's where there are too few points, or where a combination of bands does not explain alpha.
+    too, unless it is not asked for. Rec. 601's where there are too few points, or where no combination of
+    bands explains alpha.
 
     Each explanation is judged by its evidence, the probability of alpha under all responses that it allows
     (MacKay 1992): what allows more must explain more. Light differs between the views as a smooth function of
@@ -206,7 +209,7 @@ def fit(
     luma, any_weights = (groups.most_probable(kinds) for kinds in (LUMA, KINDS))
     response = points.held(luma, any_weights)
     explained = max(luma.explained, any_weights.explained)
-    if where is not None:
+    if where is not None and vignetting:
         luma, any_weights = (groups.most_probable(kinds, vignetted=True) for kinds in (LUMA, KINDS))
         explained = max(explained, luma.explained, any_weights.explained)
         shaded = points.held(luma, any_weights)

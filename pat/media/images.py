@@ -22,6 +22,7 @@ from torch import Tensor
 
 from arraygeom.runtime.atomic import write_atomically
 from arraygeom.runtime.chunks import ROWS, spans
+from arraygeom.runtime.extras import install_line
 from arraygeom.runtime.image_bytes import (
     JPEG,
     MINISBLACK,
@@ -437,7 +438,7 @@ def _of_extra(module: str, extra: str, purpose: str, advice: str = "") -> Any:
         return import_module(module)
     except ImportError:
         package = module.replace("_", "-")
-        install = f"pip install 'arraygeom-pat[{extra}]'"
+        install = install_line(module, extra)
         raise ValueError(f"{purpose} needs the package {package}: {install}{advice}") from None
 
 

@@ -31,9 +31,10 @@ class RecallSettings:
     """Pixels are those of half the size, but for `last`."""
 
     scales: int = tuned(3, "Middlebury, tune half: sizes of what is around a pixel, radii 2, 4, 8")
-    pixel: float = tuned(0.02, "Middlebury, tune half: standard deviation of what is alike in alpha")
     alike: float = tuned(
-        0.04, "Middlebury, tune half: the same of means around; and where smoothing's weight is 1 / e"
+        0.04,
+        "Middlebury, tune half: standard deviation of what is alike of means around in alpha, half of it "
+        "of a pixel; and where smoothing's weight is 1 / e",
     )
     slope: float = tuned(0.1, "Middlebury, tune half: the same of slopes there")
     distance: float = tuned(10.0, "Middlebury, tune half: pixels at which the weight falls to 1 / e")
@@ -122,7 +123,7 @@ def surroundings(alpha: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b d h/2 w/2"
     """Alpha, and how bright it is around and how that changes to the right and downwards, at each radius (a
     local jet, Koenderink and van Doorn 1987): keys that are near where alpha looks alike."""
     half = avg_pool2d(alpha - 0.5, 2)  # for small numbers, of which float32 has more digits
-    parts, (h, w) = [half / SETTINGS.pixel], half.shape[-2:]
+    parts, (h, w) = [half / (SETTINGS.alike / 2)], half.shape[-2:]
     for r in (2 << i for i in range(SETTINGS.scales)):
         square = box_mean(half, r)
         beside = pad(square, (r,) * 4, mode="replicate")

@@ -1,4 +1,4 @@
-"""Lens models beside OpenCV, kornia, pycolmap: wrong answers, error, derivatives, vmap, time; docs/lenses.md.
+"""Lens models beside OpenCV, kornia, pycolmap: answers, derivatives, vmap, time; docs/reports/lenses.md.
 
     python -m tests.benchmarks.bench_lenses [--lenses 1000] [--write]
 
@@ -32,7 +32,7 @@ from arraygeom.lenses.model import LensModel
 from docs.update_readme import write_block
 from pat.app.cli.parser import script
 from pat.lab.evaluation.tables import markdown_table
-from tests.benchmarks.printed import DOCS, timed
+from tests.benchmarks.printed import REPORTS, timed
 
 try:
     import pycolmap
@@ -411,12 +411,12 @@ def rows(lenses: int) -> list[list[str]]:
 
 
 def main(lenses: int = 1000, write: bool = False) -> None:
-    """Print the table, and put it into docs/lenses.md if asked."""
+    """Print the table, and put it into docs/reports/lenses.md if asked."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     made = markdown_table(HEAD, rows(lenses), align="l")
     if write:
-        write_block(DOCS / "lenses.md", "lenses", made)
+        write_block(REPORTS / "lenses.md", "lenses", made)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What is published, installed into empty environments and used from there; the table of docs/performance.md.
+"""Published files, installed into empty environments and used there; for docs/reports/performance.md.
 
     python -m tests.wheel.run [--python PYTHON ...] [--lowest] [--torch 2.13.0] [--folder out/wheel] [--keep]
 

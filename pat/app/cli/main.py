@@ -118,7 +118,7 @@ def _run(arguments: list[str], group: Any, prog: str, *, debug: bool) -> None:
     except (ValueError, FloatingPointError) as error:
         _fail(error, f"{error}", debug)
     except ImportError as error:
-        remedy = "" if "pip install" in f"{error}" else ": pip install 'arraygeom-pat[all]'"
+        remedy = "" if "pip install" in f"{error}" else ": in a checkout, pip install '.[all]'"
         _fail(error, f"{error}{remedy}", debug)
     except MemoryError as error:
         _fail(error, "out of memory: give smaller images, or --max-memory where there is one", debug)

@@ -23,6 +23,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from arraygeom.runtime.atomic import write_text
+from arraygeom.runtime.extras import install_line
 from pat.media.images import write_image
 from pat.networks.protocol import FusionNetwork, fused_at_once
 
@@ -138,5 +139,6 @@ def _board(folder: Path) -> Any:
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError:
-        raise ValueError("tensorboard is not installed: pip install 'arraygeom-pat[tensorboard]'") from None
+        install = install_line("tensorboard", "tensorboard")
+        raise ValueError(f"tensorboard is not installed: {install}") from None
     return SummaryWriter(folder)

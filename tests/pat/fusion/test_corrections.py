@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from pat import FuseSettings, fuse
+from pat.fusion import corrections
 from pat.fusion.corrections import Corrections, find_corrections
 from pat.fusion.fuse import corrections_of
 from pat.fusion.inputs import prepared
@@ -162,6 +163,20 @@ def test_whether_alpha_sees_luma_is_found_whatever_response_is_stated(middle, ne
         views = Views.of(sample.rig, images | {ALPHA: alpha}, alpha=ALPHA)
         frame, _ = prepared(network, views, [])
         assert find_corrections(network, frame, response, align=True).response.explains == alike
+
+
+def test_few_matches_judge_neither_the_spectrum_nor_vignetting(middle, network, monkeypatch):
+    """As with few textures: what little matches explains of alpha need not be much."""
+    sample, images, _ = middle
+    w = images[BETA].shape[-1]
+    shade = 1 - 0.4 * torch.linspace(-1, 1, w).square()
+    views = Views.of(sample.rig, images | {BETA: images[BETA] * shade}, alpha=ALPHA)
+    frame, _ = prepared(network, views, [])
+    assert find_corrections(network, frame, "fit", align=False).response.shading
+    monkeypatch.setattr(corrections, "SETTINGS", replace(corrections.SETTINGS, matched=10.0))
+    found = find_corrections(network, frame, "fit", align=False).response
+    assert found.explained == 1
+    assert not found.shading
 
 
 def test_a_sequence_finds_corrections_once(middle, network, monkeypatch):

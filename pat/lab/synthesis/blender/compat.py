@@ -7,11 +7,13 @@ import sys
 from collections.abc import Mapping
 from typing import Any
 
+from arraygeom.runtime.extras import install_line
+
 LIBRARIES = "libx11-6 libxrender1 libxfixes3 libxi6 libxkbcommon0 libsm6 libgl1"
 """Debian packages that `import bpy` needs (Cycles needs no more)."""
 
 PYTHONS = "Python 3.11 (bpy 4.5 and 5.0) or 3.13 (5.1 and newer)"
-INSTALL = "pip install 'arraygeom-pat[synthesis]'"
+INSTALL = install_line("bpy", "synthesis")
 
 
 def load() -> Any:

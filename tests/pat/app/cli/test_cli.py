@@ -426,7 +426,10 @@ def test_json_is_valid_where_the_rig_sees_to_infinity(small, capsys):
         ),
         (MemoryError(), "pat: out of memory"),
         (ImportError("drawing needs it: pip install plots"), "pat: drawing needs it: pip install plots"),
-        (ImportError("No module named 'dask'"), "No module named 'dask': pip install 'arraygeom-pat[all]'"),
+        (
+            ImportError("No module named 'dask'"),
+            "No module named 'dask': in a checkout, pip install '.[all]'",
+        ),
         (KeyError("mono"), "pat: KeyError: 'mono' (--debug shows where)"),
         (RuntimeError("CUDA\nout"), "pat: RuntimeError: CUDA out (--debug shows where)"),
         (OverflowError("big"), "pat: OverflowError: big (--debug shows where)"),

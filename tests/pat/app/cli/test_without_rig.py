@@ -83,12 +83,12 @@ def test_fuse_of_images_alone_is_that_of_the_command(folder, monkeypatch):
         assert picture.size == (3 * 320, 200)
 
 
-def test_the_evaluation_without_a_rig_is_that_of_the_command(halved, folder, monkeypatch):
-    _, images, ground_truth = halved
+def test_the_evaluation_without_a_rig_is_that_of_the_command(folder, monkeypatch):
     monkeypatch.setattr("pat.app.from_images.MATCHED", 300)
-    found = with_found_rig(load_weights("mono-colour"))(images["mono"], images["colour"], 0.0).image
-    written = score(read_image(folder / "out" / "fused.png"), ground_truth).psnr
-    assert score(found.clamp(0, 1), ground_truth).psnr == pytest.approx(written, abs=0.3)
+    mono, colour = (read_image(folder / f"{name}.png") for name in ("mono", "colour"))
+    found = with_found_rig(load_weights("mono-colour"))(mono, colour, 0.0).image
+    written = read_image(folder / "out" / "fused.png")
+    assert float((found.clamp(0, 1) - written).abs().max()) < 2 / 255
 
 
 def test_the_rig_that_was_found_serves_the_next_command(folder):
