@@ -103,7 +103,10 @@ def healed_rig(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> Healed | N
     )
     if refined.depth is not None:
         text += f"; depth changes by {refined.depth.change:.0%} (median), and is rough"
-    healed = rig.replace(cameras=cameras, depth=_depth_range(refined.rig, pairs))
+    depth = _depth_range(refined.rig, pairs)
+    if depth is not None and [*depth] != [float(bound) for bound in rig.depth or ()]:
+        text += f"; the stated depth range becomes {depth[0]:.3g} to {depth[1]:.3g}, as points are beyond it"
+    healed = rig.replace(cameras=cameras, depth=depth)
     return Healed(healed, f"{text} (--misfit warn leaves the rig as it is)")
 
 
