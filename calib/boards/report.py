@@ -468,8 +468,10 @@ def _draw_image(
 
 
 def _draw_arrows(axes: Any, x: np.ndarray, r: np.ndarray, length: float, colour: str) -> float:
-    """Draw residuals as arrows, the longest one of a given length in pixels. Returns the longest residual,
-    pixels."""
+    """Draw residuals as arrows, the longest one of a given length in pixels.
+
+    Returns the longest residual, pixels.
+    """
     longest = float(np.linalg.norm(r, axis=1).max())
     arrows = length / max(longest, 1e-9) * r
     axes.quiver(*x.T, *arrows.T, angles="xy", scale_units="xy", scale=1, width=0.004, color=colour)

@@ -192,7 +192,8 @@ def _figures(frame: Frame, extent: str, facts: Facts) -> dict[str, str]:
 
 
 def data_url(image: Float[Tensor, "c h w"]) -> str:
-    """Encode an image as the URL of a JPEG, grey or in colour, of at most `LONGEST` pixels."""
+    """Encode an image of one or three bands as the URL of a JPEG whose longer side is at most `LONGEST`
+    pixels."""
     pixels = to_bytes(reduced(image, LONGEST).detach().cpu().expand(3, -1, -1).flip(0)).transpose(1, 2, 0)
     _, content = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
     return f"data:image/jpeg;base64,{base64.b64encode(content.tobytes()).decode()}"

@@ -1,4 +1,4 @@
-"""Colour of unseen pixels by example: that of the seen pixels most alike in brightness, texture and place.
+"""Colour of unseen pixels by example: that of the seen pixels most similar in brightness, texture and place.
 
 Nearest neighbours among alpha's own seen pixels (Welsh et al. 2002 colour a grey image so, by another one).
 """
@@ -37,7 +37,7 @@ class ExampleSettings:
 
 SETTINGS = ExampleSettings()
 EVERY = (slice(None, None, 2),) * 2
-"""Size: every second pixel is looked up."""
+"""Size: every second pixel is searched for."""
 
 
 def by_examples(
@@ -46,12 +46,18 @@ def by_examples(
     weight: Float[NDArray, "h w"],
     directions: Float[NDArray, "2 2"],
 ) -> Float[NDArray, "c h w"]:
-    """Colour with the pixels of low weight replaced by the mean of their nearest seen pixels.
+    """Replace the colour of pixels of low weight by the mean of their nearest seen pixels.
 
-    `weight` (0 to 1) is how far a pixel's colour is its own. Every second pixel in each direction is looked
-    up among such pixels, and what is between them is interpolated. Where fewer are seen than a mean takes,
-    colour is returned as it is. `directions` is the mean outer product of the unit vectors (x, y) along the
-    segments that were searched.
+    Every second pixel in each direction is searched for among such pixels, and pixels between them are
+    interpolated.
+
+    Args:
+        weight: 0 to 1; a pixel counts as seen above a half.
+        directions: mean outer product of the unit vectors (x, y) along the segments that were searched;
+            examples count as nearer along these.
+
+    Returns:
+        Colour at all pixels; as given where fewer are seen than a mean takes.
     """
     seen = weight > SETTINGS.seen
     near = cv2.dilate((~seen).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
@@ -76,7 +82,7 @@ def by_examples(
 
 
 def _between(plane: Plane, hw: tuple[int, int]) -> Plane:
-    """A plane of every second pixel, from the first, at all pixels, by linear interpolation."""
+    """Enlarge a plane of every second pixel, from the first, to all pixels, by linear interpolation."""
     back = np.array([[0.5, 0, 0], [0, 0.5, 0]], np.float32)
     how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     between: Plane = cv2.warpAffine(plane, back, (hw[1], hw[0]), flags=how, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[assignment]
@@ -84,8 +90,10 @@ def _between(plane: Plane, hw: tuple[int, int]) -> Plane:
 
 
 def _features(alpha: Plane, directions: Float[NDArray, "2 2"]) -> Iterator[Plane]:
-    """Brightness, its means and standard deviations in windows, and place, scaled so that distances compare,
-    of every second pixel."""
+    """Yield brightness, its means and standard deviations in windows, and place, of every second pixel.
+
+    They are scaled so that distances compare.
+    """
     alpha = np.ascontiguousarray(alpha, np.float32)
     yield alpha[EVERY]
     for radius in SETTINGS.radii:

@@ -1,4 +1,4 @@
-"""How long the explorer takes in a browser from a moved pointer to what is drawn there.
+"""Time of the explorer in a browser from a moved pointer to the drawn result.
 
     python -m tests.benchmarks.bench_explorer [--points 40] [--out tests/benchmarks/RESULTS_explorer.md]
 

@@ -254,8 +254,10 @@ def shown_cameras(scene: ExplorerScene, alpha: str) -> list[dict[str, Any]]:
 
 
 def data_url(image: Tensor) -> str:
-    """Encode an image (c, h, w) as the URL of a PNG of at most `WIDEST` pixels; grey unless it has three
-    bands."""
+    """Encode an image (c, h, w) as the URL of a PNG whose longer side is at most `WIDEST` pixels.
+
+    Grey unless it has three bands; values are clipped to 0..1.
+    """
     image = image if len(image) == 3 else image.mean(0, keepdim=True).expand(3, -1, -1)
     scale = min(1.0, WIDEST / max(image.shape[1:]))
     if scale < 1:

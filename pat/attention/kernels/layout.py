@@ -64,7 +64,23 @@ def block_scratch(samples: int, channels: int, number: np.dtype) -> Block:
 
 
 class Geometry(NamedTuple):
-    """Positions of a call's samples."""
+    """Positions of a call's samples; arrays are flat.
+
+    Attributes:
+        points: ends of segments, or explicit positions, x and y of each pixel in turn.
+        mask: bytes, 1 for each segment or position that counts.
+        fractions: fractions of a segment at its samples, padded by `LANES`.
+        samples: number of samples per pixel.
+        straight: True for segments, False for explicit positions.
+        nearest: True for nearest pixels in place of bilinear interpolation.
+        alpha_pixels: number of alpha's pixels in an image.
+        shared: True if all images of the batch have the same points.
+        height: beta's height.
+        width: beta's width.
+        last_x: number of beta's last column, in the type of computation.
+        last_y: number of beta's last row.
+        slack: pixels beyond the edge at which a sample still counts.
+    """
 
     points: Any
     mask: Any
@@ -82,7 +98,18 @@ class Geometry(NamedTuple):
 
 
 class Call(NamedTuple):
-    """Inputs of a call: images, geometry, bias (if `biased`), and the channels of query and value."""
+    """Inputs of a call.
+
+    Attributes:
+        query: alpha's features, flat, channels last.
+        key: beta's features, flat, channels last.
+        value: beta's values, flat, channels last.
+        geometry: positions of the samples.
+        bias: numbers added to the scores.
+        biased: True if there is a bias.
+        channels: number of channels of query and key.
+        value_channels: number of channels of value.
+    """
 
     query: Any
     key: Any
@@ -95,8 +122,15 @@ class Call(NamedTuple):
 
 
 class Share(NamedTuple):
-    """Work of one of several callers: pieces of `size` of the alpha pixels first .. last, drawn from a common
-    counter, with its own scratch."""
+    """Work of one of several callers.
+
+    Attributes:
+        first: first alpha pixel of all callers.
+        last: end of the alpha pixels.
+        size: number of pixels of a piece, drawn from the counter.
+        counter: common counter of the callers.
+        block: the caller's own scratch.
+    """
 
     first: int
     last: int
@@ -106,8 +140,14 @@ class Share(NamedTuple):
 
 
 class Outputs(NamedTuple):
-    """Outputs of forward: values, statistics (pixel, 4; if `measured`), and logs of the sums of
-    exponentials."""
+    """Outputs of forward.
+
+    Attributes:
+        value: weighted values.
+        statistics: four per pixel, if `measured`.
+        logsum: logarithms of the sums of exponentials.
+        measured: True if statistics are wanted.
+    """
 
     value: Any
     statistics: Any
@@ -116,7 +156,15 @@ class Outputs(NamedTuple):
 
 
 class Saved(NamedTuple):
-    """Results of forward, and gradients by its outputs. Statistics of pixel p start at `step` p."""
+    """Results of forward, and gradients by its outputs.
+
+    Attributes:
+        statistics: statistics of forward; those of pixel p start at `step` p.
+        logsum: logarithms of the sums of exponentials.
+        value_upstream: gradients by the values.
+        statistics_upstream: gradients by the statistics.
+        step: distance between two pixels' statistics.
+    """
 
     statistics: Any
     logsum: Any
@@ -126,7 +174,16 @@ class Saved(NamedTuple):
 
 
 class Gradients(NamedTuple):
-    """Gradients of alpha's pixels, and flags for the wanted ones. `points` and `bias` must be zero before."""
+    """Gradients of alpha's pixels, with flags for the wanted ones. `points` and `bias` must be zero before.
+
+    Attributes:
+        query: gradients by the query.
+        points: gradients by the points.
+        bias: gradients by the bias.
+        wants_query: True if `query` is wanted.
+        wants_points: True if `points` is wanted.
+        wants_bias: True if `bias` is wanted.
+    """
 
     query: Any
     points: Any
@@ -137,8 +194,15 @@ class Gradients(NamedTuple):
 
 
 class TapList(NamedTuple):
-    """Input of `scatter`, for each alpha pixel from `first` on: number of taps, their rows, and their weights
-    in the gradients of key and value."""
+    """Input of `scatter`, for each alpha pixel from `first` on.
+
+    Attributes:
+        first: first alpha pixel.
+        tap_count: number of its taps.
+        rows: beta's pixels of the taps.
+        key_weight: weights of the taps in the gradient of key.
+        value_weight: weights of the taps in the gradient of value.
+    """
 
     first: int
     tap_count: Any
@@ -148,14 +212,24 @@ class TapList(NamedTuple):
 
 
 class Taps(NamedTuple):
-    """Fields of a block that backward stores in a `TapList`."""
+    """Fields of a block that backward stores in a `TapList`.
+
+    Attributes:
+        tap_count: number of a pixel's taps.
+        rows: beta's pixels of the taps.
+    """
 
     tap_count: Any
     rows: Any
 
 
 class Column(NamedTuple):
-    """One list for each pixel: start of the first, and distance to the next."""
+    """One list for each pixel.
+
+    Attributes:
+        first: pointer to the first list.
+        step: distance to the next list.
+    """
 
     first: Any
     step: Any

@@ -81,12 +81,19 @@ class RenderConfig:
     """
 
     rig: Path
+    """File of the rig."""
     seed: int = 0
+    """Seed of all scenes."""
     backend: Literal["layered", "blender"] = "layered"
+    """Renderer of the scenes."""
     layered: LayeredSettings = field(default_factory=LayeredSettings)
+    """Settings of the layered renderer."""
     blender: BlenderSettings = field(default_factory=BlenderSettings)
+    """Settings of the Blender renderer."""
     check: CheckLimits = field(default_factory=CheckLimits)
+    """Requirements of the self-check."""
     limits: RetryLimits = field(default_factory=RetryLimits)
+    """Limits of time and tries."""
 
     @classmethod
     def load(cls, path: str | Path) -> RenderConfig:

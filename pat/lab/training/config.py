@@ -98,7 +98,9 @@ class TrainConfig:
     rectified: float = 0.5
     """Share of the batches with rigs of `rectified_rigs`, the others being of `general_rigs`."""
     rectified_rigs: RigDistribution = RECTIFIED
+    """Distribution of rectified rigs."""
     general_rigs: RigDistribution = GENERAL
+    """Distribution of rigs in any pose."""
     rendered: float = 0.0
     """Share of the batches made of rendered scenes instead of layered ones."""
     rendered_from: tuple[Path, ...] = ()
@@ -108,6 +110,7 @@ class TrainConfig:
     measured_from: tuple[Path, ...] = ()
     """Folders of Middlebury's stereo pairs, with the true disparity of both images."""
     recording: RecordingConfig = RecordingConfig()
+    """Recording of the scenes by the cameras."""
     field: str = "epipolar"
     """The receptive field, by name, or MODULE:OBJECT for your own."""
     held_out: int = 12
