@@ -21,6 +21,7 @@ from arraygeom.runtime.together import refuse_others, write_together
 from ..media.images import read_recorded, write_image
 from ..media.raw import demosaiced, recorded_bands
 from .align import Aligned
+from .results import with_links
 from .views import FilesOfCameras
 
 PositionFormat = Literal["npy", "tif", "none"]
@@ -83,7 +84,8 @@ def save_aligned(
     prefix = f"{name}_" if name else ""
     files = _files(aligned, separate, positions)
     files = [(f"{prefix}{file}", *how) for file, *how in files]
-    files += [(file, write_text, text) for file, text in (pages or {}).items()]
+    named = [file for file, *_ in files]
+    files += [(file, write_text, with_links(text, named)) for file, text in (pages or {}).items()]
     kept, count = {path.resolve() for path in keep}, Counter(file.casefold() for file, *_ in files)
     for file, *_ in files:
         if count[file.casefold()] > 1:

@@ -7,8 +7,10 @@ import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
+from html import escape
 from pathlib import Path
 from typing import Literal
+from urllib.parse import quote
 
 import torch
 from jaxtyping import Float
@@ -40,6 +42,8 @@ ImageFormat = Literal["png", "tif", "exr"]
 
 FOUND_RIG = "found_rig.yaml"
 """The rig that was found from images. Not rig.yaml, which may be one that somebody wrote."""
+LINKS = "<!-- files -->"
+"""Place of the links to a run's files in its page."""
 HEALED_RIG = "healed_rig.yaml"
 """Name of the file of a given rig as corrected to its images."""
 RESULT = re.compile(
@@ -133,8 +137,6 @@ def save_frame(
             near = float(view.depth[0]) if view is not None and view.depth else None
             tasks.append(partial(write_depth, folder / f"{prefix}depth_16.png", frame.depth, near=near))
             tasks.append(lambda: write_image(folder / f"{prefix}depth.png", colour_depth(frame.depth)))
-        for file, text in (pages or {}).items():
-            write_text(folder / file, text)
         if view is not None and not name:
             view.save(folder / "view.yaml")
         if rig is not None:
@@ -151,8 +153,16 @@ def save_frame(
         image = picture_of(image)
         tasks.insert(0, partial(write_image, folder / last, image, bits=bits, profile=bits != 32))
         in_parallel(tasks, most=how_many_fit(4 * image.nbytes))
+        for file, text in (pages or {}).items():
+            write_text(folder / file, with_links(text, (path.name for path in folder.iterdir())))
         names = {file.name for file in folder.iterdir()} - {last}
     return [out / last, *(out / file for file in sorted(names, key=lambda name: ("fused" not in name, name)))]
+
+
+def with_links(page: str, names: Iterable[str]) -> str:
+    """Return a page with links to files beside it, by name, where it has `<!-- files -->`."""
+    links = ", ".join(f'<a href="{quote(name)}">{escape(name)}</a>' for name in sorted(names))
+    return page.replace(LINKS, f"<section><h2>Files</h2><p>{links}</p></section>")
 
 
 def _write_shared(path: Path, text: str) -> None:

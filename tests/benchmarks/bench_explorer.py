@@ -100,7 +100,7 @@ def measured(driver: Any, points: int) -> Iterator[tuple[str, str, list[float]]]
             word for camera in ("mono", "colour") for word in ("--image", f"{camera}={SAMPLE / camera}.png")
         ]
         for network in NETWORKS:
-            chosen = [] if network == "windows" else ["--weights", network]
+            chosen = [] if network == "windows" else ["--network", network]
             rig = str(SAMPLE / "rig.yaml")
             command = [*PAT, "explore", rig, *images, *chosen, "--no-browser"]
             with server(command, ROOT) as address:
