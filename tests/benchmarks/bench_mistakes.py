@@ -242,7 +242,7 @@ MISTAKES: dict[str, Change] = {
     "depth range too near": lambda a: a.rig.update(depth=[0.2, 0.6]),
     "depth range backwards": lambda a: a.rig.update(depth=[20.0, 1.4]),
     "image of another size than the rig's": shown("colour", lambda i: i[:, 20:]),
-    "depth map upside down": words("--around", "{}/depth.tif", depth=lambda d: d[::-1]),
+    "depth map of something else": words("--around", "{}/depth.tif", depth=lambda d: d[::-1]),
     "depth map in millimetres": words("--around", "{}/depth.tif", depth=lambda d: d * 1000),
     "depth map of another size": words("--around", "{}/depth.tif", depth=lambda d: d[:-7]),
     "JPEG, four bytes damaged": stored("colour", ".jpg", 4),
