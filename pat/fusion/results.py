@@ -74,7 +74,7 @@ def check_no_result(inputs: Iterable[Path], out: Path) -> None:
     """Raise ValueError for a file that has the name of a result and lies in the results' folder."""
     for path in inputs:
         if path.resolve().parent == out.resolve() and RESULT.fullmatch(path.name):
-            raise ValueError(f"{path}: is called as a result, which would go there: give another --out")
+            raise ValueError(f"{path}: is called as a result, which would go there: give another folder")
 
 
 def save_frame(
