@@ -33,7 +33,7 @@ from .printed import head
 Image = Any
 Change = Callable[["Array"], object]
 USUAL = re.compile(
-    r"plan: |weights: |network: |written to |to see the result|compiling|fusing: |finding |comparing |no depth"
+    r"plan: |weights: |network: |written to |to see|compiling|fusing: |finding |comparing |no depth"
 )
 """What a command says of right inputs too."""
 LONGEST = 230
