@@ -69,22 +69,29 @@ def save_aligned(
     recorded: RecordedFiles | None = None,
     pages: Mapping[str, str] | None = None,
 ) -> list[Path]:
-    """Write aligned.tif (all bands, alpha's first, with their names and wavelengths), and of each camera
-    NAME_visibility.png (0 beyond its edge, 128 occluded, 255 seen), NAME_confidence.png and
-    NAME_positions.npy (or .tif: x, y); depth.tif (metres) if any is known. NAME is by `file_names`.
+    """Write the files of an alignment to a folder.
 
-    With the `recorded` files, those with bands have the tags of alpha's, by which mapping software places
-    them, and each band's exposure, gain and black level.
+    The files are aligned.tif (all bands, alpha's first, with their names and wavelengths), visibility.txt,
+    and of each camera but alpha NAME_visibility.png (0 beyond its edge, 128 occluded, 255 seen),
+    NAME_confidence.png and NAME_positions.npy (or .tif: x, y); and depth.tif (metres) if any depth is known.
+    NAME is by `file_names`. All are swapped in together, and those of a former alignment of this name are
+    removed (`write_together`).
 
-    One file a camera, NAME.tif, if `separate`, or if their types differ: values keep theirs. With a `name`
-    the files are name_aligned.tif and so on. `pages` are further text files. All are swapped in together, and
-    those of a former alignment of this name are removed (`write_together`).
+    Args:
+        separate: True for one file a camera, NAME.tif, in place of aligned.tif, as also for values of
+            different types.
+        name: prefix of the files, as in name_aligned.tif; empty for none.
+        keep: files that must not be overwritten, such as the images.
+        pages: further text files by name.
+        recorded: files from which the values were read: files of bands then have the tags of alpha's, by
+            which mapping software places them, and each band's exposure, gain and black level. None for
+            neither.
 
     Returns:
         Paths of the files, sorted.
 
     Raises:
-        ValueError: for two files of one name, and rather than overwrite a file of `keep`, such as the images.
+        ValueError: for two files of one name, and rather than overwrite a file of `keep`.
         FileExistsError: for files in the way that no run wrote.
     """
     prefix = f"{name}_" if name else ""
@@ -116,7 +123,7 @@ def refuse_to_replace(out: Path, cameras: Iterable[str], *, separate: bool, name
 def _files(
     aligned: Aligned, separate: bool, positions: PositionFormat, recorded: RecordedFiles | None
 ) -> list[tuple[Any, ...]]:
-    """Name of each file of an alignment, the function that writes it, and what that is given."""
+    """List the name of each file of an alignment, the function that writes it, and its arguments."""
     called = file_names(aligned)
     tags = None if recorded is None else recorded_tags(Path(recorded.files[aligned.alpha]))
     facts = {name: [_of_sensor(recorded, name)] * len(view.bands) for name, view in aligned.items()}
@@ -159,7 +166,7 @@ def _shares(aligned: Aligned) -> str:
 
 
 def _of_sensor(recorded: RecordedFiles | None, name: str) -> dict[str, float]:
-    """Black level, exposure and gain of a camera, as far as its rig states them."""
+    """Return black level, exposure and gain of a camera, as far as its rig states them."""
     if recorded is None:
         return {}
     sensor = recorded.rig[name].sensor
@@ -176,9 +183,11 @@ def write_bands(
     facts: Sequence[Mapping[str, float]] = (),
     tags: RecordedTags | None = None,
 ) -> None:
-    """Write bands (C, H, W) as one TIFF in their type, with names and wavelengths (nanometres) for GIS.
+    """Write bands (C, H, W) as one TIFF file in their type, with names and wavelengths (nanometres) for GIS.
 
-    `facts` of each band, and the `tags` of the file that the pixels are of, are written too.
+    Args:
+        facts: further numbers of each band by name, written as its metadata.
+        tags: tags of the file whose pixels these are, written too; left out of files over `LARGEST_TIFF`.
     """
     items = [
         f'<Item name="{name}" sample="{i}">{value:.9g}</Item>'

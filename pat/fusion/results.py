@@ -41,7 +41,7 @@ MOST = 65535
 ImageFormat = Literal["png", "tif", "exr"]
 
 FOUND_RIG = "found_rig.yaml"
-"""The rig that was found from images. Not rig.yaml, which may be one that somebody wrote."""
+"""Name of the file of a rig estimated from images. Not rig.yaml, which may be a user's."""
 LINKS = "<!-- files -->"
 """Place of the links to a run's files in its page."""
 HEALED_RIG = "healed_rig.yaml"
