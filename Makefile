@@ -8,7 +8,7 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --no-input -
 
 DATA ?= ../shared/data
 
-.PHONY: help env synthesis demo showcase readme pairs stages conditions certainty without-rig alignment paper-network paper-tables outside fields test test-long check format bench bench-job train notebooks docs drawings wheel fuzz kills transformations
+.PHONY: help env synthesis demo showcase readme pairs stages conditions certainty without-rig alignment paper-network paper-tables outside fields test test-long check format bench bench-job train notebooks docs drawings wheel fuzz mistakes kills transformations
 
 help:
 	@echo "make demo       fuse the sample array into out/demo"
@@ -32,6 +32,7 @@ help:
 	@echo "make bench-job  measure pat fuse as a command into docs/reports/performance.md, 15 minutes; QUICK=1: one size, a minute;"
 	@echo "                AGAINST=FOLDER: another checkout too"
 	@echo "make fuzz       read 6,000 damaged files, each in a process of its own; the table of docs/reports/fuzzing.md"
+	@echo "make mistakes   fuse sixty inputs that are wrong without looking so; the table of docs/reports/mistakes.md"
 	@echo "make kills      end commands with SIGKILL some 100 times, continue and compare; the table of docs/reports/kills.md"
 	@echo "make transformations  torch's transformations of every operator; the table of docs/reports/transformations.md"
 	@echo "make train      train on the images at hand; ARGS=... goes to 'pat lab train'"
@@ -140,6 +141,9 @@ bench-job: $(READY)
 
 fuzz: $(READY)
 	@OMP_NUM_THREADS=1 $(BIN)/python -m tests.fuzz.run --out docs/reports/fuzzing.md
+
+mistakes: $(READY)
+	@$(BIN)/python -m tests.benchmarks.bench_mistakes --out docs/reports/mistakes.md
 
 kills: $(READY)
 	@OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m tests.kills.run --out docs/reports/kills.md

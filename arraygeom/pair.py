@@ -248,7 +248,7 @@ def depth_range(near: Any, far: Any) -> Depths:
         d if isinstance(d, Tensor) else torch.tensor(float(d), dtype=torch.float64) for d in (near, far)
     ]
     near, far = bounds
-    if not traced() and not bool(((near > 0) & (far >= near)).all()):
+    if not traced() and not bool(((near > 0) & near.isfinite() & (far >= near)).all()):
         raise ValueError(
             "depth bounds must satisfy 0 < near <= far, in metres; "
             f"got near = {_shown(near)}, far = {_shown(far)}"

@@ -53,6 +53,11 @@ class Curve:
 
 PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
 """Colour filter patterns: the first two pixels of the first row, then of the second."""
+RESPONSES = (
+    *("mono", "rgb", "red", "green", "blue", "red edge", "nir", "swir", "thermal"),
+    "luminance of light",  # of developed images: pat.media.raw.LIGHT
+)
+"""Names of spectral responses."""
 CODINGS = ("srgb", "linear")
 
 
@@ -64,7 +69,7 @@ class Sensor:
     matter.
 
     Attributes:
-        response: name ("mono", "rgb", "nir"), band or curve; None if unknown.
+        response: name (of `RESPONSES`), band or curve; None if unknown.
         frame_rate: frames for each second; None if unknown.
         time_offset: seconds after the rig's clock.
         coding: relation of pixel values to light, "srgb" or "linear".
@@ -75,7 +80,7 @@ class Sensor:
         gain: factor of the value; three numbers for red, green and blue.
 
     Raises:
-        ValueError: for numbers out of range, another coding or pattern.
+        ValueError: for numbers out of range, another coding, pattern or name of a response.
         TypeError: for values that are no numbers.
     """
 
@@ -97,9 +102,11 @@ class Sensor:
             check_above(0, itself=False, gain=gain)
         check_above(1, whole=True, bits=self.bits)
         check_above(0, black_level=self.black_level)
+        stated = None if isinstance(self.response, Band | Curve) else self.response
         for name, value, allowed in (
             ("coding", self.coding, CODINGS),
             ("bayer", self.bayer, (None, *PATTERNS)),
+            ("response", stated, (None, *RESPONSES)),
         ):
             if value not in allowed:
                 raise ValueError(f"{name} is {value!r}: wanted {' or '.join(repr(v) for v in allowed if v)}")

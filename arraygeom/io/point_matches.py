@@ -12,6 +12,7 @@ import sqlite3
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -84,8 +85,8 @@ def _csv(path: Path, files: Mapping[str, Path]) -> PointPairs:
     parsed = [_numbers(line, named or range(4)) for line in lines]
     wrong = next((line for line, row in zip(lines, parsed) if row is None), None)
     if wrong is not None or not parsed:
-        what = "an empty file" if wrong is None else f"line '{wrong}'"
-        raise ValueError(f"{path}: {what} is not four numbers: give x0,y0,x1,y1 a line")
+        problem = "has no line of" if wrong is None else f"line '{wrong}' is not"
+        raise ValueError(f"{path}: {problem} four numbers: give x0,y0,x1,y1 a line")
     points = torch.tensor([row for row in parsed if row], dtype=torch.float64)
     if not points.isfinite().all():
         raise ValueError(f"{path}: has points that are not finite: leave those lines out")
@@ -170,12 +171,19 @@ def _matches(
     for pair, rows, data in database.execute(f"SELECT pair_id, rows, data FROM {table} WHERE rows > 0"):
         a, b = pair // MAX_IMAGES, pair % MAX_IMAGES
         if a in names and b in names:
-            yield (a, b), np.frombuffer(data, np.uint32).reshape(rows, -1)[:, :2].astype(np.int64)
+            yield (a, b), _rows(data, np.uint32, rows, -1).astype(np.int64)
 
 
 def _keypoints(database: sqlite3.Connection, image: int) -> Tensor:
     """Return the keypoints of an image (n, 2)."""
     query = "SELECT rows, cols, data FROM keypoints WHERE image_id = ?"
     rows, columns, data = database.execute(query, (image,)).fetchone() or (0, 2, b"")
-    points = np.frombuffer(data, np.float32).reshape(rows, columns)[:, :2]
-    return torch.from_numpy(points.astype(np.float64)) - 0.5
+    return torch.from_numpy(_rows(data, np.float32, rows, columns).astype(np.float64)) - 0.5
+
+
+def _rows(data: bytes, kind: Any, rows: int, columns: int) -> NDArray[Any]:
+    """First two columns of a table of numbers. Raises sqlite3.DataError for bytes of another one."""
+    try:
+        return np.frombuffer(data, kind).reshape(rows, columns)[:, :2]
+    except ValueError as error:
+        raise sqlite3.DataError(f"{error}") from None

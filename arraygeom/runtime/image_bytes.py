@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from io import BytesIO
 from typing import Any
@@ -26,7 +26,7 @@ SEPARATE = 2
 MINISWHITE, MINISBLACK = 0, 1
 """Values of TIFF PhotometricInterpretation."""
 YCBCR = 6
-DEFLATE, LZW, JPEG_IN_TIFF = (8, 32946), (5,), (7,)
+DEFLATE, PACKBITS, LZW, JPEG_IN_TIFF = (8, 32946), 32773, 5, 7
 """Values of TIFF Compression."""
 REDUCED, MASK = 1, 4
 """Values of a TIFF directory's NewSubfileType."""
@@ -145,25 +145,28 @@ def _is_whole(content: bytes) -> bool:
 
 def _decompresses(page: Any, segment: bytes, i: int) -> bool:
     """True if a TIFF page's i-th strip or tile decompresses without a warning, to its full length."""
-    if page.compression in DEFLATE:
+    lengths = _lengths(page, i)
+    if page.compression in (*DEFLATE, PACKBITS):
+        from tifffile import TIFF as decoders
+
         try:
-            return len(zlib.decompress(segment)) >= _length(page, i)
-        except zlib.error:
+            length = len(decoders.DECOMPRESSORS[page.compression](segment))
+        except (*DAMAGED, zlib.error):
             return False
-    if page.compression in LZW:
+        return length in lengths or (page.compression in DEFLATE and length >= min(lengths))
+    if page.compression == LZW:
         from .lzw import lzw_length
 
-        wanted, data = _length(page, i), np.frombuffer(segment, np.uint8)
         unusual = segment[:2] == b"\0\1" or page.fillorder != 1  # as before TIFF 6; bits reversed
-        return bool(unusual or wanted == 1 or lzw_length(data, wanted) == wanted)
+        return bool(unusual or lzw_length(np.frombuffer(segment, np.uint8)) in lengths)
     tables = page.jpegtables[:-2] if page.jpegtables else JPEG
-    return page.compression not in JPEG_IN_TIFF or _is_sound(tables + segment[2:])
+    return page.compression != JPEG_IN_TIFF or _is_sound(tables + segment[2:])
 
 
-def _length(page: Any, i: int) -> int:
-    """Decompressed bytes of a page's i-th strip or tile; 1 where that depends on its colours."""
+def _lengths(page: Any, i: int) -> Collection[int]:
+    """Possible numbers of decompressed bytes of a page's i-th strip or tile; a last strip may be padded."""
     if page.photometric == YCBCR:
-        return 1
+        return range(1, 2**63)
     rows, width, height = page.rowsperstrip, page.imagewidth, page.imagelength
     if page.is_tiled:
         rows, width, height = page.tilelength, page.tilewidth, page.tilelength * (i + 1)
@@ -171,7 +174,8 @@ def _length(page: Any, i: int) -> int:
     samples = 1 if page.planarconfig == SEPARATE else page.samplesperpixel
     bits = page.bitspersample
     bits = max(bits) if isinstance(bits, tuple | list) else bits
-    return int(min(rows, height - i % strips * rows) * -(-width * samples * bits // 8))
+    row = -(-width * samples * bits // 8)
+    return {min(rows, height - i % strips * rows) * row, rows * row}
 
 
 def _is_sound(content: bytes) -> bool:

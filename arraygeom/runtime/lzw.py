@@ -10,18 +10,18 @@ CLEAR, END = 256, 257
 
 
 @compiled(nogil=True, cache=True)
-def lzw_length(data, wanted):
-    """Count the bytes that LZW codes stand for, up to `wanted` or slightly more.
+def lzw_length(data):
+    """Count the bytes that LZW codes stand for, up to their end.
 
     Args:
         data: codes (uint8), the most significant bit first.
 
     Returns:
-        The length; 0 if a code is not in the table, follows a full one, or is cut.
+        The length; 0 if a code is not in the table, or follows a full one.
     """
     lengths = np.ones(4096, np.int64)
     width, known, before, total, position = 9, END + 1, -1, 0, 0
-    while total < wanted and position + width <= 8 * len(data):
+    while position + width <= 8 * len(data):
         byte, bits = position >> 3, 0
         for k in range(3):
             bits = (bits << 8) | (data[byte + k] if byte + k < len(data) else 0)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
+import torch
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import interpolate
 
@@ -12,7 +15,7 @@ from arraygeom import Pair, Rig, apply_homography
 
 from .depth_change import share_outside
 from .matches import Images, Pairs, PointMatches, match_cameras, undistort_matches
-from .residuals import median_off, own_distance, related
+from .residuals import match_depths, median_off, own_distance, related, share
 
 LARGEST_SIDE = 1000
 """Longer side in pixels to which images are reduced..."""
@@ -87,6 +90,27 @@ def find_misfit(rig: Rig, images: Images) -> Misfit | None:
     diagnosis = diagnose_matches(rig, {name: rig[name].hw for name in some}, pairs)
     verdict = "" if diagnosis.healthy else f"; `pat rig doctor` says: {diagnosis.verdict}"
     return Misfit(off, outside, diagnosis.named.kind != "nothing", text + verdict)
+
+
+def share_unlike(
+    rig: Rig, images: Images, alpha: str, depth: Float[Tensor, "h w"], tolerance: float
+) -> float:
+    """Compare a depth map of `alpha`'s pixels with the depths of points matched between the images.
+
+    Returns:
+        The share of points at which the map is off by more than a tolerance relative to depth; NaN for few.
+    """
+    if (matched := _matched(rig, {alpha: images[alpha], **images}, LARGEST_SIDE)) is None:
+        return math.nan
+    rig, pairs = matched
+    pairs = {names: points for names, points in pairs.items() if names[0] == alpha}
+    found = match_depths(rig, pairs)
+    (h, w), x = depth.shape, torch.cat([points.alpha for points in pairs.values()]).double()
+    scale = x.new_tensor([w / rig[alpha].hw[1], h / rig[alpha].hw[0]])
+    column, row = ((x + 0.5) * scale - 0.5).round().long().clamp(min=0).unbind(-1)
+    stated = depth[row.clamp(max=h - 1), column.clamp(max=w - 1)]
+    off = (stated / found.depth - 1).abs() > tolerance
+    return share(off[found.observable & found.front & stated.isfinite()])
 
 
 def _scale(image: Tensor, largest: int) -> float:

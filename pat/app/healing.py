@@ -19,7 +19,7 @@ from calib.images.rig_check import OUTSIDE, find_misfit
 from calib.images.self_calibration import depth_bounds
 
 from ..fusion.checks import LowConfidenceWarning
-from ..fusion.views import ViewFiles
+from ..fusion.views import ViewFiles, check_exposures
 from ..support.settings import size
 from .from_images import MATCHED, resized_rig, scaled
 
@@ -63,6 +63,7 @@ def checked_rig(views: ViewFiles, *, heal: bool) -> Healed | None:
     """
     try:
         images = dict(views)
+        check_exposures(views.rig, images, views.alpha)
         misfit = find_misfit(views.developed, images)
     except (ValueError, OSError):  # of a file or an image: the fusion says so
         return None
@@ -102,7 +103,10 @@ def healed_rig(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> Healed | N
     )
     if refined.depth is not None:
         text += f"; depth changes by {refined.depth.change:.0%} (median), and is rough"
-    healed = rig.replace(cameras=cameras, depth=_depth_range(refined.rig, pairs))
+    depth = _depth_range(refined.rig, pairs)
+    if depth is not None and [*depth] != [float(bound) for bound in rig.depth or ()]:
+        text += f"; the stated depth range becomes {depth[0]:.3g} to {depth[1]:.3g}, as points are beyond it"
+    healed = rig.replace(cameras=cameras, depth=depth)
     return Healed(healed, f"{text} (--misfit warn leaves the rig as it is)")
 
 

@@ -25,7 +25,7 @@ from ..matching.radiometry import ResponseSpec, given_response
 from ..media.images import Images
 from ..networks.protocol import FusionNetwork
 from ..support.blocks import without_autocast
-from ..support.memory import limited, parse_bytes, planned
+from ..support.memory import LEAST_BYTES, LEAST_MATCHED, check_limit, limited, parse_bytes, planned
 from .checks import warn_of_confidence
 from .corrections import Corrections, expected_work, find_corrections
 from .depth_edges import beside_edges
@@ -218,6 +218,8 @@ def ready_frame(
         The prepared frame.
     """
     say = explain or (lambda line: None)
+    least = LEAST_MATCHED if network.uses_matches else LEAST_BYTES
+    check_limit(math.prod(rig[rig.require(alpha)].hw), settings.limit, least)
     views = Views.of(rig, images, alpha=alpha, depth=settings.depth, field=settings.field)
     check_dense(views, settings.limit)
     views, low_light = denoised_views(views, settings.noise)

@@ -20,6 +20,7 @@ from ..matching.inputs import Inputs
 from ..matching.matches import Matches
 from ..networks.protocol import FusionNetwork, matched_for
 from ..support.convolutions import convolutions_in_parallel
+from ..support.memory import LIBRARIES, SLACK
 from ..support.tensor_files import read_tensors, write_tensors
 from .depth import certain, measured_depth
 from .frame import Frame
@@ -28,10 +29,6 @@ from .inputs import FrameInputs
 MAX_HALO = 256
 """The widest halo, pixels: what is farther off changes an image of KITTI's by 7e-6 with trained weights (at
 240 pixels 5e-5, at 224 2e-4), however far their convolutions reach."""
-LIBRARIES = 0.46 * 2**30
-"""What Python, torch and the compiled loops take, bytes (430 MiB were measured)."""
-SLACK = 1.05
-"""What a process may take over what is counted here: freed blocks smaller than a page cannot be returned."""
 MATCHING_BYTES = 360.0
 """Working memory of matching for each pixel of alpha, measured."""
 FILLING_BYTES = 80.0

@@ -15,7 +15,6 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from arraygeom import (
-    Band,
     Curved,
     Dense,
     Epipolar,
@@ -34,6 +33,7 @@ from arraygeom.runtime.warned import warn
 from ..media.colour import luminance_of as grey
 from ..media.images import Images, read_image
 from ..media.raw import develop, developed_rig, recorded_bands
+from ..support.memory import check_limit
 
 T = TypeVar("T")
 Fields = Mapping[str, ReceptiveField | None]
@@ -88,6 +88,7 @@ class Views:
                 f"no image of any other camera than alpha, '{alpha}': fusion needs at least one beta"
             )
         checked = {name: checked_image(rig, images, name) for name in (alpha, *names)}
+        check_exposures(rig, checked, alpha)
         fields = field if isinstance(field, Mapping) else dict.fromkeys(names, field)
         rig = rig if depth is None else rig.replace(depth=depth)
         images = {**checked, alpha: grey_alpha(alpha, checked[alpha])}
@@ -140,6 +141,27 @@ def check_dense(views: Views, limit: float | None) -> None:
                 f"the dense field of {w}x{h} pixels in {beta[1]}x{beta[0]} of '{name}' takes "
                 f"{needed / 2**30:.1f} GiB, and there are {most / 2**30:.1f}: reduce the images, or take "
                 "another field"
+            )
+
+
+BRIGHTER = 200.0
+"""Ratio of two images' light above which their stated exposures must be wrong."""
+
+
+def check_exposures(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> None:
+    """Check the stated exposures by the developed images' brightness.
+
+    Raises:
+        ValueError: for images so unlike in brightness that their exposures must be wrong.
+    """
+    light = {n: float(i[:, ::4, ::4].detach().clamp(min=0).pow(2.2).mean()) for n, i in images.items()}
+    for name, one in light.items():
+        exposures = rig[alpha].sensor.exposure, rig[name].sensor.exposure
+        ratio = max(one, 1e-9) / max(light[alpha], 1e-9)
+        if None not in exposures and max(ratio, 1 / ratio) > BRIGHTER:
+            raise ValueError(
+                f"the images of '{alpha}' and '{name}' differ {max(ratio, 1 / ratio):.0f} times in light by "
+                f"the rig's exposures, {exposures[0]:g} and {exposures[1]:g} seconds: correct 'exposure'"
             )
 
 
@@ -305,11 +327,12 @@ class FilesOfCameras(Mapping[str, T]):
 class ViewFiles(FilesOfCameras[Tensor]):
     """An image file of each camera, read and developed when asked for; kept if it is small (`KEPT`).
 
-    Asking raises as `read_view` does.
+    Asking raises as `read_view` does; making it, as `check_limit` does by alpha's size.
     """
 
     def __init__(self, rig: Rig, files: Mapping[str, str | Path], *, alpha: str) -> None:
         super().__init__(rig, files)
+        check_limit(math.prod(rig[alpha].hw))
         self.alpha, self.like = alpha, rig[alpha].sensor
         self._kept: dict[str, Tensor] = {}
 
@@ -368,9 +391,5 @@ def _warn_of_contradictions(image: Float[Tensor, "c h w"], sensor: Sensor, label
     if share > SATURATED:
         warn(f"{label}: {share:.0%} of its pixels are saturated: they have no detail to match: expose less")
     stated = sensor.response
-    if len(image) == 3 and (isinstance(stated, Band) or stated in SINGLE_BANDS) and is_in_colour(image):
+    if len(image) == 3 and stated not in (None, "rgb") and is_in_colour(image):
         warn(f"{label}: is in colour, and the rig says response {stated}: give that band, or state rgb")
-
-
-SINGLE_BANDS = ("mono", "nir", "red", "green", "blue")
-"""Names of responses of one band."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import re
+from contextlib import suppress
 from pathlib import Path
 from typing import Literal
 
@@ -95,8 +97,13 @@ def _pfm(path: Path) -> NDArray[np.float32]:
 def _stated_scale(path: Path) -> float | None:
     """Metres for each count as `write_depth` states them in a PNG file; None in other files."""
     with Image.open(path) as image:
-        said = re.match(r"depth: ([0-9.e+-]+) counts a metre", str(image.info.get("Description", "")))
-    return None if said is None else 1 / float(said[1])
+        said = re.match(r"depth: (\S+) counts a metre", str(image.info.get("Description", "")))
+    if said is None:
+        return None
+    with suppress(ValueError, ZeroDivisionError):
+        if 0 < (scale := 1 / float(said[1])) < math.inf:
+            return scale
+    raise ValueError(f"{path}: says {said[1]} counts a metre: give FILE,scale=METRES of a count")
 
 
 def write_points(

@@ -45,6 +45,8 @@ from .suffixes import RAW_SUFFIXES
 
 FEW_BITS = (8, 10, 12, 14)
 """Bits of cameras whose counts may be stored unscaled in 16 bits."""
+CLIPPED = 0.002
+"""Share of values at the largest above which that is where a camera's counts end."""
 HIGHLIGHTS = 0.98 * 2**14
 """Value above which a largest count suggests highlights of a 14-bit camera."""
 CHANNELS = "give a grey (1) or RGB (3) image"
@@ -407,6 +409,9 @@ def _counts(planes: NDArray, label: str, bits: int | None, white: int) -> NDArra
             f"or save it with its values times {65535 // (2**needed - 1)}"
         )
     white = 2**bits - 1 if bits else white
+    fewer = next((n for n in FEW_BITS if bits and n < bits and largest == 2**n - 1), None)
+    if fewer and (planes == largest).mean() > CLIPPED:
+        warn(f"{label}: is cut off at {largest}, where {fewer} bits end; the rig says {bits}: correct 'bits'")
     if largest > white:
         raise ValueError(
             f"{label}: has values up to {largest}, the rig says {bits} bits (up to {white}): correct 'bits' "

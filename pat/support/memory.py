@@ -28,10 +28,10 @@ def parse_bytes(amount: float | str) -> float:
     (1024s).
 
     Returns:
-        Bytes; infinite amounts are not refused.
+        Bytes.
 
     Raises:
-        ValueError: for any other text, NaN, and less than any process takes.
+        ValueError: for any other text, NaN, infinity, and less than any process takes.
     """
     units = {"B": 1, "KB": 1e3, "MB": 1e6, "GB": 1e9, "KIB": 2**10, "MIB": 2**20, "GIB": 2**30}
     text = str(amount)
@@ -41,7 +41,7 @@ def parse_bytes(amount: float | str) -> float:
         size = float(number) * units[unit]
     except (KeyError, ValueError):
         size = math.nan
-    if not size >= LEAST:
+    if not LEAST <= size < math.inf:
         meant = f": is {number}GiB meant?" if 0 < size < LEAST and unit == "B" else ""
         raise ValueError(
             f"max_memory: '{amount}' is no memory for a process: give bytes, as 4GiB or 500MB{meant}"
@@ -88,6 +88,34 @@ def give_back() -> None:
         trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
         if trim:
             trim(0)
+
+
+LIBRARIES = 0.46 * 2**30
+"""What Python, torch and the compiled loops take, bytes (430 MiB were measured)."""
+SLACK = 1.05
+"""What a process may take over what is counted: freed blocks smaller than a page cannot be returned."""
+LEAST_BYTES, LEAST_MATCHED = 81.0, 110.0
+"""Least bytes for each pixel of alpha, whatever the tiles: its image, its frame, and writing that; and of
+networks that use matches (plans had from 151)."""
+
+
+def check_limit(pixels: int, limit: float | None = None, each: float = LEAST_BYTES) -> None:
+    """Check, before anything is read, that a frame of so many pixels can be fused within a memory limit.
+
+    Args:
+        pixels: of alpha.
+        limit: bytes; by default that of `limited`.
+        each: bytes of working memory for each pixel, at least.
+
+    Raises:
+        ValueError: if it cannot.
+    """
+    limit = limit or _LIMIT.get() or math.inf
+    if (needed := SLACK * (LIBRARIES + each * pixels)) > limit:
+        raise ValueError(
+            f"max_memory is {limit / 2**20:.0f} MiB; a frame of {pixels / 1e6:.1f} megapixels needs at least "
+            f"{needed / 2**20:.0f} MiB: allow more, or reduce the images"
+        )
 
 
 ROOM = 0.96

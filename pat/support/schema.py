@@ -196,7 +196,9 @@ def _read_plain(kind: Any, value: Any, entry: str) -> Any:
     if kind in (int, float) and isinstance(value, str) and _is_number(value):
         value = float(value)
     if kind is int and isinstance(value, float) and value.is_integer():
-        return int(value)
+        value = int(value)
+    if kind is int and isinstance(value, int) and abs(value) >= 2**63:
+        raise ValueError(f"{entry}: is {_short(value)}; wanted a whole number of 63 bits")
     if kind is Path and isinstance(value, str):
         return Path(value).expanduser()
     if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):

@@ -113,7 +113,7 @@ def test_images_of_colmap_called_alike_are_told_by_their_folders(tmp_path):
         (b"1,2,3,4\n1,2,3\n", "'1,2,3'"),
         (b"1,2,3\n1,2,3,4\n", "'1,2,3'"),  # taken for a header
         (b"1,2,nan,4\n", "not finite"),
-        (b"", "an empty file is not four numbers"),
+        (b"", "has no line of four numbers"),
         (b"\xff\xfe\x00", "neither CSV nor"),
         (b"SQLite format 3\0" + bytes(100), "not a COLMAP database"),
     ],

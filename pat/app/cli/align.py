@@ -187,7 +187,7 @@ class Align(Around):
         from ...fusion.aligned_files import RecordedFiles
         from ..front import align
 
-        rig, field = self.with_known(frame.rig, frame.alpha, frame.files, None)
+        rig, field = self.with_known(frame.images, frame.rig, frame.alpha, frame.files, None)
         with options.working_by_plan(f"aligning {frame.name}".strip()) as announce:
             return align(
                 frame.images,

@@ -150,7 +150,7 @@ class Fuse(Around, Fusing):
 
         field = options.field_named(self.field)
         along = measured_along(Views(rig, images, frame.alpha, dict.fromkeys(images, field)))
-        rig, around = self.with_known(rig, frame.alpha, frame.first, field)
+        rig, around = self.with_known(images, rig, frame.alpha, frame.first, field)
         settings = self.fuse_settings(noise_by_default=self.luminance in ("alpha", "recorded"))
         fused = fuse_with_progress(
             self.network or "mono-colour",

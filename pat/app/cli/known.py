@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -32,6 +33,9 @@ FRAMES = 5
 """Captures of a flight that its rig is found from."""
 OUT_OF_RANGE = 0.9
 """Share of a depth map outside the rig's depth range above which its unit must be wrong."""
+UNLIKE = 0.25
+"""Share of matched points at other depths above which a depth map is contradicted: at most .01 in seven
+Middlebury pairs with their own maps, from .56 with these upside down."""
 OFF_LINES = 5.0
 """Median distance in pixels of matched points from the rig's lines above which one of them must be wrong."""
 
@@ -131,14 +135,18 @@ class Known:
             The array.
 
         Raises:
-            ValueError: for images that cannot be used.
+            ValueError: for images that cannot be used, and a memory limit that their size exceeds.
         """
+        from ...media.headers import image_header
+        from ...support.memory import check_limit
         from ..from_images import array_from_images
 
         count = min(map(len, files.values()))
         # the first frame, then others all over; of a flight, first and last ones may be of the ground
         chosen = dict.fromkeys([count // 2 * flight, *(count * i // FRAMES for i in range(FRAMES) if flight)])
         first, *further = ({name: paths[i] for name, paths in files.items()} for i in chosen)
+        headers = [image_header(path.read_bytes()) for path in first.values()]
+        check_limit(min((math.prod(header.hw) for header in headers if header), default=0))
         options.say_when_compiling()
         with options.working("finding the rig"):
             array = array_from_images(
@@ -223,7 +231,12 @@ class Around(Known):
         return super().found_array(files, **further, matches=known.path)
 
     def with_known(
-        self, rig: Rig, alpha: str, files: Mapping[str, str | Path], field: ReceptiveField | None
+        self,
+        images: Mapping[str, Tensor],
+        rig: Rig,
+        alpha: str,
+        files: Mapping[str, str | Path],
+        field: ReceptiveField | None,
     ) -> tuple[Rig, ReceptiveField | Mapping[str, ReceptiveField | None] | None]:
         """Return the rig, and the field around the known depth or matches, by beta; `field` without --around.
 
@@ -240,16 +253,22 @@ class Around(Known):
             return rig, _around_matches(known.path, rig, alpha, files, field)
         if field is not None:
             raise UsageError("--field", "no other field beside the depth map of --around")
-        return rig, _around_depth(known, rig, alpha)
+        return rig, _around_depth(known, images, rig, alpha)
 
 
-def _around_depth(known: KnownFile, rig: Rig, alpha: str) -> ReceptiveField:
-    """Field around the depth map. Raises ValueError for depths outside the rig's range."""
+def _around_depth(known: KnownFile, images: Mapping[str, Tensor], rig: Rig, alpha: str) -> ReceptiveField:
+    """Field around the depth map, with a warning if matched points contradict it.
+
+    Raises:
+        ValueError: for depths outside the rig's range.
+    """
     import torch
 
     from arraygeom import Camera
     from arraygeom.fields import AroundDepth
     from arraygeom.runtime.text import length_unit
+    from arraygeom.runtime.warned import warn
+    from calib.images.rig_check import share_unlike
 
     from ...media.depth_maps import read_depth
 
@@ -266,6 +285,12 @@ def _around_depth(known: KnownFile, rig: Rig, alpha: str) -> ReceptiveField:
             f"{known.path}: holds {low:.3g} to {high:.3g} m, the rig's depth range is {near:g} to "
             f"{far:g} {length_unit(rig)}: state its unit with --around FILE,scale=METRES, or another range "
             "with --depth"
+        )
+    off = share_unlike(rig, images, alpha, depth, max(2 * known.tolerance, 0.1))
+    if off > UNLIKE:
+        warn(
+            f"{known.path}: {off:.0%} of the points matched between the images are at other depths: "
+            f"is it upright, of '{alpha}', and in the rig's unit?"
         )
     return AroundDepth(depth, known.tolerance, view)
 

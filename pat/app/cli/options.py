@@ -364,10 +364,10 @@ def _named_file(option: str, text: str) -> tuple[str, Path]:
 
 def _named_number(option: str, text: str) -> tuple[str, float]:
     name, _, number = text.partition("=")
-    try:
-        return name, float(number)
-    except ValueError:
-        raise ValueError(f"{option}: '{text}' is not NAME=NUMBER, such as mono=30") from None
+    with suppress(ValueError):
+        if math.isfinite(value := float(number)):
+            return name, value
+    raise ValueError(f"{option}: '{text}' is not NAME=NUMBER, such as mono=30")
 
 
 def _once(option: str, pairs: Iterable[tuple[str, T]]) -> Iterator[tuple[str, T]]:

@@ -51,6 +51,15 @@ def test_a_frame_heals_its_own_rig_and_says_so(material, capsys):
     assert not (folder / "right" / "healed_rig.yaml").exists()
 
 
+def test_a_stated_depth_range_is_not_replaced_without_a_word(material, monkeypatch):
+    folder, _ = material
+    rough = Rig.load(folder / "rough.yaml")
+    views = ViewFiles(rough, {name: folder / f"{name}.png" for name in rough.names}, alpha="mono")
+    for depth, replaced in (([*map(float, rough.depth)], False), ([0.5, 40.0], True)):
+        monkeypatch.setattr("pat.app.healing._depth_range", lambda *_, depth=depth: tuple(depth))
+        assert ("stated depth range" in checked_rig(views, heal=True).text) == replaced
+
+
 def test_a_rig_where_the_healed_one_would_go_is_refused_and_kept(material, capsys):
     folder, _ = material
     given = folder / "same" / "healed_rig.yaml"

@@ -89,10 +89,12 @@ def test_bands_are_files_by_name_with_their_confidences(tmp_path):
     assert np.allclose(read, frame.by_band[1].numpy(), atol=3e-3)
 
 
-def confidence_warning(by_band: list[float] | None) -> list[warnings.WarningMessage]:
-    least = 0.04 if by_band is None else min(by_band)
+def confidence_warning(
+    by_band: list[float] | None, confidence: torch.Tensor | None = None
+) -> list[warnings.WarningMessage]:
     maps = None if by_band is None else torch.tensor(by_band)[:, None, None].expand(-1, 8, 8)
-    frame = Frame(torch.rand(9, 8, 8), torch.ones(8, 8), torch.full((8, 8), least), torch.ones(8, 8), maps)
+    confidence = torch.full((8, 8), min(by_band or [0.04])) if confidence is None else confidence
+    frame = Frame(torch.rand(9, 8, 8), torch.ones(8, 8), confidence, torch.ones(8, 8), maps)
     inputs = FrameInputs(Inputs(torch.full((1, 1, 8, 8), 0.5), ()), [], (8, 8))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -107,6 +109,19 @@ def test_one_band_that_matches_badly_is_no_wrong_rig():
     assert none.category is LowConfidenceWarning
     assert most.category is LowConfidenceWarning
     assert "of the median band" in str(most.message)
+
+
+def test_low_confidence_is_named_by_where_it_is():
+    """A low mean is warned of, and so is a large part of low confidence, with its place."""
+    confidence = torch.full((8, 8), 0.8)
+    confidence[:, 7:] = 0.0
+    assert confidence_warning(None, confidence) == []
+    confidence[2:, 5:] = 0.0
+    (third,) = confidence_warning(None, confidence)
+    assert third.category is UserWarning
+    assert "right" in str(third.message)
+    (everywhere,) = confidence_warning(None, torch.full((8, 8), 0.39))
+    assert everywhere.category is UserWarning
 
 
 def test_plain_noise_names_the_option_that_it_needs():

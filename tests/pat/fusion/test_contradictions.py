@@ -1,15 +1,19 @@
 """Data that contradict what is stated of them are named, and only these."""
 
 import warnings
+from dataclasses import replace
 
+import cv2
+import numpy as np
 import pytest
 import torch
 
 from arraygeom import Dense, Rig, Sensor, View
 from pat import FuseSettings, fuse
 from pat.app.cli.options import response_of
+from pat.app.sample_array import SAMPLE
 from pat.fusion.corrections import Corrections
-from pat.fusion.views import read_view
+from pat.fusion.views import ViewFiles, Views, read_view
 from pat.matching.radiometry import Response
 from pat.media.images import write_image
 from pat.networks.weights import load_weights
@@ -71,6 +75,45 @@ def test_fourteen_bits_in_sixteen_are_named(tmp_path):
         assert ["bits: 14" in str(warning.message) for warning in caught] == [True] * named
 
 
+def test_bits_that_the_counts_contradict_are_named(tmp_path):
+    """Values cut off where a camera of 12 bits ends contradict 14 stated bits."""
+    image = (torch.linspace(0, 1.2, 600).reshape(1, 20, 30).clamp(max=1) * 4095 / 65535).double()
+    write_image(tmp_path / "a.png", image, bits=16)
+    for bits, named in ((12, False), (14, True), (16, True)):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            read_view(rig(bits=bits), "a", tmp_path / "a.png")
+        assert any("'bits'" in str(warning.message) for warning in caught) == named
+
+
+@pytest.mark.parametrize("text", ["RGB", "colour", "", 5])
+def test_a_response_is_a_name_that_is_known(text, tmp_path):
+    """RGB, in capitals, is refused, not taken for one band."""
+    with pytest.raises((ValueError, TypeError), match="response"):
+        Sensor(response=text)
+    (tmp_path / "rig.yaml").write_text(
+        f"format: arraygeom-rig 1\ncameras:\n  a: {{size: [4, 4], response: {text or repr('')}}}\n"
+    )
+    with pytest.raises(ValueError, match=r"rig\.yaml.*response"):
+        Rig.load(tmp_path / "rig.yaml")
+
+
+def test_exposures_in_another_unit_are_named():
+    """Exposures of 10 and 0.01 seconds for images of equal brightness are refused by name."""
+    sample = Rig.load(SAMPLE / "rig.yaml")
+    for exposures, wrong in (((0.01, 0.01), False), ((10.0, 0.01), True), ((0.01, 10.0), True)):
+        stated = sample
+        for name, exposure in zip(sample.names, exposures):
+            sensor = replace(sample[name].sensor, exposure=exposure)
+            stated = stated.with_camera(name, sample[name].replace(sensor=sensor))
+        images = ViewFiles(stated, {n: SAMPLE / f"{n}.png" for n in sample.names}, alpha="mono")
+        if wrong:
+            with pytest.raises(ValueError, match="'exposure'"):
+                Views.of(stated, images, alpha="mono")
+        else:
+            Views.of(stated, images, alpha="mono")
+
+
 def test_a_dense_field_that_does_not_fit_is_refused_before_the_work():
     """Also without a limit: 640x400 would take 22 GB."""
     wide = Rig({name: View(hw=(400, 640)) for name in ("mono", "colour")})
@@ -78,6 +121,36 @@ def test_a_dense_field_that_does_not_fit_is_refused_before_the_work():
     for settings in (FuseSettings(field=Dense()), FuseSettings(field=Dense(), max_memory="4GiB")):
         with pytest.raises(ValueError, match=r"dense field .*GiB"):
             fuse(images, wide, alpha="mono", network=load_weights("mono-colour"), settings=settings)
+
+
+class Unread(dict):
+    """Images that nobody may ask for."""
+
+    def __getitem__(self, name):
+        raise AssertionError(f"{name} was read")
+
+
+@pytest.mark.parametrize("limit", ["1GiB", "2GiB"])
+def test_a_limit_that_cannot_be_kept_is_known_from_the_sizes(limit, tmp_path, refusal):
+    """Nothing is read before 24 megapixels are refused."""
+    large = Rig({name: View(hw=(4000, 6000)) for name in ("mono", "colour")})
+    with pytest.raises(ValueError, match=r"max_memory.*24\.0 megapixels"):
+        fuse(
+            Unread(mono=None, colour=None),
+            large,
+            alpha="mono",
+            network=load_weights("mono-colour"),
+            settings=FuseSettings(max_memory=limit),
+        )
+    for name in ("mono", "colour"):
+        cv2.imwrite(str(tmp_path / f"{name}.png"), np.full((4000, 6000), ord(name[0]), np.uint8))
+    large.save(tmp_path / "rig.yaml")
+    files = [str(tmp_path / f"{name}.png") for name in ("mono", "colour")]
+    out = ["--out", str(tmp_path / "out"), "--max-memory", limit]
+    assert "24.0 megapixels" in refusal("fuse", *files, *out)
+    rig_and_files = [str(tmp_path / "rig.yaml"), *files, "--alpha", "mono", *out]
+    for command in ("fuse", "align", "batch"):
+        assert "24.0 megapixels" in refusal(command, *rig_and_files)
 
 
 @pytest.mark.parametrize("text", ["1,1,1", "0.1,0.1,0.1", "30,59,11", "nan,1,0"])

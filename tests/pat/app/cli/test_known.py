@@ -72,6 +72,15 @@ def test_a_depth_map_is_taken_as_it_is(folder, file):
     assert np.abs(found - true)[known].max() < 1e-2
 
 
+def test_a_depth_map_that_matched_points_contradict_is_said(folder, capsys):
+    depth = tifffile.imread(folder / "depth.tif")
+    tifffile.imwrite(folder / "other.tif", np.where(depth == WALL, POST, WALL).astype(np.float32))
+    for file, contradicted in (("depth.tif", False), ("other.tif", True)):
+        with suppress(SystemExit):  # status 3: the images do not match there
+            run(folder, "align", f"--around {{}}/{file}")
+        assert bool(re.search(rf"{file}: \d+% of the points", capsys.readouterr().err)) == contradicted
+
+
 def test_what_the_post_hides_is_occluded(folder):
     from arraygeom.fields import AroundDepth
 
@@ -190,4 +199,4 @@ def test_a_large_depth_map_in_another_unit_is_told_what_it_holds(folder, monkeyp
     rig, large = Rig.load(folder / "rig.yaml"), folder / "large.tif"
     large.touch()
     with pytest.raises(ValueError, match=r"holds 1e\+04 to 1e\+04 m, the rig's depth range"):
-        Around(around=str(large)).with_known(rig, rig.names[0], {}, None)
+        Around(around=str(large)).with_known({}, rig, rig.names[0], {}, None)

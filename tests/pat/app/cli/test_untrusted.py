@@ -1,15 +1,20 @@
 """Files of strangers: no code of theirs runs, and their texts reach neither terminal nor page unescaped."""
 
+import sqlite3
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
+from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from arraygeom import Rig, View
 from pat.app.cli.options import say
 from pat.app.report import Facts, filled_page
+from pat.app.sample_array import SAMPLE
 
 EVIL = "open('ran', 'w')\nfield = scene = None\n"
 
@@ -32,6 +37,46 @@ def test_a_recipe_alone_runs_no_code(entries, command, tmp_path, monkeypatch, re
     said = refusal(*command)
     assert "evilmod:" in said
     assert not (tmp_path / "ran").exists()
+
+
+def fuse_with(*options: str) -> list[str]:
+    images = [f"{name}={SAMPLE / name}.png" for name in ("mono", "colour")]
+    named = [word for image in images for word in ("--image", image)]
+    return ["fuse", str(SAMPLE / "rig.yaml"), "--alpha", "mono", *named, *options]
+
+
+@pytest.mark.parametrize("text", ["0", "x", "nan", "1e400"])
+def test_a_depth_map_with_a_scale_that_is_none_is_named(text, tmp_path, refusal):
+    said = PngInfo()
+    said.add_text("Description", f"depth: {text} counts a metre")
+    depth = Image.fromarray(np.full((400, 640), 3000, np.uint16))
+    depth.save(tmp_path / "d.png", pnginfo=said)
+    assert "d.png" in refusal(*fuse_with("--around", f"{tmp_path}/d.png", "--out", f"{tmp_path}/out"))
+
+
+def test_a_damaged_database_is_named(tmp_path, refusal):
+    database = sqlite3.connect(tmp_path / "m.db")
+    database.execute("create table images(image_id, name)")
+    database.execute("create table two_view_geometries(pair_id, rows, data)")
+    database.execute("create table matches(pair_id, rows, data)")
+    database.execute("insert into images values (1, 'mono.png'), (2, 'colour.png')")
+    database.execute("insert into two_view_geometries values (2147483649, 3, x'00')")
+    database.commit()
+    assert "m.db" in refusal(*fuse_with("--around", f"{tmp_path}/m.db", "--out", f"{tmp_path}/out"))
+
+
+@pytest.mark.parametrize("entries", ["seed: 1e40", "seed: 99999999999999999999999", "network: {kind: [x]}"])
+def test_a_recipe_that_is_none_is_named(entries, tmp_path, refusal):
+    (tmp_path / "r.yaml").write_text(entries)
+    assert "r.yaml" in refusal("lab", "train", tmp_path / "r.yaml")
+
+
+@pytest.mark.parametrize(
+    "option", ["--max-memory 1e400", "--max-memory 0", "--max-memory=-5", "--depth 1e400 inf"]
+)
+def test_numbers_without_end_are_named(option, tmp_path, refusal):
+    said = refusal(*fuse_with(*option.split(), "--out", f"{tmp_path}/out"))
+    assert option[2:5] in said
 
 
 def test_texts_do_not_steer_a_terminal(capsys):
