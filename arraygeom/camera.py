@@ -187,6 +187,11 @@ class LensView(View):
         """Whether all rays start in the camera's origin."""
         return self.distortion is None or self.distortion.central
 
+    @property
+    def parallel(self) -> bool:
+        """Whether all rays are parallel, and the image plane in metres."""
+        return self.distortion is not None and self.distortion.even == "distance"
+
     def undistort(self, x: Real[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
         """Pixels of a pinhole with the same K, and which are within the lens model's range."""
         return self._each_through(lambda lens, xy: lens.undistort(xy), x)
@@ -242,7 +247,7 @@ class Camera(LensView):
     def scaled(self, factor: float) -> Camera:
         """The camera with all lengths times a positive factor. Raises ValueError as `LensModel.scaled`."""
         K, lens = self.K, self.distortion
-        if lens is not None and lens.even == "distance":  # parallel rays: the image plane is in metres
+        if self.parallel:  # the image plane is in metres
             K = torch.cat([K[..., :2] / K.new_tensor([factor, factor, 1.0])[:, None], K[..., 2:]], -1)
         pose = Pose(self.R, self.t * factor)
         return self.replace(K=K, cam_from_world=pose, distortion=lens and lens.scaled(factor))

@@ -63,9 +63,9 @@ class BehindModel(CameraModel):
             raise ValueError(f"the lens has to be central, and {self.lens.model} is not")
 
     @property
-    def sees_behind(self) -> bool:
-        """Whether its lens does."""
-        return self.lens is not None and self.lens.sees_behind
+    def period(self) -> float:  # type: ignore[override]
+        """Its lens's."""
+        return 0.0 if self.lens is None else self.lens.period
 
     def _through(self, X: Tensor) -> tuple[Tensor, Tensor]:
         return on_plane(X) if self.lens is None else self.lens.project(X)
@@ -198,6 +198,11 @@ class FlatPort(BehindModel, name="flat-port"):
         super().__post_init__()
         if checking() and not all(bool((n >= 1).all()) for n in (self.glass, self.water)):
             raise ValueError("glass and water are refractive indices, at least 1, as 1.52 and 1.333")
+
+    @property
+    def sees_behind(self) -> bool:
+        """Points beyond the pane alone are seen."""
+        return False
 
     def project(self, X: Tensor) -> tuple[Tensor, Tensor]:
         """Points in the water, by the tangent in air of the ray that reaches them.

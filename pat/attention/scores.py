@@ -61,11 +61,15 @@ class Compared(NamedTuple):
 def log_sum(compared: Compared) -> Float[Tensor, "b ha wa"]:
     """log sum_l exp(query . key(x_l)) over the samples that count; of no meaning where none does.
 
-    Differentiable once, by query and key.
+    Differentiable by query, key and positions: once, or where positions require a gradient any number of
+    times, by the formula, which gathers all keys.
     """
-    positions = sample_positions(compared.segments, compared.query, compared.samples)
-    nearest = compared.interpolation == "nearest"
-    return _LogSum.apply(compared.query, compared.key, positions, nearest)
+    query, key, value, _, _, interpolation = compared
+    positions = sample_positions(compared.segments, query, compared.samples)
+    nearest = interpolation == "nearest"
+    if torch_op.wants_gradient(positions.points):
+        return reference.log_sum(AttentionInputs(query, key, value, positions, None, nearest))
+    return _LogSum.apply(query, key, positions, nearest)
 
 
 def mean_score(compared: Compared) -> Float[Tensor, "b ha wa"]:
