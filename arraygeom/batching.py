@@ -65,18 +65,50 @@ class Batched:
     def to(self: T, *args: Any, **kwargs: Any) -> T:
         """Like `Tensor.to`, for every tensor; a change of dtype leaves masks alone.
 
-        Raises TypeError for a dtype that is not floating point.
+        Raises TypeError for another dtype than float32 and float64: half precision holds no pixel position.
         """
 
         def moved(t: Tensor, axes: int) -> Tensor:
             there = t.to(*args, **kwargs)
-            if t.is_floating_point() and not there.is_floating_point():
+            if t.is_floating_point() and there.dtype not in (torch.float32, torch.float64):
                 raise TypeError(
-                    f"the numbers of a {type(self).__name__} are floating point; got {there.dtype}"
+                    f"the numbers of a {type(self).__name__} are float32 or float64, got {there.dtype}: "
+                    "half precision holds no pixel position; give features in it, and geometry as it is"
                 )
             return there if t.is_floating_point() else there.to(t.dtype)
 
         return map_tensors(self, moved)
+
+    def float(self: T) -> T:
+        """The same in float32."""
+        return self.to(torch.float32)
+
+    def double(self: T) -> T:
+        """The same in float64."""
+        return self.to(torch.float64)
+
+    def cpu(self: T) -> T:
+        """The same in the CPU's memory."""
+        return self.to("cpu")
+
+    def detach(self: T) -> T:
+        """The same numbers without their history."""
+        return map_tensors(self, lambda t, axes: t.detach())
+
+    def clone(self: T) -> T:
+        """A copy with memory of its own; gradients go through."""
+        return map_tensors(self, lambda t, axes: t.clone())
+
+    def pin_memory(self: T) -> T:
+        """The same in page-locked memory, which `torch.utils.data.DataLoader(pin_memory=True)` asks for."""
+        return map_tensors(self, lambda t, axes: t.pin_memory())
+
+    def requires_grad_(self: T, requires_grad: bool = True) -> T:
+        """Record, or stop recording, what is done with its numbers; in place, as of a tensor."""
+        for t, _ in tensors_of(self):
+            if t.is_floating_point():
+                t.requires_grad_(requires_grad)
+        return self
 
     def replace(self: T, **changes: Any) -> T:
         """A copy with some fields changed."""

@@ -18,6 +18,7 @@ from .lenses.common import on_plane
 from .lenses.model import LensModel, check_model
 from .pixels import (
     HW,
+    broadcast_shapes,
     coarse_grid,
     floating,
     map_homogeneous,
@@ -275,10 +276,12 @@ class Camera(LensView):
         """Pixels at depth z (metres) to world points. NaN for pixels outside the lens's range, and for depths
         that their rays do not reach: below 0 of those ahead, above 0 of those 90 degrees and more off axis.
 
-        Raises nothing: `rays` gives the validity.
+        `rays` gives the validity. Raises ValueError for as many depths of each pixel as there are pixels, as
+        (n, 1) beside (n, 2) asks for: give (n), or repeat the pixels.
         """
         rays, valid = self.rays(x)
         z = rays[..., 2]
+        _check_pairs(z.shape, depth.shape)
         valid = valid & (z != 0) & (z * depth >= 0)
         X = rays * (depth / torch.where(valid, z, 1.0))[..., None]
         if not self.central:
@@ -337,6 +340,18 @@ class Camera(LensView):
         pose = Pose(camera.extrinsics[..., :3, :3], camera.extrinsics[..., :3, 3])
         made = cls(K=camera.intrinsics[..., :3, :3], cam_from_world=pose, hw=sizes[0])
         return made[0] if made.batch_shape == (1,) and not batched else made
+
+
+def _check_pairs(pixels: torch.Size, depths: torch.Size) -> None:
+    """Raises ValueError unless pixels and depths, broadcast, are as many as one of both."""
+    try:
+        fits = broadcast_shapes(pixels, depths) in (pixels, depths)
+    except RuntimeError:
+        fits = False
+    if not fits:
+        raise ValueError(
+            f"depth has the shape {tuple(depths)} beside pixels {tuple(pixels)}: wanted one for each pixel"
+        )
 
 
 def intrinsics(

@@ -254,10 +254,10 @@ class RayCurve(NamedTuple):
         return fractions
 
     def _fractions(self, even: Tensor) -> Tensor:
-        """Even fractions for each pixel; if not central, with others closer and closer to the far end."""
+        """Even fractions for each pixel; if not central, with others closer and closer to both ends."""
         if not self.beta.central:
-            far = 1 - 10 ** (FARTHEST * (1 - self._even(len(even) // 2 + 1)[:-1]))
-            even = torch.cat([even, far]).sort().values
+            close = 10 ** (CLOSEST * (1 - self._even(len(even) // 2 + 1)[:-1]))
+            even = torch.cat([even, close, 1 - close]).sort().values
         return even.expand(*self.valid.shape, -1)
 
     def _even(self, count: int) -> Tensor:
@@ -348,9 +348,9 @@ MARGIN, NARROW = 1 / 4, 1 / 32
 """By how much larger than beta's image, in shares of its height plus width, to search and to divide in."""
 HALVINGS = 20
 """Steps of the bisection for where a model's range ends."""
-FARTHEST = -6.0
-"""Log10 of the share of a curve before its far end to which first nodes go: where one direction of beta's
-rays is parallel, most of its image is there."""
+CLOSEST = -6.0
+"""Log10 of the share of a curve from its ends to which first nodes go: by the plane of beta, and far away where
+one direction of its rays is parallel, most of its image may be there."""
 REMOTE = 1e-5
 """Inverse depth of infinity, in units of baseline plus near bound, to a beta whose rays do not meet: there a
 point is not only a direction."""

@@ -5,7 +5,9 @@ On that area the bilinear look-up takes coordinates clamped to the border's cent
 takes the pixel on whose area the position lies. An alpha pixel without a sample that counts gets 0
 everywhere, and passes no gradient.
 
-Gradients reach query, key, value, bias and the geometry. With `nearest` the value and the peak have no
+Gradients reach query, key, value, bias and the geometry. Which samples count is a constant in the graph: what
+enters or leaves beta's image when a rig moves has no gradient, which is part of the truth near its border. A
+`value` that falls to 0 towards beta's border makes it continuous there. With `nearest` the value and the peak have no
 gradient by the geometry (they are constant almost everywhere); position and spread do, as weighted means of
 the positions.
 """
