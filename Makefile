@@ -8,29 +8,32 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --no-input -
 
 DATA ?= ../shared/data
 
-.PHONY: help env synthesis demo showcase readme pairs stages conditions certainty without-rig alignment paper-network test test-long check format bench bench-job train notebooks docs drawings wheel fuzz kills transformations
+.PHONY: help env synthesis demo showcase readme pairs stages conditions certainty without-rig alignment paper-network paper-tables outside fields test test-long check format bench bench-job train notebooks docs drawings wheel fuzz kills transformations
 
 help:
 	@echo "make demo       fuse the sample array into out/demo"
 	@echo "make showcase   fuse real images from DATA=$(DATA) into out/showcase"
-	@echo "make readme     run both and put what they print into docs/results.md"
-	@echo "make pairs      measure stereo pairs, ideal, into docs/results.md; two minutes"
+	@echo "make readme     run both and put what they print into docs/results.md and docs/reports/real_images.md"
+	@echo "make pairs      measure stereo pairs, ideal, into docs/reports/pairs.md; two minutes"
 	@echo "make stages     measure each stage of the fusion left out, on the tune half, into out/stages; ten minutes"
-	@echo "make conditions measure other responses, low light and misalignment into docs/results.md; half an hour"
-	@echo "make certainty  measure how well stated confidence holds into docs/weights.md; ten minutes"
-	@echo "make alignment  measure how well bands are aligned into docs/results.md; ten minutes"
-	@echo "make paper-network  measure the paper's network, narrow and briefly trained, into docs/results.md"
-	@echo "make without-rig  fuse with rigs found from the images, against known ones, into docs/results.md"
+	@echo "make conditions measure other responses, low light and misalignment into docs/reports/conditions.md; half an hour"
+	@echo "make certainty  measure how well stated confidence holds into docs/reports/confidence.md; ten minutes"
+	@echo "make alignment  measure how well bands are aligned into docs/reports/alignment.md; ten minutes"
+	@echo "make paper-network  measure the paper's network, narrow and briefly trained, into docs/reports/paper.md"
+	@echo "make paper-tables  the paper's Tables 1 and 2 by its network, into docs/reports/paper.md"
+	@echo "make outside    fuse with disparities from elsewhere, into docs/reports/outside.md"
+	@echo "make fields     every receptive field by the network pat-supervised, into docs/reports/paper.md"
+	@echo "make without-rig  fuse with rigs found from the images, against known ones, into docs/reports/without_rig.md"
 	@echo "make test       the tests"
 	@echo "make test-long  the tests, longer ones included"
 	@echo "make check      format, lint and types"
 	@echo "make format     put the format right, and what lint can repair"
 	@echo "make bench      measure attention and training"
-	@echo "make bench-job  measure pat fuse as a command into docs/performance.md, 15 minutes; QUICK=1: one size, a minute;"
+	@echo "make bench-job  measure pat fuse as a command into docs/reports/performance.md, 15 minutes; QUICK=1: one size, a minute;"
 	@echo "                AGAINST=FOLDER: another checkout too"
-	@echo "make fuzz       read 6,000 damaged files, each in a process of its own; the table of docs/fuzzing.md"
-	@echo "make kills      end commands with SIGKILL some 100 times, continue and compare; the table of docs/kills.md"
-	@echo "make transformations  torch's transformations of every operator; the table of docs/transformations.md"
+	@echo "make fuzz       read 6,000 damaged files, each in a process of its own; the table of docs/reports/fuzzing.md"
+	@echo "make kills      end commands with SIGKILL some 100 times, continue and compare; the table of docs/reports/kills.md"
+	@echo "make transformations  torch's transformations of every operator; the table of docs/reports/transformations.md"
 	@echo "make train      train on the images at hand; ARGS=... goes to 'pat lab train'"
 	@echo "make synthesis  adds Blender to the environment (some 400 MB), to render scenes"
 	@echo "make notebooks  run the notebooks and keep what they put out"
@@ -51,40 +54,57 @@ showcase: $(READY)
 	@$(BIN)/python -m experiments showcase --data $(DATA) --out out/showcase
 
 readme: demo showcase
-	@echo "== bringing docs/results.md and docs/demo.jpg up to date"
-	@$(BIN)/python -m docs.update_readme --document docs/results.md --block demo=out/demo/demo.md --block showcase=out/showcase/showcase.md \
+	@echo "== bringing docs/results.md, docs/demo.jpg and docs/reports/real_images.md up to date"
+	@$(BIN)/python -m docs.update_readme --document docs/results.md --block demo=out/demo/demo.md \
 		--image out/demo/demo.png docs/demo.jpg
+	@$(BIN)/python -m docs.update_readme --document docs/reports/real_images.md --block showcase=out/showcase/showcase.md
 
 pairs: $(READY)
 	@$(BIN)/python -m experiments evaluate --middlebury $(DATA)/middlebury --rates 2 4 --half report --out out/pairs
-	@$(BIN)/python -m docs.update_readme --document docs/results.md --block pairs=out/pairs/scores.md
+	@$(BIN)/python -m docs.update_readme --document docs/reports/pairs.md --block pairs=out/pairs/scores.md
 
 stages: $(READY)
 	@$(BIN)/python -m experiments stages --middlebury $(DATA)/middlebury --out out/stages
 
 conditions: $(READY)
 	@$(BIN)/python -m experiments conditions --middlebury $(DATA)/middlebury --half report --out out/conditions
-	@$(BIN)/python -m docs.update_readme --document docs/results.md --block conditions=out/conditions/conditions.md \
-		--image out/conditions/conditions.png docs/conditions.jpg
+	@$(BIN)/python -m docs.update_readme --document docs/reports/conditions.md --block conditions=out/conditions/conditions.md \
+		--image out/conditions/conditions.png docs/reports/conditions.jpg
 
 certainty: $(READY)
 	@$(BIN)/python -m experiments certainty --middlebury $(DATA)/middlebury --out out/certainty
-	@$(BIN)/python -m docs.update_readme --document docs/weights.md --block reliability=out/certainty/certainty.md \
-		--image out/certainty/reliability.png docs/reliability.jpg
+	@$(BIN)/python -m docs.update_readme --document docs/reports/confidence.md --block reliability=out/certainty/certainty.md \
+		--image out/certainty/reliability.png docs/reports/reliability.jpg
 
 without-rig: $(READY)
 	@$(BIN)/python -m experiments evaluate --middlebury $(DATA)/middlebury --without-rig --rates 2 --half report --out out/without-rig
-	@$(BIN)/python -m docs.update_readme --document docs/results.md --block without-rig=out/without-rig/scores.md
+	@$(BIN)/python -m docs.update_readme --document docs/reports/without_rig.md --block without-rig=out/without-rig/scores.md
 
 alignment: $(READY)
 	@$(BIN)/python -m experiments alignment --data $(DATA) --scenes middlebury motorcycle rededge sequoia nine-band \
 		--out out/alignment
-	@$(BIN)/python -m docs.update_readme --document docs/results.md --block alignment=out/alignment/alignment.md
+	@$(BIN)/python -m docs.update_readme --document docs/reports/alignment.md --block alignment=out/alignment/alignment.md
 
 paper-network: $(READY)
 	@$(BIN)/python -m experiments evaluate --middlebury $(DATA)/middlebury --rates 2 --half report \
 		--weights tests/benchmarks/paper-2-narrow.safetensors --out out/paper-network
-	@$(BIN)/python -m docs.update_readme --document docs/results.md --block paper=out/paper-network/scores.md
+	@$(BIN)/python -m docs.update_readme --document docs/reports/paper.md --block paper=out/paper-network/scores.md
+
+outside: $(READY)
+	@$(BIN)/python -m experiments outside --middlebury $(DATA)/middlebury --half report --out out/outside
+	@$(BIN)/python -m docs.update_readme --document docs/reports/outside.md --block outside=out/outside/outside.md
+
+paper-tables: $(READY)
+	@$(BIN)/python -m experiments evaluate --kitti $(DATA)/kitti --flickr1024 $(DATA)/flickr1024 \
+		--weights pat-supervised --out out/table1
+	@$(BIN)/python -m experiments evaluate --kitti $(DATA)/kitti --flickr1024 $(DATA)/flickr1024 \
+		--protocol table2 --weights pat-supervised-4 --out out/table2
+	@$(BIN)/python -m docs.update_readme --document docs/reports/paper.md \
+		--block table1=out/table1/scores.md --block table2=out/table2/scores.md
+
+fields: $(READY)
+	@$(BIN)/python -m experiments fields --middlebury $(DATA)/middlebury --out out/fields
+	@$(BIN)/python -m docs.update_readme --document docs/reports/paper.md --block fields=out/fields/ablation.md
 
 test: $(READY)
 	@echo "== tests"
@@ -116,16 +136,16 @@ bench: $(READY)
 
 bench-job: $(READY)
 	@$(BIN)/python -m tests.benchmarks.bench_job $(if $(QUICK),--quick) $(if $(AGAINST),--against $(AGAINST))
-	@$(if $(QUICK),,$(BIN)/python -m docs.update_readme --document docs/performance.md --block job=tests/benchmarks/RESULTS_job.md)
+	@$(if $(QUICK),,$(BIN)/python -m docs.update_readme --document docs/reports/performance.md --block job=tests/benchmarks/RESULTS_job.md)
 
 fuzz: $(READY)
-	@OMP_NUM_THREADS=1 $(BIN)/python -m tests.fuzz.run --out docs/fuzzing.md
+	@OMP_NUM_THREADS=1 $(BIN)/python -m tests.fuzz.run --out docs/reports/fuzzing.md
 
 kills: $(READY)
-	@OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m tests.kills.run --out docs/kills.md
+	@OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m tests.kills.run --out docs/reports/kills.md
 
 transformations: $(READY)
-	@OMP_NUM_THREADS=1 $(BIN)/python -m tests.transformations.run --out docs/transformations.md
+	@OMP_NUM_THREADS=1 $(BIN)/python -m tests.transformations.run --out docs/reports/transformations.md
 
 notebooks: $(READY)
 	@$(BIN)/python notebooks/run.py

@@ -1,4 +1,4 @@
-"""Differentiable geometry of rigs of N unlike cameras.
+"""Differentiable geometry of rigs of N cameras of different kinds.
 
 Cameras, rigs, two-view geometry and receptive fields as tensor operations; see conventions.md.
 """
@@ -65,7 +65,7 @@ from .undistortion import pinhole_view, resampled
 
 
 def _when_called(module: str, name: str) -> Callable[..., Any]:
-    """A function whose module is imported when it is called: the formats of rig files take a while."""
+    """Function whose module is imported when it is called: the formats of rig files take a while."""
     return lambda *args: getattr(import_module(f"{__name__}.{module}"), name)(*args)
 
 

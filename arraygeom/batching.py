@@ -1,4 +1,4 @@
-"""Batches of cameras, rigs, poses and the like: one generic piece for every frozen dataclass of tensors."""
+"""Batches of cameras, rigs, poses: one base class for every frozen dataclass of tensors."""
 
 from __future__ import annotations
 
@@ -16,21 +16,23 @@ from .pixels import broadcast_shapes
 
 T = TypeVar("T", bound="Batched")
 LABELS = ("name", "sensor")
-"""Fields that may differ between what is stacked; the batch has those of the first."""
+"""Fields that may differ between stacked items; the batch has the first item's."""
 
 
 class Batched:
     """Base of frozen dataclasses whose tensors have leading batch axes: `[i]`, `len`, `to` and `==`.
 
-    `item_axes` holds, by field, the number of a tensor's last axes that belong to one item. A tensor without
-    batch axes is shared by all items of a batch. Instances are not hashable: they are equal if their tensors
-    are.
+    A tensor without batch axes is shared by all items of a batch. Instances are not hashable: they are equal
+    if their tensors are.
+
+    Attributes:
+        item_axes: by field, the number of a tensor's last axes that belong to one item.
     """
 
     item_axes: ClassVar[Mapping[str, int]] = {}
 
     def __init_subclass__(cls, **options: Any) -> None:
-        """Every kind is a pytree, and may be read by `torch.load(weights_only=True)`."""
+        """Register the subclass as a pytree, and for `torch.load(weights_only=True)`."""
         super().__init_subclass__(**options)
         register_pytree_node(
             cls,
@@ -42,7 +44,7 @@ class Batched:
 
     @property
     def batch_shape(self) -> torch.Size:
-        """The batch axes, empty for one item."""
+        """Batch axes; empty for a single item."""
         shapes = [t.shape[: t.ndim - axes] for t, axes in tensors_of(self) if t.ndim > axes]
         return broadcast_shapes(*shapes) if shapes else torch.Size()
 
@@ -53,7 +55,11 @@ class Batched:
         return True
 
     def __getitem__(self: T, index: Any) -> T:
-        """Items of the batch; `index` is as for the first axes of a tensor."""
+        """Select items of the batch; `index` applies to the batch axes as to the first axes of a tensor.
+
+        Raises:
+            TypeError: for a single item.
+        """
         shape = self._batched()
 
         def chosen(t: Tensor, axes: int) -> Tensor:
@@ -63,9 +69,13 @@ class Batched:
         return map_tensors(self, chosen)
 
     def to(self: T, *args: Any, **kwargs: Any) -> T:
-        """Like `Tensor.to`, for every tensor; a change of dtype leaves masks alone.
+        """Apply `Tensor.to` to every tensor; a change of dtype leaves masks alone.
 
-        Raises TypeError for another dtype than float32 and float64: half precision holds no pixel position.
+        Returns:
+            A copy; tensors that need no change are shared.
+
+        Raises:
+            TypeError: for another dtype than float32 and float64; half precision holds no pixel position.
         """
 
         def moved(t: Tensor, axes: int) -> Tensor:
@@ -80,38 +90,42 @@ class Batched:
         return map_tensors(self, moved)
 
     def float(self: T) -> T:
-        """The same in float32."""
+        """Return a copy in float32."""
         return self.to(torch.float32)
 
     def double(self: T) -> T:
-        """The same in float64."""
+        """Return a copy in float64."""
         return self.to(torch.float64)
 
     def cpu(self: T) -> T:
-        """The same in the CPU's memory."""
+        """Return a copy in the CPU's memory."""
         return self.to("cpu")
 
     def detach(self: T) -> T:
-        """The same numbers without their history."""
+        """Return the same numbers without their history."""
         return map_tensors(self, lambda t, axes: t.detach())
 
     def clone(self: T) -> T:
-        """A copy with memory of its own; gradients go through."""
+        """Return a copy with memory of its own; gradients go through."""
         return map_tensors(self, lambda t, axes: t.clone())
 
     def pin_memory(self: T) -> T:
-        """The same in page-locked memory, which `torch.utils.data.DataLoader(pin_memory=True)` asks for."""
+        """Return a copy in page-locked memory, which `torch.utils.data.DataLoader(pin_memory=True)` asks for."""
         return map_tensors(self, lambda t, axes: t.pin_memory())
 
     def requires_grad_(self: T, requires_grad: bool = True) -> T:
-        """Record, or stop recording, what is done with its numbers; in place, as of a tensor."""
+        """Let autograd record operations on its numbers, or not, in place.
+
+        Returns:
+            Itself.
+        """
         for t, _ in tensors_of(self):
             if t.is_floating_point():
                 t.requires_grad_(requires_grad)
         return self
 
     def replace(self: T, **changes: Any) -> T:
-        """A copy with some fields changed."""
+        """Return a copy with some fields changed, checked as in the constructor."""
         return dataclasses.replace(self, **changes)  # type: ignore[type-var]
 
     def __eq__(self, other: object) -> bool:
@@ -140,10 +154,16 @@ class Batched:
 
 
 def stack(items: Sequence[T]) -> T:
-    """One batch of items alike, along a new first axis.
+    """Stack items of one kind into a batch, along a new first axis.
 
-    What is not a tensor has to be the same in all (sizes, lens models, the cameras of rigs), but for names
-    and sensors, which are the first's. Raises ValueError where it is not.
+    Everything but tensors must be equal in all (sizes, lens models, names of a rig's cameras), except for
+    names and sensors, which are the first item's.
+
+    Returns:
+        The batch.
+
+    Raises:
+        ValueError: for no items, and items that differ in kind, shapes or anything else.
     """
     if not items:
         raise ValueError("nothing to stack: give one item or more")
@@ -151,7 +171,11 @@ def stack(items: Sequence[T]) -> T:
 
 
 def map_tensors(value: Any, f: Callable[[Tensor, int], Tensor], axes: int = 0) -> Any:
-    """The value with f(tensor, item axes) in place of each of its tensors."""
+    """Replace each tensor of a value by f(tensor, number of item axes), in nested mappings and tuples too.
+
+    Returns:
+        The new value.
+    """
     if isinstance(value, Tensor):
         return f(value, axes)
     if isinstance(value, Batched):
@@ -166,7 +190,7 @@ def map_tensors(value: Any, f: Callable[[Tensor, int], Tensor], axes: int = 0) -
 
 
 def tensors_of(value: Any, axes: int = 0) -> Iterator[tuple[Tensor, int]]:
-    """Every tensor of a value and the number of its item axes."""
+    """Yield every tensor of a value with the number of its item axes."""
     if isinstance(value, Tensor):
         yield value, axes
     elif isinstance(value, Batched):
@@ -178,7 +202,8 @@ def tensors_of(value: Any, axes: int = 0) -> Iterator[tuple[Tensor, int]]:
 
 
 class _Layout(NamedTuple):
-    """A flattened value but for its tensors: its kind, the names of what holds tensors, and the rest."""
+    """Flattened value without its tensors: its kind, the names of fields with tensors, and the
+    other fields."""
 
     kind: type
     names: tuple[str, ...]
@@ -202,7 +227,7 @@ def _flattened_with_keys(value: Batched) -> tuple[list[tuple[GetAttrKey, Any]], 
 
 
 def _unflattened(held: Iterable[Any], layout: _Layout) -> Any:
-    """Without the checks of a constructor: what takes a tensor's place in a tree need not be a tensor."""
+    """Rebuild a value without a constructor's checks: a tree may hold other things in place of tensors."""
     held = list(held)
     made: Any = object.__new__(layout.kind)
     for name, v in (layout.rest | dict(zip(layout.names, held))).items():
@@ -226,7 +251,7 @@ def _fields(value: Any) -> list[dataclasses.Field[Any]]:
 
 
 def _stacked(values: list[Any], where: str) -> Any:
-    """Values of one kind as a batch; `where` names them in errors."""
+    """Stack values of one kind; `where` names them in errors."""
     first = values[0]
     if any(type(v) is not type(first) for v in values):
         kinds = " and ".join(sorted({type(v).__name__ for v in values}))

@@ -1,4 +1,4 @@
-"""Camera: intrinsics, lens, pose and size."""
+"""Cameras: intrinsics, lens, pose and size."""
 
 from __future__ import annotations
 
@@ -40,7 +40,14 @@ if TYPE_CHECKING:
 
 
 class Projected(NamedTuple):
-    """Pixels (x, y), depth z in metres, and whether the point is in front and within the lens's range."""
+    """Projection of points into an image.
+
+    Attributes:
+        x: pixels (x, y).
+        depth: z in the camera's frame, metres.
+        valid: True for points that the model sees: in front of a pinhole, within a lens model's range; the
+            image's borders are not considered.
+    """
 
     x: Float[Tensor, "*n 2"]
     depth: Float[Tensor, "*n"]
@@ -52,7 +59,16 @@ AnyView = TypeVar("AnyView", bound="View")
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class View(Batched):
-    """What is known of every camera, calibrated or not: its image's (height, width) and what it records."""
+    """Properties of any camera, calibrated or not.
+
+    Attributes:
+        hw: image size (height, width).
+        sensor: what the camera records.
+
+    Raises:
+        ValueError: for an invalid size.
+        TypeError: for a `sensor` that is no Sensor.
+    """
 
     hw: HW
     sensor: Sensor = field(default_factory=Sensor)
@@ -66,37 +82,45 @@ class View(Batched):
                 )
 
     def resize(self: AnyView, hw: HW) -> AnyView:
-        """The same view at another size."""
+        """Return the view of images resized to `hw`: c' = (c + 0.5) s - 0.5."""
         return self.transformed(resize_matrix(self.hw, hw), hw)
 
     def crop(self: AnyView, top: int, left: int, hw: HW) -> AnyView:
-        """A window of the view, `hw` in size. A negative `top` or `left`, or a larger size, pads."""
+        """Return the view of a window of size `hw`. A negative `top` or `left`, or a larger size, pads."""
         return self.transformed(shift_matrix(left, top), hw)
 
     def rot90(self: AnyView, quarter_turns: int) -> AnyView:
-        """The view of the image rotated counter-clockwise, as `torch.rot90(image, k, (-2, -1))`."""
+        """Return the view of images rotated counter-clockwise, as `torch.rot90(image, k, (-2, -1))`."""
         hw = self.hw if quarter_turns % 2 == 0 else (self.hw[1], self.hw[0])
         return self.transformed(rot90_matrix(self.hw, quarter_turns), hw)
 
     def transformed(self: AnyView, A: Float[Tensor, "3 3"], hw: HW) -> AnyView:
-        """The camera of the image whose pixels are x' ~ A x, of size `hw`."""
+        """Return the view of images with pixels x' ~ A x and size `hw`."""
         return self.replace(hw=hw)
 
     def undistort(self, x: Real[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
-        """Undistorted pixels, and which of them are within the lens model's range."""
+        """Map pixels of the image to undistorted pixels.
+
+        Returns:
+            Undistorted pixels, and True within the lens model's range. Without a lens the pixels themselves.
+        """
         return floating(x), torch.ones_like(floating(x)[..., 0], dtype=torch.bool)
 
     def distort(self, x: Real[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
-        """Undistorted pixels to those of the image: the inverse of `undistort`."""
+        """Map undistorted pixels to pixels of the image: the inverse of `undistort`.
+
+        Returns:
+            Pixels, and True within the lens model's range.
+        """
         return floating(x), torch.ones_like(floating(x)[..., 0], dtype=torch.bool)
 
     @property
     def has_pinhole_view(self) -> bool:
-        """Whether a pinhole can stand for the view once its image is undistorted."""
+        """True if a pinhole camera can replace the view once its image is undistorted."""
         return True
 
     def contains(self, x: Real[Tensor, "*n 2"]) -> Bool[Tensor, "*n"]:
-        """Whether points lie on the image's area, [-0.5, W - 0.5] x [-0.5, H - 0.5]."""
+        """Return True for points on the image's area, [-0.5, W - 0.5] x [-0.5, H - 0.5]."""
         return within(floating(x), self.hw)
 
     def _text(self) -> str:
@@ -105,16 +129,23 @@ class View(Batched):
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class LensView(View):
-    """A view with a lens model, whose focal length and pose need not be known.
+    """View with a lens model, whose focal length and pose need not be known.
 
-    `K` maps the plane z = 1 (after the lens) to pixels. Without a calibration it is only the scale and the
-    centre in which `distortion` counts: then `rays` follow the lens but their angles mean nothing. Links of
-    such views relate undistorted pixels.
+    Without a calibration K is only the scale and the centre to which `distortion` refers: `rays` then follow
+    the lens but their angles mean nothing. Links of such views relate undistorted pixels.
 
     >>> lens = Distortion("brown-conrady", torch.tensor([-0.1, 0, 0, 0], dtype=torch.float64))
     >>> view = LensView(hw=(61, 101), K=intrinsics(50.0, (61, 101)), distortion=lens)
     >>> view.distort(torch.tensor([100.0, 30.0], dtype=torch.float64))[0].tolist()
     [95.0, 30.0]
+
+    Attributes:
+        K: map from the plane z = 1 (after the lens) to pixels.
+        distortion: lens model; None for a pinhole.
+
+    Raises:
+        ValueError: for an invalid K, or batch axes that do not broadcast.
+        TypeError: for a `distortion` that is no lens model.
     """
 
     item_axes: ClassVar = {"K": 2}
@@ -154,20 +185,29 @@ class LensView(View):
         return self.distortion.batch_shape if self.distortion is not None else torch.Size()
 
     def project_local(self, X: Real[Tensor, "*n 3"]) -> Projected:
-        """Points in the camera's own frame to pixels."""
+        """Project points in the camera's frame.
+
+        Returns:
+            Pixels, depth, and validity.
+        """
         X = floating(X)
         normalised, valid = on_plane(X) if self.distortion is None else self.distortion.project(X)
         return Projected(map_homogeneous(self.K[..., :2, :], normalised), X[..., 2], valid)
 
     def rays(self, x: Real[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*m 3"], Bool[Tensor, "*m"]]:
-        """The rays of pixels in the camera's frame, z = 1 for pinholes, and their validity."""
+        """Compute the rays of pixels in the camera's frame.
+
+        Returns:
+            Directions (z = 1 for pinholes, unit length with a lens), and True where the lens model has one.
+        """
         normalised = map_homogeneous(torch.linalg.inv(self.K)[..., :2, :], x)
         if self.distortion is None:
             return to_homogeneous(normalised), torch.ones_like(normalised[..., 0], dtype=torch.bool)
         return self.distortion.unproject(normalised)
 
     def ray_origins(self, x: Real[Tensor, "*n 2"]) -> Float[Tensor, "*m 3"]:
-        """Where rays of pixels start, metres in the camera's frame: its origin, unless it is not central."""
+        """Return the start of each pixel's ray in the camera's frame, metres: the origin unless the camera is
+        not central."""
         normalised = map_homogeneous(torch.linalg.inv(self.K)[..., :2, :], x)
         if self.distortion is None:
             return torch.zeros_like(to_homogeneous(normalised))
@@ -175,7 +215,8 @@ class LensView(View):
 
     @property
     def has_pinhole_view(self) -> bool:
-        """Whether it has no lens, a `Distortion` or a central model; all within 75 degrees of the axis."""
+        """True for no lens, a `Distortion`, or a central model with all of the image within 75 degrees of the
+        axis."""
         if isinstance(self.distortion, Distortion | None):
             return True
         if not self.distortion.central or traced():
@@ -185,28 +226,36 @@ class LensView(View):
 
     @property
     def central(self) -> bool:
-        """Whether all rays start in the camera's origin."""
+        """True if all rays start in the camera's origin."""
         return self.distortion is None or self.distortion.central
 
     @property
     def parallel(self) -> bool:
-        """Whether all rays are parallel, and the image plane in metres."""
+        """True if all rays are parallel, and the image plane is in metres."""
         return self.distortion is not None and self.distortion.even == "distance"
 
     def undistort(self, x: Real[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
-        """Pixels of a pinhole with the same K, and which are within the lens model's range."""
+        """Map pixels of the image to those of a pinhole with the same K.
+
+        Returns:
+            Undistorted pixels, and True within the lens model's range.
+        """
         return self._each_through(lambda lens, xy: lens.undistort(xy), x)
 
     def distort(self, x: Real[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
-        """Undistorted pixels to those of the image: the inverse of `undistort`."""
+        """Map undistorted pixels to pixels of the image: the inverse of `undistort`.
+
+        Returns:
+            Pixels, and True within the lens model's range.
+        """
         return self._each_through(lambda lens, xy: lens.distort(xy), x)
 
     def transformed(self: AnyLensView, A: Float[Tensor, "3 3"], hw: HW) -> AnyLensView:
-        """The camera of the image whose pixels are x' ~ A x, of size `hw`: K' = A K."""
+        """Return the view of images with pixels x' ~ A x and size `hw`: K' = A K."""
         return self.replace(K=product(A.to(self.K), self.K), hw=hw)
 
     def _each_through(self, f: ThroughLens, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixels to normalised points, through f, and back to pixels."""
+        """Map pixels to normalised points, through f, and back to pixels."""
         if self.distortion is None:
             return super().undistort(x)
         normalised, valid = f(self.distortion, map_homogeneous(torch.linalg.inv(self.K)[..., :2, :], x))
@@ -214,23 +263,25 @@ class LensView(View):
 
 
 NARROW = 0.259
-"""The cosine of 75 degrees."""
+"""Cosine of 75 degrees."""
 AnyLensView = TypeVar("AnyLensView", bound=LensView)
 ThroughLens = Callable[[Any, Tensor], tuple[Tensor, Tensor]]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Camera(LensView):
-    """A calibrated camera. Leading batch axes everywhere; every tensor may require grad.
+    """Calibrated camera. Leading batch axes everywhere; every tensor may require grad.
 
-    `K` maps the plane z = 1 (after the lens) to pixels, the first pixel's centre being (0, 0). It is affine,
-    not necessarily upper triangular: that of a rotated image has zeros on its diagonal.
-    `cam_from_world`: X_cam = R X_world + t in metres, x right, y down, z forward.
+    K is affine, not necessarily upper triangular: that of a rotated image has zeros on its diagonal. The
+    first pixel's centre is (0, 0).
 
     >>> K = torch.tensor([[100.0, 0, 49.5], [0, 100.0, 29.5], [0, 0, 1]], dtype=torch.float64)
     >>> camera = Camera(K=K, cam_from_world=Pose.identity(), hw=(60, 100))
     >>> camera.project(torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64)).x.tolist()
     [49.5, 29.5]
+
+    Attributes:
+        cam_from_world: pose, X_cam = R X_world + t in metres, x right, y down, z forward.
     """
 
     cam_from_world: Pose
@@ -246,7 +297,14 @@ class Camera(LensView):
             check_batches("K, lens and cam_from_world", *shapes)
 
     def scaled(self, factor: float) -> Camera:
-        """The camera with all lengths times a positive factor. Raises ValueError as `LensModel.scaled`."""
+        """Multiply all lengths of the camera by a positive factor, as for another unit.
+
+        Returns:
+            The scaled camera.
+
+        Raises:
+            ValueError: as `LensModel.scaled`.
+        """
         K, lens = self.K, self.distortion
         if self.parallel:  # the image plane is in metres
             K = torch.cat([K[..., :2] / K.new_tensor([factor, factor, 1.0])[:, None], K[..., 2:]], -1)
@@ -265,19 +323,26 @@ class Camera(LensView):
 
     @property
     def centre(self) -> Float[Tensor, "*b 3"]:
-        """The optical centre in the world, metres."""
+        """Optical centre in the world, metres."""
         return self.cam_from_world.centre
 
     def project(self, X: Real[Tensor, "*n 3"]) -> Projected:
-        """World points (*n, 3) to pixels; with a batched camera (*b), points are (*b, ..., 3)."""
+        """Project world points (*n, 3); with a batched camera (*b), points are (*b, ..., 3).
+
+        Returns:
+            Pixels, depth in metres, and validity.
+        """
         return self.project_local(self.cam_from_world.apply(X))
 
     def unproject(self, x: Real[Tensor, "*n 2"], depth: Real[Tensor, "*n"]) -> Float[Tensor, "*n 3"]:
-        """Pixels at depth z (metres) to world points. NaN for pixels outside the lens's range, and for depths
-        that their rays do not reach: below 0 of those ahead, above 0 of those 90 degrees and more off axis.
+        """Compute the world points of pixels at depth z (metres).
 
-        `rays` gives the validity. Raises ValueError for as many depths of each pixel as there are pixels, as
-        (n, 1) beside (n, 2) asks for: give (n), or repeat the pixels.
+        Returns:
+            World points (metres); NaN for pixels outside the lens's range (see `rays`), and for depths that
+            their rays do not reach: below 0 for rays ahead, above 0 for rays at 90 degrees and more off axis.
+
+        Raises:
+            ValueError: if pixels and depths, broadcast, are more than either, as (n, 2) beside (n, 1).
         """
         rays, valid = self.rays(x)
         z = rays[..., 2]
@@ -291,11 +356,16 @@ class Camera(LensView):
         return torch.where(valid[..., None], X, torch.nan)
 
     def to_kornia(self) -> PinholeCamera | CameraModel:
-        """The same camera in kornia: a `PinholeCamera`, batched (B, 4, 4), or with a lens a `CameraModel`.
+        """Convert to kornia: a `PinholeCamera`, batched (B, 4, 4), or with a lens a `CameraModel`.
 
         Kornia's camera models (`kornia.sensors.camera`) have no pose: keep `cam_from_world`. Pixels and axes
-        are alike. `PinholeCamera.scale` moves the principal point otherwise: `resize` before. Raises
-        ValueError for a lens that kornia does not have.
+        agree. `PinholeCamera.scale` moves the principal point differently: `resize` first.
+
+        Returns:
+            Kornia's camera.
+
+        Raises:
+            ValueError: for a lens that kornia does not have.
         """
         from kornia.geometry.camera import PinholeCamera
 
@@ -312,10 +382,18 @@ class Camera(LensView):
     def from_kornia(
         cls, camera: PinholeCamera | CameraModel, *, batched: bool = False, cam_from_world: Pose | None = None
     ) -> Camera:
-        """The camera of a kornia pinhole; a batch of one becomes a single camera unless `batched`.
+        """Convert a camera of kornia.
 
-        Of a `CameraModel`, which has no pose, at `cam_from_world`. Raises ValueError if the images of a batch
-        differ in size, TypeError for another kind of camera.
+        Args:
+            batched: True keeps a batch of one as a batch.
+            cam_from_world: pose for a `CameraModel`, which has none; None for the identity.
+
+        Returns:
+            The camera.
+
+        Raises:
+            ValueError: if the images of a batch differ in size.
+            TypeError: for another kind of camera.
         """
         from kornia.geometry.camera import PinholeCamera
         from kornia.sensors.camera import CameraModel
@@ -357,12 +435,20 @@ def _check_pairs(pixels: torch.Size, depths: torch.Size) -> None:
 def intrinsics(
     focal: tuple[Any, Any] | float | Tensor, hw: HW, centre: tuple[Any, Any] | Tensor | None = None
 ) -> Float[Tensor, "3 3"]:
-    """K in float64 from focal lengths and the principal point in pixels; by default the image's middle.
-
-    Tensors of one or two numbers serve as well, with their gradient.
+    """Make K from focal lengths and principal point in pixels.
 
     >>> intrinsics(500.0, (480, 640))[0].tolist()
     [500.0, 0.0, 319.5]
+
+    Args:
+        focal: one number, or (fx, fy); tensors keep their gradient.
+        centre: principal point (cx, cy); None for the image's middle, ((W - 1) / 2, (H - 1) / 2).
+
+    Returns:
+        K in float64.
+
+    Raises:
+        ValueError: for more than two numbers.
     """
     fx, fy = _two(focal, "focal")
     cx, cy = _two(((hw[1] - 1) / 2, (hw[0] - 1) / 2) if centre is None else centre, "centre")
@@ -374,7 +460,7 @@ def intrinsics(
 
 
 def _two(value: Any, name: str) -> tuple[Any, Any]:
-    """Two numbers; a single one counts for both."""
+    """Pair of numbers; a single one counts for both."""
     if isinstance(value, Tensor) and value.numel() > 1:
         value = tuple(value)
     pair = tuple(value) if isinstance(value, tuple | list) else (value, value)
@@ -386,7 +472,8 @@ def _two(value: Any, name: str) -> tuple[Any, Any]:
 
 
 def view_facts(view: Any) -> tuple[str, str, str, str]:
-    """Size, focal length (pixels; if calibrated), lens model and response of a view."""
+    """Describe a view in words: size, focal length (pixels; empty if not calibrated), lens model, and
+    response."""
     lens, focal = getattr(view, "distortion", None), ""
     if hasattr(view, "cam_from_world"):
         focal = "f=" + range_text(view.K.detach()[..., :2, :2].det().abs().sqrt(), ".4g")

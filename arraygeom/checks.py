@@ -1,6 +1,7 @@
-"""What constructors refuse: numbers that no camera, pose, lens or field has, each in one sentence.
+"""Checks of constructors: numbers that no camera, pose, lens or field can have are refused in one sentence
+each.
 
-Numbers cannot be asked while torch compiles, traces or transforms: nothing is checked then, nor within
+Values are not available while torch compiles, traces or transforms: nothing is checked then, nor within
 `unchecked`.
 """
 
@@ -22,18 +23,18 @@ from .runtime.tracing import followed
 T = TypeVar("T")
 
 LARGEST_SIDE, MOST_PIXELS = 65_535, 2**30
-"""A size beyond these is more likely a damaged number than an image (the largest sensors have 4e8 pixels)."""
+"""Sizes above these are more likely damaged numbers than images (the largest sensors have 4e8 pixels)."""
 ROUNDED = 1e-3
-"""Numbers are rounded: this much of R R^T - I, in the last row of K, or of the near bound, does not count."""
+"""Rounding that is tolerated in R R^T - I, in the last row of K, and relative to the near bound."""
 SINGULAR = 1e-9
-"""A K whose upper block has a smaller determinant, pixels squared, maps the plane to a line."""
+"""Determinant of K's upper block, pixels squared, below which it maps the plane to a line."""
 
 _state = threading.local()
 
 
 @contextmanager
 def unchecked() -> Iterator[None]:
-    """A block in which constructors take what they are given, for loops in which each microsecond counts."""
+    """Context manager in which constructors do not check, for loops in which each microsecond counts."""
     before, _state.off = getattr(_state, "off", False), True
     try:
         yield
@@ -42,7 +43,11 @@ def unchecked() -> Iterator[None]:
 
 
 def derived(make: Callable[..., T], *args: Any, **kwargs: Any) -> T:
-    """What is made of numbers that were checked, without asking them again."""
+    """Call `make` without checks, for results made of checked numbers.
+
+    Returns:
+        The result of the call.
+    """
     if followed():
         return make(*args, **kwargs)
     with unchecked():
@@ -50,12 +55,23 @@ def derived(make: Callable[..., T], *args: Any, **kwargs: Any) -> T:
 
 
 def checking() -> bool:
-    """Whether constructors check their numbers here and now."""
+    """Return True if constructors check their numbers here and now."""
     return not followed() and not getattr(_state, "off", False)
 
 
 def check_numbers(value: Any, shape: tuple[int, ...], what: str) -> Tensor:
-    """The value, detached, if a tensor of finite numbers (\\*b, \\*shape). Raises TypeError or ValueError."""
+    """Check that a value is a tensor of finite floating-point numbers (\\*b, \\*shape).
+
+    Args:
+        what: name of the value in messages.
+
+    Returns:
+        The tensor, detached.
+
+    Raises:
+        TypeError: for another type, or integers.
+        ValueError: for another shape, NaN or infinity.
+    """
     if not isinstance(value, Tensor):
         raise TypeError(f"{what} is a {type(value).__name__}: give a tensor of {_shape(shape)} numbers")
     if not value.is_floating_point():
@@ -69,7 +85,11 @@ def check_numbers(value: Any, shape: tuple[int, ...], what: str) -> Tensor:
 
 
 def check_origin(near: Tensor, *translations: Tensor, unit: str) -> None:
-    """Raises ValueError for float32 translations (\\*b, 3) rounded visibly for a scene at `near` (\\*b)."""
+    """Check that float32 translations (\\*b, 3) are not visibly rounded for a scene at `near` (\\*b).
+
+    Raises:
+        ValueError: if they are.
+    """
     for t in translations:
         if t.dtype != torch.float32 or t.is_meta or near.is_meta or not t.numel():
             continue
@@ -83,7 +103,12 @@ def check_origin(near: Tensor, *translations: Tensor, unit: str) -> None:
 
 
 def check_rotation(R: Any) -> None:
-    """Raises ValueError unless R (\\*b, 3, 3) is a rotation but for rounding."""
+    """Check that R (\\*b, 3, 3) is a rotation, except for rounding.
+
+    Raises:
+        ValueError: if it is a reflection, singular, or not orthonormal, or as `check_numbers`.
+        TypeError: if it is no tensor of floating-point numbers.
+    """
     R = check_numbers(R, (3, 3), "R")
     if R.is_meta or not R.numel():
         return
@@ -98,7 +123,12 @@ def check_rotation(R: Any) -> None:
 
 
 def check_K(K: Any) -> None:
-    """Raises ValueError unless K (\\*b, 3, 3) takes the plane z = 1 to pixels."""
+    """Check that K (\\*b, 3, 3) maps the plane z = 1 to pixels: last row (0, 0, 1), not singular.
+
+    Raises:
+        ValueError: if it does not, or as `check_numbers`.
+        TypeError: if it is no tensor of floating-point numbers.
+    """
     K = check_numbers(K, (3, 3), "K")
     if K.is_meta or not K.numel():
         return
@@ -111,7 +141,11 @@ def check_K(K: Any) -> None:
 
 
 def check_hw(hw: Any) -> None:
-    """Raises ValueError unless hw is the (height, width) of an image."""
+    """Check that `hw` is the (height, width) of an image, in whole pixels.
+
+    Raises:
+        ValueError: if it is not.
+    """
     try:
         h, w = map(operator.index, () if isinstance(hw, Tensor) else hw)  # a tensor would be one of a batch
     except (TypeError, ValueError):
@@ -126,7 +160,11 @@ def check_hw(hw: Any) -> None:
 
 
 def check_batches(what: str, *shapes: tuple[int, ...]) -> None:
-    """Raises ValueError unless batch axes broadcast."""
+    """Check that batch axes broadcast; `what` names them in messages.
+
+    Raises:
+        ValueError: if they do not.
+    """
     try:
         broadcast_shapes(*shapes)
     except (RuntimeError, ValueError):
@@ -135,9 +173,16 @@ def check_batches(what: str, *shapes: tuple[int, ...]) -> None:
 
 
 def check_above(least: float, *, whole: bool = False, itself: bool = True, **values: Any) -> None:
-    """Raises unless each value that is not None is a finite number from `least` up, or above if not `itself`.
+    """Check that each of the named values is a finite number from `least` up. None and tensors are not
+    checked.
 
-    TypeError for what is no number.
+    Args:
+        whole: True for integers only.
+        itself: False to exclude `least`.
+
+    Raises:
+        ValueError: for another number, infinity or NaN.
+        TypeError: for a value that is no number; text such as "3" passes unless `whole`.
     """
     bound = f"of {least:g} or more" if itself else f"above {least:g}"
     wanted = f"wanted a {'whole' if whole else 'finite'} number {bound}"
@@ -153,7 +198,12 @@ def check_above(least: float, *, whole: bool = False, itself: bool = True, **val
 
 
 def check_bounds(near: Any, far: Any) -> None:
-    """Raises unless near and far, where given, are numbers with 0 < near <= far (metres)."""
+    """Check depth bounds: 0 < near <= far, metres. None and tensors are not checked.
+
+    Raises:
+        ValueError: for other numbers.
+        TypeError: for values that are no numbers.
+    """
     for name, value in (("near", near), ("far", far)):
         if value is None or isinstance(value, Tensor):
             continue
@@ -167,7 +217,12 @@ def check_bounds(near: Any, far: Any) -> None:
 
 
 def check_pixels(x: Any) -> None:
-    """Raises unless x are pixels (\\*n, 2)."""
+    """Check that x are pixels (\\*n, 2).
+
+    Raises:
+        ValueError: for another shape.
+        TypeError: for a value that is no tensor.
+    """
     if not isinstance(x, Tensor):
         raise TypeError(f"the pixels are a {type(x).__name__}: give a tensor of (x, y)")
     if x.ndim < 1 or x.shape[-1] != 2:
@@ -175,7 +230,11 @@ def check_pixels(x: Any) -> None:
 
 
 def check_field(field: Any) -> None:
-    """Raises TypeError unless it is a field that can be called: not its class."""
+    """Check that a receptive field can be called and is not a class.
+
+    Raises:
+        TypeError: otherwise.
+    """
     if isinstance(field, type):
         raise TypeError(f"{field.__name__} is a class: make a field of it, {field.__name__}()")
     if not callable(field):

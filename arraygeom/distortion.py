@@ -60,7 +60,7 @@ LENS_TERMS = {
         **{"k1": 0.3, "k2": 0.3, "p1": 0.02, "p2": 0.02, "k3": 0.3, "k4": 0.3, "sx": 0.02, "sy": 0.02},
     },
 }
-"""Names of the coefficients, in order, and upper bounds of their usual sizes."""
+"""Names of the coefficients, in order, with upper bounds of their usual sizes."""
 COEFFICIENT_COUNTS: dict[str, tuple[int, ...]] = {
     name: (4, 5, 8, 12, 14) if name == BROWN_CONRADY else (len(terms),) for name, terms in LENS_TERMS.items()
 }
@@ -68,13 +68,19 @@ COEFFICIENT_COUNTS: dict[str, tuple[int, ...]] = {
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Distortion(LensModel):
-    """One lens, or a batch of lenses of one model.
+    """Lens with coefficients, or a batch of lenses of one model.
 
     The batch axes of `coefficients` meet the *leading* axes of the points: coefficients (5, 8) go with points
     (5, 2), (5, 100, 2), (5, 20, 30, 2). Points are independent of each other; all maps are differentiable,
     twice, in the points and the coefficients.
 
-    Raises ValueError for an unknown model or a number of coefficients that the model does not have.
+    Attributes:
+        model: name of the model, see the module.
+        coefficients: its coefficients, in the module's order.
+
+    Raises:
+        ValueError: for an unknown model, a number of coefficients that it does not have, NaN or infinity.
+        TypeError: for coefficients that are no floating-point tensor.
     """
 
     item_axes: ClassVar = {"coefficients": 1}
@@ -97,29 +103,33 @@ class Distortion(LensModel):
             check_numbers(self.coefficients, self.coefficients.shape[-1:], f"a lens ({self.model})")
 
     def with_coefficients(self, coefficients: Tensor) -> Distortion:
-        """The same model with other numbers."""
+        """Return the same model with other coefficients."""
         return replace(self, coefficients=coefficients)
 
     @property
     def is_identity(self) -> bool:
-        """Whether this lens distorts nothing: Brown-Conrady with all coefficients 0."""
+        """True if this lens distorts nothing: Brown-Conrady with all coefficients 0."""
         return self.model == BROWN_CONRADY and not bool(self.coefficients.any())
 
     @property
     def harmless(self) -> bool:
-        """Whether the lens can be left out: it distorts nothing, and no gradient is asked of it.
+        """True if the lens can be left out: it distorts nothing, and needs no gradient.
 
-        Never where numbers cannot decide (`traced`).
+        False while values are not available (`traced`).
         """
         return not self.coefficients.requires_grad and not traced() and self.is_identity
 
     @property
     def sees_behind(self) -> bool:
-        """Whether the model has directions at 90 degrees or more off axis."""
+        """True if the model has directions at 90 degrees or more off axis."""
         return self.model not in (BROWN_CONRADY, FOV)
 
     def distort(self, xy: Real[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
-        """Normalised pinhole points to distorted ones, and which are inside the model's range."""
+        """Distort normalised pinhole points.
+
+        Returns:
+            Distorted points, and True inside the model's range.
+        """
         xy, finite = finite_points(xy)
         if self.model == BROWN_CONRADY:
             xy_d, valid = brown_distort(self._lifted(xy), xy)
@@ -128,9 +138,11 @@ class Distortion(LensModel):
         return xy_d, valid & finite
 
     def undistort(self, xy_d: Real[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
-        """Distorted points to normalised pinhole ones: the inverse of `distort`, iterated to convergence.
+        """Undistort points to normalised pinhole points: the inverse of `distort`, iterated to convergence.
 
-        A fisheye ray at 90 degrees or more has no pinhole point and is not valid: see `unproject`.
+        Returns:
+            Pinhole points, and True inside the model's range. A fisheye ray at 90 degrees or more has no
+            pinhole point and is not valid: see `unproject`.
         """
         xy_d, finite = finite_points(xy_d)
         if self.model == BROWN_CONRADY:
@@ -142,11 +154,12 @@ class Distortion(LensModel):
         return xy, valid & finite
 
     def project(self, X: Real[Tensor, "*n 3"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
-        """Points in the camera's frame (any unit) to distorted normalised points.
+        """Project points in the camera's frame (any unit).
 
-        Brown-Conrady and the field-of-view model: only points ahead (z > 0) are valid. The others: any
-        direction that the model reaches is, also at and beyond 90 degrees off axis; the point (0, 0, 0) is
-        not.
+        Returns:
+            Distorted normalised points, and validity. Brown-Conrady and the field-of-view model: only points
+            ahead (z > 0) are valid. The others: every direction that the model reaches, also at and beyond 90
+            degrees off axis; (0, 0, 0) is not.
         """
         X, finite = finite_points(X)
         if self.model != BROWN_CONRADY:
@@ -157,7 +170,11 @@ class Distortion(LensModel):
         return xy_d, valid & ahead & finite
 
     def unproject(self, xy_d: Real[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 3"], Bool[Tensor, "*n"]]:
-        """Distorted normalised points to unit directions in the camera's frame: the inverse of `project`."""
+        """Compute the directions of distorted normalised points: the inverse of `project`.
+
+        Returns:
+            Unit directions in the camera's frame, and True inside the model's range.
+        """
         if self.model != BROWN_CONRADY:
             xy_d, finite = finite_points(xy_d)
             ray, valid = self._unproject(xy_d)
@@ -184,12 +201,15 @@ class Distortion(LensModel):
 
     @property
     def squared_limit(self) -> float:
-        """Up to where it is valid: a squared normalised radius (Brown-Conrady) or angle (Kannala-Brandt)."""
+        """Limit of its range: squared normalised radius (Brown-Conrady) or squared angle (Kannala-Brandt).
+
+        Meaningful for these two models and a single lens only.
+        """
         c = self.coefficients.detach()
         return float(once(fisheye_limit if self.model == KANNALA_BRANDT else brown_limit, c))
 
     def _lifted(self, points: Tensor) -> Tensor:
-        """Coefficients (*b, 1.., n): the batch axes in front, one axis of length 1 for each further axis."""
+        """Coefficients (*b, 1.., n): batch axes in front, then one axis of length 1 for each further axis."""
         c = self.coefficients
         return c.reshape(*c.shape[:-1], *[1] * (points.ndim - c.ndim), c.shape[-1])
 
@@ -197,10 +217,17 @@ class Distortion(LensModel):
 def lens_derivatives(
     lens: LensModel | None, X: Float[Tensor, "n 3"]
 ) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2 3"], Float[Tensor, "n 2 k"]]:
-    """`project` of finite points by one lens, and its derivatives by points and coefficients, as constants.
+    """Project finite points through one lens, with derivatives, as constants without gradient.
 
-    None is a pinhole. In closed form for Brown-Conrady without a tilted sensor; otherwise by two reverse
-    passes, with a copy of the coefficients for each point.
+    In closed form for Brown-Conrady without a tilted sensor; otherwise by two reverse passes, with a copy of
+    the coefficients for each point.
+
+    Args:
+        lens: the lens; None for a pinhole.
+
+    Returns:
+        Distorted normalised points (n, 2), derivatives by the points (n, 2, 3), and by the coefficients (n,
+        2, k). Validity is not checked.
     """
     X, c = X.detach(), X.new_zeros(0) if lens is None else lens.coefficients.detach()
     if lens is None or (lens.model == BROWN_CONRADY and len(c) < COEFFICIENT_COUNTS[BROWN_CONRADY][-1]):
@@ -220,17 +247,17 @@ def lens_derivatives(
 
 
 def typical_coefficients(lens: LensModel) -> tuple[float, ...]:
-    """Usual sizes of a lens's numbers; 1 for those of a camera model."""
+    """Return usual sizes of a lens's coefficients; 1 for those of a camera model."""
     count = lens.coefficients.shape[-1]
     return tuple(LENS_TERMS[lens.model].values())[:count] if lens.model in LENS_TERMS else (1.0,) * count
 
 
 def pinhole_coefficients(lens: LensModel) -> Float[Tensor, "*b n"]:
-    """Numbers with which the terms of a lens do nothing: zeros, but for the extended unified model's beta."""
+    """Return coefficients without effect: zeros, except for the extended unified model's beta of 1."""
     none = torch.zeros_like(lens.coefficients)
     return none + none.new_tensor([0.0, 1.0]) if lens.model == EXTENDED_UNIFIED else none
 
 
 def term(lens: LensModel, index: int) -> str:
-    """The name of a lens's number."""
+    """Return the name of a lens's coefficient, such as "k1"; "number 3" for a camera model."""
     return list(LENS_TERMS[lens.model])[index] if lens.model in LENS_TERMS else f"number {index + 1}"

@@ -21,16 +21,19 @@ from .segments import FLAT, Segments
 
 
 def essential_matrix(beta_from_alpha: Pose) -> Float[Tensor, "*b 3 3"]:
-    """E = [t]x R (H&Z 9.12)."""
+    """Compute E = [t]x R (H&Z 9.12)."""
     return product(cross_matrix(beta_from_alpha.t), beta_from_alpha.R)
 
 
 def fundamental_matrix(
     K_alpha: Float[Tensor, "*b 3 3"], K_beta: Float[Tensor, "*b 3 3"], beta_from_alpha: Pose
 ) -> Float[Tensor, "*b 3 3"]:
-    """F = K_beta^-T E K_alpha^-1, so that x_beta^T F x_alpha = 0: kornia's, in float64.
+    """Compute F = K_beta^-T E K_alpha^-1, so that x_beta^T F x_alpha = 0; kornia's, in float64.
 
     Along (l1, -l0) of a line l points are farther away: the sign is kornia's unless K_beta mirrors.
+
+    Returns:
+        F, zero without a baseline.
     """
     from kornia.geometry.epipolar import fundamental_from_essential
 
@@ -39,9 +42,12 @@ def fundamental_matrix(
 
 
 def shift_origin(F: Float[Tensor, "*b 3 3"], first_pixel: float) -> Float[Tensor, "*b 3 3"]:
-    """F given in pixels whose first centre is (`first_pixel`, `first_pixel`), in ours: T^T F T.
+    """Convert F from pixels whose first centre is (`first_pixel`, `first_pixel`) to ours: T^T F T.
 
     MATLAB counts from 1: `shift_origin(F, 1)`.
+
+    Returns:
+        F for pixels whose first centre is (0, 0).
     """
     T = torch.eye(3, dtype=F.dtype, device=F.device)
     T[:2, 2] = first_pixel
@@ -49,10 +55,11 @@ def shift_origin(F: Float[Tensor, "*b 3 3"], first_pixel: float) -> Float[Tensor
 
 
 def epipolar_lines(F: Float[Tensor, "*b 3 3"], x: Real[Tensor, "*n 2"]) -> Float[Tensor, "*m 3"]:
-    """l_beta = F x_alpha, scaled so that l . (x, y, 1) is a distance in pixels.
+    """Compute the lines l_beta = F x_alpha, scaled so that l . (x, y, 1) is a distance in pixels.
 
-    At alpha's epipole, to the rounding of x's type, and where F is zero, there is no line: all zeros. Batched
-    F as in `map_homogeneous`.
+    Returns:
+        Lines (*m, 3); all zeros where there is none: at alpha's epipole, to the rounding of x's type, and
+        where F is zero. Batched F as in `map_homogeneous`.
     """
     size = F.abs().amax((-2, -1), keepdim=True)
     line = map_homogeneous(F / torch.where(size > 0, size, 1.0), x)
@@ -67,11 +74,17 @@ def epipolar_lines(F: Float[Tensor, "*b 3 3"], x: Real[Tensor, "*n 2"]) -> Float
 
 
 SMALLEST_SQUARE = 1e-30
-"""A line F x is none if its (x, y) part, squared, F's largest entry being 1, is smaller than this."""
+"""Squared norm of a line's (x, y) part, for F scaled to a largest entry of 1, below which there
+is no line."""
 
 
 def epipoles(F: Float[Tensor, "*b 3 3"]) -> tuple[Float[Tensor, "*b 3"], Float[Tensor, "*b 3"]]:
-    """(e_alpha, e_beta), homogeneous unit vectors with F e_alpha = 0 and F^T e_beta = 0."""
+    """Compute the epipoles of F.
+
+    Returns:
+        (e_alpha, e_beta), homogeneous unit vectors with F e_alpha = 0 and F^T e_beta = 0; their third entry
+        is 0 at infinity.
+    """
     U, _, Vh = torch.linalg.svd(F)
     return Vh[..., 2, :], U[..., :, 2]
 
@@ -79,22 +92,31 @@ def epipoles(F: Float[Tensor, "*b 3 3"]) -> tuple[Float[Tensor, "*b 3"], Float[T
 def epipolar_distance(
     F: Float[Tensor, "*b 3 3"], x_alpha: Real[Tensor, "*n 2"], x_beta: Real[Tensor, "*n 2"]
 ) -> Float[Tensor, "*n"]:
-    """Signed distance in pixels from x_beta to the line of x_alpha."""
+    """Compute the signed distance in pixels from x_beta to the line of x_alpha.
+
+    Returns:
+        Distances (*n); 0 where there is no line.
+    """
     return (epipolar_lines(F, x_alpha) * to_homogeneous(floating(x_beta))).sum(-1)
 
 
 class Track(NamedTuple):
-    """What beta sees of alpha's rays: the homogeneous pixel `a + w b` at inverse depth w in alpha (1/m).
+    """Image of alpha's rays in beta: the homogeneous pixel `a + w b` at inverse depth w in alpha (1/m).
 
-    `a` (*n, 3) is where the point at infinity would be; `b`, which broadcasts against it, is the same for all
-    pixels of a pair of pinholes. The third coordinate is z_beta / z_alpha.
+    The third coordinate is z_beta / z_alpha.
+
+    Attributes:
+        a: homogeneous pixel of the point at infinity.
+        b: change for each unit of inverse depth; broadcasts against `a`, as it is the same for all pixels of
+            a pair of pinholes.
     """
 
     a: Float[Tensor, "*n 3"]
     b: Float[Tensor, "*m 3"]
 
     def at(self, w: Float[Tensor, "*n"]) -> Float[Tensor, "*n 2"]:
-        """Beta's pixels at inverse depths; where a point is not in front of beta the value is only finite."""
+        """Return beta's pixels at inverse depths; where a point is not in front of beta the value is only
+        finite."""
         P = self.a + w[..., None] * self.b
         z = P[..., 2:]
         return P[..., :2] / torch.where(z > FRONT, z, 1.0)
@@ -106,9 +128,13 @@ def track(
     beta_from_alpha: Pose,
     x: Real[Tensor, "*n 2"],
 ) -> Track:
-    """The track in beta of each alpha pixel. Batched rigs (*b, 3, 3) take pixels (*b, ..., 2).
+    """Compute the track in beta of each alpha pixel of a pinhole pair. Batched rigs (*b, 3, 3) take pixels
+    (*b, ..., 2).
 
     Matrices are composed in their own precision, pixels computed in that of `x`.
+
+    Returns:
+        The track.
     """
     a = map_homogeneous(infinite_homography(K_alpha, K_beta, beta_from_alpha.R), x)
     b = matvec(K_beta, beta_from_alpha.t).to(a.dtype)
@@ -118,9 +144,14 @@ def track(
 def segments_between(
     track: Track, near: Float[Tensor, "*b"], far: Float[Tensor, "*b"], beta_hw: HW
 ) -> Segments:
-    """The part of each track between depths `near` and `far` (metres; far may be inf) inside beta's image.
+    """Compute the part of each track between two depths and inside beta's image, in closed form (`clipped`).
 
-    Clipped to the image's area and to the front of beta, in closed form (`clipped`).
+    Args:
+        near: metres.
+        far: metres, may be infinite.
+
+    Returns:
+        Segments from near to far, also clipped to the front of beta; invalid where nothing is left.
     """
     h, w = beta_hw
     visible = clipped(track, near, far, (-0.5, -0.5, w - 0.5, h - 0.5))
@@ -132,7 +163,15 @@ def segments_between(
 
 
 class Clipped(NamedTuple):
-    """The homogeneous points P + s D of a track, with s from `low` (towards far) to `high` (towards near)."""
+    """Part of a track: the homogeneous points P + s D.
+
+    Attributes:
+        P: points at s = 0 (far).
+        D: their change to s = 1 (near).
+        low: least s.
+        high: largest s.
+        valid: False where nothing is left.
+    """
 
     P: Float[Tensor, "*n 3"]
     D: Float[Tensor, "*m 3"]
@@ -149,10 +188,17 @@ def clipped(
     *,
     in_front: bool = True,
 ) -> Clipped:
-    """The part of each track in `limits` (x low, y low, x high, y high; None: everywhere), in front of beta.
+    """Clip each track to depths, to limits in the image and to the front of beta.
 
     With s going from 0 at far to 1 at near in proportion to inverse depth, every limit is linear in s with a
     slope that is one number for the whole image.
+
+    Args:
+        limits: x low, y low, x high, y high; None for no limits.
+        in_front: False to keep points behind beta.
+
+    Returns:
+        The clipped tracks.
     """
     a, b = track
     w_far, w_near = (beside((1 / d.to(a.dtype)).clamp(max=HIGHEST), a.ndim - 1) for d in (far, near))
@@ -171,13 +217,14 @@ def clipped(
 
 
 HIGHEST = 1e30
-"""Inverse depths (1/m) count as no more than this: their products with a baseline in pixels stay finite."""
+"""Largest inverse depth (1/m): products with a baseline in pixels stay finite."""
 
 
 def _limited(
     low: Tensor, high: Tensor, valid: Tensor, g: Tensor, slope: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The range of s within [low, high] where g + s slope >= 0; `slope` holds one number for many pixels."""
+    """Limit the range [low, high] of s to where g + s slope >= 0; `slope` holds one number for
+    many pixels."""
     rising, falling = slope > FLAT, slope < -FLAT
     flat = ~(rising | falling)
     crossing = g * (-1 / torch.where(flat, 1.0, slope))
@@ -192,7 +239,7 @@ def _limited(
 
 
 def _place(P: tuple[Tensor, ...], D: tuple[Tensor, ...], s: Tensor, valid: Tensor, hw: HW) -> Tensor:
-    """The pixels of P + s D, kept from leaving the image by rounding; zero where not valid."""
+    """Pixels of P + s D, kept inside the image despite rounding; zero where not valid."""
     s = torch.where(valid, s, 0.0)
     X, Y, Z = (torch.addcmul(p, s, d) for p, d in zip(P, D))
     Z = torch.where(valid, Z, 1.0)
@@ -201,7 +248,7 @@ def _place(P: tuple[Tensor, ...], D: tuple[Tensor, ...], s: Tensor, valid: Tenso
 
 
 def beside(v: Tensor, ndim: int, trailing: int = 0) -> Tensor:
-    """A value for each rig of a batch (*b, `trailing` axes), 1-long axes for its pixels: `ndim` axes."""
+    """Add axes of length 1 for pixels to a value of each rig (*b, `trailing` axes), up to `ndim` axes."""
     if v.ndim == trailing:
         return v
     batch = v.ndim - trailing
@@ -209,14 +256,20 @@ def beside(v: Tensor, ndim: int, trailing: int = 0) -> Tensor:
 
 
 FRONT = 1e-3
-"""A point counts as in front of beta from this ratio of its depths in beta and alpha on.
+"""Ratio of a point's depths in beta and alpha above which it counts as in front of beta.
 
 A ray that meets beta's centre (alpha's epipole) tends to 0/0 there; at 1e-3 float32 still holds 0.1 px.
 """
 
 
 class Depth(NamedTuple):
-    """Depth z in alpha (metres), its standard deviation, and validity."""
+    """Depth of alpha's pixels.
+
+    Attributes:
+        depth: z in alpha, metres; 0 where not valid.
+        deviation: its standard deviation, metres.
+        valid: True where there is a depth.
+    """
 
     depth: Float[Tensor, "*n"]
     deviation: Float[Tensor, "*n"]
@@ -226,11 +279,15 @@ class Depth(NamedTuple):
 def depth_from_track(
     track: Track, x: Real[Tensor, "*n 2"], deviation: Float[Tensor, "*n"] | None = None
 ) -> Depth:
-    """Depth in alpha of the point of a track nearest to beta's pixels `x`.
+    """Compute the depth in alpha of the point of a track nearest to beta's pixels `x`.
 
-    `deviation` is the standard deviation of x along the track in pixels (default 0); the depth's is
-    propagated to first order, d depth = depth^2 / |dx/dw|. Invalid where the baseline gives no depth, or
-    where the depth is not positive or the point not in front of beta.
+    Args:
+        deviation: standard deviation of x along the track, pixels; None for 0. It is propagated to first
+            order, d depth = depth^2 / |dx/dw|.
+
+    Returns:
+        Depth; invalid where the baseline gives none, the depth is not positive, or the point is not in front
+        of beta.
     """
     a, b = track
     x = floating(x)

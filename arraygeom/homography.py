@@ -1,7 +1,7 @@
-"""Maps between two images of one plane (Hartley & Zisserman, chapter 13).
+"""Homographies: maps between two images of one plane (Hartley & Zisserman, chapter 13).
 
-Points are (x, y) in pixels, the centre of the first pixel being (0, 0). The pose is beta from alpha:
-X_beta = R X_alpha + t.
+Points are (x, y) in pixels, the centre of the first pixel being (0, 0). The pose is beta from alpha: X_beta =
+R X_alpha + t.
 """
 
 from __future__ import annotations
@@ -18,7 +18,12 @@ from .runtime.tracing import needs_numbers, traced
 
 
 class TransformedPoints(NamedTuple):
-    """Points after a homography, and which of them exist."""
+    """Points after a homography.
+
+    Attributes:
+        x: pixels; zero where not valid.
+        valid: True where the point exists.
+    """
 
     x: Float[Tensor, "*n 2"]
     valid: Bool[Tensor, "*n"]
@@ -33,12 +38,14 @@ def plane_homography(
     normal: Float[Tensor, "*#b 3"],
     d: Float[Tensor, "*#b"],
 ) -> Float[Tensor, "*b 3 3"]:
-    """H with x_beta ~ H x_alpha for points of the plane normal^T X + d = 0 in alpha's frame.
+    """Compute H with x_beta ~ H x_alpha for points of the plane normal^T X + d = 0 in alpha's frame.
 
     H = K_beta (R - t normal^T / d) K_alpha^-1 (Hartley & Zisserman, equation 13.2). The plane Z = 2 m is
     normal = (0, 0, 1), d = -2. The normal need not have unit length. Scaled as written, H (x_alpha, 1) equals
     (Z_beta / Z_alpha) (x_beta, 1), so its third entry is positive for points in front of both cameras.
-    A plane through alpha's centre (d = 0) has no homography: the result is not finite.
+
+    Returns:
+        H; not finite for a plane through alpha's centre (d = 0), which has no homography.
     """
     plane = R - t[..., :, None] * (normal / d[..., None])[..., None, :]
     return product(product(K_beta, plane), torch.linalg.inv(K_alpha))
@@ -47,17 +54,19 @@ def plane_homography(
 def infinite_homography(
     K_alpha: Float[Tensor, "*#b 3 3"], K_beta: Float[Tensor, "*#b 3 3"], R: Float[Tensor, "*#b 3 3"]
 ) -> Float[Tensor, "*b 3 3"]:
-    """H = K_beta R K_alpha^-1: where points at infinite depth go (Hartley & Zisserman, section 13.4)."""
+    """Compute H = K_beta R K_alpha^-1, which maps points at infinite depth (Hartley & Zisserman, section
+    13.4)."""
     return product(product(K_beta, R), torch.linalg.inv(K_alpha))
 
 
 def apply_homography(H: Float[Tensor, "*b 3 3"], x: Real[Tensor, "*n 2"]) -> TransformedPoints:
     """Map points (*n, 2); with batched H (*b), points are (*b, ..., 2).
 
-    `valid` where the result is finite and its homogeneous scale is positive. The sign of H matters:
-    `plane_homography` and `infinite_homography` give it such that the scale is positive in front of both
-    cameras; a fitted H is fixed only up to sign and has to be oriented first. Where not valid, x is zero and
-    so is its gradient.
+    The sign of H matters: `plane_homography` and `infinite_homography` give it such that the scale is
+    positive in front of both cameras; a fitted H is fixed only up to sign and has to be oriented first.
+
+    Returns:
+        Points, valid where finite and the homogeneous scale is positive; elsewhere zero, with zero gradient.
     """
     X, Y, scale = map_homogeneous(H, x).unbind(-1)
     valid = (scale > SMALLEST_SCALE) & X.isfinite() & Y.isfinite()
@@ -67,14 +76,19 @@ def apply_homography(H: Float[Tensor, "*b 3 3"], x: Real[Tensor, "*n 2"]) -> Tra
 
 
 SMALLEST_SCALE = 1e-9
-"""Homogeneous scales from here on count as positive: for a plane's homography, the ratio of depths."""
+"""Homogeneous scale above which a point is valid: for a plane's homography, the ratio of depths."""
 
 
 def fit_similarity(x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"]) -> Float[Tensor, "3 3"]:
-    """The similarity (rotation, scale, shift) that takes x nearest to y, least squares; n >= 2.
+    """Fit the similarity (rotation, scale, shift) from x to y, in least squares; n >= 2.
 
-    Umeyama 1991 in two dimensions, in closed form: as complex numbers y = a x + b. Raises ValueError for
-    points that are all one.
+    Umeyama 1991 in two dimensions, in closed form: as complex numbers y = a x + b.
+
+    Returns:
+        Matrix (3, 3), differentiable.
+
+    Raises:
+        ValueError: if all points of x coincide.
     """
     dtype = torch.promote_types(x.dtype, y.dtype)
     x, y = x.double(), y.double()
@@ -90,12 +104,17 @@ def fit_similarity(x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"]) -> Float[Te
 
 
 def fit_homography(x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"]) -> Float[Tensor, "3 3"]:
-    """The homography that takes x nearest to y, least squares in the pixels of y; n >= 4.
+    """Fit the homography from x to y, in least squares of y's pixels; n >= 4.
 
-    Levenberg and Marquardt's steps from the better of the affine and the linear fit (Hartley & Zisserman,
-    algorithm 4.2), on points centred and scaled (section 4.4), computed in float64; oriented so that the
-    scale is positive at the points. Differentiable, through ten steps of Gauss and Newton at the end. Raises
-    ValueError where there is no such homography: points on a line, or some that would be behind.
+    Levenberg-Marquardt steps from the better of the affine and the linear fit (Hartley & Zisserman, algorithm
+    4.2), on points centred and scaled (section 4.4), in float64. Outliers are not down-weighted.
+
+    Returns:
+        Matrix (3, 3), oriented so that the scale is positive at the points; differentiable, through ten
+        Gauss-Newton steps at the end.
+
+    Raises:
+        ValueError: if there is no such homography: points on a line, or some that would be behind.
     """
     needs_numbers("the number of steps of fit_homography", x, y)
     dtype = torch.promote_types(x.dtype, y.dtype)
@@ -116,7 +135,7 @@ def fit_homography(x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"]) -> Float[Te
 
 @torch.no_grad()
 def _damped_fit(u1: Tensor, v: Tensor) -> Tensor:
-    """The least squares homography of normalised points, H[2, 2] = 1 where possible."""
+    """Least squares homography of normalised points, H[2, 2] = 1 where possible."""
     affine = torch.cat([torch.linalg.lstsq(u1, v).solution.T, u1.new_tensor([[0.0, 0.0, 1.0]])])
     linear = _linear_fit(u1, v)
     linear = linear / torch.where(linear[2, 2] > 0, linear[2, 2], 1.0)
@@ -136,7 +155,7 @@ def _damped_fit(u1: Tensor, v: Tensor) -> Tensor:
 
 
 def _linear_fit(u1: Tensor, v: Tensor) -> Tensor:
-    """Least algebraic error (algorithm 4.1), oriented by the points."""
+    """Homography of least algebraic error (algorithm 4.1), oriented by the points."""
     zero = torch.zeros_like(u1)
     rows = torch.cat([torch.cat([u1, zero, -v[:, :1] * u1], 1), torch.cat([zero, u1, -v[:, 1:] * u1], 1)])
     H = torch.linalg.eigh(rows.T @ rows).eigenvectors[:, 0].reshape(3, 3)
@@ -166,7 +185,7 @@ def _stepped(H: Tensor, u1: Tensor, v: Tensor, damping: float) -> Tensor:
 
 
 def _normalising(x: Tensor) -> Tensor:
-    """The similarity that centres points and scales them to unit deviation; a constant of the fit."""
+    """Similarity that centres points and scales them to unit deviation; a constant of the fit."""
     mean = x.detach().mean(0)
     deviation = (x.detach() - mean).square().mean().sqrt().clamp(min=1e-6)
     return _affine(torch.eye(2).to(x) / deviation, -mean / deviation)

@@ -1,4 +1,5 @@
-"""Intrinsics and lenses from and to kornia's camera models (`kornia.sensors.camera`), which have no pose."""
+"""Conversion of intrinsics and lenses to and from kornia's camera models (`kornia.sensors.camera`), which
+have no pose."""
 
 from __future__ import annotations
 
@@ -18,11 +19,18 @@ if TYPE_CHECKING:
     from kornia.sensors.camera import CameraModel
 
 BROWN_TERMS = 8
-"""Kornia's models have k1 k2 p1 p2 k3 k4 k5 k6."""
+"""Number of kornia's Brown-Conrady coefficients: k1 k2 p1 p2 k3 k4 k5 k6."""
 
 
 def to_kornia_model(K: Float[Tensor, "*b 3 3"], hw: HW, lens: LensModel | None) -> CameraModel:
-    """Kornia's camera model with these intrinsics and lens. Raises ValueError where kornia has none."""
+    """Make kornia's camera model with these intrinsics and lens.
+
+    Returns:
+        The model.
+
+    Raises:
+        ValueError: for a skewed or rotated K, and lenses that kornia does not have.
+    """
     from kornia.image import ImageSize
     from kornia.sensors.camera import CameraModel, CameraModelType
 
@@ -58,7 +66,11 @@ def _eight(lens: LensModel) -> Tensor:
 
 
 def from_kornia_model(model: CameraModel) -> tuple[Float[Tensor, "*b 3 3"], HW, LensModel | None]:
-    """K, the image's (height, width) and the lens of a kornia camera model, one or a batch."""
+    """Extract intrinsics and lens from a camera model of kornia, one or a batch.
+
+    Returns:
+        K, the image's (height, width), and the lens (None for a pinhole).
+    """
     from kornia.sensors.camera.distortion_model import BrownConradyTransform, KannalaBrandtK3Transform
     from kornia.sensors.camera.projection_model import OrthographicProjection
 

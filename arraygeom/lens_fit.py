@@ -1,4 +1,4 @@
-"""How much of an image a lens model covers, and a lens fitted in its stead that covers all of it."""
+"""Coverage of an image by its lens model, and a replacement lens that covers all of it."""
 
 from __future__ import annotations
 
@@ -13,20 +13,31 @@ from .pixels import coarse_grid, map_homogeneous
 from .rig import Rig
 
 SAMPLES, ROUNDS = 160, 30
-"""Points across the disc that a lens is fitted to, and fits, with less weight of points that one misses."""
+"""Points across the disc that a lens is fitted to, and rounds of reweighted fits."""
 REACH = 1.6
-"""The disc's radius before distortion, as a multiple of the distance of the image's farthest pixel."""
+"""Radius of that disc before distortion, as a multiple of the farthest pixel's distance."""
 
 
 class LensCoverage(NamedTuple):
-    """`share` of an image's pixels that have a ray; `degrees` off the axis up to which its lens is valid."""
+    """Coverage of an image by its lens model.
+
+    Attributes:
+        share: share of pixels with a ray, 0..1.
+        degrees: largest valid angle off axis; NaN for a pinhole, or without any ray.
+    """
 
     share: float
     degrees: float
 
 
 class Refit(NamedTuple):
-    """A camera with another lens, and the most pixels, of all and of 95 %, by which it is off the old."""
+    """Camera with a replaced lens.
+
+    Attributes:
+        camera: the camera.
+        largest: largest difference to the old lens, pixels.
+        usual: 95th percentile of the difference, pixels.
+    """
 
     camera: Camera
     largest: float
@@ -34,7 +45,11 @@ class Refit(NamedTuple):
 
 
 def coverage(camera: LensView) -> LensCoverage:
-    """Share of a camera's pixels with a ray, and the widest angle of those, in degrees."""
+    """Measure the share of a camera's pixels with a ray, and their widest angle, on a coarse grid of pixels.
+
+    Returns:
+        The coverage.
+    """
     with torch.no_grad():
         grid = coarse_grid(camera.hw, max(8, max(camera.hw) // 128)).to(camera.K)
         if camera.distortion is None:
@@ -49,10 +64,15 @@ def coverage(camera: LensView) -> LensCoverage:
 
 
 def refit_lens(camera: Camera) -> Refit:
-    """The camera with Brown-Conrady's k1 k2 p1 p2 k3, which have no pole, fitted to its lens's own formula.
+    """Fit Brown-Conrady's k1 k2 p1 p2 k3, which have no pole, to a lens's own formula.
 
-    Points beyond a pole take part where the formula is smooth again. Raises ValueError for a lens of another
-    model or with a tilted sensor, and where no such lens covers the image.
+    Points beyond a pole take part where the formula is smooth again.
+
+    Returns:
+        The camera with the new lens, and the differences.
+
+    Raises:
+        ValueError: for a lens of another model or with a tilted sensor, and if no such lens covers the image.
     """
     lens = camera.distortion
     if not isinstance(lens, Distortion) or lens.model != BROWN_CONRADY or lens.coefficients[12:].any():
@@ -83,7 +103,14 @@ def refit_lens(camera: Camera) -> Refit:
 
 
 def refit_rig(rig: Rig) -> tuple[Rig, list[str]]:
-    """The rig with lenses fitted anew that end within their images, and a sentence on each of those."""
+    """Refit the lenses that end within their images.
+
+    Returns:
+        The rig, and a sentence on each refitted lens.
+
+    Raises:
+        ValueError: as `refit_lens`.
+    """
     cameras, said = dict(rig.cameras), []
     for name, camera in rig.cameras.items():
         if isinstance(camera, Camera) and (before := coverage(camera)).share < 1:
@@ -96,12 +123,13 @@ def refit_rig(rig: Rig) -> tuple[Rig, list[str]]:
 
 
 def _normalised(camera: LensView, x: Tensor) -> Tensor:
-    """Pixels as the lens gives them, before K."""
+    """Normalised points of pixels, before K."""
     return map_homogeneous(torch.linalg.inv(camera.K)[..., :2, :], x)
 
 
 def _terms(xy: Tensor) -> Tensor:
-    """By how much each of k1 k2 p1 p2 k3 moves points, (n, 2, 5): Brown's polynomials are linear in them."""
+    """Displacement of points by a unit of each of k1 k2 p1 p2 k3, (n, 2, 5): Brown's polynomials are linear
+    in them."""
     x, y = xy.unbind(-1)
     u = xy.square().sum(-1)
     p1, p2 = torch.stack([2 * x * y, u + 2 * y * y], -1), torch.stack([u + 2 * x * x, 2 * x * y], -1)
@@ -110,7 +138,7 @@ def _terms(xy: Tensor) -> Tensor:
 
 
 def _formula(c: Tensor, xy: Tensor) -> Tensor:
-    """OpenCV's distorted points of its first twelve coefficients, poles and all."""
+    """Distorted points by OpenCV's formula of the first twelve coefficients, poles included."""
     k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = torch.nn.functional.pad(c, (0, 14 - len(c)))[:12]
     u = xy.square().sum(-1, keepdim=True)
     radial = (1 + u * (k1 + u * (k2 + u * k3))) / (1 + u * (k4 + u * (k5 + u * k6)))

@@ -1,4 +1,4 @@
-"""What cameras see of each other: rays in the world, depth warps, plane sweeps, depth maps that agree."""
+"""Relations between views: rays in the world, depth warps, plane sweeps, consistent depth maps."""
 
 from __future__ import annotations
 
@@ -19,7 +19,13 @@ from .sampling import Interpolation, Sampled, sample
 
 
 class WorldRays(NamedTuple):
-    """Origins (metres) and unit directions of pixels' rays in the world, and which pixels have one."""
+    """Rays of pixels in the world.
+
+    Attributes:
+        origin: start, metres.
+        direction: unit direction; zero where not valid.
+        valid: True for pixels that have a ray.
+    """
 
     origin: Float[Tensor, "*n 3"]
     direction: Float[Tensor, "*n 3"]
@@ -32,12 +38,18 @@ class WorldRays(NamedTuple):
 
 
 def world_rays(camera: Camera, x: Real[Tensor, "*n 2"] | None = None) -> WorldRays:
-    """The rays of pixels in the world, of all of the image (*b, H, W) by default; through any lens.
+    """Compute the rays of pixels in the world, through any lens.
 
     >>> pose = Pose(torch.eye(3), torch.tensor([0.0, -1, 0]))
     >>> camera = Camera(K=torch.eye(3), cam_from_world=pose, hw=(4, 6))
     >>> world_rays(camera, torch.tensor([0.0, 0.0])).plucker.tolist()
     [0.0, 0.0, 1.0, 1.0, 0.0, -0.0]
+
+    Args:
+        x: pixels; None for all of the image, (*b, H, W).
+
+    Returns:
+        The rays.
     """
     batch = camera.batch_shape
     if x is None:
@@ -59,11 +71,17 @@ def warp(
     *,
     interpolation: Interpolation = "bilinear",
 ) -> Sampled:
-    """Beta's image as alpha sees it, given the depth (metres) of alpha's pixels; through any lenses.
+    """Warp beta's image to alpha, given the depth (metres) of alpha's pixels; through any lenses.
 
-    Values (B, C, *d, Ha, Wa) and which are valid: depth is finite and positive, and the point is in front of
-    beta and on its image. Occlusion is not looked for. A batch of pairs (B) takes images and depths of B, or
-    of 1 for the same in each. Differentiable in image, depth and cameras.
+    A batch of pairs (B) takes images and depths of B, or of 1 for the same in each. Occlusion is not
+    detected.
+
+    Returns:
+        Values (B, C, *d, Ha, Wa), 0 where not valid, and validity: depth is finite and positive, and the
+        point is in front of beta and on its image. Differentiable in image, depth and cameras.
+
+    Raises:
+        ValueError: for an image or depth of another size than its camera's.
     """
     for what, plane, view in (("image", image, pair.beta), ("depth", depth, pair.alpha)):
         _check_size(f"the {what} given", plane, view.hw)
@@ -75,9 +93,18 @@ def warp(
 
 
 def plane_sweep(pair: Pair, image: Float[Tensor, "b c h w"], depths: Float[Tensor, " d"]) -> Sampled:
-    """Beta's image warped to alpha by planes z = depth, alpha's frame: values (B, C, D, Ha, Wa), validity.
+    """Warp beta's image to alpha by the planes z = depth in alpha's frame.
 
-    Of any cameras: through lenses too, where planes are no homographies. Depths are metres.
+    For any cameras, through lenses too, where planes are no homographies.
+
+    Args:
+        depths: metres.
+
+    Returns:
+        Values (B, C, D, Ha, Wa), and validity (B, D, Ha, Wa).
+
+    Raises:
+        ValueError: for an image of another size than beta's.
     """
     planes = depths[:, None, None, None].expand(-1, len(image), *pair.alpha.hw)
     swept = [warp(pair, image, plane) for plane in planes]
@@ -90,7 +117,8 @@ def _check_size(what: str, plane: Tensor, hw: HW) -> None:
 
 
 def _in_beta(pair: Pair, depth: Tensor, x: Tensor | None = None) -> Projected:
-    """Where beta sees alpha's pixels (all, or x (*n, 2)) at depths (*b, *d, *n); a batch's axes first."""
+    """Projection into beta of alpha's pixels (all, or x (*n, 2)) at depths (*b, *d, *n); a batch's axes
+    first."""
     alpha, beta = pair.cameras
     depth = floating(depth)
     x = pixel_grid(alpha.hw, dtype=depth.dtype, device=depth.device) if x is None else x
@@ -108,7 +136,13 @@ def _in_beta(pair: Pair, depth: Tensor, x: Tensor | None = None) -> Projected:
 
 
 class ConsistentDepth(NamedTuple):
-    """Depth of alpha's pixels (metres; mean of the views that agree), how many others agree, validity."""
+    """Depth map confirmed by other views.
+
+    Attributes:
+        depth: mean depth of the agreeing views, metres; 0 where not valid.
+        views: number of agreeing other views.
+        valid: True where enough views agree.
+    """
 
     depth: Float[Tensor, "h w"]
     views: Int[Tensor, "h w"]
@@ -124,12 +158,20 @@ def consistent_depth(
     pixels: float = 1.0,
     relative: float = 0.01,
 ) -> ConsistentDepth:
-    """Alpha's depth map fused with those of other cameras that agree with it, through any lenses.
+    """Fuse alpha's depth map with those of other cameras that agree with it, through any lenses.
 
-    A view agrees where alpha's point, replaced by what the view's own depth map has at its pixel, comes back
-    to within `pixels` of where it was in alpha and to within `relative` of its depth (Yao et al. 2018,
-    MVSNet). Valid where `views` others agree. Depths that are not finite or not positive are unknown.
-    Differentiable in depths and cameras.
+    A view agrees if alpha's point, replaced by the depth in the view's own map, returns to within `pixels` of
+    its place in alpha and within `relative` of its depth (Yao et al. 2018, MVSNet).
+
+    Args:
+        depths: depth maps in metres, by camera; values that are not finite and positive are unknown.
+        views: least number of agreeing other views.
+
+    Returns:
+        The fused map, differentiable in depths and cameras.
+
+    Raises:
+        ValueError: if alpha has no map, or a map has another size than its camera.
     """
     if rig.require(alpha) not in depths:
         raise ValueError(f"there is no depth map of '{alpha}', only of {', '.join(depths)}")

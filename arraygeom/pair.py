@@ -1,4 +1,4 @@
-"""Pair: two views with their relation, and Link, the relation of views that are not calibrated."""
+"""Pairs of views, and links that relate views that are not calibrated."""
 
 from __future__ import annotations
 
@@ -25,9 +25,17 @@ Depths = tuple[Float[Tensor, "*b"], Float[Tensor, "*b"]]
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Link(Batched):
-    """The two-view geometry of an uncalibrated pair: x_beta^T F x_alpha = 0 and, roughly, x_beta ~ H x_alpha.
+    """Two-view geometry of an uncalibrated pair: x_beta^T F x_alpha = 0 and, roughly, x_beta ~ H x_alpha.
 
-    Of views with lenses, x are undistorted pixels (`LensView.undistort`).
+    For views with lenses x are undistorted pixels (`LensView.undistort`).
+
+    Attributes:
+        F: fundamental matrix.
+        H: rough homography; None if unknown.
+
+    Raises:
+        ValueError: for other shapes, NaN or infinity.
+        TypeError: for matrices that are no floating-point tensors.
     """
 
     item_axes: ClassVar = {"F": 2, "H": 2}
@@ -41,14 +49,14 @@ class Link(Batched):
                     check_numbers(matrix, (3, 3), name)
 
     def reversed(self) -> Link:
-        """The same link with alpha and beta exchanged."""
+        """Return the link with alpha and beta exchanged."""
         return Link(self.F.transpose(-1, -2), None if self.H is None else torch.linalg.inv(self.H))
 
     def _text(self) -> str:
         return "F" if self.H is None else "F and H"
 
     def transformed(self, A_alpha: Float[Tensor, "3 3"], A_beta: Float[Tensor, "3 3"]) -> Link:
-        """The link between images whose pixels are A x of the old ones."""
+        """Return the link between images whose pixels are A x of the old ones."""
         A_alpha, A_beta = A_alpha.to(self.F), A_beta.to(self.F)
         back = torch.linalg.inv(A_alpha)
         F = product(product(torch.linalg.inv(A_beta).T, self.F), back)
@@ -57,31 +65,42 @@ class Link(Batched):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Pair(Batched):
-    """Alpha and one beta with their relation: two calibrated cameras, or a link, or only sizes."""
+    """Alpha and one beta with their relation: two calibrated cameras, or a link, or only sizes.
+
+    Attributes:
+        alpha: first view.
+        beta: second view.
+        depth: (near, far) along alpha's axis; None if unknown.
+        link: F and H of an uncalibrated pair; None if there is none.
+        unit: unit of lengths; "baselines" for rigs of unknown scale.
+        memo: cache of what fields compute once for a pair; never copied.
+    """
 
     alpha: View
     beta: View
     depth: Depths | None = None
     link: Link | None = None
     unit: str = "m"
-    """Of lengths: "baselines" where the rig's scale is unknown."""
     memo: dict[str, Any] = field(default_factory=dict, init=False, compare=False, repr=False)
-    """Cache of what fields compute once a pair; never copied."""
 
     @property
     def calibrated(self) -> bool:
-        """Whether both cameras are calibrated."""
+        """True if both cameras are calibrated."""
         return isinstance(self.alpha, Camera) and isinstance(self.beta, Camera)
 
     @property
     def has_lens(self) -> bool:
-        """Whether either view has a lens that distorts, so that lines are curves in its image."""
+        """True if either view has a lens that distorts, so that lines are curves in its image."""
         lenses = [view.distortion for view in (self.alpha, self.beta) if isinstance(view, LensView)]
         return any(lens is not None and not lens.harmless for lens in lenses)
 
     @property
     def cameras(self) -> tuple[Camera, Camera]:
-        """Both cameras. Raises ValueError unless the pair is calibrated."""
+        """Both cameras.
+
+        Raises:
+            ValueError: unless both are calibrated.
+        """
         if not (isinstance(self.alpha, Camera) and isinstance(self.beta, Camera)):
             raise ValueError(
                 "this field needs calibrated cameras and the pair has none: "
@@ -91,7 +110,11 @@ class Pair(Batched):
 
     @property
     def beta_from_alpha(self) -> Pose:
-        """X_beta = R X_alpha + t; t is 0 where it is no more than the rounding of the cameras' poses."""
+        """Pose X_beta = R X_alpha + t; t is 0 where it is only rounding of the cameras' poses.
+
+        Raises:
+            ValueError: unless both cameras are calibrated, and for float32 poses too far from the origin.
+        """
         alpha, beta = self.cameras
         if checking() and self.depth is not None:
             check_origin(self.depth[0], alpha.t, beta.t, unit=self.unit)
@@ -103,7 +126,11 @@ class Pair(Batched):
 
     @property
     def depth_range(self) -> Depths:
-        """(near, far) in metres. Raises ValueError if the rig states none."""
+        """(near, far) in metres.
+
+        Raises:
+            ValueError: if the rig states none.
+        """
         if self.depth is None:
             raise ValueError(
                 "this field needs a depth range: give the rig one, `depth: [near, far]` in its file or "
@@ -114,9 +141,12 @@ class Pair(Batched):
 
     @property
     def fundamental(self) -> Float[Tensor, "*b 3 3"]:
-        """F with x_beta^T F x_alpha = 0, from cameras or as given; between undistorted pixels through lenses.
+        """F with x_beta^T F x_alpha = 0, from cameras or as given; between undistorted pixels for lenses.
 
-        0 without a baseline. Raises ValueError if neither is known.
+        Zero without a baseline.
+
+        Raises:
+            ValueError: if neither calibration nor F is known, or a camera is not central.
         """
         if self.link is not None:
             return self.link.F
@@ -129,9 +159,13 @@ class Pair(Batched):
 
     @property
     def homography(self) -> Float[Tensor, "*b 3 3"]:
-        """H with x_beta ~ H x_alpha, roughly: as given; or of the plane at the middle inverse depth.
+        """H with x_beta ~ H x_alpha, roughly: as given, or for the plane at the middle inverse depth.
 
-        A pair that is known only by sizes, or by F alone, is assumed to have the same field of view.
+        Calibrated cameras without a depth range give the plane at infinity; a pair known only by sizes, or by
+        F alone, is assumed to have the same field of view.
+
+        Raises:
+            ValueError: if a camera is not central.
         """
         if self.link is not None and self.link.H is not None:
             return self.link.H
@@ -143,17 +177,21 @@ class Pair(Batched):
         return resize_matrix(self.alpha.hw, self.beta.hw)
 
     def resize_beta(self, hw: HW) -> Pair:
-        """The pair whose beta records images of another size."""
+        """Return the pair whose beta records images of another size."""
         return self.transform_beta(resize_matrix(self.beta.hw, hw), hw)
 
     def transform_beta(self, A: Float[Tensor, "3 3"], hw: HW) -> Pair:
-        """The pair in which beta's pixels are x' ~ A x and its image's size is `hw`."""
+        """Return the pair in which beta's pixels are x' ~ A x and its image's size is `hw`."""
         eye = torch.eye(3, dtype=A.dtype)
         link = None if self.link is None else self.link.transformed(eye, A)
         return dataclasses.replace(self, beta=self.beta.transformed(A, hw), link=link)
 
     def homography_at(self, depth: Float[Tensor, "*d"] | float) -> Float[Tensor, "*b 3 3"]:
-        """The homography of the plane z = depth in alpha's frame (metres; may be inf)."""
+        """Compute the homography of the plane z = depth in alpha's frame (metres; may be infinite).
+
+        Raises:
+            ValueError: unless both cameras are calibrated and central.
+        """
         alpha, beta = self._central("homography")
         normal = alpha.K.new_tensor([0.0, 0.0, 1.0])
         pose = self.beta_from_alpha
@@ -180,11 +218,18 @@ class Pair(Batched):
 
 
 ROUNDED = 8
-"""A baseline of so many units in the last place of the cameras' translations is none."""
+"""Units in the last place of the cameras' translations below which a baseline counts as none."""
 
 
 def depth_range(near: Any, far: Any) -> Depths:
-    """(near, far) as tensors, numbers in float64. Raises ValueError unless 0 < near <= far (where known)."""
+    """Convert depth bounds to tensors, numbers to float64.
+
+    Returns:
+        (near, far).
+
+    Raises:
+        ValueError: unless 0 < near <= far; not checked while torch traces.
+    """
     bounds = [
         d if isinstance(d, Tensor) else torch.tensor(float(d), dtype=torch.float64) for d in (near, far)
     ]

@@ -1,7 +1,7 @@
-"""Pixel maps: what resizing, cropping, padding and rotating an image do to its coordinates.
+"""Pixel maps: the effect of resizing, cropping, padding and rotating an image on its coordinates.
 
-Each is a 3x3 matrix A, `x_new ~ A x_old`, on pixels whose first centre is (0, 0). Cameras follow by
-K' = A K, fundamental matrices by F' = A_beta^-T F A_alpha^-1.
+Each is a 3x3 matrix A, `x_new ~ A x_old`, on pixels whose first centre is (0, 0). Cameras follow by K' = A K,
+fundamental matrices by F' = A_beta^-T F A_alpha^-1.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ HW = tuple[int, int]
 def pixel_grid(
     hw: HW, *, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None
 ) -> Float[Tensor, "h w 2"]:
-    """The centres (x, y) of all pixels of an image.
+    """Return the centres (x, y) of all pixels of an image.
 
     >>> pixel_grid((2, 3))[1, 2].tolist()
     [2.0, 1.0]
@@ -32,14 +32,15 @@ def pixel_grid(
 def pixel_coordinates(
     hw: HW, *, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None
 ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
-    """x and y of the centres of all pixels of an image: views of a row and a column, which take no memory."""
+    """Return x and y of the centres of all pixels: expanded views of a row and a column, which take no
+    memory."""
     rows, columns = (torch.arange(n, dtype=dtype, device=device) for n in hw)
     x, y = torch.meshgrid(columns, rows, indexing="xy")
     return x, y
 
 
 def resize_matrix(old: HW, new: HW) -> Float[Tensor, "3 3"]:
-    """c' = (c + 0.5) s - 0.5, with s the ratio of sizes along each axis.
+    """Return the pixel map of a resize: c' = (c + 0.5) s - 0.5, s being the ratio of sizes along each axis.
 
     >>> (resize_matrix((4, 4), (2, 2)) @ torch.tensor([0.5, 0.5, 1.0], dtype=torch.float64)).tolist()
     [0.0, 0.0, 1.0]
@@ -49,12 +50,13 @@ def resize_matrix(old: HW, new: HW) -> Float[Tensor, "3 3"]:
 
 
 def shift_matrix(left: float, top: float) -> Float[Tensor, "3 3"]:
-    """Cropping away `left` columns and `top` rows; negative numbers pad."""
+    """Return the pixel map that crops `left` columns and `top` rows; negative numbers pad."""
     return _matrix([[1, 0, -left], [0, 1, -top], [0, 0, 1]])
 
 
 def rot90_matrix(hw: HW, quarter_turns: int) -> Float[Tensor, "3 3"]:
-    """Rotating the image counter-clockwise by quarter turns, as `torch.rot90(image, k, (-2, -1))` does.
+    """Return the pixel map of a counter-clockwise rotation by quarter turns, as `torch.rot90(image, k, (-2,
+    -1))`.
 
     >>> (rot90_matrix((2, 3), 1) @ torch.tensor([2.0, 0.0, 1.0], dtype=torch.float64)).tolist()
     [0.0, 0.0, 1.0]
@@ -67,9 +69,11 @@ def rot90_matrix(hw: HW, quarter_turns: int) -> Float[Tensor, "3 3"]:
 
 
 def floating(x: Real[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """Pixels in float32 or float64: integers and half precision, which hold no position, become float32.
+    """Convert pixels to float32 or float64: integers and half precision, which hold no position, become
+    float32.
 
-    Raises TypeError for what is no tensor.
+    Raises:
+        TypeError: for a value that is no tensor.
     """
     if not isinstance(x, Tensor):
         raise TypeError(f"the points are a {type(x).__name__}: give a tensor, as by `torch.as_tensor`")
@@ -77,16 +81,20 @@ def floating(x: Real[Tensor, "*n"]) -> Float[Tensor, "*n"]:
 
 
 def within(x: Real[Tensor, "*n 2"], hw: HW, slack: float = 0.0) -> Bool[Tensor, "*n"]:
-    """Whether points lie on the image's area, [-0.5, W - 0.5] x [-0.5, H - 0.5], to so many pixels."""
+    """Return True for points on the image's area, [-0.5, W - 0.5] x [-0.5, H - 0.5], widened by `slack`
+    pixels."""
     (column, row), (h, w), low = x.unbind(-1), hw, -0.5 - slack  # faster than an axis of length 2
     return (column >= low) & (column <= w + slack - 0.5) & (row >= low) & (row <= h + slack - 0.5)
 
 
 def product(A: Float[Tensor, "*b i j"], B: Float[Tensor, "*c j k"]) -> Float[Tensor, "*d i k"]:
-    """The matrix product of small matrices in the wider of their types, float32 or float64.
+    """Multiply small matrices in the wider of their types, float32 or float64.
 
-    Float32 by multiplications and additions of its own: TF32 and autocast lower `matmul` to ten or eight
-    bits.
+    Float32 products are computed by explicit multiplications and additions: TF32 and autocast lower `matmul`
+    to ten or eight bits.
+
+    Returns:
+        A B.
     """
     dtype = torch.promote_types(torch.promote_types(A.dtype, B.dtype), torch.float32)
     A, B = A.to(dtype), B.to(dtype)
@@ -99,25 +107,36 @@ def product(A: Float[Tensor, "*b i j"], B: Float[Tensor, "*c j k"]) -> Float[Ten
 
 
 def broadcasts(batch: Sequence[int], points: Sequence[int]) -> bool:
-    """Whether axes of points begin with a batch's, or axes of length 1 (on either side) in their place."""
+    """Return True if the axes of points begin with a batch's, or with axes of length 1 (on either side) in
+    their place."""
     return len(points) >= len(batch) and all(a == b or 1 in (a, b) for a, b in zip(batch, points))
 
 
 def broadcast_shapes(*shapes: Sequence[int]) -> torch.Size:
-    """As `torch.broadcast_shapes`, whose first call in a process takes half a second to import sympy.
+    """Compute `torch.broadcast_shapes`, whose first call in a process takes half a second to import sympy.
 
-    Raises RuntimeError (while torch follows) or ValueError for shapes that do not broadcast.
+    Returns:
+        The common shape.
+
+    Raises:
+        RuntimeError: for shapes that do not broadcast, while torch compiles or transforms.
+        ValueError: for shapes that do not broadcast, otherwise.
     """
     return torch.broadcast_shapes(*shapes) if followed() else torch.Size(np.broadcast_shapes(*shapes))
 
 
 def map_homogeneous(M: Float[Tensor, "*b k 3"], x: Real[Tensor, "*n 2"]) -> Float[Tensor, "*m k"]:
-    """M (x, y, 1) for every point, in the precision of `x` (`floating`).
+    """Compute M (x, y, 1) for every point, in the precision of `x` (`floating`).
 
     A batch of matrices (*b, k, 3) takes points (*b, ..., 2), or with axes of length 1 in place of *b.
-    By multiplications and additions of its own rather than by `matmul`, whose precision TF32 and autocast
-    lower to ten or eight bits: pixels need all of them. Raises ValueError for points without the batch's
-    axes.
+    Explicit multiplications and additions are used, as TF32 and autocast lower the precision of `matmul` to
+    ten or eight bits.
+
+    Returns:
+        (*m, k).
+
+    Raises:
+        ValueError: for points without the batch's axes.
     """
     x = floating(x)
     batch = M.ndim - 2
@@ -132,7 +151,7 @@ def map_homogeneous(M: Float[Tensor, "*b k 3"], x: Real[Tensor, "*n 2"]) -> Floa
 
 
 def coarse_grid(hw: HW, spacing: int = 16) -> Float[Tensor, "h w 2"]:
-    """About every `spacing`-th pixel centre, the outermost included, float64.
+    """Return about every `spacing`-th pixel centre, the outermost included, float64.
 
     >>> coarse_grid((3, 5), 2)[0, :, 0].tolist()
     [0.0, 2.0, 4.0]
@@ -142,7 +161,7 @@ def coarse_grid(hw: HW, spacing: int = 16) -> Float[Tensor, "h w 2"]:
 
 
 def to_homogeneous(x: Float[Tensor, "*n d"]) -> Float[Tensor, "*n d+1"]:
-    """Appends a coordinate of 1."""
+    """Append a coordinate of 1."""
     return torch.nn.functional.pad(x, (0, 1), value=1.0)
 
 

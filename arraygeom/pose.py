@@ -23,10 +23,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Pose(Batched):
-    """A rigid transform named `to_from_from`, for instance `cam_from_world`: X_cam = R X_world + t.
+    """Rigid transform named `to_from_from`, for instance `cam_from_world`: X_cam = R X_world + t.
 
-    Poses compose where the inner words meet: `b_from_a @ a_from_world` is `b_from_world`. Metres.
-    Raises ValueError for an R that is not a rotation, and for NaN and infinity.
+    Poses compose where the inner words meet: `b_from_a @ a_from_world` is `b_from_world`.
+
+    Attributes:
+        R: rotation.
+        t: translation, metres.
+
+    Raises:
+        ValueError: for an R that is not a rotation, NaN or infinity, and batch axes that do not broadcast.
+        TypeError: for values that are no floating-point tensors.
     """
 
     item_axes: ClassVar = {"R": 2, "t": 1}
@@ -41,12 +48,13 @@ class Pose(Batched):
 
     @classmethod
     def identity(cls, *, dtype: torch.dtype = torch.float64) -> Pose:
-        """The transform that changes nothing."""
+        """Return the identity transform."""
         return cls(torch.eye(3, dtype=dtype), torch.zeros(3, dtype=dtype))
 
     @classmethod
     def from_centre(cls, R: Float[Tensor, "*b 3 3"], centre: Float[Tensor, "*b 3"]) -> Pose:
-        """`cam_from_world` of a camera with rotation R whose optical centre is at `centre` in the world."""
+        """Make `cam_from_world` of a camera with rotation R and optical centre `centre` in the
+        world, metres."""
         return cls(R, -matvec(R, centre))
 
     @classmethod
@@ -57,13 +65,21 @@ class Pose(Batched):
         *,
         down: Float[Tensor, "*b 3"] | None = None,
     ) -> Pose:
-        """`cam_from_world` of a camera at `centre` whose optical axis meets `target`, with y towards `down`.
-
-        All in world coordinates (metres); down is (0, 1, 0) unless given: that of a world with z upwards is
-        (0, 0, -1). Raises ValueError where down is along the axis, or the target at the centre.
+        """Make `cam_from_world` of a camera at `centre` that looks at `target`, with y towards `down`.
 
         >>> Pose.look_at(torch.tensor([0.0, 0.0, -2.0]), torch.zeros(3)).t.tolist()
         [-0.0, -0.0, 2.0]
+
+        Args:
+            centre: world coordinates, metres.
+            target: world coordinates, metres.
+            down: direction in the world; None for (0, 1, 0). For a world with z upwards it is (0, 0, -1).
+
+        Returns:
+            The pose.
+
+        Raises:
+            ValueError: if down is along the axis, or the target at the centre.
         """
         down = centre.new_tensor([0.0, 1.0, 0.0]) if down is None else down
         z = target - centre
@@ -77,12 +93,12 @@ class Pose(Batched):
 
     @classmethod
     def from_matrix(cls, matrix: Float[Tensor, "*b 4 4"]) -> Pose:
-        """Of (*b, 4, 4) or (*b, 3, 4), [R t]."""
+        """Make a pose of [R t], (*b, 4, 4) or (*b, 3, 4)."""
         return cls(matrix[..., :3, :3], matrix[..., :3, 3])
 
     @property
     def matrix(self) -> Float[Tensor, "*b 4 4"]:
-        """[R t; 0 0 0 1]."""
+        """Matrix [R t; 0 0 0 1]."""
         R, t = self.R.expand(*self.batch_shape, 3, 3), self.t.expand(*self.batch_shape, 3)
         return torch.cat(
             [torch.cat([R, t[..., None]], -1), R.new_tensor([0.0, 0, 0, 1]).expand(*R.shape[:-2], 1, 4)], -2
@@ -90,25 +106,25 @@ class Pose(Batched):
 
     @classmethod
     def from_quaternion(cls, q: Float[Tensor, "*b 4"], t: Float[Tensor, "*b 3"]) -> Pose:
-        """Of quaternions (w, x, y, z), of any length but zero."""
+        """Make a pose of quaternions (w, x, y, z), of any length but zero."""
         from kornia.geometry.conversions import quaternion_to_rotation_matrix
 
         return cls(quaternion_to_rotation_matrix(q), t)
 
     @property
     def quaternion(self) -> Float[Tensor, "*b 4"]:
-        """Of the rotation: (w, x, y, z), unit length, any sign (q and -q are the same rotation)."""
+        """Rotation as quaternion (w, x, y, z) of unit length; q and -q are the same rotation."""
         from kornia.geometry.conversions import rotation_matrix_to_quaternion
 
         return rotation_matrix_to_quaternion(self.R)
 
     @classmethod
     def from_kornia(cls, pose: Se3) -> Pose:
-        """Of kornia's `Se3`, with its gradient."""
+        """Make a pose of kornia's `Se3`, with its gradient."""
         return cls.from_matrix(pose.matrix())
 
     def to_kornia(self) -> Se3:
-        """The same as kornia's `Se3`, which keeps a quaternion as rotation: R comes back but for rounding."""
+        """Convert to kornia's `Se3`, which stores a quaternion: R comes back except for rounding."""
         from kornia.geometry.liegroup import Se3, So3
         from kornia.geometry.quaternion import Quaternion
 
@@ -118,14 +134,18 @@ class Pose(Batched):
         return derived(Pose, product(self.R, other.R), matvec(self.R, other.t) + self.t)
 
     def inverse(self) -> Pose:
-        """`from_to_to`: the transform the other way."""
+        """Return the inverse transform, `from_from_to`."""
         Rt = self.R.transpose(-1, -2)
         return derived(Pose, Rt, -matvec(Rt, self.t))
 
     def apply(self, X: Real[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-        """Points (*n, 3) to R X + t. With batched poses (*b), points are (*b, ..., 3).
+        """Transform points (*n, 3) to R X + t. With batched poses (*b), points are (*b, ..., 3).
 
-        Raises ValueError for points without the batch's axes.
+        Returns:
+            Points of the same shape.
+
+        Raises:
+            ValueError: for points without the batch's axes.
         """
         X, batch = floating(X), self.batch_shape
         if not broadcasts(batch, X.shape[:-1]):
@@ -141,22 +161,28 @@ class Pose(Batched):
 
     @property
     def centre(self) -> Float[Tensor, "*b 3"]:
-        """Where the origin of `to` is in `from`: a camera's optical centre in the world."""
+        """Origin of `to` in `from`: a camera's optical centre in the world, metres."""
         return self.inverse().t
 
     @property
     def centre_jacobian(self) -> Float[Tensor, "*b 3 6"]:
-        """Derivatives of the centre by the rotation vector and the translation of `perturbed`."""
+        """Derivatives (3, 6) of the centre by the rotation vector and the translation of `perturbed`."""
         eye = torch.eye(3).to(self.t).expand_as(self.R)
         return -self.R.mT @ torch.cat([cross_matrix(self.t), eye], -1)
 
     def perturbed(
         self, rotation: Float[Tensor, "*b 3"] | None = None, translation: Float[Tensor, "*b 3"] | None = None
     ) -> Pose:
-        """exp(rotation) R and t + translation: a step on the manifold that never leaves SO(3).
+        """Step on the manifold: exp(rotation) R and t + translation, always in SO(3).
 
-        The rounding of the product is taken out again, so that steps do not add up to a drift.
-        `rotation` is a rotation vector in radians, about the axes of `to`.
+        Rounding of the product is removed, so that steps do not add up to a drift.
+
+        Args:
+            rotation: rotation vector in radians, about the axes of `to`; None for none.
+            translation: metres; None for none.
+
+        Returns:
+            The pose.
         """
         R = self.R if rotation is None else nearest_rotation(product(rotation_from_vector(rotation), self.R))
         return derived(Pose, R, self.t if translation is None else self.t + translation)
@@ -169,25 +195,28 @@ class Pose(Batched):
 
 
 def cross_matrix(v: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
-    """[v]x, the matrix with [v]x w = v x w: kornia's."""
+    """Return [v]x, the matrix with [v]x w = v x w; kornia's."""
     from kornia.geometry.epipolar import cross_product_matrix
 
     return cross_product_matrix(v)
 
 
 def matvec(M: Float[Tensor, "*b i j"], v: Float[Tensor, "*b j"]) -> Float[Tensor, "*b i"]:
-    """The matrix times the vector."""
+    """Multiply matrices with vectors, as `product`."""
     return product(M, v[..., None])[..., 0]
 
 
 def rotation_from_vector(w: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
-    """Rotation matrix of a rotation vector (axis times angle, radians): kornia's Rodrigues formula.
+    """Convert a rotation vector (axis times angle, radians) to a matrix, by kornia's Rodrigues formula.
 
     Exact to rounding in float32 too, and differentiable any number of times, at angle zero as elsewhere.
     (`torch.linalg.matrix_exp` is off by 2e-14 a step in float64.)
 
     >>> rotation_from_vector(torch.tensor([0.0, 0.0, torch.pi / 2])).round(decimals=6)[0, 1].item()
     -1.0
+
+    Returns:
+        The rotation matrix.
     """
     from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 
@@ -195,16 +224,20 @@ def rotation_from_vector(w: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
 
 
 def rotation_vector(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
-    """Axis times angle of a rotation, radians: the inverse of `rotation_from_vector` up to 180 degrees."""
+    """Convert a rotation to axis times angle, radians: the inverse of `rotation_from_vector` up to 180
+    degrees."""
     from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 
     return rotation_matrix_to_axis_angle(R)
 
 
 def in_float64(function: Callable[..., Tensor], *tensors: Tensor) -> Tensor:
-    """A function of small matrices computed in float64, untouched by autocast and TF32; their type again.
+    """Evaluate a function of small matrices in float64, unaffected by autocast and TF32.
 
-    Matrices are given the same batch axes.
+    Matrices are expanded to common batch axes.
+
+    Returns:
+        The result in the matrices' own type, float32 at least.
     """
     batch = broadcast_shapes(*(t.shape[:-2] for t in tensors))
     dtype = torch.promote_types(torch.float32, reduce(torch.promote_types, (t.dtype for t in tensors)))
@@ -212,12 +245,14 @@ def in_float64(function: Callable[..., Tensor], *tensors: Tensor) -> Tensor:
 
 
 def nearest_rotation(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3 3"]:
-    """A matrix that is nearly a rotation, its error squared by a step (Newton's): R (3 I - R^T R) / 2."""
+    """Correct a matrix that is nearly a rotation by one Newton step, which squares its error: R (3 I - R^T R)
+    / 2."""
     return 1.5 * R - product(0.5 * R, product(R.mT, R))
 
 
 def rotation_error(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
-    """How far R is from a rotation: the largest entry of |R R^T - I|, or 2 for a reflection."""
+    """Measure the distance of R from a rotation: the largest entry of |R R^T - I|, at least 2 for a
+    reflection."""
     eye = torch.eye(3, dtype=R.dtype, device=R.device)
     error = (product(R, R.mT) - eye).abs().amax((-1, -2))
     return torch.where(torch.linalg.det(R) > 0, error, error.clamp(min=2.0))

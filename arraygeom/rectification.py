@@ -1,4 +1,4 @@
-"""Rectifying a pair: homographies after which a point has the same row in both images."""
+"""Rectification of a pair: homographies after which a point has the same row in both images."""
 
 from __future__ import annotations
 
@@ -18,11 +18,15 @@ from .runtime.tracing import needs_numbers
 
 
 class Rectification(NamedTuple):
-    """The rectification of a pair.
+    """Rectification of a pair.
 
-    `R_alpha` and `R_beta` rotate the cameras' frames, `H_alpha` and `H_beta` take old pixels to new ones,
-    `pair` holds the rectified cameras: same K, same orientation, the baseline along x. Its depth range is
-    the pair's own in numbers, along the rotated axis now: widen it where that matters.
+    Attributes:
+        R_alpha: rotation of alpha's frame.
+        R_beta: rotation of beta's frame.
+        H_alpha: map from alpha's old pixels to new ones.
+        H_beta: map from beta's old pixels to new ones.
+        pair: rectified cameras: same K and orientation, baseline along x. Its depth range has the old
+            numbers, now along the rotated axis: widen it where that matters.
     """
 
     R_alpha: Float[Tensor, "3 3"]
@@ -33,14 +37,22 @@ class Rectification(NamedTuple):
 
 
 def rectify(pair: Pair, *, K: Float[Tensor, "3 3"] | None = None, hw: HW | None = None) -> Rectification:
-    """Rectifying homographies of a pinhole pair (Bouguet's: each camera is rotated half way).
+    """Compute the rectifying homographies of a pinhole pair (Bouguet's: each camera is rotated half way).
 
-    The new images have the size `hw` (alpha's) and the intrinsics `K`; by default the smaller of the two
-    focal lengths, and the centres of the old images about the middle of the new. The same R_alpha and R_beta
-    as OpenCV's `stereoRectify` for a horizontal pair; a vertical one is rotated by 90 degrees, so that lines
-    are rows here too. Differentiable in everything. Raises ValueError for lenses, batches, without a
-    baseline, and where the baseline is so near an optical axis (motion forwards) that the new images would
-    lie beside the old ones.
+    R_alpha and R_beta are those of OpenCV's `stereoRectify` for a horizontal pair; a vertical one is rotated
+    by 90 degrees, so that lines are rows here too.
+
+    Args:
+        K: intrinsics of the new images; None for the smaller focal length, with the centres of the old images
+            about the middle of the new.
+        hw: size of the new images; None for alpha's.
+
+    Returns:
+        The rectification, differentiable in everything.
+
+    Raises:
+        ValueError: for uncalibrated pairs, lenses, batches, no baseline, and a baseline so near an optical
+            axis (motion forwards) that the new images would lie beside the old ones.
     """
     alpha, beta = pair.cameras
     if pair.has_lens:
@@ -71,7 +83,11 @@ def rectify(pair: Pair, *, K: Float[Tensor, "3 3"] | None = None, hw: HW | None 
 
 
 def rectifying_rotations(beta_from_alpha: Pose) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3 3"]]:
-    """(R_alpha, R_beta): both frames rotated half way to one another, then until the baseline is along x."""
+    """Compute the rotations that bring both frames half way to one another and the baseline along x.
+
+    Returns:
+        (R_alpha, R_beta).
+    """
     half = rotation_from_vector(0.5 * rotation_vector(beta_from_alpha.R))
     t = matvec(half.T, beta_from_alpha.t)
     direction = t / t.norm()
@@ -81,7 +97,7 @@ def rectifying_rotations(beta_from_alpha: Pose) -> tuple[Float[Tensor, "3 3"], F
 
 
 def rotation_to(a: Float[Tensor, "3"], b: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
-    """The shortest rotation that takes unit vector a to unit vector b, less than 180 degrees away."""
+    """Return the shortest rotation from unit vector a to unit vector b, less than 180 degrees away."""
     v = torch.linalg.cross(a, b)
     W = cross_matrix(v)
     return torch.eye(3).to(v) + W + product(W, W) / (1 + (a * b).sum())
@@ -90,7 +106,7 @@ def rotation_to(a: Float[Tensor, "3"], b: Float[Tensor, "3"]) -> Float[Tensor, "
 def middle_intrinsics(
     cameras: tuple[Camera, Camera], rotations: tuple[Float[Tensor, "3 3"], Float[Tensor, "3 3"]], hw: HW
 ) -> Float[Tensor, "3 3"]:
-    """K of the smaller focal length that puts what both old images have in the middle near the new middle."""
+    """Make K of the smaller focal length, with the old images' middles about the middle of the new one."""
     focal = torch.stack([(c.K[:2, :2].det().abs()).sqrt() for c in cameras]).min()
     rays = [_middle_ray(camera, R) for camera, R in zip(cameras, rotations)]
     normalised = torch.stack([ray[:2] / ray[2] for ray in rays])
@@ -101,10 +117,10 @@ def middle_intrinsics(
 
 
 NEAREST_COSINE = 0.1
-"""The middle of an old image is to be within 84 degrees of the new optical axis."""
+"""Least cosine of the angle between an old image's middle and the new optical axis: 84 degrees."""
 
 
 def _middle_ray(camera: Camera, R: Tensor) -> Tensor:
-    """The ray of the image's middle in the rotated frame."""
+    """Ray of the image's middle in the rotated frame."""
     h, w = camera.hw
     return matvec(R, camera.rays(camera.K.new_tensor([(w - 1) / 2, (h - 1) / 2]))[0])

@@ -1,4 +1,4 @@
-"""From F or E back to the pose between two cameras."""
+"""Relative pose of two cameras from F or E."""
 
 from __future__ import annotations
 
@@ -13,11 +13,14 @@ from .pose import Pose, in_float64, nearest_rotation
 
 
 def poses_from_essential(E: Float[Tensor, "*b 3 3"]) -> Pose:
-    """The four poses (*b, 4) that E allows (H&Z 9.14), |t| = 1: both rotations with t, then with -t.
+    """Decompose E into its four poses (H&Z 9.14), |t| = 1: both rotations with t, then with -t.
 
     Kornia's decomposition without a singular value decomposition (Horn 1990): differentiable, where E's two
     equal singular values give SVD no gradient. Where noise makes them differ, the rotations are those nearest
     to Horn's matrices, which are those of the SVD.
+
+    Returns:
+        `beta_from_alpha`, a batch (*b, 4).
     """
     from kornia.geometry.epipolar import decompose_essential_matrix_no_svd
 
@@ -31,11 +34,16 @@ def poses_from_essential(E: Float[Tensor, "*b 3 3"]) -> Pose:
 
 
 STEPS = 16
-"""To the nearest rotation, enough where E's singular values differ a hundredfold."""
+"""Steps to the nearest rotation, enough where E's singular values differ a hundredfold."""
 
 
 class TwoViewPose(NamedTuple):
-    """`beta_from_alpha` with |t| = 1, and which matches it has in front of both cameras."""
+    """Relative pose from two views.
+
+    Attributes:
+        beta_from_alpha: the pose, |t| = 1.
+        in_front: True for matches in front of both cameras.
+    """
 
     beta_from_alpha: Pose
     in_front: Bool[Tensor, "*b n"]
@@ -48,11 +56,17 @@ def relative_pose(
     x: Real[Tensor, "*b n 2"],
     x_beta: Real[Tensor, "*b n 2"],
 ) -> TwoViewPose:
-    """The pose that F of two pinholes allows and that has most of the matches in front of both cameras.
+    """Choose the pose of F that puts most matches in front of both pinhole cameras.
 
-    Scale is not known: the baseline has length 1. F is as it is given, noise included; E = K_beta^T F K_alpha
-    is F itself for normalised points. Matches through lenses are to be undistorted first
-    (`LensView.undistort`).
+    F is used as given, noise included; E = K_beta^T F K_alpha is F itself for normalised points. Undistort
+    matches through lenses first (`LensView.undistort`).
+
+    Args:
+        x: matches in alpha, pixels.
+        x_beta: matches in beta, pixels.
+
+    Returns:
+        The pose; scale is unknown, so the baseline has length 1.
     """
     from kornia.geometry.epipolar import essential_from_fundamental
 

@@ -1,4 +1,4 @@
-"""Reprojection: slopes and residuals of images of points, and bundle adjustment as a differentiable layer."""
+"""Reprojection: slopes and residuals of points' images, and bundle adjustment as a differentiable layer."""
 
 from __future__ import annotations
 
@@ -15,15 +15,20 @@ from .rig import Rig
 from .robust import LEAST_DAMPING
 
 STEP = 1e-5
-"""Of central differences, in distances from the camera: in float64 they are then good to 1e-9."""
+"""Step of central differences, in distances from the camera: good to 1e-9 in float64."""
 
 
 def projection_slopes(
     camera: Camera, X: Float[Tensor, "*n 3"], distance: Float[Tensor, "*n"]
 ) -> tuple[Projected, Float[Tensor, "*n 2 3"]]:
-    """Where a float64 camera sees world points, and dx / dX, pixels a metre: any lens, central differences.
+    """Project world points by a float64 camera, with slopes dx / dX by central differences; any lens.
 
-    `distance` is the points' from the camera, metres. Differentiable as often as `Camera.project` is.
+    Args:
+        distance: distance of the points from the camera, metres.
+
+    Returns:
+        The projection, and slopes (*n, 2, 3), pixels for each metre. Differentiable as often as
+        `Camera.project` is.
     """
     step = STEP * distance[..., None, None]
     offsets = torch.eye(3).to(X) * step
@@ -42,9 +47,13 @@ def reprojection_residuals(
     *,
     seen: Bool[Tensor, " v *n"] | None = None,
 ) -> Float[Tensor, "v *n 2"]:
-    """Pixels x minus where the cameras see the world points X; zero where one is not `seen` or cannot be.
+    """Compute measured pixels x minus the projections of world points X.
 
-    Pixels that are NaN are not seen.
+    Args:
+        seen: True where a camera sees a point; None for all. NaN pixels are not seen.
+
+    Returns:
+        Residuals (v, *n, 2), pixels; zero where a point is not seen, or not valid in the camera.
     """
     projected = [camera.project(X) for camera in cameras]
     used = _used(projected, x, seen)
@@ -57,7 +66,13 @@ def _used(projected: Sequence[Projected], x: Tensor, seen: Tensor | None) -> Ten
 
 
 class Bundle(NamedTuple):
-    """The adjusted rig, points (n, 3), and sums of squared residuals (steps + 1) from the first, pixels^2."""
+    """Result of a bundle adjustment.
+
+    Attributes:
+        rig: the adjusted rig.
+        X: the adjusted points.
+        cost: sum of squared residuals before the first and after each step, pixels².
+    """
 
     rig: Rig
     X: Float[Tensor, "n 3"]
@@ -74,13 +89,25 @@ def bundle_adjusted(
     steps: int = 10,
     damping: float = 1e-3,
 ) -> Bundle:
-    """The rig and points of least reprojection error: Levenberg-Marquardt, the points eliminated (Schur).
+    """Adjust a rig and points to least reprojection error: Levenberg-Marquardt in float64, points eliminated
+    (Schur).
 
-    `x` are the points' pixels in the rig's cameras, in its order; `free` is as for `Rig.parameters`. In
-    float64. A step that does not lower the cost is not made, and the next is damped tenfold. Gradients follow
-    the steps made: at the optimum those of the least error, in everything that is given. The damping holds
-    what images do not determine, such as scale. Memory: points times free numbers. Raises ValueError for a
-    batch, and for uncalibrated cameras.
+    A step that does not lower the cost is not made, and the next is damped tenfold. The damping holds what
+    images do not determine, such as scale. Memory: points times free numbers.
+
+    Args:
+        X: world points to start from, metres.
+        x: their pixels in the rig's cameras, in its order.
+        free: free parameters, as for `Rig.parameters`.
+        seen: True where a camera sees a point; None for all.
+
+    Returns:
+        Rig and points. Gradients follow the steps made: at the optimum those of the least error, in
+        everything given.
+
+    Raises:
+        ValueError: for a batch, uncalibrated cameras, pixels of another shape, and a pattern in `free` that
+            matches nothing.
     """
     cameras = list(rig.cameras.values())
     if rig.batch_shape or not all(isinstance(camera, Camera) for camera in cameras):
@@ -103,7 +130,7 @@ def bundle_adjusted(
 
 
 ROUNDED = 1e-9
-"""A step that raises the cost by no more than this share, or this many pixels each, is made: at the optimum
+"""Relative rise of the cost, or pixels for each number, below which a step is still made: at the optimum
 gradients need it."""
 
 
@@ -146,6 +173,6 @@ def _stepped(
 
 
 def _damped(information: Tensor, damping: float) -> Tensor:
-    """With its diagonal raised by the factor of Marquardt; what nothing depends on has 1 there."""
+    """Information with its diagonal raised by Marquardt's factor; 1 where nothing depends on a parameter."""
     diagonal = information.diagonal(dim1=-2, dim2=-1)
     return information + torch.diag_embed(torch.where(diagonal > 0, damping * diagonal, 1.0))

@@ -1,4 +1,4 @@
-"""Rig: named cameras of different kinds, and the depth range of the scene."""
+"""Rigs: named cameras of different kinds, and the depth range of the scene."""
 
 from __future__ import annotations
 
@@ -25,17 +25,26 @@ if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
 
 SERVICES: dict[str, Callable[..., Any]] = {}
-"""Functions of files above this one that `Rig` offers as its own, by name: the package registers them."""
+"""Functions of higher modules that `Rig` offers as methods, by name: the package registers them."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Rig(Batched):
     """Ordered, named cameras of different sizes, lenses and spectral responses.
 
-    `depth` is (near, far) in metres along the optical axis of whichever camera is alpha; far may be inf.
-    Every number may have leading batch axes, the same for all: a batch of rigs. A depth range without them is
-    that of each rig. Kornia's pinholes are converted. `links` relate cameras that are not calibrated, by
-    (alpha, beta). A rig never changes: methods return new ones.
+    Every number may have leading batch axes, the same for all: a batch of rigs. A rig never changes: methods
+    return new ones.
+
+    Attributes:
+        cameras: views by name; kornia's pinholes are converted.
+        depth: (near, far) in metres along the optical axis of whichever camera is alpha, far may be infinite;
+            None if unknown. Without batch axes it applies to each rig of a batch.
+        links: relations of cameras that are not calibrated, by (alpha, beta).
+        name: name of the rig.
+
+    Raises:
+        ValueError: for invalid depth bounds, names that cannot be printed, and links to unknown cameras.
+        TypeError: for cameras, links or a depth of other types.
     """
 
     cameras: Mapping[str, Any]  # View once made; kornia pinholes serve as well
@@ -74,11 +83,21 @@ class Rig(Batched):
     def from_kornia(
         cls, cameras: Mapping[str, PinholeCamera], *, batched: bool = False, **fields: Any
     ) -> Rig:
-        """The rig of kornia pinholes by name; `fields` are the rig's own, such as `depth`.
+        """Make a rig of kornia's pinholes by name.
 
-        Kornia's cameras are always batched: a batch of one becomes a single camera unless `batched`. Raises
-        ValueError for batches of unequal length, TypeError for other cameras than kornia's pinholes by name.
-        `Rig(cameras)` serves as well, for batches of one or more as they come.
+        Kornia's cameras are always batched; `Rig(cameras)` serves as well, for batches of one or more as they
+        come.
+
+        Args:
+            batched: True keeps batches of one as batches.
+            fields: further fields of the rig, such as `depth`.
+
+        Returns:
+            The rig.
+
+        Raises:
+            ValueError: for batches of unequal length.
+            TypeError: for other cameras than kornia's pinholes by name.
         """
         if not isinstance(cameras, Mapping):
             kind = type(cameras).__name__
@@ -97,9 +116,10 @@ class Rig(Batched):
         return cls(made, **fields)
 
     def to_kornia(self) -> dict[str, PinholeCamera]:
-        """Kornia's pinholes by name, each a batch as long as the rig's (one for a single rig).
+        """Convert to kornia's pinholes by name, each a batch as long as the rig's (one for a single rig).
 
-        Raises ValueError for cameras with lenses and for those not calibrated.
+        Raises:
+            ValueError: for cameras with lenses, and cameras that are not calibrated.
         """
         views = [name for name, view in self.cameras.items() if not isinstance(view, Camera)]
         if views:
@@ -117,27 +137,36 @@ class Rig(Batched):
         return {name: camera.to_kornia() for name, camera in batched.items()}
 
     def __getitem__(self, name: Any) -> Any:
-        """The camera of a name; or, of a batch of rigs, those at an index."""
+        """Return the camera of a name; or for an index into a batch, the rigs there.
+
+        Raises:
+            ValueError: for an unknown name.
+            TypeError: for an index into a single rig.
+        """
         return self.cameras[self.require(name)] if isinstance(name, str) else super().__getitem__(name)
 
     def __contains__(self, name: object) -> bool:
         return name in self.cameras
 
     def __len__(self) -> int:
-        """How many cameras; of a batch of rigs, how many rigs."""
+        """Return the number of cameras; for a batch of rigs, the number of rigs."""
         return super().__len__() if self.batch_shape else len(self.cameras)
 
     def __iter__(self) -> Iterator[Any]:
-        """The cameras' names in order; of a batch of rigs, the rigs."""
+        """Iterate over the cameras' names; for a batch, over the rigs."""
         return (self[i] for i in range(len(self))) if self.batch_shape else iter(self.names)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The cameras' names in order."""
+        """Names of the cameras, in order."""
         return tuple(self.cameras)
 
     def require(self, name: str) -> str:
-        """The name itself. Raises ValueError if the rig has no such camera."""
+        """Return the name itself if the rig has such a camera.
+
+        Raises:
+            ValueError: if it has not.
+        """
         if name not in self.cameras:
             near = difflib.get_close_matches(str(name), self.names, 1)
             hint = f"; did you mean '{near[0]}'?" if near else ""
@@ -145,35 +174,45 @@ class Rig(Batched):
         return name
 
     def betas(self, alpha: str) -> tuple[str, ...]:
-        """All names but alpha's."""
+        """Return all names but alpha's.
+
+        Raises:
+            ValueError: if the rig has no camera `alpha`.
+        """
         return tuple(n for n in self.names if n != self.require(alpha))
 
     def pair(self, alpha: str, beta: str) -> Pair:
-        """What relates two cameras of the rig, in the order given."""
+        """Return the pair of two cameras, with the rig's depth range and their link if there is one.
+
+        Raises:
+            ValueError: for an unknown name.
+        """
         link = self.links.get((alpha, beta))
         if link is None and (beta, alpha) in self.links:
             link = self.links[beta, alpha].reversed()
         return Pair(self[alpha], self[beta], self.depth, link, length_unit(self))
 
     def with_camera(self, name: str, camera: View) -> Rig:
-        """A copy with one camera set, replacing that of the same name if there is one."""
+        """Return a copy with one camera set, replacing that of the same name if there is one."""
         return self.replace(cameras={**self.cameras, name: camera})
 
     def resize(self, name: str, hw: HW) -> Rig:
-        """The rig whose camera `name` records images of another size."""
+        """Return the rig whose camera `name` records images of another size; its links follow."""
         return self.transformed(name, resize_matrix(self[name].hw, hw), hw)
 
     def crop(self, name: str, top: int, left: int, hw: HW) -> Rig:
-        """The rig whose camera `name` keeps a window of its image; see `Camera.crop`."""
+        """Return the rig whose camera `name` keeps a window of its image; see `Camera.crop`. Its links
+        follow."""
         return self.transformed(name, shift_matrix(left, top), hw)
 
     def rot90(self, name: str, quarter_turns: int) -> Rig:
-        """The rig whose camera `name` has its image rotated; see `Camera.rot90`."""
+        """Return the rig whose camera `name` has its image rotated; see `Camera.rot90`. Its links follow."""
         A = rot90_matrix(self[name].hw, quarter_turns)
         return self.transformed(name, A, self[name].rot90(quarter_turns).hw)
 
     def transformed(self, name: str, A: Float[Tensor, "3 3"], hw: HW) -> Rig:
-        """The rig in which the pixels of camera `name` are x' ~ A x and its image's size is `hw`."""
+        """Return the rig in which the pixels of camera `name` are x' ~ A x and its image's size is `hw`; its
+        links follow."""
         eye = torch.eye(3, dtype=torch.float64)
         links = {
             (a, b): link.transformed(A if a == name else eye, A if b == name else eye)
@@ -184,9 +223,13 @@ class Rig(Batched):
         return self.with_camera(name, self[name].transformed(A, hw)).replace(links=links)
 
     def scaled(self, factor: float) -> Rig:
-        """The rig with all lengths (of cameras, depth range) times a positive factor: another unit, say.
+        """Multiply all lengths (of cameras and depth range) by a positive factor, as for another unit.
 
-        Raises ValueError for a camera model that does not say which of its numbers are lengths.
+        Returns:
+            The scaled rig.
+
+        Raises:
+            ValueError: for a camera model that does not say which of its numbers are lengths.
         """
         cameras = {
             name: view.scaled(factor) if isinstance(view, Camera) else view
@@ -196,12 +239,20 @@ class Rig(Batched):
         return self.replace(cameras=cameras, depth=depth)
 
     def parameters(self, *, free: Iterable[str]) -> dict[str, Tensor]:
-        """Changes an optimiser may make, all zero and requiring grad; `perturbed` applies them.
+        """Return the parameters that an optimiser may change, as zeros that require grad; `perturbed` applies
+        them.
 
-        `free` holds patterns over "camera.rotation" (rotation vector, radians), "camera.translation"
-        (metres), "camera.focal" (fx, fy in pixels), "camera.centre" (cx, cy in pixels), "camera.distortion",
-        "depth.near" and "depth.far" (metres), for instance ["colour.*", "depth.near"]. An uncalibrated view
-        has its lens's. Raises ValueError for a pattern that matches nothing.
+        Args:
+            free: patterns over "camera.rotation" (rotation vector, radians), "camera.translation" (metres),
+                "camera.focal" (fx, fy in pixels), "camera.centre" (cx, cy in pixels), "camera.distortion",
+                "depth.near" and "depth.far" (metres), for instance ["colour.*", "depth.near"]. An
+                uncalibrated view has only its lens's.
+
+        Returns:
+            Tensors by name.
+
+        Raises:
+            ValueError: for a pattern that matches nothing.
         """
         shapes = self._parameter_shapes()
         chosen: dict[str, Tensor] = {}
@@ -213,9 +264,12 @@ class Rig(Batched):
         return chosen
 
     def perturbed(self, changes: Mapping[str, Tensor]) -> Rig:
-        """The rig after changes named as in `parameters`. What is not named stays bit-identical.
+        """Return the rig after changes named as in `parameters`. Everything else stays bit-identical.
 
         Rotations step on the manifold, exp(change) R, so that they remain rotations.
+
+        Raises:
+            ValueError: for an unknown name.
         """
         unknown = set(changes) - set(self._parameter_shapes())
         if unknown:
@@ -230,16 +284,24 @@ class Rig(Batched):
         return self.replace(cameras=cameras, depth=depth)
 
     def check(self) -> tuple[str, ...]:
-        """What is odd about the rig, a sentence each; none if nothing is.
+        """List what is odd about the rig, a sentence each; empty if nothing is.
 
-        Constructors refuse numbers that cannot be; these can, and are mistakes more often than not: another
-        unit, poses of another convention, axes exchanged, views that do not overlap.
+        Constructors refuse impossible numbers; these are possible, and mistakes more often than not: another
+        unit, poses of another convention, exchanged axes, views that do not overlap.
         """
         return SERVICES["check"](self)
 
     @classmethod
     def load(cls, path: str | Path) -> Rig:
-        """Read a rig file of any format that `arraygeom.io` knows. Raises `arraygeom.io.RigFileError`."""
+        """Read a rig file of any format that `arraygeom.io` knows.
+
+        Returns:
+            The rig.
+
+        Raises:
+            arraygeom.io.RigFileError: for a file that cannot be used.
+            FileNotFoundError: for a missing file.
+        """
         return SERVICES["load"](path)
 
     def save(self, path: str | Path) -> None:
@@ -263,7 +325,7 @@ class Rig(Batched):
         return f"<table><caption>{caption}</caption>{''.join(f'<tr>{row}</tr>' for row in cells)}</table>"
 
     def _parameter_shapes(self) -> dict[str, Tensor]:
-        """One tensor of the right shape, type and device for each parameter."""
+        """Tensor of the right shape, type and device for each parameter."""
         shapes: dict[str, Tensor] = {}
         for name, camera in self.cameras.items():
             if isinstance(camera, Camera):
@@ -278,7 +340,7 @@ class Rig(Batched):
 
 
 def _view(name: str, camera: Any) -> View:
-    """A camera as given, converted if it is kornia's."""
+    """Camera as given, converted if it is kornia's."""
     if isinstance(camera, View):
         return camera
     from kornia.geometry.camera import PinholeCamera
@@ -292,7 +354,8 @@ def _view(name: str, camera: Any) -> View:
 
 
 def with_pixels(rig: Rig) -> Rig:
-    """The rig whose views all have a K, the identity if not calibrated: it follows all changes of pixels."""
+    """Return the rig whose views all have a K, the identity if not calibrated, so that it follows all changes
+    of pixels."""
     for name, view in rig.cameras.items():
         if not isinstance(view, LensView):
             eye = torch.eye(3, dtype=torch.float64)
@@ -301,14 +364,14 @@ def with_pixels(rig: Rig) -> Rig:
 
 
 def focal_positions(K: Tensor) -> Tensor:
-    """Positions of fx and fy in K, with their signs: the diagonal, or for a rotated image the other one."""
+    """Return the positions of fx and fy in K as signs: on the diagonal, or beside it for a rotated image."""
     block = K.detach()[..., :2, :2]
     largest = block.abs() == block.abs().amax(-2, keepdim=True)
     return torch.where(largest, block.sign(), 0.0)
 
 
 def _perturbed_camera(name: str, camera: View, changes: Mapping[str, Tensor]) -> View:
-    """The camera with its part of the changes, by the names of `Rig.parameters`, added."""
+    """Camera with its part of the changes, by the names of `Rig.parameters`, added."""
     mine = {k.removeprefix(f"{name}."): v for k, v in changes.items() if k.startswith(f"{name}.")}
     if not mine or not isinstance(camera, LensView):
         return camera

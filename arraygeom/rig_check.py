@@ -1,4 +1,4 @@
-"""What is odd about a rig: numbers that may be, and are mistakes more often than not."""
+"""Plausibility checks of a rig: possible numbers that are more often than not mistakes."""
 
 from __future__ import annotations
 
@@ -19,27 +19,28 @@ from .rig import Rig
 from .runtime.text import length_unit
 
 SMALLEST_BASELINE, LARGEST_BASELINE = 1e-4, 50.0
-"""A baseline outside these bounds, in metres, is more likely a mistaken unit than a camera array."""
+"""Bounds of a baseline in metres: outside, a mistaken unit is more likely than a camera array."""
 NARROWEST, WIDEST = 0.5, 140.0
-"""Degrees across a pinhole's image outside which its focal length is more likely in another unit than pixels:
-a 1 m telephoto lens on an inch of sensor has 1.5, the widest rectilinear lenses have 130."""
+"""Bounds of a pinhole's angle of view in degrees: outside, its focal length is more likely in another unit
+than pixels. A 1 m telephoto lens on an inch of sensor has 1.5, the widest rectilinear lenses have 130."""
 DECENTRED = 0.1
-"""Principal points farther than this from the image's middle, as a share of its longer side, are more likely
-of another image: exchanging the sides of a 4:3 image moves the middle by 0.18, halving the image by 0.3."""
+"""Distance of a principal point from the image's middle, as a share of its longer side, above which it is
+more likely of another image: exchanging the sides of a 4:3 image moves the middle by 0.18, halving the image
+by 0.3."""
 LEAST_DISPARITY = 0.5
-"""Pixels that matches move from near to far below which depth is not seen."""
+"""Pixels of disparity between near and far below which depth is not seen."""
 COVERED = 0.995
-"""Share of an image below which it is said where its lens model ends."""
+"""Share of an image below which the end of its lens model is reported."""
 OFF_BACK = 0.05
-"""Pixels by which projecting a pixel's ray may miss it: lenses in float32 do by thousandths."""
+"""Error in pixels of projecting a pixel's ray that is tolerated: lenses in float32 err by thousandths."""
 MOST_CAMERAS = 16
-"""Of rigs with more, each is compared with the next alone: pairs are many."""
+"""Number of cameras above which each is compared with the next alone, as there are many pairs."""
 RANK = 1e-3
-"""Least over largest singular value of F from which it is not of rank two."""
+"""Ratio of F's least to largest singular value above which it is not of rank two."""
 
 
 def oddities(rig: Rig) -> tuple[str, ...]:
-    """A sentence for each; of a batch of rigs, those of the first."""
+    """List what is odd about a rig, a sentence each; for a batch, of its first rig."""
     if rig.batch_shape:
         rig = rig[(0,) * len(rig.batch_shape)]
     with torch.no_grad():
@@ -47,7 +48,7 @@ def oddities(rig: Rig) -> tuple[str, ...]:
 
 
 def unit_oddity(rig: Rig) -> str | None:
-    """What to say of baselines that suggest another unit than metres."""
+    """Return a sentence on baselines that suggest another unit than metres; None if they do not."""
     centres = [camera.centre for camera in rig.cameras.values() if isinstance(camera, Camera)]
     if len(centres) < 2 or length_unit(rig) != "m":
         return None
@@ -68,7 +69,7 @@ def unit_oddity(rig: Rig) -> str | None:
 
 
 def lens_end(name: str, camera: LensView) -> str | None:
-    """The sentence on a lens model that ends within its image; None if it covers it.
+    """Return a sentence on a lens model that ends within its image; None if it covers the image.
 
     Camera models state themselves where they end (a pole, the rim of a fisheye's circle), which is no mistake
     unless they cover nothing.
@@ -86,14 +87,15 @@ def lens_end(name: str, camera: LensView) -> str | None:
 
 
 def file_oddities(rig: Rig) -> list[str]:
-    """The sentences that reading a rig's file warns of: its unit, lenses that fold within their images."""
+    """List the sentences that reading a rig's file warns of: its unit, and lenses that fold within their
+    images."""
     views = [(name, camera) for name, camera in rig.cameras.items() if isinstance(camera, LensView)]
     ends = [lens_end(*view) for view in views if getattr(view[1].distortion, "model", None) == BROWN_CONRADY]
     return [sentence for sentence in (unit_oddity(rig), *ends) if sentence is not None]
 
 
 def _all(rig: Rig) -> Iterator[str]:
-    """Sentences on what is odd about a rig: units, lenses, K, overlap, positions, baselines, F."""
+    """Sentences on units, lenses, K, overlap, positions, baselines, F."""
     if unit := unit_oddity(rig):
         yield f"the rig {unit}"
     for name, camera in rig.cameras.items():
@@ -129,12 +131,12 @@ def _all(rig: Rig) -> Iterator[str]:
 
 
 def _grid(camera: View) -> Tensor:
-    """Some pixels all over an image: at most 64 in a row, of huge images too."""
+    """Pixels all over an image: at most 64 in a row, for huge images too."""
     return coarse_grid(camera.hw, max(16, max(camera.hw) // 64))
 
 
 def _of_K(name: str, camera: Camera) -> Iterator[str]:
-    """On a mirrored image, an unlikely focal length, a principal point far off the middle."""
+    """Sentences on a mirrored image, an unlikely focal length, a principal point far off the middle."""
     (h, w), K = camera.hw, camera.K.double()
     focal = float(K[:2, :2].det().abs().sqrt())
     if K[:2, :2].det() < 0:
@@ -155,7 +157,8 @@ def _of_K(name: str, camera: Camera) -> Iterator[str]:
 
 
 def _of_lens(name: str, camera: LensView) -> Iterator[str]:
-    """On a lens model that covers too little of its image, or is not its own inverse."""
+    """Sentences on a lens model that covers too little of its image, or whose maps are not inverse to each
+    other."""
     if (lens := camera.distortion) is None:
         return
     points = map_homogeneous(torch.linalg.inv(camera.K)[..., :2, :], _grid(camera).to(camera.K))
@@ -174,13 +177,13 @@ def _of_lens(name: str, camera: LensView) -> Iterator[str]:
 
 
 def _reduced(hw: HW) -> HW:
-    """The size of an image reduced to at most 128 pixels a side, of the same shape."""
+    """Size of an image reduced to at most 128 pixels a side, of the same shape."""
     scale = min(1.0, 128 / max(hw))
     return max(1, round(scale * hw[0])), max(1, round(scale * hw[1]))
 
 
 def _overlap(pair: Pair) -> bool:
-    """Whether the segment of any pixel of a grid reaches beta's image."""
+    """True if the segment of any pixel of a grid reaches beta's image."""
     locations = recorded_field(pair)(pair, _grid(pair.alpha).to(pair.cameras[0].K))
     return bool((locations.valid if hasattr(locations, "valid") else locations.mask).any())
 
@@ -197,7 +200,7 @@ def _of_positions(rig: Rig, pairs: Iterable[tuple[str, str]]) -> Iterator[str]:
 
 
 def _of_baseline(rig: Rig, a: str, b: str) -> Iterator[str]:
-    """On a baseline that is out of proportion to the depth range."""
+    """Sentences on a baseline out of proportion to the depth range."""
     baseline, unit = float((rig[a].centre - rig[b].centre).norm()), length_unit(rig)
     question = f"are depth and poses both in {'metres' if unit == 'm' else unit}?"
     if baseline > 0 and rig.depth is not None:
@@ -217,7 +220,7 @@ def _of_baseline(rig: Rig, a: str, b: str) -> Iterator[str]:
 
 
 def _of_sides(rig: Rig) -> Iterator[str]:
-    """Cameras called left and right that are the other way round."""
+    """Return a sentence on cameras called left and right that are the other way round."""
     left, right = rig.cameras.get("left"), rig.cameras.get("right")
     if (
         isinstance(left, Camera)

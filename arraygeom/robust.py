@@ -1,7 +1,7 @@
-"""Weighted least squares: linear, with or without a prior, the same if values may be wrong, and nonlinear.
+"""Least squares: linear with or without a prior, robust, and nonlinear.
 
-Wrong values are down-weighted by iteratively reweighted least squares (Holland and Welsch 1977).
-`terms` (k, n) are what k coefficients are multiplied with in each of n values.
+Outliers are down-weighted by iteratively reweighted least squares (Holland and Welsch 1977). `terms` (k, n)
+are the factors of k coefficients in each of n values.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 NORMAL_DEVIATION = 1.4826
-"""Physics: the standard deviation of normal values over the median of their sizes."""
+"""Physics: standard deviation of normal values divided by the median of their absolute values."""
 STEPS = 8
-"""Size: how often the values are weighted again."""
+"""Size: number of reweightings."""
 
 LEAST_DAMPING, MOST_DAMPING = 1e-9, 1e9
-"""Size: shares of the information's diagonal that are added to it. Less would not hold, in float64, what
+"""Size: bounds of the damping, as shares of the information's diagonal. Less would not hold, in float64, what
 images leave free, such as scale."""
 
 State = TypeVar("State")
@@ -29,7 +29,13 @@ Precision = Float[Tensor, "k k"] | Callable[[Tensor], Float[Tensor, "k k"]]
 
 
 class RobustFit(NamedTuple):
-    """Coefficients, the values less what they explain, and the weights with which they were solved for."""
+    """Result of a robust fit.
+
+    Attributes:
+        coefficients: the coefficients.
+        rest: residuals, values minus their explanation.
+        weight: weights of the values in the last step.
+    """
 
     coefficients: Float[Tensor, " k *m"]
     rest: Float[Tensor, " n *m"]
@@ -37,24 +43,25 @@ class RobustFit(NamedTuple):
 
 
 def normal_deviation(rest: Float[Tensor, " n"], least: float) -> float:
-    """The standard deviation of normal residuals by their median size (outliers hardly count), or `least`."""
+    """Estimate the standard deviation of residuals from their median absolute value, robust to outliers; at
+    least `least`."""
     return max(NORMAL_DEVIATION * float(rest.abs().median()), least)
 
 
 def cauchy(rest: Float[Tensor, " n"], scale: float) -> Float[Tensor, " n"]:
-    """The weights of Cauchy's loss: 1/2 at the scale; large residuals' fall as their square."""
+    """Compute the weights of Cauchy's loss: 1/2 at `scale`; those of large residuals fall as their square."""
     return 1 / (1 + (rest / scale).square())
 
 
 def gaussian(rest: Float[Tensor, " n"], scale: float) -> Float[Tensor, " n"]:
-    """The weights of Welsch's loss: 1 / e at the scale; large residuals do not count at all."""
+    """Compute the weights of Welsch's loss: 1 / e at `scale`; large residuals do not count at all."""
     return torch.exp(-(rest / scale).square())
 
 
 def normal_equations(
     terms: Float[Tensor, "k n"], values: Float[Tensor, " n *m"], weight: Float[Tensor, " n"]
 ) -> tuple[Float[Tensor, "k k"], Float[Tensor, " k *m"]]:
-    """The matrix and the right side whose solution is that of weighted least squares."""
+    """Return the matrix (k, k) and right-hand side (k, *m) of weighted least squares."""
     weighted = terms * weight
     return weighted @ terms.T, weighted @ values
 
@@ -65,9 +72,13 @@ def least_squares(
     weight: Float[Tensor, " n"],
     precision: Float[Tensor, "k k"] | None = None,
 ) -> Float[Tensor, " k *m"]:
-    """The coefficients c of the least sum of weight (values - c terms)^2, plus c precision c.
+    """Minimise the weighted sum of squares of values - c terms, plus c precision c.
 
-    Without the precision of a prior the terms may depend on each other: of all solutions it is the shortest.
+    Args:
+        precision: inverse covariance of a prior of zero mean; None for no prior, when terms may be dependent.
+
+    Returns:
+        Coefficients c (k, *m); without a prior the shortest of all solutions.
     """
     if precision is not None:
         information, slope = normal_equations(terms, values, weight)
@@ -86,9 +97,15 @@ def robust_least_squares(
     precision: Precision | None = None,
     steps: int = STEPS,
 ) -> RobustFit:
-    """`least_squares` with weights by the residuals: `weigh` takes those (n, *m), at first of `start`.
+    """Solve `least_squares` in steps with weights from the residuals.
 
-    A precision that depends on the coefficients is a function of them.
+    Args:
+        start: coefficients whose residuals give the first weights.
+        weigh: function from residuals (n, *m) to weights (n).
+        precision: inverse covariance of a prior, or a function of the coefficients that returns it.
+
+    Returns:
+        The fit after `steps` steps; with 0 steps there are no weights, which fails.
     """
     coefficients = start
     for _ in range(steps):
@@ -99,9 +116,13 @@ def robust_least_squares(
 
 
 class LocalModel(NamedTuple, Generic[State]):
-    """A cost near a state: its value there, at any state, and the state after a step.
+    """Model of a cost near a state.
 
-    step: of Gauss and Newton, with the diagonal of the information raised by a share of it, the damping.
+    Attributes:
+        cost: cost of the state.
+        cost_of: function that returns the cost of any state.
+        step: function from a damping to the state after a Gauss-Newton step, with the diagonal of the
+            information raised by that share.
     """
 
     cost: float
@@ -117,11 +138,17 @@ def levenberg_marquardt(
     steps: int,
     damping: float,
 ) -> tuple[State, bool]:
-    """A state of least cost, and whether it was reached in so many steps: Marquardt's (1963) damping of each.
+    """Minimise a cost by Levenberg-Marquardt steps (Marquardt 1963).
 
-    The damping rises tenfold until a step does not raise the cost, and falls tenfold after it. `is_converged`
-    takes the states before and after a step, and their costs. A state from which no step leads is of least
-    cost.
+    The damping rises tenfold until a step does not raise the cost, and falls tenfold after it.
+
+    Args:
+        model: function that returns the local model of a state.
+        is_converged: function of the states before and after a step, and their costs.
+        steps: largest number of steps.
+
+    Returns:
+        The state, and True if it converged, or if no step lowers the cost.
     """
     for _ in range(steps):
         before = model(state)

@@ -1,4 +1,4 @@
-"""Roots of polynomials, and inverses of increasing functions and of maps of the plane, for many at once."""
+"""Roots of polynomials, and inverses of increasing functions and of maps of the plane, many at once."""
 
 from __future__ import annotations
 
@@ -11,11 +11,17 @@ from .runtime.tracing import followed, traced
 
 
 def first_root(coefficients: Tensor) -> Tensor:
-    """Smallest positive root of 1 + a_1 u + ... + a_n u^n; infinity if none, 0 if an a is not finite.
+    """Find the smallest positive root of 1 + a_1 u + ... + a_n u^n.
 
-    `coefficients` (*b, n + 1) starts with the 1. The roots are the inverses of those of the reversed
-    polynomial, which is monic, so a leading coefficient of 0 needs no care: eigenvalues of its companion.
-    Huge coefficients, with which LAPACK crashes, are scaled down first (u = s w, with s a power of 2).
+    The roots are the inverses of those of the reversed polynomial, which is monic, so a leading coefficient
+    of 0 needs no care: eigenvalues of its companion matrix. Huge coefficients, with which LAPACK crashes, are
+    scaled down first (u = s w, with s a power of 2).
+
+    Args:
+        coefficients: (*b, n + 1), starting with the 1.
+
+    Returns:
+        Roots (*b); infinity if there is none, 0 if a coefficient is not finite.
     """
     a = coefficients[..., 1:]
     n = a.shape[-1]
@@ -38,15 +44,19 @@ def first_root(coefficients: Tensor) -> Tensor:
 
 
 HUGE = 1e4
-"""Coefficients from the n-th power of this on are scaled before their roots are sought; no lens has such."""
+"""Base of the powers above which coefficients are scaled first; no lens has such."""
 
 
 def invert_increasing(
     f: Callable[[Tensor], tuple[Tensor, Tensor]], y: Tensor, high: Tensor, iterations: int = 100
 ) -> Tensor:
-    """r in [0, high] with f(r) = y, by Newton inside a bracket; `high` where f never gets to y.
+    """Find r in [0, high] with f(r) = y, by Newton's method inside a bracket.
 
-    f gives its value and its slope, f(0) = 0, and rises on the bracket.
+    Args:
+        f: returns its value and its slope; f(0) = 0, rising on the bracket.
+
+    Returns:
+        r; `high` where f never reaches y.
     """
     reached = f(high)[0] > y
     y = torch.where(reached, y, 0.0)
@@ -72,11 +82,12 @@ def invert_increasing(
 
 
 PATIENCE = 12
-"""Iterations after which a Newton step not half the one before is replaced by halving the bracket."""
+"""Iterations after which a Newton step that is not half the one before is replaced by halving the bracket."""
 
 
 PlaneMap = Callable[[Tensor], tuple[Tensor, Sequence[Tensor]]]
-"""Points (*n, 2) to their images and the Jacobian (dx'/dx, dx'/dy, dy'/dx, dy'/dy), each (*n)."""
+"""Function from points (*n, 2) to their images and the Jacobian (dx'/dx, dx'/dy, dy'/dx, dy'/dy),
+each (*n)."""
 
 
 def solve_in_plane(
@@ -88,9 +99,16 @@ def solve_in_plane(
     rounding: float = 2.0,
     steps: int = 30,
 ) -> Tensor:
-    """Points (*n, 2) whose images are `target` (*n, 2), by Newton from `start` on, with halved steps where a
-    whole one leaves where points may be (`within`, (*n)) or does not help; the nearest that is found where
-    there is none. `rounding`: of f's values, in units of the last place.
+    """Find the points (*n, 2) whose images are `target` (*n, 2), by Newton's method.
+
+    Steps are halved where a whole one leaves the allowed region or does not help.
+
+    Args:
+        within: function that returns True (*n) for allowed points.
+        rounding: rounding of f's values, in units of the last place.
+
+    Returns:
+        The points; where there is no solution, the nearest found.
     """
     xy = start
     value, jacobian = f(xy)
@@ -110,7 +128,11 @@ def solve_in_plane(
 
 
 def newton_step(value: Tensor, jacobian: Sequence[Tensor], target: Tensor) -> Tensor:
-    """What to take from points whose images are `value` for `target`, each (*n, 2); `PlaneMap`'s Jacobian."""
+    """Return the Newton step to subtract from points whose images are `value` for `target`, each (*n, 2).
+
+    Args:
+        jacobian: the Jacobian of a `PlaneMap`.
+    """
     xx, xy, yx, yy = jacobian
     ex, ey = (value - target).unbind(-1)
     determinant = xx * yy - xy * yx
@@ -119,7 +141,8 @@ def newton_step(value: Tensor, jacobian: Sequence[Tensor], target: Tensor) -> Te
 
 
 def keeps_orientation(jacobian: Sequence[Tensor]) -> Tensor:
-    """Whether (*n) a `PlaneMap` keeps orientation: past a fold it mirrors, past two it is half turned."""
+    """Return True (*n) where a `PlaneMap` keeps orientation: past a fold it mirrors, past two it is half
+    turned."""
     xx, xy, yx, yy = jacobian
     return (xx * yy - xy * yx > 0) & (xx + yy > 0)
 

@@ -1,4 +1,4 @@
-"""Sampling an image at positions, with validity."""
+"""Sampling of images at positions, with validity."""
 
 from __future__ import annotations
 
@@ -18,14 +18,19 @@ Interpolation = Literal["bilinear", "nearest", "bicubic"]
 
 
 class Sampled(NamedTuple):
-    """Values (B, C, *n) and whether each position (B, *n) was on the image's area."""
+    """Values of images at positions.
+
+    Attributes:
+        values: (b, c, *n).
+        valid: (b, *n), True for positions on the image's area.
+    """
 
     values: Float[Tensor, "b c *n"]
     valid: Bool[Tensor, " b *n"]
 
 
 def to_grid(x: Real[Tensor, "*n 2"], hw: HW) -> Float[Tensor, "*n 2"]:
-    """Pixels to the coordinates of `grid_sample(align_corners=False)`, where -1 and 1 are the area's edges.
+    """Convert pixels to the coordinates of `grid_sample(align_corners=False)`: -1 and 1 are the area's edges.
 
     >>> to_grid(torch.tensor([-0.5, 9.5]), (10, 20)).tolist()
     [-1.0, 1.0]
@@ -36,12 +41,12 @@ def to_grid(x: Real[Tensor, "*n 2"], hw: HW) -> Float[Tensor, "*n 2"]:
 
 
 def on_image(x: Real[Tensor, "*n 2"], hw: HW) -> Bool[Tensor, "*n"]:
-    """Whether positions lie on the image's area, [-0.5, W - 0.5] x [-0.5, H - 0.5], to 1e-3 pixels."""
+    """Return True for positions on the image's area, [-0.5, W - 0.5] x [-0.5, H - 0.5], to 1e-3 pixels."""
     return within(x, hw, SLACK)
 
 
 SLACK = 1e-3
-"""Rounding allowed to positions on the area's edge, pixels."""
+"""Rounding allowed for positions on the area's edge, pixels."""
 PIECE = 2**15
 """Positions that a thread looks up at a time."""
 
@@ -53,11 +58,22 @@ def sample(
     interpolation: Interpolation = "bilinear",
     extended: bool = False,
 ) -> Sampled:
-    """Images (B, C, H, W) at positions x (B, *n, 2), or (1, *n, 2) for the same positions in each, in pixels.
+    """Sample images at positions.
 
-    On the outer half pixel of the area the nearest pixels count; "nearest" takes the pixel on whose area a
-    position lies, halves upwards. Outside it values are 0 and valid is False; or, if
-    `extended`, they are those of the nearest pixel, which are valid.
+    On the outer half pixel of the area the nearest pixels count; "nearest" takes the pixel whose area
+    contains the position, halves upwards.
+
+    Args:
+        image: (B, C, H, W).
+        x: pixels (B, *n, 2), or (1, *n, 2) for the same positions in each image.
+        extended: True to give positions outside the area the value of the nearest pixel, as valid.
+
+    Returns:
+        Values (B, C, *n), and validity; outside values are 0 and not valid unless `extended`. Differentiable
+        in image and positions.
+
+    Raises:
+        NotImplementedError: in forward mode (jvp, jacfwd, hessian).
     """
     batch, hw = len(image), (image.shape[-2], image.shape[-1])
     dtype = torch.promote_types(image.dtype, floating(x).dtype)
@@ -81,7 +97,8 @@ def sample(
 def _looked_up(
     image: Float[Tensor, "b c h w"], grid: Float[Tensor, "b 1 n 2"], interpolation: Interpolation
 ) -> Float[Tensor, "b c 1 n"]:
-    """torch's look-up; of many numbers without gradients on all threads, where torch's takes one an image."""
+    """Look up by torch; many positions without gradients on all threads, where torch takes one for each
+    image."""
     look_up = partial(grid_sample, mode=interpolation, padding_mode="border", align_corners=False)
     gradients = torch.is_grad_enabled() and (image.requires_grad or grid.requires_grad)
     if gradients or followed() or image.device.type != "cpu" or grid.shape[2] < 2 * PIECE:

@@ -1,4 +1,4 @@
-"""Search segments and sampling positions in beta: what geometry hands to attention.
+"""Search segments and sampling positions in beta, the interface of geometry and attention.
 
 `Segments` is the compact form, two points for each alpha pixel; `Positions` is the explicit one. Both hold
 (x, y) in beta's pixels, the centre of the first pixel being (0, 0). An image of height H and width W covers
@@ -24,8 +24,9 @@ from .runtime.tracing import followed
 class Positions(Batched):
     """Explicit sample positions, L for each alpha pixel.
 
-    `xy` is in beta's pixels; `mask` says which samples count. An alpha pixel none of whose samples count is
-    not seen by beta.
+    Attributes:
+        xy: positions, pixels of beta.
+        mask: True for samples that count; without any, beta does not see the alpha pixel.
     """
 
     item_axes: ClassVar = {"xy": 2, "mask": 1}
@@ -38,10 +39,14 @@ class Positions(Batched):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Segments(Batched):
-    """One straight piece of beta's image for each alpha pixel, from `start` to `end`, in beta's pixels.
+    """One straight piece of beta's image for each alpha pixel.
 
-    For a depth-bounded field `start` is where the point would be at the near bound and `end` at the far
-    bound. Where `valid` is False there is nothing to sample and the ends mean nothing (but are finite).
+    For a depth-bounded field `start` is the point at the near bound and `end` at the far bound.
+
+    Attributes:
+        start: first end, pixels of beta.
+        end: second end.
+        valid: False where there is nothing to sample; the ends are then finite and mean nothing.
     """
 
     item_axes: ClassVar = {"start": 1, "end": 1}
@@ -60,11 +65,12 @@ class Segments(Batched):
         return torch.where(positive, torch.where(positive, squared, 1.0).sqrt(), 0.0)
 
     def at(self, fraction: Float[Tensor, "*n"]) -> Float[Tensor, "*n 2"]:
-        """The point at a fraction of the way from start (0) to end (1)."""
+        """Return the point at a fraction of the way from start (0) to end (1)."""
         return self.start + fraction[..., None] * (self.end - self.start)
 
     def fraction(self, xy: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n"]:
-        """The fraction of the point of the segment's line nearest to `xy`; 0.5 on a segment of no length."""
+        """Return the fraction of the line's point nearest to `xy`, not clamped to 0..1; 0.5 on a segment of
+        no length."""
         along = self.end - self.start
         squared = along.square().sum(-1)
         positive = squared > 0
@@ -72,28 +78,37 @@ class Segments(Batched):
         return torch.where(positive, inner / torch.where(positive, squared, 1.0), 0.5)
 
     def positions(self, samples: int) -> Positions:
-        """`samples` positions, the first at start, the last at end, evenly spaced (one sample: the middle).
+        """Return `samples` evenly spaced positions, the first at start, the last at end (one sample: the
+        middle).
 
         >>> s = Segments(torch.tensor([0.0, 4.0]), torch.tensor([6.0, 4.0]), torch.tensor(True))
         >>> s.positions(3).xy[:, 0].tolist()
         [0.0, 3.0, 6.0]
+
+        Raises:
+            ValueError: for fewer than 1 sample.
         """
         u = sample_fractions(samples, like=self.start)
         xy = self.start[..., None, :] + u[:, None] * (self.end - self.start)[..., None, :]
         return Positions(xy, self.valid[..., None].expand(xy.shape[:-1]))
 
     def distance(self, xy: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n"]:
-        """Pixels from points to their segments, to an end beyond it; infinite where those are not valid."""
+        """Compute the distance in pixels from points to their segments, beyond an end to that end; infinite
+        where not valid."""
         u = self.fraction(xy).clamp(0, 1)
         squared = (xy - self.at(u)).square().sum(-1)
         distance = torch.where(squared > 0, torch.where(squared > 0, squared, 1.0).sqrt(), 0.0)
         return torch.where(self.valid, distance, torch.inf)
 
     def mask(self, hw: HW, radius: float = 0.5) -> Bool[Tensor, "*n p"]:
-        """Which of beta's H W pixels, row by row, are within `radius` pixels of each segment.
+        """Mark beta's pixels within `radius` pixels of each segment.
 
-        As it is an `attn_mask` of `scaled_dot_product_attention` for alpha's pixels (n) as queries and beta's
-        as keys: n H W flags, so for small images; `pat.attention.segment_block_mask` is for large ones.
+        The result is an `attn_mask` of `scaled_dot_product_attention` for alpha's pixels (n) as queries and
+        beta's as keys: n H W flags, so for small images; `pat.attention.segment_block_mask` is for large
+        ones.
+
+        Returns:
+            Mask (*n, H W), beta's pixels row by row.
         """
         axes = (*self.valid.shape, hw[0] * hw[1])
         xy = pixel_grid(hw, dtype=self.start.dtype, device=self.start.device).reshape(-1, 2).expand(*axes, 2)
@@ -107,7 +122,11 @@ class Segments(Batched):
 
 
 def clip_to_image(start: Float[Tensor, "*n 2"], end: Float[Tensor, "*n 2"], hw: HW) -> Segments:
-    """The part of each segment on the image's area (Liang and Barsky 1984); invalid where there is none."""
+    """Clip each segment to the image's area (Liang and Barsky 1984).
+
+    Returns:
+        Segments, invalid where nothing is left.
+    """
     low, high = fractions_on_image(start, end, hw)
     valid = low <= high
     first, last = (_on_image(start, end, s, valid, hw) for s in (low, high))
@@ -117,7 +136,11 @@ def clip_to_image(start: Float[Tensor, "*n 2"], end: Float[Tensor, "*n 2"], hw: 
 def fractions_on_image(
     start: Float[Tensor, "*n 2"], end: Float[Tensor, "*n 2"], hw: HW
 ) -> tuple[Float[Tensor, "*n"], Float[Tensor, "*n"]]:
-    """The fractions (0 start, 1 end) between which each segment is on the image: low > high where nowhere."""
+    """Compute the fractions (0 start, 1 end) between which each segment is on the image.
+
+    Returns:
+        (low, high), low > high where it is nowhere.
+    """
     low, high = torch.zeros_like(start[..., 0]), torch.ones_like(start[..., 0])
     for a, b, limit in zip(start.unbind(-1), end.unbind(-1), (hw[1] - 0.5, hw[0] - 0.5)):
         moves = b - a
@@ -131,18 +154,23 @@ def fractions_on_image(
 
 
 def _on_image(start: Tensor, end: Tensor, s: Tensor, valid: Tensor, hw: HW) -> Tensor:
-    """The points at fraction s, kept from leaving the image by rounding; zero where not valid."""
+    """Points at fraction s, kept inside the image despite rounding; zero where not valid."""
     s = torch.where(valid, s, 0.0)
     limits = zip(start.unbind(-1), end.unbind(-1), (hw[1] - 0.5, hw[0] - 0.5))
     return torch.stack([torch.where(valid, (a + s * (b - a)).clamp(-0.5, m), 0.0) for a, b, m in limits], -1)
 
 
 FLAT = 1e-6
-"""An image limit that moves by less than this along a whole segment, in pixels, is either inside or not."""
+"""Pixels that an image limit moves by along a whole segment, below which it is either inside or not."""
 
 
 def sample_fractions(samples: int, *, like: Tensor) -> Float[Tensor, " l"]:
-    """Where the samples of a segment are: l / (L - 1) for l = 0 .. L - 1, and 0.5 if there is only one."""
+    """Return the positions of a segment's samples as fractions: l / (L - 1) for l = 0 .. L - 1; 0.5 for a
+    single one.
+
+    Raises:
+        ValueError: for fewer than 1 sample.
+    """
     if samples < 1:
         raise ValueError(f"samples must be at least 1, got {samples}")
     if samples == 1:

@@ -1,4 +1,4 @@
-"""A camera's sensor: its spectral response, timing and coding."""
+"""Sensors of cameras: spectral response, timing and coding."""
 
 from __future__ import annotations
 
@@ -12,7 +12,16 @@ from .checks import check_above
 
 @dataclass(frozen=True)
 class Band:
-    """A band of wavelengths, in nanometres."""
+    """Band of wavelengths.
+
+    Attributes:
+        centre: nanometres, more than 0.
+        width: nanometres, more than 0.
+
+    Raises:
+        ValueError: for other numbers.
+        TypeError: for values that are no numbers.
+    """
 
     centre: float
     width: float
@@ -23,7 +32,15 @@ class Band:
 
 @dataclass(frozen=True)
 class Curve:
-    """A sampled spectral response: `response[i]` at `wavelength[i]` nanometres."""
+    """Sampled spectral response.
+
+    Attributes:
+        wavelength: wavelengths, nanometres.
+        response: response at each wavelength.
+
+    Raises:
+        ValueError: for no samples, or numbers that differ.
+    """
 
     wavelength: tuple[float, ...]
     response: tuple[float, ...]
@@ -41,15 +58,25 @@ CODINGS = ("srgb", "linear")
 
 @dataclass(frozen=True)
 class Sensor:
-    """Facts about a camera that geometry does not use.
+    """Properties of a camera's sensor, which geometry does not use.
 
-    `response` is a name ("mono", "rgb", "nir"), a band or a curve. `frame_rate` is in frames a second,
-    `time_offset` in seconds after the rig's clock. `coding` says how pixel values relate to light:
-    "srgb" or "linear". `bayer` is the colour filter pattern from the top left ("RGGB"), for raw images.
+    Light times `exposure` times `gain` makes a value. Both are relative: only their ratios between cameras
+    matter.
 
-    A file's values are counts from 0 to 2^bits - 1 (by default the file's own 8 or 16 bits), of which
-    `black_level` stands for no light. Light times `exposure` (seconds) times `gain` makes the value; a gain
-    of three numbers is of red, green and blue. Both are relative: only their ratios between cameras matter.
+    Attributes:
+        response: name ("mono", "rgb", "nir"), band or curve; None if unknown.
+        frame_rate: frames for each second; None if unknown.
+        time_offset: seconds after the rig's clock.
+        coding: relation of pixel values to light, "srgb" or "linear".
+        bayer: colour filter pattern from the top left ("RGGB") of raw images; None for none.
+        bits: bits of a count: a file's values are 0 to 2^bits - 1; None for the file's own 8 or 16 bits.
+        black_level: count that stands for no light.
+        exposure: seconds; None if unknown.
+        gain: factor of the value; three numbers for red, green and blue.
+
+    Raises:
+        ValueError: for numbers out of range, another coding or pattern.
+        TypeError: for values that are no numbers.
     """
 
     response: str | Band | Curve | None = None
@@ -82,7 +109,7 @@ torch.serialization.add_safe_globals([Band, Curve, Sensor])
 
 
 def response_text(sensor: Sensor) -> str:
-    """The spectral response in a word or two, if one is stated."""
+    """Describe a sensor's spectral response in a word or two; empty if it has none."""
     response = sensor.response
     if isinstance(response, Band):
         return f"{response.centre:g}+-{response.width / 2:g} nm"

@@ -1,4 +1,4 @@
-"""A rig in numbers: fields of view, baselines, segment lengths, depth resolution."""
+"""Summary of a rig in numbers: fields of view, baselines, segment lengths, depth resolution."""
 
 from __future__ import annotations
 
@@ -21,10 +21,17 @@ from .segments import Segments
 
 
 class CameraSummary(NamedTuple):
-    """One camera. `field_of_view` (across, down), degrees; footprints: millimetres a pixel, near and far.
+    """Summary of one camera; None where calibration or a depth range is missing.
 
-    lens: its model's name, None for a pinhole; coefficients: their numbers, none for models of surfaces.
-    covered: share of the image whose pixels have a ray through the lens.
+    Attributes:
+        name: name of the camera.
+        wh: image size (width, height).
+        field_of_view: angles (across, down), degrees.
+        focal: focal lengths (x, y), pixels.
+        footprint: millimetres of a pixel at the near and the far bound.
+        lens: name of the lens model; None for a pinhole.
+        coefficients: coefficients of a `Distortion`; empty for other models.
+        covered: share of the image whose pixels have a ray.
     """
 
     name: str
@@ -38,13 +45,17 @@ class CameraSummary(NamedTuple):
 
 
 class PairSummary(NamedTuple):
-    """Alpha and one beta.
+    """Summary of alpha and one beta; None without a depth range.
 
-    baseline: metres between the optical centres; rotation: degrees between the orientations.
-    seen: share of alpha's pixels that have a segment in beta.
-    length: (median, largest) length of their segments, pixels of beta.
-    depth_step: (near, far), the change of depth that moves the point by one pixel in beta, metres: the median
-        of alpha's pixels whose point beta sees, NaN if it sees none.
+    Attributes:
+        alpha: name of alpha.
+        beta: name of beta.
+        baseline: distance of the optical centres, metres.
+        rotation: angle between the orientations, degrees.
+        seen: share of alpha's pixels with a segment in beta.
+        length: (median, largest) length of the segments, pixels of beta; None without any.
+        depth_step: change of depth at (near, far) that moves a point by one pixel of beta, metres: the median
+            of alpha's pixels whose point beta sees, NaN if it sees none.
     """
 
     alpha: str
@@ -57,20 +68,24 @@ class PairSummary(NamedTuple):
 
 
 NEXT = 1 + 1e-6
-"""A depth times this is the next, where a change is asked for."""
+"""Factor from a depth to the next, for numerical changes."""
 MOST_BETAS = 50
-"""Of one alpha."""
+"""Largest number of betas for one alpha."""
 MOST_PIXELS = 1 << 18
-"""Pixels of alpha for which segments are computed; a sixteenth of them through lenses."""
+"""Largest number of alpha's pixels for which segments are computed; a sixteenth of them through lenses."""
 
 
 def summarise_cameras(rig: Rig) -> list[CameraSummary]:
-    """One summary for each camera, in the rig's order; what needs calibration is None without it."""
+    """Summarise each camera, in the rig's order."""
     return [_camera(name, rig) for name in rig.names]
 
 
 def summarise_pairs(rig: Rig, alpha: str | None = None) -> list[PairSummary]:
-    """A summary for each ordered pair of calibrated cameras, or one alpha and its `MOST_BETAS` nearest."""
+    """Summarise each ordered pair of calibrated cameras, or one alpha with its `MOST_BETAS` nearest betas.
+
+    Returns:
+        Summaries; none if alpha is not calibrated.
+    """
     cameras = {n: c for n, c in rig.cameras.items() if isinstance(c, Camera)}
     if alpha is None:
         return [_pair(a, b, rig.pair(a, b)) for a in cameras for b in cameras if a != b]
@@ -97,9 +112,10 @@ def _camera(name: str, rig: Rig) -> CameraSummary:
 
 
 def field_of_view(camera: Camera) -> tuple[float, float]:
-    """Angles (across, down) in degrees between the rays at the middles of opposite edges, through the lens.
+    """Compute the angles between the rays at the middles of opposite edges, through the lens.
 
-    An edge outside the lens model's range gives NaN.
+    Returns:
+        Angles (across, down) in degrees; NaN for an edge outside the lens model's range.
     """
     h, w = camera.hw
     middle = ((w - 1) / 2, (h - 1) / 2)
@@ -123,7 +139,8 @@ def _pair(alpha: str, beta: str, pair: Pair) -> PairSummary:
 
 
 def _segments(pair: Pair) -> tuple[float, tuple[float, float] | None]:
-    """Share of alpha's pixels with a segment, its (median, largest) length; of each fourth pixel or fewer."""
+    """Share of alpha's pixels with a segment, and its (median, largest) length, on each fourth pixel or
+    fewer."""
     h, w = pair.alpha.hw
     field, most = (Curved(64), MOST_PIXELS // 16) if pair.has_lens else (Epipolar(), MOST_PIXELS)
     step = max(4, math.ceil(math.sqrt(h * w / most)))
@@ -141,7 +158,7 @@ def _segments(pair: Pair) -> tuple[float, tuple[float, float] | None]:
 
 
 def _depth_step(pair: Pair, baseline: float) -> tuple[float, float] | None:
-    """`depth_step` of a pair."""
+    """Depth step of a pair; None without depth range or baseline."""
     if pair.depth is None or baseline == 0:
         return None
     spacing = max(16, math.ceil(math.sqrt(math.prod(pair.alpha.hw) / MOST_PIXELS)))

@@ -1,4 +1,4 @@
-"""From images back to depth: two views along a field, N views by triangulation."""
+"""Depth from images: of two views along a field, of N views by triangulation."""
 
 from __future__ import annotations
 
@@ -20,9 +20,13 @@ from .reprojection import projection_slopes
 
 
 class Triangulated(NamedTuple):
-    """World points (*n, 3) in metres, their covariance (*n, 3, 3) in m^2, validity, and residuals in pixels.
+    """Triangulated points.
 
-    `residual` is the largest distance, over the views that count, between a match and the point's image.
+    Attributes:
+        X: world points, metres; 0 where not valid.
+        covariance: their covariance, m².
+        valid: True for usable points.
+        residual: largest distance between a match and the point's image over the views that count, pixels.
     """
 
     X: Float[Tensor, "*n 3"]
@@ -39,18 +43,28 @@ def triangulate(
     deviation: float = 1.0,
     residual: float | None = None,
 ) -> Triangulated:
-    """Points from their pixels in two views or more, of least reprojection error, through any lens.
+    """Triangulate points from their pixels in two views or more, of least reprojection error, through any
+    lens.
 
     Gauss-Newton in float64 on direction and inverse distance from the first view that sees the point (Civera,
     Davison and Montiel 2008), in which the error is nearly linear however far the point is; from the inverse
-    distance at which rays meet in least squares. Exact derivatives; batched cameras (*b) take pixels (views,
-    *b, ..., 2).
+    distance at which rays meet in least squares.
 
-    `deviation` is the standard deviation of the pixels' coordinates. The covariance is of that noise, to
-    first order across the ray; along it, three deviations extend to where the inverse distance is three
-    deviations less: the error stays within them as often as a normal distribution's. Valid where that is
-    still finite, all views that see the point (`seen`) have it in front, and no residual exceeds `residual`
-    pixels (five deviations).
+    Args:
+        cameras: two cameras or more; batched cameras (*b) take pixels (views, *b, ..., 2).
+        x: pixels of the points in each camera; NaN where unknown.
+        seen: True where a camera sees a point; None for all.
+        deviation: standard deviation of pixel coordinates.
+        residual: largest accepted residual, pixels; None for five deviations.
+
+    Returns:
+        Points with exact derivatives. The covariance is to first order across the ray; along it, three
+        deviations extend to where the inverse distance is three deviations less: the error stays within them
+        as often as a normal distribution's. Valid where that is still finite, all views that see the point
+        have it in front, and no residual is too large.
+
+    Raises:
+        ValueError: for fewer than two cameras, or another number of views in `x`.
     """
     if len(cameras) != len(x) or len(cameras) < 2:
         raise ValueError(
@@ -76,12 +90,12 @@ def triangulate(
 
 
 STEPS = 5
-"""Of Gauss and Newton."""
+"""Number of Gauss-Newton steps."""
 FOLLOWED = 3
-"""Steps that derivatives go through: each takes the difference to those of the least error down by about
+"""Steps that derivatives go through: each reduces the difference to those of the least error by about
 residual / disparity."""
 SMALLEST_PARALLAX = 1e-9
-"""Radians between two rays: what is farther away is so far that float64 pixels do not show it."""
+"""Least angle between two rays, radians: float64 pixels do not show less."""
 
 
 def depth_of(
@@ -90,10 +104,17 @@ def depth_of(
     x_beta: Real[Tensor, "*n 2"],
     deviation: Float[Tensor, "*n"] | None = None,
 ) -> Depth:
-    """Depth in alpha of what its pixels x see at beta's pixels `x_beta`; through lenses too.
+    """Compute the depth in alpha of matches x (alpha) and `x_beta` (beta); through central lenses too.
 
-    `deviation` is the standard deviation of x_beta along the segment, in pixels; that of the depth is
-    propagated to first order. Raises ValueError for uncalibrated pairs.
+    Args:
+        deviation: standard deviation of x_beta along the segment, pixels; None for 0. It is propagated to
+            first order.
+
+    Returns:
+        Depth z in metres, its deviation, and validity.
+
+    Raises:
+        ValueError: for uncalibrated pairs, and lenses whose rays do not meet in a point.
     """
     alpha, beta = pair.cameras
     x, x_beta = floating(x), floating(x_beta)
@@ -115,7 +136,7 @@ def depth_of(
 
 
 def _metres_per_pixel(pair: Pair, x: Tensor, depth: Tensor, valid: Tensor) -> Tensor:
-    """How much depth a pixel of beta is worth there, by central differences of a thousandth of the depth."""
+    """Metres of depth for each pixel of beta, by central differences of a thousandth of the depth."""
     alpha, beta = pair.cameras
     safe = torch.where(valid, depth, 1.0).to(alpha.K.dtype)
     ends = [beta.project(alpha.unproject(x.to(safe), safe * (1 + s))).x for s in (5e-4, -5e-4)]
@@ -124,7 +145,7 @@ def _metres_per_pixel(pair: Pair, x: Tensor, depth: Tensor, valid: Tensor) -> Te
 
 
 class _Sight(NamedTuple):
-    """A camera, the pixels (*n, 2) of the points in it, which of them count, and its centre (*n or 1, 3)."""
+    """Camera, pixels (*n, 2) of the points in it, which of them count, and its centre (*n or 1, 3)."""
 
     camera: Camera
     x: Tensor
@@ -133,7 +154,8 @@ class _Sight(NamedTuple):
 
 
 class _Chart(NamedTuple):
-    """Points p = (a, b, w): `origin` + `scale` (a u + b v + d) / w; `axes` (*n, 3, 3) has columns u, v, d."""
+    """Chart of points p = (a, b, w): `origin` + `scale` (a u + b v + d) / w; `axes` (*n, 3, 3) has columns u,
+    v, d."""
 
     origin: Tensor
     axes: Tensor
@@ -146,14 +168,14 @@ class _Chart(NamedTuple):
         return self.origin + (self.scale / p[..., 2])[..., None] * self.direction(p)
 
     def slopes(self, p: Tensor) -> Tensor:
-        """dX / dp (*n, 3, 3)."""
+        """Derivatives dX / dp (*n, 3, 3)."""
         along = -self.direction(p) / p[..., 2:]
         columns = torch.cat([self.axes[..., :2], along[..., None]], -1)
         return (self.scale / p[..., 2])[..., None, None] * columns
 
 
 class _NormalEquations(NamedTuple):
-    """Of a Gauss-Newton step, the identity where it is not `solvable`; and how the point is seen."""
+    """Gauss-Newton equations, the identity where not `solvable`, and visibility and residual of the point."""
 
     matrix: Tensor
     target: Tensor
@@ -165,7 +187,8 @@ class _NormalEquations(NamedTuple):
 def _sighted(
     cameras: Sequence[Camera], x: Tensor, seen: Tensor | None
 ) -> tuple[list[_Sight], _Chart, Tensor]:
-    """What is seen of each point, its first view's chart, and where in it the rays meet in least squares."""
+    """Sights of each point, its first view's chart, and the point in it where the rays meet in
+    least squares."""
     finite = x.isfinite().all(-1)
     x = torch.where(finite[..., None], x, 0.0)
     centres, directions, usable = (
@@ -198,7 +221,7 @@ def _perpendicular(d: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _normal_equations(sights: Sequence[_Sight], chart: _Chart, p: Tensor) -> _NormalEquations:
-    """Of the reprojection error in pixels, at p."""
+    """Normal equations of the reprojection error in pixels, at p."""
     X, slopes = chart.point(p), chart.slopes(p)
     matrix, target = torch.zeros_like(slopes), torch.zeros_like(p)
     in_front, worst = torch.ones_like(p[..., 0], dtype=torch.bool), torch.zeros_like(p[..., 0])
@@ -221,4 +244,5 @@ def _normal_equations(sights: Sequence[_Sight], chart: _Chart, p: Tensor) -> _No
 
 
 LEAST_DETERMINANT = 1e-18
-"""Of normal equations, largest diagonal entry 1: inverse distance is known 1e-9 as well as directions."""
+"""Least determinant of normal equations scaled to a largest diagonal entry of 1: inverse distance is then
+known 1e-9 as well as directions."""

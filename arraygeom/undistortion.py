@@ -1,4 +1,4 @@
-"""Undistorting images: pinhole cameras in place of those with lenses, and images resampled to them."""
+"""Undistortion: pinhole cameras in place of cameras with lenses, and images resampled to them."""
 
 from __future__ import annotations
 
@@ -17,17 +17,23 @@ from .runtime.tracing import needs_numbers
 from .sampling import Interpolation, Sampled, sample
 
 WIDEST = math.radians(62)
-"""How far off axis a pinhole view reaches: there it stretches outwards 4.5 times as much as in the middle."""
+"""Largest angle off axis of a pinhole view: there it stretches outwards 4.5 times as much as in
+the middle."""
 AT_ONCE = 1 << 18
 """Pixels that are resampled at once."""
 
 
 def pinhole_view(camera: AnyLensView) -> AnyLensView:
-    """The camera without its lens, large enough for all the old image shows up to `WIDEST` off axis.
+    """Make the pinhole camera that covers an image with a lens, up to `WIDEST` off axis.
 
-    Same position, orientation and K but for the principal point: pixels in the middle keep their size. Links
-    follow by `rig.transformed(name, view.K @ camera.K^-1, view.hw)`. Raises ValueError for a batch of
-    cameras, and for an image whose middle is outside its lens's range.
+    Position, orientation and K stay except for the principal point: pixels in the middle keep their size.
+    Links follow by `rig.transformed(name, view.K @ camera.K^-1, view.hw)`.
+
+    Returns:
+        The camera without its lens, usually of another size.
+
+    Raises:
+        ValueError: for a batch of cameras, and an image without a pixel inside its lens's range.
     """
     needs_numbers("the size of a pinhole view", camera.K)
     if camera.K.ndim > 2:
@@ -51,7 +57,15 @@ def pinhole_view(camera: AnyLensView) -> AnyLensView:
 def pixels_between(
     source: LensView, target: LensView, x: Float[Tensor, "h w 2"] | None = None
 ) -> tuple[Float[Tensor, "h w 2"], Bool[Tensor, "h w"]]:
-    """Positions of `target`'s pixels x (default: all) in the co-located `source`, which it sees. Float64."""
+    """Compute the positions in `source` of the pixels of a co-located `target`.
+
+    Args:
+        x: pixels of target; None for all.
+
+    Returns:
+        Positions in source's image, float64, and True where both lenses are valid and the position is on the
+        image.
+    """
     if x is None:
         return _by_rows(lambda x: pixels_between(source, target, x), target.hw, axis=0)
     source, target = source.to(torch.float64), target.to(torch.float64)
@@ -63,7 +77,8 @@ def pixels_between(
 
 
 def _by_rows(function: Callable[[Tensor], Any], hw: HW, *, axis: int) -> Any:
-    """What a function makes of an image's pixels (h, w, 2), some rows at a time: some 300 bytes a pixel."""
+    """Apply a function to an image's pixels (h, w, 2), some rows at a time: it takes some 300
+    bytes a pixel."""
     x, y = pixel_coordinates(hw, dtype=torch.float64)
     rows = max(AT_ONCE // hw[1], 1)
     return chunked(lambda x, y: function(torch.stack([x, y], -1)), x, y, rows=rows, axis=axis)
@@ -72,9 +87,15 @@ def _by_rows(function: Callable[[Tensor], Any], hw: HW, *, axis: int) -> Any:
 def recorded_pixels(
     x: Float[Tensor, "*n 2"], now: View, recorded: LensView
 ) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
-    """Pixels of a view cropped, resized, rotated, or without its lens, in the recorded image; which it shows.
+    """Map pixels of a view that was cropped, resized, rotated or undistorted to the image as recorded.
 
-    K of both views says how pixels were changed: x ~ K_now K_recorded^-1 x_recorded but for the lens.
+    K of both views says how pixels were changed: x ~ K_now K_recorded^-1 x_recorded, apart from the lens.
+
+    Returns:
+        Pixels of the recorded image, and True within the lens model's range.
+
+    Raises:
+        ValueError: for a view `now` without K.
     """
     x = map_homogeneous(_between(recorded, now)[:2], x)
     return _lens_taken(recorded, now).distort(x)
@@ -83,19 +104,26 @@ def recorded_pixels(
 def straight_pixels(
     x: Float[Tensor, "*n 2"], now: View, recorded: LensView
 ) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
-    """The inverse of `recorded_pixels`: pixels of the image as recorded in the view as it is now."""
+    """Map pixels of the image as recorded to the view as it is now: the inverse of `recorded_pixels`.
+
+    Returns:
+        Pixels, and True within the lens model's range.
+
+    Raises:
+        ValueError: for a view `now` without K.
+    """
     x, valid = _lens_taken(recorded, now).undistort(x)
     return map_homogeneous(torch.linalg.inv(_between(recorded, now))[:2], x), valid
 
 
 def _lens_taken(recorded: LensView, now: View) -> LensView:
-    """The recorded view, float64, with the lens that it has no longer; without one if it still has it."""
+    """Recorded view, float64, with the lens that it no longer has; without one if it still has it."""
     kept = isinstance(now, LensView) and now.distortion is not None
     return (recorded.replace(distortion=None) if kept else recorded).to(torch.float64)
 
 
 def _between(recorded: LensView, now: View) -> Float[Tensor, "3 3"]:
-    """K_recorded K_now^-1."""
+    """Matrix K_recorded K_now^-1."""
     if not isinstance(now, LensView):
         raise ValueError(
             "which pixels were recorded views without K do not say: give them one (`with_pixels`)"
@@ -111,10 +139,16 @@ def resampled(
     interpolation: Interpolation = "bicubic",
     extended: bool = False,
 ) -> Sampled:
-    """The image that `target`, co-located with `source`, would have recorded: values (1, C, H, W), validity.
+    """Resample an image of `source` to a co-located `target`.
 
-    Where `source` sees nothing values are 0, or if `extended` those of its nearest pixel; they are not valid.
     The baseline between the two is ignored; uncalibrated views count as having the same orientation.
+
+    Args:
+        extended: True to fill pixels that source does not see from its nearest pixel; they are still not
+            valid.
+
+    Returns:
+        Values (1, C, H, W), 0 where source sees nothing unless `extended`, and validity.
     """
 
     def part(x: Tensor) -> Sampled:
@@ -133,7 +167,11 @@ def sampled_between(
     *,
     extended: bool = False,
 ) -> Sampled:
-    """`resampled` with what `pixels_between` found, which several images of one camera share."""
+    """Resample as `resampled`, with the result of `pixels_between`, which several images of one camera share.
+
+    Returns:
+        Values (1, C, H, W), and validity.
+    """
     x, defined = pixels
     h, w = source.hw
     nearest = torch.minimum(x.clamp(min=0), x.new_tensor([w - 1, h - 1]))

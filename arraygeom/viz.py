@@ -1,4 +1,4 @@
-"""Drawings of rigs, fields and residuals. Functions give back a figure and show nothing.
+"""Drawings of rigs, fields and residuals. Functions return a figure and show nothing.
 
 Matplotlib figures are made without pyplot, so there is no global state: `figure.savefig("rig.png")`, or leave
 the figure as the last line of a notebook's cell. Matplotlib is imported when something is drawn.
@@ -33,17 +33,27 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c564b", "#5c5c5c")
-"""Okabe and Ito's, which colour-blind readers can tell apart."""
+"""Okabe and Ito's palette, which colour-blind readers can tell apart."""
 
 
 # The rig in space -------------------------------------------------------------------------------------------
 
 
 def draw_rig(rig: Rig, *, alpha: str | None = None) -> Figure:
-    """The rig in three dimensions: each camera's frustum and name, and alpha's view from near to far.
+    """Draw a rig in three dimensions: each camera's frustum and name, and alpha's view from near to far.
 
-    `alpha` is the camera whose depth range is drawn (the first calibrated one; the range is left out where it
-    would dwarf the rig, beyond 6 times its extent, or is infinite). Up in the figure is -y of the world.
+    Up in the figure is -y of the world.
+
+    Args:
+        alpha: camera whose depth range is drawn; None for the first calibrated one. Bounds that would dwarf
+            the rig (beyond 6 times its extent, or infinite) are left out.
+
+    Returns:
+        The figure.
+
+    Raises:
+        ValueError: if no camera is calibrated.
+        ImportError: without matplotlib.
     """
     cameras = calibrated(rig)
     figure = new_figure(figsize=(5.2, 4.6), layout="constrained")
@@ -68,7 +78,11 @@ def draw_rig(rig: Rig, *, alpha: str | None = None) -> Figure:
 
 
 def calibrated(rig: Rig) -> dict[str, Camera]:
-    """The rig's calibrated cameras. Raises ValueError if there are none."""
+    """Return the calibrated cameras of a rig, by name.
+
+    Raises:
+        ValueError: if there are none.
+    """
     cameras = {n: c for n, c in rig.cameras.items() if isinstance(c, Camera)}
     if not cameras:
         raise ValueError("no camera of this rig is calibrated: there is nothing to draw in space")
@@ -76,19 +90,24 @@ def calibrated(rig: Rig) -> dict[str, Camera]:
 
 
 def frustum_size(cameras: Mapping[str, Camera]) -> float:
-    """A length of frusta that suits the distances between the cameras, metres."""
+    """Return a length of frusta that suits the distances between the cameras, metres."""
     extent = extent_of(cameras)
     return 0.45 * extent / max(1.0, len(cameras) ** 0.5) if extent > 0 else 0.1
 
 
 def extent_of(cameras: Mapping[str, Camera]) -> float:
-    """The largest distance between two cameras, metres."""
+    """Return the largest distance between two cameras, metres."""
     centres = torch.stack([c.centre.detach().double().cpu() for c in cameras.values()])
     return float(torch.cdist(centres, centres).max())
 
 
 def frustum(camera: Camera, length: float) -> list[np.ndarray]:
-    """Lines in the world from the centre to the image's corners, and the image's border, `length` away."""
+    """Return the lines of a camera's frustum: from its centre to the image's corners, and the border at depth
+    `length`.
+
+    Returns:
+        Arrays (n, 3) of world points, metres.
+    """
     border = seen_at(camera, image_border(camera.hw), length)
     centre = numpy(camera.centre)
     corners = border[:: len(border) // 4][:4]
@@ -96,7 +115,11 @@ def frustum(camera: Camera, length: float) -> list[np.ndarray]:
 
 
 def depth_outline(rig: Rig, cameras: Mapping[str, Camera], alpha: str | None) -> list[np.ndarray]:
-    """The borders of alpha's view at near and at far, and its edges between them, as lines in the world."""
+    """Return the lines around alpha's view: borders at near and at far, and edges between them.
+
+    Returns:
+        Arrays (n, 3) of world points; empty without a depth range, or for bounds too far away.
+    """
     if rig.depth is None:
         return []
     camera = cameras[alpha or next(iter(cameras))]
@@ -108,7 +131,7 @@ def depth_outline(rig: Rig, cameras: Mapping[str, Camera], alpha: str | None) ->
 
 
 def image_border(hw: HW) -> Float[Tensor, "n 2"]:
-    """Points round the image's area from its first corner back to it, 16 a side, in pixels."""
+    """Return points around the image's area, from its first corner back to it, 16 on each side, in pixels."""
     h, w = hw
     corners = torch.tensor([[0.0, 0], [w, 0], [w, h], [0, h], [0, 0]], dtype=torch.float64) - 0.5
     steps = torch.arange(16, dtype=torch.float64)[:, None] / 16
@@ -117,10 +140,13 @@ def image_border(hw: HW) -> Float[Tensor, "n 2"]:
 
 
 def seen_at(camera: Camera, x: Float[Tensor, "n 2"], depth: float) -> np.ndarray:
-    """World points of pixels at a depth; NaN where the lens has no ray.
+    """Compute world points of pixels at a depth.
 
     Pixels outside the lens model's range are moved towards the middle until they are inside, and rays more
     than 53 degrees off axis are cut at 1 / 0.6 of the depth: a fisheye's border would be at infinity.
+
+    Returns:
+        Points (n, 3), metres; NaN where the lens has no ray.
     """
     camera = camera.to(torch.float64)
     middle = x.mean(0)
@@ -143,11 +169,20 @@ def draw_fields(
     field: ReceptiveField | Mapping[str, ReceptiveField] | None = None,
     images: Mapping[str, Any] | None = None,
 ) -> Figure:
-    """Alpha's pixels x, and their sampling locations in every beta, in the same colours.
+    """Draw alpha's pixels x, and their sampling locations in every beta in the same colours.
 
-    `field` is one for all betas or one for each by name (`recorded_field` by default). `images` holds (H, W),
-    (H, W, 3) or (3, H, W) images by camera name.
     Segments are lines with a dot at their near end, positions are dots.
+
+    Args:
+        field: field of all betas, or fields by name; None for `recorded_field`.
+        images: images (H, W), (H, W, 3) or (3, H, W) by camera.
+
+    Returns:
+        The figure.
+
+    Raises:
+        ValueError: for an unknown camera.
+        ImportError: without matplotlib.
     """
     names = (alpha, *rig.betas(alpha))
     images = images or {}
@@ -166,7 +201,7 @@ def draw_fields(
 
 
 def draw_sampling_locations(axes: Axes, field: ReceptiveField, pair: Pair, x: Float[Tensor, "n 2"]) -> None:
-    """The sampling locations in beta of a few alpha pixels, each in its own colour."""
+    """Draw the sampling locations in beta of some alpha pixels into `axes`, each in its own colour."""
     locations = sampling_locations(field, pair, x)
     for i, colour in enumerate(_colours(len(x))):
         if isinstance(locations, Segments):
@@ -183,16 +218,27 @@ def draw_sampling_locations(axes: Axes, field: ReceptiveField, pair: Pair, x: Fl
 
 
 class NearLine(NamedTuple):
-    """The part of an epipolar line (a curve, through a lens) around a point of beta, the point's distance."""
+    """Parts of epipolar lines next to points of beta.
+
+    Attributes:
+        curve: points along the line (a curve, for lenses), pixels; NaN where a lens has no ray.
+        distance: distance of the point from its line, pixels.
+    """
 
     curve: Float[Tensor, "n p 2"]
     distance: Float[Tensor, " n"]
 
 
 def near_line(pair: Pair, x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"], half: float) -> NearLine:
-    """Lines of alpha's points x where they pass y, `half` pixels to each side. Pixels of images as recorded.
+    """Compute the lines of alpha's points x where they pass beta's points y, `half` pixels to each side.
 
-    Distances are from the nearest point of the line. NaN where a lens has no ray.
+    Pixels are those of images as recorded.
+
+    Returns:
+        Curves, and distances to the nearest point of the line.
+
+    Raises:
+        ValueError: if neither calibration nor F is known.
     """
     F = pair.fundamental.to(torch.float64)
     (x_pinhole, _), (y_pinhole, _) = pair.alpha.undistort(x.double()), pair.beta.undistort(y.double())
@@ -212,11 +258,19 @@ def draw_matches(
     matches: Mapping[str, tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2"]]],
     images: Mapping[str, Any],
 ) -> Figure:
-    """Patches around points matched between alpha and each beta, spread over alpha, and the lines they miss.
+    """Draw patches around points matched between alpha and each beta, with the lines that the rig gives.
 
     Above, alpha's patch, 18 pixels to either side of the point; below, beta's around the match, with the line
-    that the rig gives to alpha's point and the distance in pixels. `matches` holds points (x, y) of alpha and
-    of the beta, by beta, found in the images: they are on their lines only if the rig is right.
+    of alpha's point and the distance in pixels. Matches lie on their lines only if the rig is right.
+
+    Args:
+        matches: points (x, y) of alpha and of the beta, by beta.
+
+    Returns:
+        The figure.
+
+    Raises:
+        ImportError: without matplotlib.
     """
     count, half = 7, 18
     figure = new_figure(figsize=(1.55 * count, 3.7 * len(matches)), layout="constrained")
@@ -244,7 +298,7 @@ def draw_matches(
 
 
 def _draw_patch(axes: Axes, hw: HW, image: Any, middle: np.ndarray, half: float) -> None:
-    """An image around a point, which a small cross marks without covering it."""
+    """Draw an image around a point, marked by a small cross that does not cover it."""
     show_image(axes, hw, image)
     for span in ([0.12, 0.35], [-0.12, -0.35]):
         ends = np.array(span) * half
@@ -269,10 +323,22 @@ def draw_residuals(
     *,
     image: Any = None,
 ) -> Figure:
-    """Measured matches against the geometry: distances from beta's points to their epipolar lines.
+    """Draw measured matches against the geometry: distances from beta's points to their epipolar lines.
 
-    Left, each distance drawn across its line and enlarged so that the median is 2 % of the width; right,
-    their histogram, with the median. Pixels of undistorted images.
+    Left, each distance across its line, enlarged so that the median is 2 % of the width; right, their
+    histogram.
+
+    Args:
+        x_alpha: matches in alpha, undistorted pixels.
+        x_beta: matches in beta, undistorted pixels.
+        image: beta's image.
+
+    Returns:
+        The figure.
+
+    Raises:
+        ValueError: if neither calibration nor F is known.
+        ImportError: without matplotlib.
     """
     with needs("plots", "drawing"):
         from matplotlib.collections import LineCollection
@@ -307,14 +373,21 @@ def draw_residuals(
 
 
 def new_figure(**options: Any) -> Figure:
-    """A matplotlib figure outside pyplot. Raises ImportError where matplotlib is not installed."""
+    """Make a matplotlib figure outside pyplot.
+
+    Returns:
+        The figure.
+
+    Raises:
+        ImportError: without matplotlib.
+    """
     with needs("plots", "drawing"):
         from matplotlib.figure import Figure
     return Figure(**options)
 
 
 def show_image(axes: Axes, hw: HW, image: Any = None) -> None:
-    """The image, or an empty frame of its size, with pixel centres at whole numbers."""
+    """Show an image, or an empty frame of its size, in `axes`, with pixel centres at whole numbers."""
     h, w = hw
     if image is not None:
         pixels = np.asarray(image.detach().cpu() if isinstance(image, Tensor) else image)
@@ -328,12 +401,12 @@ def show_image(axes: Axes, hw: HW, image: Any = None) -> None:
 
 
 def numpy(x: Tensor) -> np.ndarray:
-    """The tensor's values, without gradient, on the CPU."""
+    """Return a tensor's values as float64 array, without gradient, on the CPU."""
     return x.detach().cpu().double().numpy()
 
 
 def _sheet(sizes: list[HW], height: float = 2.6) -> tuple[float, float]:
-    """The figure's size in inches for images side by side, at most 16 wide."""
+    """Size of a figure in inches for images side by side, at most 16 wide."""
     width = sum(height * w / h for h, w in sizes)
     shrink = min(1.0, 16 / width)
     return width * shrink, height * shrink + 0.3
@@ -348,13 +421,13 @@ def _colours(n: int) -> list[Any]:
 
 
 def _upright(X: np.ndarray) -> np.ndarray:
-    """World axes (x, y down, z ahead) to the figure's (x, z, up)."""
+    """Convert world axes (x, y down, z ahead) to the figure's (x, z, up)."""
     x, y, z = np.moveaxis(X, -1, 0)
     return np.stack([x, z, -y])
 
 
 def _equal_axes(axes: Any) -> None:
-    """The same metres along each axis."""
+    """Scale all axes alike."""
     limits = np.array([getattr(axes, f"get_{a}lim")() for a in "xyz"])
     spans = np.maximum(np.diff(limits)[:, 0], 0.35 * np.diff(limits).max())
     middles = limits.mean(1)

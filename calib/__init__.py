@@ -11,7 +11,8 @@ from typing import Any
 
 
 def _lazy(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
-    """A package's `__getattr__` that imports functions on first use: OpenCV and matplotlib load slowly."""
+    """Return a package's `__getattr__` that imports functions on first use: OpenCV and matplotlib load
+    slowly."""
 
     def get(name: str) -> Any:
         if name not in modules:
@@ -25,7 +26,11 @@ __all__ = ["boards", "images"]
 
 
 def __getattr__(name: str) -> Any:
-    """The two packages, imported on first use."""
+    """Import one of the two packages on first use.
+
+    Raises:
+        AttributeError: for any other name.
+    """
     if name not in __all__:
         raise AttributeError(f"module 'calib' has no attribute '{name}'")
     return import_module(f"calib.{name}")

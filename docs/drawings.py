@@ -1,16 +1,38 @@
-"""The drawings of the concepts page, from the sample array: python docs/drawings.py."""
+"""The drawings of the pages and the figures of README: python docs/drawings.py [--only NAME]."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from matplotlib.figure import Figure
+from PIL import Image, ImageDraw, ImageFont
+from skimage.data import chelsea
+from torch import Generator, Tensor
 
-from arraygeom import Dense, Epipolar, EpipolarLine, HomographyDisplacement, Local, NearestVoxels, Rectified
+from arraygeom import (
+    Camera,
+    Dense,
+    Epipolar,
+    EpipolarLine,
+    HomographyDisplacement,
+    Local,
+    NearestVoxels,
+    Pose,
+    Rectified,
+    Rig,
+    intrinsics,
+)
+from arraygeom.runtime.atomic import write_atomically
 from arraygeom.viz import draw_fields, draw_rig, draw_sampling_locations, show_image
+from pat import FuseSettings, fuse
+from pat.app.cli.parser import script
+from pat.app.demo import as_real_cameras
 from pat.app.sample_array import ALPHA, BETA, SampleArray, load_sample
-from pat.media.figures import save_figure
+from pat.media.colour import exposed, linear_from_srgb, luminance, srgb_from_linear, to_bytes
+from pat.media.figures import colour_depth, save_figure
+from pat.sensors import NoiseLevel
 
 OUT = Path(__file__).parent / "drawings"
 FAMILIES = {
@@ -22,6 +44,98 @@ FAMILIES = {
     "Local(9, spacing=3)": Local(9, spacing=3.0),
     "Dense(12)": Dense(12),
 }
+
+
+DARKER = 8
+"""How many times less light the mono camera of the cat has."""
+DISPARITY, FOCAL, BASELINE = 24, 600.0, 0.08
+"""Where the cat's photograph hangs: pixels between its images, pixels, and metres between the cameras."""
+WIDE, GAP = 902, 8
+"""Width of the fused image in README's figures, and the space between images, pixels."""
+
+
+def dark_cat() -> tuple[Rig, dict[str, Tensor]]:
+    """Return two cameras and their images of a photograph on a wall: mono in the dark, and colour.
+
+    The photograph is scikit-image's cat (CC0). It is flat: its figure shows no depth.
+    """
+    photo = torch.from_numpy(chelsea().copy()).movedim(-1, 0) / 255
+    generator, hw = Generator().manual_seed(0), (photo.shape[1], photo.shape[2])
+    dark = srgb_from_linear(luminance(linear_from_srgb(photo)) / DARKER)
+    shifted = torch.cat([photo[..., DISPARITY:], photo[..., -1:].expand(-1, -1, DISPARITY)], -1)
+    images = {
+        ALPHA: NoiseLevel.of_electrons(1000, 2.0).recorded(dark[None], generator)[0],
+        BETA: NoiseLevel.of_electrons(8000, 2.0).recorded(shifted[None], generator)[0],
+    }
+    mono = Camera(K=intrinsics(FOCAL, hw).double(), cam_from_world=Pose.identity(), hw=hw)
+    beside = Pose(mono.R, torch.tensor([-BASELINE, 0, 0]).double())
+    return Rig({ALPHA: mono, BETA: mono.replace(cam_from_world=beside)}, depth=(1, 8)), images
+
+
+def cat() -> Image.Image:
+    """Two in, one out: a cat out of the dark."""
+    rig, images = dark_cat()
+    frame = fuse(images, rig, alpha=ALPHA, settings=FuseSettings(noise="estimate"))
+    words = {
+        f"in: a mono camera with 1/{DARKER} of the light": images[ALPHA],
+        "in: a colour camera beside it": images[BETA],
+        "out: the mono camera's view, fused": exposed(frame.image, DARKER),
+    }
+    return two_in_one_out(words)
+
+
+def table() -> Image.Image:
+    """Two in, one out, with depth: the sample array, in low light."""
+    array, noise = as_real_cameras(load_sample())
+    frame = fuse(array.images, array.rig, alpha=ALPHA, settings=FuseSettings(noise=noise))
+    words = {
+        "in: a mono camera, in low light": array.images[ALPHA],
+        "in: a wide colour camera, in low light": array.images[BETA],
+        "out: the mono camera's view, fused": frame.image,
+    }
+    return two_in_one_out(words, depth=colour_depth(frame.depth))
+
+
+def two_in_one_out(words: dict[str, Tensor], depth: Tensor | None = None) -> Image.Image:
+    """Draw two images above each other, a large one beside them, depth in its corner, words on all."""
+    first, _, fused = words.values()
+    high = round(WIDE * fused.shape[-2] / fused.shape[-1])
+    above = (high - GAP) // 2
+    beside = round(above * first.shape[-1] / first.shape[-2])
+    drawn = Image.new("RGB", (beside + GAP + WIDE, high), "white")
+    boxes = [(0, 0, beside, above), (0, high - above, beside, above), (beside + GAP, 0, WIDE, high)]
+    for (word, image), box in zip(words.items(), boxes):
+        paste(drawn, image, box, word)
+    if depth is not None:
+        wide, margin = WIDE // 4, 12
+        inset = round(wide * fused.shape[-2] / fused.shape[-1])
+        at = (drawn.width - wide - margin, high - inset - margin)
+        drawn.paste("white", (at[0] - 2, at[1] - 2, at[0] + wide + 2, at[1] + inset + 2))
+        paste(drawn, depth, (*at, wide, inset), "out: depth, red is near")
+    return drawn
+
+
+def paste(drawn: Image.Image, image: Tensor, box: tuple[int, int, int, int], word: str) -> None:
+    """Put an image into a box (left, top, width, height), cut to its shape, with a word in its corner."""
+    left, top, width, height = box
+    pixels = to_bytes(image.clamp(0, 1).expand(3, -1, -1)).transpose(1, 2, 0)
+    picture = Image.fromarray(pixels)
+    factor = max(width / picture.width, height / picture.height)
+    size = round(factor * picture.width), round(factor * picture.height)
+    picture = picture.resize(size, Image.Resampling.LANCZOS)
+    x, y = (size[0] - width) // 2, (size[1] - height) // 2
+    drawn.paste(picture.crop((x, y, x + width, y + height)), (left, top))
+    font = ImageFont.load_default(20 if width > WIDE / 2 else 16)
+    text = ImageDraw.Draw(drawn, "RGBA")
+    end = left + 16 + text.textlength(word, font)
+    text.rectangle((left, top, end, top + font.size + 12), (0, 0, 0, 150))
+    text.text((left + 8, top + 5), word, "white", font)
+
+
+def save(image: Image.Image, name: str) -> None:
+    """Write an image as JPEG, atomically."""
+    with write_atomically(OUT / name) as temporary:
+        image.save(temporary, "JPEG", quality=92, subsampling=0)
 
 
 def families(array: SampleArray, x: torch.Tensor) -> Figure:
@@ -40,14 +154,32 @@ def families(array: SampleArray, x: torch.Tensor) -> Figure:
     return figure
 
 
-def main() -> None:
-    """Write them all."""
-    array = load_sample()
-    x = torch.tensor([[60.0, 60], [150, 90], [330, 210], [420, 60], [520, 320], [600, 200]])
-    save_figure(draw_rig(array.rig, alpha=ALPHA), OUT / "rig.png", dpi=80)
-    save_figure(draw_fields(array.rig, ALPHA, x, images=array.images), OUT / "segments.jpg", dpi=80)
-    save_figure(families(array, x[1::2]), OUT / "families.jpg", dpi=80)
+@dataclass
+class Drawings:
+    """Draw the documentation's pictures into docs/drawings."""
+
+    only: str | None = None
+    """One of cat, table, rig, segments, families."""
+
+    def run(self) -> None:
+        """Write them. Raises ValueError for a name that is none."""
+        array = load_sample()
+        x = torch.tensor([[60.0, 60], [150, 90], [330, 210], [420, 60], [520, 320], [600, 200]])
+        drawings = {
+            "cat": lambda: save(cat(), "cat.jpg"),
+            "table": lambda: save(table(), "table.jpg"),
+            "rig": lambda: save_figure(draw_rig(array.rig, alpha=ALPHA), OUT / "rig.png", dpi=80),
+            "segments": lambda: save_figure(
+                draw_fields(array.rig, ALPHA, x, images=array.images), OUT / "segments.jpg", dpi=80
+            ),
+            "families": lambda: save_figure(families(array, x[1::2]), OUT / "families.jpg", dpi=80),
+        }
+        if self.only not in {None, *drawings}:
+            raise ValueError(f"--only: expected one of {', '.join(drawings)}, got {self.only}")
+        for name, draw in drawings.items():
+            if self.only in (None, name):
+                draw()
 
 
 if __name__ == "__main__":
-    main()
+    script(Drawings).run()

@@ -122,7 +122,7 @@ class Record:
     sensors: Path | None = None
     """File (YAML) with a list of steps for each camera, instead of those that follow from their responses."""
     seed: int = 0
-    """Of the noise."""
+    """Seed of the noise."""
 
     def run(self) -> None:
         """Write images and rigs. Raises ValueError for a folder without scenes, and for unknown steps."""

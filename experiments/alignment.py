@@ -1,4 +1,4 @@
-"""How well bands are aligned: beside a homography, on stereo pairs as bands and multispectral cameras.
+"""Alignment of bands, measured: beside a homography, on stereo pairs as bands and multispectral cameras.
 
 A patch counts around a corner of alpha's image that the alignment says the beta sees (with true disparity:
 and whose patch it does see), if it can be located: its best match within some pixels of where the alignment,
@@ -64,8 +64,8 @@ SCALE = np.diag([2.0, 2.0, 1.0])
 BOARD = "chessboard:11x8:30mm"
 CAMERAS = 9
 ONE_BOARD = 0.1
-"""How uncertain a lens is that was calibrated by one board in a quarter of the picture, in units of
-`--sigma`; a round number: .5 gives the same patches to a percent, a drift's .02 too few."""
+"""Uncertainty of a lens calibrated by one board in a quarter of the picture, in units of `--sigma`; a round
+number: .5 gives the same patches to a percent, a drift's .02 too few."""
 WIDEST = 0.15
 """Largest disparity in the scene of nine bands that is searched, as a share of the width."""
 
@@ -101,7 +101,8 @@ MEDIANS = "median", "median_homography"
 
 
 class AlignmentScene(NamedTuple):
-    """What is aligned: rig, developed images, recorded values, alpha, its true disparity if it is known."""
+    """A scene to align: rig, developed images, recorded values, alpha, and its true disparity if
+    it is known."""
 
     name: str
     rig: Rig
@@ -226,9 +227,15 @@ def composites(scene: AlignmentScene, aligned: Aligned) -> dict[str, Float[Tenso
 def local_offsets(
     alpha: NDArray[np.uint8], beta: NDArray[np.uint8], x: NDArray[Any]
 ) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """How far the patch of `beta` that is most like that of `alpha` at pixels x (n, 2) lies from there, and
-    whether it can be located: it is like it, and its halves agree. Alike is by correlation squared, which
-    does not depend on the sign of a band's contrast. The peak is found by a parabola.
+    """Compute the distance from each pixel x (n, 2) to the patch of `beta` that is most similar to alpha's
+    there.
+
+    Similarity is correlation squared, which does not depend on the sign of a band's contrast. The peak is
+    found by a parabola.
+
+    Returns:
+        Distances in pixels, and a mask of the patches that can be located: similar, and with halves that
+        agree.
     """
     offsets, like = zip(*(_best_match(alpha, beta, pixel) for pixel in x)) if len(x) else ([], [])
     best = np.reshape(offsets, (len(x), len(PARTS), 2))
@@ -239,7 +246,8 @@ def local_offsets(
 def _best_match(
     alpha: NDArray[np.uint8], beta: NDArray[np.uint8], pixel: NDArray[Any]
 ) -> tuple[list[tuple[float, float]], float]:
-    """Of the patch and its halves: the offset (y, x) of what is most like them; how like the patch is."""
+    """Return the offsets (y, x) of the best matches of the patch and its halves, and the patch's
+    similarity."""
     offsets, like = [], []
     for section in PARTS:
         rows, columns = (slice(centre + s.start, centre + s.stop) for centre, s in zip(pixel[::-1], section))
@@ -298,7 +306,7 @@ def ecc_homography(alpha: NDArray[np.uint8], beta: NDArray[np.uint8]) -> Float[n
 
 
 def _correlation(a: NDArray[Any], b: NDArray[Any], H: NDArray[Any]) -> float:
-    """Of gradients and those of the other image, brought to them by a homography."""
+    """Return the correlation of gradients with those of the other image, warped by a homography."""
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     return float(cv2.computeECC(a, cv2.warpPerspective(b, H.astype(np.float64), a.shape[::-1], flags=flags)))
 

@@ -38,7 +38,7 @@ from pat.support.tensor_files import write_tensors
 NEAR = 0.8
 """A candidate so many pixels from the true disparity scores half."""
 FAR = 0.05
-"""Of the score, for which all candidates compete, however far off."""
+"""Weight in the score for which all candidates compete, however far off."""
 OTHER = 0.35
 """Share of windows whose alpha is of another response than beta, so that brightness tells less."""
 
@@ -57,8 +57,17 @@ class ChoiceTraining(PairTraining):
 
 
 class Kept(NamedTuple):
-    """Of a pair: alpha and beta as they were compared (1, h, w), what matching found and its facts, the true
-    disparity, 0 where it is not known, and whether beta sees the point (1, h, w); and blurs (2,)."""
+    """Samples of a pair for training.
+
+    Attributes:
+        alpha: alpha as it was compared, (1, h, w).
+        beta: beta as it was compared, (1, h, w).
+        disparity: disparity by matching.
+        facts: facts of the matches.
+        truth: true disparity, 0 where it is not known.
+        seen: mask of the pixels whose point beta sees, (1, h, w).
+        blurs: blurs of both views, (2,).
+    """
 
     alpha: Tensor
     beta: Tensor
@@ -101,8 +110,14 @@ def train_choice(config: ChoiceTraining) -> Path:
 def matched(
     network: GuidedPAT, pair: StereoPair, seed: int, *, without: Sequence[str]
 ) -> dict[str, Tensor] | None:
-    """What matching finds in a pair recorded at random, left as alpha, before anything is chosen: a `Kept`.
-    None without true disparity, and for pairs with one of these parts in their name."""
+    """Match a pair recorded at random, with left as alpha, before anything is chosen.
+
+    Args:
+        without: parts of names of pairs to leave out.
+
+    Returns:
+        The fields of a `Kept`; None without true disparity, and for pairs that are left out.
+    """
     if pair.disparity is None or any(fragment in pair.name for fragment in without):
         return None
     given: list[tuple[ComparedViews, BetaMatches]] = []
@@ -129,8 +144,11 @@ def matched(
 def losses(
     config: ChoiceTraining, samples: Sequence[Sequence[Kept]], network: Choice, start: int
 ) -> Iterator[Tensor]:
-    """Of each step from one on: the cross-entropy of how near candidates are to the true disparity, of the
-    statement that the best one is right, and how far it is off beyond or within what is stated."""
+    """Yield the loss of each step from one on.
+
+    It has the cross-entropy of the candidates' nearness to the true disparity, that of the statement that the
+    best one is right, and the excess or lack of the stated error.
+    """
     for _, windows in config.windows(samples, "choice", start, window):
         inputs, options, truth, visible = (torch.cat(parts).to(config.device) for parts in zip(*windows))
         with config.autocast():

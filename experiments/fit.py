@@ -32,7 +32,7 @@ AVERAGE = 300
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
-    """What training runs of windows have in common. The same command continues a run that stopped."""
+    """Options that training runs of windows have in common. The same command continues a run that stopped."""
 
     out: Path
     """Folder for weights, checkpoints, and what else a run keeps."""

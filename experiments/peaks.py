@@ -12,8 +12,11 @@ Result = TypeVar("Result")
 
 
 def with_peak(work: Callable[[], Result]) -> tuple[Result, float | None]:
-    """What `work` returns, and the bytes by which this process grew at most meanwhile; None where the system
-    cannot say (Linux can)."""
+    """Call `work`, and measure the memory by which this process grows.
+
+    Returns:
+        The result, and bytes at the peak; None where the system cannot report them (Linux can).
+    """
     give_back()
     before = resident()
     try:

@@ -1,4 +1,4 @@
-"""What cameras record of ideal images: responses, filters, motion; chains of steps, from files too.
+"""Recording of ideal images by cameras: responses, filters, motion; chains of steps, from files too.
 
 A chain is a list of steps, applied in order to images (B, C, H, W) with values 0..1. Light adds up in linear
 values only, so a chain for ordinary images begins with `DecodeSRGB()` and ends with `EncodeSRGB()`:
@@ -249,7 +249,8 @@ def record_rendered(
 
 
 def _ideal(folder: Path, name: str) -> Float[Tensor, "c h w"]:
-    """What a camera of a scene sees: red, green, blue, and near infrared if that was rendered."""
+    """Read the ideal image of a camera of a scene: red, green, blue, and near infrared if that
+    was rendered."""
     rgb, nir = read_view(folder, name).rgb, Rendered(folder).frame(name).nir
     return rgb if nir is None else torch.cat([rgb, nir])
 

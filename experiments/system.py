@@ -131,7 +131,7 @@ def run_system(
 
 
 def files_of(folder: Path) -> list[Path]:
-    """Those in a folder itself, in order."""
+    """List the files in a folder itself, in order."""
     return sorted(path for path in folder.iterdir() if path.is_file())
 
 
@@ -336,7 +336,8 @@ def _ranges(
 def _permuted(
     network: FusionNetwork, rig: Rig, images: Mapping[str, Tensor], alpha: str, frame: Frame
 ) -> list[str]:
-    """How a fusion with betas in another order differs from the same fusion with bands reordered."""
+    """Return lines of text on a fusion with betas in another order against the same fusion with bands
+    reordered."""
     betas = rig.betas(alpha)
     order = [2, 0, 1]
     permuted = rig.replace(cameras={n: rig[n] for n in (alpha, *(betas[i] for i in order))})

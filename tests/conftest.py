@@ -38,7 +38,7 @@ def pytest_runtest_setup() -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call() -> Generator:
-    """A test leaves torch no more threads than it had: they would spin, and slow all that runs after it."""
+    """Restore torch's number of threads after a test: more would spin, and slow all later tests."""
     import torch
 
     threads = torch.get_num_threads()
@@ -57,7 +57,7 @@ def shared_data() -> Path:
 
 @pytest.fixture
 def refusal(capsys):
-    """What `pat`, or another group of commands, says as it refuses its arguments: the last line, and one."""
+    """Return the one line with which `pat`, or another group of commands, refuses its arguments."""
 
     def said(*arguments: object, **group: object) -> str:
         from pat.app.cli.main import main

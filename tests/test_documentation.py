@@ -13,13 +13,16 @@ import torch
 
 from arraygeom import Camera, Pose, Rig, intrinsics
 from arraygeom.io import opencv, write_rig
-from docs.hooks import on_page_markdown
+from docs.hooks import help_of, on_page_markdown
+from docs.update_readme import QUOTE, quoting
 from experiments.__main__ import Experiments
 from pat.app.cli.main import command_paths
 from pat.media.images import write_image
 
 ROOT = Path(__file__).parents[1]
-PAGES = sorted((ROOT / "docs").glob("*.md"))
+GUIDES = sorted((ROOT / "docs").glob("*.md"))
+PAGES = sorted((ROOT / "docs").rglob("*.md"))
+REPORTS = sorted((ROOT / "docs" / "reports").glob("*.md"))
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 
 
@@ -64,12 +67,12 @@ def write_an_array(folder: Path) -> None:
 
 @those_with("python")
 def test_samples_in_the_pages_run(page, tmp_path, monkeypatch):
-    if page.stem == "explorer":
+    if page.stem == "exploring":
         pytest.importorskip("anywidget")
     (tmp_path / "rig.yaml").write_text(blocks(ROOT / "docs" / "index.md", "yaml")[0])
     for name, channels in (("a", 1), ("b", 3)):
         write_image(tmp_path / f"{name}.png", torch.rand(channels, 400, 640))
-    if page.stem == "rig_files":
+    if page.stem == "rigs":
         write_an_array(tmp_path)
     monkeypatch.chdir(tmp_path)
     scope: dict = {}
@@ -78,7 +81,7 @@ def test_samples_in_the_pages_run(page, tmp_path, monkeypatch):
             exec(text, scope)
 
 
-@pytest.mark.parametrize("page", [*PAGES, ROOT / "README.md", ROOT / "CONTRIBUTING.md"], ids=lambda p: p.stem)
+@pytest.mark.parametrize("page", [*PAGES, *ROOT.glob("*.md")], ids=lambda p: p.stem)
 def test_links_lead_somewhere(page):
     links = re.findall(r"\]\(([^)]+)\)", page.read_text())
     local = [link.partition(" ")[0].partition("#")[0] for link in links if "://" not in link]
@@ -86,7 +89,7 @@ def test_links_lead_somewhere(page):
 
 
 def test_pages_are_filled_in_on_the_site_and_are_links_on_a_code_host():
-    page = (ROOT / "docs" / "rig_files.md").read_text() + (ROOT / "docs" / "conventions.md").read_text()
+    page = (ROOT / "docs" / "rigs.md").read_text() + (ROOT / "docs" / "api" / "conventions.md").read_text()
     assert "{{" not in page
     filled = on_page_markdown(page)
     assert "| `colmap` |" in filled
@@ -120,6 +123,21 @@ def test_commands_in_the_pages_exist():
     assert shown <= known
 
 
+def test_options_in_the_pages_exist():
+    """Every option that a page shows with a `pat` command is in its --help; not a recipe's parts."""
+    unknown = []
+    for page in [*PAGES, ROOT / "README.md"]:
+        shown = [*blocks(page, "text"), *blocks(page, ""), *re.findall(r"`(pat [^`]+)`", page.read_text())]
+        for line in re.split(r"\n(?! )", "\n".join(text.replace("\\\n", " ") for text in shown)):
+            words = line.split(" #")[0].split()
+            paths = [p for p in command_paths() if words[:1] == ["pat"] and tuple(words[1 : 1 + len(p)]) == p]
+            if paths:
+                known = set(re.findall(r"--[a-z][\w-]*|-\w\b", help_of(max(paths, key=len))))
+                options = {word.partition("=")[0] for word in words if re.match("--?[a-z][^.]*$", word)}
+                unknown += [(page.name, line, name) for name in options - known - {"--help", "--version"}]
+    assert unknown == []
+
+
 def test_commands_of_the_experiments_in_the_pages_exist():
     known = {path[0] for path in command_paths(Experiments)}
     texts = [page.read_text() for page in [*PAGES, ROOT / "README.md", ROOT / "Makefile"]]
@@ -141,7 +159,7 @@ def test_the_site_builds_without_a_warning(tmp_path):
     assert built.stderr.count("WARNING") == 0
     assert built.returncode == 0, built.stderr
     assert "Epipolar" in (tmp_path / "api" / "arraygeom.html").read_text()
-    assert "--alpha" in (tmp_path / "commands.html").read_text()
+    assert "--alpha" in (tmp_path / "api" / "commands.html").read_text()
     story = (tmp_path / "notebooks" / "1_ten_minutes.html").read_text()
     assert 'src="data:image/jpeg;base64,' in story
     assert 'href="2_receptive_fields.html"' in story
@@ -151,3 +169,46 @@ def test_the_site_builds_without_a_warning(tmp_path):
 def test_names_of_the_packages_in_the_pages_are_there(page):
     for name in re.findall(r"`((?:arraygeom|calib|pat)(?:\.\w+)+)", page.read_text()):
         assert resolve_name(name) is not None
+
+
+FIGURE = re.compile(
+    r"(?<![\w./-])[.\d][\d.,]*\s*(%|dB|ms|s|seconds?|minutes?|hours?|[kMG]i?B|GiB|px|fps|points?|pixels?)(?![\w-])"
+)
+"""A number with a unit of what is measured. Metres, degrees and millimetres are of cameras and scenes."""
+BLOCK = re.compile(r"<!-- ([\w-]+):begin -->.*?<!-- \1:end -->", re.S)
+
+
+def prose(text: str) -> str:
+    """A page without blocks that commands fill, code, links' targets and comments."""
+    for kind in (BLOCK, QUOTE, re.compile(r"^( *)```.*?^\1```", re.M | re.S)):
+        text = kind.sub("", text)
+    return re.sub(r"`[^`]*`|\]\([^)]*\)|<!--.*?-->", "", text, flags=re.S)
+
+
+@pytest.mark.parametrize("page", [*PAGES, ROOT / "README.md"], ids=lambda p: p.stem)
+def test_figures_with_units_stand_in_blocks_that_commands_fill(page):
+    assert [found[0] for found in FIGURE.finditer(prose(page.read_text()))] == []
+
+
+@pytest.mark.parametrize("page", GUIDES, ids=lambda p: p.stem)
+def test_rows_that_a_page_quotes_are_the_report_s(page):
+    assert quoting(page) == page.read_text()
+
+
+def test_pages_for_users_are_at_most_twelve_and_reports_stay_out_of_the_navigation():
+    assert len(GUIDES) <= 12
+    assert (
+        "reports/" not in (ROOT / "mkdocs.yml").read_text().partition("nav:")[2].partition("not_in_nav:")[0]
+    )
+
+
+@pytest.mark.parametrize("report", REPORTS, ids=lambda p: p.stem)
+def test_a_report_names_its_commands_and_dates_its_blocks(report):
+    text = report.read_text()
+    assert re.search(r"`(make|python -m) ", text)
+    assert all(
+        re.match(r"\s*\*Printed on \d{4}-\d\d-\d\d", found[0].split("-->", 1)[1])
+        for found in BLOCK.finditer(text)
+    )
+    if report.stem != "index":
+        assert f"]({report.name})" in (report.parent / "index.md").read_text()

@@ -86,7 +86,7 @@ def test_the_explorer_is_shown_by_a_cell(tmp_path):
 
 
 def test_the_field_of_notebook_4_has_gradients_all_over():
-    """Beyond alpha's image, where fusion pads, its depth was 0: a differentiable fusion had NaN gradients."""
+    """Also beyond alpha's image, where fusion pads: no depth is 0 there."""
     cells = [c.source for c in read(ROOT / "notebooks" / "4_your_own_field.ipynb").cells]
     scope = {}
     source = next(c for c in cells if "class AroundDepth" in c).replace("field = AroundDepth(depth)", "")

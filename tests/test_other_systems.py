@@ -1,4 +1,5 @@
-"""What Windows lacks (fcntl, resource, a process's pwd) is not needed to import the packages or to fuse."""
+"""Modules that Windows lacks (fcntl, resource, a process's pwd) are not needed to import the packages or to
+fuse."""
 
 import os
 import subprocess
@@ -41,7 +42,7 @@ def test_every_module_is_imported_without_what_only_posix_has():
 
 
 def test_what_a_lock_of_the_system_left_is_not_waited_for(tmp_path):
-    """Of each compiled kernel, where another system's or Python's processes use the same folder."""
+    """Locks of each compiled kernel, in a folder that another system's or Python's processes use."""
     with alone(tmp_path / "kernel.lock", 1):
         pass
     (tmp_path / "kernel.lock").touch()

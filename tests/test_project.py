@@ -165,7 +165,7 @@ def test_importing_arraygeom_and_fusion_is_light():
 
 def test_an_optional_package_that_is_missing_is_named_with_its_extra():
     with (
-        pytest.raises(ImportError, match=r"writing video needs av_: pip install 'arraygeom-pat\[video\]'"),
+        pytest.raises(ImportError, match=r"writing video needs av_: .*'\.\[video\]'"),
         needs("video", "writing video"),
     ):
         importlib.import_module("av_.video")
@@ -271,3 +271,11 @@ def test_licence_is_the_one_stated():
     text = (ROOT / "LICENSE").read_text()
     assert PROJECT["license"] == "Apache-2.0"
     assert "Apache License\n                           Version 2.0, January 2004" in text
+
+
+def test_no_message_or_page_installs_this_distribution_from_an_index():
+    """Nobody owns its name there: an installation by that name would run a stranger's code."""
+    named = re.compile(r"install[^\n]*['\" ]arraygeom-pat")
+    texts = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "notebooks").glob("*.ipynb")]
+    texts += [path for room in ("arraygeom", "calib", "pat") for path in (ROOT / room).rglob("*.py")]
+    assert [str(path) for path in texts if named.search(path.read_text())] == []

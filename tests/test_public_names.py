@@ -8,7 +8,8 @@ LISTED = Path(__file__).with_name("public_names.txt")
 
 
 def public(path: Path) -> list[str]:
-    """What a module offers: `__all__`, or what it defines without an underscore; not what it imports."""
+    """Return the names that a module offers: `__all__`, or its definitions without an underscore, without
+    imports."""
     tree = ast.parse(path.read_text())
     names: list[str] = []
     for node in tree.body:

@@ -95,7 +95,8 @@ def checked(fn: Callable) -> Callable:
 
 @functools.cache
 def named(module: str) -> dict[str, Any]:
-    """What checks need, by the name of a module they are in: `warn` takes their lines for that module's."""
+    """Types that checks need, by the name of a module they are in: `warn` takes their lines for that
+    module's."""
     return globals() | {"__name__": module}
 
 
@@ -145,7 +146,7 @@ def axes_of(array: Any) -> tuple[list[str | int | None], int, Any] | None:
 
 
 def is_of(array: Any, value: Any) -> bool:
-    """Whether a value is of a type of arrays: `problem`, quicker for one like one seen before."""
+    """Return True if a value is of a type of arrays: `problem`, quicker for values like one seen before."""
     calls = CALLS.sizes
     if not calls or (sizes := calls[-1]) is None:
         return not problem(array, value)
@@ -163,7 +164,7 @@ def is_of(array: Any, value: Any) -> bool:
 
 
 def problem(array: Any, value: Any) -> str:
-    """What is wrong with a value for a type of arrays; empty if nothing is. As jaxtyping, but quickly."""
+    """Return the fault of a value for a type of arrays; empty if there is none. As jaxtyping, but quickly."""
     calls = CALLS.sizes
     sizes = calls[-1] if calls else None
     if sizes is None or axes_of(array) is None:

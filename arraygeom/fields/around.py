@@ -1,4 +1,4 @@
-"""Fields around what is known from elsewhere: a depth map of alpha, or matches of its pixels in beta."""
+"""Fields around knowledge from another source: a depth map of alpha, or matches of its pixels in beta."""
 
 from __future__ import annotations
 
@@ -24,11 +24,15 @@ from .straight import pinhole_track, require_pinholes
 
 @dataclass(frozen=True, eq=False)
 class AroundDepth:
-    """The segment from depth / (1 + tolerance) to depth * (1 + tolerance) of a known map; needs calibration.
+    """Segments from depth / (1 + tolerance) to depth * (1 + tolerance) of a known depth map.
 
-    `depth` (H, W) is z in metres at the pixels of `view`, alpha as it was recorded (None: the pair's alpha,
-    without a lens). Where it is not positive and finite, the segment is that between the pair's depth bounds,
-    which it needs to have only if there is such a pixel.
+    Needs a calibrated pair without lenses. Where the depth is not positive and finite, the segment is that
+    between the pair's depth bounds, which are needed only if there is such a pixel.
+
+    Attributes:
+        depth: map (H, W) of depth z in the rig's unit (metres), at the pixels of `view`.
+        tolerance: relative tolerance of the depth, at least 0.
+        view: alpha as it was recorded; None for the pair's alpha.
     """
 
     depth: Float[Tensor, "h w"]
@@ -40,7 +44,15 @@ class AroundDepth:
         _check_size(self.depth, self.view)
 
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Segments:
-        """Segments from near to far, inside beta's image and in front of it. Raises ValueError for lenses."""
+        """Compute the segments of alpha's pixels from near to far, inside beta's image and in front of it.
+
+        Returns:
+            Segments in beta's pixels; no gradients reach the depth map.
+
+        Raises:
+            ValueError: for a pair that is not calibrated or has lenses, a depth map of another size, or a
+                pixel without depth in a pair without a depth range.
+        """
         require_pinholes(pair)
         _check_size(self.depth, self.view or pair.alpha)
 
@@ -58,17 +70,23 @@ class AroundDepth:
 
 
 BESIDE = 1.0
-"""Pixels by which a match may be off its segment beyond the tolerance: rigs and matches are seldom better."""
+"""Pixels, beyond the tolerance, by which a match may be off its segment: rigs and matches are
+seldom better."""
 
 
 @dataclass(frozen=True, eq=False)
 class AroundMatches:
-    """The parts of another field's segments within `tolerance` pixels of known matches.
+    """Parts of another field's segments within `tolerance` pixels of known matches.
 
-    `positions` (H, W, 2) are where the pixels of alpha are in beta (x, y), NaN where it is not known; both as
-    recorded, by `views` (None: as the pair has them, without lenses). Where no match is known, or it is off
-    its segment by more than `tolerance` and a pixel, the segment is the whole one of `field` (default: the
-    pair's default field).
+    Where no match is known, or it is off its segment by more than `tolerance` and a pixel, the segment is the
+    whole one of `field`.
+
+    Attributes:
+        positions: (H, W, 2), positions (x, y) in beta of alpha's pixels; NaN where unknown.
+        tolerance: pixels of beta, at least 0.
+        views: alpha and beta as they were recorded, to whose pixels `positions` refers; None for the pair's
+            views.
+        field: field of straight segments; None for the pair's default field without lenses.
     """
 
     positions: Float[Tensor, "h w 2"]
@@ -92,8 +110,15 @@ class AroundMatches:
         views: tuple[LensView, LensView] | None = None,
         field: ReceptiveField | None = None,
     ) -> AroundMatches:
-        """Of points (x, y) of an alpha of size `hw` and the same in beta; each is known in 3 x 3 pixels, as
-        far as no other is nearer."""
+        """Build the field from matched points (x, y) of an alpha of size `hw` and of beta.
+
+        Each match is taken for 3 x 3 pixels of alpha, as far as no other is nearer.
+
+        Args:
+            tolerance: pixels of beta.
+            views: alpha and beta as recorded; None for the pair's.
+            field: as of the class.
+        """
         positions = torch.full((*hw, 2), torch.nan, dtype=torch.float32, device=alpha.device)
         column, row = alpha.round().long().unbind(-1)
         displacement = (beta - alpha).float()
@@ -106,7 +131,14 @@ class AroundMatches:
         return cls(positions, tolerance, views, field)
 
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Segments:
-        """Parts of the segments of `field`. Raises ValueError unless it is of straight segments."""
+        """Compute the parts of the segments of `field` near the matches.
+
+        Returns:
+            Segments in beta's pixels; no gradients reach `positions`.
+
+        Raises:
+            ValueError: for positions of another size than alpha, or a field that gives no straight segments.
+        """
         x = floating(x)
         _check_size(self.positions, pair.alpha if self.views is None else self.views[0])
         whole = (self.field or straight_field(pair))(pair, x)
@@ -143,9 +175,10 @@ def _check_size(plane: Tensor, view: View | None) -> None:
 
 
 def _at_nearest(plane: Tensor, x: Float[Tensor, "*n 2"], now: View, recorded: LensView | None) -> Tensor:
-    """Values (H, W, ...) of the recorded pixels nearest to pixels `x` of alpha as it is now; no gradients.
+    """Look up values (H, W, ...) of the recorded pixels nearest to pixels `x` of alpha as it is now; no
+    gradients.
 
-    Between two pixels of different depth there is no depth: values are not interpolated.
+    Values are not interpolated: between two pixels of different depth there is no depth.
     """
     with torch.no_grad():
         if recorded is not None:

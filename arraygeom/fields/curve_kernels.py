@@ -1,6 +1,6 @@
-"""Compiled loops of `Curved`: what its readable form in `curved.py` computes, in float64, pixel by pixel.
+"""Compiled loops of `Curved`, equal to its readable form in `curved.py`, in float64, pixel by pixel.
 
-Each in one thread and without Python's lock. Imported when first needed.
+Each runs in one thread and without Python's lock. Imported when first needed.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ SERIES = 1e-3
 
 @compiled(nogil=True, cache=True, error_model="numpy")
 def curved_positions(begin, end, first, last, valid, lens, even, fractions, hw, xy, mask):
-    """Positions xy (n, samples, 2) and mask (n, samples) of alpha's pixels `begin` to `end`.
+    """Write the positions xy (n, samples, 2) and mask (n, samples) of alpha's pixels `begin` to `end`.
 
-    `first`, `last` (n, 3) and `valid` (n) are of the curve; `lens` is what `lens_of` makes; `even` are the
+    `first`, `last` (n, 3) and `valid` (n) are of the curve; `lens` is a `LensNumbers`; `even` are the
     fractions of the nodes and `fractions` those of the samples.
     """
     nodes, samples = len(even), len(fractions)
@@ -53,7 +53,8 @@ def curved_positions(begin, end, first, last, valid, lens, even, fractions, hw, 
 
 @compiled(inline="always")
 def _shares(first, last, wide, u, s):
-    """The share of `last` in the points at fractions u: evenly in undistorted pixels, or in angle."""
+    """Write to s the share of `last` in the points at fractions u: evenly in undistorted pixels,
+    or in angle."""
     if not wide:
         z0, z1 = first[2], last[2]
         for i in range(len(u)):
@@ -79,7 +80,7 @@ def _sinc(angle):
 
 @compiled(inline="always")
 def _project(first, last, s, lens, x, y, visible):
-    """Beta's pixels of the points at shares s, and which it can see."""
+    """Write beta's pixels of the points at shares s, and which it can see."""
     a, b = (first[0], first[1], first[2]), (last[0] - first[0], last[1] - first[1], last[2] - first[2])
     # A loop for each model, without branches within the first two: they become vector instructions.
     if lens.model == PINHOLE:
@@ -106,7 +107,7 @@ def _project(first, last, s, lens, x, y, visible):
 
 @compiled(inline="always")
 def _brown(c, limit, x, y, visible):
-    """Distorted normalised points, invalid ones unseen; `distortion._brown_distort` without a tilt."""
+    """Distort normalised points in place, invalid ones unseen; `distortion._brown_distort` without a tilt."""
     farthest = 0.0
     for i in range(len(x)):
         farthest = max(farthest, x[i] * x[i] + y[i] * y[i])
@@ -135,7 +136,8 @@ def _brown(c, limit, x, y, visible):
 
 @compiled(inline="always")
 def _fisheye(c, limit, x, y, z):
-    """The same of a point in the camera's frame; `distortion._fisheye_project`."""
+    """Return the normalised distorted point of a point in the camera's frame;
+    `distortion._fisheye_project`."""
     u = x * x + y * y
     if z > 0 and u < SERIES * z * z:
         t = u / (z * z)
@@ -155,8 +157,12 @@ def _fisheye(c, limit, x, y, z):
 
 @compiled(inline="always")
 def _pieces(x, y, visible, hw, out):
-    """Of each piece between nodes from and to which fraction it is visible, its visible length, and the sum
-    of the lengths up to its end; gives the whole length. `curved.visible_pieces`."""
+    """Write each piece's visible fractions (from, to), its visible length, and the sum of lengths up to its
+    end.
+
+    Returns:
+        The whole visible length; `curved.visible_pieces` in its readable form.
+    """
     total = 0.0
     for i in range(out.shape[1]):
         low, high = 0.0, 1.0
@@ -179,7 +185,7 @@ def _pieces(x, y, visible, hw, out):
 
 @compiled(inline="always")
 def _along(pieces, total, fractions, out):
-    """Where on the whole polyline fractions of the visible length are; `curved.along_pieces`."""
+    """Write the fractions of the whole polyline at fractions of its visible length; `curved.along_pieces`."""
     count = pieces.shape[1]
     final = 0
     while final < count - 1 and pieces[3, final] < total:

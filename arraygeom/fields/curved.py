@@ -31,16 +31,22 @@ from .straight import Epipolar
 
 @dataclass(frozen=True)
 class Curved:
-    """Depth samples through lens models: `samples` positions, near to far, evenly spaced in beta's pixels.
+    """Depth samples through lens models: positions near to far, evenly spaced in beta's pixels.
 
     Needs a calibrated pair; without lenses it is `Epipolar` sampled. The part of each ray that can be on
-    beta's image is clipped in closed form, followed at `nodes` points (even in undistorted pixels, or in
-    angle where beta sees more than 75 degrees off axis), and what is on the image is divided evenly. In a
-    beta that is not central the nodes are first moved to where its image is (`RayCurve.nodes`). `near` and
-    `far` (metres) override the pair's own. Positions are exact for their depths; with a lens the spacing,
-    and where an edge of the image cuts the curve, are to the accuracy of straight pieces between nodes. What
-    alpha sees at 90 degrees or more off axis has no depth along the axis and no samples, unless the bounds
-    are of the `distance` along the ray.
+    beta's image is clipped in closed form, followed at nodes (even in undistorted pixels, or in angle where
+    beta sees more than 75 degrees off axis), and its part on the image is divided evenly. In a beta that is
+    not central the nodes are first moved to where its image is. Positions are exact for their depths; with a
+    lens the spacing, and where an edge of the image cuts the curve, are to the accuracy of straight pieces
+    between nodes. A point that alpha sees at 90 degrees or more off axis has no depth along the axis and no
+    samples, unless the bounds are of the `distance` along the ray.
+
+    Attributes:
+        samples: number of positions per pixel of alpha.
+        near: near bound in the rig's unit (metres); None for the pair's own.
+        far: far bound in the rig's unit, possibly infinite; None for the pair's own.
+        nodes: number of points at which a curve is followed, at least 2.
+        bounds: quantity that near and far bound: "depth" along alpha's axis or "distance" along the ray.
     """
 
     samples: int = 96
@@ -57,11 +63,19 @@ class Curved:
         check_bounds(self.near, self.far)
 
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Positions:
-        """Positions (*n, samples, 2), differentiable in all numbers of the rig, lenses included."""
+        """Compute the positions in beta of alpha's pixels.
+
+        Returns:
+            Positions (*n, samples, 2) in beta's pixels, near to far, differentiable in all numbers of the
+            rig, lenses included; masked ones are 0.
+
+        Raises:
+            ValueError: for an uncalibrated pair, or one without the bounds that the field leaves open.
+        """
         pair.cameras  # noqa: B018  (raises for an uncalibrated pair, before the depth range is asked for)
         near, far = Epipolar(self.near, self.far).bounds(pair)
         x = floating(x)
-        curve = RayCurve.of(pair, near, far, x, self.bounds)
+        curve = RayCurve.from_pixels(pair, near, far, x, self.bounds)
         if curve.compilable and curve.valid.numel() > FEW:
             return curve.positions(self.nodes, self.samples)
         fractions = curve.nodes(self.nodes)
@@ -74,7 +88,8 @@ class Curved:
 
 
 FEW = 16
-"""Pixels for which the formulas do: to compile the loop, once on a machine, takes half a minute."""
+"""Number of pixels up to which the formulas serve: compiling the loop, once on a machine, takes half a
+minute."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +97,11 @@ class ThroughLenses:
     """A straight field seen through lenses: for pairs known by F, or any field other than `Epipolar`.
 
     The field is evaluated for the pair without its lenses (`pinhole_view`) and the result is distorted by
-    beta's lens. Segments are sampled at `samples` positions, evenly spaced before distortion.
+    beta's lens.
+
+    Attributes:
+        field: field of the pair without lenses.
+        samples: number of positions per segment, evenly spaced before distortion.
     """
 
     field: ReceptiveField
@@ -93,8 +112,16 @@ class ThroughLenses:
         check_above(1, whole=True, samples=self.samples)
 
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Positions:
-        """Positions (*n, samples, 2), beta's pixels. Raises ValueError for a batch of rigs with lenses."""
-        alpha, beta = (_Straight.of(view) for view in (pair.alpha, pair.beta))
+        """Compute the positions in beta of alpha's pixels.
+
+        Returns:
+            Positions (*n, samples, 2) in beta's pixels; masked ones are 0.
+
+        Raises:
+            ValueError: for a batch of rigs with lenses, views without a pinhole equivalent, or an invalid
+                result of the field.
+        """
+        alpha, beta = (_Straight.from_view(view) for view in (pair.alpha, pair.beta))
         link = None if pair.link is None else pair.link.transformed(alpha.A, beta.A)
         straight = dataclasses.replace(pair, alpha=alpha.pinhole, beta=beta.pinhole, link=link)
         there, valid = alpha.undistort(floating(x))
@@ -114,44 +141,54 @@ class _Straight(NamedTuple):
     A: Tensor
 
     @classmethod
-    def of(cls, view: View) -> _Straight:
-        """Of a view; one without a lens is its own."""
+    def from_view(cls, view: View) -> _Straight:
+        """Build it from a view; a view without a lens is its own equivalent."""
         if not isinstance(view, LensView) or view.distortion is None:
             return cls(view, view, torch.eye(3, dtype=torch.float64))
         pinhole = pinhole_view(view)
         return cls(view, pinhole, product(pinhole.K, torch.linalg.inv(view.K)))
 
     def undistort(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixels (*n, 2) of the view in those of the pinhole, and which the lens model covers."""
+        """Return the pinhole's pixels of pixels (*n, 2) of the view, and a mask of those that the lens model
+        covers."""
         straight, valid = self.view.to(x.dtype).undistort(x)
         return map_homogeneous(self.A[:2].to(x.device), straight), valid
 
     def distort(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixels (*n, 2) of the pinhole in those of the view, and which the lens model covers."""
+        """Return the view's pixels of pixels (*n, 2) of the pinhole, and a mask of those that the lens model
+        covers."""
         return self.view.to(x.dtype).distort(map_homogeneous(torch.linalg.inv(self.A)[:2].to(x.device), x))
 
 
 EDGE, ROUNDED = 0.25, 1e-3
-"""How far outside the image a sample that should be on its edge may fall, pixels; it is moved onto the edge.
-By the spacing of nodes, and by rounding alone."""
+"""Pixels outside the image within which a sample is moved onto its edge: by the spacing of nodes, and by
+rounding alone."""
 
 
 def _onto_edge(xy: Tensor, hw: HW, margin: float) -> tuple[Tensor, Tensor]:
-    """Points moved onto the image, and which were less than `margin` pixels outside it."""
+    """Move points onto the image, and return which were less than `margin` pixels outside it."""
     limits = xy.new_tensor([hw[1] - 0.5, hw[0] - 0.5])
     inside = ((xy > -0.5 - margin) & (xy < limits + margin)).all(-1)
     return torch.minimum(xy.clamp(min=-0.5), limits), inside
 
 
 WIDE = math.tan(math.radians(75))
-"""A lens that sees further than this from the axis, in undistorted focal lengths, is followed by angle."""
+"""Tangent of the angle off axis beyond which a lens is followed by angle."""
 
 
 class RayCurve(NamedTuple):
     """The points from `first` (towards near) to `last` in beta's frame, in units of their depth in alpha.
 
-    Fractions go evenly in undistorted pixels, or in angle if `wide` (all that is not central is); in metres
-    where beta's rays are parallel. `inverse` are the inverse depths (or distances) of both ends.
+    Fractions of the way are even in undistorted pixels, in angle if `wide`, or in metres where beta's rays
+    are parallel.
+
+    Attributes:
+        first: end towards near.
+        last: end towards far.
+        valid: mask of the pixels whose ray beta may see.
+        beta: the camera whose image holds the curve.
+        wide: True if fractions are even in angle, as in all cameras that are not central.
+        inverse: inverse depths (or distances) of both ends.
     """
 
     first: Float[Tensor, "*n 3"]
@@ -162,8 +199,14 @@ class RayCurve(NamedTuple):
     inverse: tuple[Tensor, Tensor]
 
     @classmethod
-    def of(cls, pair: Pair, near: Tensor, far: Tensor, x: Tensor, bounds: str = "depth") -> RayCurve:
-        """Curves of alpha's pixels x (*n, 2), near to far (metres), as far as beta's image may show them."""
+    def from_pixels(cls, pair: Pair, near: Tensor, far: Tensor, x: Tensor, bounds: str = "depth") -> RayCurve:
+        """Build the curves of alpha's pixels x (*n, 2), near to far, as far as beta's image may show them.
+
+        Args:
+            near: near bound, metres.
+            far: far bound, metres, possibly infinite.
+            bounds: "depth" or "distance".
+        """
         pose = pair.beta_from_alpha.to(x.dtype)
         alpha, beta = (c.to(x.dtype) for c in pair.cameras)
         start, rays, ahead = _lines(alpha, x, bounds)
@@ -196,7 +239,7 @@ class RayCurve(NamedTuple):
     def between(
         cls, points: Track, near_end: Tensor, far_end: Tensor, valid: Tensor, beta: Camera, wide: bool
     ) -> RayCurve:
-        """The curve of a track of points in beta's frame between two inverse depths."""
+        """Make the curve of a track of points in beta's frame between two inverse depths."""
         first, last = (points.a + v[..., None] * points.b for v in (near_end, far_end))
         return cls(first, last, valid, beta, wide, (near_end, far_end))
 
@@ -210,7 +253,7 @@ class RayCurve(NamedTuple):
 
     @property
     def compilable(self) -> bool:
-        """Whether a compiled loop can follow the curve: on the CPU, of one pair, no gradient asked for."""
+        """True if a compiled loop can follow the curve: on the CPU, of one pair, without gradients."""
         lens = self.beta.distortion
         numbers = [self.first, self.last, self.beta.K, *([] if lens is None else [lens.coefficients])]
         free = torch.is_grad_enabled() and any(t.requires_grad for t in numbers)
@@ -222,7 +265,7 @@ class RayCurve(NamedTuple):
         return not free and lens_compiled and not self.beta.batch_shape and compilable(self.first)
 
     def positions(self, nodes: int, samples: int) -> Positions:
-        """What `Curved` gives, by a compiled loop in float64."""
+        """Compute the positions of `Curved` by a compiled loop in float64."""
         from .curve_kernels import curved_positions
 
         like, n = self.first, self.valid.numel()
@@ -231,7 +274,11 @@ class RayCurve(NamedTuple):
         ends = (t.detach().double().reshape(n, 3).contiguous().numpy() for t in (self.first, self.last))
         double = like.new_empty(0, dtype=torch.float64)
         fractions = (torch.linspace(0, 1, nodes, dtype=torch.float64), sample_fractions(samples, like=double))
-        given = (*ends, self.valid.reshape(n).contiguous().numpy(), LensNumbers.of(self.beta, wide=self.wide))
+        given = (
+            *ends,
+            self.valid.reshape(n).contiguous().numpy(),
+            LensNumbers.from_camera(self.beta, wide=self.wide),
+        )
         rest = (*(t.numpy() for t in fractions), self.beta.hw, xy, mask)
         in_parallel([partial(curved_positions, *span, *given, *rest) for span in spans(n, PIECE)])
         axes = self.valid.shape
@@ -241,7 +288,7 @@ class RayCurve(NamedTuple):
 
     @torch.no_grad()
     def nodes(self, count: int) -> Float[Tensor, "*n k"]:
-        """Fractions (*n, count) at which the curve is followed: even, or evenly in pixels if not central.
+        """Compute fractions (*n, count) at which to follow the curve: even, or even in pixels if not central.
 
         In pixels too where the image repeats itself: by a pole the columns run away.
         """
@@ -254,7 +301,7 @@ class RayCurve(NamedTuple):
         return fractions
 
     def _fractions(self, even: Tensor) -> Tensor:
-        """Even fractions for each pixel; if not central, with others closer and closer to both ends."""
+        """Return even fractions for each pixel; if not central, with others closer and closer to both ends."""
         if not self.beta.central:
             close = 10 ** (CLOSEST * (1 - self._even(len(even) // 2 + 1)[:-1]))
             even = torch.cat([even, close, 1 - close]).sort().values
@@ -264,7 +311,7 @@ class RayCurve(NamedTuple):
         return torch.linspace(0, 1, count, dtype=self.first.dtype, device=self.first.device)
 
     def _ends_on_image(self) -> tuple[Tensor, Tensor]:
-        """The inverse depths between which an image larger by `MARGIN` shows the curve: constants.
+        """Find the inverse depths between which an image larger by `MARGIN` shows the curve: constants.
 
         A camera whose rays do not meet bounds no directions by its image, and what it has of a curve may be
         a small part. An end that the image shows stays, with its gradient.
@@ -285,14 +332,14 @@ class RayCurve(NamedTuple):
         return torch.where(near_shown, first, near_end), torch.where(far_shown, last, far_end)
 
     def _pieces(self, fractions: Tensor, share: float) -> Pieces:
-        """The pieces on an image that is larger by a share of its height plus width on each side."""
+        """Find the pieces on an image that is larger by a share of its height plus width on each side."""
         xy, visible = self.at(fractions)
         margin = math.ceil(share * sum(self.beta.hw))
         h, w = self.beta.hw
         return visible_pieces(xy + margin, visible, (h + 2 * margin, w + 2 * margin), self.turn)
 
     def _covered(self, fractions: Tensor) -> Tensor:
-        """The first and last fractions (*n, 2) of the curve that the model covers, by bisection."""
+        """Find the first and last fractions (*n, 2) of the curve that the model covers, by bisection."""
         visible, last = self.at(fractions)[1], fractions.shape[-1] - 1
         ends = torch.stack([visible.int().argmax(-1), last - visible.int().flip(-1).argmax(-1)], -1)
         inner = fractions.gather(-1, ends)
@@ -304,7 +351,8 @@ class RayCurve(NamedTuple):
         return torch.where(visible.any(-1, keepdim=True), inner, fractions[..., [0, -1]])
 
     def at(self, fraction: Tensor) -> tuple[Tensor, Tensor]:
-        """Beta's pixels (*n, l, 2) at fractions (*n, l) of the way first to last, and which it can see."""
+        """Compute beta's pixels (*n, l, 2) at fractions (*n, l) of the way first to last, with a mask of the
+        visible ones."""
         weights = self._weights_in_angle(fraction) if self.wide else self._weights_in_pixels(fraction)
         s = (weights[1] / (weights[0] + weights[1]))[..., None]
         X = torch.lerp(self.first[..., None, :], self.last[..., None, :], s)
@@ -315,7 +363,7 @@ class RayCurve(NamedTuple):
         return projected.x, projected.valid & far_enough
 
     def inverse_depth(self, fraction: Tensor) -> Tensor:
-        """The inverse depth (or distance) in alpha of the points at fractions (*n, l)."""
+        """Compute the inverse depth (or distance) in alpha of the points at fractions (*n, l)."""
         weights = self._weights_in_angle(fraction) if self.wide else self._weights_in_pixels(fraction)
         return self._inverse_at(weights[1] / (weights[0] + weights[1]))
 
@@ -324,13 +372,15 @@ class RayCurve(NamedTuple):
         return torch.lerp(first, last, s)
 
     def _weights_in_pixels(self, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Shares of first and of last in the point whose pixel, without the lens, is a fraction u along."""
+        """Return shares of first and of last in the point whose pixel, without the lens, is a fraction u
+        along."""
         ends = self.inverse if self.beta.parallel else (self.first[..., 2], self.last[..., 2])
         z0, z1 = (torch.where(self.valid, z, 1.0)[..., None] for z in ends)
         return (1 - u) * z1, u * z0
 
     def _weights_in_angle(self, u: Tensor) -> tuple[Tensor, Tensor]:
-        """The same for the direction that has gone a fraction u of the angle between first and last."""
+        """Return the same for the direction that has gone a fraction u of the angle between first
+        and last."""
         squared = torch.linalg.cross(self.first, self.last).square().sum(-1)
         opens = squared > TINY
         sine = torch.where(opens, torch.where(opens, squared, 1.0).sqrt(), 0.0)
@@ -349,15 +399,16 @@ MARGIN, NARROW = 1 / 4, 1 / 32
 HALVINGS = 20
 """Steps of the bisection for where a model's range ends."""
 CLOSEST = -6.0
-"""Log10 of the share of a curve from its ends to which first nodes go: by the plane of beta, and far away where
-one direction of its rays is parallel, most of its image may be there."""
+"""Log10 of the share of a curve from its ends to which first nodes go: most of beta's image may be there,
+by the plane of beta, and far away where one direction of its rays is parallel."""
 REMOTE = 1e-5
-"""Inverse depth of infinity, in units of baseline plus near bound, to a beta whose rays do not meet: there a
-point is not only a direction."""
+"""Inverse depth taken for infinity, in units of baseline plus near bound, for a beta whose rays do not meet:
+there a point is not only a direction."""
 
 
 def _lines(alpha: Camera, x: Tensor, bounds: str) -> tuple[Tensor | None, Tensor, Tensor]:
-    """Where the rays of pixels start, their directions at a depth (or a distance) of 1 m, and which have one.
+    """Return starts and directions, at a depth (or a distance) of 1 m, of pixels' rays, and a mask of those
+    that exist.
 
     The start is in the plane of depth 0, and None if it is alpha's origin.
     """
@@ -371,11 +422,19 @@ def _lines(alpha: Camera, x: Tensor, bounds: str) -> tuple[Tensor | None, Tensor
 
 
 COMPILED_LENSES = {"brown-conrady": 1, "kannala-brandt": 2}
-"""Lens models that the compiled loop knows (those of a tilted sensor excepted), by its numbers."""
+"""Numbers of the lens models that the compiled loop supports (except with a tilted sensor)."""
 
 
 class LensNumbers(NamedTuple):
-    """A camera as the compiled loop knows it: 0 pinhole, else `COMPILED_LENSES`; float64."""
+    """A camera's numbers for the compiled loop, in float64.
+
+    Attributes:
+        model: 0 for a pinhole, else a number of `COMPILED_LENSES`.
+        c: 14 coefficients, padded with zeros.
+        limit: squared limit of the lens model's domain.
+        K: intrinsics.
+        wide: True if fractions are even in angle.
+    """
 
     model: int
     c: NDArray[np.float64]
@@ -384,8 +443,8 @@ class LensNumbers(NamedTuple):
     wide: bool
 
     @classmethod
-    def of(cls, camera: Camera, *, wide: bool) -> LensNumbers:
-        """Of one camera."""
+    def from_camera(cls, camera: Camera, *, wide: bool) -> LensNumbers:
+        """Read the numbers of one camera."""
         K, lens = camera.K.detach().double().numpy(), camera.distortion
         if lens is None:
             return cls(0, np.zeros(14), 0.0, np.ascontiguousarray(K), wide)
@@ -397,14 +456,15 @@ class LensNumbers(NamedTuple):
 
 
 TINY = 1e-24
-"""Two rays whose squared sine, times their squared lengths, is smaller than this have one direction."""
+"""Squared sine of two rays, times their squared lengths, below which they have one direction."""
 
 
 def undistorted_limits(camera: Camera) -> tuple[Tensor, Tensor, Tensor, Tensor] | None:
-    """(x low, y low, x high, y high) of a lens's image, normalised undistorted points, (*b) each, 2 % wider.
+    """Compute the bounds of a lens's image in normalised undistorted points, 2 % wider.
 
-    None if it reaches 75 degrees off axis, or over the range of its lens, and where numbers cannot decide
-    (`traced`).
+    Returns:
+        x low, y low, x high, y high, (*b) each; None if the image reaches 75 degrees off axis, or over the
+        domain of its lens model, and where numbers cannot decide (`traced`).
     """
     h, w = camera.hw
     along = torch.linspace(0, 1, 17).to(camera.K)
@@ -424,14 +484,20 @@ def undistorted_limits(camera: Camera) -> tuple[Tensor, Tensor, Tensor, Tensor] 
 
 
 def _each(M: Tensor, v: Tensor) -> Tensor:
-    """The product of matrices (*b, 3, 3) with vectors (*b, ..., 3)."""
+    """Multiply matrices (*b, 3, 3) with vectors (*b, ..., 3)."""
     axes = v.ndim - M.ndim + 1
     M = M.reshape(*M.shape[:-2], *[1] * axes, 3, 3)
     return (M * v[..., None, :]).sum(-1)
 
 
 class Pieces(NamedTuple):
-    """The visible part of each of a polyline's m pieces: from `first` to `last` (0..1), `length` pixels."""
+    """Visible part of each of a polyline's m pieces.
+
+    Attributes:
+        first: fraction of the piece at which the part begins.
+        last: fraction at which it ends.
+        length: visible length, pixels; 0 for invisible pieces.
+    """
 
     first: Float[Tensor, "*n m"]
     last: Float[Tensor, "*n m"]
@@ -441,11 +507,16 @@ class Pieces(NamedTuple):
 def visible_pieces(
     nodes: Float[Tensor, "*n k 2"], visible: Tensor, hw: HW, turn: Tensor | None = None
 ) -> Pieces:
-    """The parts of a polyline that lie on the image, of pieces with a node that is `visible` (*n, k).
+    """Compute the parts of a polyline that lie on the image, of pieces with a node that is `visible`.
 
-    Across the seam of an image that repeats itself after `turn` (2), pixels, a piece counts twice, as it
-    leaves and as it returns: then all pieces do. A visible piece of no length counts as 1e-3 pixels, so that
-    a curve that is a point is somewhere.
+    Across the seam of an image that repeats itself a piece counts twice, as it leaves and as it returns:
+    then all pieces do. A visible piece of no length counts as 1e-3 pixels, so that a curve that is a point
+    has a position.
+
+    Args:
+        nodes: pixels of the polyline.
+        visible: mask (*n, k) of the nodes.
+        turn: pixels (2) after which the image repeats itself; None if it does not.
     """
     start, end = nodes[..., :-1, :], nodes[..., 1:, :]
     visible = visible[..., :-1] | visible[..., 1:]
@@ -465,7 +536,7 @@ def visible_pieces(
 def along_pieces(
     pieces: Pieces, u: Float[Tensor, " l"], nodes: Float[Tensor, "*n k"]
 ) -> Float[Tensor, "*n l"]:
-    """Where fractions u of the visible length are, in the numbers of the polyline's `nodes`."""
+    """Compute the numbers, between those of the polyline's `nodes`, at fractions u of its visible length."""
     first, last, length = pieces
     ends = length.cumsum(-1)
     wanted = u * ends[..., -1:]

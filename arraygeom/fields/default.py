@@ -26,13 +26,17 @@ FIELDS: dict[str, type[Any]] = {
     "dense": Dense,
     "curved": Curved,
 }
-"""The families that can be chosen by name; each can be made without arguments."""
+"""Families of fields by name; each can be constructed without arguments."""
 
 
 def named_field(name: str) -> ReceptiveField:
-    """The field of a name in `FIELDS`, or one's own as "module:object", which is imported from here too.
+    """Return the field of a name in `FIELDS`, or another one named "module:object", which is imported.
 
-    A class is made without arguments. Raises ValueError for a name that is neither.
+    A class is instantiated without arguments. Importing runs the module's code; the current directory is
+    searched too.
+
+    Raises:
+        ValueError: for a name that is neither, or an object that is no field.
     """
     if ":" not in name:
         if name in FIELDS:
@@ -56,19 +60,20 @@ ROW_SHARE = 0.12
 
 
 def default_field(pair: Pair) -> ReceptiveField:
-    """The field for a pair, which is what fusion uses; through lenses where a view has one.
+    """Return the field that fusion uses for a pair; through lenses where a view has one.
 
     A pair with a link has `HomographyDisplacement`, also if it is calibrated: a link was measured between
-    these very images. A calibrated one has `Epipolar`, which raises ValueError if the pair has no depth
-    range: a search of the whole line is ambiguous and has to be asked for (`EpipolarLine`). A pair of which
-    only the sizes are known counts as rectified, with alpha on either side. With lenses these are `Curved`,
-    or `ThroughLenses` of the field without them. The bounds of `Curved` are those of `natural_bounds`.
+    these very images. A calibrated one has `Epipolar`, which raises ValueError when called if the pair has no
+    depth range: a search of the whole line is ambiguous and must be requested (`EpipolarLine`). A pair of
+    which only the sizes are known counts as rectified, with alpha on either side. With lenses these are
+    `Curved`, or `ThroughLenses` of the field without them. The bounds of `Curved` are those of
+    `natural_bounds`.
     """
     return _through_lenses(straight_field(pair), pair)
 
 
 def straight_field(pair: Pair) -> ReceptiveField:
-    """`default_field` of the pair once its images are undistorted."""
+    """Return the `default_field` of the pair after its images are undistorted."""
     if pair.link is not None:
         return HomographyDisplacement(LINE_SHARE * max(pair.beta.hw))
     if pair.calibrated:
@@ -85,7 +90,14 @@ def _through_lenses(field: ReceptiveField, pair: Pair, samples: int = 96, nodes:
 
 
 def natural_bounds(pair: Pair) -> Literal["depth", "distance"]:
-    """What a pair's depth range is of: the distance along the ray where alpha sees 90 degrees off axis."""
+    """Return the quantity that a pair's depth range bounds: "distance" where alpha sees 90 degrees off axis.
+
+    Returns:
+        "depth" along alpha's axis, or "distance" along the ray; "depth" too while the pair is traced.
+
+    Raises:
+        ValueError: for an uncalibrated pair.
+    """
     alpha = pair.cameras[0]
     if alpha.distortion is None or not alpha.distortion.sees_behind or traced():
         return "depth"
@@ -94,10 +106,13 @@ def natural_bounds(pair: Pair) -> Literal["depth", "distance"]:
 
 
 def recorded_field(pair: Pair, *, samples: int = 256, nodes: int = 64) -> ReceptiveField:
-    """`default_field`, and the whole line without a depth range.
+    """Return the `default_field`, or the whole line for a calibrated pair without a depth range.
 
-    Drawings use it, which need no depth range. `samples` and `nodes` are those of `Curved` and
-    `ThroughLenses`.
+    Used for drawings, which need no depth range.
+
+    Args:
+        samples: positions per pixel of `Curved` and `ThroughLenses`.
+        nodes: nodes of `Curved`.
     """
     field = straight_field(pair)
     if isinstance(field, Epipolar) and pair.depth is None:

@@ -25,11 +25,15 @@ from .straight import require_straight
 
 @dataclass(frozen=True)
 class NearestVoxels:
-    """The `count` integer pixels of beta nearest the epipolar line, within +-`window` of H x; from F.
+    """The integer pixels of beta nearest the epipolar line, in a window about H x; from F.
 
     The paper's own construction. Distances are perpendicular to the line; pixels equally far, to 1e-3 px, are
     taken by row, then column. Where fewer pixels of the image lie in the window the rest are masked, and
     where there is no line (the epipole, no baseline) all are.
+
+    Attributes:
+        count: number of pixels.
+        window: pixels from H x to the edge of the window, in x and y.
     """
 
     count: int = 96
@@ -40,7 +44,14 @@ class NearestVoxels:
         check_above(0, whole=True, window=self.window)
 
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Positions:
-        """Positions (*n, count, 2), beta's pixels. Not differentiable: pixels are whole. Not for lenses."""
+        """Compute the positions in beta of alpha's pixels. Not differentiable: pixels are whole.
+
+        Returns:
+            Positions (*n, count, 2) in beta's pixels, the nearest first; masked ones are 0.
+
+        Raises:
+            ValueError: for a pair with lenses, or with neither F nor calibration.
+        """
         require_straight(pair)
         x = floating(x)
         with torch.no_grad():
@@ -58,7 +69,7 @@ class NearestVoxels:
         return Positions(torch.where(mask[..., None], xy, 0.0), mask)
 
     def _nearest(self, line: Tensor, centre: Tensor, pair: Pair) -> tuple[Tensor, Tensor]:
-        """Beside the line first; the whole window where that may not hold the nearest `count`."""
+        """Search beside the line first, and the whole window where that may not hold the nearest `count`."""
         if traced():
             return self._choose(self._window(centre), line, centre, pair)[:2]
         beside = 2 + self.count // (2 * self.window + 1)
@@ -73,7 +84,7 @@ class NearestVoxels:
         return xy, mask
 
     def _compiled(self, line: Tensor, centre: Tensor, usable: Tensor, hw: HW) -> tuple[Tensor, Tensor]:
-        """The same by a compiled loop, which keeps no list of candidates of all pixels."""
+        """Search by a compiled loop, which keeps no list of candidates of all pixels."""
         from .kernels import nearest_pixels
 
         n, size = len(line), line.dtype.itemsize
@@ -85,7 +96,11 @@ class NearestVoxels:
         return xy, mask
 
     def _choose(self, xy: Tensor, line: Tensor, centre: Tensor, pair: Pair) -> tuple[Tensor, Tensor, Tensor]:
-        """(pixels, which count, distances) of the nearest `count` of some candidates."""
+        """Choose the nearest `count` of some candidates.
+
+        Returns:
+            Pixels, a mask of those that count, and distances.
+        """
         h, w = pair.beta.hw
         inside = pair.beta.contains(xy) & ((xy - centre[:, None]).abs() <= self.window).all(-1)
         at_centre = (centre * line[:, :2]).sum(-1, keepdim=True) + line[:, 2:]
@@ -101,7 +116,8 @@ class NearestVoxels:
         return xy.gather(-2, nearest.indices[..., None].expand(*mask.shape, 2)), mask, nearest.values
 
     def _candidates(self, line: Tensor, centre: Tensor, beside: int) -> Tensor:
-        """Whole pixels (n, k, 2): in every column of the window (or row, if steep) those nearest the line."""
+        """List whole pixels (n, k, 2): in every column of the window (or row, if steep) those nearest the
+        line."""
         steps, across = (torch.arange(-n, n + 1).to(line) for n in (self.window, beside))
         steep = line[:, 0].abs() > line[:, 1].abs()
         u = torch.where(steep, centre[:, 1], centre[:, 0])[:, None] + steps
@@ -114,19 +130,24 @@ class NearestVoxels:
         ).flatten(1, 2)
 
     def _window(self, centre: Tensor) -> Tensor:
-        """All pixels (n, k, 2) of the windows."""
+        """List all pixels (n, k, 2) of the windows."""
         side = 2 * self.window + 1
         grid = pixel_grid((side, side), dtype=centre.dtype, device=centre.device) - self.window
         return centre[:, None] + grid.reshape(-1, 2)
 
 
 TIE = 1e-3
-"""Distances closer than this, in pixels, count as equal."""
+"""Difference of distances, in pixels, below which they count as equal."""
 
 
 @dataclass(frozen=True)
 class Local:
-    """A `size` x `size` window around H x, `spacing` pixels between samples; H only (the CNN-like case)."""
+    """A square window around H x; from H only (the CNN-like case).
+
+    Attributes:
+        size: samples per side.
+        spacing: pixels between samples.
+    """
 
     size: int = 5
     spacing: float = 1.0
@@ -136,7 +157,15 @@ class Local:
         check_above(0, spacing=self.spacing)
 
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Positions:
-        """Positions (*n, size^2, 2), row by row, centred on H x. Raises ValueError for lenses."""
+        """Compute the positions in beta of alpha's pixels.
+
+        Returns:
+            Positions (*n, size^2, 2) in beta's pixels, row by row, centred on H x; those outside the image
+            are masked and 0.
+
+        Raises:
+            ValueError: for a pair with lenses.
+        """
         require_straight(pair)
         x = floating(x)
         centre, placed = apply_homography(pair.homography, x)
@@ -148,7 +177,11 @@ class Local:
 
 @dataclass(frozen=True)
 class Dense:
-    """Every `stride`-th pixel of beta; from nothing (small images, and the unphysical control)."""
+    """Every `stride`-th pixel of beta, from sizes alone (small images, and the unphysical control).
+
+    Attributes:
+        stride: pixels between samples in x and y.
+    """
 
     stride: int = 1
 
@@ -156,7 +189,7 @@ class Dense:
         check_above(1, whole=True, stride=self.stride)
 
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Positions:
-        """Positions (*n, H W / stride^2, 2), the same for every alpha pixel."""
+        """Return the same positions for every alpha pixel: (*n, H W / stride^2, 2) in beta's pixels."""
         x = floating(x)
         grid = pixel_grid(pair.beta.hw, dtype=x.dtype, device=x.device)[:: self.stride, :: self.stride]
         xy = grid.reshape(-1, 2).expand(*x.shape[:-1], -1, 2)

@@ -1,4 +1,4 @@
-"""A receptive field evaluated once for every pixel of alpha, to be cut like an image."""
+"""A receptive field evaluated once for every pixel of alpha, which can be cut like an image."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from ..segments import Positions, Segments, clip_to_image
 from .protocol import ReceptiveField, SamplingLocations, device_of, lazily
 
 At = Callable[[Tensor], SamplingLocations]
-"""A field as a function of alpha's pixels (n, 2)."""
+"""Function from alpha's pixels (n, 2) to a field's sampling locations."""
 
 BLOCK = 2
-"""Side of the blocks of alpha's pixels whose centres `FieldOnGrid.blocks` is of."""
+"""Side of the blocks of alpha's pixels whose centres `FieldOnGrid.blocks` has."""
 LARGE = 1 << 22
-"""Pixels of a grid from which its segments are stored as float32."""
+"""Number of pixels of a grid from which its segments are stored as float32."""
 _CHUNK = 1 << 18
-"""Pixels evaluated at once."""
+"""Number of pixels evaluated at once."""
 
 
 @dataclass(frozen=True)
@@ -32,13 +32,14 @@ class FieldOnGrid:
 
     Float32 would round positions by up to 3e-5 px, which is enough to change which of two equally good
     matches is taken: 7e-4 in the fused image. Those of a large grid are stored as float32 (17 bytes)
-    nevertheless, without blocks, and cut to float64: the rounding is the same whatever the parts. Explicit
-    positions stay lazy: `pixels` is None then, and only `at` answers.
+    nevertheless, without blocks, and cut to float64: the rounding is the same whatever the parts.
 
-    pixels: (B or 1, H, W), in beta's pixels.
-    blocks: (B or 1, H / 2, W / 2), of the centres of blocks of 2 x 2 pixels; None if not asked for.
-    at: maps any pixels of alpha (n, 2) to segments or positions, (n) or (B, n).
-    samples: how many positions of a segment are to be sampled, or how many positions there are.
+    Attributes:
+        at: function from any pixels of alpha (n, 2) to segments or positions, (n) or (B, n).
+        samples: number of positions to sample from a segment, or number of explicit positions.
+        pixels: segments (B or 1, H, W) in beta's pixels; None for explicit positions, which only `at` gives.
+        blocks: segments (B or 1, H / 2, W / 2) of the centres of blocks of 2 x 2 pixels; None if not
+            requested.
     """
 
     at: At
@@ -52,8 +53,17 @@ class FieldOnGrid:
     ) -> FieldOnGrid:
         """Evaluate a pair's field on alpha's pixels, with about one sample a pixel of the longest segment.
 
-        `hw` is the size of the grid if it is not alpha's, as for images that are padded at the bottom and the
-        right.
+        Args:
+            hw: size of the grid; None for alpha's. Larger for images that are padded at the bottom and the
+                right.
+            blocks: True to evaluate blocks of 2 x 2 pixels too, unless the grid is large.
+
+        Returns:
+            The field; explicit positions are not evaluated, as those of a whole frame may not fit into
+            memory.
+
+        Raises:
+            ValueError: for an invalid result of the field, or whatever the field raises for this pair.
         """
         evaluate, hw = lazily(field, pair), hw or pair.alpha.hw
         device = device_of(pair)
@@ -73,14 +83,20 @@ class FieldOnGrid:
 
     @classmethod
     def evaluated(cls, evaluate: Callable[[Tensor], Segments], hw: HW, samples: int) -> FieldOnGrid:
-        """A straight field, given as a function of alpha's pixels, on a grid of even sides."""
+        """Evaluate a straight field, given as a function of alpha's pixels, on a grid of even sides.
+
+        Args:
+            samples: number of positions to sample from a segment.
+        """
         on_grid = cls(evaluate, samples, _on_grid(evaluate, hw))
         return replace(on_grid, blocks=on_grid.of_blocks(BLOCK))
 
     def of_blocks(self, side: int) -> Segments:
-        """Segments of centres of blocks of `side` x `side` pixels of the grid, (B or 1, H / side, W / side).
+        """Evaluate the segments at the centres of blocks of `side` x `side` pixels, (B or 1, H / side, W /
+        side).
 
-        Raises ValueError for a field of explicit positions.
+        Raises:
+            ValueError: for a field of explicit positions.
         """
         if self.blocks is not None and side == BLOCK:
             return self.blocks
@@ -88,7 +104,14 @@ class FieldOnGrid:
         return _on_grid(self.at, (h // side, w // side), side, self.straight.start.device)
 
     def displaced(self, step: Callable[[Segments, Tensor], Tensor]) -> FieldOnGrid:
-        """A straight field, segments moved by a step that depends on them and on alpha's pixels (*n, 2)."""
+        """Return the straight field with its segments moved.
+
+        Args:
+            step: function from segments and alpha's pixels (*n, 2) to the step in beta's pixels.
+
+        Raises:
+            ValueError: for a field of explicit positions.
+        """
 
         def moved(locations: SamplingLocations, x: Tensor) -> Segments:
             assert isinstance(locations, Segments)
@@ -107,7 +130,8 @@ class FieldOnGrid:
         return replace(self, at=lambda x: moved(self.at(x), x), pixels=grid(self.straight, 1), blocks=blocks)
 
     def any_valid(self, hw: HW) -> bool:
-        """Whether any of alpha's h x w pixels may look into beta; every eighth row and column counts."""
+        """Return True if any of alpha's h x w pixels may see into beta; every eighth row and
+        column counts."""
         h, w = hw
         if self.pixels is not None:
             return bool(self.pixels.valid[..., :h:8, :w:8].any())
@@ -117,12 +141,16 @@ class FieldOnGrid:
 
     @property
     def large(self) -> bool:
-        """Whether segments are stored as float32."""
+        """True if segments are stored as float32."""
         return self.pixels is not None and self.pixels.valid[0].numel() >= LARGE
 
     @property
     def straight(self) -> Segments:
-        """`pixels`. Raises ValueError for a field of explicit positions."""
+        """Segments of every pixel of alpha, as `pixels`.
+
+        Raises:
+            ValueError: for a field of explicit positions.
+        """
         if self.pixels is None:
             raise ValueError(
                 "this network samples straight segments: choose a straight field, or undistort the images"
@@ -131,12 +159,16 @@ class FieldOnGrid:
 
     @property
     def nbytes(self) -> int:
-        """Memory held."""
+        """Memory held by the segments, bytes."""
         parts = [p for p in (self.pixels, self.blocks) if p is not None]
         return sum(t.nbytes for segments in parts for t in (segments.start, segments.end, segments.valid))
 
     def cut(self, box: Box, shift: tuple[int, int] = (0, 0)) -> FieldOnGrid:
-        """The field of alpha's pixels in a box (even sides), for a beta that began at `shift` (x, y)."""
+        """Return the field of alpha's pixels in a box (even sides), for a beta cut at `shift` (x, y).
+
+        Args:
+            box: rows and columns: top, bottom, left, right.
+        """
         top, _, left, _ = box
 
         def at(x: Tensor) -> SamplingLocations:
@@ -151,7 +183,7 @@ class FieldOnGrid:
         return FieldOnGrid(at, self.samples, pixels, blocks)
 
     def of_one(self, i: int) -> FieldOnGrid:
-        """The field of the i-th rig of a batch, still with a batch axis, of length 1."""
+        """Return the field of the i-th rig of a batch, still with a batch axis, of length 1."""
 
         def one(locations: SamplingLocations) -> SamplingLocations:
             parts = [t if len(t) == 1 else t[i : i + 1] for t in vars(locations).values()]
@@ -162,7 +194,7 @@ class FieldOnGrid:
 
 
 def _on_grid(evaluate: At, hw: HW, side: int = 1, device: torch.device | None = None) -> Segments:
-    """A straight field at the centres of h x w blocks of so many pixels as (B or 1, h, w)."""
+    """Evaluate a straight field at the centres of h x w blocks of so many pixels as (B or 1, h, w)."""
     h, w = hw
 
     def segments(x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
@@ -179,7 +211,7 @@ def _on_grid(evaluate: At, hw: HW, side: int = 1, device: torch.device | None = 
 
 
 def _clipped(field: ReceptiveField) -> ReceptiveField:
-    """A field of segments, of each the part on beta's image."""
+    """Return a field with the part on beta's image of each of a field's segments."""
 
     def on_image(pair: Pair, x: Tensor) -> Segments:
         segments = field(pair, x)
@@ -191,7 +223,7 @@ def _clipped(field: ReceptiveField) -> ReceptiveField:
 
 
 def _finite(locations: SamplingLocations) -> Positions:
-    """Positions of which none that counts is NaN or infinite: own fields may divide by zero."""
+    """Mask positions that are NaN or infinite: users' fields may divide by zero."""
     assert isinstance(locations, Positions)
     finite = locations.xy.isfinite().all(-1)
     return Positions(torch.where(finite[..., None], locations.xy, 0.0), locations.mask & finite)

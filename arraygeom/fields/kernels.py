@@ -7,18 +7,18 @@ import numpy as np
 from ..runtime.compiled import compiled
 
 BUCKETS = 128
-"""Buckets into which distances are sorted first."""
+"""Number of buckets into which distances are sorted first."""
 MORE = 1.15
-"""Share of the pixels that should be within the first distance tried, over those wanted."""
+"""Factor of the number of wanted pixels that should be within the first distance tried."""
 
 
 @compiled(nogil=True, cache=True, error_model="numpy")
 def nearest_pixels(first, last, line, centre, usable, window, tie, hw, xy, mask):
-    """The pixels of the window about the centre nearest to the line, for pixels `first` to `last` of alpha.
+    """Write the window's pixels nearest to the line, for pixels `first` to `last` of alpha.
 
-    Out come xy (n, count, 2), the nearest first, and mask (n, count). `line` (n, 3) and `centre` (n, 2) are
-    of the type in which distances are computed; `tie` is by how much a pixel counts as farther than the one
-    before it in the image.
+    Written are xy (n, count, 2), the nearest first, and mask (n, count). `line` (n, 3) and `centre` (n, 2)
+    are of the type in which distances are computed; `tie` is the distance by which a pixel counts as farther
+    than the one before it in the image.
     """
     count, most = mask.shape[1], (2 * window + 1) ** 2
     keys, pixels = np.empty(most, line.dtype), np.empty((most, 2), np.int32)
@@ -37,7 +37,11 @@ def nearest_pixels(first, last, line, centre, usable, window, tie, hw, xy, mask)
 
 @compiled(inline="always")
 def _within(line, centre, window, tie, hw, count, keys, pixels):
-    """How many pixels are no farther than some distance, and that: `count` or more, or all of the window."""
+    """Collect the pixels up to some distance: at least `count`, or all of the window.
+
+    Returns:
+        Their number and that distance.
+    """
     x, y, a, b = int(centre[0]), int(centre[1]), line[0], line[1]
     at_centre = centre[0] * a + centre[1] * b + line[2]
     spans = window * (abs(a) + abs(b))
@@ -53,7 +57,7 @@ def _within(line, centre, window, tie, hw, count, keys, pixels):
 
 @compiled(inline="always")
 def _collect(line, at_centre, x, y, window, tie, hw, limit, keys, pixels):
-    """The pixels of the window with keys up to a limit: by columns, or by rows if the line is steep."""
+    """Collect the window's pixels with keys up to a limit: by columns, or by rows if the line is steep."""
     a, b = line[0], line[1]
     steep = abs(a) > abs(b)
     slope, other = (b, a) if steep else (a, b)
@@ -76,7 +80,7 @@ def _collect(line, at_centre, x, y, window, tie, hw, limit, keys, pixels):
 
 @compiled(inline="always")
 def _sort(keys, n, limit, order, begins, buckets, ordered):
-    """The order of keys in 0 .. limit, and `ordered`, keys in that order: into buckets, then by insertion."""
+    """Sort keys in 0 .. limit into buckets, then by insertion: `order` and, in that order, `ordered`."""
     scale = keys.dtype.type(BUCKETS / limit)
     begins[:] = 0
     for i in range(n):

@@ -27,16 +27,29 @@ class ReceptiveField(Protocol):
     """The search segment or sampling locations in beta of each alpha pixel."""
 
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> SamplingLocations:
-        """Segments or positions in beta's pixels, of alpha's pixels x. Differentiable in a pair's numbers."""
+        """Compute sampling locations in beta of alpha's pixels x.
+
+        Returns:
+            Segments (*n) or positions (*n, L) in beta's pixels, differentiable in a pair's numbers.
+        """
         ...
 
 
 def sampling_locations(
     field: ReceptiveField, pair: Pair, x: Real[Tensor, "*n 2"] | None = None
 ) -> SamplingLocations:
-    """The field over given pixels, or over alpha's whole image (H, W); a batch of rigs gives (*b, H, W).
+    """Evaluate a field at given pixels, or over alpha's whole image.
 
-    Raises TypeError for what is not a field, such as the class of one.
+    Args:
+        x: pixels of alpha; None for all, (H, W, 2), with the axes *b of a batch of rigs in front.
+
+    Returns:
+        Segments or positions in beta's pixels, one per pixel.
+
+    Raises:
+        TypeError: for an object that is no field, such as a class of one, or pixels that are no tensor.
+        ValueError: for pixels of another shape, an invalid result of the field, or whatever the field raises
+            for this pair.
     """
     check_field(field)
     if x is not None:
@@ -45,9 +58,14 @@ def sampling_locations(
 
 
 def answered(field: ReceptiveField, pair: Pair, x: Real[Tensor, "*n 2"]) -> SamplingLocations:
-    """What a field gives for pixels. Raises ValueError for what is not Segments or Positions of each.
+    """Call a field, and check its result.
 
-    What the field itself raises has a note of which it was.
+    Returns:
+        The field's segments or positions. An exception of the field gets a note with its name.
+
+    Raises:
+        ValueError: if the result is not Segments or Positions for each pixel, with floats and bools on one
+            device.
     """
     name = getattr(field, "__name__", type(field).__name__)
     try:
@@ -75,7 +93,7 @@ def answered(field: ReceptiveField, pair: Pair, x: Real[Tensor, "*n 2"]) -> Samp
 
 
 def _check_parts(answer: SamplingLocations, name: str) -> None:
-    """Raises ValueError unless points are floats (..., 2), and bools (...) say which of them count."""
+    """Raise ValueError unless points are floats (..., 2), and bools (...) mask those that count."""
     *points, counts = vars(answer).values()
     fit = all(xy.is_floating_point() and xy.shape == (*counts.shape, 2) for xy in points)
     some = isinstance(answer, Segments) or counts.shape[-1] > 0
@@ -91,9 +109,12 @@ def _check_parts(answer: SamplingLocations, name: str) -> None:
 
 
 def lazily(field: ReceptiveField, pair: Pair) -> Callable[[Tensor], SamplingLocations]:
-    """The field as a function of alpha pixels (n, 2) alone, which attention calls chunk by chunk.
+    """Return the field as a function of alpha pixels (n, 2) alone, which attention calls chunk by chunk.
 
-    For a batch of rigs it answers for each of them, (*b, n); on the device of the pair's numbers.
+    For a batch of rigs the result is for each of them, (*b, n), on the device of the pair's numbers.
+
+    Raises:
+        TypeError: for an object that is no field.
     """
     check_field(field)
     axes, device = len(pair.batch_shape), device_of(pair)
@@ -101,31 +122,33 @@ def lazily(field: ReceptiveField, pair: Pair) -> Callable[[Tensor], SamplingLoca
 
 
 def device_of(pair: Pair) -> torch.device | None:
-    """Where a pair's numbers are; None for one of which only the sizes are known."""
+    """Return the device of a pair's numbers; None for one of which only the sizes are known."""
     calibration = pair.alpha if isinstance(pair.alpha, Camera) else pair.link
     return next((t.device for t, _ in tensors_of(calibration)), None)
 
 
 def all_pixels(pair: Pair) -> Float[Tensor, "*b h w 2"]:
-    """Alpha's pixel centres, float32, with the axes of a batch of rigs (of length 1) in front."""
+    """Return alpha's pixel centres, float32, with the axes of a batch of rigs (of length 1) in front."""
     grid = pixel_grid(pair.alpha.hw, device=device_of(pair))
     return grid.reshape(*[1] * len(pair.batch_shape), *grid.shape)
 
 
 def compilable(x: Tensor) -> bool:
-    """Whether compiled loops can take a tensor: plain numbers on the CPU that nothing follows."""
+    """Return True if compiled loops can take a tensor: plain numbers on the CPU that neither a gradient nor a
+    trace follows."""
     plain = type(x) is Tensor and x.device.type == "cpu" and x.dtype in (torch.float32, torch.float64)
     return plain and not followed() and can_compile()
 
 
 CHUNK = 1 << 15
-"""Pixels handled at once, so that what is computed on the way stays in a core's cache."""
+"""Number of pixels handled at once, so that intermediate results stay in a core's cache."""
 PIECE = 1 << 12
-"""Pixels of alpha that a thread takes at a time."""
+"""Number of pixels of alpha that a thread takes at a time."""
 
 
 def segments_by_rows(f: Callable[[Tensor], Segments], pair: Pair, x: Float[Tensor, "*n 2"]) -> Segments:
-    """f over pixels, some rows of the first axis after the batch's at once; f must take each pixel alone."""
+    """Apply f to pixels, some rows of the first axis after the batch's at once; f must take each
+    pixel alone."""
     axis = len(pair.batch_shape)
     if x.ndim <= axis + 1:
         return f(x)

@@ -1,4 +1,4 @@
-"""From positions in beta back to depth, any cameras: along the curve that the pair's rays have in beta."""
+"""Depth from positions in beta, for any cameras: along the curve that the pair's rays have in beta."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from .curved import Curved, RayCurve
 from .default import natural_bounds
 
 ROWS = 1 << 12
-"""Pixels that are searched at once."""
+"""Number of pixels that are searched at once."""
 NODES, FINER = 65, 17
-"""Points at which the curve is followed, and then again between the neighbours of the nearest."""
+"""Number of points at which the curve is followed, and then again between the neighbours of the nearest."""
 PART = 0.005
-"""Of the curve, to either side, over which differences are taken."""
+"""Share of the curve, to either side, over which differences are taken."""
 
 
 def ray_depth(
@@ -32,11 +32,23 @@ def ray_depth(
     *,
     deviation: Float[Tensor, " n"] | None = None,
 ) -> Depth:
-    """Depth of what alpha's pixels see at beta's, or distance along the ray, within the pair's depth range.
+    """Compute depth, or distance along the ray, of the point that alpha and beta see, within the pair's depth
+    range.
 
-    That of the nearest point of the curve on which beta sees the ray. `deviation` is the standard deviation
-    of x_beta along the curve in pixels (default 0); that of the depth is propagated to first order. Raises
-    ValueError for pairs that are not calibrated or have no depth range.
+    It is that of the nearest point of the curve on which beta sees the ray.
+
+    Args:
+        x: pixels of alpha.
+        x_beta: positions in beta.
+        bounds: "depth" along alpha's axis or "distance" along the ray, also of the pair's depth range.
+        deviation: standard deviation of x_beta along the curve, pixels; None for 0.
+
+    Returns:
+        Depth in the rig's unit (metres) with its standard deviation to first order and validity; invalid
+        depths are 0.
+
+    Raises:
+        ValueError: for pairs that are not calibrated or have no depth range.
     """
     pair.cameras  # noqa: B018  (raises for an uncalibrated pair)
     near, far = pair.depth_range
@@ -44,7 +56,7 @@ def ray_depth(
     def of(x: Tensor, x_beta: Tensor, deviation: Tensor) -> tuple[Tensor, ...]:
         finite = x.isfinite().all(-1) & x_beta.isfinite().all(-1)
         x, x_beta = (torch.where(finite[:, None], p, 0.0) for p in (x, x_beta))
-        curve = RayCurve.of(pair, near, far, x, bounds)
+        curve = RayCurve.from_pixels(pair, near, far, x, bounds)
         fraction = curve.nodes(NODES)
         for finer in (FINER, FINER, FINER, 0):
             apart, last = _apart(curve, fraction, x_beta), fraction.shape[-1] - 1
@@ -70,7 +82,7 @@ def ray_depth(
 def _nearest(
     curve: RayCurve, fraction: Float[Tensor, "n 1"], x_beta: Float[Tensor, "n 2"]
 ) -> Float[Tensor, "n 1"]:
-    """The fraction one Gauss-Newton step nearer to positions, which its gradients are by."""
+    """Return the fraction one Gauss-Newton step nearer to positions, through which gradients flow."""
     with torch.no_grad():
         ends = torch.cat([(fraction + step).clamp(0, 1) for step in (-PART, PART)], -1)
         along = curve.at(ends)[0].diff(dim=-2)[:, 0] / ends.diff(dim=-1)
@@ -82,7 +94,7 @@ def _nearest(
 
 
 def _inverse_depth_per_pixel(curve: RayCurve, fraction: Float[Tensor, "n 1"]) -> Float[Tensor, " n"]:
-    """How much inverse depth a pixel of beta along the curve is worth, by differences over a part of it."""
+    """Compute the inverse depth per pixel of beta along the curve, by differences over a part of it."""
     ends = torch.cat([(fraction + step).clamp(0, 1) for step in (-PART, PART)], -1)
     xy, _ = curve.at(ends)
     pixels = (xy[:, 1] - xy[:, 0]).norm(dim=-1)
@@ -90,7 +102,14 @@ def _inverse_depth_per_pixel(curve: RayCurve, fraction: Float[Tensor, "n 1"]) ->
 
 
 def rough_transfer(pair: Pair, x: Real[Tensor, "n 2"]) -> TransformedPoints:
-    """Pixels of alpha in beta, roughly: by the pair's homography, or the middle of other cameras' curves."""
+    """Map pixels of alpha roughly to beta: by the pair's homography, or the middle of other cameras' curves.
+
+    Returns:
+        Positions in beta's pixels, detached, with their validity.
+
+    Raises:
+        ValueError: for a pair that is not calibrated or has no depth range, where curves are needed.
+    """
     if pair.alpha.has_pinhole_view and pair.beta.has_pinhole_view:
         return apply_homography(pair.homography.detach().to(x), x)
     with torch.no_grad():
@@ -101,6 +120,7 @@ def rough_transfer(pair: Pair, x: Real[Tensor, "n 2"]) -> TransformedPoints:
 def _apart(
     curve: RayCurve, fraction: Float[Tensor, "n l"], x_beta: Float[Tensor, "n 2"]
 ) -> Float[Tensor, "n l"]:
-    """Squared pixels from positions to the points at fractions, infinite where beta does not see these."""
+    """Return squared pixels from positions to the points at fractions; infinite where beta does not see
+    these."""
     xy, visible = curve.at(fraction)
     return torch.where(visible, (xy - x_beta[:, None].to(xy)).square().sum(-1), torch.inf)

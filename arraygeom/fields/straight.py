@@ -27,12 +27,14 @@ from .protocol import CHUNK, all_pixels, segments_by_rows
 class Epipolar:
     """The segment of the epipolar line between the pair's depth bounds; needs calibration.
 
-    `near` and `far` (metres) override the pair's own.
+    A segment of which nothing is in beta's image and in front of beta is invalid. Without a baseline, with
+    near = far, and for identical cameras it is a point. An alpha pixel on the epipole sees one point of beta,
+    whatever the depth: a point too. Where the epipole is inside beta's image, segments end short of it:
+    points of the line between the cameras would be behind one of them.
 
-    Where nothing of the segment is in beta's image and in front of beta it is invalid. Without a baseline,
-    with near = far, and for identical cameras it is a point. An alpha pixel on the epipole sees one point of
-    beta, whatever the depth: a point too. Where the epipole is inside beta's image, segments end short of
-    it: what lies on the line between the cameras would be behind one of them.
+    Attributes:
+        near: near bound in the rig's unit (metres); None for the pair's own.
+        far: far bound, possibly infinite; None for the pair's own.
     """
 
     near: float | None = None
@@ -42,12 +44,27 @@ class Epipolar:
         check_bounds(self.near, self.far)
 
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Segments:
-        """Segments from near to far, inside beta's image and in front of it. Raises ValueError for lenses."""
+        """Compute the segments of alpha's pixels from near to far, inside beta's image and in front of it.
+
+        Returns:
+            Segments in beta's pixels, differentiable in the pair's numbers.
+
+        Raises:
+            ValueError: for a pair that is not calibrated or has lenses, or without the bounds that the field
+                leaves open.
+        """
         require_pinholes(pair)
         return _between(pair, *self.bounds(pair), x)
 
     def bounds(self, pair: Pair) -> Depths:
-        """(near, far): this field's own where given, else the pair's."""
+        """Return near and far: this field's own where given, else the pair's.
+
+        Returns:
+            Near and far, in the rig's unit.
+
+        Raises:
+            ValueError: if neither states one.
+        """
         if self.near is not None and self.far is not None:
             return depth_range(self.near, self.far)
         near, far = pair.depth_range
@@ -63,7 +80,14 @@ class EpipolarLine:
     """
 
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Segments:
-        """Segments across beta's image. Raises ValueError for lenses."""
+        """Compute the segments of alpha's pixels across beta's image.
+
+        Returns:
+            Segments in beta's pixels; from near to far with calibration.
+
+        Raises:
+            ValueError: for a pair with lenses, or with neither calibration nor F.
+        """
         if pair.link is None and pair.calibrated:
             baseline = pair.beta_from_alpha.t.detach().norm(dim=-1)
             infinite = torch.full_like(baseline, torch.inf)
@@ -81,7 +105,7 @@ class EpipolarLine:
 
 
 NEAREST = 1e-3
-"""Where a line that has no near bound begins: its depth as a share of the baseline."""
+"""Depth, as a share of the baseline, at which a line without a near bound begins."""
 
 
 @dataclass(frozen=True)
@@ -89,11 +113,12 @@ class HomographyDisplacement:
     """The part of the epipolar line within +-`displacement` pixels of H x; from F and H, or from calibration.
 
     The paper's homography-based field. For a calibrated pair H is that of the plane at the middle of the
-    depth range (`approximated` fits a better one), and `displacement=None` takes the smallest that covers
-    near to far at every pixel of alpha's image. With calibration, the start is towards near and the end
-    towards far.
-
+    depth range (`approximated` fits a better one), and a segment starts towards near and ends towards far.
     Where there is no line (at the epipole, and without a baseline) the segment is the point H x.
+
+    Attributes:
+        displacement: pixels of beta, at least 0; None for the smallest that covers near to far at every pixel
+            of alpha's image, which needs calibration.
     """
 
     displacement: float | None = None
@@ -102,9 +127,14 @@ class HomographyDisplacement:
         check_above(0, displacement=self.displacement)
 
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Segments:
-        """Segments centred on the point of the line nearest to H x, then clipped to beta's image.
+        """Compute segments centred on the point of the line nearest to H x, then clipped to beta's image.
 
-        Raises ValueError for lenses.
+        Returns:
+            Segments in beta's pixels.
+
+        Raises:
+            ValueError: for a pair with lenses, with neither F nor calibration, or uncalibrated if
+                `displacement` is None.
         """
         require_straight(pair)
         F, H, hw = pair.fundamental, pair.homography, pair.beta.hw
@@ -121,10 +151,18 @@ class HomographyDisplacement:
 
 
 def covering_displacement(pair: Pair, x: Real[Tensor, "*n 2"] | None = None) -> Float[Tensor, "*b"]:
-    """The displacement from H x that reaches near and far for every pixel x, pixels of beta; one a rig.
+    """Compute the displacement from H x that reaches near and far for every pixel x.
 
-    Of depth-bounded segments as beta's image clips them; 0 if there are none. Without x: for all of alpha's
-    pixels. Raises ValueError for an uncalibrated pair.
+    Depth-bounded segments count as beta's image clips them.
+
+    Args:
+        x: pixels of alpha; None for all.
+
+    Returns:
+        Pixels of beta, one per rig; 0 if no pixel has a segment.
+
+    Raises:
+        ValueError: for a pair that is not calibrated, has lenses, or has no depth range.
     """
     squared = _squared_reach(pair, _widest(pair) if x is None else floating(x))
     largest = (
@@ -134,7 +172,8 @@ def covering_displacement(pair: Pair, x: Real[Tensor, "*n 2"] | None = None) -> 
 
 
 def _squared_reach(pair: Pair, x: Tensor) -> Tensor:
-    """The squared distance from the foot of H x to the farther end of the segment, 0 where there is none."""
+    """Return the squared distance from the foot of H x to the farther end of the segment, 0 where there is
+    none."""
     exact = Epipolar()(pair, x)
     centre, placed = apply_homography(pair.homography, x)
     foot = foot_on_line(epipolar_lines(pair.fundamental, x), centre)
@@ -143,7 +182,8 @@ def _squared_reach(pair: Pair, x: Tensor) -> Tensor:
 
 
 def _widest(pair: Pair) -> Tensor:
-    """The alpha pixel (*b, 1, 2) of the largest displacement: searched once a pair, anew when it changes.
+    """Return the alpha pixel (*b, 1, 2) of the largest displacement, searched once per pair and again when it
+    changes.
 
     Nothing is kept of a trace, nor as a tensor of inference mode, which no gradient could use later.
     """
@@ -167,15 +207,16 @@ def _searched_widest(pair: Pair) -> Tensor:
 
 
 SIDES = Literal["left", "right", "either"]
-"""Which camera of a rectified pair alpha is."""
+"""The camera of a rectified pair that alpha is."""
 
 
 @dataclass(frozen=True)
 class Rectified:
-    """A horizontal run of up to `max_disparity` pixels of beta, from the two sizes alone (the PAM case).
+    """A horizontal run of pixels of beta, from the two sizes alone (the PAM case).
 
-    Alpha is the "left" or the "right" camera of a rectified pair ("either": the run goes both ways). Without
-    `max_disparity`, the whole row.
+    Attributes:
+        max_disparity: largest disparity, pixels of beta; None for the whole row.
+        alpha_is: the camera of the rectified pair that alpha is; for "either" the run goes both ways.
     """
 
     max_disparity: float | None = None
@@ -187,7 +228,13 @@ class Rectified:
             raise ValueError(f"alpha_is must be one of {', '.join(get_args(SIDES))}, got {self.alpha_is!r}")
 
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Segments:
-        """Segments from the largest disparity (near) to none (far)."""
+        """Compute segments from the largest disparity (near) to none (far).
+
+        Images of different sizes are taken to show the same view.
+
+        Returns:
+            Segments in beta's pixels, not differentiable in a rig, of which nothing but sizes is used.
+        """
         (ha, wa), (hb, wb) = pair.alpha.hw, pair.beta.hw
         x = floating(x)
         column = (x[..., 0] + 0.5) * (wb / wa) - 0.5
@@ -207,25 +254,36 @@ class Rectified:
 
 
 def pinhole_track(pair: Pair, x: Real[Tensor, "*n 2"]) -> Track:
-    """The track in beta of alpha's pixels. Raises ValueError unless both cameras are pinholes."""
+    """Return the track in beta of alpha's pixels, by inverse depth.
+
+    Raises:
+        ValueError: unless both cameras are calibrated and without lenses.
+    """
     alpha, beta = require_pinholes(pair)
     return track(alpha.K, beta.K, pair.beta_from_alpha, x)
 
 
 def require_pinholes(pair: Pair) -> tuple[Camera, Camera]:
-    """Both cameras. Raises ValueError unless they are calibrated and without lenses."""
+    """Return both cameras of a pair.
+
+    Raises:
+        ValueError: unless they are calibrated and without lenses.
+    """
     alpha, beta = pair.cameras
     require_straight(pair)
     return alpha, beta
 
 
 def approximated(pair: Pair) -> Pair:
-    """The pair with its exact F and the H that fits best to the middles of its depth-bounded segments.
+    """Return the pair with its exact F and the H that fits best to the middles of its depth-bounded segments.
 
-    Least squares in pixels of beta, over the segments that beta's image holds of every 16th alpha pixel:
-    what the paper calls the homography-based approximation. `HomographyDisplacement()` on the result takes
-    the displacement that covers near to far. Differentiable. Raises ValueError for uncalibrated or batched
-    pairs and where beta sees nothing between the bounds.
+    Least squares in pixels of beta, over the segments that beta's image holds of every 16th alpha pixel: the
+    paper's homography-based approximation. `HomographyDisplacement()` on the result takes the displacement
+    that covers near to far. Differentiable.
+
+    Raises:
+        ValueError: for uncalibrated or batched pairs, lenses, no depth range, and where beta sees nothing
+            between the bounds.
     """
     alpha, _ = pair.cameras
     if alpha.K.ndim > 2:
@@ -243,7 +301,7 @@ def approximated(pair: Pair) -> Pair:
 
 
 def require_straight(pair: Pair) -> None:
-    """Raises ValueError if a view has a lens."""
+    """Raise ValueError if a view has a lens."""
     if pair.has_lens:
         raise ValueError(
             "a straight field needs pinhole cameras: "
@@ -252,7 +310,8 @@ def require_straight(pair: Pair) -> None:
 
 
 def foot_on_line(line: Float[Tensor, "*#n 3"], point: Float[Tensor, "*#n 2"]) -> Float[Tensor, "*n 2"]:
-    """The point of a line (scaled as `epipolar_lines` does) nearest to a point; without a line, the point."""
+    """Return the point of a line (scaled as `epipolar_lines` does) nearest to a point; without a line, the
+    point."""
     l0, l1, l2 = line.unbind(-1)
     u, v = point.unbind(-1)
     off = l2 + l0 * u + l1 * v
@@ -262,7 +321,7 @@ def foot_on_line(line: Float[Tensor, "*#n 3"], point: Float[Tensor, "*#n 2"]) ->
 def line_piece(
     line: Float[Tensor, "*#n 3"], point: Float[Tensor, "*#n 2"], reach: Float[Tensor, "*#d"], hw: HW
 ) -> Segments:
-    """The piece of each line within `reach` pixels of the foot of `point`, clipped to the image.
+    """Return the piece of each line within `reach` pixels of the foot of `point`, clipped to the image.
 
     It runs along (l1, -l0), which for a calibrated F is from near to far. Without a line: the point itself.
     """

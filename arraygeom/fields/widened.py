@@ -23,9 +23,13 @@ from .straight import Epipolar, EpipolarLine, HomographyDisplacement
 class Moved:
     """Any field, for cameras that are not synchronised, evaluated where alpha's pixels are when beta records.
 
-    `displacement` (2, H, W) says by how many pixels of alpha each of its pixels moves from alpha's exposure
-    to beta's, in x and y, for instance by optical flow between alpha's own frames. It is interpolated
-    bilinearly, and extended by the nearest pixel outside alpha's image. `Widened` allows for its error.
+    The displacement is interpolated bilinearly, and extended by the nearest pixel outside alpha's image.
+    `Widened` allows for its error.
+
+    Attributes:
+        field: field of the point after it has moved.
+        displacement: (2, H, W), motion in x and y of each of alpha's pixels from alpha's exposure to beta's,
+            pixels of alpha, for instance by optical flow between alpha's own frames.
     """
 
     field: ReceptiveField
@@ -39,9 +43,13 @@ class Moved:
             )
 
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> SamplingLocations:
-        """The field's sampling locations for the points where alpha's pixels x will be.
+        """Compute the field's sampling locations for the points to which alpha's pixels x move.
 
-        Raises ValueError if alpha has another size than the displacement.
+        Returns:
+            As of `field`.
+
+        Raises:
+            ValueError: if alpha has another size than the displacement, or the field's result is invalid.
         """
         self.require(pair.alpha.hw)
         return answered(self.field, pair, self.points(x))
@@ -55,7 +63,7 @@ class Moved:
             )
 
     def points(self, x: Real[Tensor, "*n 2"]) -> Float[Tensor, "*n 2"]:
-        """Where alpha's pixels are when beta records."""
+        """Return the positions in alpha of alpha's pixels when beta records."""
         x = floating(x)
         h, w = self.displacement.shape[-2:]
         inside = torch.minimum(x.clamp(min=0), x.new_tensor([w - 1, h - 1]))
@@ -68,12 +76,17 @@ class Widened:
     """Any field with `across` pixels to either side of it and `along` more pixels at either end.
 
     Uncertain calibration moves lines sideways: `across` alone. Motion between cameras that are not
-    synchronised moves points anywhere: `across` and `along`.
+    synchronised moves points anywhere: `across` and `along`. Segments that are only longer stay segments.
+    Wider ones become positions, on rows at most one pixel apart, the rows following one another (the first
+    `across` to the left of the way from start to end). Positions (of `Curved`) are taken as ordered along a
+    curve; each is stretched and widened about its own tangent. A segment of no length widens to a window with
+    sides along x and y.
 
-    Segments made longer stay segments. Made wider they become positions: `samples` along, on rows at most one
-    pixel apart, the rows following one another (the first `across` to the left of the way from start to end).
-    Positions (of `Curved`) are taken as ordered along a curve; each is stretched and widened about its own
-    tangent. A segment of no length widens to a window with sides along x and y.
+    Attributes:
+        field: the field to widen.
+        across: pixels of beta to either side, at least 0.
+        along: pixels of beta at either end, at least 0.
+        samples: number of positions along a segment that becomes wider.
     """
 
     field: ReceptiveField
@@ -87,7 +100,15 @@ class Widened:
         check_above(1, whole=True, samples=self.samples)
 
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> SamplingLocations:
-        """Segments if `across` is 0 and the field gives segments, else positions (*n, rows * samples, 2)."""
+        """Compute the field's sampling locations, widened and on beta's image.
+
+        Returns:
+            Segments if `across` is 0 and the field gives segments, else positions (*n, rows * samples, 2), in
+            beta's pixels.
+
+        Raises:
+            ValueError: for an invalid result of the field, or whatever the field raises for this pair.
+        """
         locations = self._evaluated(pair, x)
         if isinstance(locations, Segments):
             more = self.along * direction(locations.end - locations.start)
@@ -103,7 +124,8 @@ class Widened:
         return self._band(locations, pair.beta.hw)
 
     def _evaluated(self, pair: Pair, x: Tensor) -> SamplingLocations:
-        """The field about beta's image too, as far as it may be brought in; of sizes alone on the image."""
+        """Evaluate the field around beta's image too, as far as widening may bring it in; by sizes alone on
+        the image."""
         margin = math.ceil(self.across + self.along)
         if margin == 0 or not _follows_beta(self.field, pair):
             return answered(self.field, pair, x)
@@ -116,7 +138,7 @@ class Widened:
 
     @property
     def rows(self) -> int:
-        """How many rows of samples a band has."""
+        """Number of rows of samples of a band."""
         return 2 * math.ceil(self.across) + 1
 
     def _band(self, p: Positions, hw: HW) -> Positions:
@@ -131,7 +153,8 @@ class Widened:
 
 
 def _follows_beta(field: ReceptiveField, pair: Pair) -> bool:
-    """Whether a padded beta's field is the same in its pixels: by F or calibration it is, by sizes not."""
+    """Return True if the field of a padded beta is the same in its pixels: by F or calibration it is, by
+    sizes not."""
     if isinstance(field, ThroughLenses | Moved):
         return _follows_beta(field.field, pair)
     if isinstance(field, HomographyDisplacement):
@@ -141,14 +164,14 @@ def _follows_beta(field: ReceptiveField, pair: Pair) -> bool:
 
 
 def direction(step: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n 2"]:
-    """Unit vectors; along x for steps shorter than 1e-3 pixels."""
+    """Return unit vectors of steps; along x for steps shorter than 1e-3 pixels."""
     squared = step.square().sum(-1, keepdim=True)
     moves = squared > 1e-6
     return torch.where(moves, step / torch.where(moves, squared, 1.0).sqrt(), step.new_tensor([1.0, 0.0]))
 
 
 def tangents(p: Positions) -> Float[Tensor, "*n l 2"]:
-    """The direction of the curve at each position, from those of its neighbours that count."""
+    """Return the direction of the curve at each position, from those of its neighbours that count."""
     if p.xy.shape[-2] < 2:
         return direction(torch.zeros_like(p.xy))
     here, counts = p.xy, p.mask[..., None]

@@ -33,12 +33,12 @@ FORMATS = (
     *("middlebury", "syntim", "nerfstudio", "multical", "aniposelib", "strecha", "open3d"),
     *("metashape", "xmp", "luxonis", "mrcal", "lensboy", "realsense", "zed", "azure", "pycalib"),
 )
-"""Each a module, in the order in which they are asked whether they recognise a file."""
+"""Formats, each a module, in the order in which they are tried on a file."""
 READERS: dict[str, Any] = {
     name: kitti.Raw if name == "kitti-raw" else import_module(f"{__name__}.{name}") for name in FORMATS
 }
 ANY_SCALE = ("colmap", "nerfstudio", "pycalib", "strecha")
-"""Formats that state no unit: their lengths are metres only if whoever wrote the file scaled them so."""
+"""Formats that state no unit: their lengths are metres only if the file's author scaled them so."""
 READERS["caliscope"] = READERS["aniposelib"]
 LIKELY = {
     r"Camera\d?\.fx|Camera\.type": "ORB-SLAM's settings, whose numbers are not read as a rig",
@@ -50,7 +50,7 @@ LIKELY = {
     r"(?i)\[(left|right|stereo)|\bbaseline\b": "a stereo camera's own settings",
     r"(?i)fisheye|distort|focal|intrinsic": "some tool for cameras",
 }
-"""Formats that a file that no reader recognises is likely of, by words in it."""
+"""Tools that probably wrote a file that no reader recognises, by words in it."""
 WRITERS = {name: READERS[name] for name in ("native", "opencv", "colmap", "kalibr", "nerfstudio")}
 
 __all__ = [
@@ -72,14 +72,26 @@ def read_rig(
     hw: HW | None = None,
     lens: str | None = None,
 ) -> Rig:
-    """The rig of a file (or folder, for formats of several files); its format is recognised unless named.
+    """Read the rig of a file (or folder, for formats of several files).
 
-    `scale` multiplies all lengths, for files in another unit than their format's. `hw` is the images'
-    (height, width), and `lens` the model of the coefficients, for files that do not state them. Suspicious
-    but readable values, and entries that look like a lens, a flag or a unit and are not read, give a
-    RigFileWarning.
-    Raises RigFileError, which names the file and the entry; FileNotFoundError; ValueError for an unknown
-    format.
+    Suspicious but readable values, and entries that look like a lens, a flag or a unit and are not read, give
+    a RigFileWarning.
+
+    Args:
+        format: name of a format in `READERS`; None to recognise it.
+        scale: positive factor of all lengths, for files in another unit than their format's.
+        hw: height and width of the images in pixels, for files that do not state them; None to guess them,
+            with a warning.
+        lens: model of the coefficients, for files that do not state it.
+
+    Returns:
+        The rig in double precision, with pixel centres at whole numbers and lengths in metres.
+
+    Raises:
+        RigFileError: for a file that is damaged, of no known format, or with numbers that no camera has; its
+            text names the file and the entry.
+        FileNotFoundError: for a missing file.
+        ValueError: for an unknown format or lens model.
     """
     path = Path(path)
     if not path.exists():
@@ -119,12 +131,18 @@ def read_rig(
 
 
 def write_rig(rig: Rig, path: str | Path, *, format: str = "native") -> None:
-    """Write a rig atomically. Formats of several files make a folder, the last of them once others are there.
+    """Write a rig to a file atomically. Formats of several files make a folder, the last of them after the
+    others.
 
     What a format leaves out of the rig is named by one RigFileWarning: all but the native one the depth
-    range, links, what a sensor records; OpenCV's where the first camera is in the world. Raises ValueError
-    for an unknown format, for a rig that the format cannot hold, and a batch; FileExistsError for a folder
-    with files of these names that nothing here wrote.
+    range, links, what a sensor records; OpenCV's where the first camera is in the world.
+
+    Args:
+        format: "native", "opencv", "colmap", "kalibr" or "nerfstudio".
+
+    Raises:
+        ValueError: for an unknown format, a rig that the format cannot hold, and a batch.
+        FileExistsError: for a folder with files of these names that nothing here wrote.
     """
     if format not in WRITERS:
         raise ValueError(f"cannot write rig format '{format}' (known: {', '.join(WRITERS)})")
@@ -141,7 +159,11 @@ def write_rig(rig: Rig, path: str | Path, *, format: str = "native") -> None:
 
 
 def recognise(path: str | Path) -> str:
-    """The name of a file's or folder's format. Raises RigFileError if it is none that is known."""
+    """Return the name of a file's or folder's format.
+
+    Raises:
+        RigFileError: for an empty file; its subclass UnknownRigFormat for one of no known format.
+    """
     path = Path(path)
     head = decoded(path.read_bytes()[:4096]) if path.is_file() else ""
     if path.is_file() and not head.strip():
@@ -160,7 +182,7 @@ def recognise(path: str | Path) -> str:
 
 
 def _left_out(rig: Rig, format: str) -> str:
-    """What only the native format holds and this rig states."""
+    """Return what only the native format holds and this rig states, as words; empty for nothing."""
     kept = {"time_offset": 0.0} if format == "kalibr" else {}
     sensors = (dataclasses.replace(view.sensor, **kept) for view in rig.cameras.values())
     first = calibrated(rig, format)[0][1]
@@ -174,7 +196,8 @@ def _left_out(rig: Rig, format: str) -> str:
 
 
 SMALLEST_FOCAL, LARGEST_NUMBER = 1e-3, 1e9
-"""Bounds of focal lengths (pixels), all of K, translations (metres). Beyond them pixels lose their digits."""
+"""Bounds of focal lengths (pixels), of all of K, and of translations (metres). Beyond them pixels lose their
+digits."""
 
 
 def _check_magnitudes(path: Path, rig: Rig) -> None:

@@ -16,11 +16,16 @@ from .source import LENS_NAME, Entry, RigSource, pose_of
 
 
 def recognises(path: Path, head: str) -> bool:
+    """Return True for a TOML file, or a text with tables of cameras as aniposelib writes them."""
     return path.suffix == ".toml" or ("[cam" in head and "matrix =" in head)
 
 
 def read(source: RigSource) -> Rig:
-    """Every camera that is not marked `ignore`, under its name, or else that of its table."""
+    """Read every camera that is not marked `ignore`, under its name, or else that of its table.
+
+    Raises:
+        RigFileError: for a damaged file, or one without such a camera.
+    """
     document = source.toml()
     tables = document["cameras"] if isinstance(document.get("cameras").value, dict) else document
     cameras = [(k, fields) for k, fields in tables.items() if isinstance(fields.value, dict)]

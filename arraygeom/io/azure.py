@@ -1,10 +1,9 @@
 """An Azure Kinect's factory calibration, the JSON in its memory and its recordings.
 
 Source convention: K in shares of the calibrated sensor's size, pixels with the first centre at 0.5 (shift
--0.5) as in the maker's own code (`k4a_calibration`); OpenCV axes; `Rt` takes points of the depth camera
-into the camera's, in metres. ModelParameters are cx cy fx fy k1..k6, the distortion's centre, p2 p1. The
-colour camera is of the whole sensor, or of the mode that is asked for: scaled in width, as much cut off
-above as below.
+-0.5) as in the maker's own code (`k4a_calibration`); OpenCV axes; `Rt` takes points of the depth camera into
+the camera's, in metres. ModelParameters are cx cy fx fy k1..k6, the distortion's centre, p2 p1. The colour
+camera is of the whole sensor, or of the requested mode: scaled in width, as much cut off above as below.
 """
 
 from __future__ import annotations
@@ -20,11 +19,17 @@ MODEL = "CALIBRATION_LensDistortionModelBrownConrady"
 
 
 def recognises(path: Path, head: str) -> bool:
+    """Return True for a text with the maker's `CalibrationInformation`."""
     return '"CalibrationInformation"' in head
 
 
 def read(source: RigSource) -> Rig:
-    """The cameras "depth" and "color"."""
+    """Read the cameras "depth" and "color".
+
+    Raises:
+        RigFileError: for a damaged file, another lens model, or a requested size that is no part of the
+            sensor.
+    """
     cameras = source.json()["CalibrationInformation"]["Cameras"].each()
     return source.rig(_camera(fields) for fields in cameras)
 

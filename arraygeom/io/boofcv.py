@@ -20,11 +20,16 @@ MODELS = ("pinhole_radial_tangential", "pinhole")
 
 
 def recognises(path: Path, head: str) -> bool:
+    """Return True for a text with BoofCV's lens model, or its `rightToLeft`."""
     return "pinhole_radial_tangential" in head or "rightToLeft" in head
 
 
 def read(source: RigSource) -> Rig:
-    """The pair "left", "right", or a single "camera"."""
+    """Read the pair "left" and "right", or a single "camera" at the origin.
+
+    Raises:
+        RigFileError: for a damaged file, another camera model, or more than three radial coefficients.
+    """
     document = source.yaml()
     if "pinhole" in document:
         return source.rig([("camera", _camera(document, Pose.identity()))])
@@ -49,7 +54,7 @@ def _camera(fields: Entry, pose: Pose) -> Camera:
 
 
 def _lens(lens: Entry) -> Distortion | None:
-    """k1 k2 p1 p2 k3 of `radial` (up to three numbers), t1 and t2."""
+    """Read k1 k2 p1 p2 k3 from `radial` (up to three numbers), t1 and t2."""
     radial = lens.get("radial")
     k = radial.numbers().tolist() if radial.value else []
     if len(k) > 3:

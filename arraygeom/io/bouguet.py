@@ -19,6 +19,7 @@ SIDES = ("left", "right")
 
 
 def recognises(path: Path, head: str) -> bool:
+    """Return True for a MAT-file with the toolbox's variables."""
     if not (path.is_file() and (path.suffix == ".mat" or head.startswith("MATLAB "))):
         return False
     try:
@@ -29,7 +30,11 @@ def recognises(path: Path, head: str) -> bool:
 
 
 def read(source: RigSource) -> Rig:
-    """The pair "left" and "right", or one camera, "camera"."""
+    """Read the pair "left" and "right", or one camera "camera" at the origin.
+
+    Raises:
+        RigFileError: for a damaged file, or missing variables.
+    """
     fields = source.at(load_variables(source))
     if "fc_left" not in fields:
         return source.rig([("camera", _camera(fields, "", Pose.identity()))])

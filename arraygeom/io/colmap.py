@@ -26,7 +26,14 @@ from .source import Entry, RigFileError, RigSource
 
 
 class _Model(NamedTuple):
-    """How a camera model's parameters are laid out: how many focal lengths, then cx cy, then the lens."""
+    """Layout of a camera model's parameters: focal lengths, then cx cy, then the lens.
+
+    Attributes:
+        id: number of the model in binary files.
+        focals: number of focal lengths, 1 or 2.
+        lens: name of our lens model; None for none.
+        coefficients: number of its coefficients.
+    """
 
     id: int
     focals: int
@@ -50,18 +57,25 @@ MODELS = {
 
 
 AT_ORIGIN = [1.0] + 6 * [0.0]
-"""QW QX QY QZ TX TY TZ."""
+"""QW QX QY QZ TX TY TZ of a pose at the origin."""
 
 Posed = tuple[Pose, int, str]
-"""Of an image, or of a camera in its rig: pose, the camera's id, name."""
+"""Pose of an image, or of a camera in its rig, with the camera's id and a name."""
 
 
 def recognises(path: Path, head: str) -> bool:
+    """Return True for a model's folder, one of its files, or a project folder."""
     return _folder(path) is not None
 
 
 def read(source: RigSource) -> Rig:
-    """The cameras of a model's rig, or one for each image. Name the folder or any file in it."""
+    """Read the cameras of a model's rig, or one for each image.
+
+    The path is that of the folder or of any file in it.
+
+    Raises:
+        RigFileError: for missing or damaged files, unknown models, or several rigs.
+    """
     folder = _folder(source.path)
     if folder is None:
         raise source.fail(
@@ -84,9 +98,13 @@ def read(source: RigSource) -> Rig:
 
 
 def write(rig: Rig) -> dict[str, str]:
-    """A text model: every camera of the rig as one camera and one image, no points.
+    """Format a text model: every camera of the rig as one camera and one image, no points.
 
-    Raises ValueError for what the format cannot hold.
+    Returns:
+        Texts by file name.
+
+    Raises:
+        ValueError: for names of several lines, and what the format cannot hold.
     """
     cameras = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
     images = ["# IMAGE_ID, QW..QZ, TX..TZ, CAMERA_ID, NAME"]
@@ -107,7 +125,8 @@ def write(rig: Rig) -> dict[str, str]:
 
 
 def _folder(path: Path) -> Path | None:
-    """The folder with the model, from itself, one of its files, or the project folder."""
+    """Return the folder with the model, from itself, one of its files, or the project folder;
+    None for none."""
     files = {
         f"{stem}{suffix}" for stem in ("cameras", "images", "rigs", "frames") for suffix in (".txt", ".bin")
     }
@@ -136,7 +155,7 @@ def _camera(source: RigSource, cameras: dict[int, LensView], i: int, pose: Pose)
 
 
 def _pose(entry: Entry) -> Pose:
-    """From QW QX QY QZ TX TY TZ."""
+    """Read a pose from QW QX QY QZ TX TY TZ."""
     numbers = entry.numbers((7,))
     q, t = numbers.split([4, 3])
     if not (q.norm() - 1).abs() < ROUNDED:
@@ -153,13 +172,13 @@ def _sensor(entry: Entry, camera: int, numbers: list[float] | None) -> Posed:
 
 
 def _sensor_name(camera: int, images: list[Posed]) -> str:
-    """The folder that all images of the camera are in, if they are in one; else after its id."""
+    """Return the folder that all images of the camera are in, if they are in one; else a name from its id."""
     folders = {str(Path(name).parent) for _, i, name in images if i == camera}
     return folders.pop() if len(folders) == 1 and "." not in folders else f"camera{camera}"
 
 
 def _intrinsics(entry: Entry, model: str) -> LensView:
-    """From WIDTH HEIGHT PARAMS."""
+    """Read a view from WIDTH HEIGHT PARAMS."""
     if model not in MODELS:
         raise entry.fail(f"has model {model}, which is not read: calibrate with one of {', '.join(MODELS)}")
     kind = MODELS[model]
@@ -179,7 +198,7 @@ def _intrinsics(entry: Entry, model: str) -> LensView:
 
 
 def _cameras_text(source: RigSource) -> Iterator[tuple[Entry, int, str]]:
-    """WIDTH HEIGHT PARAMS, the id and the model of every line CAMERA_ID MODEL WIDTH HEIGHT PARAMS."""
+    """Yield WIDTH HEIGHT PARAMS, the id and the model of every line CAMERA_ID MODEL WIDTH HEIGHT PARAMS."""
     for entry in _lines(source, "cameras"):
         fields = entry.value.split()
         if len(fields) < 5:
@@ -188,7 +207,8 @@ def _cameras_text(source: RigSource) -> Iterator[tuple[Entry, int, str]]:
 
 
 def _images_text(source: RigSource) -> Iterator[Posed]:
-    """Every other line; those between hold the points, X Y POINT3D_ID each, and may be blank."""
+    """Yield the images of every other line; those between hold the points, X Y POINT3D_ID each, and may be
+    blank."""
     for entry in _lines(source, "images", every=2):
         fields = entry.value.split(maxsplit=9)
         if len(fields) != 10:
@@ -205,7 +225,8 @@ def _rigs_text(source: RigSource) -> list[list[Posed]]:
 
 
 def _sensors(entry: Entry) -> Iterator[Posed]:
-    """RIG_ID NUM_SENSORS REF_TYPE REF_ID, then TYPE ID HAS_POSE [QW QX QY QZ TX TY TZ] for the others."""
+    """Yield cameras of RIG_ID NUM_SENSORS REF_TYPE REF_ID, then TYPE ID HAS_POSE [QW QX QY QZ TX TY TZ] for
+    the others."""
     tokens = iter(entry.value.split()[1:])
     try:
         for k in range(int(next(tokens))):
@@ -222,7 +243,8 @@ def _sensors(entry: Entry) -> Iterator[Posed]:
 
 
 def _lines(source: RigSource, what: str, every: int = 1) -> list[Entry]:
-    """The lines that are no comments, nor blank (of an image's two the second may be); as many as stated."""
+    """Return the lines that are no comments, nor blank (of an image's two the second may be); as many as
+    stated."""
     lines = [(n, line) for n, line in enumerate(source.text().splitlines(), 1) if not line.startswith("#")]
     first = next((i for i, (_, line) in enumerate(lines) if line.strip()), 0)
     content = [source.at(line, f"line {n}") for n, line in lines[first::every] if line.strip()]
@@ -268,7 +290,7 @@ def _images_binary(source: RigSource) -> Iterator[Posed]:
 
 
 def _rigs_binary(source: RigSource) -> list[list[Posed]]:
-    """The cameras of each rig; other sensors are passed over."""
+    """Read the cameras of each rig; other sensors are left out."""
     data, rigs = _Bytes(source), []
     for _ in range(data.count()):
         rig, count = data.take("<II")
@@ -287,7 +309,7 @@ PARTS: dict[str, tuple[Any, Any, Any]] = {
     ".txt": (_cameras_text, _images_text, _rigs_text),
     ".bin": (_cameras_binary, _images_binary, _rigs_binary),
 }
-"""How cameras, images and rigs are read, by the ending of their files."""
+"""Functions that read cameras, images and rigs, by the suffix of their files."""
 
 
 class _Bytes:
@@ -297,7 +319,11 @@ class _Bytes:
         self.source, self.data, self.at = source, source.content(), 0
 
     def take(self, layout: str) -> tuple[Any, ...]:
-        """The next values."""
+        """Return the next values of a `struct` layout.
+
+        Raises:
+            RigFileError: if the file ends before.
+        """
         try:
             values = struct.unpack_from(layout, self.data, self.at)
         except struct.error:
@@ -306,7 +332,11 @@ class _Bytes:
         return values
 
     def count(self) -> int:
-        """The next count of entries."""
+        """Return the next count of entries.
+
+        Raises:
+            RigFileError: if the file cannot hold so many.
+        """
         (n,) = self.take("<Q")
         if n > len(self.data):
             raise self.source.fail(
@@ -315,7 +345,11 @@ class _Bytes:
         return int(n)
 
     def string(self) -> str:
-        """The next zero-terminated text."""
+        """Return the next zero-terminated text.
+
+        Raises:
+            RigFileError: if the file ends before.
+        """
         end = self.data.find(b"\0", self.at)
         if end < 0:
             raise self.source.fail(f"byte {self.at}", "the file ends within a name; was it cut off?")

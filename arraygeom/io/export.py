@@ -1,4 +1,4 @@
-"""What every writer shares: the numbers of a camera, or an error that says what the format cannot hold."""
+"""Numbers of a camera for every writer, with errors that state what a format cannot hold."""
 
 from __future__ import annotations
 
@@ -13,7 +13,11 @@ from ..rig import Rig
 
 
 def calibrated(rig: Rig, format: str) -> list[tuple[str, Camera]]:
-    """The rig's cameras. Raises ValueError if there are none, or one is uncalibrated or a batch."""
+    """Return the rig's cameras with their names.
+
+    Raises:
+        ValueError: if there are none, or one is uncalibrated or a batch.
+    """
     cameras = []
     for name, camera in rig.cameras.items():
         if not isinstance(camera, Camera):
@@ -33,7 +37,11 @@ def calibrated(rig: Rig, format: str) -> list[tuple[str, Camera]]:
 def focal_and_centre(
     name: str, camera: Camera, *, first_pixel: float = 0.0
 ) -> tuple[float, float, float, float]:
-    """fx, fy, cx, cy, the first pixel's centre at `first_pixel`. Raises ValueError if K has other entries."""
+    """Return fx, fy, cx, cy of a camera, in pixels whose first centre is `first_pixel`.
+
+    Raises:
+        ValueError: if K has skew, or is rotated or mirrored.
+    """
     (fx, skew, cx), (other, fy, cy) = camera.K[:2].tolist()
     if skew != 0 or other != 0 or min(fx, fy) <= 0:
         raise ValueError(
@@ -44,7 +52,11 @@ def focal_and_centre(
 
 
 def brown_conrady(name: str, lens: LensModel | None, *, at_most: int) -> list[float]:
-    """Brown-Conrady coefficients, four or more and no more than `at_most`; zeros for no lens."""
+    """Return Brown-Conrady coefficients, four or more and no more than `at_most`; zeros for no lens.
+
+    Raises:
+        ValueError: for another lens model, or more coefficients that are not 0.
+    """
     if lens is None:
         return [0.0] * 4
     c = lens.coefficients.tolist()
@@ -57,10 +69,10 @@ def brown_conrady(name: str, lens: LensModel | None, *, at_most: int) -> list[fl
 
 
 def pose_rows(R: Tensor, t: Tensor) -> list[list[float]]:
-    """The 4 x 4 matrix of a pose."""
+    """Return the 4 x 4 matrix of a pose, row by row."""
     return [[*row, x] for row, x in zip(R.tolist(), t.tolist())] + [[0.0, 0.0, 0.0, 1.0]]
 
 
 def at_origin(pose: Pose) -> bool:
-    """Whether a camera's frame is the world's."""
+    """Return True if a camera's frame is the world's, exactly."""
     return pose_rows(pose.R, pose.t) == torch.eye(4).tolist()

@@ -30,22 +30,27 @@ MODELS: dict[str, tuple[str | None, int, tuple[str, ...]]] = {
     "ds": (DOUBLE_SPHERE, 2, ("none",)),
     "eucm": (EXTENDED_UNIFIED, 2, ("none",)),
 }
-"""Of each camera model: the lens, the numbers before the focal lengths, distortion models."""
+"""Lens, number of numbers before the focal lengths, and distortion models, by camera model."""
 DISTORTIONS = {"radtan": (BROWN_CONRADY, 4), "equidistant": (KANNALA_BRANDT, 4), "fov": (FOV, 1)}
-"""The lens of a pinhole's distortion model, and how many numbers it has."""
+"""Lens of a pinhole's distortion model, and the number of its coefficients."""
 ALSO = ("plumb_bob", "radial-tangential", "fisheye")
-"""Distortion models as EuRoC and ROS name them."""
+"""Distortion models as named by EuRoC and ROS."""
 AGAIN = "calibrate again with --models pinhole-radtan, or ds-none for wide angles"
 
 
 def recognises(path: Path, head: str) -> bool:
+    """Return True for a camchain, EuRoC's sensor.yaml, or a folder of these."""
     if path.is_dir():
         return bool(_sensors(path))
     return "T_BS" in head or re.search(r"(?ms)^cam\d+:.*(camera_model|intrinsics)", head) is not None
 
 
 def read(source: RigSource) -> Rig:
-    """Cameras cam0, cam1, ...; EuRoC's sensor.yaml, or a folder of them, by the names of their folders."""
+    """Read cameras cam0, cam1, ...; EuRoC's sensor.yaml, or a folder of them, by the names of their folders.
+
+    Raises:
+        RigFileError: for a damaged file, a gap in the chain, or unsupported models.
+    """
     if files := _sensors(source.path) if source.path.is_dir() else []:
         return source.rig((file.parent.name, _sensor(source.beside(file).yaml())) for file in files)
     if "T_BS" in source.text():
@@ -61,21 +66,26 @@ def read(source: RigSource) -> Rig:
 
 
 def _sensors(folder: Path) -> list[Path]:
-    """EuRoC's files of cameras, in a data set's folder or its mav0."""
+    """List EuRoC's files of cameras, in a data set's folder or its mav0."""
     files = [file for place in ("", "*/", "mav0/*/") for file in sorted(folder.glob(f"{place}sensor.yaml"))]
     return [file for file in files if "camera" in decoded(file.read_bytes()[:4096])]
 
 
 def _sensor(fields: Entry) -> Camera:
-    """A camera of EuRoC's; the world is the body, to which T_BS takes points of the camera."""
+    """Read a camera of EuRoC's; the world is the body, to which T_BS takes points of the camera."""
     return _camera(fields, fields["T_BS"]["data"].pose_matrix().inverse())
 
 
 def write(rig: Rig) -> str:
-    """Cameras cam0, cam1, ... in the rig's order, the names stored in `rostopic`.
+    """Format cameras cam0, cam1, ... in the rig's order, with their names in `rostopic`.
 
     Kalibr's chain has no world: if cam0 is not at the origin, the world is written as the IMU.
-    Raises ValueError for what the format cannot hold.
+
+    Returns:
+        The text of a YAML file.
+
+    Raises:
+        ValueError: for what the format cannot hold.
     """
     cameras = calibrated(rig, "Kalibr")
     has_imu = not at_origin(cameras[0][1].cam_from_world)
@@ -95,7 +105,7 @@ def write(rig: Rig) -> str:
 
 
 def _poses(chain: list[Entry]) -> list[Pose]:
-    """Poses of the cameras in camera 0, or in the IMU if all of them state that."""
+    """Return poses of the cameras from camera 0, or from the IMU if all of them state that."""
     if all("T_cam_imu" in fields for fields in chain):
         return [fields["T_cam_imu"].pose_matrix() for fields in chain]
     poses = [Pose.identity()]
@@ -121,7 +131,8 @@ def _camera(fields: Entry, pose: Pose) -> Camera:
 
 
 def _lens(camera: str, before: list[float], fields: Entry) -> Distortion | None:
-    """The lens of a camera model and a distortion model; `before` are the numbers before focal lengths."""
+    """Read the lens of a camera model and a distortion model; `before` are the numbers before
+    focal lengths."""
     lens, _, supported = MODELS[camera]
     model = fields.get("distortion_model")
     coefficients = fields.find(LENS_NAME)
@@ -155,7 +166,7 @@ def _entry(name: str, camera: Camera) -> dict[str, Any]:
 
 
 def _spelled(name: str, lens: LensModel | None) -> tuple[str, list[float], str, list[float]]:
-    """Camera model, what stands before its focal lengths, distortion model and coefficients."""
+    """Return camera model, the numbers before its focal lengths, distortion model and coefficients."""
     c = [] if lens is None else lens.coefficients.tolist()
     if lens is None:
         return "pinhole", [], "none", []

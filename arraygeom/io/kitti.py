@@ -18,15 +18,20 @@ from ..rig import Rig
 from .source import Entry, RigSource, pose_of
 
 ENTRIES = r"(P|S|K|D|R|T)\d?(_rect)?(_\d\d)?"
-"""Names of the lines that are read; others may be dates, say."""
+"""Pattern of the names of lines that are read; others may be dates, say."""
 
 
 def recognises(path: Path, head: str) -> bool:
+    """Return True for a text with lines of rectified cameras."""
     return re.search(r"^(P0|P_rect_0\d):", head, re.MULTILINE) is not None
 
 
 def read(source: RigSource) -> Rig:
-    """The rectified cameras: P0..P3 of `calib.txt`, P_rect and S_rect of `calib_cam_to_cam.txt`."""
+    """Read the rectified cameras: P0..P3 of `calib.txt`, P_rect and S_rect of `calib_cam_to_cam.txt`.
+
+    Raises:
+        RigFileError: for a damaged file, or one without such a camera.
+    """
     entries = source.lines(":", ENTRIES)
     names = [name for name in entries.value if re.fullmatch(r"P\d|P_rect_\d\d", name)]
     if not names:
@@ -45,15 +50,20 @@ def _rectified(entries: Entry, name: str) -> Camera:
 
 
 class Raw:
-    """Reader of the cameras as they are, before rectification, in `calib_cam_to_cam.txt`."""
+    """Reader of the cameras before rectification, in `calib_cam_to_cam.txt`."""
 
     @staticmethod
     def recognises(path: Path, head: str) -> bool:
+        """Return True for a text with lines of raw cameras."""
         return re.search(r"^K_0\d:", head, re.MULTILINE) is not None
 
     @staticmethod
     def read(source: RigSource) -> Rig:
-        """The unrectified cameras: S, K, D, R and T."""
+        """Read the unrectified cameras from S, K, D, R and T.
+
+        Raises:
+            RigFileError: for a damaged file, or one without such a camera.
+        """
         entries = source.lines(":", ENTRIES)
         numbers = sorted(name[-2:] for name in entries.value if re.fullmatch(r"K_\d\d", name))
         if not numbers:

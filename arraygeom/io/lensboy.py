@@ -21,15 +21,20 @@ from ..rig import Rig
 from .source import Entry, RigSource
 
 OLDEST = 3
-"""The first version whose splines are these."""
+"""First version whose splines have this form."""
 
 
 def recognises(path: Path, head: str) -> bool:
+    """Return True for a text with lensboy's version."""
     return '"lensboy-version"' in head
 
 
 def read(source: RigSource) -> Rig:
-    """The one camera, by its file's name."""
+    """Read the one camera, at the origin and named by its file.
+
+    Raises:
+        RigFileError: for a damaged file, an unsupported lens, or splines of an older version.
+    """
     fields = source.json()
     K = fields.listed("fx", "fy", "cx", "cy").focal_and_centre()
     camera = Camera(

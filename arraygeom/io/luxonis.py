@@ -16,16 +16,24 @@ from .source import Entry, RigSource, pose_of
 
 PERSPECTIVE, FISHEYE = 0, 1
 CENTIMETRES = 1
-"""What a `lengthUnit`, if there is one, may be."""
+"""Accepted value of a `lengthUnit`, if there is one."""
 SOCKETS = "ABCDEFGHIJ"
 
 
 def recognises(path: Path, head: str) -> bool:
+    """Return True for a text with the JSON's own keys."""
     return '"cameraData"' in head or ('"boardName"' in head and '"boardRev"' in head)
 
 
 def read(source: RigSource) -> Rig:
-    """The calibrated cameras by their sockets: "CAM_A" (colour on most), "CAM_B", "CAM_C", ..."""
+    """Read the calibrated cameras by their sockets: "CAM_A" (colour on most), "CAM_B", "CAM_C", ...
+
+    Cameras whose K is zeros are left out, with a warning.
+
+    Raises:
+        RigFileError: for a damaged file, no calibrated camera, other units, or extrinsics that are circular
+            or relate not all cameras.
+    """
     listed = source.json()["cameraData"]
     entries: dict[int, Entry] = {}
     left_out: list[str] = []
@@ -61,7 +69,8 @@ def _name(socket: int) -> str:
 
 
 def _to_root(entries: dict[int, Entry], socket: int) -> tuple[int, Pose]:
-    """The camera that a chain of extrinsics ends at, and its points from the first camera's."""
+    """Return the camera at which a chain of extrinsics ends, and the pose that takes points of this one into
+    it."""
     pose, passed = Pose.identity(), [socket]
     while True:
         extrinsics = entries[passed[-1]].get("extrinsics")

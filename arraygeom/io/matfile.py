@@ -1,4 +1,5 @@
-"""MAT-files of version 5, walked before scipy, which trusts their lengths: a damaged one can crash it.
+"""MAT-files of version 5, checked before scipy reads them: it trusts their lengths, and a damaged one can
+crash it.
 
 Layout: "MAT-File Format" (MathWorks). A header of 128 bytes, then elements of a tag (type, bytes) and data,
 padded to 8 bytes; a matrix is an element whose data are elements again: flags, dimensions, name, contents.
@@ -17,12 +18,12 @@ from ..runtime.extras import needs
 from .source import RigSource
 
 LARGEST = 2**26
-"""Bytes of a file, and of a variable that is unpacked."""
+"""Largest size in bytes of a file, and of a variable that is unpacked."""
 DEEPEST = 20
-"""Structs and cells within one another."""
+"""Largest depth of nested structs and cells."""
 MATRIX, COMPRESSED = 14, 15
 SIZES = {1: 1, 2: 1, 3: 2, 4: 2, 5: 4, 6: 4, 7: 4, 9: 8, 12: 8, 13: 8, 16: 1, 17: 2, 18: 4}
-"""Bytes a value of the types of data."""
+"""Bytes per value, by type of data."""
 CELL, STRUCT, TEXT, NUMBERS = 1, 2, 4, range(6, 16)
 COMPLEX = 0x800
 
@@ -33,7 +34,14 @@ class _Element(NamedTuple):
 
 
 def load_variables(source: RigSource) -> dict[str, Any]:
-    """The variables of a .mat file made of structs, cells, text and numbers, by name. Raises RigFileError."""
+    """Load the variables of a .mat file made of structs, cells, text and numbers.
+
+    Returns:
+        Values by name: structs as mappings, numbers as arrays or scalars.
+
+    Raises:
+        RigFileError: for an empty or damaged file, or one of another version.
+    """
     data = source.content()
     if not data:
         raise source.fail(None, "is empty")
@@ -50,9 +58,10 @@ def load_variables(source: RigSource) -> dict[str, Any]:
 
 
 def readable_variables(content: bytes) -> list[str]:
-    """Names of the variables that consist of structs, cells, text and numbers only.
+    """List the names of the variables that consist of structs, cells, text and numbers only.
 
-    Raises ValueError for a file that is not a MAT-file of version 5, or is damaged.
+    Raises:
+        ValueError: for a file that is not a MAT-file of version 5, too large, or damaged.
     """
     if len(content) > LARGEST:
         raise ValueError(f"it has {len(content)} bytes; at most {LARGEST} are read")
@@ -85,7 +94,11 @@ def _unpacked(data: memoryview) -> memoryview:
 
 
 def _elements(data: memoryview, order: str) -> Iterator[_Element]:
-    """The elements one after the other. Raises ValueError for one that is not whole."""
+    """Yield the elements one after the other.
+
+    Raises:
+        ValueError: for one that is not whole.
+    """
     offset = 0
     while offset < len(data):
         if offset + 8 > len(data):
@@ -105,7 +118,11 @@ def _elements(data: memoryview, order: str) -> Iterator[_Element]:
 
 
 def _check_matrix(data: memoryview, order: str, depth: int) -> str | None:
-    """The name of a matrix, None for one of a class that is not read; raises ValueError for a damaged one."""
+    """Return the name of a matrix; None for one of a class that is not read.
+
+    Raises:
+        ValueError: for a damaged one.
+    """
     if depth > DEEPEST:
         raise ValueError(f"it is nested more than {DEEPEST} deep")
     parts = _elements(data, order)
@@ -126,7 +143,11 @@ def _check_matrix(data: memoryview, order: str, depth: int) -> str | None:
 
 
 def _check_contents(parts: Iterator[_Element], order: str, depth: int, what: tuple[int, int, bool]) -> bool:
-    """Whether a matrix, and those in it, can be read. Raises ValueError for other sizes than it states."""
+    """Return True if a matrix, and those in it, can be read.
+
+    Raises:
+        ValueError: for other sizes than it states.
+    """
     kind, count, is_complex = what
     if kind in (CELL, STRUCT):
         wanted = count * (_fields(parts, order) if kind == STRUCT else 1)
@@ -149,7 +170,11 @@ def _check_contents(parts: Iterator[_Element], order: str, depth: int, what: tup
 
 
 def _fields(parts: Iterator[_Element], order: str) -> int:
-    """How many fields a struct has."""
+    """Return the number of a struct's fields.
+
+    Raises:
+        ValueError: if their names are damaged.
+    """
     length, names = (next(parts, _Element(0, memoryview(b""))) for _ in range(2))
     if length.kind != 5 or len(length.data) != 4 or names.kind != 1:
         raise ValueError("a struct has no field names")

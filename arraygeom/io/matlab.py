@@ -41,6 +41,7 @@ UNITS = {name: metres for metres, names in METRES.items() for name in names}
 
 
 def recognises(path: Path, head: str) -> bool:
+    """Return True for a MAT-file, or a JSON text with MATLAB's names of parameters."""
     names = (
         "CameraParameters1",
         "PoseCamera2",
@@ -53,7 +54,12 @@ def recognises(path: Path, head: str) -> bool:
 
 
 def read(source: RigSource) -> Rig:
-    """The pair, named "camera1" and "camera2", or a single camera "camera1"."""
+    """Read the pair "camera1" and "camera2", or a single camera "camera1" at the origin.
+
+    Raises:
+        RigFileError: for a damaged file, a MATLAB object in place of a struct, unknown units, or a
+            fundamental matrix that contradicts the pose.
+    """
     fields = _outermost(source)
     if "CameraParameters1" not in fields:
         return source.rig([("camera1", _camera(fields, Pose.identity()))])
@@ -65,7 +71,7 @@ def read(source: RigSource) -> Rig:
 
 
 def _outermost(source: RigSource) -> Entry:
-    """The struct itself, or the first variable of the file that holds one."""
+    """Return the struct itself, or the first variable of the file that holds one."""
     with source.path.open("rb") as file:
         is_text = source.path.suffix != ".mat" and not file.read(7).startswith(b"MATLAB ")
     fields = source.json().value if is_text else load_variables(source)
@@ -134,7 +140,7 @@ def _lens(fields: Entry) -> Distortion | None:
 
 
 def _pose(fields: Entry) -> Pose:
-    """X_2 = R X_1 + t, in metres."""
+    """Read the pose X_2 = R X_1 + t, in metres."""
     unit = str(fields.get("WorldUnits").value or "mm").strip().lower()
     if unit not in UNITS:
         raise fields["WorldUnits"].fail(f"is '{unit}'; known: {', '.join(UNITS)}")
@@ -148,7 +154,11 @@ def _pose(fields: Entry) -> Pose:
 
 
 def _check_fundamental(F: Entry, one: Camera, two: Camera) -> None:
-    """Points both pinholes see have to be on the lines of F as stated, which is of pixels counted from 1."""
+    """Check that points both pinholes see are on the lines of F as stated, which is of pixels counted from 1.
+
+    Raises:
+        RigFileError: if their median distance is a pixel or more.
+    """
     h, w = one.hw
     x = pixel_grid((4, 4), dtype=torch.float64).reshape(-1, 2) * torch.tensor([w / 4, h / 4])
     baseline = two.centre.norm()

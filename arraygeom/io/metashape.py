@@ -26,11 +26,16 @@ LENS_NUMBERS = ("k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
 
 
 def recognises(path: Path, head: str) -> bool:
+    """Return True for a text with a chunk of Metashape's."""
     return "<chunk" in head
 
 
 def read(source: RigSource) -> Rig:
-    """All aligned cameras of the file's one chunk."""
+    """Read all aligned cameras of the file's one chunk, by label; others are left out with a warning.
+
+    Raises:
+        RigFileError: for a damaged file, several chunks, no aligned camera, or lens terms that are not read.
+    """
     chunks = list(_document(source).iter("chunk"))
     if len(chunks) != 1:
         raise source.fail("chunk", f"occurs {len(chunks)} times: export one chunk's cameras")
@@ -69,7 +74,8 @@ def read(source: RigSource) -> Rig:
 
 
 def _name(camera: ET.Element, labels: Counter[str | None]) -> str:
-    """An image's label; of several with one label with its folder, where that is stated, else its number."""
+    """Return an image's label; of several with one label with its folder, where that is stated, else its
+    number."""
     label, photo = camera.get("label"), camera.find(".//photo")
     if label is None or labels[label] == 1:
         return label or f"camera{camera.get('id')}"
@@ -77,7 +83,7 @@ def _name(camera: ET.Element, labels: Counter[str | None]) -> str:
 
 
 def _offset(source: RigSource, sensor: ET.Element) -> Pose | None:
-    """The master's points from a slave's, in a multi-camera system; None if the sensor does not state it."""
+    """Return the pose that takes a slave's points into the master's; None if the sensor does not state it."""
     R, t = sensor.findtext("rotation"), sensor.findtext("location")
     if R is None and t is None:
         return None
@@ -89,7 +95,11 @@ def _offset(source: RigSource, sensor: ET.Element) -> Pose | None:
 
 
 def _document(source: RigSource) -> ET.Element:
-    """The parsed text, once it is not too large and defines no entities."""
+    """Return the parsed text.
+
+    Raises:
+        RigFileError: if it is too large, defines entities, or is no XML.
+    """
     text = source.text(LARGEST_TEXT)
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise source.fail(None, "defines entities, which Metashape does not write")
@@ -100,7 +110,7 @@ def _document(source: RigSource) -> ET.Element:
 
 
 def _sensor(source: RigSource, sensor: ET.Element, entry: str) -> LensView:
-    """A sensor's last calibration (the adjusted one, where there are two)."""
+    """Read a sensor's last calibration (the adjusted one, where there are two)."""
     calibrations = sensor.findall("calibration")
     if not calibrations:
         raise source.fail(entry, "has no calibration: optimise the cameras, and export again")
@@ -132,11 +142,11 @@ def _lens(fields: Entry, kind: str) -> Distortion | None:
 
 
 def _scale(source: RigSource, element: ET.Element) -> float | None:
-    """Metres a unit of a chunk or a component, if that is known."""
+    """Return metres per unit of a chunk or a component; None if not stated."""
     text = element.findtext("transform/scale")
     return None if text is None else source.at(text, "scale").words().number()
 
 
 def _number(fields: Entry, name: str) -> float:
-    """A number of a calibration; 0 where it is not stated, but for f."""
+    """Return a number of a calibration; 0 where it is not stated, except for f."""
     return (fields[name] if name == "f" else fields.get(name, "0")).words().number()

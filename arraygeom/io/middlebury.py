@@ -19,11 +19,16 @@ from .source import RigSource
 
 
 def recognises(path: Path, head: str) -> bool:
+    """Return True for a text with a line of cam0."""
     return re.search(r"^cam0\s*=\s*\[", head, re.MULTILINE) is not None
 
 
 def read(source: RigSource) -> Rig:
-    """The pair cam0, cam1."""
+    """Read the pair cam0, cam1, with the depth range of the stated disparities.
+
+    Raises:
+        RigFileError: for a damaged file, a baseline that is not positive, or a contradictory `doffs`.
+    """
     entries = source.lines("=", ".*")
     Ks = [entries[name].intrinsics() for name in ("cam0", "cam1")]
     baseline = entries["baseline"].number()

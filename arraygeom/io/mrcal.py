@@ -21,21 +21,26 @@ from .source import Entry, RigSource, pose_of
 
 SUFFIX = ".cameramodel"
 LENSES = {"LENSMODEL_PINHOLE": 0, **{f"LENSMODEL_OPENCV{n}": n for n in (4, 5, 8, 12)}}
-"""How many coefficients follow fx, fy, cx, cy."""
+"""Number of coefficients after fx, fy, cx, cy, by lens model."""
 SPHERE = "LENSMODEL_LONLAT"
 SPLINED = re.compile(
     r"LENSMODEL_SPLINED_STEREOGRAPHIC_order=([23])_Nx=(\d+)_Ny=(\d+)_fov_x_deg=(\d+(?:\.\d+)?)"
 )
 LONGEST = 1_000_000
-"""Characters of a file at most: splined models have thousands of numbers."""
+"""Largest number of characters of a file: splined models have thousands of numbers."""
 
 
 def recognises(path: Path, head: str) -> bool:
+    """Return True for a file with mrcal's suffix or lens models, or a folder of such files."""
     return any(path.glob(f"*{SUFFIX}")) if path.is_dir() else path.suffix == SUFFIX or "LENSMODEL_" in head
 
 
 def read(source: RigSource) -> Rig:
-    """The cameras by the names of their files."""
+    """Read the cameras by the names of their files.
+
+    Raises:
+        RigFileError: for a damaged file, or an unsupported lens model.
+    """
     files = sorted(source.path.glob(f"*{SUFFIX}")) if source.path.is_dir() else [source.path]
     return source.rig((file.stem, _camera(source.beside(file))) for file in files)
 
@@ -55,7 +60,7 @@ def _camera(source: RigSource) -> Camera:
 
 
 def _lens(model: Entry, numbers: Entry) -> LensModel | None:
-    """The lens of a model's name and of what follows focal lengths and centre in the numbers."""
+    """Read the lens of a model from the numbers after focal lengths and centre."""
     name = str(model.value)
     splined = SPLINED.fullmatch(name)
     if not splined and name not in LENSES and name != SPHERE:
@@ -74,7 +79,7 @@ def _lens(model: Entry, numbers: Entry) -> LensModel | None:
 
 
 def _fields(source: RigSource) -> Entry:
-    """What the file, a dictionary of Python's literals with comments, says."""
+    """Return the entries of the file, a dictionary of Python's literals with comments."""
     text = source.text(LONGEST)
     try:
         document = ast.literal_eval(text.strip())

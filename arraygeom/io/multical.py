@@ -16,11 +16,16 @@ from .source import LENS_NAME, Entry, RigSource, pose_of
 
 
 def recognises(path: Path, head: str) -> bool:
+    """Return True for a text with multical's keys."""
     return '"cameras"' in head and ('"image_size"' in head or '"camera_poses"' in head)
 
 
 def read(source: RigSource) -> Rig:
-    """The cameras that have a pose, under their names."""
+    """Read the cameras, all of which must have a pose, under their names.
+
+    Raises:
+        RigFileError: for a damaged file, or a camera without a pose.
+    """
     document = source.json()
     cameras = dict(document["cameras"].items())
     poses = _poses(document["camera_poses"], cameras)
@@ -33,7 +38,7 @@ def read(source: RigSource) -> Rig:
 
 
 def _poses(entries: Entry, cameras: dict[str, Entry]) -> dict[str, Pose]:
-    """Poses by camera: those that are stated, then those that follow from others."""
+    """Return poses by camera: those that are stated, then those that follow from others."""
     links = []
     poses: dict[str, Pose] = {}
     for key, fields in entries.items():

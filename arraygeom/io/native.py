@@ -74,21 +74,37 @@ CALIBRATION = {"focal", "centre", "K", "rotation", "translation", "position", "d
 
 
 def recognises(path: Path, head: str) -> bool:
+    """Return True for a text with the format's name, or a YAML file with cameras."""
     return "arraygeom-rig" in head or (path.suffix in {".yaml", ".yml"} and "\ncameras:" in "\n" + head)
 
 
 def read(source: RigSource) -> Rig:
-    """The rig of a native file. Raises RigFileError naming the file, the entry and what to do."""
+    """Read the rig of a native file.
+
+    Raises:
+        RigFileError: for a damaged file; its text names the file, the entry and what to do.
+    """
     return _rig(source.yaml())
 
 
 def read_text(text: str, path: str | Path) -> Rig:
-    """The rig of a native file's text; `path` names it in errors."""
+    """Read the rig of a native file's text.
+
+    Args:
+        path: name of the file in errors; nothing is read from it.
+
+    Raises:
+        RigFileError: as `read`.
+    """
     return _rig(RigSource(Path(path)).yaml(text))
 
 
 def write(rig: Rig) -> str:
-    """The text of a native file. Raises ValueError for a batch of rigs."""
+    """Format a rig as the text of a native file.
+
+    Raises:
+        ValueError: for a batch of rigs, or a camera model that has no name or that no file can hold.
+    """
     if rig.batch_shape:
         raise ValueError(
             "a rig file holds one rig and this is a batch of "
@@ -135,7 +151,7 @@ def _rig(document: Entry) -> Rig:
 
 
 def _camera(fields: Entry, origin: float) -> View:
-    """A calibrated camera, a view with a lens alone, or one of which only the size is known."""
+    """Read a calibrated camera, a view with a lens alone, or one of which only the size is known."""
     _check_keys(fields, CAMERA)
     size, lens = fields.get("size"), fields.get("distortion")
     view = View(hw=Entry(size.source, _pair(size), size.name).size(), sensor=_sensor(fields))
@@ -155,7 +171,7 @@ def _camera(fields: Entry, origin: float) -> View:
 
 
 def _lens_view(fields: Entry, view: View, origin: float) -> View:
-    """An uncalibrated view whose lens states its own scale and centre."""
+    """Read an uncalibrated view whose lens states its own scale and centre."""
     kind = CAMERA_MODELS.get(str(fields.get("model").value))
     keys = ("coefficients",) if kind is None else tuple(f.name for f in dataclasses.fields(kind))  # type: ignore[arg-type]
     _check_keys(fields, ("model", *keys, "scale", "centre", "K"))
@@ -172,7 +188,7 @@ def _lens_view(fields: Entry, view: View, origin: float) -> View:
 
 
 def _intrinsics(fields: Entry, hw: HW, origin: float, scale: str = "focal") -> Tensor:
-    """The intrinsic matrix as stated, or by `scale` (a calibrated camera's focal lengths) and centre."""
+    """Read the intrinsic matrix as stated, or by `scale` (a calibrated camera's focal lengths) and centre."""
     if "K" in fields:
         K = fields.get("K").numbers((3, 3))
         if K[2].tolist() != [0, 0, 1] or K[:2, :2].det().abs() < 1e-9:
@@ -197,7 +213,7 @@ def _pose(fields: Entry) -> Pose:
 
 
 def _rotation(entry: Entry) -> Tensor:
-    """From a matrix, or a rotation vector in degrees."""
+    """Read a matrix, or a rotation vector in degrees."""
     if isinstance(entry.value, list) and entry.value and isinstance(entry.value[0], list):
         entry.numbers((3, 3))
         return entry.rotation()
@@ -220,7 +236,7 @@ def _lens(entry: Entry) -> LensModel | None:
 
 
 def _model(entry: Entry, kind: type[CameraModel]) -> CameraModel:
-    """A camera model with its own numbers: tensors, models within it, and what is neither as it is."""
+    """Read a camera model from its own numbers: tensors, models within it, and other values as they are."""
     fields = {f.name: f for f in dataclasses.fields(kind)}  # type: ignore[arg-type]
     _check_keys(entry, ("model", *fields))
     numbers: dict[str, Any] = {}
@@ -302,7 +318,7 @@ def _one_of(entry: Entry, choices: Iterable[Any]) -> Any:
 
 
 def _pair(entry: Entry) -> tuple[float, float]:
-    """Two numbers; a single one counts for both."""
+    """Return two numbers; a single one counts for both."""
     if entry.value is None:
         raise entry.fail("is missing; wanted two numbers, in pixels")
     if not isinstance(entry.value, list):
@@ -312,7 +328,7 @@ def _pair(entry: Entry) -> tuple[float, float]:
 
 
 def _made(entry: Entry, kind: Callable[..., T], *numbers: Any, **named: Any) -> T:
-    """What a constructor makes, its refusals with the entry's name."""
+    """Call a constructor; its errors get the entry's name."""
     try:
         return kind(*numbers, **named)
     except (TypeError, ValueError) as error:
@@ -333,7 +349,11 @@ def _camera_entry(camera: View) -> dict[str, Any]:
 
 
 def _model_entry(lens: LensModel) -> dict[str, Any]:
-    """A lens or a camera model with its numbers. Raises ValueError for one without a name."""
+    """Return a lens or a camera model with its numbers.
+
+    Raises:
+        ValueError: for one without a name, or with values that no file holds.
+    """
     if isinstance(lens, Distortion):
         return {"model": lens.model, "coefficients": lens.coefficients.tolist()}
     if not isinstance(lens, CameraModel) or not lens.registered:
@@ -379,7 +399,7 @@ def _link_entry(alpha: str, beta: str, link: Link) -> dict[str, Any]:
 
 
 class _Dumper(SafeDumper):
-    """Lists and tuples of numbers on one line."""
+    """YAML dumper that writes lists and tuples of numbers on one line."""
 
 
 def _represent_list(dumper: yaml.SafeDumper, items: Sequence[Any]) -> yaml.Node:

@@ -31,11 +31,16 @@ FLIP = Pose(
 
 
 def recognises(path: Path, head: str) -> bool:
+    """Return True for a text with the JSON's own keys."""
     return any(f'"{key}"' in head for key in ("transform_matrix", "fl_x", "camera_angle_x"))
 
 
 def read(source: RigSource) -> Rig:
-    """One camera for each frame, named by its `file_path`."""
+    """Read one camera for each frame, named by its `file_path`.
+
+    Raises:
+        RigFileError: for a damaged file, or an unsupported lens.
+    """
     document = source.json()
     frames, shared = document["frames"].each(), document.value
     cameras = []
@@ -46,7 +51,14 @@ def read(source: RigSource) -> Rig:
 
 
 def write(rig: Rig) -> str:
-    """A transforms.json with intrinsics in each frame. Raises ValueError for what the format cannot hold."""
+    """Format a transforms.json with intrinsics in each frame.
+
+    Returns:
+        The text of the file.
+
+    Raises:
+        ValueError: for what the format cannot hold.
+    """
     frames = [_frame(name, camera) for name, camera in calibrated(rig, "nerfstudio")]
     return json.dumps({"frames": frames}, indent=1) + "\n"
 
@@ -66,7 +78,7 @@ def _camera(fields: Entry) -> Camera:
 
 
 def _focal(fields: Entry, axis: str, size: int) -> float:
-    """Stated, or from the field of view in radians."""
+    """Return the stated focal length, or that of the field of view in radians."""
     stated = fields[f"fl_{axis}", f"camera_angle_{axis}"]
     if fields.get(f"fl_{axis}").value is not None:
         return stated.number()

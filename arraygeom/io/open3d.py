@@ -16,11 +16,16 @@ from .source import Entry, RigSource
 
 
 def recognises(path: Path, head: str) -> bool:
+    """Return True for a JSON text with Open3D's classes or keys."""
     return head.lstrip().startswith("{") and ('"PinholeCamera' in head or '"intrinsic_matrix"' in head)
 
 
 def read(source: RigSource) -> Rig:
-    """All cameras of a trajectory, or the one camera."""
+    """Read all cameras of a trajectory, or the one camera.
+
+    Raises:
+        RigFileError: for a damaged file.
+    """
     document = source.json()
     cameras = document["parameters"].each() if "parameters" in document else [document]
     return source.rig((f"cam{i}", _camera(fields)) for i, fields in enumerate(cameras))

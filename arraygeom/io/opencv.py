@@ -29,18 +29,24 @@ from .export import brown_conrady, calibrated, focal_and_centre
 from .source import K_NAME, LENS_NAME, R_NAME, T_NAME, Entry, RigSource, plain, pose_of
 
 MOST_NUMBERS = 10_000
-"""Of a matrix; a file may state any number."""
+"""Largest number of numbers of a matrix; a file may state any."""
 PARTS = ("intri", "extri")
 
 
 def recognises(path: Path, head: str) -> bool:
+    """Return True for a text of OpenCV's FileStorage, or a folder with a pair's files."""
     if path.is_dir():
         return any(_named(path, kind) for kind in PARTS)
     return "opencv-matrix" in head or "opencv_storage" in head or '"type_id": "opencv' in head
 
 
 def read(source: RigSource) -> Rig:
-    """One camera at the origin, named "camera"; or a pair, named "left" and "right" unless the file says."""
+    """Read one camera "camera" at the origin, or a pair "left" and "right", or cameras by the names that the
+    file states.
+
+    Raises:
+        RigFileError: for a damaged file, half a pair, or cameras without a common frame.
+    """
     entries: dict[str, Any] = {}
     for path in _files(source.path):
         entries |= _nodes(source.beside(path))
@@ -66,9 +72,14 @@ def read(source: RigSource) -> Rig:
 
 
 def write(rig: Rig) -> str | dict[str, str]:
-    """One camera as a file; two as `intrinsics.yml`, `extrinsics.yml` in a folder, the world as camera 1.
+    """Format one camera as a file; two as `intrinsics.yml` and `extrinsics.yml` of a folder, with camera 1 as
+    the world.
 
-    Raises ValueError for more cameras, and for what the format cannot hold.
+    Returns:
+        A text, or texts by file name.
+
+    Raises:
+        ValueError: for more cameras, and for what the format cannot hold.
     """
     cameras = calibrated(rig, "OpenCV")
     if len(cameras) == 1:
@@ -101,7 +112,7 @@ def _camera(nodes: Entry, i: str, pose: Pose) -> Camera:
 
 
 def _of_group(fields: Entry) -> Camera:
-    """A camera of MC-Calib's; its pose takes the camera's points into the group's reference camera."""
+    """Read a camera of MC-Calib's; its pose takes the camera's points into the group's reference camera."""
     K, pose = fields["camera_matrix"].intrinsics(), fields["camera_pose_matrix"].pose_matrix().inverse()
     if fields.get("camera_group", 0).number():
         raise fields["camera_group"].fail("is not 0: cameras of several groups have no common frame")
@@ -110,7 +121,7 @@ def _of_group(fields: Entry) -> Camera:
 
 
 def _named_camera(nodes: Entry, name: str) -> Camera:
-    """A camera of EasyMocap's intri.yml and extri.yml."""
+    """Read a camera of EasyMocap's intri.yml and extri.yml."""
     K, matrix_R, vector_R, t = (nodes.find(kind + name) for kind in ("k", "rot", "r", "t"))
     R = vector_R if matrix_R.value is None else matrix_R
     if K.value is None or R.value is None or t.value is None:
@@ -138,7 +149,7 @@ def _size(nodes: Entry, i: str, K: Tensor) -> HW:
 
 
 def _files(path: Path) -> list[Path]:
-    """The file, or the two files of a pair."""
+    """Return the file, or the two files of a pair."""
     if path.is_dir():
         return [file for kind in PARTS if (file := _named(path, kind))]
     for kind, other in (PARTS, PARTS[::-1]):
@@ -154,7 +165,11 @@ def _named(folder: Path, kind: str) -> Path | None:
 
 
 def _nodes(source: RigSource) -> dict[str, Any]:
-    """The outermost entries by name. Raises RigFileError for a file that OpenCV cannot read."""
+    """Return the outermost entries by name.
+
+    Raises:
+        RigFileError: for a file that OpenCV cannot read.
+    """
     text = source.text(LARGEST_TEXT)
     with needs("calibration", "reading OpenCV's files"):
         import cv2
@@ -170,7 +185,7 @@ def _nodes(source: RigSource) -> dict[str, Any]:
 
 
 def _check_nesting(source: RigSource, text: str) -> None:
-    """OpenCV's parsers recurse without a limit, and crash on files that nest deeply."""
+    """Raise RigFileError for files that nest deeply: OpenCV's parsers recurse without a limit, and crash."""
     depth = 0
     # Tags, brackets, and what nests within a line of YAML: "- - - 1" and "a: b: c: 1".
     for token in re.finditer(r"<(/?)[\w!?](?:[^<>]*?(/?)>)?|[\[{]|[\]}]", text):

@@ -2,7 +2,7 @@
 
 CSV: x0 y0 x1 y1 a line, in the order of two images given, first pixel's centre at 0; a header may name the
 columns. COLMAP: verified matches where there are any; the first pixel's centre is at 0.5 (shift -0.5); images
-by file name, and by folder where several are called alike.
+by file name, and by folder where several have one name.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from ..pixels import HW
 from .source import decoded
 
 MAX_IMAGES = 2**31 - 1
-"""COLMAP numbers the pair of images a < b as a * MAX_IMAGES + b (its documentation of the database)."""
+"""Factor in COLMAP's number of a pair of images a < b: a * MAX_IMAGES + b (its documentation of the
+database)."""
 COLUMNS = ("x0", "y0", "x1", "y1")
 SQLITE = b"SQLite format 3\0"
 
@@ -31,10 +32,19 @@ PointPairs = dict[tuple[str, str], tuple[Tensor, Tensor]]
 
 
 def read_matches(path: str | Path, files: Mapping[str, str | Path], sizes: Mapping[str, HW]) -> PointPairs:
-    """The matches of a file between the images of cameras, whose sizes are given too.
+    """Read the matches between the images of cameras from a file.
 
-    Raises FileNotFoundError, and ValueError for files of another kind, for more or fewer than two images with
-    a CSV file, for a database without these images, and for points outside the images.
+    Args:
+        files: image file of each camera; only names are used, the images are not opened.
+        sizes: height and width of each image, pixels.
+
+    Returns:
+        Points by pair of camera names, with pixel centres at whole numbers.
+
+    Raises:
+        FileNotFoundError: for a missing file.
+        ValueError: for files of another kind, more or fewer than two images with a CSV file, a database
+            without these images, and points outside the images.
     """
     path = Path(path)
     if not path.is_file():
@@ -56,7 +66,11 @@ def read_matches(path: str | Path, files: Mapping[str, str | Path], sizes: Mappi
 
 
 def _csv(path: Path, files: Mapping[str, Path]) -> PointPairs:
-    """The points of two images, x0,y0,x1,y1 a line. Raises ValueError naming a line that is none."""
+    """Read the points of two images, x0,y0,x1,y1 a line.
+
+    Raises:
+        ValueError: for a line that is not of numbers, by its text.
+    """
     if len(files) != 2:
         raise ValueError(
             f"{path}: x0 y0 x1 y1 relate two images, and {len(files)} are given: give two, or a database"
@@ -84,7 +98,8 @@ def _words(line: str) -> list[str]:
 
 
 def _named_columns(line: str) -> Sequence[int] | None:
-    """Where a header has x0, y0, x1, y1; the first four if it has none such; None for a line of numbers."""
+    """Return the columns of x0, y0, x1, y1 by a header; the first four if it has none such; None for a line
+    of numbers."""
     words = [word.strip("\"'").lower() for word in _words(line)]
     if any(map(_is_number, words)):
         return None
@@ -100,7 +115,7 @@ def _is_number(word: str) -> bool:
 
 
 def _numbers(line: str, columns: Iterable[int]) -> list[float] | None:
-    """The numbers in four columns of a line; None if there is none in one."""
+    """Return the numbers in four columns of a line; None unless each has one."""
     try:
         words = _words(line)
         return [float(words[i]) for i in columns]
@@ -132,7 +147,11 @@ def _colmap(database: sqlite3.Connection, path: Path, files: Mapping[str, Path])
 
 
 def _image(path: Path, file: Path, images: Sequence[tuple[Path, int]]) -> int:
-    """The number of the image called like a file; its folder too, where several are called so."""
+    """Return the number of the image named like a file; by its folder too, where several have one name.
+
+    Raises:
+        ValueError: for no or several such images.
+    """
     alike = [(name, number) for name, number in images if name.name == file.name]
     end = file.absolute().parts
     below = [(len(name.parts), number) for name, number in alike if end[-len(name.parts) :] == name.parts]
@@ -147,7 +166,7 @@ def _image(path: Path, file: Path, images: Sequence[tuple[Path, int]]) -> int:
 def _matches(
     database: sqlite3.Connection, table: str, names: Mapping[int, str]
 ) -> Iterator[tuple[tuple[int, int], NDArray[np.int64]]]:
-    """Pairs of image numbers, and the numbers of their matched keypoints (n, 2)."""
+    """Yield pairs of image numbers with the indices of their matched keypoints (n, 2)."""
     for pair, rows, data in database.execute(f"SELECT pair_id, rows, data FROM {table} WHERE rows > 0"):
         a, b = pair // MAX_IMAGES, pair % MAX_IMAGES
         if a in names and b in names:
@@ -155,7 +174,7 @@ def _matches(
 
 
 def _keypoints(database: sqlite3.Connection, image: int) -> Tensor:
-    """The keypoints of an image (n, 2)."""
+    """Return the keypoints of an image (n, 2)."""
     query = "SELECT rows, cols, data FROM keypoints WHERE image_id = ?"
     rows, columns, data = database.execute(query, (image,)).fetchone() or (0, 2, b"")
     points = np.frombuffer(data, np.float32).reshape(rows, columns)[:, :2]

@@ -16,12 +16,17 @@ from .source import K_NAME, LENS_NAME, R_NAME, T_NAME, Entry, RigSource, plain, 
 
 
 def recognises(path: Path, head: str) -> bool:
+    """Return True for a JSON text with a list named like K."""
     lists = re.findall(r'"([^"\n]{1,60})"\s*:\s*\[', head) if head.lstrip().startswith("{") else []
     return any(re.fullmatch(K_NAME, plain(name)) for name in lists)
 
 
 def read(source: RigSource) -> Rig:
-    """All cameras of the lists K, d, R, t; or the one camera."""
+    """Read all cameras of the lists K, d, R, t; or the one camera.
+
+    Raises:
+        RigFileError: for a damaged file, no K, or lists of different lengths.
+    """
     document = source.json()
     K, d, R, t = (document.find(name) for name in (K_NAME, LENS_NAME, R_NAME, T_NAME))
     if K.value is None:

@@ -1,4 +1,4 @@
-"""What `rs-enumerate-devices -c` prints of a RealSense camera, kept as a text file.
+"""Output of `rs-enumerate-devices -c` for a RealSense camera, kept as a text file.
 
 Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; `Extrinsic from "A" To "B"` takes
 points of A into B, in metres, the matrix row by row. The world is the depth camera, or the first stream that
@@ -28,7 +28,7 @@ ENTRY = re.compile(r"^\s*([^:\n]+?)\s*:\s*(.*?)\s*$", re.M)
 
 
 def recognises(path: Path, head: str) -> bool:
-    """The lists of modes before the intrinsics may be longer than what was read of the file."""
+    """Return True for a text with intrinsics; the lists of modes before them may be longer than `head`."""
     if not path.is_file() or head.lstrip().startswith(("{", "[")):
         return False
     whole = decoded(path.read_bytes()[:LONGEST]) if "Intel RealSense" in head else head
@@ -36,7 +36,11 @@ def recognises(path: Path, head: str) -> bool:
 
 
 def read(source: RigSource) -> Rig:
-    """The streams that are images, by name, each at the size that is asked for, else at its largest."""
+    """Read the streams that are images, by name, each at the requested size, else at its largest.
+
+    Raises:
+        RigFileError: for a damaged file, no stream, one without extrinsics, or an unsupported lens.
+    """
     text = source.text(LONGEST)
     streams: dict[str, tuple[HW, Entry]] = {}
     for name, listed in INTRINSIC.findall(text):
@@ -74,7 +78,7 @@ def _camera(fields: Entry, hw: HW, pose: Pose) -> Camera:
 
 
 def _lens(fields: Entry) -> Distortion | None:
-    """A lens; none of coefficients 0.
+    """Read a lens; None if all coefficients are 0.
 
     The modified model applies p1 and p2 to points that are distorted already: it is read where they are 0,
     and then the same. The inverse model's polynomial undistorts.

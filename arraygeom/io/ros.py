@@ -20,13 +20,18 @@ from .source import LENS_NAME, Entry, RigSource, decoded
 
 
 def recognises(path: Path, head: str) -> bool:
+    """Return True for the text of a CameraInfo, or a folder with one."""
     if path.is_dir():
         return any(_is_camera_info(decoded(file.read_bytes()[:4096])) for file in _yaml_files(path))
     return _is_camera_info(head)
 
 
 def read(source: RigSource) -> Rig:
-    """The cameras, under their `camera_name` (else the file's name)."""
+    """Read the cameras, under their `camera_name` (else the frame's, else the file's name).
+
+    Raises:
+        RigFileError: for a damaged file, or an unsupported lens.
+    """
     files = _yaml_files(source.path) if source.path.is_dir() else [source.path]
     infos = [file for file in files if len(files) == 1 or _is_camera_info(decoded(file.read_bytes()))]
     return source.rig(_camera(source.beside(file)) for file in infos)
@@ -54,7 +59,7 @@ def _camera(source: RigSource) -> tuple[str, Camera]:
 
 
 def _numbers(entry: Entry) -> Entry:
-    """The numbers of a file's matrix, or a message's."""
+    """Return the numbers of a file's matrix, or a message's."""
     return entry["data"] if isinstance(entry.value, dict) else entry
 
 

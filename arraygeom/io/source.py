@@ -1,4 +1,4 @@
-"""What every reader shares: a file's text, its numbers, and checks that name the entry they fail on."""
+"""A rig file's text, its numbers, and checks that name the entry they fail on, for every reader."""
 
 from __future__ import annotations
 
@@ -32,20 +32,20 @@ LENS_NAME = (
     r"|matrix|array|value)?s?|coef(f|ficient)?s?)"
 )
 R_NAME, T_NAME = "(r|rot|rotation)(vector|vec|matrix|mat)?", "(t|trans|translation)(vector|vec|matrix)?"
-"""Usual names of K, R, t and of a lens's coefficients, in small letters without signs."""
+"""Patterns of the usual names of K, R, t and of a lens's coefficients, in small letters without signs."""
 MODEL_NAMES = (
     r"(lens|distortion|dist)(model|type)",
     r"(is)?fisheye(model|lens|camera)?",
     r"(camera|cam|projection)?(model|type)|projection|lens",
 )
-"""Names of a lens's model, and those that may be of another thing."""
+"""Patterns of the names of a lens's model; the last may be of another thing."""
 SUSPECT = re.compile(
     rf"(left|right|[lr])?{LENS_NAME}(left|right|[lr]|\d*)|.*(distort|distcoef|coef|radial|tangential|fisheye"
     r"|dewarp|undist|thinprism|vignetting|hmatrix|blackl|blackc|units?$).*|xi|skew|alphac|is(omni|rectified)"
 )
-"""Names of what may be a lens, a flag or a unit."""
+"""Pattern of the names of what may be a lens, a flag or a unit."""
 SCALAR = re.compile(r"[kps][1-9]|t[12xy]")
-"""Names of a lens's numbers where they stand alone."""
+"""Pattern of the names of a lens's numbers where each is an entry."""
 HARMLESS = re.compile(
     r".*(err|std|sigma|cov|rms|noise|uncert|optim|name|path|initial|guess|squareunits|label|comment|frame|topic|title|serial).*"
 )
@@ -60,18 +60,31 @@ LENS_WORD = re.compile(
     "|".join([*BROWN_WORDS[:3], *FISHEYE_WORDS, ".*(fisheye|omni|fov|mei|eucm|sphere|division).*"])
 )
 SMALL_TANGENTIAL = 0.01
-"""Above, the tangential coefficients of a lens are more likely a fisheye's third and fourth."""
+"""Size above which the tangential coefficients of a lens are more likely a fisheye's third and fourth."""
 NO_MAPPING = "is not a mapping of names to values, or an empty one; is the file whole?"
 
 
 def decoded(content: bytes, errors: str = "replace") -> str:
-    """The text of a file in UTF-8, or in UTF-16 with a mark, as PowerShell's `>` writes what tools print."""
+    """Decode the text of a file in UTF-8, or in UTF-16 with a mark, as PowerShell's `>` writes the output of
+    tools.
+
+    Args:
+        errors: as of `bytes.decode`.
+
+    Raises:
+        UnicodeDecodeError: if `errors` is "strict", for bytes that are no such text.
+    """
     utf16 = content[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
     return content.decode("utf-16" if utf16 else "utf-8-sig", errors)
 
 
 class RigFileError(ValueError):
-    """A rig file that cannot be read: which file, which entry of it, and what to do, in one line."""
+    """A rig file that cannot be read: in one line, the file, its entry, and what to do.
+
+    Attributes:
+        path: the file.
+        entry: name of the entry; None for the file as a whole.
+    """
 
     def __init__(self, path: str | Path, entry: str | None, message: str) -> None:
         super().__init__(f"{path}: {entry}: {message}" if entry else f"{path}: {message}")
@@ -87,21 +100,28 @@ class RigFileWarning(UserWarning):
 
 
 class RigSource:
-    """One rig file being read. `hw` and `lens`: the images' size and the lens model, if files state none."""
+    """One rig file while it is read.
+
+    Attributes:
+        path: the file or folder.
+        hw: height and width of the images as stated by the user; None if unstated.
+        lens: lens model as stated by the user; None if unstated.
+        lookups: entries with the names that readers have looked up in each.
+    """
 
     def __init__(self, path: Path, *, hw: HW | None = None, lens: str | None = None) -> None:
         self.path, self.hw, self.lens = path, hw, lens
         self.lookups: dict[int, tuple[Entry, set[str]]] = {}
 
     def beside(self, path: Path) -> RigSource:
-        """Another file of the same rig."""
+        """Return another file of the same rig, with the user's statements and shared lookups."""
         source = RigSource(path, hw=self.hw, lens=self.lens)
         source.lookups = self.lookups
         return source
 
     def warn_of_unread(self) -> None:
-        """Warn of entries that no reader has looked up, beside others that it has, if they look like a lens,
-        a model, a flag or a unit."""
+        """Warn of entries that no reader has looked up, if they look like a lens, a model, a flag
+        or a unit."""
         unread: dict[Path, list[str]] = {}
         for entry, used in self.lookups.values():
             left = [
@@ -119,19 +139,24 @@ class RigSource:
                 )
 
     def fail(self, entry: str | None, message: str) -> RigFileError:
-        """The error to raise about an entry."""
+        """Return the RigFileError to raise about an entry; None for the file as a whole."""
         return RigFileError(self.path, entry, message)
 
     def warn(self, message: str) -> None:
-        """Warn about the file as a whole."""
+        """Give a RigFileWarning about the file as a whole."""
         warn(f"{self.path}: {message}", RigFileWarning)
 
     def at(self, value: Any, name: str = "") -> Entry:
-        """A value of the file, by its name there."""
+        """Return a value of the file with its name there."""
         return Entry(self, value, name)
 
     def content(self) -> bytes:
-        """The file's bytes; reading a pipe would wait for ever."""
+        """Return the file's bytes.
+
+        Raises:
+            RigFileError: for a file that cannot be read, and for a pipe, on which reading would wait for
+                ever.
+        """
         try:
             if not self.path.is_file() and self.path.exists():
                 raise self.fail(None, "is not a file: put the rig's own file there")
@@ -140,7 +165,14 @@ class RigSource:
             raise self.fail(None, f"cannot be read: {error.strerror}") from None
 
     def text(self, most: int | None = None) -> str:
-        """The file's text, of at most so many characters."""
+        """Return the file's text.
+
+        Args:
+            most: largest number of characters; None for any.
+
+        Raises:
+            RigFileError: for a file that cannot be read, is empty, too long, or no text.
+        """
         try:
             text = decoded(self.content(), "strict")
         except UnicodeDecodeError:
@@ -152,7 +184,11 @@ class RigSource:
         return text
 
     def json(self) -> Entry:
-        """The file as a JSON object without repeated keys."""
+        """Return the file as a JSON object without repeated keys.
+
+        Raises:
+            RigFileError: for any other file.
+        """
         text = self.text()
         try:
             document = load_json(text)
@@ -165,7 +201,11 @@ class RigSource:
         return self.at(document).mapping()
 
     def toml(self) -> Entry:
-        """The file as TOML."""
+        """Return the file as a TOML document that is not empty.
+
+        Raises:
+            RigFileError: for any other file.
+        """
         text = self.text()
         try:
             return self.at(tomllib.loads(text)).mapping()
@@ -173,7 +213,11 @@ class RigSource:
             raise self.fail(None, f"is not TOML ({error}); is the file whole?") from None
 
     def yaml(self, text: str | None = None) -> Entry:
-        """The file, or a text instead of it, as a YAML mapping without repeated keys."""
+        """Return the file, or a text instead of it, as a YAML mapping without repeated keys.
+
+        Raises:
+            RigFileError: for any other file.
+        """
         try:
             return self.at(load_yaml(self.text() if text is None else text)).mapping()
         except yaml.YAMLError as error:
@@ -183,7 +227,11 @@ class RigSource:
             ) from None
 
     def lines(self, separator: str, pattern: str) -> Entry:
-        """Numbers by name, one a line, of the names that a pattern matches; the text of others."""
+        """Return numbers by name, one a line, of the names that a pattern matches; the text of others.
+
+        Raises:
+            RigFileError: for a name that occurs twice, or values that are no numbers.
+        """
         entries: dict[str, Tensor | str] = {}
         for line in self.text().splitlines():
             name, separated, value = (text.strip() for text in line.partition(separator))
@@ -200,7 +248,18 @@ class RigSource:
         return self.at(entries)
 
     def size_unstated(self, K: Tensor | None) -> HW:
-        """The size for a file that states none: as given by the user, else guessed from K, with a warning."""
+        """Return the image size for a file that states none: the user's, else twice the principal point, with
+        a warning.
+
+        Args:
+            K: intrinsic matrix in our pixels; None if it depends on the size.
+
+        Returns:
+            Height and width in pixels.
+
+        Raises:
+            RigFileError: if the user states no size and K is None.
+        """
         if self.hw is not None:
             return self.hw
         if K is None:
@@ -216,7 +275,14 @@ class RigSource:
         return h, w
 
     def rig(self, cameras: Iterable[tuple[str, Camera]], **fields: Any) -> Rig:
-        """The rig, once no name occurs twice."""
+        """Return the rig of named cameras.
+
+        Args:
+            fields: further fields of the rig.
+
+        Raises:
+            RigFileError: for no camera, or a name that occurs twice.
+        """
         named: dict[str, Camera] = {}
         for name, camera in cameras:
             if name in named:
@@ -228,27 +294,41 @@ class RigSource:
 
 
 class Entry:
-    """A value in a rig file and its name there, with which errors begin (RigFileError)."""
+    """A value in a rig file and its name there. Its methods raise RigFileError, which begins with that name.
+
+    Attributes:
+        source: the file.
+        value: the value as parsed; None for an entry that is missing.
+        name: name in the file, with those of the mappings around it.
+    """
 
     def __init__(self, source: RigSource, value: Any, name: str) -> None:
         self.source, self.value, self.name = source, value, name
 
     def fail(self, message: str) -> RigFileError:
-        """The error to raise about the value."""
+        """Return the RigFileError to raise about the value."""
         return self.source.fail(self.name or None, message)
 
     def at(self, value: Any, name: str) -> Entry:
-        """A value within this one."""
+        """Return a value within this one, with its name there."""
         return Entry(self.source, value, f"{self.name}.{name}" if self.name else name)
 
     def mapping(self) -> Entry:
-        """This, a mapping with something in it."""
+        """Return this entry.
+
+        Raises:
+            RigFileError: unless it is a mapping that is not empty.
+        """
         if not self._named():
             raise self.fail(NO_MAPPING)
         return self
 
     def _named(self) -> Mapping[Any, Any]:
-        """What a mapping has by name."""
+        """Return the value.
+
+        Raises:
+            RigFileError: unless it is a mapping.
+        """
         if not isinstance(self.value, Mapping):
             raise self.fail(NO_MAPPING)
         return self.value
@@ -257,7 +337,11 @@ class Entry:
         return key in self._named()
 
     def __getitem__(self, keys: str | tuple[str, ...]) -> Entry:
-        """What a mapping has under the first of the keys that is there."""
+        """Return the entry under the first of the keys that is there and not None.
+
+        Raises:
+            RigFileError: if there is none.
+        """
         keys = (keys,) if isinstance(keys, str) else keys
         for key in keys:
             self.use(key)
@@ -266,7 +350,11 @@ class Entry:
         raise self.fail(f"has no {' or '.join(keys)}")
 
     def get(self, key: str, default: Any = None) -> Entry:
-        """What a mapping has under a key, or the default."""
+        """Return the entry under a key, or the default.
+
+        Raises:
+            RigFileError: unless this is a mapping.
+        """
         self.use(key)
         return self.at(self._named().get(key, default), key)
 
@@ -278,13 +366,27 @@ class Entry:
             self.source.lookups.setdefault(id(mapping), (entry, set()))[1].update(map(str, keys))
 
     def items(self) -> list[tuple[str, Entry]]:
-        """All that a mapping has."""
+        """Return all names and entries of a mapping.
+
+        Raises:
+            RigFileError: unless this is a mapping.
+        """
         self.use()
         return [(str(key), self.at(value, str(key))) for key, value in self._named().items()]
 
     def find(self, name: str, side: str = "") -> Entry:
-        """The entry whose name matches a pattern (small letters, no signs), and the side "1" or "2", or none;
-        with the value None if there is none. Names with the side are preferred; equal ones are an error."""
+        """Find the entry whose name matches a pattern (small letters, no signs), of one side of a pair or of
+        none.
+
+        Args:
+            side: "1" for the left camera, "2" for the right one, else "". Names with the side are preferred.
+
+        Returns:
+            The entry; its value is None if no name matches.
+
+        Raises:
+            RigFileError: if two names match whose values differ.
+        """
         ends = {"1": ("left|l", "1"), "2": ("right|r", "2")}.get(side)
         name = f"({name})"
         one = f"({ends[0]}){name}|{name}({ends[0]}|{ends[1]})" if ends else name
@@ -303,7 +405,11 @@ class Entry:
         return self.at(self.value[keys[0]], keys[0]) if keys else self.at(None, "")
 
     def model(self, side: str = "") -> Entry:
-        """The entry that names the lens's model, of one side or of all; its value is None if none does."""
+        """Find the entry that names the lens's model, of one side or of all; its value is None if none does.
+
+        Raises:
+            RigFileError: if two names match whose values differ.
+        """
         for name in MODEL_NAMES:
             for which in dict.fromkeys((side, "")):
                 word, sure = self.find(name, which), name != MODEL_NAMES[-1]
@@ -312,24 +418,47 @@ class Entry:
         return self.at(None, "")
 
     def sized(self, *keys: str, K: Tensor | None) -> HW:
-        """The size under two keys (width, height) or one, else that of a file without (`size_unstated`)."""
+        """Return the image size under two keys (width, height) or one, else that of a file without
+        (`size_unstated`).
+
+        Returns:
+            Height and width in pixels.
+
+        Raises:
+            RigFileError: for a size that is not positive and whole, or too large.
+        """
         if any(self.get(key).value is None for key in keys):
             return self.source.size_unstated(K)
         return (self[keys[0]] if len(keys) == 1 else self.listed(*keys)).size()
 
     def each(self) -> list[Entry]:
-        """The parts of a list."""
+        """Return the parts of a list.
+
+        Raises:
+            RigFileError: unless this is a list that is not empty.
+        """
         if not isinstance(self.value, list) or not self.value:
             raise self.fail("is no list, or an empty one; is the file whole?")
         return [Entry(self.source, value, f"{self.name}[{i}]") for i, value in enumerate(self.value)]
 
     def listed(self, *keys: str) -> Entry:
-        """What a mapping has under these keys, as one list."""
+        """Return the values of a mapping under these keys, as one list.
+
+        Raises:
+            RigFileError: if one is missing.
+        """
         return self.at([self[key].value for key in keys], ", ".join(keys))
 
     def tensor(self, *, infinite: bool = False, also: str = "") -> Tensor:
-        """Finite numbers (or infinite ones too), nested in lists or not, as a float64 tensor. `also` ends the
-        message where it holds something else."""
+        """Return the numbers, nested in lists or not, as a float64 tensor.
+
+        Args:
+            infinite: accept infinite numbers.
+            also: end of the message for other values.
+
+        Raises:
+            RigFileError: for NaN, infinity unless accepted, and values that are no numbers.
+        """
         tensor = float64_of(self.value)
         if tensor is None:
             raise self.fail(f"holds something other than numbers: {short(self.value)}{also}")
@@ -338,7 +467,15 @@ class Entry:
         return tensor
 
     def numbers(self, shape: tuple[int, ...] | None = None, *, infinite: bool = False) -> Tensor:
-        """Its numbers as a tensor of a shape (any nesting that has as many), or a vector."""
+        """Return the numbers as a tensor of a shape (from any nesting that has as many), or as a vector.
+
+        Args:
+            shape: wanted shape; None for a vector of any length.
+            infinite: accept infinite numbers.
+
+        Raises:
+            RigFileError: for another number of numbers, and as `tensor`.
+        """
         wanted = "" if shape is None else f", wanted {' x '.join(map(str, shape))}"
         tensor = self.tensor(infinite=infinite, also=wanted)
         if shape is not None and tensor.numel() != torch.Size(shape).numel():
@@ -346,7 +483,11 @@ class Entry:
         return tensor.reshape(shape or (-1,))
 
     def words(self) -> Entry:
-        """The numbers that a text, or several, consist of, between spaces."""
+        """Return the numbers of which a text, or several, consist, between spaces, as one list.
+
+        Raises:
+            RigFileError: for words that are no numbers.
+        """
         text = self.value if isinstance(self.value, str) else " ".join(self.value)
         try:
             return Entry(self.source, [float(word) for word in text.split()], self.name)
@@ -354,15 +495,27 @@ class Entry:
             raise self.fail(f"holds something other than numbers: {short(text)}") from None
 
     def number(self) -> float:
-        """One finite number."""
+        """Return one finite number.
+
+        Raises:
+            RigFileError: for anything else.
+        """
         return float(self.numbers((1,)))
 
     def transposed(self, side: int) -> Entry:
-        """A square matrix column by column."""
+        """Return a square matrix column by column.
+
+        Raises:
+            RigFileError: for another number of numbers.
+        """
         return Entry(self.source, self.numbers((side, side)).T, self.name)
 
     def size(self) -> HW:
-        """(height, width), positive and whole, from a width and a height."""
+        """Return height and width from a width and a height, in pixels.
+
+        Raises:
+            RigFileError: for a size that is not positive and whole, or too large.
+        """
         w, h = self.numbers((2,)).tolist()
         if min(w, h) < 1 or w != int(w) or h != int(h):
             raise self.fail(f"is {w:g} x {h:g}, wanted an image's width x height in whole pixels")
@@ -374,7 +527,11 @@ class Entry:
         return int(h), int(w)
 
     def intrinsics(self, first_pixel: float = 0.0) -> Tensor:
-        """K (3, 3) with the first pixel's centre moved from `first_pixel` to 0."""
+        """Return K (3, 3) with the first pixel's centre moved from `first_pixel` to 0.
+
+        Raises:
+            RigFileError: for another last row, or focal lengths that are not positive.
+        """
         K = self.numbers((3, 3))
         if K[2].tolist() != [0.0, 0.0, 1.0]:
             raise self.fail(f"has last row {short(K[2].tolist())}, wanted [0, 0, 1]; is it transposed?")
@@ -383,15 +540,23 @@ class Entry:
         return shift_matrix(first_pixel, first_pixel) @ K
 
     def focal_and_centre(self, first_pixel: float = 0.0, skew: float = 0.0) -> Tensor:
-        """K from [fx, fy, cx, cy]."""
+        """Return K from [fx, fy, cx, cy], with the first pixel's centre moved from `first_pixel` to 0.
+
+        Raises:
+            RigFileError: as `intrinsics`.
+        """
         fx, fy, cx, cy = self.numbers((4,)).tolist()
         K = [[fx, skew, cx], [0, fy, cy], [0, 0, 1]]
         return Entry(self.source, K, self.name).intrinsics(first_pixel)
 
     def rotation(self) -> Tensor:
-        """A rotation matrix from nine numbers, or three (a rotation vector in radians).
+        """Return a rotation matrix from nine numbers, or three (a rotation vector in radians).
 
         A deviation below 1e-3, as rounding in text files makes, is removed (nearest rotation).
+
+        Raises:
+            RigFileError: for other matrices, vectors longer than `LARGEST_ANGLE`, and another number of
+                numbers.
         """
         numbers = self.numbers()
         if numbers.numel() == 3:
@@ -410,14 +575,22 @@ class Entry:
         return R if error < 1e-12 else U @ Vh
 
     def pose_matrix(self, metres: float = 1.0) -> Pose:
-        """A pose from a 4 x 4 or 3 x 4 matrix with translations in units of `metres`."""
+        """Return a pose from a 4 x 4 or 3 x 4 matrix with translations in units of `metres`.
+
+        Raises:
+            RigFileError: for another last row, and as `rotation`.
+        """
         M = self.numbers((3, 4) if self.numbers().numel() == 12 else (4, 4))
         if len(M) == 4 and (M[3] - M.new_tensor([0, 0, 0, 1])).abs().max() > 1e-9:
             raise self.fail(f"has last row {short(M[3].tolist())}, wanted [0, 0, 0, 1]; is it transposed?")
         return Pose(Entry(self.source, M[:3, :3], self.name).rotation(), M[:3, 3] * metres)
 
     def brown_conrady(self) -> Distortion | None:
-        """A lens from OpenCV's coefficients, zero-padded to a number the model has; none if all are 0."""
+        """Return a lens from OpenCV's coefficients, zero-padded to a number the model has; None if all are 0.
+
+        Raises:
+            RigFileError: for more than 14.
+        """
         c = torch.zeros(0) if self.value is None else self.numbers()
         if not c.any():
             return None
@@ -427,17 +600,31 @@ class Entry:
         return Distortion(BROWN_CONRADY, torch.nn.functional.pad(c, (0, count - c.numel())))
 
     def kannala_brandt(self) -> Distortion:
-        """A fisheye lens from one to four coefficients."""
+        """Return a fisheye lens from one to four coefficients.
+
+        Raises:
+            RigFileError: for another number of them.
+        """
         c = self.numbers()
         if not 1 <= c.numel() <= 4:
             raise self.fail(f"has {c.numel()} coefficients; the fisheye model has 4 (k1 k2 k3 k4)")
         return Distortion(KANNALA_BRANDT, torch.nn.functional.pad(c, (0, 4 - c.numel())))
 
     def of_model(self, word: Entry) -> Distortion | None:
-        """The lens of the model that an entry names, by a word or a flag of fisheyes.
+        """Return the lens of the model that an entry names, by a word or a flag of fisheyes.
 
-        Where it names none: of the model that the user gives, else of OpenCV's that fits, with a warning if
+        Where it names none: of the model that the user states, else of OpenCV's that fits, with a warning if
         there are four numbers, which both have.
+
+        Args:
+            word: entry with the model's name or flag; its value is None if there is none.
+
+        Returns:
+            The lens; None for a pinhole, with a warning if the file states no coefficients.
+
+        Raises:
+            RigFileError: for an unknown model, one that contradicts the user's, or a fisheye without
+                coefficients.
         """
         said = plain(word.value) if isinstance(word.value, str) else None
         if said is None and word.value is not None:
@@ -478,7 +665,12 @@ class Entry:
         return self.lens(model)
 
     def lens(self, model: str) -> Distortion | None:
-        """A lens of any model; others than the two above from all coefficients, within the model's bounds."""
+        """Return a lens of any model; models other than Brown-Conrady and Kannala-Brandt need all their
+        coefficients.
+
+        Raises:
+            RigFileError: for another number of coefficients, or values that no lens has.
+        """
         if model in (BROWN_CONRADY, KANNALA_BRANDT):
             return self.brown_conrady() if model == BROWN_CONRADY else self.kannala_brandt()
         c = self.numbers((COEFFICIENT_COUNTS[model][0],))
@@ -489,17 +681,17 @@ class Entry:
 
 
 def plain(key: Any) -> str:
-    """A name in small letters without signs."""
+    """Return a name in small letters without signs."""
     return re.sub(r"[\W_]", "", str(key).lower())
 
 
 def single(value: Any) -> bool:
-    """Whether a value is a number by itself."""
+    """Return True if a value is a number by itself."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def suspicious(key: Any, value: Any) -> bool:
-    """Whether an entry may be a lens, a model, a flag or a unit, and states something."""
+    """Return True if an entry may be a lens, a model, a flag or a unit, and states something."""
     name = plain(key)
     if value is None or HARMLESS.fullmatch(name):
         return False
@@ -519,12 +711,17 @@ def suspicious(key: Any, value: Any) -> bool:
 
 
 def pose_of(R: Entry, t: Entry, metres: float = 1.0) -> Pose:
-    """X_to = R X_from + t with t given in units of `metres`."""
+    """Return the pose X_to = R X_from + t with t given in units of `metres`.
+
+    Raises:
+        RigFileError: for a matrix that is no rotation, or another number of numbers.
+    """
     return Pose(R.rotation(), t.numbers((3,)) * metres)
 
 
 def float64_of(value: Any) -> Tensor | None:
-    """Numbers, nested in lists or not, as a float64 tensor; None for anything else, such as true or text."""
+    """Return numbers, nested in lists or not, as a float64 tensor; None for anything else, such as true or
+    text."""
     if _has_truth(value):
         return None
     try:

@@ -17,11 +17,16 @@ from .source import RigSource
 
 
 def recognises(path: Path, head: str) -> bool:
+    """Return True for a .camera file, or a folder of them."""
     return bool(_files(path)) if path.is_dir() else path.suffix == ".camera"
 
 
 def read(source: RigSource) -> Rig:
-    """The cameras, under the names of their images."""
+    """Read the cameras, under the names of their images.
+
+    Raises:
+        RigFileError: for a damaged file, a lens, or a folder without such files.
+    """
     files = _files(source.path) if source.path.is_dir() else [source.path]
     if not files:
         raise source.fail(None, "holds no .camera file")

@@ -18,11 +18,16 @@ NUMBER = r"([-+]?(?:nan|inf|[\d.]+(?:[eE][-+]?\d+)?))"
 
 
 def recognises(path: Path, head: str) -> bool:
+    """Return True for a text with the format's headings."""
     return "Intrinsic parameters:" in head and "Scale factor" in head
 
 
 def read(source: RigSource) -> Rig:
-    """The pair "left", "right", or the one camera that is there."""
+    """Read the pair "left" and "right", or the one camera that is there.
+
+    Raises:
+        RigFileError: for a damaged file.
+    """
     side = source.path.name[-2:]
     if side not in SIDES:
         return source.rig([(source.path.name, _camera(source))])

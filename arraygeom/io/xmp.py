@@ -41,38 +41,49 @@ PIX4D, DJI, MICASENSE = "pix4d.com", "drone-dji", "micasense.com/MicaSense"
 EXIF, GPS = 0x8769, 0x8825
 """Tags of TIFF's directories with EXIF's fields (2.32)."""
 LARGEST_XMP = 1 << 20
-"""Bytes of an XMP packet, at most: those of cameras have some tens of thousands."""
+"""Largest size of an XMP packet, bytes: those of cameras have some tens of thousands."""
 PHOTOGRAPHS = (".jpg", ".jpeg")
 SUFFIXES = (".tif", ".tiff", *PHOTOGRAPHS)
 USUAL_WIDTH = 20.0
-"""Nanometres of a band, where none are stated."""
+"""Width in nanometres of a band for which none is stated."""
 IN_PIXELS = 100.0
-"""A focal length above is in pixels: no lens of these has so many millimetres, no image so few pixels."""
+"""Focal length above which it is in pixels: no lens of these has so many millimetres, no image so
+few pixels."""
 LONGEST_TRANSLATION = 1.0
-"""Metres between cameras of one body; what is longer is in another unit."""
+"""Largest distance in metres between cameras of one body; a longer one is in another unit."""
 BLACK_LEVEL, EXPOSURE, ISO, ISO_SPEED, TAKEN, SERIAL = 50714, 0x829A, 0x8827, 0x8833, 0x9003, 0xA431
 NORTH, LATITUDE, EAST, LONGITUDE = 1, 2, 3, 4
 """GPS tags: the hemispheres' letters, and degrees, minutes and seconds."""
 SAME_PLACE = 1e-3
-"""Degrees of latitude or longitude, some 100 m, images of one capture may differ by: receivers wander."""
+"""Degrees of latitude or longitude, some 100 m, by which images of one capture may differ:
+receivers drift."""
 RESOLUTION_X, RESOLUTION_Y, RESOLUTION_UNIT = 0xA20E, 0xA20F, 0xA210
 ORIENTATION, QUARTER_TURNS = 274, {1: 0, 3: 2, 6: 3, 8: 1}
-"""EXIF's orientations, and the quarter turns counter-clockwise that put them upright."""
+"""EXIF's tag of the orientation, and the quarter turns counter-clockwise that turn each upright."""
 MILLIMETRES = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
-"""Of EXIF's units of resolution: inch, cm, mm, micrometre."""
+"""Millimetres in EXIF's units of resolution: inch, cm, mm, micrometre."""
 
 
 def recognises(path: Path, head: str) -> bool:
+    """Return True for a TIFF or JPEG image whose tags state its camera."""
     return path.suffix.lower() in SUFFIXES and path.is_file() and _states_camera(image_tags(path))
 
 
 def read(source: RigSource) -> Rig:
-    """The rig of the capture that an image is of, its cameras named by their bands."""
+    """Read the rig of the capture that an image belongs to, its cameras named by their bands.
+
+    Raises:
+        RigFileError: as `rig_of_images`.
+    """
     return rig_of_images(named_by_band(capture_of(source.path)))
 
 
 def capture_of(path: Path) -> list[Path]:
-    """The images of the same capture: names that differ only in what follows the last "_"."""
+    """List the images of the same capture: those beside it whose names differ only in what follows the last
+    "_".
+
+    Images whose tags state no camera are left out. An image without "_" in its name is alone.
+    """
     stem = path.stem.rpartition("_")[0]
     beside = sorted(
         p for p in path.parent.iterdir() if p.suffix.lower() in SUFFIXES and p.stem.rpartition("_")[0] == stem
@@ -81,7 +92,8 @@ def capture_of(path: Path) -> list[Path]:
 
 
 def named_by_band(paths: Sequence[Path]) -> dict[str, Path]:
-    """Images by the names of their bands; where not given, by what follows the last "_" of the files'."""
+    """Return images by the names of their bands; where not given, by what follows the last "_" of
+    the files'."""
     bands = []
     for path in paths:
         tags = image_tags(path)
@@ -96,7 +108,7 @@ def named_by_band(paths: Sequence[Path]) -> dict[str, Path]:
 
 
 def states_cameras(paths: Sequence[Path]) -> bool:
-    """Whether the tags of every image state its camera."""
+    """Return True if the tags of every image state its camera; False for no images."""
     return bool(paths) and all(
         path.suffix.lower() in SUFFIXES and path.is_file() and _states_camera(image_tags(path))
         for path in paths
@@ -104,15 +116,24 @@ def states_cameras(paths: Sequence[Path]) -> bool:
 
 
 def rig_of_images(files: Mapping[str, Path]) -> Rig:
-    """The rig of one capture's images, by camera. Without translations in the tags all are at one point.
+    """Read the rig of one capture's images from their tags.
 
-    Warns of what the tags do not state. Raises RigFileError for images without tags, of several captures or
-    bodies, and for numbers that no camera has.
+    Missing tags give warnings; without translations all cameras are at one point.
+
+    Args:
+        files: image of each camera by name.
+
+    Returns:
+        The rig, of the images as their orientation tags rotate them; lengths in metres.
+
+    Raises:
+        RigFileError: for images without tags, of several captures or bodies, and numbers that no camera has.
+        ValueError: for no images.
     """
     if not files:
         raise ValueError("there are no images")
     first = RigSource(next(iter(files.values())))
-    images = {name: _Image.of(first.beside(path)) for name, path in files.items()}
+    images = {name: _Image.from_source(first.beside(path)) for name, path in files.items()}
     _check_one_capture(images)
     cameras = [(name, image.camera()) for name, image in images.items()]
     rig = first.rig(cameras)
@@ -132,14 +153,19 @@ def rig_of_images(files: Mapping[str, Path]) -> Rig:
 
 
 class _Image(NamedTuple):
-    """One image's tags, and where they are from."""
+    """One image's tags with their source."""
 
     source: RigSource
     tags: ImageTags
     stated: dict[str, Entry]
 
     @classmethod
-    def of(cls, source: RigSource) -> _Image:
+    def from_source(cls, source: RigSource) -> _Image:
+        """Read the tags of an image.
+
+        Raises:
+            RigFileError: unless they state its camera.
+        """
         tags = image_tags(source.path)
         if tags is None or not _states_camera(tags):
             raise source.fail(None, "has no tags of a camera (Camera: or drone-dji): give a rig file instead")
@@ -150,18 +176,22 @@ class _Image(NamedTuple):
         )
 
     def text(self, name: str, namespace: str = PIX4D) -> str | None:
-        """An XMP tag; None if it is not stated."""
+        """Return an XMP tag; None if it is not stated."""
         value = self.stated[namespace].get(name).value
         return None if value is None else str(value)
 
     def numbers(self, name: str, *count: int, namespace: str = PIX4D) -> Tensor | None:
-        """The numbers of a tag, as many as are wanted; None if it is not stated."""
+        """Return the numbers of a tag, as many as `count` states; None if it is not stated."""
         text = self.text(name, namespace)
         words = None if text is None else self.source.at(re.sub("[,;]", " ", text), name).words()
         return None if words is None else words.numbers(count or None)
 
     def needed(self, name: str, count: int) -> Tensor:
-        """So many numbers of a tag of Pix4D's."""
+        """Return so many numbers of a tag of Pix4D's.
+
+        Raises:
+            RigFileError: if it is not stated.
+        """
         numbers = self.numbers(name, count)
         if numbers is None:
             raise self.source.fail(name, "is not stated: give a rig file instead")
@@ -169,7 +199,7 @@ class _Image(NamedTuple):
 
     @property
     def per_mm(self) -> Tensor:
-        """Pixels a millimetre of the sensor, (x, y)."""
+        """Pixels per millimetre of the sensor, (x, y)."""
         fields = self.tags.fields
         if RESOLUTION_X not in fields:
             raise self.source.fail(
@@ -190,7 +220,7 @@ class _Image(NamedTuple):
 
     @property
     def centre(self) -> Tensor:
-        """The camera's centre in the rig, metres; zero if it is not stated."""
+        """Camera's centre in the rig, metres; zero if it is not stated."""
         if (translation := self.numbers("RigTranslations", 3)) is None:
             return torch.zeros(3, dtype=torch.float64)
         if float(translation.abs().max()) > LONGEST_TRANSLATION:
@@ -201,7 +231,7 @@ class _Image(NamedTuple):
         return translation
 
     def camera(self) -> Camera:
-        """The camera with its pose in the rig."""
+        """Return the camera with its pose in the rig."""
         K, lens = self._dji() if self.text("ModelType") is None else self._pix4d()
         K, rotation = self._checked(K), self.rotation
         R = torch.eye(3, dtype=torch.float64) if rotation is None else rotation.mT
@@ -210,7 +240,7 @@ class _Image(NamedTuple):
         return camera.rot90(self._quarter_turns())
 
     def _quarter_turns(self) -> int:
-        """Those by which a viewer, and `pat`, rotate the stored pixels, which the tags are of."""
+        """Return the turns by which a viewer, and `pat`, rotate the stored pixels, which the tags are of."""
         orientation = int(self.tags.fields.get(ORIENTATION, (1,))[0])
         if orientation not in QUARTER_TURNS:
             raise self.source.fail(
@@ -219,7 +249,7 @@ class _Image(NamedTuple):
         return QUARTER_TURNS[orientation]
 
     def _pix4d(self) -> tuple[Tensor, LensModel | None]:
-        """K and the lens by Pix4D's tags; lengths are in millimetres or pixels."""
+        """Return K and the lens by Pix4D's tags; lengths are in millimetres or pixels."""
         kind, centre = self.text("ModelType"), self.needed("PrincipalPoint", 2)
         if "pixel" not in (self.text("PrincipalPointUnits") or "mm"):
             centre = centre * self.per_mm
@@ -247,7 +277,7 @@ class _Image(NamedTuple):
         return K, PolynomialFisheye(bends)
 
     def _dji(self) -> tuple[Tensor, Distortion | None]:
-        """K and the lens by DJI's DewarpData: fx, fy, cx, cy from the middle, k1, k2, p1, p2, k3."""
+        """Return K and the lens by DJI's DewarpData: fx, fy, cx, cy from the middle, k1, k2, p1, p2, k3."""
         (h, w), text = self.tags.hw, self.text("DewarpData", DJI) or ""
         dated, _, numbers = text.rpartition(";")
         if not dated:
@@ -266,7 +296,7 @@ class _Image(NamedTuple):
         return K, None if flag is not None and flag.any() else self.source.at(c, "DewarpData").brown_conrady()
 
     def _checked(self, K: Tensor) -> Tensor:
-        """An intrinsic matrix, its principal point near the image's middle."""
+        """Return an intrinsic matrix after checking that its principal point is near the image's middle."""
         K = self.source.at(K, "PrincipalPoint").intrinsics()
         (h, w), (x, y) = self.tags.hw, K[:2, 2].tolist()
         if not (0.25 * w < x < 0.75 * w and 0.25 * h < y < 0.75 * h):
@@ -276,7 +306,7 @@ class _Image(NamedTuple):
         return K
 
     def sensor(self) -> Sensor:
-        """What the tags say of the sensor: band, black level, exposure and gain."""
+        """Return the sensor by the tags: band, black level, exposure and gain."""
         fields = self.tags.fields
         colour = len((self.text("BandName") or "").split(",")) == 3
         centre, width = (self._one(name) for name in ("CentralWavelength", "WavelengthFWHM"))
@@ -346,7 +376,7 @@ def _check_one_capture(images: Mapping[str, _Image]) -> None:
 
 
 def _place(tags: ImageTags) -> tuple[float, float] | None:
-    """Latitude and longitude, degrees; None if they are not stated."""
+    """Return latitude and longitude, degrees; None if they are not stated."""
     degrees = []
     for letter, number in ((NORTH, LATITUDE), (EAST, LONGITUDE)):
         parts = tags.fields.get(number, ())
@@ -361,19 +391,32 @@ def _place(tags: ImageTags) -> tuple[float, float] | None:
 
 
 class ImageTags(NamedTuple):
-    """Size, TIFF and EXIF fields by number, XMP tags by namespace and name (lists joined by commas)."""
+    """Tags of an image file.
+
+    Attributes:
+        hw: height and width of the stored pixels.
+        fields: values of TIFF, EXIF and GPS fields by their number, as tuples.
+        xmp: XMP tags by namespace and name (lists joined by commas).
+    """
 
     hw: HW
     fields: dict[int, tuple[Any, ...]]
     xmp: dict[tuple[str, str], str]
 
     def text(self, namespace: str, name: str) -> str | None:
-        """An XMP tag; None if it is not stated."""
+        """Return an XMP tag; None if it is not stated."""
         return self.xmp.get((namespace, name))
 
 
 def image_tags(path: Path) -> ImageTags | None:
-    """The tags of a TIFF or JPEG file; None for other files, damaged ones, and those without XMP."""
+    """Read the tags of a TIFF or JPEG file.
+
+    Returns:
+        The tags; None for other files, damaged ones, and those without XMP.
+
+    Raises:
+        OSError: for a file that cannot be opened.
+    """
     xmp = _xmp(path.read_bytes())
     if not xmp:
         return None
@@ -392,7 +435,7 @@ def image_tags(path: Path) -> ImageTags | None:
 
 
 def _xmp(content: bytes) -> dict[tuple[str, str], str]:
-    """XMP tags of the namespaces above; empty if there are none, or the packet is damaged."""
+    """Return XMP tags of the namespaces above; empty if there are none, or the packet is damaged."""
     begin = content.find(b"<x:xmpmeta")
     end = content.find(b"</x:xmpmeta>", begin)
     if begin < 0 or not 0 < end - begin < LARGEST_XMP:

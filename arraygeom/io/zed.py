@@ -30,15 +30,20 @@ SIZES: dict[str, HW] = {
     "svga": (600, 960),
     "vga": (376, 672),
 }
-"""Of one camera's image, by the name of the resolution; the largest first."""
+"""Height and width of one camera's image, by the name of the resolution; the largest first."""
 
 
 def recognises(path: Path, head: str) -> bool:
+    """Return True for a text with sections of the left camera."""
     return path.is_file() and "[LEFT_CAM_" in head.upper()
 
 
 def read(source: RigSource) -> Rig:
-    """Both cameras, `left` and `right`, at the size that is asked for, else at the largest."""
+    """Read the cameras `left` and `right`, at the requested size, else at the largest.
+
+    Raises:
+        RigFileError: for a damaged file, no camera of a known or of the requested size, or missing numbers.
+    """
     parser = configparser.ConfigParser(interpolation=None)
     try:
         parser.read_string(source.text(LONGEST).replace(",", "."))  # some systems write a decimal comma
@@ -67,7 +72,8 @@ def read(source: RigSource) -> Rig:
 
 
 def _pose(stereo: Entry, name: str) -> Pose:
-    """Of the right camera: points are R X + t. Offsets have been written for all resolutions at once too."""
+    """Return the pose of the right camera: points are R X + t. Offsets may be stated for all resolutions at
+    once."""
     offsets = [stereo[f"{key}_{name}", key].words().number() for key in ("ty", "tz")]
     t = stereo.at([-stereo["baseline"].words().number(), *offsets], "baseline, ty, tz")
     rotation = stereo.listed(*(f"{key}_{name}" for key in ("rx", "cv", "rz"))).words()

@@ -1,7 +1,6 @@
-"""Camera models: maps between directions and points of the image plane, a file each family.
+"""Camera models: maps between directions and points of the image plane, one file for each family.
 
-A model of one's own is a subclass of `CameraModel`; see the page "A camera of one's own" of the
-documentation.
+A model of your own is a subclass of `CameraModel`; see the page "A camera of one's own" of the documentation.
 """
 
 from .angular import Equirectangular, PolynomialFisheye

@@ -17,10 +17,13 @@ from .model import CameraModel, beside_points
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PolynomialFisheye(CameraModel, name="polynomial-fisheye"):
-    """The angle theta from the axis goes to the radius theta + k2 theta^2 + k3 theta^3 + ...: all powers.
+    """Fisheye that maps the angle theta off axis to the radius theta + k2 theta^2 + k3 theta^3 + ...
 
-    Without coefficients it is the equidistant fisheye. `widest` is the angle, radians, up to which the lens
-    was calibrated, at most pi; where the radius stops increasing it ends before.
+    Without coefficients it is the equidistant fisheye. It ends earlier where the radius stops increasing.
+
+    Attributes:
+        k: coefficients k2, k3, ...
+        widest: largest calibrated angle, radians, at most pi.
     """
 
     item_axes: ClassVar = {"k": 1}
@@ -28,7 +31,11 @@ class PolynomialFisheye(CameraModel, name="polynomial-fisheye"):
     widest: Float[Tensor, "*b"] = field(default_factory=lambda: torch.tensor(math.pi, dtype=torch.float64))
 
     def project(self, X: Tensor) -> tuple[Tensor, Tensor]:
-        """Directions at up to `widest` from the axis; the point (0, 0, 0) is not seen."""
+        """Project points or directions (*n, 3).
+
+        Returns:
+            Points of the image plane, and True up to `widest` off axis; (0, 0, 0) is not valid.
+        """
         X, finite = finite_points(X)
         squared = X[..., :2].square().sum(-1)
         ratio = angle_over_radius(squared, X[..., 2])
@@ -41,7 +48,11 @@ class PolynomialFisheye(CameraModel, name="polynomial-fisheye"):
         return X[..., :2] * (ratio * scale)[..., None], valid
 
     def unproject(self, xy: Tensor) -> tuple[Tensor, Tensor]:
-        """Unit directions: the inverse of `project`."""
+        """Compute unit directions: the inverse of `project`.
+
+        Returns:
+            Directions, and validity.
+        """
         xy, finite = finite_points(xy)
         squared = xy.square().sum(-1)
         off = squared > 0
@@ -67,7 +78,7 @@ class PolynomialFisheye(CameraModel, name="polynomial-fisheye"):
         return theta * ratio, slope
 
     def _radius_over_angle(self, theta: Tensor) -> tuple[Tensor, Tensor]:
-        """radius / theta, and the derivative of the radius."""
+        """Radius / theta, and the derivative of the radius."""
         k = beside_points(self.k, theta[..., None], 1)
         ratio, slope = torch.ones_like(theta), torch.ones_like(theta)
         for i in range(k.shape[-1]):
@@ -77,7 +88,7 @@ class PolynomialFisheye(CameraModel, name="polynomial-fisheye"):
 
     @torch.no_grad()
     def _limit(self) -> Tensor:
-        """The widest angle (*b): float64 on the CPU."""
+        """Largest valid angle (*b): float64 on the CPU."""
         k, widest = (t.detach().to("cpu", torch.float64) for t in (self.k, self.widest))
         widest = widest.clamp(max=math.pi)
         if not k.shape[-1]:
@@ -88,12 +99,13 @@ class PolynomialFisheye(CameraModel, name="polynomial-fisheye"):
 
 
 ITERATIONS = 40
-"""Of the search for an angle, at most; most take five."""
+"""Largest number of steps in the search for an angle; most take five."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Equirectangular(CameraModel, name="equirectangular"):
-    """Longitude and latitude, radians: x to the right of the axis, up to pi either way, y down, up to pi / 2.
+    """Camera model of longitude and latitude, radians: x right of the axis, up to pi either way, y down, up
+    to pi / 2.
 
     The K of a whole sphere W pixels wide has the focal length W / (2 pi) and the image's middle as its
     centre.
@@ -102,7 +114,11 @@ class Equirectangular(CameraModel, name="equirectangular"):
     period: ClassVar[float] = 2 * math.pi
 
     def project(self, X: Tensor) -> tuple[Tensor, Tensor]:
-        """Any direction; the point (0, 0, 0) is not seen."""
+        """Project directions (*n, 3).
+
+        Returns:
+            Longitude and latitude; every direction is valid, (0, 0, 0) is not.
+        """
         X, finite = finite_points(X)
         x, y, z = X.unbind(-1)
         squared = x.square() + z.square()
@@ -113,7 +129,11 @@ class Equirectangular(CameraModel, name="equirectangular"):
         return torch.stack([longitude, torch.atan2(y, torch.where(valid, level, 1.0))], -1), valid
 
     def unproject(self, xy: Tensor) -> tuple[Tensor, Tensor]:
-        """Unit directions."""
+        """Compute unit directions: the inverse of `project`.
+
+        Returns:
+            Directions, and True within the sphere's range.
+        """
         xy, finite = finite_points(xy)
         longitude, latitude = xy.unbind(-1)
         level = latitude.cos()

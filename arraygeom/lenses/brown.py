@@ -1,4 +1,5 @@
-"""Brown-Conrady: radial, tangential and thin-prism polynomials and a tilted sensor, and their inverse."""
+"""Brown-Conrady model: radial, tangential and thin-prism polynomials and a tilted sensor, and
+their inverse."""
 
 from __future__ import annotations
 
@@ -16,8 +17,14 @@ from .common import BEYOND, MARGIN, POLE, SOLVED, TINY, WIDEST, norm, once, poly
 
 @dataclass(frozen=True)
 class Brown:
-    """The coefficients by name, each of shape (*b, 1..): k1 to k3, or to k6 if the lens is rational; none of
-    s where it has none of the prism; and a 15th, the factor of r^8.
+    """Coefficients by name, each of shape (*b, 1..).
+
+    Attributes:
+        k: k1 to k3, or to k6 if the lens is rational.
+        p: tangential coefficients.
+        s: prism coefficients; empty if there are none.
+        tilt: angles of the sensor; None if there are none.
+        eighth: factor of r^8; None if there is none.
     """
 
     k: tuple[Tensor, ...]
@@ -28,7 +35,7 @@ class Brown:
 
     @staticmethod
     def named(c: Tensor) -> Brown:
-        """From 4 to 14 coefficients in OpenCV's order, or those and the 15th."""
+        """Name 4 to 14 coefficients in OpenCV's order, optionally with a 15th (factor of r^8)."""
         n, eighth = c.shape[-1], c[..., 14] if c.shape[-1] == 15 else None
         c = c[..., :14]
         padded = torch.cat([c, c.new_zeros((*c.shape[:-1], 14 - c.shape[-1]))], -1).unbind(-1)
@@ -38,7 +45,11 @@ class Brown:
 
 
 def brown_distort(c: Tensor, xy: Tensor) -> tuple[Tensor, Tensor]:
-    """Points (*n, 2) to distorted ones, and which are within the range."""
+    """Distort points (*n, 2).
+
+    Returns:
+        Distorted points, and True within the model's range.
+    """
     lens, limit = Brown.named(c), once(brown_limit, c).to(xy)
     squared = xy.square().sum(-1)
     inside = squared < limit
@@ -49,9 +60,10 @@ def brown_distort(c: Tensor, xy: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def brown_derivatives(c: Tensor, xy: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """`brown_distort` of points (n, 2) through a lens (k,) whose sensor is not tilted, in closed form.
+    """Distort points (n, 2) by a lens (k,) without tilt, with derivatives in closed form.
 
-    The distorted points, their derivatives by the points (n, 2, 2) and by the coefficients (n, 2, k).
+    Returns:
+        Distorted points, derivatives by the points (n, 2, 2) and by the coefficients (n, 2, k).
     """
     lens, limit = Brown.named(c[None]), once(brown_limit, c[None]).to(xy)
     squared = xy.square().sum(-1)
@@ -81,11 +93,15 @@ def brown_derivatives(c: Tensor, xy: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def brown_undistort(c: Tensor, xy_d: Tensor) -> tuple[Tensor, Tensor]:
-    """Undo the tilt exactly, solve for the radius in a bracket, then for (x, y) by Newton.
+    """Undistort points: undo the tilt exactly, solve for the radius in a bracket, then for (x, y) by Newton's
+    method.
 
     The last two Newton steps are differentiable: from a solution that is a constant, one step propagates the
     first derivatives and the next one the second (the error of a Newton step is the square of the one
     before).
+
+    Returns:
+        Undistorted points, and True within the model's range.
     """
     lens = Brown.named(c)
     H = _tilt_matrix(lens)
@@ -101,7 +117,7 @@ def brown_undistort(c: Tensor, xy_d: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _brown_planar(lens: Brown, xy: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor, Tensor]]:
-    """Everything but the tilt, and its Jacobian (dx'/dx, dx'/dy, dy'/dx, dy'/dy)."""
+    """Distorted points without the tilt, and the Jacobian (dx'/dx, dx'/dy, dy'/dx, dy'/dy)."""
     x, y = xy.unbind(-1)
     p1, p2 = lens.p
     u = x * x + y * y
@@ -120,7 +136,8 @@ def _brown_planar(lens: Brown, xy: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor
 
 
 def _radial_factor(lens: Brown, u: Tensor) -> tuple[Tensor, Tensor]:
-    """g = (1 + k1 u + k2 u^2 + k3 u^3) / (1 + k4 u + k5 u^2 + k6 u^3) of the squared radius u, and dg/du."""
+    """Radial factor g = (1 + k1 u + k2 u^2 + k3 u^3) / (1 + k4 u + k5 u^2 + k6 u^3) of the squared radius u,
+    and dg/du."""
     k1, k2, k3, *rational = lens.k
     top, d_top = 1 + u * (k1 + u * (k2 + u * k3)), k1 + u * (2 * k2 + 3 * u * k3)
     if lens.eighth is not None:
@@ -135,9 +152,12 @@ def _radial_factor(lens: Brown, u: Tensor) -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def brown_limit(c: Tensor) -> Tensor:
-    """The squared radius up to which the radial part r g(r^2) rises: float64 on the CPU, shape (*b, 1..).
+    """Compute the squared radius up to which the radial part r g(r^2) rises.
 
     With g = N / D the slope is P / D^2, P(u) = (N + 2 u N') D - 2 u N D', of degree 6 (or 7) with P(0) = 1.
+
+    Returns:
+        Limits (*b, 1..), float64 on the CPU.
     """
     lens = Brown.named(c)
     k1, k2, k3, *rational = (k.detach().to("cpu", torch.float64) for k in lens.k)
@@ -156,12 +176,11 @@ def brown_limit(c: Tensor) -> Tensor:
 
 
 def _before_dip(lens: Brown, limit: Tensor) -> Tensor:
-    """The squared radius at which the radial slope is least, if tangential and prism terms may fold the image
-    there and the slope rises again after it: past such a fold points look right, and are another's; else the
-    limit.
+    """Limit the squared radius to where the radial slope is least, if other terms may fold the image there.
 
-    The terms' Jacobian is at most 7 |p| r and 2 |s| r (4 |s| r^3): where the slope is larger there is no
-    fold.
+    Past such a fold, after which the slope rises again, points look right, and are another's. The Jacobian of
+    the tangential and prism terms is at most 7 |p| r and 2 |s| r (4 |s| r^3): where the slope is larger there
+    is no fold.
     """
     lens = _each(lens, lambda v: v.detach().to("cpu", torch.float64)[..., None])
     angles = torch.linspace(1 / RADII, 1, RADII, dtype=torch.float64)
@@ -178,11 +197,11 @@ def _before_dip(lens: Brown, limit: Tensor) -> Tensor:
 
 
 RADII = 256
-"""Radii, evenly spaced in angle, at which a dip of the slope is sought."""
+"""Number of radii, evenly spaced in angle, at which a dip of the slope is sought."""
 
 
 def _brown_start(lens: Brown, target: Tensor, limit: Tensor) -> Tensor:
-    """The solution if there were only the radial terms."""
+    """Solution for the radial terms alone."""
 
     def radius(r: Tensor) -> tuple[Tensor, Tensor]:
         g, dg = _radial_factor(lens, r * r)
@@ -197,7 +216,7 @@ def _brown_start(lens: Brown, target: Tensor, limit: Tensor) -> Tensor:
     "arraygeom::brown_inverse", mutates_args=(), schema="(Tensor c, Tensor target) -> (Tensor, Tensor)"
 )
 def _traced_brown_inverse(c: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    """The same for torch.compile, which cannot follow iterations that numbers end."""
+    """Inverse for torch.compile, which cannot follow iterations whose number depends on values."""
     solved, valid = _brown_inverse(c, target)
     return solved.contiguous(), valid.contiguous()
 
@@ -209,7 +228,7 @@ def _(c: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _brown_inverse(c: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    """The solution and whether there is one; where not, the solution of the radial terms alone.
+    """Solution, and True where there is one; elsewhere the solution of the radial terms alone.
 
     Most points need a few steps. The rest are begun again by themselves, unless they are out of reach.
     """
@@ -231,7 +250,8 @@ def _brown_inverse(c: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _reach(lens: Brown, limit: Tensor) -> Tensor:
-    """No point within the range is distorted to one farther out: radial, tangential and prism terms there."""
+    """Largest distorted radius of any point within the range: radial, tangential and prism terms at the
+    limit."""
     radial = limit.sqrt() * _radial_factor(lens, limit)[0].abs()
     constant, squared = _prism_sizes(lens)
     tangential, prism = 3 * torch.hypot(*lens.p), constant + limit * squared
@@ -239,7 +259,7 @@ def _reach(lens: Brown, limit: Tensor) -> Tensor:
 
 
 def _prism_sizes(lens: Brown) -> tuple[Tensor | float, Tensor | float]:
-    """The sizes of the prism's terms in r^2 and in r^4."""
+    """Sizes of the prism's terms in r^2 and in r^4."""
     if not lens.s:
         return 0.0, 0.0
     s1, s2, s3, s4 = lens.s
@@ -247,11 +267,12 @@ def _prism_sizes(lens: Brown) -> tuple[Tensor | float, Tensor | float]:
 
 
 FEW = 8
-"""Newton steps that take all points to their solutions where none is near the turn."""
+"""Newton steps that solve all points where none is near the turn."""
 
 
 def _attempts(lens: Brown, limit: Tensor, start: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    """Close to the turn the slope is nearly 0 and leads nowhere, hence two more attempts from further in."""
+    """Solve with two further attempts from further in: near the turn the slope is nearly 0 and
+    leads nowhere."""
     solved, valid = start, torch.zeros_like(target[..., 0], dtype=torch.bool)
     for begin in (start, _pulled_in(start, 0.9 * limit), _pulled_in(target, 0.5 * limit)):
         begun = torch.where(valid[..., None], solved, begin)
@@ -268,7 +289,7 @@ MANY = 30
 def _attempt(
     lens: Brown, limit: Tensor, start: Tensor, begun: Tensor, target: Tensor, *, steps: int
 ) -> tuple[Tensor, Tensor]:
-    """Solutions by Newton from `begun`, and whether they are; `start` where not."""
+    """Solutions by Newton's method from `begun`, and True where found; `start` elsewhere."""
 
     def distorted(xy: Tensor) -> tuple[Tensor, tuple[Tensor, ...]]:
         return _brown_planar(lens, xy)
@@ -285,7 +306,7 @@ def _attempt(
 
 
 def _each(lens: Brown, function: Callable[[Tensor], Tensor]) -> Brown:
-    """The lens after a function of each of its coefficients; without its tilt."""
+    """Lens after a function of each of its coefficients, without its tilt."""
     (p1, p2), eighth = lens.p, lens.eighth
     return Brown(
         tuple(map(function, lens.k)),
@@ -302,7 +323,7 @@ def _pulled_in(xy: Tensor, squared_radius: Tensor) -> Tensor:
 
 
 def _tilt_matrix(lens: Brown) -> Tensor | None:
-    """The homography (*b, 1.., 3, 3) of a sensor tilted by tx, ty about x, then y (OpenCV's)."""
+    """Homography (*b, 1.., 3, 3) of a sensor tilted by tx, ty about x, then y (OpenCV's)."""
     if lens.tilt is None:
         return None
     from kornia.geometry.calibration.distort import tilt_projection
@@ -312,7 +333,7 @@ def _tilt_matrix(lens: Brown) -> Tensor | None:
 
 
 def _apply(H: Tensor | None, xy: Tensor) -> tuple[Tensor, Tensor]:
-    """The homography H of points, and which lie on this side of the line it sends to infinity."""
+    """Homography H of points, and True for points on this side of the line that it sends to infinity."""
     if H is None:
         return xy, torch.ones_like(xy[..., 0], dtype=torch.bool)
     p = product(H.to(xy), to_homogeneous(xy)[..., None])[..., 0]

@@ -1,4 +1,5 @@
-"""Other wide-angle models: radial maps of the direction, two of them then by Brown-Conrady's polynomials.
+"""Further wide-angle models: radial maps of the direction, two of them followed by Brown-Conrady's
+polynomials.
 
 Directions are limited to the cone that the model reaches; those outside count as on its border, and are not
 valid.
@@ -27,12 +28,15 @@ THIN_PRISM_FISHEYE = "thin-prism-fisheye"
 
 
 class _Model(NamedTuple):
-    """A radial map and its inverse in closed form or by iteration.
+    """Radial map, and its inverse in closed form or by iteration.
 
-    `project` takes coefficients and directions within the cone to points, `unproject` points to directions of
-    any length; `limit` gives the squared radius that is reached, `bounds` are those of the first coefficients
-    of any lens, and `harmless` ones that stand in for those beyond; `planar` Brown-Conrady's coefficients of
-    the second stage.
+    Attributes:
+        project: from coefficients and directions within the cone to points.
+        unproject: from coefficients and points to directions of any length.
+        limit: squared radius that is reached.
+        bounds: bounds of the first coefficients of any lens.
+        harmless: coefficients that replace invalid ones.
+        planar: Brown-Conrady's coefficients of the second stage; None for none.
     """
 
     project: Callable[[Tensor, Tensor], Tensor]
@@ -44,7 +48,11 @@ class _Model(NamedTuple):
 
 
 def central_project(model: str, c: Tensor, X: Tensor) -> tuple[Tensor, Tensor]:
-    """Directions (*n, 3) of any length to distorted normalised points (*n, 2), and which are valid."""
+    """Project directions (*n, 3) of any length.
+
+    Returns:
+        Distorted normalised points (*n, 2), and validity.
+    """
     kind = MODELS[model]
     c, sound = _sound(kind, c)
     _, sine, cosine = (v.to(X) for v in _border(kind, c))
@@ -66,7 +74,11 @@ def central_project(model: str, c: Tensor, X: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def central_unproject(model: str, c: Tensor, xy_d: Tensor) -> tuple[Tensor, Tensor]:
-    """Distorted normalised points (*n, 2) to unit directions (*n, 3), and which are valid."""
+    """Compute unit directions (*n, 3) of distorted normalised points (*n, 2).
+
+    Returns:
+        Directions, and validity.
+    """
     kind = MODELS[model]
     c, valid = _sound(kind, c)
     planar = kind.planar(c)
@@ -81,7 +93,7 @@ def central_unproject(model: str, c: Tensor, xy_d: Tensor) -> tuple[Tensor, Tens
 
 
 def within_bounds(kind: _Model, c: Tensor) -> Tensor:
-    """The nearest coefficients of a lens."""
+    """Clamp coefficients to the bounds of a model."""
     free = ((-torch.inf, torch.inf),) * (c.shape[-1] - len(kind.bounds))
     low, high = c.new_tensor([*kind.bounds, *free]).T
     return c.clamp(low, high)
@@ -96,7 +108,8 @@ def _sound(kind: _Model, c: Tensor) -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def _border(kind: _Model, c: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Squared radius at the end of the model's range, its angle's sine and cosine: float64, CPU (*b, 1..)."""
+    """Squared radius at the end of the model's range, and its angle's sine and cosine: float64, CPU (*b,
+    1..)."""
     c = c.detach().to("cpu", torch.float64)
     limit = kind.limit(c).clamp(max=WIDEST**2) * (1 - MARGIN)
     ray = unit(kind.unproject(c, torch.stack([limit.sqrt(), torch.zeros_like(limit)], -1)))
@@ -175,7 +188,7 @@ def _equidistant_inverse(_: Tensor, xy: Tensor) -> Tensor:
 
 
 def _prism_coefficients(c: Tensor) -> Tensor:
-    """k1 k2 p1 p2 k3 k4 sx1 sy1 as Brown-Conrady's 14 and the factor of r^8."""
+    """Coefficients k1 k2 p1 p2 k3 k4 sx1 sy1 as Brown-Conrady's 14 and the factor of r^8."""
     k1, k2, p1, p2, k3, k4, sx, sy = c.unbind(-1)
     none = torch.zeros_like(k1)
     return torch.stack([k1, k2, p1, p2, k3, none, none, none, sx, none, sy, none, none, none, k4], -1)
@@ -185,7 +198,7 @@ def _prism_coefficients(c: Tensor) -> Tensor:
 
 
 def _along(c: Tensor, r: Tensor) -> tuple[Tensor, Tensor]:
-    """The depth of a point at radius r, 1 + b2 r^2 + b3 r^3 + b4 r^4, and its slope."""
+    """Depth of a point at radius r, 1 + b2 r^2 + b3 r^3 + b4 r^4, and its slope."""
     b2, b3, b4 = c.unbind(-1)
     return 1 + r * r * (b2 + r * (b3 + r * b4)), r * (2 * b2 + r * (3 * b3 + r * 4 * b4))
 
@@ -227,7 +240,7 @@ def _scaramuzza_radius(c: Tensor, angle: Tensor) -> Tensor:
     "arraygeom::scaramuzza_radius", mutates_args=(), schema="(Tensor c, Tensor angle) -> Tensor"
 )
 def _traced_scaramuzza_radius(c: Tensor, angle: Tensor) -> Tensor:
-    """The same for torch.compile, which cannot follow iterations that numbers end."""
+    """Radius for torch.compile, which cannot follow iterations whose number depends on values."""
     return _scaramuzza_radius(c, angle).contiguous()
 
 

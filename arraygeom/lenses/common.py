@@ -1,4 +1,5 @@
-"""What all lens models share: bounds of validity, and small functions that are smooth on the optical axis."""
+"""Shared parts of lens models: bounds of validity, and small functions that are smooth on the
+optical axis."""
 
 from __future__ import annotations
 
@@ -28,7 +29,8 @@ SOLVED = 64
 
 
 def angle_over_radius(u: Tensor, z: Tensor) -> Tensor:
-    """theta / r of the squared radius u = r^2 and the depth z, each (*n), by its series near the axis."""
+    """Compute theta / r from the squared radius u = r^2 and the depth z, each (*n), by a series near the
+    axis."""
     near = (z > 0) & (u < 1e-3 * z.square())
     z_near = torch.where(near, z, 1.0)
     t = torch.where(near, u, 0.0) / z_near.square()
@@ -39,7 +41,7 @@ def angle_over_radius(u: Tensor, z: Tensor) -> Tensor:
 
 
 def cosine_and_sinc(v: Tensor) -> tuple[Tensor, Tensor]:
-    """cos(theta) and sin(theta) / theta of the squared angle v = theta^2 (*n), by their series near 0."""
+    """Compute cos(theta) and sin(theta) / theta from the squared angle v = theta^2 (*n), by series near 0."""
     near = v < 1e-3
     s, theta = torch.where(near, v, 0.0), torch.where(near, 1.0, v).sqrt()
     cosine = 1 - s * (1 / 2 - s * (1 / 24 - s * (1 / 720 - s / 40320)))
@@ -48,7 +50,7 @@ def cosine_and_sinc(v: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def polynomial_product(a: tuple[Tensor, ...], b: tuple[Tensor, ...]) -> list[Tensor]:
-    """The coefficients of the product of two polynomials."""
+    """Multiply two polynomials, given by their coefficients from the constant up."""
     terms: list[Tensor] = [torch.zeros_like(a[0])] * (len(a) + len(b) - 1)
     for i, a_i in enumerate(a):
         for j, b_j in enumerate(b):
@@ -58,9 +60,12 @@ def polynomial_product(a: tuple[Tensor, ...], b: tuple[Tensor, ...]) -> list[Ten
 
 @torch.no_grad()
 def once(bound: Callable[[Tensor], Tensor], c: Tensor) -> Tensor:
-    """A bound of lenses by coefficients (*b, n), computed once for copies of one lens made by `expand`.
+    """Compute a bound of lenses by coefficients (*b, n) once for copies of one lens made by `expand`.
 
-    It is remembered for the lenses that were asked for last, unless torch has to see how it is computed.
+    It is cached for recent lenses, unless torch has to see its computation.
+
+    Returns:
+        Bounds (*b).
     """
     if c.ndim > 1 and len(c) > 1 and c.stride(0) == 0:
         return once(bound, c[:1]).expand(c.shape[:-1])
@@ -77,25 +82,32 @@ def _remembered(
 
 
 def unit(ray: Tensor) -> Tensor:
-    """Vectors (*n, k) at length 1."""
+    """Scale vectors (*n, k) to length 1; NaN for zero vectors."""
     return ray / norm(ray)[..., None]
 
 
 def on_plane(X: Tensor) -> tuple[Tensor, Tensor]:
-    """Where rays (*n, 3) meet the plane z = 1, and which do: those ahead."""
+    """Intersect rays (*n, 3) with the plane z = 1.
+
+    Returns:
+        Points (*n, 2), and True for rays ahead (z > 0).
+    """
     ahead = X[..., 2] > 0
     return X[..., :2] / torch.where(ahead, X[..., 2], 1.0)[..., None], ahead
 
 
 def norm(xy: Tensor) -> Tensor:
-    """Lengths (*n) of vectors (*n, k)."""
+    """Compute the lengths (*n) of vectors (*n, k)."""
     return xy.square().sum(-1).sqrt()
 
 
 def finite_points(points: Tensor) -> tuple[Tensor, Tensor]:
-    """Points (*n, k) with those that hold a NaN or an infinity at the origin, and which (*n) did not.
+    """Replace points (*n, k) with NaN or infinity by the origin.
 
-    Huge ones of float32 are brought nearer along their direction, as their squares would be infinite.
+    Huge float32 points are brought nearer along their direction, as their squares would be infinite.
+
+    Returns:
+        The points, and True (*n) for those that were finite.
     """
     points = floating(points)
     finite = points.isfinite().all(-1)
@@ -107,4 +119,5 @@ def finite_points(points: Tensor) -> tuple[Tensor, Tensor]:
 
 
 HUGE = 1e9
-"""Of float32: its fourth power is finite, and a direction so far off axis is at 90 degrees to rounding."""
+"""Largest float32 coordinate: its fourth power is finite, and a direction so far off axis is at 90 degrees to
+rounding."""

@@ -1,4 +1,4 @@
-"""The odd polynomial of the angle from the optical axis (Kannala and Brandt), and its inverse."""
+"""Kannala-Brandt model: an odd polynomial of the angle off axis, and its inverse."""
 
 from __future__ import annotations
 
@@ -12,7 +12,11 @@ from .common import MARGIN, SOLVED, TINY, angle_over_radius, cosine_and_sinc, on
 
 
 def fisheye_project(c: Tensor, X: Tensor) -> tuple[Tensor, Tensor]:
-    """Points (*n, 3) of the camera to distorted normalised ones (*n, 2), and which are in the range."""
+    """Project points (*n, 3) of the camera's frame.
+
+    Returns:
+        Distorted normalised points (*n, 2), and True within the model's range.
+    """
     xy, z = X[..., :2], X[..., 2]
     u = xy.square().sum(-1)
     ratio = angle_over_radius(u, z)
@@ -25,7 +29,12 @@ def fisheye_project(c: Tensor, X: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def fisheye_unproject(c: Tensor, xy_d: Tensor) -> tuple[Tensor, Tensor]:
-    """Solve v p(v)^2 = |xy_d|^2 for the squared angle v: smooth on the axis too, where the angle is not."""
+    """Compute unit directions (*n, 3): solve v p(v)^2 = |xy_d|^2 for the squared angle v, smooth on the axis
+    too.
+
+    Returns:
+        Directions, and validity.
+    """
     limit = once(fisheye_limit, c).to(xy_d)
     u_d = xy_d.square().sum(-1)
     outermost = limit * _fisheye_factor(c, limit)[0].square()
@@ -57,7 +66,7 @@ def _fisheye_start(c: Tensor, u_d: Tensor, limit: Tensor) -> Tensor:
     "arraygeom::fisheye_start", mutates_args=(), schema="(Tensor c, Tensor u_d, Tensor limit) -> Tensor"
 )
 def _traced_fisheye_start(c: Tensor, u_d: Tensor, limit: Tensor) -> Tensor:
-    """The same for torch.compile, which cannot follow iterations that numbers end."""
+    """Start for torch.compile, which cannot follow iterations whose number depends on values."""
     return _fisheye_start(c, u_d, limit).contiguous()
 
 
@@ -67,7 +76,7 @@ def _(c: Tensor, u_d: Tensor, limit: Tensor) -> Tensor:
 
 
 def _fisheye_factor(c: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-    """p = theta_d / theta and slope = d theta_d / d theta of the squared angle v."""
+    """Ratio p = theta_d / theta and slope d theta_d / d theta of the squared angle v."""
     k1, k2, k3, k4 = c.unbind(-1)
     p = 1 + v * (k1 + v * (k2 + v * (k3 + v * k4)))
     return p, 1 + v * (3 * k1 + v * (5 * k2 + v * (7 * k3 + v * 9 * k4)))
@@ -75,7 +84,7 @@ def _fisheye_factor(c: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def fisheye_limit(c: Tensor) -> Tensor:
-    """The squared angle up to which the radius rises, at most pi^2: float64 on the CPU, shape (*b, 1..)."""
+    """Compute the squared angle up to which the radius rises, at most pi^2: (*b, 1..), float64 on the CPU."""
     odd = torch.tensor([3.0, 5.0, 7.0, 9.0], dtype=torch.float64)
     slope = torch.cat([torch.ones_like(c[..., :1]).to(odd), c.detach().to(odd) * odd], -1)
     return first_root(slope).clamp_max(pi**2) * (1 - MARGIN)

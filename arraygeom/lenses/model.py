@@ -1,4 +1,4 @@
-"""The protocol that every camera model follows, and the models by name."""
+"""Interface of camera models, and the models by name."""
 
 from __future__ import annotations
 
@@ -17,82 +17,112 @@ from .common import on_plane
 AnyLens = TypeVar("AnyLens", bound="LensModel")
 
 CAMERA_MODELS: dict[str, type[CameraModel]] = {}
-"""The models that rig files know by name, each with its own numbers: those that were defined with one."""
+"""Camera models that rig files know by name, registered when they are defined with one."""
 
 
 class LensModel(Batched):
-    """What `Camera.distortion` holds: a `Distortion` or a `CameraModel`."""
+    """Lens of a camera (`Camera.distortion`): a `Distortion` or a `CameraModel`."""
 
     central: ClassVar[bool] = True
-    """Whether all rays start in the camera's origin."""
+    """True if all rays start in the camera's origin."""
     even: ClassVar[Literal["pixels", "distance"]] = "pixels"
-    """Along which a ray of another camera is followed evenly, of models that are not central."""
+    """Quantity along which another camera's ray is followed evenly, for models that are not central."""
     period: ClassVar[float] = 0.0
-    """After how much of the image plane it repeats itself; 0: never."""
+    """Length of the image plane after which it repeats itself; 0 for never."""
     model: str
-    """Its name in rig files."""
+    """Name of the model in rig files."""
     coefficients: Float[Tensor, "*b n"]
-    """Its own numbers, one after the other."""
+    """Numbers of the model, one after the other."""
 
     def project(self, X: Real[Tensor, "*n 3"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
-        """Points in the camera's frame to points of the image plane, and which are seen."""
+        """Project points in the camera's frame (*n, 3).
+
+        Returns:
+            Points of the image plane (*n, 2), and True where seen.
+
+        Raises:
+            NotImplementedError: in this base class.
+        """
         raise NotImplementedError(
             f"{type(self).__name__} has no project(X): points (..., 3) to (x, y) and valid"
         )
 
     def unproject(self, xy: Real[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 3"], Bool[Tensor, "*n"]]:
-        """The directions of rays of points of the image plane, of any length, and which have one."""
+        """Compute the directions of points of the image plane (*n, 2).
+
+        Returns:
+            Directions (*n, 3) of any length, and True where there is one.
+
+        Raises:
+            NotImplementedError: in this base class.
+        """
         raise NotImplementedError(
             f"{type(self).__name__} has no unproject(xy): points (..., 2) to rays and valid"
         )
 
     def origins(self, xy: Real[Tensor, "*n 2"]) -> Float[Tensor, "*n 3"]:
-        """Where those rays start, metres in the camera's frame."""
+        """Return the start of those rays, metres in the camera's frame: zeros for central models."""
         return torch.zeros_like(to_homogeneous(floating(xy)))
 
     @property
     def harmless(self) -> bool:
-        """Whether it is a pinhole after all."""
+        """True if the model is a pinhole after all."""
         return False
 
     @property
     def sees_behind(self) -> bool:
-        """Whether the model may have directions at 90 degrees or more off axis."""
+        """True if the model may have directions at 90 degrees or more off axis."""
         return True
 
     def undistort(self, xy: Real[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
-        """Points of the image plane to those of a pinhole, and which it has."""
+        """Map points of the image plane to points of a pinhole.
+
+        Returns:
+            Pinhole points, and True where there is one: rays ahead.
+        """
         ray, valid = self.unproject(xy)
         xy, ahead = on_plane(ray)
         return xy, valid & ahead
 
     def distort(self, xy: Real[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
-        """Points of a pinhole to those of the image plane."""
+        """Map points of a pinhole to points of the image plane.
+
+        Returns:
+            Points, and validity.
+        """
         return self.project(to_homogeneous(floating(xy)))
 
     def scaled(self: AnyLens, factor: float) -> AnyLens:
-        """The same with all lengths times a factor: as it is where rays meet, which are of no length."""
+        """Multiply all lengths by a factor; central models have none and are returned unchanged."""
         return self
 
     def with_coefficients(self: AnyLens, coefficients: Float[Tensor, "*b n"]) -> AnyLens:
-        """The same with other numbers."""
+        """Return the same model with other numbers.
+
+        Raises:
+            NotImplementedError: in this base class.
+        """
         raise NotImplementedError
 
 
 class CameraModel(LensModel):
-    """How points in a camera's frame become points (x, y) of its image plane, which `K` then takes to pixels.
+    """Base class of camera models: maps from points in a camera's frame to points (x, y) of its image plane,
+    which `K` then takes to pixels.
 
-    A model of one's own is a frozen dataclass with `project` and `unproject`, the one the inverse of the
-    other, and tensors for its numbers; defined with a name, rig files hold it. It goes where a lens does, in
+    A model of your own is a frozen dataclass with `project` and `unproject`, inverse to each other, and
+    tensors for its numbers; if it is defined with a name, rig files hold it. It is used as
     `Camera.distortion`. Resizing, cropping and rotating an image change `K` alone. Rays that do not start in
     the camera's origin also need `origins`, and `central = False`.
+
+    Raises:
+        ValueError: when a subclass is defined with the name of another one.
     """
 
     registered: ClassVar[str] = ""
     asked: ClassVar[bool] = False
-    """Whether `check_model` asked its methods."""
+    """True once `check_model` has called the class's methods."""
     lengths: ClassVar[tuple[str, ...] | None] = None
-    """Which of its numbers are metres, or metres a second; to be stated where rays do not meet."""
+    """Names of numbers in metres, or metres for each second; required for models that are not central."""
 
     def __init_subclass__(cls, *, name: str = "", **rest: Any) -> None:
         super().__init_subclass__(**rest)
@@ -107,25 +137,32 @@ class CameraModel(LensModel):
 
     @property
     def model(self) -> str:  # type: ignore[override]
-        """The name in rig files."""
+        """Name of the model in rig files; the class's name without one."""
         return type(self).registered or type(self).__name__
 
     @property
     def coefficients(self) -> Float[Tensor, "*b n"]:  # type: ignore[override]
-        """The model's own numbers, one after the other."""
+        """Numbers of the model, one after the other."""
         numbers = [t.flatten(t.ndim - axes) if axes else t[..., None] for t, axes in self._own().values()]
         batch = broadcast_shapes(*(t.shape[:-1] for t in numbers))
         return torch.cat([t.expand(*batch, -1) for t in numbers], -1) if numbers else torch.zeros(0).double()
 
     def scaled(self: AnyLens, factor: float) -> AnyLens:
-        """The same model with its `lengths` times a factor. Raises ValueError if it does not state them."""
+        """Multiply the model's `lengths` by a factor.
+
+        Returns:
+            The model.
+
+        Raises:
+            ValueError: if it is not central and does not state them.
+        """
         names = self.lengths  # type: ignore[attr-defined]
         if names is None and not self.central:
             raise ValueError(f"{self.model} does not say which of its numbers are lengths: state `lengths`")
         return dataclasses.replace(self, **{n: getattr(self, n) * factor for n in names or ()})  # type: ignore
 
     def with_coefficients(self: AnyLens, coefficients: Float[Tensor, "*b n"]) -> AnyLens:
-        """The same model with other numbers."""
+        """Return the same model with other numbers."""
         tensors = self._own()  # type: ignore[attr-defined]
         sizes = [t.shape[t.ndim - axes :].numel() for t, axes in tensors.values()]
         parts = zip(tensors.items(), coefficients.split(sizes, -1))
@@ -139,15 +176,20 @@ class CameraModel(LensModel):
         return self.model
 
     def _own(self) -> dict[str, tuple[Tensor, int]]:
-        """The model's tensors and the number of their item axes, by field."""
+        """Tensors of the model with the number of their item axes, by field."""
         held = ((f.name, getattr(self, f.name)) for f in dataclasses.fields(self))  # type: ignore[arg-type]
         return {name: (t, self.item_axes.get(name, 0)) for name, t in held if isinstance(t, Tensor)}
 
 
 def check_model(model: LensModel | None) -> None:
-    """Raises unless a camera model's numbers are finite, and its methods return what `LensModel`'s do.
+    """Check that a camera model's numbers are finite, and that its methods return tensors like `LensModel`'s.
 
-    They are asked once a class, in float32 and float64. TypeError or ValueError.
+    Methods are called once for each class, in float32 and float64. A `Distortion` or None is not checked.
+
+    Raises:
+        ValueError: for NaN or infinity.
+        TypeError: for numpy arrays, and methods that raise, return other tensors or change their argument.
+        NotImplementedError: for a missing method.
     """
     if not isinstance(model, CameraModel):
         return
@@ -175,7 +217,7 @@ def check_model(model: LensModel | None) -> None:
 
 
 def _check_method(model: CameraModel, method: str, points: Tensor, like: tuple[Tensor, ...]) -> None:
-    """Raises TypeError unless a method gives tensors like those, and leaves the points as they are."""
+    """Raise TypeError unless a method returns tensors of these kinds and leaves the points unchanged."""
     name, given = f"{type(model).__name__}.{method}", points.clone()
     try:
         with torch.no_grad():
@@ -199,12 +241,12 @@ def _check_method(model: CameraModel, method: str, points: Tensor, like: tuple[T
 
 
 def _kind(value: Any) -> str:
-    """A tensor's dtype and shape, or what else it is."""
+    """Describe a value: a tensor's dtype and shape, or its type."""
     return f"{value.dtype} {tuple(value.shape)}" if isinstance(value, Tensor) else f"a {type(value).__name__}"
 
 
 def beside_points(number: Tensor, points: Tensor, axes: int = 0) -> Tensor:
-    """A model's number (*b, and `axes` of its own) for points (*b, ..., k): 1-long axes for the points'."""
+    """Reshape a model's number (*b, and `axes` of its own) for points (*b, ..., k), by axes of length 1."""
     batch = number.ndim - axes
     trailing = number.shape[batch:]
     return number.to(points).reshape((*number.shape[:batch], *[1] * (points.ndim - 1 - batch), *trailing))

@@ -1,4 +1,4 @@
-"""Camera models whose rays do not meet in a point: parallel rays, a rolling shutter, a flat port."""
+"""Camera models whose rays do not meet in a point: parallel rays, rolling shutter, flat port."""
 
 from __future__ import annotations
 
@@ -17,16 +17,17 @@ from .common import cosine_and_sinc, finite_points, on_plane, unit
 from .model import CameraModel, LensModel, beside_points
 
 ROWS, ANGLES = 12, 24
-"""Steps, at most, to the row at which a point is seen, and to the angle at which a pane is looked through."""
+"""Largest number of steps to the row at which a point is seen, and to the angle at which a pane is passed."""
 FOLLOWED = 2
-"""Further steps, which first and second derivatives go through."""
+"""Further steps, which carry first and second derivatives."""
 SETTLED = 64
-"""A solution is found where a step is this many roundings."""
+"""Size of a step, in units of rounding, below which a solution is accepted."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Orthographic(CameraModel, name="orthographic"):
-    """Parallel rays along the axis, as of a telecentric lens: (x, y) metres, focal length pixels a metre."""
+    """Parallel rays along the axis, as of a telecentric lens: (x, y) in metres, focal length in pixels for
+    each metre."""
 
     central: ClassVar[bool] = False
     lengths: ClassVar = ()
@@ -34,27 +35,42 @@ class Orthographic(CameraModel, name="orthographic"):
 
     @property
     def sees_behind(self) -> bool:
-        """Points ahead alone are seen."""
+        """False: only points ahead are seen."""
         return False
 
     def project(self, X: Tensor) -> tuple[Tensor, Tensor]:
-        """Points ahead, z > 0."""
+        """Project points along the axis.
+
+        Returns:
+            (x, y) in metres, and True for z > 0.
+        """
         X, finite = finite_points(X)
         return X[..., :2], finite & (X[..., 2] > 0)
 
     def unproject(self, xy: Tensor) -> tuple[Tensor, Tensor]:
-        """The axis, for each."""
+        """Return the axis for each point.
+
+        Returns:
+            Directions (0, 0, 1), and True for finite points.
+        """
         xy, finite = finite_points(xy)
         return torch.zeros_like(to_homogeneous(xy)) + xy.new_tensor([0.0, 0.0, 1.0]), finite
 
     def origins(self, xy: Tensor) -> Tensor:
-        """The points themselves, in the plane z = 0."""
+        """Return the points themselves, in the plane z = 0."""
         return torch.nn.functional.pad(finite_points(xy)[0], (0, 1))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class BehindModel(CameraModel):
-    """A pinhole, or a camera with a central lens, behind something else."""
+    """Base of cameras behind something else: a pinhole, or a camera with a central lens.
+
+    Attributes:
+        lens: central lens model; None for a pinhole.
+
+    Raises:
+        ValueError: for a lens that is not central.
+    """
 
     lens: LensModel | None = None
 
@@ -64,7 +80,7 @@ class BehindModel(CameraModel):
 
     @property
     def period(self) -> float:  # type: ignore[override]
-        """Its lens's."""
+        """Period of its lens."""
         return 0.0 if self.lens is None else self.lens.period
 
     def _through(self, X: Tensor) -> tuple[Tensor, Tensor]:
@@ -80,15 +96,15 @@ class BehindModel(CameraModel):
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class RollingShutter(BehindModel, name="rolling-shutter"):
-    """A camera that moves while its rows are read, one after the other.
+    """Camera that moves while its rows are read, one after the other, at constant velocities.
 
-    velocity: of the camera, metres a second along its axes.
-    rotation: its angular velocity about its axes, radians a second.
-    readout: seconds that as many rows take as are one focal length, `row_time * fy`; the row of the principal
-    point is
-        read at time 0, for which the pose is. Both motions are constant while the image is read.
+    The row of the principal point is read at time 0, to which the pose refers. K is upright: images rotated
+    by a quarter turn have columns for rows.
 
-    K is upright: images that are rotated by a quarter turn have columns for rows.
+    Attributes:
+        velocity: velocity of the camera along its axes, metres for each second.
+        rotation: angular velocity about its axes, radians for each second.
+        readout: seconds in which as many rows are read as the focal length has pixels, `row_time * fy`.
     """
 
     item_axes: ClassVar = {"velocity": 1, "rotation": 1}
@@ -99,7 +115,11 @@ class RollingShutter(BehindModel, name="rolling-shutter"):
     readout: Float[Tensor, "*b"]
 
     def project(self, X: Tensor) -> tuple[Tensor, Tensor]:
-        """Where the row that sees a point is read, by the secant method; not valid where that finds none."""
+        """Project points by the secant method for the row that sees them.
+
+        Returns:
+            Points of the image plane; not valid where no row is found.
+        """
         X, finite = finite_points(X)
         with torch.no_grad():
             row, slope = self._row(X)
@@ -110,7 +130,7 @@ class RollingShutter(BehindModel, name="rolling-shutter"):
         return xy, valid & finite & settled
 
     def _row(self, X: Tensor) -> tuple[Tensor, Tensor]:
-        """The row that sees a point when it is read, and how far it moves while a row is read, in rows."""
+        """Row that sees a point while it is read, and the point's motion during a row, in rows."""
         before = self._through(X)[0][..., 1]
         row, slope = before, torch.zeros_like(before)
         last, rounding = torch.zeros_like(before), torch.finfo(before.dtype).eps
@@ -128,12 +148,16 @@ class RollingShutter(BehindModel, name="rolling-shutter"):
         return row, slope
 
     def unproject(self, xy: Tensor) -> tuple[Tensor, Tensor]:
-        """Unit directions, in the frame of time 0."""
+        """Compute unit directions in the frame of time 0.
+
+        Returns:
+            Directions, and validity.
+        """
         ray, valid = self._ray(xy)
         return _rotated(ray, self.rotation, self._time(ray, xy[..., 1])), valid
 
     def origins(self, xy: Tensor) -> Tensor:
-        """Where the camera is when the row is read."""
+        """Return the position of the camera when the row is read, metres."""
         xy = finite_points(xy)[0]
         return self._time(xy, xy[..., 1])[..., None] * beside_points(self.velocity, xy, 1)
 
@@ -147,11 +171,11 @@ class RollingShutter(BehindModel, name="rolling-shutter"):
 
 
 STEEPEST = 0.9
-"""The largest slope that a step is made by."""
+"""Largest slope that a step is computed with."""
 
 
 def _rotated(v: Tensor, rotation: Tensor, time: Tensor) -> Tensor:
-    """Vectors (*b, ..., 3) after a time at angular velocities (*b, 3) (Rodrigues), smooth at angle 0."""
+    """Rotate vectors (*b, ..., 3) for a time at angular velocities (*b, 3) (Rodrigues), smooth at angle 0."""
     w = beside_points(rotation, v, 1)
     sinc, versed = _sinc_and_versed(time.square() * w.square().sum(-1))
     once = _cross(w, v)
@@ -159,7 +183,7 @@ def _rotated(v: Tensor, rotation: Tensor, time: Tensor) -> Tensor:
 
 
 def _sinc_and_versed(squared: Tensor) -> tuple[Tensor, Tensor]:
-    """sin(t) / t and (1 - cos(t)) / t^2 of squared angles t^2; by their series alone where all are small."""
+    """sin(t) / t and (1 - cos(t)) / t^2 of squared angles t^2; by series alone if all are small."""
     if followed() or bool((squared > SMALL).any()):
         sinc, half = cosine_and_sinc(squared)[1], cosine_and_sinc(squared / 4)[1]
         return sinc, 0.5 * half.square()
@@ -170,21 +194,28 @@ def _sinc_and_versed(squared: Tensor) -> tuple[Tensor, Tensor]:
 
 
 SMALL = 0.1
-"""Squared angles up to which the eighth term of their series is below rounding."""
+"""Squared angle up to which the eighth term of the series is below rounding."""
 
 
 def _cross(w: Tensor, v: Tensor) -> Tensor:
-    """Cross products by their parts: `torch.linalg.cross` of a broadcast vector takes three times as long."""
+    """Cross products by components: `torch.linalg.cross` of a broadcast vector takes three times as long."""
     (wx, wy, wz), (x, y, z) = w.unbind(-1), v.unbind(-1)
     return torch.stack([wy * z - wz * y, wz * x - wx * z, wx * y - wy * x], -1)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class FlatPort(BehindModel, name="flat-port"):
-    """A camera in air that looks into water through a flat pane of glass, at right angles to its axis.
+    """Camera in air that looks into water through a flat pane of glass, at right angles to its axis
+    (Treibitz, Schechner, Kunz and Singh 2012).
 
-    distance: from the camera's centre to the pane, metres. thickness: of the pane, metres. glass, water:
-    their refractive indices, at least 1 (Treibitz, Schechner, Kunz and Singh 2012).
+    Attributes:
+        distance: from the camera's centre to the pane, metres.
+        thickness: thickness of the pane, metres.
+        glass: refractive index of the glass, at least 1.
+        water: refractive index of the water, at least 1.
+
+    Raises:
+        ValueError: for refractive indices below 1, and a lens that is not central.
     """
 
     central: ClassVar[bool] = False
@@ -205,10 +236,13 @@ class FlatPort(BehindModel, name="flat-port"):
         return False
 
     def project(self, X: Tensor) -> tuple[Tensor, Tensor]:
-        """Points in the water, by the tangent in air of the ray that reaches them.
+        """Project points in the water by the ray that reaches them, found by Newton's method.
 
-        By Newton's method on the tangent over the radius, from its value on the axis: how far off axis a ray
-        gets is concave in its tangent, so that no step goes too far.
+        The unknown is the ray's tangent in air over the radius, started from its value on the axis: how far
+        off axis a ray gets is concave in its tangent, so that no step goes too far.
+
+        Returns:
+            Points of the image plane, and True for points behind the pane that a ray reaches.
         """
         X, finite = finite_points(X)
         distance, thickness = self._layers(X)
@@ -230,14 +264,18 @@ class FlatPort(BehindModel, name="flat-port"):
         return xy, valid & settled & lens_valid
 
     def unproject(self, xy: Tensor) -> tuple[Tensor, Tensor]:
-        """Unit directions in the water, by Snell's law."""
+        """Compute unit directions in the water, by Snell's law.
+
+        Returns:
+            Directions, and validity.
+        """
         ray, valid = self._ray(xy)
         across = ray[..., :2] / beside_points(self.water, ray)[..., None]
         ahead = (1 - across.square().sum(-1)).clamp(min=0).sqrt()
         return torch.cat([across, ahead[..., None]], -1), valid & (ray[..., 2] > 0)
 
     def origins(self, xy: Tensor) -> Tensor:
-        """Where the rays leave the pane."""
+        """Return the points where rays leave the pane, metres."""
         ray, _ = self._ray(xy)
         distance, thickness = self._layers(ray)
         ahead = ray[..., 2].clamp(min=1e-6)
@@ -250,7 +288,8 @@ class FlatPort(BehindModel, name="flat-port"):
         return beside_points(self.distance, points), beside_points(self.thickness, points)
 
     def _step(self, share: Tensor, squared: Tensor, depths: tuple[Tensor, Tensor]) -> Tensor:
-        """Newton's, to the tangent in air over the radius whose ray gets as far as the (squared) radius."""
+        """Newton step of the tangent in air over the radius, for the ray that reaches the
+        (squared) radius."""
         across = squared * share.square()
         reached = slope = self._layers(share[..., None])[0]
         for depth, number in zip(depths, (self.glass, self.water)):

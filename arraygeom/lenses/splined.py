@@ -1,4 +1,5 @@
-"""Lenses by a smooth surface of B-splines, not a formula: any lens, and each sensor's own unevenness."""
+"""Splined lenses: a smooth surface of B-splines in place of a formula, for any lens and a sensor's
+unevenness."""
 
 from __future__ import annotations
 
@@ -18,27 +19,29 @@ from .model import CameraModel, beside_points
 
 STEREOGRAPHIC, PINHOLE = "stereographic", "pinhole"
 SUPPORT = {2: 3, 3: 4}
-"""Knots to a side that a point depends on, by the order of the splines."""
+"""Knots on a side that a point depends on, by the order of the splines."""
 STEPS, MOST = 6, 30
-"""Of Newton for all points, and for those that six do not suffice for."""
+"""Newton steps for all points, and for those that need more."""
 NEARLY = 1e-6
-"""A knot's spacing from the last whole one, and squared sine from 90 degrees: the border is left out."""
+"""Margin at the border: of a knot's spacing to the last whole one, and of the squared sine to 90 degrees."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Splined(CameraModel, name="splined"):
-    """A point of the image plane is that of a simple projection plus a displacement, a surface of B-splines.
+    """Camera model of a simple projection plus a displacement, given by a surface of B-splines.
 
-    The surface is over the stereographic projection u = 2 tan(theta / 2) of directions: `knots` (ny, nx)
-    displacements (x, y), `spacing` of u apart along x and y, the middle one at u = 0; of `order` 2
-    (quadratic) or 3 (cubic). `base` is what is displaced: the stereographic point itself (mrcal's
-    LENSMODEL_SPLINED_STEREOGRAPHIC), or the pinhole's (x / z, y / z) (lensboy's pinhole_splined), which has
-    no directions at 90 degrees or more from the axis.
+    The surface is over the stereographic projection u = 2 tan(theta / 2) of directions. Directions beyond the
+    knots, within half a support of the border, are not valid, nor are those past a fold.
 
-    Directions beyond the knots, within half a support of the border, are not valid, nor are those past a
-    fold.
+    Attributes:
+        knots: displacements (x, y) at (ny, nx) knots, the middle one at u = 0.
+        spacing: distance of the knots in u along x and y.
+        order: 2 (quadratic) or 3 (cubic).
+        base: displaced projection: "stereographic" (mrcal's LENSMODEL_SPLINED_STEREOGRAPHIC), or "pinhole" (x
+            / z, y / z) (lensboy's pinhole_splined), which has no directions at 90 degrees or more off axis.
 
-    Raises ValueError for another base or order, and for too few knots.
+    Raises:
+        ValueError: for another base or order, too few knots, and a spacing that is not positive.
     """
 
     item_axes: ClassVar = {"knots": 3, "spacing": 1}
@@ -66,11 +69,15 @@ class Splined(CameraModel, name="splined"):
 
     @property
     def sees_behind(self) -> bool:
-        """Whether the base has directions at 90 degrees or more off axis."""
+        """True if the base has directions at 90 degrees or more off axis."""
         return self.base == STEREOGRAPHIC
 
     def project(self, X: Tensor) -> tuple[Tensor, Tensor]:
-        """Directions within the knots; the point (0, 0, 0) is not seen."""
+        """Project directions (*n, 3).
+
+        Returns:
+            Points of the image plane, and True within the knots; (0, 0, 0) is not valid.
+        """
         X, finite = finite_points(X)
         length = _length(X)
         away = length + X[..., 2]  # 0 straight behind
@@ -80,7 +87,11 @@ class Splined(CameraModel, name="splined"):
         return xy, finite & some & inside & keeps_orientation(jacobian)
 
     def unproject(self, xy: Tensor) -> tuple[Tensor, Tensor]:
-        """Unit directions: the inverse of `project`. The last two steps of Newton are differentiable."""
+        """Compute unit directions: the inverse of `project`. The last two Newton steps are differentiable.
+
+        Returns:
+            Directions, and validity.
+        """
         xy, finite = finite_points(xy)
         with torch.no_grad():
             wanted = xy.detach()
@@ -100,7 +111,7 @@ class Splined(CameraModel, name="splined"):
         return torch.cat([4 * u, 4 - squared], -1) / (4 + squared), valid
 
     def _solved(self, start: Tensor, xy: Tensor, steps: int) -> Tensor:
-        """Stereographic points of points of the image plane, by at most so many steps of Newton."""
+        """Stereographic points of points of the image plane, by at most `steps` Newton steps."""
 
         def within(u: Tensor) -> Tensor:
             return self._within(u)[1]
@@ -108,12 +119,14 @@ class Splined(CameraModel, name="splined"):
         return solve_in_plane(self._displaced, start, xy, within, rounding=SOLVED / 8, steps=steps)
 
     def _off(self, u: Tensor, xy: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
-        """Which stereographic points are no points of the image plane, where the others are, the Jacobian."""
+        """True for stereographic points that do not solve for the image plane's, with their projections and
+        the Jacobian."""
         there, jacobian = self._displaced(u)
         return norm(there - xy) >= SOLVED * torch.finfo(xy.dtype).eps * (1 + norm(xy)), there, jacobian
 
     def _within(self, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Stereographic points, outer ones at the border of what knots (and base) cover; which are out."""
+        """Clamp stereographic points to the border of knots and base. Returns them, and True for points
+        inside."""
         spacing = beside_points(self.spacing, u, 1).detach()
         ny, nx = self.knots.shape[-3:-1]
         margin = 0.5 * (self.order - 1) + NEARLY
@@ -135,7 +148,7 @@ class Splined(CameraModel, name="splined"):
         return 2 * xy / (1 + (1 + xy.square().sum(-1, keepdim=True)).sqrt())
 
     def _displaced(self, u: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor, Tensor]]:
-        """Points of the image plane of stereographic ones within the knots, and the Jacobian."""
+        """Points of the image plane of stereographic points within the knots, and the Jacobian."""
         moved, along_x, along_y = self._surface(u)
         if self.base == STEREOGRAPHIC:
             return u + moved, (1 + along_x[..., 0], along_y[..., 0], along_x[..., 1], 1 + along_y[..., 1])
@@ -151,7 +164,7 @@ class Splined(CameraModel, name="splined"):
         return u * g[..., None] + moved, jacobian
 
     def _surface(self, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The displacements (*n, 2) and their derivatives by u's x and y."""
+        """Displacements (*n, 2) and their derivatives by u's x and y."""
         ny, nx = self.knots.shape[-3:-1]
         spacing, knots = beside_points(self.spacing, u, 1), beside_points(self.knots, u, 3)
         position = u / spacing + 0.5 * (u.new_tensor([nx, ny]) - 1)
@@ -179,13 +192,13 @@ class Splined(CameraModel, name="splined"):
 
 
 def _length(X: Tensor) -> Tensor:
-    """Of vectors; 1 of those of length 0, without a gradient."""
+    """Lengths of vectors; 1 for zero vectors, without gradient."""
     squared = X.square().sum(-1)
     return torch.where(squared > 0, squared, 1.0).sqrt()
 
 
 def _basis(t: Tensor, order: int) -> tuple[Tensor, Tensor]:
-    """Uniform B-splines (*n, side) and their slopes, of knots 0, 1, ...; t is from the first of them."""
+    """Uniform B-splines (*n, side) and their slopes, for knots 0, 1, ...; t counts from the first of them."""
     s = t - 1
     if order == 2:
         weights = [(0.5 - s) ** 2 / 2, 0.75 - s**2, (0.5 + s) ** 2 / 2]

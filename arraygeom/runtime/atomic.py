@@ -1,4 +1,4 @@
-"""Files written atomically."""
+"""Atomic writing of files."""
 
 from __future__ import annotations
 
@@ -11,14 +11,19 @@ from uuid import uuid4
 
 @contextmanager
 def write_atomically(path: str | Path) -> Iterator[Path]:
-    """A temporary path beside `path` to write to; it replaces `path` when the block ends without error.
+    """Context manager that yields a temporary path beside `path`, which replaces `path` if the block
+    succeeds.
 
-    After an error (a full disk, say) the temporary file is gone and a former `path` is as it was. The
-    temporary name ends as `path` does, so that writers that choose the format by suffix choose the same.
-    Missing folders are made. The content is on the disk before the name is, so that a file that is there
-    after a crash is whole.
+    After an error (such as a full disk) the temporary file is gone and a former `path` is as it was. The
+    temporary name ends as `path` does, for writers that choose the format by suffix. Missing folders are
+    made. Content reaches the disk before the name does, so that a file that exists after a crash is complete.
 
-    Raises OSError that names `path`, whatever file the system's own names; IsADirectoryError for a folder.
+    Yields:
+        The temporary path.
+
+    Raises:
+        IsADirectoryError: if `path` is a folder.
+        OSError: naming `path`, if writing fails.
     """
     path = Path(path)
     if path.is_dir():
@@ -39,12 +44,16 @@ def write_atomically(path: str | Path) -> Iterator[Path]:
 
 
 def speaks_for_itself(error: OSError) -> bool:
-    """Whether it is not the system's, nor a library's that could not write."""
+    """Return True for an error that neither the system nor a library's failed write raised."""
     return error.errno is None and type(error) is not OSError
 
 
 def naming(path: Path, error: OSError, temporary: Path) -> OSError:
-    """The error, of `path` in place of a temporary one; NumPy's have a text alone, without a file."""
+    """Replace a temporary path by `path` in an error; NumPy's errors have a text alone, without a file.
+
+    Returns:
+        The new error.
+    """
     if error.errno is not None:
         return OSError(error.errno, error.strerror, str(path))
     text = str(error).replace(str(temporary), str(path))
@@ -52,7 +61,11 @@ def naming(path: Path, error: OSError, temporary: Path) -> OSError:
 
 
 def flush(path: Path) -> None:
-    """Wait until a file's content, or the names in a folder, are on the disk."""
+    """Wait until a file's content, or the names in a folder, are on the disk.
+
+    Raises:
+        OSError: if the system reports an error.
+    """
     if os.name == "nt" and path.is_dir():  # Windows opens no folders
         return
     handle = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
@@ -63,18 +76,22 @@ def flush(path: Path) -> None:
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a text file atomically. Missing folders are made."""
+    """Write a text file (UTF-8) atomically. Missing folders are made.
+
+    Raises:
+        OSError: naming the file, if writing fails.
+    """
     with write_atomically(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
 @contextmanager
 def alone(lock: Path, longest: float) -> Iterator[None]:
-    """A block that one process is in at a time, or one that has waited so many seconds for the others, or
-    that cannot lock the file. The system unlocks what a process that ended had locked.
+    """Context manager that admits one process at a time, by a lock file.
 
-    Where Python cannot ask the system for locks, a file of another name is there while a process is in the
-    block: the system's locks leave theirs, and would be waited for.
+    A process that waited `longest` seconds, or cannot lock the file, enters all the same. The system releases
+    locks of ended processes. Where Python cannot ask the system for locks, a file of another name exists
+    while a process is in the block.
     """
     from filelock import FileLock, SoftFileLock
 

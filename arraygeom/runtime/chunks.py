@@ -1,4 +1,4 @@
-"""A large thing in parts: boxes of an image with halos, and functions called for one part after the other."""
+"""Processing in parts: boxes of an image with halos, and functions called for one part after the other."""
 
 from __future__ import annotations
 
@@ -14,42 +14,56 @@ from .threads import in_order
 from .tracing import transformations
 
 ROWS = 256
-"""Rows at a time: of an image of 12 megapixels, 12 MB of three colours in float32."""
+"""Rows at a time: for an image of 12 megapixels, 12 MB of three colours in float32."""
 
 Box = tuple[int, ...]
 """First pixel, and the one after the last, along each axis: (top, bottom, left, right) of an image."""
 
 
 class Tile(NamedTuple):
-    """A box of what is made, and the box of what is given that it needs: the same with a halo."""
+    """Box of a result, and the box of the input that it needs.
+
+    Attributes:
+        inner: box of the result.
+        outer: the same box with a halo.
+    """
 
     inner: Box
     outer: Box
 
 
 def area(box: Box) -> int:
-    """Pixels in a box."""
+    """Return the number of pixels in a box."""
     return math.prod(last - first for first, last in zip(box[::2], box[1::2]))
 
 
 def slices(box: Sequence[int]) -> tuple[Any, ...]:
-    """What is indexed to get a box, along its axes."""
+    """Convert a box to the index that selects it."""
     return tuple(slice(*span) for span in zip(box[::2], box[1::2]))
 
 
 def whole(lengths: Sequence[int]) -> Tile:
-    """All of a frame (h, w) as one tile."""
+    """Return one tile for all of a frame (h, w)."""
     box = tuple(chain(*((0, n) for n in lengths)))
     return Tile(box, box)
 
 
 def spans(length: int, step: int) -> list[tuple[int, int]]:
-    """First index, and the one after the last, of parts of `step`; the last part may be shorter."""
+    """Split a length into parts of `step`; the last part may be shorter.
+
+    Returns:
+        (first index, index after the last) of each part; one empty part for length 0.
+    """
     return [(first, min(first + step, length)) for first in range(0, max(length, 1), step)]
 
 
 def tiles_of(lengths: Sequence[int], side: int | Sequence[int], halo: int) -> Iterator[Tile]:
-    """Tiles of a frame (h, w), square or of a height and a width, whose halos end at its borders."""
+    """Yield the tiles of a frame (h, w), whose halos end at its borders.
+
+    Args:
+        side: side of square tiles, or (height, width).
+        halo: pixels around each tile.
+    """
     sides = [side] * len(lengths) if isinstance(side, int) else side
     for inner in product(*map(spans, lengths, sides)):
         outer = ((max(first - halo, 0), min(last + halo, n)) for (first, last), n in zip(inner, lengths))
@@ -63,17 +77,18 @@ def chunked(
     halo: int = 0,
     axis: int | Sequence[int] = -2,
 ) -> Any:
-    """`function(*tensors)`, computed for some rows at a time; with several axes, for one tile at a time.
+    """Compute `function(*tensors)` for some rows at a time; with several axes, for one tile at a time.
 
-    Of tensors on the CPU parts are computed `in_order` on several threads.
+    Results must be tensors as long as the input along the axis, or shorter by a whole factor of which `rows`
+    and `halo` are multiples. Each part gets up to `halo` more rows on either side, whose results are dropped.
+    On the CPU parts are computed `in_order` on several threads. Gradients pass through.
 
-    The tensors are cut along the axis, and so is what the function gives: a tensor or several, as long as
-    what it is given or shorter by a whole factor, of which `rows` and `halo` are multiples. Each part is
-    given `halo` more rows on either side, as far as there are any; what the function gives for those is
-    dropped. Gradients pass through.
+    Args:
+        axis: axis, or axes, to cut along.
 
-    Gives a tensor if the function does, else a tuple. If all fits into one part the function is called as it
-    is.
+    Returns:
+        A tensor if the function returns one, else a tuple. If all fits into one part the function's own
+        result.
     """
     axes = [axis] if isinstance(axis, int) else axis
     lengths = [tensors[0].shape[a] for a in axes]
@@ -89,10 +104,14 @@ def chunked(
 def assembled(
     lengths: Sequence[int], parts: Iterable[tuple[Tile, Any]], axes: Sequence[int] = (-2, -1)
 ) -> Any:
-    """Tensors of a frame (h, w), put together from the inner parts of those of its tiles.
+    """Assemble tensors of a frame (h, w) from the inner parts of its tiles' results.
 
-    Of each tile a tensor or several are given, as large as the outer box or smaller by a whole factor. A tile
-    that is the whole frame is given back as it is.
+    Args:
+        parts: tiles with one or several tensors each, as large as the outer box or smaller by a whole factor.
+
+    Returns:
+        A tensor if the parts are tensors, else a tuple; the result of a tile that is the whole frame is
+        returned as it is.
     """
     planes: list[_Plane] = []
     single = False
@@ -110,7 +129,14 @@ def assembled(
 
 
 def sides_by_work(hw: Sequence[int], halo: int, multiple: int, most: float) -> list[tuple[int, int]]:
-    """Heights and widths of tiles of at most `most` pixels with their halos, the least work first."""
+    """List sizes of tiles of at most `most` pixels with their halos, the least total work first.
+
+    Args:
+        multiple: number that sides are multiples of; they are 64 or more.
+
+    Returns:
+        (height, width) of tiles; empty if none fits.
+    """
     h, w = hw
     sides: dict[tuple[int, int], int] = {}
     for rows in range(1, -(-h // 64) + 1):
@@ -125,15 +151,15 @@ def sides_by_work(hw: Sequence[int], halo: int, multiple: int, most: float) -> l
 
 
 def _covered_length(length: int, side: int, halo: int) -> int:
-    """The sum of the lengths of pieces with their halos."""
+    """Total length of pieces with their halos."""
     return sum(min(last + halo, length) - max(first - halo, 0) for first, last in spans(length, side))
 
 
 class _Plane:
-    """A tensor put together from parts: written in place, so that parts can be forgotten.
+    """Tensor assembled from parts: written in place, so that parts can be released.
 
-    Along a single axis they are concatenated at the end where something follows them (gradients,
-    transformations): gradients through writing in place copy the whole once a part.
+    Along a single axis they are concatenated at the end if something follows them (gradients,
+    transformations): gradients through writing in place copy the whole once for each part.
     """
 
     def __init__(self, block: Tensor, tile: Tile, lengths: Sequence[int], axes: Sequence[int]) -> None:
@@ -149,7 +175,7 @@ class _Plane:
             self.whole = torch.empty_permuted(shape, order, dtype=block.dtype, device=block.device)
 
     def add(self, block: Tensor, tile: Tile) -> None:
-        """Keep the inner part of what was made of a tile."""
+        """Keep the inner part of a tile's result."""
         inner, outer = (tuple(n // self.factor for n in box) for box in tile)
         begin = [n for n in outer[::2] for _ in range(2)]
         block = _cut(block, tuple(n - first for n, first in zip(inner, begin)), self.axes)
@@ -159,7 +185,7 @@ class _Plane:
             _cut(self.whole, inner, self.axes).copy_(block)
 
     def tensor(self) -> Tensor:
-        """All of it."""
+        """Return the whole tensor."""
         return torch.cat(self.parts, self.axes[0]) if self.whole is None else self.whole
 
 

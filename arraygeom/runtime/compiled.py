@@ -1,4 +1,4 @@
-"""Functions compiled by numba, and where it keeps what it compiled."""
+"""Functions compiled by numba, and their cache."""
 
 from __future__ import annotations
 
@@ -14,14 +14,20 @@ from .atomic import alone
 from .warned import warn
 
 LONGEST = 300.0
-"""Seconds for which a process waits for another that compiles what it needs, before it does so, too."""
+"""Seconds that a process waits for another one that compiles the same function."""
 
 
 def compiled(function=None, **options):
-    """numba's njit, of the bare function: a checker of types that tests put around it cannot be compiled.
+    """Compile a function by numba's njit, without the type checker that tests wrap around it.
 
-    With `cache` it is called from Python; without, mostly by compiled functions. Where there is no folder
-    that can be written, what `cache` asks to keep is compiled by each process.
+    With `cache` it is called from Python; without, mostly by compiled functions. If no folder can be written,
+    each process compiles for itself, with a warning.
+
+    Returns:
+        The compiled function; without `function` a decorator.
+
+    Raises:
+        ImportError: without numba.
     """
     from numba import njit
 
@@ -42,7 +48,7 @@ def compiled(function=None, **options):
 
 
 def _one_process_at_a_time(entry: Any) -> None:
-    """Let other processes wait for the one that compiles an entry point, and then load what it kept.
+    """Make processes wait for the one that compiles an entry point, and then load its result.
 
     numba counts its files: two processes that compile at once, each for other types, can choose the same
     number, and then load each other's code.
@@ -58,7 +64,7 @@ def _one_process_at_a_time(entry: Any) -> None:
 
 @cache
 def can_compile() -> bool:
-    """Whether numba is installed: without it, what has a readable form takes that."""
+    """Return True if numba is installed; without it, functions with a readable form use that."""
     return find_spec("numba") is not None
 
 
@@ -71,12 +77,12 @@ def _warn_of_no_folder() -> None:
 
 
 def cache_folder(entry: Any) -> str | None:
-    """The folder in which an entry point is kept; None where it is not."""
+    """Return the folder of an entry point's cache; None if it has none."""
     return entry.stats.cache_path
 
 
 def renew_with(entry: Any, sources: Iterable[Path]) -> None:
-    """Let numba's cache of an entry point be renewed when any of these files changes, not its own alone."""
+    """Make numba renew the cache of an entry point when any of these files changes, not only its own."""
     if cache_folder(entry) is not None:
         text = b"".join(path.read_bytes() for path in sorted(sources))
         entry._cache._cache_file._source_stamp = hashlib.sha256(text).hexdigest()

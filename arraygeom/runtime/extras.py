@@ -1,4 +1,4 @@
-"""Modules that only some users need, and those of users."""
+"""Import of optional modules, and of users' own code."""
 
 from __future__ import annotations
 
@@ -11,19 +11,42 @@ from pathlib import Path
 from typing import Any
 
 
+def install_line(module: str, extra: str) -> str:
+    """Return the shell line that installs an optional module, with a checkout and without.
+
+    It names the module's own package: arraygeom-pat is on no index.
+    """
+    packages = {"cv2": "opencv-contrib-python-headless"}
+    package = packages.get(module, module.replace("_", "-"))
+    return f"pip install {package}, or in a checkout: pip install '.[{extra}]'"
+
+
 @contextmanager
 def needs(extra: str, purpose: str) -> Iterator[None]:
-    """Around an optional module's import: raises ImportError in one line that names the extra to install."""
+    """Context manager for the import of an optional module.
+
+    Raises:
+        ImportError: in one line that names the extra to install, if the import fails.
+    """
     try:
         yield
     except ImportError as error:
         module = (error.name or str(error)).partition(".")[0]
-        raise ImportError(f"{purpose} needs {module}: pip install 'arraygeom-pat[{extra}]'") from error
+        raise ImportError(f"{purpose} needs {module}: {install_line(module, extra)}") from error
 
 
 def imported(name: str, what: str) -> Any:
-    """A user's "module:object", or a module, looked for from here too. Raises ValueError, which says what it
-    was to be."""
+    """Import a user's "module:object", or a module, also from the current folder.
+
+    Args:
+        what: what it is, for messages.
+
+    Returns:
+        The object, or the module.
+
+    Raises:
+        ValueError: if it cannot be imported.
+    """
     module, _, attribute = name.partition(":")
     try:
         sys.path.insert(0, str(Path.cwd()))

@@ -1,4 +1,4 @@
-"""File names for names that others chose: of cameras, bands, scenes."""
+"""File names for names of cameras, bands and scenes that others chose."""
 
 from __future__ import annotations
 
@@ -9,23 +9,26 @@ from collections import Counter
 from collections.abc import Iterable
 
 LONGEST = 80
-"""Bytes of a name that is kept; file systems allow 255 for the whole file name."""
+"""Longest unchanged name, in bytes; file systems allow 255 for the whole file name."""
 _DIGEST = 12
-"""Hexadecimal digits that tell changed names apart."""
+"""Hexadecimal digits that distinguish changed names."""
 _RESERVED = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
 """Names of devices on Windows, with any suffix."""
 _CHANGED = re.compile(rf".*-[0-9a-f]{{{_DIGEST}}}", re.DOTALL)
 
 
 def file_names(names: Iterable[str]) -> dict[str, str]:
-    """A file name (or the beginning of one) for each name, by name.
+    """Make a file name (or the beginning of one) for each name; no two names share one.
 
     Letters, digits and ``. _ + - , = @ ~ ( )`` and spaces within stay, others become "_". A name that this
     changes, that is reserved, begins with "." or ends with "." or a space, is longer than `LONGEST` bytes, or
-    differs from another one by case alone ends in "-" and a digest of the name, so no two share a file.
+    differs from another one by case alone ends in "-" and a digest of the name.
 
     >>> file_names(["left", "a/b"])
     {'left': 'left', 'a/b': 'a_b-c14cddc033f6'}
+
+    Returns:
+        File names by name.
     """
     kept = {name: re.sub(r"[^\w.+\-,=@~() ]", "_", unicodedata.normalize("NFC", name)) for name in names}
     count = Counter(text.casefold() for text in kept.values())

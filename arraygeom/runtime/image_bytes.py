@@ -1,7 +1,7 @@
-"""Bytes of image files, checked before a decoder that trusts them sees them.
+"""Checks of image files' bytes, for decoders that trust them.
 
-OpenCV 4.11 to 4.13 crash on damaged animated PNGs, take what is missing of a planar TIFF for black, do not
-read a PNM of text without a line break at its end, and give pixels where libjpeg and libtiff report damage.
+OpenCV 4.11 to 4.13 crash on damaged animated PNGs, take missing parts of a planar TIFF for black, do not read
+a text PNM without a line break at its end, and return pixels where libjpeg and libtiff report damage.
 """
 
 from __future__ import annotations
@@ -20,26 +20,27 @@ TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 JPEG = b"\xff\xd8"
 PNM_OF_TEXT = (b"P1", b"P2", b"P3")
 ANIMATION = (b"acTL", b"fcTL", b"fdAT")
-"""Chunks of a PNG file beside those of its first image."""
+"""Chunks of a PNG file next to those of its first image."""
 SEPARATE = 2
-"""A TIFF file's PlanarConfiguration: one plane after the other."""
+"""TIFF PlanarConfiguration for one plane after the other."""
 MINISWHITE, MINISBLACK = 0, 1
-"""Of its PhotometricInterpretation."""
+"""Values of TIFF PhotometricInterpretation."""
 YCBCR = 6
 DEFLATE, LZW, JPEG_IN_TIFF = (8, 32946), (5,), (7,)
-"""Of its Compression."""
+"""Values of TIFF Compression."""
 REDUCED, MASK = 1, 4
-"""Of a TIFF directory's NewSubfileType."""
+"""Values of a TIFF directory's NewSubfileType."""
 DAMAGED = (OSError, SyntaxError, ValueError, struct.error, LookupError, TypeError, ArithmeticError)
-"""What Pillow and tifffile raise where a file's head is damaged."""
+"""Exceptions of Pillow and tifffile for a damaged header."""
 
 
 def decodable(content: bytes) -> bytes | None:
-    """The bytes to give to OpenCV: a PNG without its animation, if it is whole as a TIFF has to be, a PNM of
-    text with a line break at its end, others as they are.
+    """Check an image file's bytes, and prepare them for OpenCV.
 
-    None for a PNG that is cut or fails its own checks, which OpenCV leaves to a library that writes to the
-    terminal, for a TIFF that lacks some of its pixels, and where the decoder of compressed pixels warns.
+    Returns:
+        A PNG without its animation, a text PNM with a line break at its end, others unchanged; None for a PNG
+        that is cut or fails its checksums, an incomplete TIFF, and compressed pixels that the decoder warns
+        of.
     """
     if content.startswith(PNG):
         chunks = png_chunks(content)
@@ -53,7 +54,7 @@ def decodable(content: bytes) -> bytes | None:
 
 
 def png_chunks(content: bytes) -> list[tuple[bytes, int, int]]:
-    """Kind, start and end of each chunk of a PNG file, whose last may be cut; nothing of what follows it."""
+    """List kind, start and end of each chunk of a PNG file, up to IEND; the last one may be cut."""
     chunks: list[tuple[bytes, int, int]] = []
     start = len(PNG)
     while start + 8 <= len(content) and not (chunks and chunks[-1][0] == b"IEND"):
@@ -64,25 +65,30 @@ def png_chunks(content: bytes) -> list[tuple[bytes, int, int]]:
 
 
 def _is_undamaged(content: bytes, chunk: tuple[bytes, int, int]) -> bool:
-    """Whether a chunk that is needed, by its kind's first letter, is all there and has its own checksum."""
+    """True if a chunk is not required (by its kind's first letter), or complete with the right checksum."""
     kind, start, end = chunk
     found = zlib.crc32(memoryview(content)[start + 4 : end - 4])
     return kind[:1].islower() or content[end - 4 : end] == found.to_bytes(4, "big")
 
 
 def first_tiff_page(content: bytes) -> Any:
-    """The first directory of a TIFF file (tifffile.TiffPage), without messages of what is damaged in it.
+    """Parse the first directory of a TIFF file, without messages about damage.
 
-    Raises one of `DAMAGED` where there is none.
+    Returns:
+        tifffile's TiffPage.
+
+    Raises:
+        ValueError: or another of `DAMAGED`, if there is none.
     """
     with _quiet_tiff(content) as file:
         return file.pages.first
 
 
 def tiff_colours(content: bytes) -> Any:
-    """Values (H, W, C) of a TIFF file's first image of several bands, by tifffile.
+    """Read the values of a TIFF file's first image of several bands, by tifffile.
 
-    None for a damaged file, and for a compression that needs imagecodecs.
+    Returns:
+        (h, w, c); None for a damaged file, and a compression that needs imagecodecs.
     """
     try:
         with _quiet_tiff(content) as file:
@@ -94,7 +100,8 @@ def tiff_colours(content: bytes) -> Any:
 
 
 def has_further_images(content: bytes) -> bool:
-    """Whether a TIFF file holds more images of the first one's size, which are no copies or masks of it."""
+    """Return True for a TIFF file with more images of the first one's size that are no copies or
+    masks of it."""
     try:
         with _quiet_tiff(content) as file:
             first, second = file.pages.first, file.pages[1]
@@ -118,7 +125,7 @@ def _quiet_tiff(content: bytes) -> Iterator[Any]:
 
 
 def _is_whole(content: bytes) -> bool:
-    """Whether all strips or tiles of a TIFF file's first image lie within the file."""
+    """True if all strips or tiles of a TIFF file's first image lie within the file and decompress."""
     try:
         page = first_tiff_page(content)
     except DAMAGED:
@@ -137,7 +144,7 @@ def _is_whole(content: bytes) -> bool:
 
 
 def _decompresses(page: Any, segment: bytes, i: int) -> bool:
-    """Whether a TIFF page's i-th strip or tile is decompressed without a warning, to its length."""
+    """True if a TIFF page's i-th strip or tile decompresses without a warning, to its full length."""
     if page.compression in DEFLATE:
         try:
             return len(zlib.decompress(segment)) >= _length(page, i)
@@ -154,7 +161,7 @@ def _decompresses(page: Any, segment: bytes, i: int) -> bool:
 
 
 def _length(page: Any, i: int) -> int:
-    """Bytes of a page's i-th strip or tile once it is decompressed; 1 where that depends on its colours."""
+    """Decompressed bytes of a page's i-th strip or tile; 1 where that depends on its colours."""
     if page.photometric == YCBCR:
         return 1
     rows, width, height = page.rowsperstrip, page.imagewidth, page.imagelength
@@ -168,7 +175,7 @@ def _length(page: Any, i: int) -> int:
 
 
 def _is_sound(content: bytes) -> bool:
-    """Whether libjpeg decodes a JPEG without a warning, or one of other colours than it gives."""
+    """True if libjpeg decodes a JPEG without a warning, or it has other colours."""
     try:
         jpeg_colours(content)
     except Exception:  # the decoder raises nothing narrower
@@ -177,9 +184,13 @@ def _is_sound(content: bytes) -> bool:
 
 
 def jpeg_colours(content: bytes) -> Any:
-    """Values (H, W, 1 or 3; red first) of a JPEG file, as OpenCV's; None for other colours than RGB and grey.
+    """Decode a JPEG file, with the values of OpenCV.
 
-    Raises an Exception where libjpeg warns: OpenCV prints the warning, and gives the pixels that it has.
+    Returns:
+        (h, w, 1 or 3), red first; None for other colours than RGB and grey.
+
+    Raises:
+        Exception: where libjpeg warns; OpenCV would print the warning, and return the pixels that it has.
     """
     from kornia_rs import io
     from PIL.JpegImagePlugin import JpegImageFile

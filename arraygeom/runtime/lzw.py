@@ -1,4 +1,4 @@
-"""How much a TIFF strip in LZW holds: libtiff reports damage in it to a terminal, if at all."""
+"""Length of a TIFF strip in LZW: libtiff reports damage only to a terminal, if at all."""
 
 from __future__ import annotations
 
@@ -11,9 +11,13 @@ CLEAR, END = 256, 257
 
 @compiled(nogil=True, cache=True)
 def lzw_length(data, wanted):
-    """Bytes that LZW codes (uint8, the most significant bit first) stand for, once they reach `wanted`.
+    """Count the bytes that LZW codes stand for, up to `wanted` or slightly more.
 
-    0 if a code is not in the table, follows a full one, or is cut.
+    Args:
+        data: codes (uint8), the most significant bit first.
+
+    Returns:
+        The length; 0 if a code is not in the table, follows a full one, or is cut.
     """
     lengths = np.ones(4096, np.int64)
     width, known, before, total, position = 9, END + 1, -1, 0, 0

@@ -1,7 +1,6 @@
-"""How far long work is: its steps go to the log, each with the share of its stage that is done.
+"""Progress of long work: steps go to the log, each with the share of its stage that is done.
 
-`pat.support.steps` shows them with the time that is left. Outside a stage a step is an ordinary line of the
-log.
+`pat.support.steps` shows them with the remaining time. Outside a stage a step is an ordinary line of the log.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from typing import Any, NamedTuple
 
 
 class _Part(NamedTuple):
-    """A part of a stage, from one share of it to another."""
+    """Part of a stage, from one share of it to another."""
 
     stage: str
     begin: float
@@ -26,7 +25,7 @@ _CURRENT: ContextVar[_Part | None] = ContextVar("_CURRENT", default=None)
 
 @contextmanager
 def stage(name: str = "", *, new: bool = False) -> Iterator[None]:
-    """A block that is a stage of its own; within another one it is a part of that, unless it is `new`."""
+    """Context manager of a stage; inside another one it is a part of that, unless it is `new`."""
     outer = _CURRENT.get()
     token = _CURRENT.set(_Part(name, 0.0, 1.0) if outer is None or new else outer)
     try:
@@ -37,7 +36,7 @@ def stage(name: str = "", *, new: bool = False) -> Iterator[None]:
 
 @contextmanager
 def part(begin: float, end: float) -> Iterator[None]:
-    """A block that is a part of the current stage or part, from one share of it (0..1) to another."""
+    """Context manager of a part of the current stage or part, from one share of it (0..1) to another."""
     outer = _CURRENT.get()
     if outer is None:
         yield
@@ -57,6 +56,6 @@ def log_step(log: Logger, share: float, text: str, *values: Any) -> None:
 
 
 def progress() -> tuple[str, float] | None:
-    """The current stage and how much of it is done; None outside any."""
+    """Return the current stage and its completed share; None outside any."""
     now = _CURRENT.get()
     return None if now is None else (now.stage, now.begin)

@@ -1,7 +1,8 @@
-"""YAML and JSON of unknown origin: bounded in nesting, YAML in size and aliases, no repeated keys.
+"""YAML and JSON of unknown origin: limited nesting, YAML with limited size and aliases, no repeated keys.
 
-The one loader of each in the project. Both build plain values only. What uses these may still run code that
-they name: a field or a generator MODULE:OBJECT, which commands import only if their own options name it too.
+The only loaders of both in the project. They build plain values only. Users of them may still run code that a
+document names: a field or a generator MODULE:OBJECT, which commands import only if their own options name it
+too.
 """
 
 from __future__ import annotations
@@ -13,22 +14,26 @@ from typing import Any
 import yaml
 
 LARGEST_TEXT = 2**25
-"""Characters. 3,000 cameras are about 1 million."""
+"""Largest number of characters. 3,000 cameras take about 1 million."""
 DEEPEST = 50
-"""Nested lists and mappings. The deepest format of the project has 8."""
+"""Largest nesting of lists and mappings. The deepest format of the project has 8."""
 MOST_VALUES = 500_000
-"""Keys and values, also those that aliases repeat. 3,000 cameras are about 200,000."""
+"""Largest number of keys and values, repeated ones of aliases included. 3,000 cameras take about 200,000."""
 MOST_ALIASED = 100_000
-"""Values that aliases repeat, in total, counted as if they were written out."""
+"""Largest number of values that aliases repeat, in total, counted as if they were written out."""
 
 _Base: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 def load_yaml(text: str) -> Any:
-    """The document of a YAML text.
+    """Load the document of a YAML text.
 
-    Raises yaml.YAMLError, with the line where one is known, for text that is not YAML, for repeated keys (1
-    and "1" are the same key, and so are 1 and true), and for a document beyond the limits of this module.
+    Returns:
+        Plain values; None for an empty text.
+
+    Raises:
+        yaml.YAMLError: with the line where known, for text that is not YAML, repeated keys (1 and "1" are the
+            same key, and so are 1 and true), and documents beyond this module's limits.
     """
     if len(text) > LARGEST_TEXT:
         raise _refused(f"has {len(text):,} characters; at most {LARGEST_TEXT:,} are read")
@@ -42,11 +47,15 @@ def load_yaml(text: str) -> Any:
 
 
 def load_json(text: str) -> Any:
-    """The document of a JSON text.
+    """Load the document of a JSON text.
 
-    Raises json.JSONDecodeError, with the line, for text that is not JSON; ValueError for repeated keys, text
-    that is half a character (a lone surrogate, which cannot be printed), and for one that is nested too
-    deeply.
+    Returns:
+        Plain values.
+
+    Raises:
+        json.JSONDecodeError: with the line, for text that is not JSON.
+        ValueError: for repeated keys, a lone surrogate (half a character, which cannot be printed), and too
+            deep nesting.
     """
     try:
         document = json.loads(text, object_pairs_hook=_without_repeated_keys)
@@ -73,7 +82,7 @@ def _without_repeated_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def yaml_problem(error: Exception) -> tuple[int | None, str]:
-    """The line of an error (from 1; None if unknown) and what is wrong, for messages."""
+    """Return the line of a YAML error (from 1; None if unknown) and its problem, for messages."""
     mark = getattr(error, "problem_mark", None)
     return (mark.line + 1 if mark else None), getattr(error, "problem", None) or "not text"
 
@@ -83,7 +92,7 @@ def _refused(problem: str, mark: Any = None) -> yaml.YAMLError:
 
 
 def _check_extent(text: str) -> None:
-    """Refuse, before anything is built, what would nest too deeply or grow too large by its aliases."""
+    """Refuse a document that nests too deeply or grows too large by aliases, before anything is built."""
     sizes: dict[str, int] = {}
     open_nodes: list[tuple[str | None, int]] = []  # the anchor of each, and how many values came before it
     values = aliased = 0
@@ -115,10 +124,10 @@ def _check_extent(text: str) -> None:
 
 
 class _SafeLoader(_Base):  # type: ignore[misc]
-    """YAML in which a repeated key is an error, not silently the last one."""
+    """YAML loader in which a repeated key is an error."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """The parent's, once no key is there twice."""
+        """Check for repeated keys, then build the mapping as the parent does."""
         lines: dict[Any, int] = {}
         for key_node, _ in node.value:
             if key_node.tag == "tag:yaml.org,2002:merge":
@@ -135,7 +144,8 @@ class _SafeLoader(_Base):  # type: ignore[misc]
 
 
 class SafeDumper(yaml.SafeDumper):
-    """Writes what `load_yaml` reads back the same: a text such as 1e3, which is a number there, in quotes."""
+    """YAML dumper whose text `load_yaml` reads back the same: a text such as 1e3, which is a number there, is
+    quoted."""
 
 
 for _kind in (
@@ -150,5 +160,5 @@ for _kind in (
 
 
 def dump_yaml(document: Any, **layout: Any) -> str:
-    """The text of a document of plain values, keys in their order; `layout` as of `yaml.dump`."""
+    """Format a document of plain values as YAML, keys in their order; `layout` as for `yaml.dump`."""
     return str(yaml.dump(document, Dumper=SafeDumper, sort_keys=False, **layout))

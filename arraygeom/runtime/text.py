@@ -10,20 +10,21 @@ import torch
 from torch import Tensor
 
 UNSCALED = "found from images: lengths are multiples of the baseline, not metres"
-"""The name of a rig of unknown scale."""
+"""Name of a rig of unknown scale."""
 ASSUMED = f"{UNSCALED}; focal lengths are assumed, and the proportions of depth with them"
-"""The name of one whose focal lengths nobody stated: an interval of its depths would be a guess."""
+"""Name of a rig with assumed focal lengths: an interval of its depths would be a guess."""
 OPEN = "found from images that leave lines and depth open: of these images alone"
-"""The name of a rig whose cameras one homography relates as well as any lines."""
+"""Name of a rig whose cameras one homography relates as well as any lines."""
 
 
 def length_unit(rig: Any) -> str:
-    """What lengths of a rig are in: "m", or "baselines" of one of unknown scale."""
+    """Return the unit of a rig's lengths: "m", or "baselines" for unknown scale."""
     return "baselines" if rig.name in (UNSCALED, ASSUMED) else "m"
 
 
 def baseline_text(cameras: Mapping[str, Any], unit: str = "m") -> str:
-    """Distances between the cameras whose poses are known; metres in a unit that suits them."""
+    """Describe the distances between cameras of known pose; metres are converted to a suitable unit. Empty
+    without any."""
     centres = [c.centre.detach() for c in cameras.values() if hasattr(c, "cam_from_world")]
     pairs = [(a - b).norm(dim=-1) for i, a in enumerate(centres) for b in centres[:i]]
     if not pairs:
@@ -37,11 +38,11 @@ def baseline_text(cameras: Mapping[str, Any], unit: str = "m") -> str:
 
 
 UNITS = ((0.01, 1e3, "mm"), (1.0, 1e2, "cm"), (float("inf"), 1.0, "m"))
-"""Below which length (metres) another unit reads better, its factor and name."""
+"""Length in metres below which a unit reads better, its factor and name."""
 
 
 def depth_text(depth: tuple[Tensor, Tensor] | None, unit: str = "m") -> str:
-    """The depth range: "2-5 m"."""
+    """Describe a depth range, such as "2-5 m"; empty for None."""
     if depth is None:
         return ""
     near, far = float(depth[0].detach().min()), float(depth[1].detach().max())
@@ -49,7 +50,8 @@ def depth_text(depth: tuple[Tensor, Tensor] | None, unit: str = "m") -> str:
 
 
 def angle(R: Tensor) -> Tensor:
-    """The angle (*b) of a rotation (*b, 3, 3), radians; exact for small ones too."""
+    """Compute the angle (*b) of rotations (*b, 3, 3) in radians, without gradient; exact for small angles
+    too."""
     R = R.detach()
     skew = torch.stack(
         [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], -1
@@ -58,17 +60,17 @@ def angle(R: Tensor) -> Tensor:
 
 
 def range_text(values: Tensor, form: str) -> str:
-    """The least and the largest value, as one where they read alike."""
+    """Format the least and the largest value, as one if they read alike."""
     low, high = (format(float(v), form) for v in (values.min(), values.max()))
     return low if low == high else f"{low}-{high}"
 
 
 def share_text(mask: Tensor) -> str:
-    """How much of a mask is true."""
+    """Format the true share of a mask, such as "50 %"; "none" for an empty one."""
     return f"{100 * float(mask.float().mean()):.0f} %" if mask.numel() else "none"
 
 
 def short(value: object) -> str:
-    """A value in a message: numbers with four digits, no more than its first 60 characters, in ASCII."""
+    """Shorten a value for a message: numbers with four digits, at most 60 characters, ASCII."""
     text = re.sub(r"-?\d+\.\d{4,}(?:e[-+]\d+)?", lambda number: f"{float(number[0]):.4g}", ascii(value))
     return text if len(text) <= 60 else f"{text[:57]}..."

@@ -1,8 +1,8 @@
-"""Compiled loops on as many threads as torch may use, and torch's own loops kept out of their way.
+"""Threads for compiled loops, as many as torch may use, with torch's own loops kept out of their way.
 
-A plain pool, for loops that release Python's lock: its idle threads sleep. Torch's spin while they wait,
-unless `OMP_WAIT_POLICY=PASSIVE` was set before torch was loaded, and take the cores of the pool and of other
-processes.
+A plain pool serves loops that release Python's lock: its idle threads sleep. Torch's threads spin while they
+wait, unless `OMP_WAIT_POLICY=PASSIVE` was set before torch was loaded, and take the cores of the pool and of
+other processes.
 """
 
 from __future__ import annotations
@@ -24,20 +24,21 @@ _ALLOWED: ContextVar[int | None] = ContextVar("threads", default=None)
 
 
 def threads() -> int:
-    """How many threads loops may take: as many as torch, or as it had before `torch_in_one_thread`."""
+    """Return the number of threads that loops may use: torch's, or torch's before `torch_in_one_thread`."""
     return _ALLOWED.get() or torch.get_num_threads()
 
 
 @contextmanager
 def limited_to(count: int | None) -> Iterator[None]:
-    """Let torch and loops take so many threads; None: as many as they may."""
+    """Context manager that limits torch and loops to `count` threads; None keeps the number."""
     with _torch_threads(torch.get_num_threads() if count is None else count):
         yield
 
 
 @contextmanager
 def torch_in_one_thread() -> Iterator[None]:
-    """Let torch's own loops run in the calling thread alone; `in_parallel` takes as many `threads` as before.
+    """Context manager that runs torch's own loops in the calling thread alone; `in_parallel` keeps its
+    `threads`.
 
     For work that is mostly in compiled loops, beside which torch's own threads spin between short loops:
     without this a frame of 640x400 took twice the time of the cores where other processes wanted them.
@@ -51,10 +52,16 @@ def torch_in_one_thread() -> Iterator[None]:
 
 
 def in_parallel(tasks: Sequence[Callable[[], Any]], *, most: int | None = None) -> list[Any]:
-    """What tasks give, on as many `threads` as there are, or `most` of them, this one included; torch in each
-    alone, with gradients and inference mode as here.
+    """Run tasks on several threads, this one included, with torch in one thread each, gradients and inference
+    mode as here.
 
-    After an error in one no other is begun; it is raised once those that were are at their end.
+    After an error no further task begins; it is raised once the running ones have ended.
+
+    Args:
+        most: largest number of threads; None for `threads`.
+
+    Returns:
+        The tasks' results, in order.
     """
     left, made = enumerate(tasks), [None] * len(tasks)
 
@@ -81,11 +88,14 @@ def in_parallel(tasks: Sequence[Callable[[], Any]], *, most: int | None = None) 
 
 
 def in_order(function: Callable[[Any], Any], parts: Sequence[Any]) -> Iterator[Any]:
-    """`map(function, parts)`, a few parts ahead on as many `threads` as there are; torch in each alone.
+    """Compute `map(function, parts)` some parts ahead on several `threads`, with torch in one thread each.
 
-    A single part is computed in this thread, and so are all where torch itself takes several threads, or has
-    to see each operation (`followed`, a function mode, autocast), which it does in one thread only. An error
-    is raised once no part is computed any more.
+    A single part is computed in this thread, and so are all if torch itself uses several threads, or has to
+    see each operation (`followed`, a function mode, autocast). An error is raised once no part is being
+    computed.
+
+    Returns:
+        Iterator over the results, in order.
     """
     if followed() or torch._C._len_torch_function_stack() or torch.is_autocast_enabled("cpu"):
         return map(function, parts)
@@ -94,7 +104,7 @@ def in_order(function: Callable[[Any], Any], parts: Sequence[Any]) -> Iterator[A
 
 
 def _ahead(function: Callable[[Any], Any], parts: Sequence[Any]) -> Iterator[Any]:
-    """`in_order` on several threads: at most as many parts ahead as there are threads."""
+    """Run `in_order` on several threads, at most as many parts ahead as there are threads."""
     count, work = threads(), _as_here(function)
     ahead: deque[Future[Any]] = deque()
     try:
@@ -109,7 +119,7 @@ def _ahead(function: Callable[[Any], Any], parts: Sequence[Any]) -> Iterator[Any
 
 
 def _as_here(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function for other threads: torch in each alone, with gradients and inference mode as here."""
+    """Wrap a function for other threads: torch in one thread, gradients and inference mode as here."""
     graph, inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
 
     def called(*args: Any) -> Any:
@@ -121,7 +131,7 @@ def _as_here(function: Callable[..., Any]) -> Callable[..., Any]:
 
 @contextmanager
 def _torch_threads(count: int) -> Iterator[None]:
-    """Torch has a number of threads for each thread that calls it, and that of the last call for new ones."""
+    """Set torch's number of threads for this thread; torch uses that of the last call for new threads."""
     before = torch.get_num_threads()
     if before == count:
         yield
@@ -135,5 +145,5 @@ def _torch_threads(count: int) -> Iterator[None]:
 
 @lru_cache(maxsize=4)
 def _pool(process: int, threads: int) -> ThreadPoolExecutor:
-    """Threads of this process: those of a parent do not live on in its forks."""
+    """Thread pool of this process: a parent's threads do not survive in its forks."""
     return ThreadPoolExecutor(threads, thread_name_prefix="arraygeom")

@@ -1,7 +1,7 @@
-"""Files of one making: swapped in whole or not at all, and listed, so that only they are replaced later.
+"""Groups of files that are replaced together or not at all, and listed, so that only they are replaced later.
 
 A folder of results has a folder `.arraygeom`, in which a JSON file for each group of files lists their names
-and digests. The list is moved there last: with it a new making is complete.
+and digests. The list is moved there last: with it a group is complete.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from uuid import uuid4
 from .atomic import flush, naming, speaks_for_itself, write_text
 
 LISTS = ".arraygeom"
-"""The folder of the lists, and of what an unfinished run keeps."""
+"""Folder of the lists, and of what an unfinished run keeps."""
 _LIST, _FORMER = ".list.json", ".former"
-"""In a temporary folder: the list of the files in it, and the files that they replace."""
+"""Names in a temporary folder: the list of the files in it, and the folder of files that they replace."""
 ANY = "any"
-"""Stands for any digest."""
+"""Placeholder for any digest."""
 _SHOWN = 4
-"""Names in a message."""
+"""Number of names in a message."""
 
 
 @contextmanager
@@ -37,16 +37,25 @@ def write_together(
     about: Mapping[str, str] | None = None,
     given: Collection[str] = (),
 ) -> Iterator[Path]:
-    """A temporary folder inside `folder` for files that belong together, the one named `last` among them.
+    """Context manager that yields a temporary folder inside `folder` for files that belong together.
 
-    When the block ends without error they replace the group's former files, those of other names too: the
-    former last one goes first and the new one comes last, so where it is, the others are of the same making.
-    After an error (a full disk, say) all former files are as they were; after a kill they are so again once
-    `recover` has run, which the next call does. `about` is kept in the list (`read_about`). Missing folders
-    are made.
+    If the block succeeds they replace the group's former files, those of other names too: the former last
+    file goes first and the new one comes last, so where it is, the others are of the same run. After an error
+    (such as a full disk) all former files are as they were; after a kill they are so again once `recover` has
+    run, which the next call does. Missing folders are made.
 
-    Raises FileExistsError for a file in the way that no list has as it is, unless its name is `given`, that
-    is, chosen by the user; OSError that names the file.
+    Args:
+        group: name of the group.
+        last: name of the file that completes the group.
+        about: texts stored in the list (`read_about`).
+        given: file names that the user chose, which may replace unlisted files.
+
+    Yields:
+        The temporary folder.
+
+    Raises:
+        FileExistsError: for a file in the way that no list has in its present state and that is not `given`.
+        OSError: naming the file, if writing fails.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -68,7 +77,13 @@ def write_together(
 
 
 def write_listed(path: Path, text: str, *, given: bool = False) -> None:
-    """`write_together` of one text file, a group of its own name. Raises as it does."""
+    """Write one text file as a group of its own name; `given` as the user chose it. Errors as in
+    `write_together`.
+
+    Raises:
+        FileExistsError: for an unlisted file in the way, unless `given`.
+        OSError: naming the file, if writing fails.
+    """
     chosen = (path.name,) if given else ()
     with write_together(path.parent, group=path.name, last=path.name, given=chosen) as folder:
         write_text(folder / path.name, text)
@@ -77,7 +92,7 @@ def write_listed(path: Path, text: str, *, given: bool = False) -> None:
 def _swap(
     folder: Path, temporary: Path, group: str, last: str, about: dict[str, str], given: Collection[str]
 ) -> None:
-    """Move former files out and new ones in; the move of the list, the last one, makes it count."""
+    """Move former files out and new ones in; the last move, that of the list, makes it count."""
     names = sorted((file.name for file in temporary.iterdir()), key=lambda name: name == last)
     files = {name: digest(temporary / name) for name in names}
     refuse_others(folder, {name: files[name] for name in names if name not in given}, group=group)
@@ -101,7 +116,7 @@ def _swap(
 
 
 def _undo(folder: Path, temporary: Path) -> None:
-    """Put a folder back as it was before a swap that was not completed; may be stopped and repeated."""
+    """Restore a folder after an incomplete swap; may be interrupted and repeated."""
     if not (temporary / _LIST).is_file():
         return
     files = list(_read_list(temporary / _LIST)["files"])
@@ -115,7 +130,11 @@ def _undo(folder: Path, temporary: Path) -> None:
 
 
 def recover(folder: Path, group: str | None = None) -> None:
-    """Put back what a killed swap of a group, or of any, had moved. Raises OSError if that cannot be done."""
+    """Restore the files that a killed swap had moved, of one group or (None) of any.
+
+    Raises:
+        OSError: if that is not possible.
+    """
     for path in _temporary(folder, group):
         if (path / _LIST).is_file():
             _undo(folder, path)
@@ -123,8 +142,14 @@ def recover(folder: Path, group: str | None = None) -> None:
 
 
 def sweep(folder: Path, stem: str | None = None) -> None:
-    """`recover`, and remove temporary files and folders of killed processes, those of safetensors too; or
-    only those of a stem or group."""
+    """Run `recover`, and remove temporary files and folders of killed processes, safetensors' too.
+
+    Args:
+        stem: file stem or group to restrict this to; None for all.
+
+    Raises:
+        OSError: if files cannot be moved or removed.
+    """
     recover(folder, stem)
     for path in _temporary(folder, stem):
         shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
@@ -137,13 +162,13 @@ def _temporary(folder: Path, stem: str | None) -> list[Path]:
 
 
 def retire(folder: Path, group: str) -> None:
-    """Count a group as not made any more; its files stay until a new making replaces them, changed or not."""
+    """Mark a group as no longer made; its files stay until a new run replaces them, changed or not."""
     with suppress(FileNotFoundError):
         os.replace(list_file(folder, group), list_file(folder, group, retired=True))
 
 
 def read_about(folder: Path, group: str) -> dict[str, str] | None:
-    """What a group's list says of it, if all its files are there as they were written; else None."""
+    """Return the texts of a group's list if all its files are there as written; None otherwise."""
     document = _read_list(list_file(folder, group))
     if any(digest(folder / name) != known for name, known in document["files"].items()):
         return None
@@ -153,10 +178,15 @@ def read_about(folder: Path, group: str) -> dict[str, str] | None:
 def refuse_others(
     folder: Path, names: Iterable[str] | Mapping[str, str], *, group: str = "", by_name: bool = False
 ) -> None:
-    """Raise FileExistsError if files of these names are in the folder that no list has as they are.
+    """Check that no unlisted or changed files of these names are in a folder.
 
-    Of a mapping, to digests, files of the same content are no obstacle. `group` names the likeliest list;
-    with `by_name` files are not read, and one whose name is listed will do.
+    Args:
+        names: file names, or a mapping to digests: files of the same content are no obstacle.
+        group: name of the likeliest list.
+        by_name: True to accept a file whose name is listed, without reading it.
+
+    Raises:
+        FileExistsError: naming the files, if there are any.
     """
     new = names if isinstance(names, Mapping) else dict.fromkeys(names, "")
     there = {name: {""} for name in new if os.path.lexists(folder / name)}
@@ -178,7 +208,7 @@ def refuse_others(
 
 
 def digest(path: Path) -> str:
-    """The SHA-256 of a file's content, in hexadecimal; of what is no file "none"."""
+    """Return the SHA-256 of a file's content in hexadecimal; "none" if it is no file."""
     if not path.is_file():
         return "none"
     with path.open("rb") as file:
@@ -186,19 +216,19 @@ def digest(path: Path) -> str:
 
 
 def list_file(folder: Path, group: str, *, retired: bool = False) -> Path:
-    """The file that lists a group: it is there when the group was made; if that is `retired`, another one."""
+    """Return the path of a group's list, or of its list once `retired`."""
     return folder / LISTS / f"{group}.{'former' if retired else 'json'}"
 
 
 def _lists(folder: Path, group: str | None) -> list[Path]:
-    """The files with the lists of a group, or of all."""
+    """Paths of the lists of a group, or of all."""
     if group is not None:
         return [list_file(folder, group), list_file(folder, group, retired=True)]
     return [*(folder / LISTS).glob("*.json"), *(folder / LISTS).glob("*.former")]
 
 
 def _listed(lists: Iterable[Path]) -> dict[str, set[str]]:
-    """The digests of each file's name in lists, and `ANY` if a retired one has it."""
+    """Digests in lists by file name, with `ANY` for names in retired lists."""
     listed: dict[str, set[str]] = {}
     for path in lists:
         for name, known in _read_list(path)["files"].items():
@@ -207,7 +237,7 @@ def _listed(lists: Iterable[Path]) -> dict[str, set[str]]:
 
 
 def _read_list(path: Path) -> dict[str, dict[str, str]]:
-    """A list's `about`, and `files` but for those in other folders; both empty if there is no whole list."""
+    """Texts and files of a list, files in other folders left out; both empty if there is no complete list."""
     try:
         document = json.loads(path.read_bytes())
         about, files = ({str(k): str(v) for k, v in document[part].items()} for part in ("about", "files"))

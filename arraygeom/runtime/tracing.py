@@ -1,4 +1,4 @@
-"""What torch is doing around a call: transformations in which numbers cannot decide what is computed next."""
+"""State of torch around a call: transformations in which values are not available for decisions."""
 
 from __future__ import annotations
 
@@ -7,20 +7,26 @@ from torch import Tensor
 
 
 def traced() -> bool:
-    """Whether within `torch.compile` or `torch.func.vmap`: all branches are computed, loops to their end."""
+    """Return True inside `torch.compile` or `torch.func.vmap`: all branches are then computed, loops to their
+    end."""
     return torch.compiler.is_compiling() or "Vmap" in transformations()
 
 
 def followed() -> bool:
-    """Whether torch has to see each operation: it compiles, traces, transforms, or hands them to a mode."""
+    """Return True if torch has to see each operation: it compiles, traces, transforms, or runs a dispatch
+    mode."""
     compiled_or_traced = torch.compiler.is_compiling() or torch.jit.is_tracing()
     return bool(compiled_or_traced or torch._C._len_torch_dispatch_stack() or transformations())
 
 
 def needs_numbers(what: str, *tensors: Tensor) -> None:
-    """Say why a call cannot be traced: it breaks `torch.compile`'s graph, an error with `fullgraph`.
+    """Declare that a call depends on values: it breaks `torch.compile`'s graph, an error with `fullgraph`.
 
-    Raises NotImplementedError for tensors that `torch.func.vmap` has batched.
+    Args:
+        what: the result that depends on them, for messages.
+
+    Raises:
+        NotImplementedError: for tensors that `torch.func.vmap` has batched.
     """
     if torch.compiler.is_compiling():
         torch._dynamo.graph_break(msg=f"{what} depends on numbers: compute it before compiling")
@@ -29,7 +35,10 @@ def needs_numbers(what: str, *tensors: Tensor) -> None:
 
 
 def transformations() -> tuple[str, ...]:
-    """The transformations of `torch.func` that are under way, outermost first, such as ("Vmap", "Grad")."""
+    """Return the active transformations of `torch.func`, outermost first, such as ("Vmap", "Grad").
+
+    Empty while torch compiles.
+    """
     if torch.compiler.is_compiling():
         return ()
     stack = torch._C._functorch.get_interpreter_stack()

@@ -1,4 +1,4 @@
-"""Warnings that stand at the line of whoever called this software, however deep their cause is."""
+"""Warnings that point at the caller's line outside this software, however deep their cause is."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import warnings
 from types import FrameType
 
 OWN, WRAPPERS = {"arraygeom", "calib", "pat"}, {"contextlib", "torch"}
-"""The packages whose lines are not the caller's, and those whose decorators may stand around them."""
+"""Packages whose lines are not the caller's, and packages whose decorators may stand around them."""
 
 
 def warn(text: str, category: type[Warning] = UserWarning) -> None:
-    """Warn at the line outside these packages that led here; the outermost one where there is none."""
+    """Warn at the line outside these packages that led here; at the outermost line if there is none."""
     roots: list[str] = []
     frame: FrameType | None = sys._getframe(1)
     while frame is not None:

@@ -1,10 +1,10 @@
-"""Calibration from images of a board: from its specification to a rig with covariance and report.
+"""Calibration from images of a board: from the board's specification to a rig with covariance and report.
 
-`board`, `target` (boards, from text and to print) -> `photos`, `corners`, `detect` (detections) ->
-`deformation`, `bundle` (what is adjusted, and its equations) -> `intrinsics`, `poses` (where the fit starts)
--> `uncertainty`, `solve` (the fit) -> `validation` (frames held out, notes) -> `rig` (calibration) ->
-`adequacy`, `report`. `run` does all of it from files to files, or guides while images are taken, `simulation`
-renders the images that a planned rig would take, `rig_diff` compares two calibrations.
+Reading order: `board`, `target` (boards, from text and to print), `photos`, `corners`, `detect` (detections),
+`deformation`, `bundle` (unknowns and equations), `intrinsics`, `poses` (initial values), `uncertainty`,
+`solve` (the fit), `validation` (held-out frames, notes), `rig` (calibration), `adequacy`, `report`. `run`
+goes from files to files, or guides while images are taken; `simulation` renders the images of a planned rig;
+`rig_diff` compares two calibrations.
 """
 
 from typing import Literal

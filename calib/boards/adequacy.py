@@ -1,4 +1,4 @@
-"""Whether a camera's images are enough: what boards cover, and which views would help most."""
+"""Adequacy of a camera's images: what boards cover, and which further views would help most."""
 
 from __future__ import annotations
 
@@ -32,16 +32,19 @@ POSITIONS = (
 TILT = 30.0
 """Degrees by which a proposed board is tilted."""
 FILLS = 0.35, 0.7
-"""Widths of proposed boards, as shares of the image's."""
+"""Widths of proposed boards, as shares of the image's width."""
 TILTS = {(0, 1): "right", (0, -1): "left", (1, 0): "upper", (-1, 0): "lower"}
-"""The edge that comes nearer by a rotation about x and y."""
+"""Edge that comes nearer by a rotation about x and y."""
 
 
 class Coverage(NamedTuple):
-    """Coverage of one camera by its boards.
+    """Coverage of one camera's image and depths by its boards.
 
-    cells: points in each cell of the image. depths: (nearest, furthest) point, metres. tilts: (least, most)
-    angle between the board's normal and the optical axis, degrees. missing: advice, one sentence each.
+    Attributes:
+        cells: number of points in each cell of the image.
+        depths: depth of the nearest and the farthest point, metres.
+        tilts: least and largest angle between a board's normal and the optical axis, degrees.
+        missing: advice, one sentence each.
     """
 
     cells: Int[np.ndarray, "r c"]
@@ -51,12 +54,16 @@ class Coverage(NamedTuple):
 
     @property
     def share(self) -> float:
-        """The share of cells with a point."""
+        """Share of cells with a point, 0..1."""
         return float((self.cells > 0).mean())
 
 
 def coverage(views: BoardViews, cam_from_board: Mapping[FrameKey, Pose], board: Board) -> Coverage:
-    """Coverage of a camera by its boards, from their poses in it."""
+    """Compute a camera's coverage from its detections and the boards' poses in its frame.
+
+    Returns:
+        Coverage and advice. Every detection needs a pose, at least one is required.
+    """
     cells = point_counts([d.x for d in views.seen.values()], views.hw)
     poses = {key: cam_from_board[key] for key in views.seen}
     depths = [
@@ -69,7 +76,11 @@ def coverage(views: BoardViews, cam_from_board: Mapping[FrameKey, Pose], board: 
 
 
 def point_counts(parts: Iterable[Float[np.ndarray, "_ 2"]], hw: HW) -> Int[np.ndarray, "r c"]:
-    """The number of points in each of the `CELLS` of an image."""
+    """Count points (x, y) in each of the `CELLS` of an image of size `hw`.
+
+    Returns:
+        Counts (rows, columns).
+    """
     x = np.concatenate([np.zeros((0, 2)), *parts])
     counts, _, _ = np.histogram2d(
         x[:, 1], x[:, 0], bins=CELLS, range=((-0.5, hw[0] - 0.5), (-0.5, hw[1] - 0.5))
@@ -78,7 +89,7 @@ def point_counts(parts: Iterable[Float[np.ndarray, "_ 2"]], hw: HW) -> Int[np.nd
 
 
 def _missing(coverage: Coverage, board: Board) -> Iterator[str]:
-    """What is missing, and what to photograph: parts of the image, depths, tilts."""
+    """Sentences on missing parts of the image, depths and tilts, and what to photograph."""
     thirds = coverage.cells.reshape(3, CELLS[0] // 3, CELLS[1])
     empty = [
         POSITIONS[i][j]
@@ -98,7 +109,13 @@ def _missing(coverage: Coverage, board: Board) -> Iterator[str]:
 
 
 class NextView(NamedTuple):
-    """A board's view that would help, in words; the median uncertainty (pixels) with and without it."""
+    """Proposed view of a board.
+
+    Attributes:
+        text: the view in words.
+        before: median uncertainty of projection without it, pixels.
+        after: the same with it and the proposals before it.
+    """
 
     text: str
     before: float
@@ -106,9 +123,17 @@ class NextView(NamedTuple):
 
 
 def next_views(intrinsics: Intrinsics, board: Board, depth: float, *, count: int = 2) -> list[NextView]:
-    """The views that lower a camera's uncertainty of projection most, one after the other.
+    """Propose the views that lower a camera's uncertainty of projection most, one after the other.
 
-    None where the image shows hardly any of the board in each, as a strip does, and of points in space.
+    Args:
+        depth: depth in metres at which uncertainty is evaluated.
+
+    Returns:
+        Up to `count` views; none for points in space, or if the image shows hardly any of the board in every
+        candidate (a strip).
+
+    Raises:
+        numpy.linalg.LinAlgError: for a singular covariance.
     """
     _, change = moved_pixels(intrinsics, depth)
 
@@ -130,7 +155,11 @@ def next_views(intrinsics: Intrinsics, board: Board, depth: float, *, count: int
 
 
 def proposed_views(camera: Camera, board: Board) -> Mapping[str, Float[np.ndarray, "n 3"]]:
-    """Views of a board in words, and its points in the camera's frame."""
+    """List candidate views of a board: 9 positions, 2 distances, 4 tilts.
+
+    Returns:
+        Board points (n, 3) in the camera's frame, metres, by description.
+    """
     proposals, (h, w) = {}, camera.hw
     middle = torch.from_numpy(board.middle)
     for fill in FILLS:
@@ -148,7 +177,8 @@ def proposed_views(camera: Camera, board: Board) -> Mapping[str, Float[np.ndarra
 
 
 def _gain(intrinsics: Intrinsics, X: np.ndarray) -> np.ndarray | None:
-    """A view's information on the free intrinsics, its pose unknown; None if hardly any of it is visible."""
+    """Information of a view on the free intrinsics, its pose unknown; None if hardly any of the board is
+    visible."""
     projected = intrinsics.camera.project_local(torch.from_numpy(X))
     inside = (projected.valid & intrinsics.camera.contains(projected.x)).numpy()
     if inside.sum() < 0.6 * len(X) or not inside.any():
@@ -161,7 +191,7 @@ def _gain(intrinsics: Intrinsics, X: np.ndarray) -> np.ndarray | None:
 
 
 def coverages(calibration: Calibration) -> dict[str, Coverage]:
-    """Coverage of every camera."""
+    """Compute the coverage of every camera of a calibration, by name."""
     boards, by_camera = calibration.fit.problem.board_poses, {}
     for name, views in calibration.views.items():
         camera = calibration.fit.problem.cameras[name]
@@ -171,7 +201,11 @@ def coverages(calibration: Calibration) -> dict[str, Coverage]:
 
 
 def coverage_advice(calibration: Calibration) -> Iterator[str]:
-    """What each camera's images lack, and, where that is something, which views would help most."""
+    """Yield advice on each camera's coverage and, where something is missing, the views that would help most.
+
+    Yields:
+        Sentences "camera: advice".
+    """
     for name, covered in coverages(calibration).items():
         yield from (f"{name}: {text}" for text in covered.missing)
         intrinsics = intrinsics_of(calibration.fit, name)

@@ -1,4 +1,4 @@
-"""Calibration boards: their points, the markers that identify some, how they are drawn.
+"""Calibration boards: points, identifying markers, and drawing.
 
 Points are (x, y, 0) in metres: x along the rows, y down the columns, z into the board, the first point at the
 origin.
@@ -17,29 +17,35 @@ from jaxtyping import Float, Int
 from matplotlib.patches import Circle, Rectangle
 
 FLAT = 0.03
-"""Relief below which points of known position count as lying in a plane, as a share of their extent."""
+"""Relief as a share of extent below which known points count as coplanar."""
 ON_A_LINE = 0.01
-"""Extent of known points across a line, as a share of that along it, below which they lie on one."""
+"""Extent across a line as a share of that along it below which known points count as collinear."""
 
 
 @dataclass(frozen=True)
 class Board:
-    """A flat grid of points, `columns` x `rows` of them, `spacing` metres apart."""
+    """Flat grid of points.
+
+    Attributes:
+        columns: points in a row.
+        rows: number of rows.
+        spacing: distance of neighbouring points, metres.
+    """
 
     columns: int
     rows: int
     spacing: float
     identified: ClassVar[bool] = False
-    """Whether points are identified one by one, by markers."""
+    """True if markers identify each point."""
 
     @property
     def flat(self) -> bool:
-        """Whether the points lie in a plane."""
+        """True if the points lie in a plane."""
         return True
 
     @property
     def members(self) -> tuple[Board, ...]:
-        """The boards, if there are several."""
+        """Single boards that make up this one; itself unless there are several."""
         return (self,)
 
     @cached_property
@@ -49,7 +55,8 @@ class Board:
 
     @cached_property
     def symmetries(self) -> tuple[Int[np.ndarray, " n"], ...]:
-        """Renumberings of points under rotations of the board, the identity first; it alone with markers.
+        """Renumberings of the points under rotations of the board, the identity first; only that one with
+        markers.
 
         A detector may number the points in any of these ways: colours do not disambiguate them, as they are
         inverted in some images (near infrared).
@@ -67,12 +74,12 @@ class Board:
 
     @cached_property
     def part(self) -> Int[np.ndarray, " n"]:
-        """The board that each point is on: 0, unless several boards are used at once."""
+        """Index of the single board that each point is on: 0 unless there are several."""
         return np.repeat(np.arange(len(self.members)), [len(b.points) for b in self.members])
 
     @property
     def middle(self) -> Float[np.ndarray, "3"]:
-        """The point half way between its outermost ones, metres."""
+        """Midpoint between the outermost points, metres."""
         return np.asarray((self.points.max(0) + self.points.min(0)) / 2)
 
     @property
@@ -83,7 +90,7 @@ class Board:
 
     @property
     def offset(self) -> float:
-        """The first point's distance from the print's upper and left edge without its margin, metres."""
+        """Distance of the first point from the upper and left edge of the print without margin, metres."""
         return self.spacing
 
     def _draw(self, axes: Any) -> None:
@@ -93,9 +100,11 @@ class Board:
 
 @dataclass(frozen=True)
 class MarkedBoard(Board):
-    """A board whose points are identified individually: a part is enough, its orientation unambiguous.
+    """Board whose points are identified by markers: a part of it is enough, its orientation is unambiguous.
 
-    markers: their numbers, in order.
+    Attributes:
+        dictionary: name of OpenCV's dictionary, such as "4x4_50".
+        markers: numbers of its markers, in order.
     """
 
     dictionary: str
@@ -109,7 +118,7 @@ class MarkedBoard(Board):
     def _draw_marker(
         self, axes: Any, number: int, left: float, top: float, side: float, *, border: int = 1, turns: int = 0
     ) -> None:
-        """Draw a marker, runs of black bits as one rectangle each: no hairlines between bits."""
+        """Draw a marker with runs of black bits as one rectangle each, without hairlines between bits."""
         dictionary = marker_dictionary(self.dictionary)
         bits = dictionary.markerSize + 2 * border
         black = np.rot90(
@@ -124,7 +133,7 @@ class MarkedBoard(Board):
 
 @dataclass(frozen=True)
 class Chessboard(Board):
-    """`columns` x `rows` inner corners."""
+    """Chessboard of `columns` x `rows` inner corners."""
 
     def __str__(self) -> str:
         return f"chessboard:{self.columns}x{self.rows}:{millimetres(self.spacing)}"
@@ -138,7 +147,12 @@ class Chessboard(Board):
 
 @dataclass(frozen=True)
 class Charuco(MarkedBoard):
-    """A chessboard with markers in its white squares; `columns` x `rows` counts its inner corners."""
+    """Chessboard with markers in its white squares; `columns` x `rows` counts inner corners.
+
+    Attributes:
+        marker: side of a marker, metres.
+        legacy: True for the layout of OpenCV before 4.6.
+    """
 
     marker: float
     legacy: bool = False
@@ -174,7 +188,11 @@ class Charuco(MarkedBoard):
 class AprilGrid(MarkedBoard):
     """Kalibr's grid of AprilTags; `columns` x `rows` counts all tags' corners, `spacing` is twice the gap.
 
-    tag: side of a tag, metres; border: black bits around its code. Tags are numbered row by row from below.
+    Tags are numbered row by row from below.
+
+    Attributes:
+        tag: side of a tag, metres.
+        border: black bits around a tag's code.
     """
 
     tag: float
@@ -188,19 +206,19 @@ class AprilGrid(MarkedBoard):
 
     @cached_property
     def corners(self) -> Int[np.ndarray, "m 4"]:
-        """The points at the upper left, upper right, lower right and lower left corner of each tag."""
+        """Points at the upper left, upper right, lower right and lower left corner of each tag."""
         index = np.arange(self.columns * self.rows).reshape(self.rows, self.columns)
         a, b = index[::2][::-1], index[1::2][::-1]
         return np.stack([a[:, ::2], a[:, 1::2], b[:, 1::2], b[:, ::2]], -1).reshape(-1, 4)
 
     @property
     def gap(self) -> float:
-        """The space between two tags, metres."""
+        """Space between two tags, metres."""
         return self.spacing / 2
 
     @property
     def offset(self) -> float:
-        """The gap, metres: small squares at the tags' corners."""
+        """Gap in metres: small squares fill it at the tags' corners."""
         return self.gap
 
     def __str__(self) -> str:
@@ -219,19 +237,23 @@ class AprilGrid(MarkedBoard):
 
 @dataclass(frozen=True)
 class Boards(Board):
-    """Several boards seen at once, each with poses of its own; their points in one list."""
+    """Several boards in view at once, each with its own pose; their points form one list.
+
+    Attributes:
+        boards: the single boards.
+    """
 
     boards: tuple[Board, ...] = ()
     identified: ClassVar[bool] = True
 
     @property
     def members(self) -> tuple[Board, ...]:
-        """The boards."""
+        """The single boards."""
         return self.boards
 
     @cached_property
     def points(self) -> Float[np.ndarray, "n 3"]:
-        """The points of all boards, each in its own frame, metres."""
+        """Points of all boards, each in its own board's frame, metres."""
         return np.concatenate([b.points for b in self.boards])
 
     def __str__(self) -> str:
@@ -240,7 +262,11 @@ class Boards(Board):
 
 @dataclass(frozen=True)
 class Circles(Board):
-    """Black circles on white in rows; in an asymmetric grid every other row is off by half their distance."""
+    """Grid of black circles on white; in an asymmetric grid every other row is shifted by half a spacing.
+
+    Attributes:
+        asymmetric: True for OpenCV's asymmetric grid.
+    """
 
     asymmetric: bool = False
 
@@ -263,7 +289,7 @@ class Circles(Board):
 
     @property
     def offset(self) -> float:
-        """A circle's radius, metres."""
+        """Radius of a circle, metres."""
         return self.radius
 
     def _draw(self, axes: Any) -> None:
@@ -274,10 +300,13 @@ class Circles(Board):
 
 @dataclass(frozen=True)
 class KnownPoints(MarkedBoard):
-    """Points at known positions: the centres of markers, or corners of them.
+    """Points at surveyed positions: centres or corners of markers.
 
-    ids: (marker, corner) of each point, corners clockwise from the marker's upper left, -1 for its centre.
-    positions: (x, y, z) of each, metres, in any frame.
+    Attributes:
+        file: file that they were read from.
+        ids: (marker, corner) of each point; corners clockwise from the marker's upper left, -1 for its
+            centre.
+        positions: (x, y, z) of each point, metres, in any frame.
     """
 
     file: str
@@ -286,7 +315,7 @@ class KnownPoints(MarkedBoard):
 
     @cached_property
     def points(self) -> Float[np.ndarray, "n 3"]:
-        """Their positions about their mean, metres; in their own plane, x and y, if they lie in one."""
+        """Positions about their mean, metres; in the axes of their own plane if they are coplanar."""
         points = np.array(self.positions, dtype=np.float64)
         points -= points.mean(0)
         if not self.flat:
@@ -296,14 +325,14 @@ class KnownPoints(MarkedBoard):
 
     @cached_property
     def flat(self) -> bool:
-        """Whether they are so nearly in a plane that cameras need several views of them."""
+        """True if the points are so nearly coplanar that cameras need several views of them."""
         points = np.array(self.positions, dtype=np.float64)
         first, *_, third = np.linalg.svd(points - points.mean(0), compute_uv=False)
         return bool(third / first < FLAT)
 
     @property
     def offset(self) -> float:
-        """Nothing is printed around the points."""
+        """Always 0: nothing is printed around the points."""
         return 0.0
 
     def __str__(self) -> str:
@@ -311,30 +340,34 @@ class KnownPoints(MarkedBoard):
 
 
 def unit_grid(columns: int, rows: int) -> Float[np.ndarray, "n 3"]:
-    """The points (x, y, 0) of a grid of spacing 1, row by row."""
+    """Return the points (x, y, 0) of a grid of spacing 1, row by row."""
     grid = np.zeros((rows, columns, 3))
     grid[..., 0], grid[..., 1] = np.arange(columns), np.arange(rows)[:, None]
     return grid.reshape(-1, 3)
 
 
 def on_a_line(points: Float[np.ndarray, "n 3"]) -> bool:
-    """Whether points lie on a line, about which a camera's pose is not determined."""
+    """Return True if points are collinear, which leaves a camera's pose undetermined."""
     along, across, _ = np.linalg.svd(points - points.mean(0), compute_uv=False)
     return bool(across <= ON_A_LINE * along)
 
 
 def apart(points: Float[np.ndarray, "n k"]) -> Float[np.ndarray, " n"]:
-    """The distance of each point from the next one."""
+    """Compute the distance of each point from its nearest neighbour."""
     return np.asarray(np.sort(np.linalg.norm(points[:, None] - points, axis=-1), axis=1)[:, 1])
 
 
 def marker_dictionary(name: str) -> cv2.aruco.Dictionary:
-    """OpenCV's dictionary of a name such as "4x4_50"."""
+    """Return OpenCV's marker dictionary of a name such as "4x4_50".
+
+    Raises:
+        AttributeError: for a name that OpenCV does not have.
+    """
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name.upper()}"))
 
 
 def millimetres(length: float) -> str:
-    """A length in metres as text, such as "30mm"."""
+    """Format a length in metres as millimetres, such as "30mm"."""
     return f"{1e3 * length:.6g}mm"
 
 

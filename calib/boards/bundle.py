@@ -1,4 +1,4 @@
-"""The problem that bundle adjustment solves: cameras, boards, what was observed, and its normal equations.
+"""Bundle adjustment problem: cameras, boards, observations, and its normal equations.
 
 Boards are coupled by the cameras alone: the equations are those of the cameras after the Schur complement of
 the boards (Triggs et al. 2000, section 6); derivatives with respect to the camera parameters are automatic,
@@ -31,20 +31,28 @@ from .detect import BoardViews
 from .photos import FrameKey
 
 ROBUST = 3.0
-"""Residuals beyond this many standard deviations are down-weighted."""
+"""Standard deviations beyond which residuals are down-weighted."""
 POSE = 6
-"""Parameters of a board: a rotation vector about the world's axes and a translation."""
+"""Parameters of a board's pose: a rotation vector about the world's axes, and a translation."""
 TYPICAL_FOCAL_ERROR, TYPICAL_CENTRE_ERROR = 0.1, 0.1
-"""Likewise of the error of a guessed focal length, as a share of it, and principal point, of the width."""
+"""Typical error of a guessed focal length as a share of it, and of a principal point as a share
+of the width."""
 CENTRE_DEVIATION, ASPECT_DEVIATION = 0.03, 0.01
-"""Standard deviations of the principal point about the centre (share of the width), and of aspect ratio."""
+"""Standard deviations of the principal point from the centre (share of the width), and of the
+aspect ratio."""
 Array = np.ndarray
 Masks = Mapping[str, Bool[np.ndarray, " _"]]
-"""By camera, which of its parameters are meant, in the order of `parameter_names`."""
+"""Mask of each camera's parameters, in the order of `parameter_names`."""
 
 
 class Observations(NamedTuple):
-    """Points observed by one camera: the board of each, its position on it (metres) and its pixel."""
+    """Points that one camera observed.
+
+    Attributes:
+        block: index of each point's board pose.
+        p: position on the board, metres.
+        x: pixel.
+    """
 
     block: Int[np.ndarray, " n"]
     p: Float[np.ndarray, "n 3"]
@@ -55,9 +63,15 @@ class Observations(NamedTuple):
 class BundleProblem:
     """Cameras, boards and observations.
 
-    boards: `world_from_board`, a batch, of the `frames`. free: the parameters that may change. sigma: by
-    camera, the noise along x or y, pixels. deformation: that of the boards, adjusted with the cameras; None
-    for flat ones.
+    Attributes:
+        cameras: cameras by name.
+        boards: `world_from_board`, a batch.
+        seen: observations by camera.
+        frames: moment of each board pose.
+        free: parameters that may change.
+        sigma: noise along x or y by camera, pixels.
+        priors: priors by camera.
+        deformation: shapes of the boards, adjusted with the cameras; None for flat boards.
     """
 
     cameras: Mapping[str, Camera]
@@ -71,7 +85,7 @@ class BundleProblem:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The cameras' free parameters, such as "left.focal.0"."""
+        """Free camera parameters, such as "left.focal.0"."""
         return tuple(
             f"{name}.{entry}"
             for name, camera in self.cameras.items()
@@ -85,23 +99,24 @@ class BundleProblem:
         return {key: self.boards[i] for i, key in enumerate(self.frames)}
 
     def on_board(self, name: str) -> Float[np.ndarray, "n 3"]:
-        """The points that a camera observed, on the boards as they are shaped, metres."""
+        """Return the points that a camera observed on its deformed boards, in the boards' frames, metres."""
         observed = self.seen[name]
         if self.deformation is None:
             return observed.p
         return self.deformation.deformed(observed.p, self.deformation.part[observed.block])
 
     def rotated(self, name: str) -> Float[np.ndarray, "n 3"]:
-        """The points that a camera observed, along the world's axes from the origin of their board."""
+        """Return the points that a camera observed relative to their board's origin, in the world's axes,
+        metres."""
         return np.einsum("nij,nj->ni", self.boards.R.numpy()[self.seen[name].block], self.on_board(name))
 
     def world(self, name: str) -> Float[np.ndarray, "n 3"]:
-        """The points that a camera observed, in the world, metres."""
+        """Return the points that a camera observed in the world, metres."""
         return self.rotated(name) + self.boards.t.numpy()[self.seen[name].block]
 
     @cached_property
     def residuals(self) -> dict[str, Float[np.ndarray, "_ 2"]]:
-        """By camera: measured minus projected, pixels."""
+        """Measured minus projected pixels, by camera."""
         residuals = {}
         for name, observed in self.seen.items():
             X = torch.from_numpy(self.world(name))
@@ -109,13 +124,14 @@ class BundleProblem:
         return residuals
 
     def rms(self) -> float:
-        """Root mean square length of all residuals, pixels: OpenCV's reprojection error."""
+        """Return the root mean square length of all residuals, pixels: OpenCV's reprojection error."""
         lengths = np.concatenate([(r**2).sum(-1) for r in self.residuals.values()])
         return float(np.sqrt(lengths.mean()))
 
     @cached_property
     def loss(self) -> float:
-        """Sum over residuals of s in standard deviations: s^2 / 2 up to k, k^2 (1/2 + log(s / k)) beyond."""
+        """Robust loss: the sum over residuals of s standard deviations of s^2 / 2 up to k, k^2 (1/2 + log(s /
+        k)) beyond, plus priors."""
         total = sum(prior.loss(self.cameras[name]) for name, prior in self.priors.items())
         if self.deformation is not None:
             total += self.deformation.loss()
@@ -126,7 +142,7 @@ class BundleProblem:
         return total
 
     def of_boards(self, kept: Bool[np.ndarray, " b"]) -> BundleProblem:
-        """The problem with some of its boards only."""
+        """Return the problem with the boards of a mask only."""
         index, observations = np.cumsum(kept) - 1, {}
         for name, s in self.seen.items():
             mine = kept[s.block]
@@ -140,7 +156,8 @@ class BundleProblem:
         )
 
     def stepped(self, change: Float[np.ndarray, " c"], boards: Float[np.ndarray, "b 6"]) -> BundleProblem:
-        """The problem after a change of its free parameters, deformations' last, and of the boards' poses."""
+        """Return the problem after a step of its free parameters (deformations last) and of the boards' poses
+        (b, 6)."""
         cameras, offset = {}, 0
         for name, camera in self.cameras.items():
             full = np.zeros(len(self.free[name]))
@@ -158,10 +175,16 @@ class BundleProblem:
 
 
 class InitialRig(NamedTuple):
-    """What a fit starts from: cameras, `world_from_board` of each moment, and views, numbered consistently.
+    """Initial values of a fit.
 
-    left_out: images that disagree with the others, (camera, moment). priors: those of cameras whose poses are
-    known roughly; without them, those of ordinary cameras, the first of which is the world.
+    Attributes:
+        cameras: cameras by name.
+        boards: `world_from_board` by moment.
+        views: detections by camera, numbered consistently.
+        left_out: images (camera, moment) that contradict the others.
+        priors: priors of cameras whose poses are roughly known; None for priors of ordinary cameras, the
+            first of which is the world.
+        deformation: shapes of the boards; None for flat ones.
     """
 
     cameras: Mapping[str, Camera]
@@ -172,7 +195,12 @@ class InitialRig(NamedTuple):
     deformation: BoardDeformation | None = None
 
     def problem(self, board: Board) -> BundleProblem:
-        """What is to be adjusted."""
+        """Make the bundle adjustment problem, all parameters free except the first camera's pose without
+        priors.
+
+        Returns:
+            The problem, without noise levels.
+        """
         index, observations, free = {key: i for i, key in enumerate(self.boards)}, {}, {}
         for number, (name, camera) in enumerate(self.cameras.items()):
             detections = self.views[name].seen
@@ -189,7 +217,7 @@ class InitialRig(NamedTuple):
         )
 
     def flat(self, board: Board) -> BoardDeformation | None:
-        """Flat boards, in the order of the moments; None for points whose positions are known."""
+        """Make flat shapes of the boards, in the order of the moments; None for points of known position."""
         if isinstance(board, KnownPoints):
             return None
         first = {key: d.ids[0] for v in self.views.values() for key, d in v.seen.items()}
@@ -199,11 +227,17 @@ class InitialRig(NamedTuple):
 
 @dataclass(frozen=True)
 class Solved:
-    """A problem after bundle adjustment, its noise estimated from the residuals.
+    """Solution of a bundle adjustment, its noise estimated from the residuals.
 
-    covariance: of the cameras' free parameters, in their own units; None where they are not observable.
-    raised: the largest factor by which a standard deviation was raised to that of the jackknife. views: the
-    detections used. left_out: images that contradict other cameras'.
+    Attributes:
+        problem: the adjusted problem.
+        covariance: covariance of the cameras' free parameters in their own units; None if they are not
+            observable.
+        converged: True if the iteration converged.
+        notes: sentences on the solution.
+        raised: largest factor by which a standard deviation was raised to that of the jackknife.
+        views: detections used.
+        left_out: images (camera, moment) that contradict other cameras' images.
     """
 
     problem: BundleProblem
@@ -216,12 +250,13 @@ class Solved:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The free parameters, in the order of the covariance."""
+        """Free parameters, in the order of the covariance."""
         return self.problem.names
 
     @property
     def deviations(self) -> dict[str, float]:
-        """Of each free parameter by name ("left.focal.0"), in its own unit; empty without a covariance."""
+        """Standard deviation of each free parameter by name ("left.focal.0"), in its own unit; empty without
+        a covariance."""
         if self.covariance is None:
             return {}
         return dict(zip(self.names, np.sqrt(self.covariance.diagonal()).tolist()))
@@ -231,10 +266,14 @@ class Solved:
 
 
 class Linearised(NamedTuple):
-    """One camera's residuals, and its pixels' derivatives, weighted.
+    """Weighted residuals and derivatives of one camera's pixels.
 
-    by_shared: by the camera's free parameters and the boards' deformations, which are the `columns` of all
-    cameras'. by_board: by the pose of the board of each point.
+    Attributes:
+        r: residuals.
+        by_shared: derivatives by the camera's free parameters and the boards' deformations.
+        by_board: derivatives by the pose of each point's board.
+        block: index of each point's board.
+        columns: columns of `by_shared` among those of all cameras.
     """
 
     r: Float[np.ndarray, "n 2"]
@@ -245,7 +284,7 @@ class Linearised(NamedTuple):
 
 
 def linearised(problem: BundleProblem) -> dict[str, Linearised]:
-    """The residuals and derivatives of each camera."""
+    """Compute the weighted residuals and derivatives of each camera, by name."""
     shapes = 0 if problem.deformation is None else len(problem.deformation)
     first, rows = 0, {}
     total = len(problem.names) + shapes
@@ -268,7 +307,7 @@ def linearised(problem: BundleProblem) -> dict[str, Linearised]:
 
 
 def _by_deformation(problem: BundleProblem, name: str) -> Float[np.ndarray, "n 3 s"]:
-    """Derivatives of a camera's points in the world by the boards' deformations."""
+    """Derivatives of a camera's world points by the boards' deformations."""
     observed = problem.seen[name]
     if problem.deformation is None:
         return np.zeros((len(observed.block), 3, 0))
@@ -278,9 +317,15 @@ def _by_deformation(problem: BundleProblem, name: str) -> Float[np.ndarray, "n 3
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """[H W; W^T B] [cameras; boards] = [g; h], B block-diagonal (b, 6, 6), W (b, c, 6).
+    """Normal equations [H W; W^T B] [cameras; boards] = [g; h].
 
-    shapes: the number of the cameras' rows, at their end, that are of the boards' deformations.
+    Attributes:
+        H: block of the cameras and deformations.
+        W: coupling with each board (b, c, 6).
+        B: block of each board (b, 6, 6).
+        g: right-hand side of the cameras and deformations.
+        h: right-hand side of the boards.
+        shapes: number of the last rows of H that belong to deformations.
     """
 
     H: Array
@@ -291,7 +336,11 @@ class NormalEquations:
     shapes: int = 0
 
     def solve(self, damping: float) -> tuple[Array, Array]:
-        """The step of cameras (c,) and boards (b, 6), with diagonals multiplied by 1 + damping."""
+        """Solve for a step of the cameras (c,) and boards (b, 6), with diagonals multiplied by 1 + damping.
+
+        Returns:
+            Both steps.
+        """
         S, Y, inverse = self.reduced(damping)
         scale = 1 / np.sqrt(np.maximum(S.diagonal(), 1e-300))
         right = scale * (self.g - np.einsum("bcd,bd->c", Y, self.h))
@@ -300,13 +349,18 @@ class NormalEquations:
         return change, boards
 
     def information(self) -> Array:
-        """Inverse covariance (c, c) of the camera parameters, marginalised over boards and deformations."""
+        """Compute the inverse covariance (c, c) of the camera parameters, marginalised over boards and
+        deformations."""
         S, _, _ = self.reduced(0.0)
         c = len(S) - self.shapes
         return S[:c, :c] - S[:c, c:] @ np.linalg.solve(S[c:, c:], S[c:, :c])
 
     def reduced(self, damping: float) -> tuple[Array, Array, Array]:
-        """The Schur complement of the boards, W B^-1 and B^-1."""
+        """Eliminate the boards.
+
+        Returns:
+            The Schur complement, W B^-1, and B^-1.
+        """
         eye = np.eye(POSE)
         inverse = np.linalg.inv(self.B * (1 + damping * eye) + 1e-12 * eye)
         Y = self.W @ inverse
@@ -315,7 +369,7 @@ class NormalEquations:
 
 
 def normal_equations(problem: BundleProblem, parts: Mapping[str, Linearised]) -> NormalEquations:
-    """The Gauss-Newton equations of the free camera parameters, the boards' deformations and their poses."""
+    """Assemble the Gauss-Newton equations of free camera parameters, deformations and board poses."""
     shapes = 0 if problem.deformation is None else len(problem.deformation)
     b, c = len(problem.frames), len(problem.names) + shapes
     H, g = np.zeros((c, c)), np.zeros(c)
@@ -342,13 +396,17 @@ def normal_equations(problem: BundleProblem, parts: Mapping[str, Linearised]) ->
 def block_sums(
     block: Int[np.ndarray, " n"], values: Float[np.ndarray, " n *k"], count: int
 ) -> Float[np.ndarray, " b *k"]:
-    """Sums of values by their block, of which there are so many."""
+    """Sum values by their block, of which there are `count`.
+
+    Returns:
+        Sums (b, *k).
+    """
     marks = csr_array((np.ones(len(block)), (block, np.arange(len(block)))), (count, len(block)))
     return np.asarray(marks @ values.reshape(len(values), -1)).reshape(count, *values.shape[1:])
 
 
 def robust_weights(lengths: Array) -> Array:
-    """Robust weights of residuals in standard deviations."""
+    """Compute the robust weights, 0..1, of residual lengths in standard deviations."""
     return np.minimum(1.0, (ROBUST / np.maximum(lengths, ROBUST)) ** 2)
 
 
@@ -356,20 +414,21 @@ def robust_weights(lengths: Array) -> Array:
 
 
 def parameter_sizes(camera: Camera) -> dict[str, int]:
-    """The length of each of a camera's parameter vectors, by its name in a rig with one camera called ""."""
+    """Return the length of each of a camera's parameter vectors, keyed as in a rig whose camera
+    is called ""."""
     lens = {} if camera.distortion is None else {".distortion": camera.distortion.coefficients.shape[-1]}
     return {".rotation": 3, ".translation": 3, ".focal": 2, ".centre": 2} | lens
 
 
 def parameter_names(camera: Camera) -> list[str]:
-    """The parameters of a camera as `Rig.parameters` orders them: "rotation.0", ..., "distortion.4"."""
+    """List a camera's parameters in the order of `Rig.parameters`: "rotation.0", ..., "distortion.4"."""
     return [
         f"{key.removeprefix('.')}.{i}" for key, size in parameter_sizes(camera).items() for i in range(size)
     ]
 
 
 def intrinsic_values(camera: Camera) -> Float[np.ndarray, " p"]:
-    """The parameters' values, in the order of `parameter_names`; 0 for those of the pose."""
+    """Return a camera's parameter values in the order of `parameter_names`; 0 for the pose's."""
     lens = () if camera.distortion is None else camera.distortion.coefficients.tolist()
     K = camera.K.detach()[:2]
     focal = K[:, :2].abs().amax(0)  # beside the diagonal if the image is rotated
@@ -377,9 +436,9 @@ def intrinsic_values(camera: Camera) -> Float[np.ndarray, " p"]:
 
 
 def changed(camera: Camera, change: torch.Tensor) -> Camera:
-    """The camera after a change of all its parameters, in the order of `parameter_names`.
+    """Return the camera after a change of all its parameters, in the order of `parameter_names`.
 
-    Coefficients stay within their lens's bounds: of unified's xi, 0 is the least.
+    Lens coefficients stay within their model's bounds, such as 0 for unified's xi.
     """
     sizes = parameter_sizes(camera)
     moved = Rig({"": camera}).perturbed(dict(zip(sizes, change.split(list(sizes.values())))))[""]
@@ -392,16 +451,22 @@ def changed(camera: Camera, change: torch.Tensor) -> Camera:
 
 
 def camera_jacobian(camera: Camera, X: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 p"]:
-    """Derivatives of the pixels of world points by the camera, in the order of `parameter_names`."""
+    """Compute the derivatives of world points' pixels by a camera's parameters, in the order of
+    `parameter_names`.
+
+    Returns:
+        Derivatives (n, 2, p).
+    """
     return linear_projection(camera, X)[1]
 
 
 def linear_projection(
     camera: Camera, X: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 p"]]:
-    """Pixels of world points, and their derivatives with respect to the camera (`camera_jacobian`).
+    """Project world points, and differentiate by the camera's parameters (`camera_jacobian`).
 
-    Through the lens by `lens_derivatives`; the others by the chain rule.
+    Returns:
+        Pixels (n, 2) and derivatives (n, 2, p). Validity is not checked.
     """
     local = camera.cam_from_world.apply(torch.from_numpy(X)).detach()
     plane, *slopes = lens_derivatives(camera.distortion, local)
@@ -414,7 +479,14 @@ def linear_projection(
 
 
 def with_default(camera: Camera, entry: str) -> tuple[Camera, str]:
-    """The camera, a principal point's entry central, or a lens's term without effect; that in words."""
+    """Reset one intrinsic parameter: a principal point to the centre, a lens term to no effect.
+
+    Args:
+        entry: name such as "centre.0" or "distortion.2"; focal lengths are not supported.
+
+    Returns:
+        The camera, and what was done in words.
+    """
     kind, index = entry.split(".")[0], int(entry.split(".")[1])
     if kind == "centre":
         K = camera.K.clone()
@@ -432,10 +504,13 @@ def with_default(camera: Camera, entry: str) -> tuple[Camera, str]:
 
 
 class CameraPrior(NamedTuple):
-    """A normal prior of a camera's parameters: mean, inverse covariance, in `parameter_names`'s order.
+    """Normal prior of a camera's parameters.
 
-    pose: the mean of its pose, whose entries are a rotation vector about the camera's axes and the optical
-    centre in the world (not the translation), metres. Without it, the entries of the pose are zero.
+    Attributes:
+        mean: mean in the order of `parameter_names`; 0 for the pose.
+        information: inverse covariance, the pose's part for a rotation vector about the camera's axes and the
+            optical centre in the world (not the translation), metres.
+        pose: mean of the pose; None for no prior of it.
     """
 
     mean: Float[np.ndarray, " p"]
@@ -443,7 +518,8 @@ class CameraPrior(NamedTuple):
     pose: Pose | None = None
 
     def equations(self, camera: Camera) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, " p"]]:
-        """The prior's part of the normal equations: inverse covariance, negative gradient, by parameter."""
+        """Return the prior's part of the normal equations: inverse covariance (p, p) and negative gradient
+        (p)."""
         derivatives = np.eye(len(self.mean))
         if self.pose is not None:
             derivatives[3:6, :6] = camera.cam_from_world.centre_jacobian.numpy()
@@ -451,12 +527,12 @@ class CameraPrior(NamedTuple):
         return weighted @ derivatives, weighted @ self.residual(camera)
 
     def loss(self, camera: Camera) -> float:
-        """Half the squared Mahalanobis distance from the mean."""
+        """Return half the squared Mahalanobis distance of a camera from the mean."""
         offset = self.residual(camera)
         return float(offset @ self.information @ offset) / 2
 
     def residual(self, camera: Camera) -> Float[np.ndarray, " p"]:
-        """The mean minus the camera's values, in the prior's own terms."""
+        """Return the mean minus the camera's values, in the prior's parameters."""
         offset = self.mean - intrinsic_values(camera)
         if self.pose is not None:
             offset[:3] = rotation_vector(self.pose.R @ camera.R.T).numpy()
@@ -465,7 +541,8 @@ class CameraPrior(NamedTuple):
 
 
 def typical_sizes(camera: Camera) -> Float[np.ndarray, " p"]:
-    """Typical errors of a camera's parameters before any measurement, in the order of `parameter_names`."""
+    """Return typical errors of a camera's parameters before any measurement, in the order of
+    `parameter_names`."""
     lens = camera.distortion
     coefficients = () if lens is None else typical_coefficients(lens)
     scaled = lens is not None and term(lens, 0) == "xi"  # in the middle, by 1 / (1 + xi)
@@ -476,9 +553,14 @@ def typical_sizes(camera: Camera) -> Float[np.ndarray, " p"]:
 
 
 def typical_prior(camera: Camera) -> CameraPrior:
-    """Prior of ordinary cameras: square pixels, a principal point near the centre, moderate distortion.
+    """Make the prior of an ordinary camera: square pixels, principal point near the centre, moderate
+    distortion.
 
-    Negligible where boards were observed at many positions and tilts; elsewhere it keeps a camera plausible.
+    It is negligible where boards were observed at many positions and tilts; elsewhere it keeps a camera
+    plausible.
+
+    Returns:
+        The prior, without a pose.
     """
     h, w = camera.hw
     deviation = typical_sizes(camera)

@@ -21,30 +21,30 @@ from scipy.special import erf
 from arraygeom.robust import cauchy, least_squares, robust_least_squares
 
 LONGEST_EDGE = 12.0
-"""Edges are used up to this many pixels from their corner: distorted edges are parabolas no further."""
+"""Pixels of an edge that are used at most: distorted edges are parabolas no further."""
 SHORTEST_EDGE = 2.5
-"""Corners whose edges are visible over fewer pixels than this are not refined."""
+"""Visible pixels of an edge below which its corner is not refined."""
 WIDEST_BAND = 5.0
-"""Largest number of pixels used to either side of an edge."""
+"""Largest number of pixels used on either side of an edge."""
 NARROWEST_BAND = 0.7
-"""Smallest such number."""
+"""Smallest number of pixels used on either side of an edge."""
 BLEED = 0.7
 """Pixels by which the blur of neighbouring edges extends into the corner's own squares."""
 STEPS = 12
 CONVERGED = 1e-3
-"""Steps below this, in pixels, end the iteration."""
+"""Step in pixels below which the iteration ends."""
 BLUR = 0.4, 3.0
-"""Least and most standard deviation of the blur, pixels."""
+"""Least and largest standard deviation of the blur, pixels."""
 DEGREES = {0: 0, 12: 1, 30: 3, 42: 4, 54: 5}
 """Degree of the polynomial part of the board's map, by the least number of points."""
 PASSES = 2
-"""The map of the board is fitted again to the refined corners."""
+"""Number of fits of the board's map, each to the refined corners."""
 FEWEST = 8
-"""Corners needed to predict the others."""
+"""Corners that must be good to predict the others."""
 MISFIT = 0.4
 """Largest residual of a corner (root mean square, as a share of its contrast)."""
 LARGEST_SHIFT = 0.5
-"""Largest distance of a corner from its prediction, as a share of the length of its edges."""
+"""Largest distance of a corner from its prediction, as a share of its edges' length."""
 
 Array = np.ndarray
 Map = Callable[[Float[np.ndarray, "n 2"]], Float[np.ndarray, "n 2"]]
@@ -53,8 +53,10 @@ Map = Callable[[Float[np.ndarray, "n 2"]], Float[np.ndarray, "n 2"]]
 class EdgeGeometry(NamedTuple):
     """The two edges through each corner.
 
-    along: direction of each edge, pixels per square; normal: unit normal, towards the next square; curvature:
-    pixels along the normal by which the edge leaves its tangent, per square pixel.
+    Attributes:
+        along: direction of each edge, pixels for each square.
+        normal: unit normal, towards the next square.
+        curvature: pixels along the normal by which the edge leaves its tangent, for each square pixel.
     """
 
     along: Float[np.ndarray, "n 2 2"]
@@ -69,10 +71,16 @@ def refine_corners(
     *,
     clear: float = 0.5,
 ) -> tuple[Float[np.ndarray, "n 2"], Bool[np.ndarray, " n"]]:
-    """Refine corners near `x`, and flag those that fit the corner model.
+    """Refine chessboard corners near `x` by fitting the corner model.
 
-    `p` are their positions on the board, in squares; nothing but the corner's own squares is within `clear`
-    squares of its edges.
+    Args:
+        grey: image, 8 bits.
+        x: approximate pixels.
+        p: positions on the board, in squares.
+        clear: squares from a corner's edges within which there is nothing but its own four squares.
+
+    Returns:
+        Pixels, and True for corners that fit the model; the others keep `x`.
     """
     refined, good = x, np.ones(len(x), dtype=bool)
     for _ in range(PASSES):
@@ -85,9 +93,14 @@ def refine_corners(
 
 
 def smooth_map(p: Float[np.ndarray, "n 2"], x: Float[np.ndarray, "n 2"], good: Bool[np.ndarray, " n"]) -> Map:
-    """The map from the board to the image: a homography plus a polynomial, of degree 5 if the points allow.
+    """Fit a smooth map from the board to the image: a homography plus a polynomial, of degree up to 5,
+    robustly.
 
-    Outliers are down-weighted.
+    Args:
+        good: points to fit to, 4 or more.
+
+    Returns:
+        Function from board positions (n, 2) to pixels (n, 2).
     """
 
     def weigh(rest: torch.Tensor) -> torch.Tensor:
@@ -109,13 +122,17 @@ def smooth_map(p: Float[np.ndarray, "n 2"], x: Float[np.ndarray, "n 2"], good: B
 
 
 def monomials(q: Float[np.ndarray, "n 2"], degree: int) -> Float[np.ndarray, "n m"]:
-    """All products of powers of u and v up to a total degree."""
+    """Compute all products of powers of u and v up to a total degree.
+
+    Returns:
+        Values (n, m).
+    """
     u, v = q.T
     return np.stack([u**i * v**j for i in range(degree + 1) for j in range(degree + 1 - i)], 1)
 
 
 def _shape(board: Map, p: Array) -> EdgeGeometry:
-    """The edges along the board's y (first) and x (second), by differences over a quarter of a square."""
+    """Edges along the board's y (first) and x (second), by differences over a quarter of a square."""
     step, middle = 0.25, board(p)
     ends = [[board(p + s * step * np.eye(2)[axis]) for s in (1, -1)] for axis in (1, 0)]
     along = np.stack([(a - b) / (2 * step) for a, b in ends], 1)
@@ -127,7 +144,7 @@ def _shape(board: Map, p: Array) -> EdgeGeometry:
 
 
 def _fitted(grey: Array, start: Array, shape: EdgeGeometry, clear: float) -> tuple[Array, Array]:
-    """Corners fitted from their predicted positions."""
+    """Corners fitted from their predicted positions, and True where the fit is good."""
     length = np.linalg.norm(shape.along, axis=-1).min(1)
     inside = np.minimum(start, np.array(grey.shape)[::-1] - 1 - start).min(1)
     extent = np.minimum(np.minimum(0.45 * length, LONGEST_EDGE), inside - 1)
@@ -144,7 +161,14 @@ def _fitted(grey: Array, start: Array, shape: EdgeGeometry, clear: float) -> tup
 
 
 class CornerModel(NamedTuple):
-    """Parameters of the corner model: position, mean grey, contrast (signed), blur; one row per corner."""
+    """Parameters of the corner model, one row for each corner.
+
+    Attributes:
+        x: position, pixels.
+        level: mean grey.
+        contrast: signed contrast.
+        blur: standard deviation of the blur, pixels.
+    """
 
     x: Float[np.ndarray, "n 2"]
     level: Float[np.ndarray, "n 1"]
@@ -152,7 +176,7 @@ class CornerModel(NamedTuple):
     blur: Float[np.ndarray, "n 1"]
 
     def changed(self, step: Float[np.ndarray, "n 5"]) -> CornerModel:
-        """The model after a step of at most a pixel, and a factor of the blur between 0.6 and 1.6."""
+        """Return the model after a step of at most a pixel and a factor of the blur between 0.6 and 1.6."""
         blur = (self.blur * np.exp(step[:, 4:].clip(-0.5, 0.5))).clip(*BLUR)
         return CornerModel(
             self.x + step[:, :2].clip(-1, 1), self.level + step[:, 2:3], self.contrast + step[:, 3:4], blur
@@ -183,7 +207,7 @@ def _least_squares(
 
 
 def _initial_model(values: Array, x: Array, root: Array, d: Array, e: Array) -> CornerModel:
-    """The model with the level and the contrast that fit at the given positions; its blur is 1."""
+    """Model with level and contrast fitted at the given positions, and a blur of 1."""
     pattern, weight = erf(d) * erf(e), root**2
     level = np.average(values, weights=weight + 1e-9, axis=1)[:, None]
     contrast = (weight * pattern * (values - level)).sum(1) / (weight * pattern**2).sum(1).clip(1e-9)
@@ -191,7 +215,7 @@ def _initial_model(values: Array, x: Array, root: Array, d: Array, e: Array) -> 
 
 
 def _linearised(values: Array, model: CornerModel, normal: Array, d: Array, e: Array) -> tuple[Array, Array]:
-    """Residuals (n, m), derivatives of the model by a step (n, m, 5), at distances d and e from the edges."""
+    """Residuals (n, m) and derivatives (n, m, 5) of the model, at distances d and e from the edges."""
     _, _, b, blur = model
     S, T = (erf(v / (2**0.5 * blur)) for v in (d, e))
     by_d, by_e = (b * (2 / np.pi) ** 0.5 / blur * np.exp(-((v / blur) ** 2) / 2) for v in (d, e))
@@ -202,7 +226,7 @@ def _linearised(values: Array, model: CornerModel, normal: Array, d: Array, e: A
 
 
 def _distances(offset: Array, shape: EdgeGeometry, extent: Array, width: Array) -> tuple[Array, Array, Array]:
-    """The square root of each pixel's weight, and its distances from the first and the second edge."""
+    """Square root of each pixel's weight, and its distances from the first and the second edge."""
     unit = shape.along / np.linalg.norm(shape.along, axis=-1, keepdims=True)
     straight = np.einsum("npk,njk->npj", offset, shape.normal)
     run = np.einsum("npk,njk->npj", offset, unit)

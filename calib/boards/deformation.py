@@ -1,4 +1,4 @@
-"""Boards that are neither flat nor printed true to size: their shape as unknowns of the bundle adjustment.
+"""Deformed boards, neither flat nor printed true to size: shapes as unknowns of the bundle adjustment.
 
 A print may be longer along one axis, and a sheet be curved. To third order a bent sheet keeps the lengths on
 it: with the symmetric curvature C (1/m) about the board's middle, the point q moves to q - C q (q^T C q) / 6,
@@ -16,22 +16,25 @@ from jaxtyping import Float, Int
 from scipy.special import fdtrc
 
 PARAMETERS = 4
-"""Per board: stretch of y against x, curvatures xx, xy, yy (1/m)."""
+"""Number of shape parameters: stretch of y against x, curvatures xx, xy, yy (1/m)."""
 DEVIATIONS = np.array([0.05, 0.5, 0.5, 0.5])
 """Standard deviations of a board's shape before any measurement."""
 SIGNIFICANCE = 1e-3
-"""Chance at which frames agree on a shape that is not there (Hotelling's test), and"""
+"""Chance of agreement by accident (Hotelling's test) below which a shape is accepted."""
 LEAST_GAIN = 20.0
-"""by how much the loss must fall (half a chi-square)."""
+"""Least fall of the loss (half a chi-square) for a shape to be accepted."""
 STEP = 1e-5
 
 
 @dataclass(frozen=True)
 class BoardDeformation:
-    """The shapes of some boards.
+    """Shapes of boards.
 
-    values: stretch (y / x - 1) and curvatures xx, xy, yy (1/m, positive: the middle lies in front) of each
-    board. middle: the board's middle, metres. part: the board of each block.
+    Attributes:
+        values: stretch (y / x - 1) and curvatures xx, xy, yy (1/m, positive where the middle lies in front)
+            of each board.
+        middle: each board's middle, metres.
+        part: board of each block.
     """
 
     values: Float[np.ndarray, "k 4"]
@@ -40,20 +43,31 @@ class BoardDeformation:
 
     @classmethod
     def flat(cls, middle: Float[np.ndarray, "k 2"], part: Int[np.ndarray, " b"]) -> BoardDeformation:
-        """Flat boards."""
+        """Make flat boards with these middles; `part` is the board of each block."""
         return cls(np.zeros((len(middle), PARAMETERS)), middle, part)
 
     def __len__(self) -> int:
         return self.values.size
 
     def deformed(self, p: Float[np.ndarray, "n 3"], part: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
-        """Flat points of some boards on the boards as they are, metres."""
+        """Deform points of flat boards.
+
+        Args:
+            part: board of each point.
+
+        Returns:
+            Points in their board's frame, metres.
+        """
         return _deformed(p, self.middle[part], self.values[part])
 
     def jacobian(
         self, p: Float[np.ndarray, "n 3"], part: Int[np.ndarray, " n"]
     ) -> Float[np.ndarray, "n 3 s"]:
-        """Derivatives of the deformed points with respect to all values, by central differences."""
+        """Differentiate the deformed points by all values, by central differences.
+
+        Returns:
+            Derivatives (n, 3, s).
+        """
         jacobian = np.zeros((len(p), 3, *self.values.shape))
         rows, middle, values = np.arange(len(p)), self.middle[part], self.values[part]
         for i, step in enumerate(STEP * np.eye(PARAMETERS)):
@@ -62,7 +76,7 @@ class BoardDeformation:
         return jacobian.reshape(len(p), 3, -1)
 
     def stepped(self, change: Float[np.ndarray, " s"]) -> BoardDeformation:
-        """The shapes after a change of all values."""
+        """Return the shapes after a change of all values."""
         return replace(self, values=self.values + change.reshape(self.values.shape))
 
     @property
@@ -71,7 +85,7 @@ class BoardDeformation:
         return np.tile(DEVIATIONS**-2.0, len(self.values))
 
     def loss(self) -> float:
-        """Half the squared Mahalanobis distance from flat boards."""
+        """Return half the squared Mahalanobis distance from flat boards."""
         return float(self.information @ self.values.ravel() ** 2) / 2
 
 
@@ -87,7 +101,12 @@ def _deformed(p: np.ndarray, middle: np.ndarray, values: np.ndarray) -> np.ndarr
 def is_significant(
     values: Float[np.ndarray, " s"], covariance: Float[np.ndarray, "s s"], frames: int
 ) -> bool:
-    """Whether shapes differ from flat by more than the jackknife over frames explains (Hotelling's test)."""
+    """Test whether shapes differ from flat by more than the jackknife over frames explains (Hotelling's
+    test).
+
+    Returns:
+        True for a chance below `SIGNIFICANCE`.
+    """
     count = len(values)
     squared = float(values @ np.linalg.solve(covariance, values))
     ratio = squared * (frames - count) / (count * (frames - 1))
@@ -97,7 +116,11 @@ def is_significant(
 def described(
     shape: BoardDeformation, deviations: Float[np.ndarray, "k 4"], extents: list[tuple[float, float]]
 ) -> Iterator[str]:
-    """Sentences on boards whose shapes were estimated, with standard deviations."""
+    """Yield sentences on boards whose estimated stretch or bend exceeds three standard deviations.
+
+    Args:
+        extents: width and height of each board, metres.
+    """
     for k, (extent, deviation) in enumerate(zip(extents, deviations)):
         name = f"board {k + 1}" if len(extents) > 1 else "the board"
         stretch, a, b, c = shape.values[k]

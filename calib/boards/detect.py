@@ -1,7 +1,7 @@
-"""Detection of a board's points in images, to a fraction of a pixel, with likely reasons where it fails.
+"""Detection of a board's points in images to a fraction of a pixel, with likely reasons where it fails.
 
-OpenCV 4.10 and newer, and 5. Images that are dim, flat or inverted (near infrared, narrow bands) are
-stretched, equalised and inverted in turn until the board is found.
+Works with OpenCV 4.10 and newer, and 5. Images that are dim, flat or inverted (near infrared, narrow bands)
+are stretched, equalised and inverted in turn until the board is found.
 """
 
 from __future__ import annotations
@@ -36,56 +36,71 @@ from .corners import monomials, refine_corners
 from .photos import FrameKey, Grey, Photo, Photos, find_photos
 
 FEWEST = 8
-"""Points that a detection must have: a pose needs 4, a check of it more."""
+"""Least points of a detection: a pose needs 4, a check of it more."""
 FEWEST_KNOWN = 6
-"""Likewise of points of known position."""
+"""Least points of a detection of known positions."""
 ENOUGH = 0.6
-"""Share of a board's corners that must fit the corner model, else all are refined by gradients."""
+"""Share of corners that must fit the corner model; otherwise all are refined by gradients."""
 APRIL_SHIFT = 0.5
-"""The first pixel's centre, x and y, where OpenCV finds corners in the way of AprilTag's authors."""
+"""Position (x and y) of the first pixel's centre in corners of OpenCV's AprilTag method."""
 LARGEST_MISFIT = 0.35
-"""Largest median distance (spacings) of points from a smoothly distorted grid: beyond, a false detection."""
+"""Largest median distance (in spacings) of points from a smoothly distorted grid; above, the detection is
+false."""
 SMALL = 640
-"""Width to which images are reduced to identify the board they show."""
+"""Width to which images are reduced to identify the board in them."""
 OTHER_DICTIONARIES = ("4x4_1000", "5x5_1000", "6x6_1000", "7x7_1000", "aruco_original", "apriltag_36h11")
 EXPLAINED_IMAGES = 4
-"""Images without a board that are analysed for the reason."""
+"""Number of images without a board that are analysed for the reason."""
 NAMED = 6
-"""Images named in a message."""
+"""Number of images named in a message."""
 
 Progress = Callable[[Iterable[Any], int], Iterable[Any]]
 
 
 class Detection(NamedTuple):
-    """Points of a board detected in one image: their indices on the board and their pixels."""
+    """Board points detected in one image.
+
+    Attributes:
+        ids: indices of the points on the board.
+        x: pixels.
+    """
 
     ids: Int[np.ndarray, " n"]
     x: Float[np.ndarray, "n 2"]
 
     def where(self, mask: Bool[np.ndarray, " n"]) -> Detection:
-        """Some of the points."""
+        """Return the points in a mask."""
         return Detection(self.ids[mask], self.x[mask])
 
 
 @dataclass(frozen=True)
 class BoardViews:
-    """One camera's image size and, by moment, the board points detected."""
+    """Detections of one camera.
+
+    Attributes:
+        hw: image size.
+        seen: detected points by moment.
+    """
 
     hw: HW
     seen: Mapping[FrameKey, Detection]
 
     @property
     def count(self) -> int:
-        """The number of points."""
+        """Number of points in all images."""
         return sum(len(d.ids) for d in self.seen.values())
 
     def only(self, keys: Collection[FrameKey]) -> BoardViews:
-        """The views at some moments."""
+        """Return the views at some moments; others are ignored."""
         return BoardViews(self.hw, {key: d for key, d in self.seen.items() if key in keys})
 
 
 def detect(grey: Grey, board: Board) -> Detection | None:
-    """The board's points in a grey image (uint8), or None if it is not found."""
+    """Detect a board's points in a grey image (uint8).
+
+    Returns:
+        The points, refined; None if the board is not found.
+    """
     for candidate in _versions(grey):
         detection = _FINDERS[type(board)](candidate, board)
         if detection is not None and _plausible(detection, board):
@@ -95,15 +110,24 @@ def detect(grey: Grey, board: Board) -> Detection | None:
 
 
 def explain(images: Iterable[Grey], board: Board) -> str:
-    """The likeliest reason why a board was not found in images, as text."""
+    """Guess the likeliest reason why a board was not found in images.
+
+    Returns:
+        A sentence.
+    """
     reasons = Counter(_reason(grey, board) for grey in images)
     return reasons.most_common(1)[0][0] if reasons else "there are no images"
 
 
 def other_size(images: Iterable[Grey], board: Board, *, larger: bool = False) -> str | None:
-    """The size of the chessboard in the images, as "9x6", if most show one of another size than `board`.
+    """Find the size of a chessboard in the images that is not `board`'s.
 
-    Only a larger one counts if `board` was found in them: patches of it pass for smaller ones.
+    Args:
+        larger: True to count only larger ones, for images in which `board` was found: patches of a board pass
+            for smaller ones.
+
+    Returns:
+        Size such as "9x6" if most images show it; None otherwise, and for other kinds of board.
     """
     if not isinstance(board, Chessboard):
         return None
@@ -134,13 +158,13 @@ def _chessboard(grey: Grey, board: Chessboard) -> Detection | None:
 
 
 def _right_handed(grid: np.ndarray) -> np.ndarray:
-    """The grid, mirrored if x, y and the direction into the board are not a right-handed frame."""
+    """Mirror a grid whose x, y and direction into the board are no right-handed frame."""
     (ax, ay), (bx, by) = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
     return grid[:, ::-1] if ax * by < ay * bx else grid
 
 
 def _numbered(grid: np.ndarray) -> Detection:
-    """All points of a board, row by row."""
+    """Detection of all points of a board, row by row."""
     x = grid.reshape(-1, 2).astype(np.float64)
     return Detection(np.arange(len(x)), x)
 
@@ -170,7 +194,7 @@ def _april_grid(grey: Grey, board: AprilGrid) -> Detection | None:
 
 
 def _known_points(grey: Grey, board: KnownPoints) -> Detection | None:
-    """Corners, and centres by the diagonals, which lenses hardly move."""
+    """Detect corners, and centres by the diagonals, which lenses hardly move."""
     markers = _tags(grey, board.dictionary, 1)
     ids = [i for i, (marker, _) in enumerate(board.ids) if marker in markers]
     if len(ids) < FEWEST_KNOWN:
@@ -183,17 +207,17 @@ def _known_points(grey: Grey, board: KnownPoints) -> Detection | None:
 
 
 def _crossing(corners: np.ndarray) -> np.ndarray:
-    """Where the diagonals of a quadrilateral cross: the projection of a square's centre."""
+    """Intersection of a quadrilateral's diagonals: the projection of a square's centre."""
     a, b, c, d = corners.astype(np.float64)
     along = np.linalg.solve(np.stack([c - a, b - d], -1), b - a)
     return np.asarray(a + along[0] * (c - a))
 
 
 def _tags(grey: Grey, dictionary: str, border: int) -> dict[int, np.ndarray]:
-    """The four corners of each visible marker, by number.
+    """Corners (4) of each visible marker, by number.
 
-    AprilTags touch other squares at their corners: OpenCV's way of finding them and that of their authors
-    miss others.
+    AprilTags touch other squares at their corners: OpenCV's method and that of their authors miss different
+    ones.
     """
     tags: dict[int, np.ndarray] = {}
     april = [cv2.aruco.CORNER_REFINE_APRILTAG] if dictionary.startswith("april") else []
@@ -209,7 +233,11 @@ def _tags(grey: Grey, dictionary: str, border: int) -> dict[int, np.ndarray]:
 
 
 def homography_errors(p: Float[np.ndarray, "n 2"], x: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
-    """Distances of pixels from a homography of points on a board (least median of squares), inf if none."""
+    """Compute the distances of pixels from a homography of board points (least median of squares).
+
+    Returns:
+        Distances in pixels; infinite if there is no homography.
+    """
     H, _ = cv2.findHomography(p, x, cv2.LMEDS)
     if H is None:
         return np.full(len(p), np.inf)
@@ -217,7 +245,7 @@ def homography_errors(p: Float[np.ndarray, "n 2"], x: Float[np.ndarray, "n 2"]) 
 
 
 def _circles(grey: Grey, board: Circles) -> Detection | None:
-    """The centres of a grid of circles, in the order of the board's points; None unless all are found."""
+    """Detect the centres of a grid of circles in the board's order; None unless all are found."""
     kind = cv2.CALIB_CB_ASYMMETRIC_GRID if board.asymmetric else cv2.CALIB_CB_SYMMETRIC_GRID
     for flags in (kind, kind | cv2.CALIB_CB_CLUSTERING):
         succeeded, centres = cv2.findCirclesGrid(grey, (board.columns, board.rows), flags=flags)
@@ -243,9 +271,9 @@ _FINDERS: dict[type[Board], Callable[[Grey, Any], Detection | None]] = {
 
 
 def _refined(grey: Grey, detection: Detection, board: Board) -> Detection:
-    """Corners refined to a hundredth of a pixel; of boards that may be seen in part, without occluded ones.
+    """Refine corners to a hundredth of a pixel; boards that may be partly visible lose occluded ones.
 
-    Where few fit the corner model, as in images that are too small for it, all are refined by gradients.
+    If few fit the corner model, as in too small images, all are refined by gradients.
     """
     if isinstance(board, Circles | KnownPoints):
         return detection
@@ -259,7 +287,8 @@ def _refined(grey: Grey, detection: Detection, board: Board) -> Detection:
 
 
 def _clear(board: Board) -> float:
-    """How far from a corner's edges there is nothing but its own squares, as a share of `spacing`."""
+    """Distance from a corner's edges that is free of anything but its own squares, as a share of
+    `spacing`."""
     if isinstance(board, Charuco):
         return (1 - board.marker / board.spacing) / 2
     if isinstance(board, AprilGrid):
@@ -269,7 +298,8 @@ def _clear(board: Board) -> float:
 
 
 def _by_gradients(grey: Grey, x: np.ndarray, share: float) -> np.ndarray:
-    """Corners by OpenCV's gradient criterion, in windows of `share` times the distance to the next corner."""
+    """Refine corners by OpenCV's gradient criterion, in windows of `share` times the distance to the next
+    corner."""
     half = int(np.clip(share * np.quantile(apart(x), 0.1), 2, 11))
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
     refined = cv2.cornerSubPix(grey, x.astype(np.float32).reshape(-1, 1, 2), (half, half), (-1, -1), criteria)
@@ -277,7 +307,7 @@ def _by_gradients(grey: Grey, x: np.ndarray, share: float) -> np.ndarray:
 
 
 def _plausible(detection: Detection, board: Board) -> bool:
-    """Whether there are enough points, not collinear, and on a smoothly distorted grid.
+    """True for enough points that are not collinear and lie on a smoothly distorted grid.
 
     A homography plus a polynomial of degree 3 has to map the points on the board to the pixels.
     """
@@ -297,7 +327,7 @@ def _plausible(detection: Detection, board: Board) -> bool:
 
 
 def _reason(grey: Grey, board: Board) -> str:
-    """The likeliest reason why a board is not found, and what to do."""
+    """Guess why a board is not found, and what to do."""
     low, high = np.percentile(grey, (2, 98))
     if high - low < 40:
         return "the images have hardly any contrast: expose them longer, or light the board"
@@ -317,7 +347,7 @@ def _reason(grey: Grey, board: Board) -> str:
 
 
 def _marker_reason(grey: Grey, board: MarkedBoard) -> str | None:
-    """The same by the markers that are visible; None if they say nothing."""
+    """Guess the reason from visible markers; None if they give no hint."""
     border = board.border if isinstance(board, AprilGrid) else 1
     ids, last = _tags(grey, board.dictionary, border), board.markers[-1]
     if isinstance(board, AprilGrid) and len(_tags(grey, board.dictionary, 3 - border)) >= max(4, len(ids)):
@@ -351,7 +381,7 @@ def _marker_reason(grey: Grey, board: MarkedBoard) -> str | None:
 
 
 def _grid_size(grey: Grey) -> tuple[int, int] | None:
-    """The inner corners of the largest chessboard in an image along its sides, the longer first."""
+    """Inner corners along the sides of the largest chessboard in an image, the longer first."""
     scale = min(1.0, SMALL / grey.shape[1])
     small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE
@@ -363,11 +393,17 @@ def _grid_size(grey: Grey) -> tuple[int, int] | None:
 
 
 DetectedImage = tuple[HW, dict[FrameKey, Detection]]
-"""An image's size, and the points of each board in it."""
+"""Size of an image, and the points of each board in it by moment."""
 
 
 class CollectedViews(NamedTuple):
-    """Detections of each camera, its images, and notes on failed ones."""
+    """Detections in a folder of images.
+
+    Attributes:
+        views: detections by camera.
+        photos: images by camera and moment.
+        notes: sentences on images without the board.
+    """
 
     views: dict[str, BoardViews]
     photos: Photos
@@ -381,10 +417,19 @@ def collect_folder(
     patterns: Mapping[str, str] | None = None,
     progress: Progress | None = None,
 ) -> CollectedViews:
-    """Detect the board in all images of all cameras of a folder (see `find_photos`).
+    """Detect the board in all images of all cameras in a folder (see `find_photos`).
 
-    Raises ValueError, naming images and cause, if a camera's images differ in size, if the board is found in
-    none of them, or if they show a board of another size.
+    Args:
+        patterns: file name patterns by camera; None derives cameras from folders or names.
+        progress: wraps the iterable of results and their number, to show progress.
+
+    Returns:
+        Detections, images and notes.
+
+    Raises:
+        FileNotFoundError: for a missing folder.
+        ValueError: naming images and cause, if a camera's images differ in size, none shows the board, or
+            they show a board of another size.
     """
     photos = find_photos(Path(folder), patterns=patterns)
     jobs = [job for moments in photos.values() for job in moments.items()]
@@ -407,10 +452,17 @@ def collect_folder(
 
 
 def detected(photo: Photo, key: FrameKey, board: Board) -> DetectedImage:
-    """An image's size and the points of each board in it, numbered as those of all boards.
+    """Detect each board in an image; points are numbered as in the list of all boards.
 
-    Each board has poses of its own, hence a key of its own; that of the first one is the image's. Raises
-    ValueError if the image cannot be read.
+    Args:
+        key: moment of the image, which the first board keeps; others get a key of their own, as they have
+            poses of their own.
+
+    Returns:
+        Size of the image, and detections by key; empty if there is none.
+
+    Raises:
+        ValueError: if the image cannot be read.
     """
     grey, detections, before = photo.read(), dict[FrameKey, Detection](), 0
     for index, member in enumerate(board.members):
@@ -425,7 +477,14 @@ def detected(photo: Photo, key: FrameKey, board: Board) -> DetectedImage:
 def board_views(
     name: str, moments: Mapping[FrameKey, Photo], images: Mapping[FrameKey, DetectedImage]
 ) -> BoardViews:
-    """What was detected in a camera's images. Raises ValueError if they differ in size."""
+    """Combine the detections in a camera's images.
+
+    Returns:
+        The views.
+
+    Raises:
+        ValueError: if the images differ in size.
+    """
     by_size: dict[HW, list[str]] = {}
     for key, (hw, _) in images.items():
         by_size.setdefault(hw, []).append(moments[key].label)
@@ -440,7 +499,7 @@ def board_views(
 def _missing(
     name: str, moments: Mapping[FrameKey, Photo], with_board: Collection[FrameKey], board: Board
 ) -> Iterator[str]:
-    """A note on a camera's images without the board. Raises ValueError if all are."""
+    """Note on a camera's images without the board. Raises ValueError if it is in none."""
     why, missing = "", [photo for key, photo in moments.items() if key not in with_board]
     if missing:
         labels = named([photo.label for photo in missing], NAMED)
@@ -457,5 +516,5 @@ def _greys(photos: list[Photo]) -> Iterable[Grey]:
 
 
 def named(labels: Sequence[str], most: int) -> str:
-    """The first labels, and how many more there are."""
+    """List the first `most` labels, and how many more there are, as text."""
     return ", ".join(labels[:most]) + (f" and {len(labels) - most} more" if len(labels) > most else "")

@@ -1,4 +1,5 @@
-"""One camera from its images: Zhang's method by OpenCV, then all observable parameters; lenses compared."""
+"""Calibration of one camera from its images: initial values by Zhang's method (OpenCV), outliers, board
+poses."""
 
 from __future__ import annotations
 
@@ -33,25 +34,32 @@ LENSES: dict[Lens, tuple[str, int]] = {
     "thin-prism-fisheye": ("thin-prism-fisheye", 8),
     "none": ("none", 0),
 }
-"""Model and number of coefficients; those of Brown and Conrady have all terms of the former."""
+"""Model and number of coefficients of each lens choice."""
 FEWEST_IMAGES = 3
 FEWEST_POINTS = 6
 """Points of an image below which none is left out."""
 OUTLIER = 6.0
-"""Points beyond this many standard deviations (of a coordinate) are left out."""
+"""Standard deviations (of a coordinate) above which a point is left out."""
 LEAST_SIGMA = 0.02
-"""Lower bound of that deviation, pixels: no real corners are better."""
+"""Lower bound of that standard deviation, pixels: no real corners are better."""
 RAYLEIGH_MEDIAN = 1.17741
-"""The median length of a vector of two independent standard normal variables."""
+"""Median length of a vector of two independent standard normal variables."""
 OBLONG = 0.1
-"""Pixels whose sides differ by more than this share are no camera's."""
+"""Largest relative difference between the sides of a real camera's pixels."""
 OpenCVSolution = tuple[np.ndarray, np.ndarray, list[np.ndarray], list[np.ndarray]]
-"""K, coefficients, rotations, translations."""
+"""K, distortion coefficients, rotations, translations."""
 
 
 @dataclass(frozen=True)
 class CalibratedViews:
-    """A calibrated camera at the origin with its views, and the board's pose in it by moment."""
+    """One calibrated camera with its views.
+
+    Attributes:
+        name: name of the camera.
+        camera: the camera, at the origin.
+        views: its detections.
+        poses: `cam_from_board` by moment.
+    """
 
     name: str
     camera: Camera
@@ -60,10 +68,14 @@ class CalibratedViews:
 
 
 def initial_camera(name: str, views: BoardViews, board: Board, lens: Lens) -> CalibratedViews:
-    """A camera's intrinsics, lens and board poses from its own images, without outliers.
+    """Estimate a camera's intrinsics, lens and board poses from its own images, and drop outlying points.
 
-    Raises ValueError if there are fewer than three images with a board (one, with points that are not in a
-    plane).
+    Returns:
+        The camera with its remaining points.
+
+    Raises:
+        ValueError: for fewer than three images with a board (one, for points that are not coplanar), and if
+            OpenCV finds no camera.
     """
     fewest = FEWEST_IMAGES if board.flat else 1
     if len(views.seen) < fewest:
@@ -82,7 +94,11 @@ def initial_camera(name: str, views: BoardViews, board: Board, lens: Lens) -> Ca
 
 
 def without_bad_images(views: BoardViews, initial: CalibratedViews, board: Board) -> BoardViews:
-    """The views without images whose reprojection error is far above the others'."""
+    """Drop the images whose reprojection error is far above the others'.
+
+    Returns:
+        The remaining views.
+    """
     rms = {}
     for key, pose in initial.poses.items():
         errors = _projection_errors(initial.camera, pose, initial.views.seen[key], board.points)
@@ -99,11 +115,16 @@ def without_outliers(
     *,
     sigma: float | None = None,
 ) -> BoardViews:
-    """The views without points farther from a camera's projections than `OUTLIER` standard deviations.
+    """Drop points farther than `OUTLIER` standard deviations from a camera's projections.
 
-    `points` are the board's, metres. `sigma` is along x or y, pixels; by default estimated from the median of
-    all distances. Images without a pose, or with fewer than `FEWEST_POINTS` points or one row of them left,
-    keep all.
+    Args:
+        poses: `cam_from_board` by moment.
+        points: the board's points, metres.
+        sigma: standard deviation along x or y, pixels; None estimates it from the median of all distances.
+
+    Returns:
+        The views; images without a pose, or left with fewer than `FEWEST_POINTS` points or collinear ones,
+        keep all.
     """
     off = {
         key: _projection_errors(camera, poses[key], d, points)
@@ -117,20 +138,25 @@ def without_outliers(
 
 
 def _spans(points: Float[np.ndarray, "n 3"]) -> bool:
-    """Whether there are enough points, and not all on a line."""
+    """True for enough points that are not collinear."""
     return len(points) >= FEWEST_POINTS and bool(np.linalg.matrix_rank(points - points.mean(0), 1e-6) > 1)
 
 
 def _projection_errors(
     camera: Camera, pose: Pose, detection: Detection, points: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, " m"]:
-    """How far the points of an image are from a camera's projections of the board's, pixels."""
+    """Distances of an image's points from a camera's projections of the board, pixels."""
     projected = camera.project_local(pose.apply(torch.from_numpy(points[detection.ids]))).x.numpy()
     return np.linalg.norm(projected - detection.x, axis=-1)
 
 
 def near_homography(detection: Detection, board: Board) -> Detection:
-    """Points that a homography of the board fits (least median of squares), but for the lens's distortion."""
+    """Drop points that no homography of the board fits (least median of squares), with tolerance for
+    distortion.
+
+    Returns:
+        The remaining points; all for boards that are not flat, or with few points.
+    """
     if len(detection.ids) < FEWEST_POINTS or not board.flat:
         return detection
     off = homography_errors(board.points[detection.ids, :2], detection.x)
@@ -138,7 +164,7 @@ def near_homography(detection: Detection, board: Board) -> Detection:
 
 
 def _solved(name: str, views: BoardViews, board: Board, lens: Lens) -> tuple[Camera, dict[FrameKey, Pose]]:
-    """OpenCV's camera, and `cam_from_board` of each frame. Raises ValueError if it finds none."""
+    """OpenCV's camera, and `cam_from_board` by moment. Raises ValueError if it finds none."""
     model, count = LENSES[lens]
     pinhole = model in ("brown-conrady", "none")
     try:
@@ -157,7 +183,7 @@ def _solved(name: str, views: BoardViews, board: Board, lens: Lens) -> tuple[Cam
 
 
 def _with_model(camera: Camera, model: str) -> Camera:
-    """A fisheye's camera by another lens model of nearly the same rays: focal length, two terms fitted."""
+    """Fit another lens model to a fisheye's rays: focal length and two terms."""
     plain = np.array(MODELS[model].harmless)
     h, w = camera.hw
     grid = np.stack(np.meshgrid(np.linspace(0, w - 1, 16), np.linspace(0, h - 1, 12)), -1).reshape(-1, 2)
@@ -178,10 +204,13 @@ def _with_model(camera: Camera, model: str) -> Camera:
 
 
 def board_pose(camera: Camera, detection: Detection, board: Board) -> Pose:
-    """`cam_from_board` of one image, for a camera whose intrinsics are known.
+    """Estimate `cam_from_board` of one image for a camera of known intrinsics.
 
-    Raises ValueError for fewer than four points in front of the camera, as a lens far from the true one may
-    see them.
+    Returns:
+        The pose, metres.
+
+    Raises:
+        ValueError: if fewer than four points are in front of the camera, as by a lens far from the true one.
     """
     directions, valid = camera.rays(torch.from_numpy(detection.x))
     rays = directions.numpy()
@@ -201,7 +230,7 @@ def board_pose(camera: Camera, detection: Detection, board: Board) -> Pose:
 
 
 def _pinhole(views: BoardViews, board: Board, count: int) -> OpenCVSolution:
-    """K, coefficients, rotations, translations; two radial terms suffice initially.
+    """Fit K and two radial terms, with rotations and translations, as initial values.
 
     Few, small or similar boards determine neither these nor the aspect ratio, and a fit without a prior ends
     anywhere. Where pixels become oblong, a camera with square ones, a central principal point and one radial
@@ -231,7 +260,8 @@ def _pinhole(views: BoardViews, board: Board, count: int) -> OpenCVSolution:
 
 
 def _linear_intrinsics(view: tuple[np.ndarray, np.ndarray], hw: HW) -> np.ndarray:
-    """K, square pixels, central principal point, by a linear camera of one view (Hartley & Zisserman 7.1)."""
+    """K with square pixels and central principal point, by a linear camera of one view (Hartley & Zisserman
+    7.1)."""
     X, x = view[0].astype(np.float64), view[1][:, 0].astype(np.float64)
     if len(X) < FEWEST_POINTS:
         return np.array(intrinsics(float(max(hw)), hw))
@@ -246,7 +276,7 @@ def _linear_intrinsics(view: tuple[np.ndarray, np.ndarray], hw: HW) -> np.ndarra
 
 
 def _fisheye(views: BoardViews, board: Board) -> OpenCVSolution:
-    """From the focal length of half a sphere, and of a narrow view: what fits better, if both lead there."""
+    """Fit from the focal length of half a sphere and from that of a narrow view; the better fit is kept."""
     if not board.flat:
         raise ValueError("fisheyes need a flat board to start from: points in space give pinhole cameras")
     points = [board.points[d.ids][:, None] for d in views.seen.values()]

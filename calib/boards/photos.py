@@ -1,7 +1,7 @@
-"""Cameras and moments of the images in a folder: subfolders, file names, videos.
+"""Assignment of the images in a folder to cameras and moments: subfolders, file names, videos.
 
-A folder for each camera, or files in one folder whose names begin with the camera's, or patterns. Images of
-one moment have the same number (or the same name, apart from the part that all names of a camera share).
+A camera is a subfolder, or a prefix of file names in one folder, or a pattern. Images of one moment have the
+same number (or the same name, apart from the part that all names of a camera share).
 """
 
 from __future__ import annotations
@@ -27,36 +27,49 @@ Grey = UInt8[np.ndarray, "h w"]
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp"}
 VIDEOS = {".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg"}
 MOST_FRAMES = 80
-"""Largest number of frames used of a video: every first, second, fourth, eighth ..., so that videos of
+"""Largest number of frames used from a video: every first, second, fourth, eighth ..., so that videos of
 somewhat different lengths share them."""
 
 ORIENTATION = 274
-"""EXIF's tag."""
+"""Number of EXIF's orientation tag."""
 
 FrameKey = int | str
 
 
 @dataclass(frozen=True)
 class Photo:
-    """One image of one camera, decoded when needed. `label` names it in messages."""
+    """One image of one camera, decoded when needed.
+
+    Attributes:
+        label: name in messages.
+        decode: function that decodes the image.
+    """
 
     label: str
     decode: Callable[[], np.ndarray]
 
     def read(self) -> Grey:
-        """The image in grey. Raises ValueError if it cannot be read."""
+        """Decode the image in grey, 8 bits (see `to_grey`).
+
+        Raises:
+            ValueError: if it cannot be read.
+        """
         return to_grey(self.decode())
 
 
 Photos = Mapping[str, Mapping[FrameKey, Photo]]
-"""By camera, then by moment."""
+"""Images by camera, then by moment."""
 
 
 def to_grey(image: np.ndarray) -> Grey:
-    """An image (H, W) or (H, W, C) in grey, 8 bits; if dim or of other values it is stretched to all of them.
+    """Convert an image (h, w) or (h, w, c) to grey, 8 bits; dim images and other types are stretched to
+    0..255.
 
-    Fewer than three channels are grey, and whatever else; of more, the first three are blue, green and red.
-    NaN and infinity are black.
+    Of one or two channels the first is grey; of more, the first three are blue, green and red. NaN and
+    infinity become black.
+
+    Returns:
+        Grey image (h, w), uint8.
     """
     image = np.atleast_3d(image if image.dtype in (np.uint8, np.uint16) else image.astype(np.float32))
     grey = image[..., 0] if image.shape[2] < 3 else cv2.cvtColor(image[..., :3], cv2.COLOR_BGR2GRAY)
@@ -72,12 +85,20 @@ def to_grey(image: np.ndarray) -> Grey:
 
 
 def find_photos(folder: Path, *, patterns: Mapping[str, str] | None = None) -> Photos:
-    """The images of every camera below a folder.
+    """Find the images of every camera below a folder.
 
-    `patterns` maps camera names to patterns of file names, relative to the folder. Without it every subfolder
-    with images or a video is a camera; where there is none, every prefix of file names before a final number
-    (left01.jpg, right01.jpg), or every video. If each camera has one image, they are of one moment. Raises
-    FileNotFoundError and ValueError, for images beside subfolders of images too.
+    Args:
+        patterns: patterns of file names, relative to the folder, by camera; None takes each subfolder with
+            images or a video as a camera, or else each prefix of file names before a final number
+            (left01.jpg, right01.jpg) or each video. If each camera has one image, these are of one moment.
+
+    Returns:
+        Images by camera and moment, not decoded yet.
+
+    Raises:
+        FileNotFoundError: for a missing folder.
+        ValueError: for no images, images beside subfolders of images, patterns without a file or with a
+            shared one, and images that differ in orientation tags or repeat a number.
     """
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder: give one with a subfolder for each camera")
@@ -93,10 +114,13 @@ def find_photos(folder: Path, *, patterns: Mapping[str, str] | None = None) -> P
 
 
 def frame_keys(stems: list[str]) -> list[FrameKey]:
-    """What tells the images of one camera apart: the part of the names that differs, a number if it is one.
+    """Derive the moments of one camera's images: the part in which names differ, as a number if it is one.
 
     >>> frame_keys(["cam01_08_int", "cam01_09_int", "cam01_10_int"])
     [8, 9, 10]
+
+    Returns:
+        One key for each name, in order; equal keys are not refused.
     """
     pieces = [re.split(r"(\d+)", stem) for stem in stems]
     if len(stems) == 1:
@@ -109,7 +133,7 @@ def frame_keys(stems: list[str]) -> list[FrameKey]:
 
 
 def _common_prefix(lists: list[list[str]]) -> int:
-    """The number of first items that all lists share."""
+    """Number of first items that all lists share."""
     return next((i for i, items in enumerate(zip(*lists)) if len(set(items)) > 1), min(map(len, lists)))
 
 
@@ -155,7 +179,7 @@ def _usable(paths: Iterable[Path]) -> list[Path]:
 
 
 def _moments(name: str, files: list[Path]) -> dict[FrameKey, Photo]:
-    """A camera's photos by moment. Raises ValueError for mixed videos, orientations, or equal numbers."""
+    """Photos of a camera by moment. Raises ValueError for mixed videos, orientations, or equal numbers."""
     videos = [f for f in files if f.suffix.lower() in VIDEOS]
     if len(videos) > 1 or (videos and len(videos) < len(files)):
         raise ValueError(f"{name}: {len(videos)} videos among {len(files)} files: keep one video, or images")
@@ -174,7 +198,7 @@ def _moments(name: str, files: list[Path]) -> dict[FrameKey, Photo]:
 
 
 def _orientation(file: Path) -> int:
-    """The EXIF orientation, 1 if there is none or the file is unreadable, which is reported on decoding.
+    """EXIF orientation; 1 if there is none or the file is unreadable, which decoding reports.
 
     Raises ValueError for a file that states more pixels than any camera has, before anything is decoded.
     """

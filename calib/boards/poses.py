@@ -1,7 +1,6 @@
-"""Initial poses of the cameras and boards.
+"""Initial poses of cameras and boards.
 
-Relative poses of pairs by vote, joined along a maximum spanning tree; or those of a rig that is known
-roughly.
+Relative poses of pairs by vote, joined along a maximum spanning tree; or the poses of a roughly known rig.
 """
 
 from __future__ import annotations
@@ -27,17 +26,21 @@ from .intrinsics import LENSES, CalibratedViews, Lens, board_pose
 from .photos import FrameKey
 
 TOLERANCE = 0.03
-"""A frame agrees with a pose if it predicts the board to this share of the image width: one view of a small
+"""Prediction error as a share of the image width below which a frame agrees with a pose: one view of a small
 board determines its tilt, hence the other camera's position, no better."""
 FEWEST_TO_JUDGE = 3
-"""Frames that two cameras must share for their consistency to be checked."""
+"""Least number of shared frames to check two cameras for consistency."""
 MOST_CANDIDATES = 15
 
 
 class RelativePose(NamedTuple):
-    """A relative pose of two cameras, and which of their shared frames agree with it.
+    """Relative pose of two cameras.
 
-    score: how many those are, then minus their total error, pixels.
+    Attributes:
+        a_from_b: the pose.
+        agreeing: shared frames that agree with it.
+        shared: all shared frames.
+        score: number of agreeing frames, then minus their total error in pixels.
     """
 
     a_from_b: Pose
@@ -47,16 +50,22 @@ class RelativePose(NamedTuple):
 
     @property
     def consistent(self) -> bool:
-        """Whether enough of the frames agree."""
+        """True if most frames agree, or there are too few to judge."""
         return len(self.shared) < FEWEST_TO_JUDGE or len(self.agreeing) > max(1, len(self.shared) // 2)
 
 
 @dataclass(frozen=True)
 class StartDeviations:
-    """How far a rig may be from its start: standard deviations of each camera's parameters.
+    """Standard deviations of each camera's parameters about a start rig.
 
-    position: of the optical centre along each axis, metres. rotation: about each axis, degrees. focal: a
-    share of the focal length. centre: of the principal point, a share of the width.
+    Attributes:
+        position: optical centre along each axis, metres.
+        rotation: rotation about each axis, degrees.
+        focal: share of the focal length.
+        centre: principal point as a share of the width.
+
+    Raises:
+        ValueError: for a value that is not positive and finite.
     """
 
     position: float = 5e-4
@@ -70,15 +79,23 @@ class StartDeviations:
                 raise ValueError(f"the start's deviation {name}={value:g} is not a positive number")
 
     @classmethod
-    def of(cls, deviations: Mapping[str, float]) -> StartDeviations:
-        """By name. Raises ValueError for another name."""
+    def from_numbers(cls, deviations: Mapping[str, float]) -> StartDeviations:
+        """Make deviations from values by name; the others keep their defaults.
+
+        Raises:
+            ValueError: for an unknown name, and values that are not positive.
+        """
         if unknown := deviations.keys() - vars(cls()).keys():
             raise ValueError(f"a start has no deviation '{min(unknown)}': it has {', '.join(vars(cls()))}")
         return cls(**deviations)
 
 
 def start_prior(camera: Camera, deviations: StartDeviations) -> CameraPrior:
-    """The prior of a camera by its start, and of what that does not state by ordinary cameras."""
+    """Make the prior of a camera from its start, completed by that of an ordinary camera.
+
+    Returns:
+        The prior, with the start's pose as mean.
+    """
     information = typical_prior(camera).information.copy()
     information[:3, :3] = np.eye(3) / np.radians(deviations.rotation) ** 2
     information[3:6, 3:6] = np.eye(3) / deviations.position**2
@@ -89,10 +106,17 @@ def start_prior(camera: Camera, deviations: StartDeviations) -> CameraPrior:
 
 
 def initial_rig(singles: Mapping[str, Solved], board: Board) -> InitialRig:
-    """Poses of all cameras and boards from pairs, along the tree of most corners; the first is the world.
+    """Estimate the poses of all cameras and boards from pairs, along the spanning tree of most corners.
 
-    Raises ValueError if cameras are not connected by shared frames, or if the frames of a pair contradict
-    each other: images that are mirrored, or not of the same moments.
+    Args:
+        singles: each camera's own calibration.
+
+    Returns:
+        Initial values; the first camera is the world.
+
+    Raises:
+        ValueError: if cameras share no frames, or a pair's frames contradict each other (mirrored images,
+            different moments).
     """
     cameras = [
         CalibratedViews(name, single.problem.cameras[name], single.views[name], single.problem.board_poses)
@@ -109,10 +133,17 @@ def rig_near_start(
     lens: Mapping[str, Lens],
     deviations: StartDeviations,
 ) -> InitialRig:
-    """Cameras at the start's positions, rotated to agree on the boards, and boards in the start's world.
+    """Initialise cameras at the start's positions, rotated to agree on the boards, and boards in the start's
+    world.
 
-    The camera with most images keeps its orientation. Raises ValueError if the start has no such camera, or
-    one of another size, if a camera shares no moment with another, or if none of its images fits the start.
+    The camera with most images keeps its orientation.
+
+    Returns:
+        Initial values, with priors about the start.
+
+    Raises:
+        ValueError: if the start lacks a camera or has it in another size, a camera shares no moment with
+            another, or none of its images fits the start.
     """
     cameras = []
     for name, v in views.items():
@@ -134,10 +165,10 @@ def rig_near_start(
 
 
 def _start_camera(name: str, start: Rig, views: BoardViews, model_name: Lens) -> Camera:
-    """A camera of a start, with a lens: its own, if it has one.
+    """Camera of a start with its own lens, or else one of the wanted model without effect.
 
-    Brown and Conrady's has all the terms that are wanted. Raises ValueError if the camera is missing or its
-    size is not the images'.
+    Brown and Conrady's model gets all wanted terms. Raises ValueError if the camera is missing or of another
+    size.
     """
     camera = start.cameras.get(name)
     if not isinstance(camera, Camera):
@@ -159,7 +190,7 @@ def _start_camera(name: str, start: Rig, views: BoardViews, model_name: Lens) ->
 
 
 def _aligned(cameras: Sequence[CalibratedViews], board: Board) -> dict[str, Pose]:
-    """`cam_from_world` of all cameras, oriented by the frames that each shares with one before.
+    """`cam_from_world` of all cameras, oriented by the frames that each shares with an earlier one.
 
     The first is that with most images; then always those two that share most. Cameras that share none keep
     their own.
@@ -180,7 +211,11 @@ def _aligned(cameras: Sequence[CalibratedViews], board: Board) -> dict[str, Pose
 
 
 def pair_pose(a: CalibratedViews, b: CalibratedViews, board: Board) -> RelativePose | None:
-    """The relative pose that most of the shared frames agree with; None if there are none."""
+    """Find the relative pose of two cameras that most shared frames agree with.
+
+    Returns:
+        The pose; None without shared frames.
+    """
     shared = tuple(key for key in a.views.seen if key in b.views.seen)
     if not shared:
         return None
@@ -200,7 +235,7 @@ def pair_pose(a: CalibratedViews, b: CalibratedViews, board: Board) -> RelativeP
 def _vote(
     a: CalibratedViews, b: CalibratedViews, a_from_b: Pose, shared: tuple[FrameKey, ...], board: Board
 ) -> RelativePose:
-    """A relative pose with the frames that agree with it."""
+    """Relative pose with the frames that agree with it."""
     errors = _prediction_errors(a, {key: a_from_b @ b.poses[key] for key in shared}, board).min(0)
     agree = errors < _tolerance(a)
     frames = tuple(key for key, good in zip(shared, agree) if good)
@@ -208,19 +243,19 @@ def _vote(
 
 
 def nearest_pose(a_from_b: Pose, a_from_board: Pose, b_from_board: Pose, symmetries: Sequence[Pose]) -> Pose:
-    """One frame's relative pose, for the numbering that brings it closest to a given one."""
+    """Return one frame's relative pose, for the board numbering that brings it closest to `a_from_b`."""
     poses = [a_from_board @ symmetry @ b_from_board.inverse() for symmetry in symmetries]
     return max(poses, key=lambda pose: float((pose.R * a_from_b.R).sum()))
 
 
 def average_pose(poses: Sequence[Pose]) -> Pose:
-    """The rotation nearest to the mean of all, and the median translation."""
+    """Average poses: the chordal mean of rotations, and the median translation."""
     R = Rotation.from_matrix(np.stack([pose.R for pose in poses])).mean().as_matrix()
     return Pose(torch.from_numpy(R), torch.stack([pose.t for pose in poses]).median(0).values)
 
 
 def symmetry_poses(board: Board) -> list[Pose]:
-    """The rotations of the board that belong to its renumberings: point i moves to point `image[i]`."""
+    """Return the rotations of a board that belong to its renumberings (`Board.symmetries`)."""
     poses, mean = [], board.points.mean(0)
     for image in board.symmetries:
         R = Rotation.align_vectors(board.points[image] - mean, board.points - mean)[0].as_matrix()
@@ -231,7 +266,7 @@ def symmetry_poses(board: Board) -> list[Pose]:
 def _prediction_errors(
     camera: CalibratedViews, cam_from_board: Mapping[FrameKey, Pose], board: Board
 ) -> Float[np.ndarray, "s k"]:
-    """By numbering and frame: the median distance of a camera's points from those of board poses, pixels."""
+    """Median distance of a camera's points from predicted board poses, pixels, by numbering and frame."""
     detections = [camera.views.seen[key] for key in cam_from_board]
     ends, points = np.cumsum([len(d.ids) for d in detections])[:-1], torch.from_numpy(board.points)
     errors = []
@@ -245,14 +280,14 @@ def _prediction_errors(
 
 
 def _tolerance(camera: CalibratedViews) -> float:
-    """Largest error of a prediction that agrees, pixels."""
+    """Largest error of an agreeing prediction, pixels."""
     return TOLERANCE * camera.views.hw[1]
 
 
 def _along_tree(
     cameras: Sequence[CalibratedViews], pairs: Mapping[tuple[str, str], RelativePose], board: Board
 ) -> dict[str, Pose]:
-    """Prim's algorithm from the first camera, by the number of corners in agreeing frames."""
+    """Join cameras from the first one by Prim's algorithm, by the number of corners in agreeing frames."""
     poses, detections = {cameras[0].name: Pose.identity()}, {c.name: c.views.seen for c in cameras}
 
     def corners(edge: tuple[tuple[str, str], RelativePose]) -> int:
@@ -274,12 +309,19 @@ def _along_tree(
 def _crossing(
     pairs: Mapping[tuple[str, str], RelativePose], joined: Collection[str]
 ) -> dict[tuple[str, str], RelativePose]:
-    """The pairs of which one camera is among the joined ones."""
+    """Pairs of which exactly one camera is joined."""
     return {names: pair for names, pair in pairs.items() if (names[0] in joined) != (names[1] in joined)}
 
 
 def consistent_boards(cameras: Sequence[CalibratedViews], poses: dict[str, Pose], board: Board) -> InitialRig:
-    """Board poses from the camera most others agree with, other cameras' numbering made consistent."""
+    """Choose board poses that most cameras agree with, and number all cameras' points consistently.
+
+    Args:
+        poses: `cam_from_world` by camera.
+
+    Returns:
+        Initial values; images that contradict the chosen poses are in `left_out`.
+    """
     boards: dict[FrameKey, Pose] = {}
     detections: dict[str, dict[FrameKey, Detection]] = {c.name: {} for c in cameras}
     left_out = []
@@ -311,7 +353,7 @@ def _connection_error(
     pairs: Mapping[tuple[str, str], RelativePose],
     board: Board,
 ) -> str:
-    """The error message if the cameras joined so far have no consistent edge to the rest."""
+    """Error message if no consistent pair joins the remaining cameras."""
     by_name = {c.name: c for c in cameras}
     if not (crossing := _crossing(pairs, joined)):
         rest = ", ".join(name for name in by_name if name not in joined)
@@ -327,7 +369,7 @@ def _connection_error(
 
 
 def _explain_contradiction(a: CalibratedViews, b: CalibratedViews, board: Board) -> str:
-    """What would make two cameras' frames agree: mirroring one, or shifting it by a few frames."""
+    """Find what would make two cameras' frames agree: mirroring one, or shifting it by a few frames."""
     for mirrored, other in () if board.identified else ((b, a), (a, b)):
         if (pair := pair_pose(other, _mirrored(mirrored, board), board)) and pair.consistent:
             return f"they agree once {mirrored.name} is mirrored: save its images as captured, not mirrored"
@@ -340,7 +382,7 @@ def _explain_contradiction(a: CalibratedViews, b: CalibratedViews, board: Board)
 
 
 def _mirrored(calibrated: CalibratedViews, board: Board) -> CalibratedViews:
-    """The camera with its images mirrored."""
+    """Camera with its images mirrored."""
     width, columns = calibrated.views.hw[1], board.columns
     K = calibrated.camera.K.clone()
     K[0, 2] = width - 1 - K[0, 2]
@@ -354,7 +396,7 @@ def _mirrored(calibrated: CalibratedViews, board: Board) -> CalibratedViews:
 
 
 def _shifted(a: CalibratedViews, b: CalibratedViews, shift: int) -> CalibratedViews:
-    """b with each image renumbered as the one `shift` positions before it among all numbers of both."""
+    """Camera b with each image renumbered as the one `shift` positions before, among all numbers of both."""
     keys = sorted({*a.views.seen, *b.views.seen}, key=lambda k: (isinstance(k, str), k))
     renamed = {key: keys[i - shift] for i, key in enumerate(keys) if 0 <= i - shift < len(keys)}
     detections = {renamed[key]: d for key, d in b.views.seen.items() if key in renamed}

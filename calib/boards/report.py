@@ -1,4 +1,4 @@
-"""A calibration's report: one HTML file with tables and figures: rig, residuals, coverage, uncertainty."""
+"""Report of a calibration: one HTML file with tables and figures of rig, residuals, coverage, uncertainty."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ from .validation import half_difference
 THUMBNAIL = 480
 """Width of a drawn image, pixels."""
 DRAWN = 6
-"""Images drawn at most."""
+"""Largest number of drawn images."""
 
 
 STYLE = """
@@ -71,9 +71,16 @@ def report_html(
     detected: Mapping[str, BoardViews] | None = None,
     photos: Photos | None = None,
 ) -> str:
-    """The report: notes, accuracy by camera, pair, image, coverage, residual fields, uncertainties, the rig.
+    """Compose the report: notes, accuracy by camera, pair and image, coverage, residual fields, uncertainty,
+    the rig.
 
-    With the points `detected` in `photos`, the images that fit worst are drawn.
+    Args:
+        notes: sentences at the top; "No advice." without any.
+        detected: all detections by camera; with `photos`, the images that fit worst are drawn.
+        photos: images by camera and moment.
+
+    Returns:
+        The page as HTML, figures embedded.
     """
     covers, has_covariance = coverages(calibration), calibration.fit.covariance is not None
     near, far = _depths(covers.values())
@@ -108,7 +115,7 @@ def report_html(
 
 
 def _section(title: str, text: str, figure: Figure) -> str:
-    """A figure under its title, with what it shows."""
+    """HTML of a figure under its title and text."""
     FigureCanvasAgg(figure)
     data = BytesIO()
     figure.savefig(data, format="png", dpi=110)
@@ -117,13 +124,18 @@ def _section(title: str, text: str, figure: Figure) -> str:
 
 
 def html_page(parts: Iterable[str], title: str, further: str = "") -> str:
-    """A page of these parts in the report's style; `further` is for its head."""
+    """Compose an HTML page of these parts in the report's style; `further` goes into its head."""
     head = f'<meta charset="utf-8">{further}<title>{escape(title)}</title><style>{STYLE}</style>'
     return "\n".join([f'<!DOCTYPE html>\n<html lang="en">{head}', *parts, "</html>\n"])
 
 
 def by_cameras(notes: Iterable[str]) -> list[str]:
-    """Notes such as "left: no points at the top", equal ones as one: "left, right: no points at the top"."""
+    """Merge notes that differ only in the camera: "left: no points" and "right: no points" become "left,
+    right: no points".
+
+    Returns:
+        The merged notes, in order of first appearance.
+    """
     names: dict[str, list[str]] = {}
     for note in notes:
         name, between, text = note.partition(": ")
@@ -135,7 +147,8 @@ def by_cameras(notes: Iterable[str]) -> list[str]:
 
 
 def summary(calibration: Calibration) -> str:
-    """The calibration in a sentence or two."""
+    """Summarise a calibration in a sentence or two: numbers of cameras, frames and points, errors
+    in pixels."""
     points = sum(len(observed.x) for observed in calibration.fit.problem.seen.values())
     cameras, frames = len(calibration.views), len(calibration.frames)
     text = (
@@ -150,7 +163,7 @@ def summary(calibration: Calibration) -> str:
 
 
 def _depths(covers: Iterable[Coverage]) -> tuple[float, float]:
-    """Depths of the nearest and the furthest board point, metres."""
+    """Depths of the nearest and the farthest board point, metres."""
     near, far = zip(*(c.depths for c in covers))
     return max(min(near), 1e-3), max(far)
 
@@ -159,7 +172,11 @@ def _depths(covers: Iterable[Coverage]) -> tuple[float, float]:
 
 
 def camera_table(calibration: Calibration, covers: Mapping[str, Coverage]) -> str:
-    """One row per camera: points, residuals, and parameters with standard deviations."""
+    """Format a table with one row for each camera: points, residuals, parameters with standard deviations.
+
+    Returns:
+        HTML.
+    """
     rows = []
     for name, camera in calibration.fit.problem.cameras.items():
         r, covered = calibration.fit.problem.residuals[name], covers[name]
@@ -181,7 +198,11 @@ def camera_table(calibration: Calibration, covers: Mapping[str, Coverage]) -> st
 
 
 def pair_table(calibration: Calibration) -> str:
-    """One row per pair: baseline, relative rotation and epipolar errors."""
+    """Format a table with one row for each pair: baseline, relative rotation, epipolar errors.
+
+    Returns:
+        HTML; deviations only where the fit has a covariance.
+    """
     covariance = rig_covariance(calibration.fit)
     cameras = calibration.fit.problem.cameras
     rows = []
@@ -206,7 +227,7 @@ def _mean_and_quantile(errors: np.ndarray, between: str = ", ") -> str:
 
 
 def _with_deviations(calibration: Calibration, name: str, camera: Camera, kind: str) -> str:
-    """The numbers of a kind of intrinsics (focal, centre, distortion), each with its deviation."""
+    """Values of a kind of intrinsics (focal, centre, distortion), each with its standard deviation."""
     lens, deviations = camera.distortion, calibration.fit.deviations
     texts = []
     for entry, value in zip(parameter_names(camera), intrinsic_values(camera)):
@@ -233,7 +254,7 @@ def _table(rows: Sequence[Mapping[str, str]]) -> str:
 
 
 def draw_scene(calibration: Calibration) -> Figure:
-    """The rig alone, and the rig with the boards from above."""
+    """Draw the rig alone, and the rig with the boards from above."""
     figure = draw_rig(Rig({escaped(n): c for n, c in calibration.rig.cameras.items()}))
     figure.set_size_inches(10.4, 4.6)
     axes: Any = figure.axes[0]
@@ -260,7 +281,7 @@ def draw_scene(calibration: Calibration) -> Figure:
 
 
 def draw_by_image(calibration: Calibration) -> Figure:
-    """The root mean square residual of every image of every camera, by frame."""
+    """Plot the root mean square residual of every image of every camera, by frame."""
     frames = calibration.frames
     figure = Figure(figsize=(10.4, 2.8), layout="constrained")
     axes = figure.subplots()
@@ -278,7 +299,8 @@ def draw_by_image(calibration: Calibration) -> Figure:
 
 
 def draw_camera(calibration: Calibration, name: str, covered: Coverage) -> Figure:
-    """One camera: observed points; median residuals of parts of the image, magnified; their scatter."""
+    """Draw one camera's observed points, median residuals over the image (enlarged), and scatter of
+    residuals."""
     observed, r = calibration.fit.problem.seen[name], calibration.fit.problem.residuals[name]
     hw = calibration.views[name].hw
     figure = Figure(
@@ -302,7 +324,7 @@ def draw_camera(calibration: Calibration, name: str, covered: Coverage) -> Figur
 
 
 def _draw_field(axes: Any, x: np.ndarray, r: np.ndarray, hw: tuple[int, int]) -> None:
-    """The median residual in each cell as an arrow, magnified so that the longest nearly fills a cell."""
+    """Draw the median residual of each cell as an arrow, enlarged so that the longest nearly fills a cell."""
     rows, columns = 2 * CELLS[0], 2 * CELLS[1]
     row = np.clip(((x[:, 1] + 0.5) / hw[0] * rows).astype(int), 0, rows - 1)
     column = np.clip(((x[:, 0] + 0.5) / hw[1] * columns).astype(int), 0, columns - 1)
@@ -317,7 +339,15 @@ def _draw_field(axes: Any, x: np.ndarray, r: np.ndarray, hw: tuple[int, int]) ->
 
 
 def draw_uncertainty(calibration: Calibration, depths: tuple[float, float]) -> Figure:
-    """By beta (rows) and depth (columns): the predicted pixel's deviation, over the first camera's image."""
+    """Draw the standard deviation of predicted pixels over the first camera's image, by beta (rows) and
+    depth.
+
+    Args:
+        depths: depths in metres.
+
+    Returns:
+        The figure. The fit must have a covariance.
+    """
     covariance = rig_covariance(calibration.fit)
     assert covariance is not None
     alpha, *betas = calibration.views
@@ -338,7 +368,12 @@ def _extent(hw: tuple[int, int]) -> tuple[float, float, float, float]:
 
 
 def draw_adequacy(calibration: Calibration, depths: tuple[float, float]) -> Figure:
-    """A row per camera: uncertainty of projection at two depths, and how halves of the frames differ."""
+    """Draw each camera's uncertainty of projection at two depths, and the difference between halves of the
+    frames.
+
+    Returns:
+        The figure. The fit must have a covariance.
+    """
     names = list(calibration.views)
     figure = Figure(figsize=(10.4, 2.5 * len(names) + 0.3), layout="constrained")
     halves = half_difference(calibration.fit, float(np.mean(depths)))
@@ -361,7 +396,7 @@ def draw_adequacy(calibration: Calibration, depths: tuple[float, float]) -> Figu
 def _map(
     axes: Any, figure: Figure, hw: tuple[int, int], x: np.ndarray, value: np.ndarray, title: str
 ) -> None:
-    """Draw values at pixels of `grid_points`; what lies between pixels that are no neighbours is grey."""
+    """Draw values at pixels of `grid_points`; grey between pixels that are no neighbours."""
     show_image(axes, hw)
     axes.set_facecolor("0.85")
     if len(x) < 4:
@@ -383,7 +418,8 @@ def draw_images(
     detected: Mapping[str, BoardViews],
     photos: Photos,
 ) -> Figure:
-    """Some images (camera, moment) with their points (red: left out) and residuals, enlarged."""
+    """Draw images (camera, moment) with used points (dots), left-out ones (red circles) and enlarged
+    residuals."""
     columns = min(3, len(chosen))
     rows = -(-len(chosen) // columns)
     figure = Figure(figsize=(10.4, 2.9 * rows), layout="constrained")
@@ -396,7 +432,7 @@ def draw_images(
 
 
 def worst_images(calibration: Calibration, detected: Mapping[str, BoardViews]) -> list[tuple[str, FrameKey]]:
-    """Images (camera, moment) that do not fit, then those with most points left out."""
+    """List images (camera, moment) that do not fit, then those with most points left out; at most `DRAWN`."""
     worst = [(m.camera, m.frame) for m in misfits(calibration.fit)]
     left_out: dict[tuple[str, FrameKey], int] = {}
     for name, v in detected.items():
@@ -409,7 +445,7 @@ def worst_images(calibration: Calibration, detected: Mapping[str, BoardViews]) -
 def _draw_image(
     axes: Any, calibration: Calibration, name: str, key: FrameKey, views: BoardViews, photos: Photos
 ) -> None:
-    """The image, its corners, those left out in red, and the residuals as arrows."""
+    """Draw an image, its corners, left-out ones in red, and residuals as arrows."""
     image_key = str(key).split(" board ")[0]  # of several boards in it
     photo = next((photo for other, photo in photos[name].items() if str(other) == image_key), None)
     if photo is not None:
@@ -432,7 +468,8 @@ def _draw_image(
 
 
 def _draw_arrows(axes: Any, x: np.ndarray, r: np.ndarray, length: float, colour: str) -> float:
-    """Draw residuals, magnified so that the longest has a length in pixels. Returns the longest, pixels."""
+    """Draw residuals as arrows, the longest one of a given length in pixels. Returns the longest residual,
+    pixels."""
     longest = float(np.linalg.norm(r, axis=1).max())
     arrows = length / max(longest, 1e-9) * r
     axes.quiver(*x.T, *arrows.T, angles="xy", scale_units="xy", scale=1, width=0.004, color=colour)
@@ -440,5 +477,5 @@ def _draw_arrows(axes: Any, x: np.ndarray, r: np.ndarray, length: float, colour:
 
 
 def escaped(text: str) -> str:
-    """Text that matplotlib does not parse as formulas."""
+    """Escape text so that matplotlib does not parse it as a formula."""
     return text.replace("$", r"\$")

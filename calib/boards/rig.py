@@ -1,4 +1,4 @@
-"""A calibrated rig from detected board points, with its accuracy."""
+"""Calibration of a rig from detected board points, with its accuracy."""
 
 from __future__ import annotations
 
@@ -25,10 +25,15 @@ from .validation import epipolar_errors, held_out_errors, left_out_notes, start_
 
 @dataclass(frozen=True)
 class Calibration:
-    """A rig with its accuracy.
+    """Calibrated rig with its accuracy.
 
-    fit: result of the bundle adjustment.
-    single: each camera's reprojection error (RMS, px) when it is calibrated by itself; none with a start.
+    Attributes:
+        rig: the rig; its world is the first camera's frame, or the start's.
+        board: the board.
+        fit: result of the bundle adjustment.
+        single: reprojection error (RMS, pixels) of each camera calibrated alone; empty with a start.
+        epipolar: epipolar errors by pair, undistorted pixels.
+        notes: sentences on the calibration.
     """
 
     rig: Rig
@@ -40,26 +45,30 @@ class Calibration:
 
     @property
     def views(self) -> Mapping[str, BoardViews]:
-        """The detections used, numbered consistently in all cameras."""
+        """Detections used, numbered consistently in all cameras."""
         return self.fit.views
 
     @property
     def frames(self) -> tuple[FrameKey, ...]:
-        """The moments of the boards' poses."""
+        """Moments of the boards' poses."""
         return self.fit.problem.frames
 
     @property
     def rms(self) -> float:
-        """The reprojection error of all points of all images, pixels, outliers included."""
+        """Reprojection error of all points used, pixels."""
         return self.fit.problem.rms()
 
     @cached_property
     def held_out(self) -> dict[tuple[str, str], Float[np.ndarray, " _"]]:
-        """By pair: epipolar errors (pixels) of all frames, each by a rig of the others; empty if too few."""
+        """Epipolar errors (pixels) by pair, each frame's by a rig calibrated without it; empty for too few
+        frames."""
         return held_out_errors(self.fit, self.views)
 
     def deviations(self) -> dict[str, float]:
-        """The standard deviation of each free parameter by name ("left.focal.0"), in its own unit."""
+        """Return the standard deviation of each free parameter by name ("left.focal.0"), in its own unit.
+
+        Empty if the parameters are not observable.
+        """
         return self.fit.deviations
 
 
@@ -72,12 +81,20 @@ def calibrate(
     start: Rig | None = None,
     deviations: StartDeviations | None = None,
 ) -> Calibration:
-    """Calibrate a rig from detected board points. Its world is the first camera.
+    """Calibrate a rig from detected board points.
 
-    `lens` is the model of all cameras, or of each by name. Raises ValueError, with advice, for another model,
-    if a camera has too few images or only parallel boards, if cameras are not connected, or if frames
-    contradict each other. With `start`, a rig known to within `deviations`, one image of each camera is
-    enough, and the world is the start's; so are its lenses.
+    Args:
+        lens: lens model of all cameras, or of each by name.
+        start: rig known to within `deviations`; one image of each camera is then enough, and the start's
+            world and lenses are kept.
+        deviations: deviations from the start; None for the defaults.
+
+    Returns:
+        The calibration; its world is the first camera's frame, or the start's.
+
+    Raises:
+        ValueError: with advice, for no views, an unknown lens model, too few images, parallel boards, cameras
+            without common frames, frames that contradict each other, or a start that does not fit.
     """
     if not views:
         raise ValueError("there are no views: give those of one camera or more, by name")

@@ -1,9 +1,9 @@
-"""Whether a rig has moved: two calibrations of the same cameras compared by their pixels and depths.
+"""Comparison of two calibrations of the same cameras, by pixels and depths: has the rig moved?
 
-Gauge: the whole rig may have been set up elsewhere, so the projections compared are those after the one rigid
-motion of space that brings all cameras' pixels together best, in least squares, over a grid of pixels at
-several depths. A pose and a lens can stand for one another: the difference of all pixels is tested together,
-against what the covariances of both calibrations let it be, and no parameter by itself.
+Gauge: the whole rig may have been set up elsewhere, so projections are compared after the one rigid motion of
+space that aligns all cameras' pixels best, in least squares, over a grid of pixels at several depths. A pose
+and a lens can stand for one another: the difference of all pixels is tested together against the covariances
+of both calibrations, and no parameter by itself.
 """
 
 from __future__ import annotations
@@ -27,25 +27,29 @@ from .bundle import camera_jacobian
 from .uncertainty import RigCovariance, beta_covariance, grid_points, worst_deviation
 
 DEPTHS = 3
-"""Depths at which projections are compared, at even steps of inverse depth."""
+"""Number of depths at which projections are compared, in even steps of inverse depth."""
 FARTHEST = 50.0
-"""The far bound as a multiple of the near one, at most: farther away pixels hardly change."""
+"""Largest ratio of far to near bound: farther away pixels hardly change."""
 LEVEL = 0.001
-"""Probability with which a rig that has not moved is said to have moved."""
+"""Probability of a false alarm for a rig that has not moved."""
 LEAST = 1e-3
-"""Changes of pixels by less (RMS) count as none: their parameters are not tested, a motion is found."""
+"""Change of pixels (RMS) that counts as none: such parameters are not tested, and the motion has
+converged."""
 STEP = 1e-3
-"""Relative change of depth by which a derivative is taken."""
+"""Relative change of depth for a numerical derivative."""
 ITERATIONS = 5
-"""Steps of the motion at most."""
+"""Largest number of steps for the motion."""
 
 
 class Difference(NamedTuple):
-    """Pixels x, depths there (metres), how much differs, and its standard deviation by both calibrations.
+    """Difference of one camera's pixels, or of one pair's depths.
 
-    Of one camera, at pixels of the first rig: how far the second rig's are from them, (n, 2), and the
-    deviation in the worst direction, pixels. Of a pair, at pixels of its alpha: depth by the second rig over
-    that by the first, minus 1, (n). Deviations are NaN if unknown.
+    Attributes:
+        x: pixels of the first rig's camera, or of the pair's alpha.
+        depth: their depths, metres.
+        change: of a camera, offset of the second rig's pixels (n, 2); of a pair, depth by the second rig over
+            depth by the first, minus 1 (n).
+        sigma: standard deviation of the change (in the worst direction) by both calibrations; NaN if unknown.
     """
 
     x: Float[np.ndarray, "n 2"]
@@ -55,9 +59,16 @@ class Difference(NamedTuple):
 
 
 class Significance(NamedTuple):
-    """Chi-square of the difference with so many degrees of freedom, and the probability of more by chance.
+    """Test of the difference against the calibrations' covariances.
 
-    camera: that whose own motion explains most of it. degrees and metres: that motion. share: of chi-square.
+    Attributes:
+        chi_square: chi-square of the difference.
+        freedom: its degrees of freedom.
+        probability: probability of a larger one by chance.
+        camera: camera whose motion explains most of it.
+        degrees: rotation of that camera.
+        metres: shift of that camera.
+        share: share of chi-square that this motion explains.
     """
 
     chi_square: float
@@ -70,15 +81,21 @@ class Significance(NamedTuple):
 
     @property
     def moved(self) -> bool:
-        """Whether the rigs differ by more than their calibrations' errors."""
+        """True if the rigs differ by more than their calibrations' errors."""
         return self.probability < LEVEL
 
 
 @dataclass(frozen=True)
 class RigDifference:
-    """Two rigs compared. motion: from the first one's world to the second one's. alpha: that of the depths.
+    """Comparison of two rigs.
 
-    depths: by the other cameras that see points of alpha. significance: None without covariances.
+    Attributes:
+        cameras: difference of pixels by camera.
+        depths: difference of depths by the other cameras that see alpha's points.
+        alpha: camera of the depths.
+        motion: rigid motion from the first rig's world to the second's.
+        significance: result of the test; None without covariances.
+        unit: unit of depths; "baselines" for rigs of unknown scale.
     """
 
     cameras: Mapping[str, Difference]
@@ -87,10 +104,9 @@ class RigDifference:
     motion: Pose
     significance: Significance | None
     unit: str = "m"
-    """Of depths; of rigs of unknown scale, "baselines"."""
 
     def as_text(self) -> str:
-        """A line for each camera and each pair, and the verdict."""
+        """Format a line for each camera and pair, and the verdict."""
         lines = ["after the rigid motion of the whole rig that brings all pixels together best:"]
         for name, difference in self.cameras.items():
             off = np.linalg.norm(difference.change, axis=1)
@@ -105,7 +121,7 @@ class RigDifference:
 
     @property
     def verdict(self) -> str:
-        """One line: whether the rig has moved."""
+        """Verdict in one line: moved, the same, or none without covariances."""
         motion = self.significance
         if motion is None:
             return "verdict: none: no deviations are known; one rig calibrated twice may differ so"
@@ -128,10 +144,20 @@ def rig_difference(
     covariances: tuple[RigCovariance | None, RigCovariance | None] = (None, None),
     depth: tuple[float, float],
 ) -> RigDifference:
-    """Compare two calibrations of the same cameras over their images and a range of depths (metres, along the
-    axis of each camera). Where one covariance is None, the other one's serves for both.
+    """Compare two calibrations of the same cameras over their images and a range of depths.
 
-    Raises ValueError for rigs of other cameras, and for cameras that are not calibrated.
+    Args:
+        a: first rig.
+        b: second rig.
+        covariances: covariances of both; where one is None the other serves for both, without any nothing is
+            tested.
+        depth: (near, far) along each camera's axis, metres, or the rigs' own unit.
+
+    Returns:
+        Differences of pixels and depths, and the test's result.
+
+    Raises:
+        ValueError: for rigs of other cameras, sizes or units, and cameras that are not calibrated.
     """
     names = _same_cameras(a, b)
     a, b = (rig.replace(cameras={name: rig[name].to(torch.float64) for name in names}) for rig in (a, b))
@@ -165,7 +191,8 @@ def rig_difference(
 
 
 def _same_cameras(a: Rig, b: Rig) -> tuple[str, ...]:
-    """Their names. Raises ValueError unless both rigs are of the same calibrated cameras, sizes and unit."""
+    """Names of the cameras. Raises ValueError unless both rigs have the same calibrated cameras, sizes and
+    unit."""
     if set(a.names) != set(b.names):
         listed = f"{', '.join(a.names)}; and {', '.join(b.names)}"
         raise ValueError(f"the rigs are of other cameras ({listed}): give two calibrations of the same")
@@ -202,7 +229,8 @@ def _points(camera: Camera, other: Camera, depth: tuple[float, float]) -> Grid:
 
 
 class _Part(NamedTuple):
-    """One camera: differences (n, 2), derivatives by motion (2 n, 6), by both cameras' numbers (n, 2, p)."""
+    """Differences of one camera (n, 2), derivatives by motion (2 n, 6), and by both cameras' parameters (n,
+    2, p)."""
 
     name: str
     change: np.ndarray
@@ -211,7 +239,8 @@ class _Part(NamedTuple):
 
 
 def _projections(a: Rig, b: Rig, motion: Pose, name: str, X: np.ndarray) -> _Part:
-    """How the pixels of points change from a to b, and by what: the rig's motion, each rig's parameters."""
+    """Changes of points' pixels from a to b, with derivatives by the rig's motion and each rig's
+    parameters."""
     one, other, points = a[name], b[name], torch.from_numpy(X)
     moved = other.replace(cam_from_world=other.cam_from_world @ motion)
     J_a, J_b = camera_jacobian(one, X), camera_jacobian(moved, X)
@@ -234,7 +263,7 @@ def _same_lens(a: Camera, b: Camera) -> bool:
 
 
 def _best_motion(a: Rig, b: Rig, grids: Mapping[str, Grid]) -> Pose:
-    """From the first rig's world to the second's: least squares of all pixels, by Gauss and Newton."""
+    """Motion from the first rig's world to the second's: Gauss-Newton least squares of all pixels."""
     first = a.names[0]
     motion = b[first].cam_from_world.inverse() @ a[first].cam_from_world
     for _ in range(ITERATIONS):
@@ -254,7 +283,7 @@ def _root(covariance: RigCovariance) -> np.ndarray:
 
 
 def _rows(parts: list[_Part]) -> list[slice]:
-    """The rows of each camera among the coordinates of all."""
+    """Rows of each camera among the coordinates of all."""
     ends = np.cumsum([0, *(projected.change.size for projected in parts)]).tolist()
     return [slice(start, end) for start, end in pairwise(ends)]
 
@@ -262,7 +291,8 @@ def _rows(parts: list[_Part]) -> list[slice]:
 def _tested(
     change: np.ndarray, spread: np.ndarray, by_motion: np.ndarray, b: Rig, parts: list[_Part]
 ) -> Significance:
-    """The difference in directions in which calibrations' errors move pixels, in standard deviations."""
+    """Test the difference in the directions that calibration errors move pixels in, in standard
+    deviations."""
     U, s, _ = np.linalg.svd(spread, full_matrices=False)
     counts = s > LEAST * np.sqrt(len(change) / 2)
     U, s = U[:, counts], s[counts]
@@ -288,7 +318,7 @@ def _tested(
 def _depths(
     a: Rig, b: Rig, alpha: str, beta: str, grid: Grid, covariances: list[RigCovariance | None]
 ) -> Difference:
-    """Depth of points by the second rig, found from the pixels at which the first one has them."""
+    """Depths of points by the second rig, triangulated from the first rig's pixels."""
     x, X, z = grid
     there = a[beta].project(torch.from_numpy(X))
     kept = (there.valid & a[beta].contains(there.x)).numpy()
@@ -315,7 +345,7 @@ def _depths(
 
 
 def _sizes(values: np.ndarray, sigma: np.ndarray, unit: str = "") -> str:
-    """How large values are, and their standard deviations, if known."""
+    """Format RMS and maximum of values, and their standard deviation if known."""
     rms, most = np.sqrt(np.square(values).mean()), np.abs(values).max()
     stated, finite = "", sigma[np.isfinite(sigma)]
     if len(finite):
@@ -324,7 +354,8 @@ def _sizes(values: np.ndarray, sigma: np.ndarray, unit: str = "") -> str:
 
 
 def draw_difference(difference: RigDifference) -> Figure:
-    """How far two rigs' pixels differ, at nearest and farthest depth, and depths by each pair, in percent."""
+    """Draw the differences of pixels at the nearest and farthest depth, and those of depths by pair, in
+    percent."""
     maps = [(f"{n}: pixels", c, np.linalg.norm(c.change, axis=1)) for n, c in difference.cameras.items()]
     maps += [
         (f"depth by {difference.alpha} and {n}: %", d, 100 * d.change) for n, d in difference.depths.items()

@@ -1,4 +1,4 @@
-"""From a folder of images to files: a calibration, or a page of guidance while they are taken."""
+"""Calibration from a folder of images to files, and a page of guidance while images are taken."""
 
 from __future__ import annotations
 
@@ -32,13 +32,18 @@ from .uncertainty import intrinsics_of, rig_covariance
 from .validation import compare_lenses
 
 WIDTH = 420
-"""Of the images shown, pixels."""
+"""Width of the images shown, pixels."""
 COLOURS = (60, 60, 230), (80, 200, 80)
-"""Blue, green, red of cells without and with points."""
+"""Colours (blue, green, red) of cells without and with points."""
 
 
 class CalibrationOutput(NamedTuple):
-    """Messages on the calibration, and the files written."""
+    """Output of a calibration.
+
+    Attributes:
+        messages: summary and notes.
+        written: files written.
+    """
 
     messages: list[str]
     written: list[Path]
@@ -56,12 +61,26 @@ def calibrate_photos(
     deviations: StartDeviations | None = None,
     progress: Progress | None = None,
 ) -> CalibrationOutput:
-    """Calibrate from a folder of images; write the rig file, its report and its covariance, the rig last.
+    """Calibrate from a folder of images; write the rig file and its HTML report, and a covariance file if the
+    parameters are observable.
 
-    Several boards may be in the images at once. The lens "auto" is, for each camera, the model that its
-    images support. `start` is the file of a rig known to within `deviations`: one image of each camera is
-    enough then, such as one called like the camera; its depth range stays, unless `depth` is given. Raises
-    ValueError and OSError for unusable images, and then writes nothing.
+    Args:
+        photos: folder of images; see `find_photos`.
+        board: board, or several that may be in the images at once, as text.
+        out: rig file (.yaml); the others get its name with other suffixes. All appear together.
+        patterns: file name patterns by camera.
+        lens: lens model; "auto" chooses for each camera the model that its images support.
+        depth: depth range of the rig, metres; None keeps the start's.
+        start: file of a rig known to within `deviations`; one image of each camera is then enough, such as a
+            file named like the camera.
+
+    Returns:
+        Messages and files.
+
+    Raises:
+        FileNotFoundError: for a missing folder, start or board file.
+        ValueError: for unusable images, boards and options; nothing is written.
+        OSError: if files cannot be written.
     """
     if out.suffix.lower() not in (".yaml", ".yml"):
         raise ValueError(f"{out}: a rig file's name ends in .yaml")
@@ -104,7 +123,16 @@ def calibrate_photos(
 
 @dataclass
 class Session:
-    """What was detected so far, and the last calibration or why there is none."""
+    """State of a calibration while images are taken.
+
+    Attributes:
+        board: the board.
+        lens: lens model of all cameras.
+        seen: detections by camera and moment.
+        calibration: last calibration; None if it failed.
+        problem: reason why there is none; empty if there is one.
+        photos: images by camera and moment.
+    """
 
     board: Board
     lens: Lens = "brown-conrady"
@@ -114,7 +142,11 @@ class Session:
     photos: Photos = field(default_factory=dict)
 
     def detect(self, photos: Photos) -> bool:
-        """Detect the board in images that are new. Returns whether there were any."""
+        """Detect the board in new images; unreadable ones are tried again later.
+
+        Returns:
+            True if there were any.
+        """
         fresh = [
             (name, key) for name, moments in photos.items() for key in moments if (name, key) not in self.seen
         ]
@@ -127,7 +159,11 @@ class Session:
         return any(image in self.seen for image in fresh)
 
     def views(self) -> dict[str, BoardViews]:
-        """The board points of all cameras."""
+        """Combine the detections of all cameras that have images.
+
+        Raises:
+            ValueError: if a camera's images differ in size.
+        """
         images = {name: self.images(name) for name in self.photos}
         return {
             name: board_views(name, self.photos[name], detections)
@@ -136,12 +172,12 @@ class Session:
         }
 
     def images(self, name: str) -> dict[FrameKey, DetectedImage]:
-        """What was detected in the images of a camera, the last to arrive last."""
+        """Return a camera's detections by moment, in order of arrival."""
         moments = self.photos[name]
         return {key: detection for (n, key), detection in self.seen.items() if n == name and key in moments}
 
     def calibrate(self) -> None:
-        """Calibrate with all that was detected."""
+        """Calibrate with all detections; sets `calibration`, or `problem` if that fails."""
         try:
             self.calibration, self.problem = calibrate(self.views(), self.board, lens=self.lens), ""
         except ValueError as error:
@@ -158,10 +194,18 @@ def watch(
     interval: float = 1.0,
     finished: Callable[[], bool] = lambda: False,
 ) -> Session:
-    """Write a page on the images of a folder again whenever some arrive, until `finished` or Ctrl-C.
+    """Write a page about the images in a folder whenever some arrive, until `finished` or Ctrl-C.
 
-    It shows what was detected, coverage, the current uncertainty, and which view would help most. Raises
-    OSError.
+    It shows detections, coverage, current uncertainty, and the view that would help most.
+
+    Args:
+        interval: seconds between looks at the folder.
+
+    Returns:
+        The final state.
+
+    Raises:
+        OSError: if the page cannot be written, or the folder is missing.
     """
     session, problem = Session(board, lens), ""
     write_text(page, _page(session))
@@ -199,7 +243,7 @@ def _note(text: str) -> str:
 
 
 def _camera(session: Session, name: str) -> str:
-    """A camera's part of the page: what was found, advice, the last image, where points were."""
+    """HTML of one camera: detections, advice, the last image, coverage."""
     images = session.images(name)
     count = sum(bool(boards) for _, boards in images.values())
     parts = [f"<h2>{escape(name)}: the board is in {count} of {len(images)} images</h2>"]
@@ -215,7 +259,7 @@ def _camera(session: Session, name: str) -> str:
 
 
 def _advice(calibration: Calibration, name: str) -> str:
-    """Its focal length, the view that would help most, and what is missing."""
+    """HTML of a camera's focal length, the view that would help most, and missing coverage."""
     deviation = calibration.deviations().get(f"{name}.focal.0")
     stated = f" ± {deviation:.2g}" if deviation else ""
     parts = [f"<p>Focal length {float(calibration.rig[name].K[0, 0]):.1f} px{stated}.</p>"]
@@ -231,7 +275,7 @@ def _advice(calibration: Calibration, name: str) -> str:
 
 
 def _drawn(grey: Grey, boards: Mapping[FrameKey, Detection]) -> np.ndarray:
-    """An image with the points found in it."""
+    """Image with its detected points."""
     scale = WIDTH / grey.shape[1]
     small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     small = cv2.cvtColor(small, cv2.COLOR_GRAY2BGR)
@@ -242,7 +286,7 @@ def _drawn(grey: Grey, boards: Mapping[FrameKey, Detection]) -> np.ndarray:
 
 
 def _coverage(images: Collection[DetectedImage]) -> np.ndarray:
-    """Cells of the image with and without points."""
+    """Image of the cells with and without points."""
     h, w = next(hw for hw, _ in images)
     counts = point_counts([d.x for _, boards in images for d in boards.values()], (h, w))
     cells = np.where((counts > 0)[..., None], COLOURS[1], COLOURS[0]).astype(np.uint8)

@@ -25,7 +25,7 @@ from .board import Board
 from .target import MARGIN, draw_board
 
 FILLS = (0.35, 0.9)
-"""Least and largest width of the board, as a share of the narrowest view."""
+"""Least and largest width of the board as a share of the narrowest view."""
 TILT = 35.0
 """Largest rotation of the board about x and about y, degrees."""
 TRIES = 2000
@@ -37,11 +37,17 @@ WALL = 90
 def simulate_photos(
     rig: Rig, board: Board, folder: Path, *, count: int = 12, noise: float = 1.5, seed: int = 0
 ) -> Pose:
-    """Render a board in `count` random poses: `folder`/CAMERA/000.png and so on.
+    """Render a board in `count` random poses into `folder`/CAMERA/000.png and so on.
 
-    `noise` is in grey values of 255. Returns the true `world_from_board`, a batch (count).
-    Raises ValueError for a rig without calibrated cameras, or whose cameras nowhere see a board together, a
-    `count` below 1, and a negative `noise`.
+    Args:
+        noise: standard deviation in grey values of 255.
+
+    Returns:
+        The true `world_from_board`, a batch (count).
+
+    Raises:
+        ValueError: for a rig without calibrated cameras, cameras that nowhere see a board together, a `count`
+            below 1, and a negative `noise`.
     """
     if not 0 <= noise < math.inf:
         raise ValueError(f"noise is a standard deviation in grey values, 0 or more; got {noise:g}")
@@ -61,9 +67,13 @@ def simulate_photos(
 
 @torch.no_grad()
 def board_poses(rig: Rig, board: Board, count: int, *, seed: int = 0) -> Pose:
-    """Random `world_from_board` (a batch), boards' centres seen by every camera, at several depths and tilts.
+    """Draw random board poses whose centres all cameras see, at several depths and tilts.
 
-    Raises ValueError if there are too few such poses, and for a `count` below 1.
+    Returns:
+        `world_from_board`, a batch (count).
+
+    Raises:
+        ValueError: if there are too few such poses, and for a `count` below 1.
     """
     if count < 1:
         raise ValueError(f"count is a number of images, 1 or more; got {count}")
@@ -92,9 +102,13 @@ Rays = tuple[Float[Tensor, "n 3"], Bool[Tensor, " n"]]
 def photograph(
     camera: Camera, cam_from_board: Pose, board: Board, *, rays: Rays | None = None
 ) -> UInt8[np.ndarray, "h w"]:
-    """The image of a printed board by a camera, through its lens: the mean of four samples per pixel.
+    """Render the image of a printed board by a camera, through its lens, as the mean of four samples a pixel.
 
-    The print's pixels match the distance of the samples. `rays` are `fine_rays(camera)`, if precomputed.
+    Args:
+        rays: `fine_rays(camera)`, if precomputed.
+
+    Returns:
+        Grey image (h, w), uint8, without noise; `WALL` around the print.
     """
     directions, valid = rays or fine_rays(camera)
     R, t = cam_from_board.R, cam_from_board.t
@@ -110,7 +124,11 @@ def photograph(
 
 
 def fine_rays(camera: Camera) -> Rays:
-    """The rays of a camera's pixels at twice its resolution, row by row, and which are valid."""
+    """Compute the rays of a camera's pixels at twice its resolution, row by row.
+
+    Returns:
+        Directions (4 h w, 3) in the camera's frame, and True where the lens has one.
+    """
     fine = camera.to(torch.float64).resize((2 * camera.hw[0], 2 * camera.hw[1]))
     return fine.rays(pixel_grid(fine.hw, dtype=torch.float64).reshape(-1, 2))
 
@@ -125,7 +143,11 @@ def _resolution(camera: Camera, cam_from_board: Pose, board: Board) -> float:
 
 @lru_cache(maxsize=32)
 def printed(board: Board, dpi: float) -> tuple[UInt8[np.ndarray, "h w"], float, Float[np.ndarray, "2"]]:
-    """The printed board: grey values, pixels per metre, and the pixel of its first point."""
+    """Draw the printed board as an image.
+
+    Returns:
+        Grey values (uint8), pixels for each metre, and the pixel (x, y) of the board's first point.
+    """
     figure = draw_board(board)
     canvas = FigureCanvasAgg(figure)
     figure.set_dpi(dpi)

@@ -1,4 +1,4 @@
-"""Bundle adjustment of a calibration: what images determine, how boards are shaped, what is left out.
+"""Bundle adjustment of a calibration: observable parameters, board shapes, outliers.
 
 Gauss-Newton with Marquardt's damping (Triggs et al. 2000).
 """
@@ -46,36 +46,44 @@ from .uncertainty import jackknife
 LEAST_NOISE = 1e-3
 """Lower bound of the noise, pixels: perfect corners must not get infinite weight."""
 CONVERGED = 1e-3
-"""Iteration ends once a step lowers the loss by less than this, in squared standard deviations."""
+"""Decrease of the loss, in squared standard deviations, below which the iteration ends."""
 DAMPING = 1e-4
-"""Of the first step."""
+"""Damping of the first step."""
 POOLED = 50
-"""Each camera's noise is estimated as if it had this many additional residuals of the average noise."""
+"""Number of residuals of average noise that are added to each camera's own for its noise estimate."""
 UNOBSERVABLE = 0.5
-"""A parameter is unobservable if its posterior deviation stays above this share of its typical size."""
+"""Share of a parameter's typical size above which its posterior deviation makes it unobservable."""
 ROUNDS = 3
 """Times that parameters may return, and that outliers may change."""
 MISFIT = 1.8
-"""A frame does not fit if its residuals exceed those of the camera's median frame by this factor,"""
+"""Ratio of a frame's residuals to those of the camera's median frame above which it may not fit,"""
 CONSPICUOUS = 1.8
-"""and the camera's noise by this one."""
+"""and ratio to the camera's noise, which it must exceed too."""
 SYNCHRONISED = "taken at the same moments, with matching numbers, not mirrored, with a stiff board"
 INCONSISTENT, REJECTED = 3.0, 20.0
-"""Ratios of joint to single RMS from which a camera is inconsistent with the others, or refused."""
+"""Ratios of joint to single RMS above which a camera is inconsistent with the others, or refused."""
 LISTED = 5
-"""Frames named at most."""
+"""Largest number of frames named."""
 FEWEST_TILT = 8.0
-"""Boards whose normals differ by less than this many degrees count as parallel."""
+"""Angle in degrees between boards' normals below which all count as parallel."""
 MANY_WRONG = 0.34
-"""The share of a camera's images that may be left out, in all, because they contradict the others."""
+"""Largest share of a camera's images that may be left out in all because they contradict the others."""
 
 
 def calibrate_single(
     name: str, views: BoardViews, board: Board, *, lens: Lens = "brown-conrady", final: bool = True
 ) -> Solved:
-    """A camera's intrinsics and lens from its images. Raises ValueError, with advice, if they do not suffice.
+    """Calibrate one camera's intrinsics and lens from its images.
 
-    Unless `final`, a poorly constrained focal length is accepted, as other cameras will add constraints.
+    Args:
+        final: False accepts a poorly constrained focal length, as other cameras will add constraints.
+
+    Returns:
+        The solution.
+
+    Raises:
+        ValueError: with advice, for too few images, parallel boards, or (`final`) an undetermined focal
+            length.
     """
     first = initial_camera(name, views, board, lens)
     kept = without_bad_images(views, first, board)
@@ -89,7 +97,8 @@ def calibrate_single(
 
 
 def _check_tilts(name: str, poses: Mapping[FrameKey, Pose], board: Board) -> None:
-    """Raises ValueError if all (flat) boards are parallel: focal length and distance are ambiguous then."""
+    """Raise ValueError if all (flat) boards are parallel, which leaves focal length and distance
+    ambiguous."""
     if not board.flat:
         return
     normals = np.stack([pose.R[:, 2].numpy() for pose in poses.values()])
@@ -103,11 +112,16 @@ def _check_tilts(name: str, poses: Mapping[FrameKey, Pose], board: Board) -> Non
 
 
 def solve(initial: InitialRig, board: Board, *, final: bool = True) -> Solved:
-    """Fit all observable parameters; those that turn out to be unobservable are fixed, until none is.
+    """Fit all observable parameters; unobservable ones are fixed at defaults.
 
-    Parameters fixed before the fit, when the noise was overestimated, may return after it; and boards that
-    are clearly neither flat nor printed true are deformed. Raises ValueError where a `final` fit has no focal
-    length.
+    Parameters fixed before the fit, when the noise was overestimated, may return after it; boards that are
+    clearly neither flat nor printed true are deformed.
+
+    Returns:
+        The solution, with a note for each fixed parameter.
+
+    Raises:
+        ValueError: for a `final` fit without an observable focal length.
     """
     problem, flat = initial.problem(board), initial.flat(board)
     full = problem.free
@@ -134,7 +148,14 @@ def solve_inliers(
     *,
     final: bool = True,
 ) -> Solved:
-    """`solve` in some rounds, each without the `detected` points that the one before shows to be outliers."""
+    """Run `solve` in rounds, each without the `detected` points that the round before shows to be outliers.
+
+    Returns:
+        The last solution.
+
+    Raises:
+        ValueError: as `solve`.
+    """
     solved = solve(initial, board, final=final)
     for _ in range(ROUNDS - 1):
         problem, boards, deformation = solved.problem, solved.problem.board_poses, solved.problem.deformation
@@ -152,10 +173,15 @@ def solve_inliers(
 
 
 def observable(problem: BundleProblem, *, final: bool) -> tuple[BundleProblem, list[str]]:
-    """The problem, unobservable parameters of lenses and principal points fixed at defaults, and notes.
+    """Fix unobservable parameters of lenses and principal points at their defaults, the worst first.
 
-    Judged by pixels and stated priors, in units of typical sizes; the worst is fixed first. Once the fit is
-    `final`, raises ValueError where a focal length is unobservable.
+    They are judged by pixels and stated priors, in units of typical sizes.
+
+    Returns:
+        The problem, and a note for each fixed parameter.
+
+    Raises:
+        ValueError: for an unobservable focal length if `final`.
     """
     free = {name: mask.copy() for name, mask in problem.free.items()}
     cameras, notes = dict(problem.cameras), list[str]()
@@ -182,7 +208,8 @@ def observable(problem: BundleProblem, *, final: bool) -> tuple[BundleProblem, l
 
 
 def _worst(candidates: list[tuple[str, int]], information: np.ndarray) -> int | None:
-    """The parameter with the largest deviation by its typical size, if too large; focal lengths last."""
+    """Index of the parameter with too large a deviation relative to its typical size; None if
+    there is none."""
     covariance = np.linalg.inv(information + np.eye(len(candidates)))
     shares = np.sqrt(np.maximum(covariance.diagonal(), 0))
     order = np.array([2 if i >= 8 else 1 if i >= 6 else 0 for _, i in candidates]) * (shares > UNOBSERVABLE)
@@ -191,9 +218,9 @@ def _worst(candidates: list[tuple[str, int]], information: np.ndarray) -> int | 
 
 
 def _with_deformation(solved: Solved, flat: BoardDeformation | None) -> Solved:
-    """The solution with boards' deformations as unknowns if the points show them and frames agree on them.
+    """Add the boards' deformations as unknowns if the points show them and frames agree on them.
 
-    Where frames are too few to agree, the loss must fall by half.
+    If frames are too few to agree, the loss must fall by half.
     """
     if flat is None or solved.problem.deformation is not None:
         return solved
@@ -217,10 +244,16 @@ def _with_deformation(solved: Solved, flat: BoardDeformation | None) -> Solved:
 def adjust(problem: BundleProblem, *, rounds: int = 4, equal_noise: bool = False) -> Solved:
     """Minimise the reprojection error over the free camera parameters and all boards.
 
-    First by least squares of equal noise, as the initial values may be poor; then `rounds` times with the
-    noise of each camera estimated from its residuals. (Individual noise from the beginning would discard the
-    camera that starts worst.) With `equal_noise` all cameras share one noise: where the board moves between
-    exposures, a camera with a noise of its own would attract every board pose.
+    First by least squares of equal noise, as the initial values may be poor; then up to `rounds` times with
+    the noise of each camera estimated from its residuals. (Individual noise from the beginning would discard
+    the camera that starts worst.)
+
+    Args:
+        equal_noise: True for one noise of all cameras: where the board moves between exposures, a camera with
+            a noise of its own would attract every board pose.
+
+    Returns:
+        The solution; its covariance is None if the parameters are not observable.
     """
     parameters = len(problem.names) + POSE * len(problem.frames)
     start = dict.fromkeys(problem.cameras, max(problem.rms(), LEAST_NOISE))
@@ -237,12 +270,20 @@ def adjust(problem: BundleProblem, *, rounds: int = 4, equal_noise: bool = False
 
 
 def readjusted(problem: BundleProblem) -> BundleProblem:
-    """The problem adjusted once more, from a solution of nearly the same problem and with its noise."""
+    """Adjust a problem again from the solution of nearly the same one, with its noise. Returns
+    the problem."""
     return _minimised(problem, iterations=10)[0]
 
 
 def noise(problem: BundleProblem, parameters: int) -> dict[str, float]:
-    """A robust estimate of each camera's noise in x or y, pixels, given the number of fitted parameters."""
+    """Estimate each camera's noise along x or y robustly, in pixels.
+
+    Args:
+        parameters: number of fitted parameters, by which degrees of freedom are reduced.
+
+    Returns:
+        Noise by camera.
+    """
     residuals = problem.residuals
     numbers = 2 * sum(len(r) for r in residuals.values())
     left = numbers / max(numbers - parameters, 0.1 * numbers)
@@ -254,19 +295,19 @@ def noise(problem: BundleProblem, parameters: int) -> dict[str, float]:
 
 
 def _pooled(sigma: Mapping[str, float]) -> dict[str, float]:
-    """Their root mean square, for all cameras."""
+    """Root mean square of all cameras' noise, for each."""
     return dict.fromkeys(sigma, float(np.sqrt(np.mean(np.square(list(sigma.values()))))))
 
 
 def _square(r: Array) -> float:
-    """The mean square of a coordinate, with outliers down-weighted."""
+    """Mean square of a coordinate, with outliers down-weighted."""
     lengths = np.linalg.norm(r, axis=-1)
     typical = max(float(np.median(lengths)) / RAYLEIGH_MEDIAN, LEAST_NOISE)
     return max(float((robust_weights(lengths / typical) * lengths**2).mean() / 2), LEAST_NOISE**2)
 
 
 def _minimised(problem: BundleProblem, *, iterations: int = 50) -> tuple[BundleProblem, bool]:
-    """The problem with its loss minimised, and whether that converged."""
+    """Minimise a problem's loss. Returns the problem, and True if that converged."""
 
     def model(problem: BundleProblem) -> LocalModel[BundleProblem]:
         equations = normal_equations(problem, linearised(problem))
@@ -284,7 +325,7 @@ def _minimised(problem: BundleProblem, *, iterations: int = 50) -> tuple[BundleP
 
 
 def _covariance(problem: BundleProblem) -> Array | None:
-    """Of the free camera parameters; None if some combination of them changes no pixel."""
+    """Covariance of the free camera parameters; None if some combination of them changes no pixel."""
     information = normal_equations(problem, linearised(problem)).information()
     scale = 1 / np.sqrt(np.maximum(information.diagonal(), 1e-300))
     scaled = information * scale[:, None] * scale
@@ -297,7 +338,14 @@ def _covariance(problem: BundleProblem) -> Array | None:
 
 
 class FrameMisfit(NamedTuple):
-    """A frame a camera does not fit: its residuals, and those of the camera's median frame (RMS, pixels)."""
+    """Frame that does not fit a camera.
+
+    Attributes:
+        camera: the camera.
+        frame: the moment.
+        rms: its residuals (RMS, pixels).
+        typical: residuals of the camera's median frame.
+    """
 
     camera: str
     frame: FrameKey
@@ -306,7 +354,7 @@ class FrameMisfit(NamedTuple):
 
 
 def frame_rms(problem: BundleProblem) -> dict[str, dict[FrameKey, float]]:
-    """By camera and frame: root mean square residual, pixels."""
+    """Compute the root mean square residual in pixels, by camera and frame."""
     by_camera = {}
     for name, r in problem.residuals.items():
         block = problem.seen[name].block
@@ -318,7 +366,7 @@ def frame_rms(problem: BundleProblem) -> dict[str, dict[FrameKey, float]]:
 
 
 def misfits(fit: Solved) -> list[FrameMisfit]:
-    """Frames whose residuals stand out, worst first."""
+    """List the frames with conspicuous residuals, worst first."""
     misfits = []
     for name, by_frame in frame_rms(fit.problem).items():
         typical = float(np.median(list(by_frame.values())))
@@ -328,7 +376,8 @@ def misfits(fit: Solved) -> list[FrameMisfit]:
 
 
 def misfit_notes(fit: Solved) -> Iterator[str]:
-    """A note if the adjustment went on changing, and one per camera on its frames that do not fit."""
+    """Yield a note if the adjustment did not converge, and one for each camera with frames that
+    do not fit."""
     if not fit.converged:
         yield "the adjustment has not come to rest: too few boards, or some that contradict it"
     for name in fit.problem.cameras:
@@ -344,11 +393,19 @@ def misfit_notes(fit: Solved) -> Iterator[str]:
 
 
 def solve_together(initial: InitialRig, board: Board, singles: Mapping[str, Solved]) -> Solved:
-    """All cameras at once; if they fit far worse than alone, with their single calibrations as priors.
+    """Fit all cameras at once; if they fit far worse than alone, with their single calibrations as priors.
 
-    Boards that move between the exposures of unsynchronised cameras would distort the lens models otherwise.
-    A few images that contradict the others (boards detected a square off, say) are left out. Raises
-    ValueError if a camera contradicts the others altogether.
+    Boards that move between the exposures of unsynchronised cameras would otherwise distort the lens models.
+    A few images that contradict the others (boards detected a square off, for instance) are left out.
+
+    Args:
+        singles: each camera's own solution.
+
+    Returns:
+        The solution; for one camera its own.
+
+    Raises:
+        ValueError: if a camera contradicts the others altogether.
     """
     if len(singles) == 1:
         return next(iter(singles.values()))
@@ -371,7 +428,7 @@ def solve_together(initial: InitialRig, board: Board, singles: Mapping[str, Solv
 
 
 def _wrong_images(solved: Solved, single_rms: Mapping[str, float]) -> list[tuple[str, FrameKey]]:
-    """Images so far off that their camera would be refused, one of a moment, unless many are one camera's."""
+    """Images that contradict the others, one for each moment; none if they are too many of one camera's."""
     reasons = dict[FrameKey, str]()
     for misfit in misfits(solved):
         if misfit.rms > _refused_from(single_rms[misfit.camera]):
@@ -391,15 +448,23 @@ def _without(initial: InitialRig, images: Sequence[tuple[str, FrameKey]]) -> Ini
 
 
 def many_wrong(wrong: Sequence[str], before: Sequence[str], counts: Mapping[str, int]) -> bool:
-    """Whether images found wrong, and those left out before (the camera of each), are more than `MANY_WRONG`
-    of all of a camera's; `counts` are those that are left of it."""
+    """Test whether too large a share of a camera's images contradicts the others (`MANY_WRONG`).
+
+    Args:
+        wrong: camera of each contradicting image.
+        before: camera of each image left out before.
+        counts: remaining images by camera.
+
+    Returns:
+        True if a camera has too many.
+    """
     return any(
         wrong.count(n) + before.count(n) > MANY_WRONG * (counts[n] + before.count(n)) for n in set(wrong)
     )
 
 
 def _refused_from(single_rms: float) -> float:
-    """The reprojection error (RMS, px) with the other cameras from which a camera contradicts them."""
+    """Joint reprojection error (RMS, pixels) above which a camera contradicts the others."""
     return REJECTED * max(single_rms, 0.3)
 
 
@@ -417,7 +482,7 @@ def _inconsistent_cameras(solved: Solved, single_rms: Mapping[str, float]) -> st
 
 
 def _as_prior(name: str, single: Solved) -> CameraPrior:
-    """A camera's single calibration as a prior of its intrinsics; none for parameters that were fixed."""
+    """A camera's own calibration as a prior of its intrinsics; none for fixed parameters."""
     camera = single.problem.cameras[name]
     entries = parameter_names(camera)
     free = [entries.index(entry.removeprefix(f"{name}.")) for entry in single.names]

@@ -70,11 +70,11 @@ OPTIONS = {
     },
     "aprilgrid": {"ratio": r"\d*\.?\d+", "border": "border[12]", "first": FIRST},
 }
-"""Patterns of what may follow the counts and the length of each kind of board."""
+"""Patterns of options that may follow the counts and the length of each kind of board."""
 COLUMNS = ("id", "x", "y", "z"), ("id", "corner", "x", "y", "z")
-"""Of a file of points."""
+"""Columns of a file of points."""
 FEWEST_POINTS = 6
-"""Points that a target of known points needs."""
+"""Least number of points in a target of known points."""
 PAPERS = {
     "A4": (210, 297),
     "letter": (216, 279),
@@ -83,17 +83,22 @@ PAPERS = {
     "A1": (594, 841),
     "A0": (841, 1189),
 }
-"""Sheets of printers, millimetres."""
+"""Paper sizes, millimetres."""
 MARGIN = 0.012
-"""White around a board, metres."""
+"""White margin around a board, metres."""
 BELOW = 14.0
 """Millimetres below a board, for its ruler and name."""
 
 
 def parse_board(text: str) -> Board:
-    """The board that a text specifies, such as ``charuco:8x6:30mm``; see the module.
+    """Parse the text of a board, such as ``charuco:8x6:30mm``, or read a target file; see the module.
 
-    Raises ValueError, or FileNotFoundError for a file that is not there.
+    Returns:
+        The board.
+
+    Raises:
+        ValueError: for text or a file that is no board.
+        FileNotFoundError: for a missing file.
     """
     if text.lower().endswith((".yaml", ".yml")):
         text = _kalibr_target(Path(text))
@@ -115,7 +120,8 @@ def parse_board(text: str) -> Board:
 
 
 def _options(text: str, options_text: Sequence[str], patterns: Mapping[str, str]) -> dict[str, str]:
-    """Each option by the name of the pattern that it matches. Raises ValueError for others, and for two."""
+    """Options by the name of the pattern that each matches. Raises ValueError for others, and for two of one
+    kind."""
     options: dict[str, str] = {}
     for option in options_text:
         name = next((n for n, p in patterns.items() if re.fullmatch(p, option)), None)
@@ -128,7 +134,15 @@ def _options(text: str, options_text: Sequence[str], patterns: Mapping[str, str]
 
 
 def parse_boards(texts: Sequence[str]) -> Board:
-    """One board, or several at once, which need markers with numbers of their own. Raises ValueError."""
+    """Parse the texts of one board, or of several that are in view at once and need distinct markers.
+
+    Returns:
+        The board, or `Boards`.
+
+    Raises:
+        ValueError: for text that is no board, and several boards without markers or with the same ones.
+        FileNotFoundError: for a missing file.
+    """
     boards = [parse_board(text) for text in texts]
     if len(boards) == 1:
         return boards[0]
@@ -170,7 +184,7 @@ def _april_grid(text: str, columns: int, rows: int, tag: float, options: Mapping
 
 
 def _kalibr_target(path: Path) -> str:
-    """The board of Kalibr's target file as text. Raises ValueError, FileNotFoundError."""
+    """Convert Kalibr's target file to a board's text. Raises ValueError, FileNotFoundError."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file of a target")
     try:
@@ -206,9 +220,9 @@ def _length(text: str, word: str) -> float:
 
 
 def _smallest_dictionary(text: str, name: str, markers: int) -> str:
-    """The smallest dictionary of a kind that has enough markers; larger ones begin with the same markers.
+    """Smallest dictionary of a kind with enough markers; larger ones begin with the same markers.
 
-    `text` names the target in the ValueError where there is none.
+    Raises ValueError, naming the target's `text`, if there is none.
     """
     names = [name.upper()] if "_" in name else [f"{name.upper()}_{n}" for n in (50, 100, 250, 1000)]
     for full in names:
@@ -218,7 +232,8 @@ def _smallest_dictionary(text: str, name: str, markers: int) -> str:
 
 
 def _known_points(text: str) -> KnownPoints:
-    """Points of a CSV file `targets.csv`, or `targets.csv:5x5_100` with their dictionary (4x4 by default).
+    """Read points of a CSV file `targets.csv`, or `targets.csv:5x5_100` with their dictionary (4x4 by
+    default).
 
     Columns id, x, y, z (metres) for markers' centres, or id, corner (0 to 3), x, y, z. Raises ValueError.
     """
@@ -269,19 +284,23 @@ def _point(
 
 
 def page_of(board: Board) -> tuple[float, float]:
-    """Width and height of the page that a board is drawn on, with margins and ruler, millimetres."""
+    """Return width and height of the page that a board is drawn on, with margins and ruler, millimetres."""
     width, height = (1e3 * (v + 2 * MARGIN) for v in board.extent)
     return width, height + BELOW
 
 
 def smallest_paper(page: tuple[float, float]) -> str | None:
-    """The smallest sheet a page (millimetres) fits on, upright or across; None if none is large enough."""
+    """Find the smallest sheet that a page (millimetres) fits on, upright or across.
+
+    Returns:
+        Name such as "A4"; None if no sheet is large enough.
+    """
     fitting = [name for name, paper in PAPERS.items() if all(a <= b for a, b in zip(sorted(page), paper))]
     return fitting[0] if fitting else None
 
 
 def page_note(board: Board) -> str:
-    """What to print a board on."""
+    """Say which paper to print a board on, in a sentence."""
     page = page_of(board)
     size = f"the page is {page[0]:.0f} x {page[1]:.0f} mm"
     if (paper := smallest_paper(page)) is None:
@@ -290,10 +309,16 @@ def page_note(board: Board) -> str:
 
 
 def draw_board(board: Board, *, paper: str | None = None) -> Figure:
-    """The board as a figure whose size in inches is the true one, with a white margin, ruler below.
+    """Draw a board at true size, with a white margin and a ruler below to check the print.
 
-    Saved as PDF or SVG it prints at true size; the ruler serves to check it. On a sheet of `paper` ("A4") it
-    is in the middle. Raises ValueError if it does not fit there.
+    Args:
+        paper: sheet such as "A4", in whose middle the board is drawn; None for a page of the board's size.
+
+    Returns:
+        The figure; saved as PDF or SVG it prints at true size.
+
+    Raises:
+        ValueError: for an unknown sheet, a board that does not fit on it, and boards that cannot be printed.
     """
     width, height = (1e3 * v for v in board.extent)
     page = page_of(board)
@@ -325,7 +350,7 @@ def _sheet(paper: str, page: tuple[float, float]) -> tuple[float, float]:
 
 
 def _draw_ruler(axes: Any, text: str, width: float, y: float) -> None:
-    """Draw a line of a whole number of centimetres with a tick at each, and the board's name."""
+    """Draw a line of whole centimetres with ticks, and the board's name."""
     length = max(10.0, 10 * (min(width, 100.0) // 10))
     axes.plot([0, length], [y, y], color="0.4", lw=0.6)
     for x in np.arange(0, length + 1, 10):
@@ -335,9 +360,17 @@ def _draw_ruler(axes: Any, text: str, width: float, y: float) -> None:
 
 
 def write_board(board: str, out: Path, *, paper: str | None = None) -> Path:
-    """Write a board as a PDF or SVG of its true size, on a sheet of paper if given.
+    """Write a board as PDF or SVG at true size, atomically.
 
-    Raises ValueError for another ending, and if the board does not fit on the sheet.
+    Args:
+        board: text of the board.
+        paper: sheet such as "A4"; None for a page of the board's size.
+
+    Returns:
+        The path `out`.
+
+    Raises:
+        ValueError: for another suffix, text that is no board, and a board that does not fit on the sheet.
     """
     if out.suffix.lower() not in (".pdf", ".svg"):
         raise ValueError(f"{out}: a board is written as .pdf or .svg, which keep its true size")

@@ -1,4 +1,4 @@
-"""How uncertain a rig is: its parameters' covariance, in a file beside the rig's, and what follows from it.
+"""Uncertainty of a rig: covariance of its parameters, in a file beside the rig's, and its consequences.
 
 A camera's pose and its lens can stand for one another: what is compared are the pixels of points at a
 distance, after the small motion of the camera that fits them best (as in mrcal's projection uncertainty and
@@ -42,42 +42,53 @@ FORMAT = "arraygeom-covariance 1"
 GRID = 15, 20
 """Rows and columns of the pixels at which projections are compared."""
 SEEN = 400
-"""Board points of a camera by which its motion is compensated, about."""
+"""Approximate number of a camera's board points that compensate its motion."""
 FEWEST_TO_JACKKNIFE = 6
 UNCHECKED = 3.0
-"""The factor by which standard deviations are raised of fewer frames, which cannot be checked: real sets
-of six frames and more are raised by 1.0 to 4.8 (tests/benchmarks/RESULTS_sigma.md)."""
+"""Factor that raises standard deviations from too few frames to check them: real sets of six frames and more
+are raised by 1.0 to 4.8 (tests/benchmarks/RESULTS_sigma.md)."""
 CONSIDERABLE = 1.3
-"""Standard deviations are raised if the jackknife's are larger by this."""
+"""Ratio of the jackknife's standard deviations to those of the points' noise above which they are raised."""
 
 
 @dataclass(frozen=True)
 class RigCovariance:
-    """The covariance of some parameters of a rig; all others are fixed.
+    """Covariance of some parameters of a rig; all others are fixed.
 
-    names: parameters as `Rig.parameters` names them with the index of a component, "left.rotation.0",
-    "left.focal.1": rotation vectors in radians about the camera's axes, metres, pixels, distortion
-    coefficients.
+    Attributes:
+        names: parameters as in `Rig.parameters` with the index of a component, "left.rotation.0",
+            "left.focal.1": rotation vectors in radians about the camera's axes, metres, pixels, distortion
+            coefficients.
+        matrix: the covariance.
     """
 
     names: tuple[str, ...]
     matrix: Float[np.ndarray, "c c"]
 
     def of(self, name: str, camera: Camera) -> Float[np.ndarray, "p c"]:
-        """The selection matrix of a camera's parameters, in the order of `parameter_names`, among these."""
+        """Return the selection matrix (p, c) from these parameters to a camera's, in the order of
+        `parameter_names`."""
         entries = np.array([f"{name}.{entry}" for entry in parameter_names(camera)])
         return (entries[:, None] == np.array(self.names, dtype=str)).astype(np.float64)
 
     def save(self, path: str | Path, rig: Rig) -> None:
-        """Write it as JSON, atomically, and the rig that it is of."""
+        """Write the covariance and the geometry of its rig as JSON, atomically."""
         document = {"format": FORMAT, "names": list(self.names), "covariance": self.matrix.tolist()}
         write_text(path, json.dumps(document | {"rig": write(_geometry(rig))}))
 
     @classmethod
     def load(cls, path: str | Path, rig: Rig | None = None) -> RigCovariance:
-        """Read what `save` wrote. Raises FileNotFoundError, or ValueError for another file.
+        """Read a covariance file.
 
-        And for one that says that it is of another rig than `rig`, if given.
+        Args:
+            rig: rig that the file must belong to; None does not check.
+
+        Returns:
+            The covariance.
+
+        Raises:
+            FileNotFoundError: for a missing file.
+            ValueError: for another file, a damaged one, or one of another rig.
         """
         path = Path(path)
         if not path.is_file():
@@ -103,12 +114,12 @@ class RigCovariance:
 
 
 def _geometry(rig: Rig) -> Rig:
-    """The rig's cameras without what their sensors record."""
+    """Rig without the sensors' properties."""
     return Rig({name: view.replace(sensor=Sensor()) for name, view in rig.cameras.items()})
 
 
 def rig_covariance(fit: Solved) -> RigCovariance | None:
-    """The covariance of a solution's free parameters, if they are observable."""
+    """Return the covariance of a solution's free parameters; None if they are not observable."""
     matrix = fit.covariance
     return None if matrix is None else RigCovariance(fit.names, matrix)
 
@@ -116,10 +127,16 @@ def rig_covariance(fit: Solved) -> RigCovariance | None:
 def beta_covariance(
     rig: Rig, covariance: RigCovariance, alpha: str, beta: str, x: Float[np.ndarray, "n 2"], depth: float
 ) -> Float[np.ndarray, "n 2 2"]:
-    """The covariance, in pixels^2 of beta, of the predicted positions of alpha's pixels at a depth (metres).
+    """Propagate a rig's covariance to the positions in beta of alpha's pixels at a depth.
 
     To first order: the point moves in alpha's plane of that depth so that alpha's pixel is unchanged.
-    NaN where alpha's lens has no ray or beta does not see the point.
+
+    Args:
+        depth: metres.
+
+    Returns:
+        Covariances (n, 2, 2) in pixels² of beta; NaN where alpha's lens has no ray or beta does not see the
+        point.
     """
     a, b = rig.pair(alpha, beta).cameras
     X = a.unproject(torch.from_numpy(x), torch.full((len(x),), depth, dtype=torch.float64))
@@ -136,7 +153,7 @@ def beta_covariance(
 
 
 def baseline_deviation(rig: Mapping[str, Camera], a: str, b: str, covariance: RigCovariance) -> float:
-    """The standard deviation of the distance between two cameras, metres."""
+    """Compute the standard deviation of the distance between two cameras, metres."""
     baseline = (rig[b].centre - rig[a].centre).numpy()
     direction = baseline / max(float(np.linalg.norm(baseline)), 1e-12)
     of_a, of_b = (
@@ -150,9 +167,14 @@ def baseline_deviation(rig: Mapping[str, Camera], a: str, b: str, covariance: Ri
 
 
 class Intrinsics(NamedTuple):
-    """A camera in its own frame, its free intrinsics, their covariance, and its noise in pixels.
+    """One camera's intrinsics with their uncertainty.
 
-    seen: some of the board points that it observed, in its frame.
+    Attributes:
+        camera: the camera in its own frame.
+        covariance: covariance of the free intrinsics.
+        free: mask of the free intrinsics among all parameters.
+        sigma: noise along x or y, pixels.
+        seen: some board points that it observed, in its frame, metres.
     """
 
     camera: Camera
@@ -163,7 +185,7 @@ class Intrinsics(NamedTuple):
 
 
 def intrinsics_of(fit: Solved, name: str) -> Intrinsics:
-    """One camera of a fit; none of its intrinsics is free where the fit has no covariance."""
+    """Extract one camera from a fit; without a covariance none of its intrinsics is free."""
     camera, points = in_own_frame(fit.problem, name)
     of_rig = rig_covariance(fit) or RigCovariance((), np.zeros((0, 0)))
     mine = of_rig.of(name, camera)
@@ -174,14 +196,15 @@ def intrinsics_of(fit: Solved, name: str) -> Intrinsics:
 
 
 def in_own_frame(problem: BundleProblem, name: str) -> tuple[Camera, Float[np.ndarray, "m 3"]]:
-    """A camera at the origin, and some of the board points that it observed, in its frame."""
+    """Return a camera at the origin, and some board points that it observed, in its frame, metres."""
     camera = problem.cameras[name]
     X = camera.cam_from_world.apply(torch.from_numpy(problem.world(name))).numpy()
     return camera.replace(cam_from_world=Pose.identity()), X[:: max(1, len(X) // SEEN)]
 
 
 def grid_points(camera: Camera, depth: float) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 3"]]:
-    """Pixels over the image, and their points at a depth in the camera's frame, where the lens has a ray."""
+    """Return pixels over a camera's image, and their points at a depth in its frame, where the lens has a
+    ray."""
     rows, columns = GRID
     h, w = camera.hw
     x = np.stack(np.meshgrid(np.linspace(0, w - 1, columns), np.linspace(0, h - 1, rows)), -1).reshape(-1, 2)
@@ -193,21 +216,28 @@ def grid_points(camera: Camera, depth: float) -> tuple[Float[np.ndarray, "n 2"],
 def uncertainty(
     intrinsics: Intrinsics, depth: float
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
-    """Standard deviations (pixels, worst direction) of projections at a depth (metres), over the image."""
+    """Compute the standard deviation of projections at a depth (metres) over the image.
+
+    Returns:
+        Pixels (n, 2), and deviations in the worst direction (n), pixels.
+    """
     x, change = moved_pixels(intrinsics, depth)
     return x, worst_deviation(change @ intrinsics.covariance @ change.swapaxes(-1, -2))
 
 
 def worst_deviation(covariance: Float[np.ndarray, "n 2 2"]) -> Float[np.ndarray, " n"]:
-    """The standard deviation in the direction in which it is largest."""
+    """Return the standard deviation in the direction in which it is largest."""
     return np.asarray(np.sqrt(np.linalg.eigvalsh(covariance)[:, -1]))
 
 
 def moved_pixels(intrinsics: Intrinsics, depth: float) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels, and how they move with the free intrinsics: (n, 2), (n, 2, f).
+    """Differentiate pixels over the image by the free intrinsics, at a depth (metres).
 
-    That is after the motion of the camera that keeps the boards where they were seen best, so that points
-    nearer or farther than the boards move more.
+    The camera is moved to keep the boards where they were seen, so that points nearer or farther than the
+    boards move more.
+
+    Returns:
+        Pixels (n, 2) and derivatives (n, 2, f).
     """
     x, X = grid_points(intrinsics.camera, depth)
     J, at_boards = camera_jacobian(intrinsics.camera, X), camera_jacobian(intrinsics.camera, intrinsics.seen)
@@ -216,7 +246,15 @@ def moved_pixels(intrinsics: Intrinsics, depth: float) -> tuple[np.ndarray, np.n
 
 
 def compensation(by_pose: np.ndarray, moved: np.ndarray) -> np.ndarray:
-    """The motion (6, f) of a camera whose derivatives (m, 2, 6) move pixels like (m, 2, f), least squares."""
+    """Fit the camera motion whose effect on pixels is closest to given changes, in least squares.
+
+    Args:
+        by_pose: derivatives by the pose (m, 2, 6).
+        moved: changes (m, 2, f), or (m, 2).
+
+    Returns:
+        Motions (6, f).
+    """
     return np.asarray(
         np.linalg.lstsq(by_pose.reshape(-1, 6), moved.reshape(len(by_pose) * 2, -1), rcond=None)[0]
     )
@@ -225,7 +263,7 @@ def compensation(by_pose: np.ndarray, moved: np.ndarray) -> np.ndarray:
 def covered(
     x: Float[np.ndarray, "n 2"], observed: Float[np.ndarray, "m 2"], hw: HW
 ) -> Bool[np.ndarray, " n"]:
-    """Which pixels have a board point within a cell of the grid at which projections are compared."""
+    """Return True for pixels with a board point within a cell of the comparison grid."""
     reach = max(hw[0] / GRID[0], hw[1] / GRID[1])
     nearest = np.array([np.linalg.norm(observed - each, axis=1).min() for each in x])
     return np.asarray(nearest < reach)
@@ -235,10 +273,13 @@ def covered(
 
 
 class Jackknife(NamedTuple):
-    """By how the frames disagree: covariances of the cameras' parameters and of the boards' deformations.
+    """Covariances from the disagreement of frames.
 
-    left_out: of the cameras' parameters by leaving out each frame in turn. step: the deformations after a
-    Gauss-Newton step.
+    Attributes:
+        covariance: covariance of the cameras' parameters.
+        left_out: the same by leaving out each frame in turn.
+        deformations: covariance of the boards' deformations.
+        step: deformations after a Gauss-Newton step.
     """
 
     covariance: Float[np.ndarray, "c c"]
@@ -248,11 +289,17 @@ class Jackknife(NamedTuple):
 
 
 def jackknife(problem: BundleProblem) -> Jackknife:
-    """The covariance of the free parameters by how the frames disagree, to first order.
+    """Estimate covariances from the disagreement of frames, to first order.
 
-    It contains what frames have in common beyond their points' noise: a bent board, blur, wrong exposure
-    times. A plain jackknife's deviations are too large by 15 to 40 % with a dozen boards that determine all
+    They include common errors of a frame beyond its points' noise: a bent board, blur, wrong exposure times.
+    A plain jackknife's deviations are too large by 15 to 40 % with a dozen boards that determine all
     parameters between them; Bell and McCaffrey's (2002) correction removes that.
+
+    Returns:
+        The covariances.
+
+    Raises:
+        numpy.linalg.LinAlgError: if parameters are not observable.
     """
     parts = linearised(problem)
     equations = normal_equations(problem, parts)
@@ -290,13 +337,18 @@ def _clustered(total: Array, H: Array, g: Array) -> Array:
 
 
 def with_disagreement(solved: Solved, board: Board, *, unchecked: bool = False) -> Solved:
-    """The solution, its covariance raised if frames disagree considerably; notes on that and on the boards.
+    """Raise a solution's covariance where frames disagree considerably, and add notes on that and on the
+    boards.
 
-    Where frames are too few to tell, it is raised by `UNCHECKED` if it is of such frames alone (`unchecked`).
+    The raised covariance is the mean of the jackknife's, which few frames make noisy, and that of the points'
+    noise scaled to the jackknife's level: the median over the parameters, as frames that disagree about a
+    focal length say nothing of the lens.
 
-    The raised covariance is the mean of the jackknife's, which few
-    frames make noisy, and of that of the points' noise, scaled to the jackknife's level: the median over the
-    parameters, as frames that disagree about a focal length say nothing of the lens.
+    Args:
+        unchecked: True to raise it by `UNCHECKED` where frames are too few to tell.
+
+    Returns:
+        The solution.
     """
     problem, covariance, notes = solved.problem, solved.covariance, list[str]()
     raised, frames = 1.0, len(problem.frames)
@@ -326,5 +378,5 @@ def with_disagreement(solved: Solved, board: Board, *, unchecked: bool = False) 
 
 
 def _ratio(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Of the standard deviations of two covariances."""
+    """Ratios of the standard deviations of two covariances."""
     return np.asarray(np.sqrt(a.diagonal() / b.diagonal()))

@@ -1,4 +1,4 @@
-"""How well a calibration predicts: epipolar errors, held-out frames, lens models compared by those, notes."""
+"""Validation of a calibration: epipolar errors, held-out frames, comparison of lens models, notes."""
 
 from __future__ import annotations
 
@@ -22,26 +22,31 @@ from .solve import calibrate_single, readjusted
 from .uncertainty import compensation, covered, grid_points, in_own_frame
 
 FEWEST_TO_HOLD_OUT = 8
-"""Frames are held out from this many on that two cameras share."""
+"""Least number of frames shared by two cameras for holding some out."""
 FOLDS = 5
-"""Frames are held out in so many parts, each once."""
+"""Number of parts of the frames, each held out once."""
 FEWEST_TO_HALVE = 8
 FEWEST_LEFT = 3
-"""Frames that every camera must keep."""
+"""Least number of frames that every camera keeps."""
 FAR_FROM_START = 4.0
-"""Standard deviations from the start beyond which a camera is named."""
+"""Standard deviations from the start above which a camera is named."""
 COMPARED: tuple[Lens, ...] = ("none", "brown-conrady", "kannala-brandt", "rational", "thin-prism", "tilted")
-"""Models that are compared, the most usual first; then by number of coefficients."""
+"""Lens models under comparison, the most usual first; then by number of coefficients."""
 LENS_FOLDS = 4
 FEWEST_TO_COMPARE = 8
 EQUAL = 0.01
-"""Held-out errors that differ by less than this share are equal."""
+"""Relative difference of held-out errors below which they are equal."""
 
 
 def epipolar_errors(
     rig: Rig, views: Mapping[str, BoardViews]
 ) -> dict[tuple[str, str], Float[np.ndarray, " _"]]:
-    """By pair: distances in undistorted pixels from beta's points to alpha's lines, and the reverse."""
+    """Compute epipolar errors by pair: the mean of the distances of each camera's points from the other's
+    lines.
+
+    Returns:
+        Errors in undistorted pixels, one for each common point; pairs without common points are absent.
+    """
     errors = {}
     for a, b in combinations(views, 2):
         parts = []
@@ -67,9 +72,10 @@ def epipolar_errors(
 def held_out_errors(
     fit: Solved, views: Mapping[str, BoardViews]
 ) -> dict[tuple[str, str], Float[np.ndarray, " _"]]:
-    """Epipolar errors of all frames, each by a rig calibrated without it; empty if there are too few.
+    """Compute epipolar errors of all frames, each by a rig calibrated without it (in five parts).
 
-    Frames are held out in five parts.
+    Returns:
+        Errors by pair, undistorted pixels; empty for too few frames.
     """
     frames = fit.problem.frames
     shared = [key for key in frames if sum(key in v.seen for v in views.values()) > 1]
@@ -88,10 +94,14 @@ def held_out_errors(
 
 
 def half_difference(fit: Solved, depth: float) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """By camera: pixels (n, 2) near points of both halves, how far (n, 2) projections of their fits differ.
+    """Compare the fits to every other frame with those to the rest.
 
-    Halves are every other frame; elsewhere a lens model is extrapolated. Empty if there are too few frames,
-    or a camera sees no board in one of the halves.
+    Args:
+        depth: metres.
+
+    Returns:
+        By camera, pixels (n, 2) near points of both halves and differences (n, 2) of projections there,
+        pixels; empty for too few frames, or a camera that sees no board in one half.
     """
     count = len(fit.problem.frames)
     even = np.arange(count) % 2 == 0
@@ -122,17 +132,22 @@ def _difference(a: Camera, b: Camera, X: np.ndarray) -> Float[np.ndarray, "n 2"]
 
 @dataclass(frozen=True)
 class LensComparison:
-    """Mean square errors of a coordinate (pixels^2) of each frame by each model that fits without it."""
+    """Held-out errors of the lens models of one camera.
+
+    Attributes:
+        errors: mean square error of a coordinate (pixels²) of each frame, by model; empty for too few frames.
+    """
 
     errors: Mapping[Lens, Float[np.ndarray, " f"]]
 
     def rms(self, lens: Lens) -> float:
-        """The held-out error along x or y, pixels."""
+        """Return the held-out error of a model along x or y, pixels."""
         return float(np.sqrt(self.errors[lens].mean()))
 
     @property
     def advised(self) -> Lens:
-        """The first model that predicts like the best, to a standard error or 1 %."""
+        """First model that predicts as well as the best, to a standard error or 1 %; brown-conrady without
+        errors."""
         if not self.errors:
             return "brown-conrady"
         best = min(self.errors, key=self.rms)
@@ -145,7 +160,7 @@ class LensComparison:
 
     @property
     def advice(self) -> str:
-        """The advised model and all errors, in a sentence."""
+        """Advised model and all errors, in a sentence."""
         if not self.errors:
             return f"too few frames to compare lenses (fewer than {FEWEST_TO_COMPARE}): brown-conrady is used"
         listed = ", ".join(f"{lens} {self.rms(lens):.3f}" for lens in COMPARED if lens in self.errors)
@@ -153,15 +168,21 @@ class LensComparison:
 
 
 def compare_lenses(views: Mapping[str, BoardViews], board: Board) -> dict[str, LensComparison]:
-    """The lens models of each camera, judged on frames that they were not fitted to.
+    """Compare the lens models of each camera on frames that they were not fitted to.
 
-    A model that contradicts frames which others fit is left out.
+    Models that contradict frames which others fit are left out.
+
+    Returns:
+        Comparisons by camera.
+
+    Raises:
+        ValueError: if no camera can be calibrated with the usual model.
     """
     return {name: _compared(name, v, board) for name, v in views.items()}
 
 
 def _compared(name: str, views: BoardViews, board: Board) -> LensComparison:
-    """The errors of each lens model on frames that its fit was not given; none of too few frames."""
+    """Errors of each lens model on held-out frames; empty for too few frames."""
     if len(views.seen) < FEWEST_TO_COMPARE:
         return LensComparison({})
     kept = calibrate_single(name, views, board, final=False).views[name]
@@ -181,7 +202,8 @@ def _compared(name: str, views: BoardViews, board: Board) -> LensComparison:
 
 
 def _held_out(problem: BundleProblem, out: np.ndarray) -> Float[np.ndarray, " f"]:
-    """Mean squares of frames held `out` by a camera fitted to the others, board poses fitted to them."""
+    """Mean square errors of the frames in `out` by a camera fitted to the others, with board poses fitted to
+    them."""
     fitted, judged = readjusted(problem.of_boards(~out)), problem.of_boards(out)
     (name,) = fitted.cameras
     if fitted.deformation is not None and judged.deformation is not None:
@@ -202,7 +224,7 @@ def _held_out(problem: BundleProblem, out: np.ndarray) -> Float[np.ndarray, " f"
 def left_out_notes(
     detected: Mapping[str, BoardViews], singles: Mapping[str, Solved], solved: Solved
 ) -> Iterator[str]:
-    """Notes on images and points cameras were calibrated without, by themselves (`singles`) and together."""
+    """Yield notes on images and points that were left out, of each camera alone (`singles`) and together."""
     for name, v in detected.items():
         used = singles[name].views[name]
         if rejected := [str(key) for key in v.seen if key not in used.seen]:
@@ -215,10 +237,8 @@ def left_out_notes(
 def start_notes(
     detected: Mapping[str, BoardViews], solved: Solved, deviations: StartDeviations, lens: Mapping[str, Lens]
 ) -> Iterator[str]:
-    """Notes on a rig that was known roughly: what images add, what lies far from it, what was left out.
-
-    And which cameras have a lens of the start's that is not the one wanted.
-    """
+    """Yield notes on a calibration from a start: gains by the images, distance from the start, lenses, points
+    left out."""
     yield _gains(solved, deviations)
     for name, camera in solved.problem.cameras.items():
         if (distortion := camera.distortion) is not None and distortion.model != LENSES[lens[name]][0]:
@@ -231,7 +251,7 @@ def start_notes(
 
 
 def _points_left_out(name: str, detected: BoardViews, used: BoardViews) -> Iterator[str]:
-    """A note on points that were left out as outliers, most of an image first."""
+    """Note on points that were left out as outliers, most of an image first."""
     counts = {
         key: len(d.ids) - len(used.seen[key].ids) for key, d in detected.seen.items() if key in used.seen
     }
@@ -242,7 +262,7 @@ def _points_left_out(name: str, detected: BoardViews, used: BoardViews) -> Itera
 
 
 def _gains(fit: Solved, deviations: StartDeviations) -> str:
-    """What the images add to the start, by kind of parameter."""
+    """Sentence on how the images reduce the start's deviations, by kind of parameter."""
     focal = np.mean([intrinsic_values(c)[6] for c in fit.problem.cameras.values()])
     width = np.mean([c.hw[1] for c in fit.problem.cameras.values()])
     stated = (
@@ -259,7 +279,7 @@ def _gains(fit: Solved, deviations: StartDeviations) -> str:
 
 
 def _position_deviations(fit: Solved) -> list[float]:
-    """Of each camera's optical centre, root mean square of the axes, metres."""
+    """Standard deviation of each camera's optical centre, root mean square of the axes, metres."""
     assert fit.covariance is not None
     deviations = []
     for name, camera in fit.problem.cameras.items():
@@ -272,7 +292,7 @@ def _position_deviations(fit: Solved) -> list[float]:
 
 
 def _far(fit: Solved) -> Iterator[str]:
-    """Which cameras lie far from the start."""
+    """Notes on cameras that lie far from the start."""
     for name, camera in fit.problem.cameras.items():
         prior = fit.problem.priors[name]
         ratio = np.abs(prior.residual(camera)) / np.sqrt(np.linalg.inv(prior.information).diagonal())

@@ -1,8 +1,9 @@
-"""Rigs and ordinary images: diagnosis, refinement, and uncalibrated rigs, by points matched between cameras.
+"""Rigs and ordinary images: diagnosis, refinement and uncalibrated rigs, by points matched between cameras.
 
-`matches`, `patch_matching` (matched points) -> `residuals` -> `hypotheses`, `evidence`, `doctor` (the usual
-mistakes) and `parameters`, `least_squares`, `depth_change`, `lenses`, `photometric`, `refinement` (a better
-rig) -> `from_images` (a rig from images alone) and `rig_check` (whether a rig fits images at all).
+`matches` and `patch_matching` match points; `residuals` measures them; `hypotheses`, `evidence` and `doctor`
+find the usual mistakes; `parameters`, `least_squares`, `depth_change`, `lenses`, `photometric` and
+`refinement` improve a rig; `from_images` makes a rig from images alone; `rig_check` tests whether a rig fits
+images at all.
 """
 
 from .. import _lazy

@@ -1,10 +1,10 @@
-"""What a rig's change does to depth, and which directions of change points determine well enough to make it.
+"""The change of depth that a change of the rig causes, and the directions of it that points determine well.
 
 Epipolar distances hardly change under some rotations and shifts that change depth much (a rotation about the
 vertical and a shift of the principal point move points along their lines). The points' depth is therefore
 split into the modes of its posterior covariance, and the change along a mode is made only if it is
 significant, well determined, and clearly better known by the points than by the prior; otherwise that
-combination of parameters stays where it was.
+combination of parameters keeps its value.
 """
 
 from __future__ import annotations
@@ -22,29 +22,33 @@ from .matches import Pairs
 from .residuals import FEW, match_depths, share
 
 SIGNIFICANT_CHANGE = 3.0
-"""Standard deviations by which a mode of depth must change."""
+"""Least change of a mode of depth that counts, in standard deviations."""
 KNOWN_BETTER = 0.15
-"""The largest posterior deviation of a mode of depth that changes, as a share of the prior's."""
+"""Largest posterior deviation of a mode that may change, as a share of its prior deviation."""
 LARGEST_DEVIATION = 0.02
-"""The largest posterior deviation, relative to depth, of a mode that changes."""
+"""Largest posterior deviation of a mode that may change, relative to depth."""
 NEGLIGIBLE = 5e-4
-"""Relative deviation of depth below which a mode is no concern."""
+"""Deviation of depth, relative, below which a mode may change freely."""
 LARGE_CHANGE = 0.25
-"""Relative change of depth that is not accepted unasked."""
+"""Change of depth, relative, that is not accepted unless forced."""
 SMALL_CHANGE = 0.03
-"""Relative change of depth of no concern, where lines come nearer and depth becomes more certain."""
+"""Change of depth, relative, that is accepted where lines come nearer and depth becomes more certain."""
 BEYOND = 1.5
-"""Points are outside the depth range by more than this factor."""
+"""Factor of depth beyond the rig's depth range at which a point counts as outside."""
 UNGAINED_CHANGE = 3.0
-"""A change of depth is of concern beyond this many times the deviation of it that it takes away."""
+"""Largest change of depth as a multiple of the deviation that it removes; a larger one is doubtful."""
 
 
 class DepthChange(NamedTuple):
-    """Relative change of the matched points' depth (median), and its deviations before and after (rms).
+    """Relative change of the matched points' depth, and its standard deviations.
 
-    The deviations are those that the stated deviations of the parameters imply; after, given the matched
-    points where these changed the rig. known: the deviation if the rig had followed the matched points in
-    everything.
+    The deviations follow from the stated prior deviations of the parameters.
+
+    Attributes:
+        change: median over the points of |depth after / depth before - 1|.
+        before: relative deviation of depth by the prior (root mean square over the points).
+        after: the same after the refinement, given the matched points where these changed the rig.
+        known: the deviation left if the rig had followed the matched points in every direction.
     """
 
     change: float
@@ -54,10 +58,11 @@ class DepthChange(NamedTuple):
 
     @property
     def doubtful(self) -> bool:
-        """Whether depth changes by less than some deviations of what the points determine, and considerably.
+        """True if depth changes considerably, but by less than `SIGNIFICANT_CHANGE` times `known`.
 
-        That is by more than a small share, or by far more than it gains in certainty: by a mode of depth that
-        was uncertain by so little beforehand, some other mistake of the rig (of a lens, say) is explained.
+        Considerably means by more than `SMALL_CHANGE`, or by more than `UNGAINED_CHANGE` times the deviation
+        that it removes: a mode that was hardly uncertain beforehand then explains another mistake of the rig,
+        such as one of a lens.
         """
         if self.change <= NEGLIGIBLE or self.change >= SIGNIFICANT_CHANGE * self.known:
             return False
@@ -65,7 +70,11 @@ class DepthChange(NamedTuple):
         return self.change > SMALL_CHANGE or self.change > UNGAINED_CHANGE * gained
 
     def objections(self) -> Iterator[str]:
-        """Why the rig's change should not be accepted."""
+        """Yield a sentence for each reason not to accept the rig's change.
+
+        Yields:
+            Text without a full stop; nothing where depth raises no objection.
+        """
         if self.after > self.before:
             yield "depth would be less certain than before"
         if self.doubtful:
@@ -84,9 +93,11 @@ class DepthChange(NamedTuple):
 
 
 def relative_change(original: Rig, refined: Rig, pairs: Pairs) -> float:
-    """The median of |depth after / depth before - 1| over points observable before; NaN for too few.
+    """Compute how much the depth of matched points differs between two rigs.
 
-    Points that have no depth afterwards (behind a camera, too far) count as 1.
+    Returns:
+        The median of |depth after / depth before - 1| over points observable in `original`; NaN for fewer
+        than `FEW`. Points without depth afterwards (behind a camera, too far) count as 1.
     """
     before, after = (observed_depths(rig, pairs) for rig in (original, refined))
     usable = (after / before - 1).abs()[~before.isnan()].nan_to_num(1.0)
@@ -94,16 +105,23 @@ def relative_change(original: Rig, refined: Rig, pairs: Pairs) -> float:
 
 
 def observed_depths(rig: Rig, pairs: Pairs) -> Float[Tensor, " n"]:
-    """Depths in alpha (metres) of all points of all pairs; NaN behind a camera and where unobservable."""
+    """Compute the depth in alpha of all points of all pairs.
+
+    Returns:
+        Depths in the rig's unit (metres), the pairs' points one after the other, detached; NaN for points
+        behind a camera, with too little parallax, or of uncalibrated pairs.
+    """
     depth, front, observable = match_depths(rig, pairs)
     return torch.where(front & observable, depth, torch.nan).detach()
 
 
 def share_outside(rig: Rig, pairs: Pairs) -> float:
-    """The share of points of observable depth that are behind the cameras or outside the rig's depth range.
+    """Compute the share of points behind the cameras or outside the rig's depth range.
 
-    Points of calibrated pairs only: 0 where there is no such pair, NaN for few points. The depth range, if
-    the rig has one, counts with a margin.
+    Only points of observable depth count. The depth range, if the rig has one, is widened by `BEYOND`.
+
+    Returns:
+        A share in 0..1; 0 without a calibrated pair, NaN for fewer than `FEW` such points.
     """
     depth, front, observable = match_depths(rig, pairs)
     if bool(depth.isnan().all()):
@@ -117,9 +135,14 @@ def share_outside(rig: Rig, pairs: Pairs) -> float:
 def log_depths(
     after: Callable[[Tensor], Rig], rigs: Sequence[Rig], pairs: Pairs
 ) -> Callable[[Tensor], list[Tensor]] | None:
-    """The logarithm of depth as a function of the parameters, of points observable in all these rigs.
+    """Build the function from parameters to the logarithm of the depth of the points observable in all these
+    rigs.
 
-    None for too few.
+    Args:
+        after: the rig after a change z of its parameters.
+
+    Returns:
+        A function of z with one tensor of logarithms, differentiable; None for fewer than `FEW` points.
     """
     observable = ~torch.stack([observed_depths(rig, pairs) for rig in rigs]).isnan().any(0)
     if int(observable.sum()) < FEW:
@@ -130,11 +153,15 @@ def log_depths(
 
 
 class DepthModes(NamedTuple):
-    """Modes of the points' depth: z is a sum of uncorrelated parts, each changing depth in its own pattern.
+    """Modes of the points' depth: uncorrelated parts of z, each of which changes depth in its own pattern.
 
-    root: columns, one a mode; z = root a. a: the modes' changes in posterior standard deviations.
-    deviation, prior: the relative deviation of depth by each mode (rms over the points), posterior and prior;
-    the posterior's is raised to that of a jackknife over parts of the image where that is larger.
+    Attributes:
+        root: columns, one a mode: z = root a.
+        a: changes of the modes, in posterior standard deviations.
+        deviation: posterior deviation of depth by each mode, relative (root mean square over the points),
+            raised to that of a jackknife over parts of the image where that is larger.
+        prior: prior deviation of depth by each mode, relative.
+        raised: factor, at least 1, by which the jackknife raised each mode's deviation.
     """
 
     root: Float[Tensor, "n n"]
@@ -145,18 +172,22 @@ class DepthModes(NamedTuple):
 
     @property
     def kept(self) -> Bool[Tensor, " n"]:
-        """Which modes may change."""
+        """Mask of the modes that may change.
+
+        Those are significant, well determined and better known than by the prior, or negligible in depth.
+        """
         significant = self.a.abs() > SIGNIFICANT_CHANGE * self.raised
         determined = (self.deviation < KNOWN_BETTER * self.prior) & (self.deviation < LARGEST_DEVIATION)
         return (significant & determined) | (self.deviation < NEGLIGIBLE)
 
     def gained(self, kept: Bool[Tensor, " n"]) -> float:
-        """The variance of depth that some modes lose, relative to depth squared (mean over the points)."""
+        """Compute the variance of depth that the `kept` modes lose, relative to depth squared (mean over the
+        points)."""
         return float((self.prior.square() - self.deviation.square())[kept].sum())
 
     @property
     def total(self) -> float:
-        """The posterior's relative deviation of depth by all modes: root mean square over the points."""
+        """Relative posterior deviation of depth by all modes: root mean square over the points."""
         return float(self.deviation.square().sum().sqrt())
 
 
@@ -166,9 +197,16 @@ def depth_modes(
     covariance: Float[Tensor, "n n"],
     left_out: Float[Tensor, "g n"],
 ) -> DepthModes:
-    """The modes, from derivatives G of the logarithm of depth by parameters whose prior covariance is 1.
+    """Split a change of parameters into the modes of depth.
 
-    `left_out`: the changes of z when a part of the points is left out.
+    Args:
+        G: derivatives of the logarithm of depth by parameters whose prior covariance is 1.
+        z: the change, in prior deviations.
+        covariance: posterior covariance of z; positive definite.
+        left_out: changes of z when one part of the points is left out, one row a part; may be empty.
+
+    Returns:
+        The modes, one per parameter.
     """
     lower = torch.linalg.cholesky(covariance)
     V = torch.linalg.eigh(lower.T @ G.T @ G @ lower).eigenvectors

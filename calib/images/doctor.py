@@ -51,46 +51,54 @@ from .residuals import image_parts, line_distances, related, within_lenses
 LOG = logging.getLogger(__name__)
 
 MOST = 250
-"""Largest number of matches used of a pair."""
+"""Largest number of matches used per pair."""
 HEALTHY_MISFIT = 0.2
-"""A rig with a smaller misfit than this, in pixels, is healthy."""
+"""Misfit in pixels below which a rig is healthy."""
 USUAL_MISFIT = 0.0015
-"""And so is one with a smaller misfit than this share of the image's longer side that no mistake explains."""
+"""Misfit, as a share of the image's longer side, below which a rig is healthy if no mistake explains it."""
 FOCAL_SHARES, FOCAL_SHARE = (0.3, 3.0), 1.2
-"""Focal lengths that are tried, as shares of the image's longer side; of equal ones that nearest to this."""
+"""Focal lengths that are tried (lowest and highest), and the one preferred among equal ones, all as shares of
+the image's longer side."""
 OF_SIZES = ("resized", "focal length")
-"""Mistakes that an image's size shows, though lines may not."""
+"""Kinds of mistakes that an image's size shows where lines may not."""
 EQUAL = (1.4, 0.03)
-"""Explanations are equal whose misfit is less than 1.4 times the best one's plus 0.03 px."""
+"""Explanations count as equal whose misfit is less than 1.4 times the best one's plus 0.03 px."""
 LARGEST_REMAINDER = (0.33, 0.2)
-"""A mistake is named if its rig leaves no more than the first share of the misfit: many wrong hypotheses
-improve a drifted rig somewhat. Nor is one as good as another that leaves less than the second share of what
-it leaves."""
+"""Largest share of the misfit that the rig of a named mistake may leave, as many wrong hypotheses improve a
+drifted rig somewhat; and the least share of another explanation's remainder that the best one may leave if
+both are to be compared."""
 MARGIN, TIE = 12.0, 2.0
-"""A mistake is named if -2 log evidence is smaller by this than that of a drift, and others are as good that
-have less than this more; of those within the second, the likely one is named."""
+"""Lead in -2 log evidence over a drift that a mistake needs to be named, within which others are as good; and
+the lead within which the likelier mistake is named."""
 MOST_COMPARED = 10
-"""Explanations whose evidence is computed: those that leave least."""
+"""Number of explanations whose evidence is computed: those with the least misfit."""
 EXPLAINED, ROUGHLY = (2 * HEALTHY_MISFIT, 0.06), 0.9
-"""A mistake explains the points if no more than so many pixels, or that share of the misfit, are left; pixels
-of those whose rig is approximate."""
+"""Largest misfit that a named mistake may leave: pixels, or a share of the misfit of the given rig; and the
+pixels for hypotheses whose rig is approximate."""
 SAME_DEPTH, SAME_DISTANCE = 1e-3, 1e-3
-"""Rigs are the same whose depths (relative) and distances from lines (pixels) differ by less, in median."""
+"""Differences below which two rigs are the same: of depths (relative), and of distances from lines (pixels),
+in the median."""
 BARREL, PINCUSHION = -0.6, 0.4
 """Bounds of k1 times the squared radius of the farthest corner, at z = 1."""
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """The result of a diagnosis.
+    """Result of a diagnosis.
 
-    named: the mistake, with the repaired rig; or that of kind "nothing": no mistake explains the images
-    clearly better than a drift of the cameras does. equal: other kinds of mistake that explain them as well.
-    before, after: statistics of the given rig and of the repaired one. tried: of all, best first. matches:
-    number of points used. healthy: the given rig fits the images. certain: all explanations that are
-    as good as the one named are undone by the same rig. depth: bounds of the points' depth, as of
-    `depth_seen`, by the rig named, if that states no depth range. beyond: points left out, where a lens model
-    of the given rig has ended.
+    Attributes:
+        named: the mistake with its repaired rig; of kind "nothing" if no mistake explains the images clearly
+            better than a drift of the cameras.
+        equal: other kinds of mistakes that explain the images as well.
+        before: statistics of the given rig.
+        after: statistics of the repaired rig.
+        tried: statistics of all hypotheses, best first.
+        matches: number of points used.
+        healthy: True if the given rig fits the images.
+        certain: True if all explanations as good as the named one lead to the same rig.
+        depth: near and far of the points by the named rig, as of `depth_seen`; None if that rig states a
+            depth range or too few points have depth.
+        beyond: number of points left out because a lens model of the given rig has ended there.
     """
 
     named: Hypothesis
@@ -106,7 +114,7 @@ class Diagnosis:
 
     @property
     def verdict(self) -> str:
-        """The diagnosis in a sentence or two."""
+        """The diagnosis in one or two sentences."""
         others = "; or: ".join(hypothesis.words for hypothesis in self.equal)
         if self.named.kind != "nothing":
             return f"likely mistake: {self.named.words}" + (f"; or: {others}" if others else "")
@@ -130,7 +138,7 @@ class Diagnosis:
         ) + (f". As plausible as a drift, but not more: {others}" if others else "")
 
     def as_text(self) -> str:
-        """The verdict, and the statistics before and after, as text."""
+        """Return the verdict and the statistics before and after as lines of text."""
         unit = length_unit(self.named.rig)
         lines = [self.verdict, f"as given: {self.before.as_text(unit)}"]
         if self.beyond:
@@ -150,7 +158,10 @@ class Diagnosis:
         return "\n".join(lines)
 
     def as_json(self) -> str:
-        """The same as JSON, with the ten best explanations."""
+        """Return the verdict, statistics and the ten best explanations as an indented JSON object.
+
+        NaN is written as null, numbers to four digits after the point.
+        """
         tried = [{"kind": h.kind, "words": h.words, **_rounded(f)} for h, f in self.tried.items()][:10]
         document = {
             "verdict": self.verdict,
@@ -174,12 +185,18 @@ def _rounded(fit: FitStatistics) -> dict[str, float | None]:
 
 @torch_in_one_thread()
 def diagnose(rig: Rig, images: Images, matches: Pairs | None = None) -> Diagnosis:
-    """Find the usual mistake, if any, in a rig, by one image (C, H, W) of two or more of its cameras.
+    """Find the usual mistake, if any, in a rig, by one image of each of two or more of its cameras.
 
-    `matches` are taken in place of those that would be found.
+    Args:
+        images: one image (C, H, W) in 0..1 per camera, by name; any size.
+        matches: matched points used instead of matching the images.
 
-    Raises ValueError, one line, for a camera that the rig lacks, fewer than two images, equal ones, and
-    images in which too few points match; and for a rig that does not relate its cameras.
+    Returns:
+        The mistake with its repaired rig, and what else was compared.
+
+    Raises:
+        ValueError: in one line, for a camera that the rig lacks, fewer than two images, two equal images, too
+            few matching points, or a rig that does not relate its cameras.
     """
     for name in images:
         rig.require(name)
@@ -188,7 +205,14 @@ def diagnose(rig: Rig, images: Images, matches: Pairs | None = None) -> Diagnosi
 
 
 def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnosis:
-    """`diagnose` from matched points of images of these sizes."""
+    """Find the usual mistake, if any, in a rig, by points matched between images of these sizes.
+
+    Returns:
+        As of `diagnose`.
+
+    Raises:
+        ValueError: for a rig that relates none of the pairs.
+    """
     pairs = {names: _thinned(matches) for names, matches in related(rig, pairs).items()}
     fits = all(rig[name].hw == hw for name, hw in sizes.items())
     found = sum(len(matches.alpha) for matches in pairs.values())
@@ -244,12 +268,19 @@ def _by_evidence(
     *,
     mirrored: bool,
 ) -> tuple[Hypothesis, list[Hypothesis]]:
-    """The mistake that explains the points clearly better than a drift of the rig does, or the rig as given.
+    """Choose the mistake that explains the points clearly better than a drift of the rig, or the rig as
+    given.
 
-    And all that are as good as it, or as the drift, best first. Points of one object, or wrong ones in one
-    place, do not decide: it is better without each part of them in turn. No drift mirrors an image; one of
-    the principal point does what a small shift of pixels does. `misfit` has likely ones first, `table` those
-    that leave least.
+    Points of one object, or wrong ones in one place, do not decide: the choice must hold without each part of
+    them in turn. No drift mirrors an image; a drift of the principal point does what a small shift of pixels
+    does.
+
+    Args:
+        misfit: pixels of each hypothesis, likely ones first.
+        table: the hypotheses, those with the least misfit first.
+
+    Returns:
+        The chosen hypothesis, and all that are as good as it, or as the drift, best first.
     """
     given = next(iter(misfit))
     limit = LARGEST_REMAINDER[0] * misfit[given]
@@ -258,7 +289,7 @@ def _by_evidence(
         return given, []
     limit = misfit[some[0]] / LARGEST_REMAINDER[1] + EQUAL[1]
     evidence_for = {
-        h: DriftEvidence.of(h.rig, pairs, inliers, noise)
+        h: DriftEvidence.from_points(h.rig, pairs, inliers, noise)
         for h in (given, *some)
         if misfit[h] <= limit or h is given
     }
@@ -282,7 +313,8 @@ def _by_evidence(
 
 
 def _same_rig(rig: Rig, other: Rig, pairs: Pairs) -> bool:
-    """Whether no point tells two rigs apart: by its depth or, if they are not calibrated, by its line."""
+    """Return True if no point distinguishes two rigs: by its depth or, if they are not calibrated, by its
+    line."""
     change = relative_change(rig, other, pairs)
     if not math.isnan(change):
         return change < SAME_DEPTH
@@ -291,13 +323,17 @@ def _same_rig(rig: Rig, other: Rig, pairs: Pairs) -> bool:
 
 
 def _thinned(matches: PointMatches) -> PointMatches:
-    """At most `MOST` of them, evenly through the list."""
+    """Select at most `MOST` matches, evenly through the list."""
     step = max(1, -(-len(matches.alpha) // MOST))
     return PointMatches(matches.alpha[::step], matches.beta[::step])
 
 
 def _ignored_lens(rig: Rig, pairs: Pairs) -> list[Hypothesis]:
-    """The distortion that best explains the points, for cameras that have none."""
+    """Search for the distortion that best explains the points, for cameras that have none.
+
+    Returns:
+        One hypothesis, or none if every camera has a distortion.
+    """
     bare = [name for name in cameras_of(rig, pairs) if isinstance(rig[name], Camera)]
     bare = [name for name in bare if rig[name].distortion is None]
     if not bare:
@@ -316,7 +352,10 @@ def _ignored_lens(rig: Rig, pairs: Pairs) -> list[Hypothesis]:
 
 
 def _far_from_range(hypothesis: Hypothesis, depth: float) -> float:
-    """By what factor, as a logarithm, the points' median depth is from the middle of the depth range."""
+    """Return the absolute log ratio of the points' median depth to the middle of the depth range.
+
+    0 where the rig states no range or one that begins at 0, or the depth is unknown.
+    """
     if hypothesis.rig.depth is None or not (depth > 0 and float(hypothesis.rig.depth[0]) > 0):
         return 0.0
     near, far = (float(bound) for bound in hypothesis.rig.depth)
@@ -324,7 +363,8 @@ def _far_from_range(hypothesis: Hypothesis, depth: float) -> float:
 
 
 def _zoomed(rig: Rig, pairs: Pairs) -> list[Hypothesis]:
-    """The focal lengths that fit best: of one camera, or of all that cannot be in pixels."""
+    """Search for the focal lengths that fit best: of one camera, or of all whose focal length is too short
+    for pixels."""
     names = [name for name in cameras_of(rig, pairs) if isinstance(rig[name], Camera)]
     short = [name for name in names if is_short(rig[name])]
     found = []
@@ -345,9 +385,11 @@ def _zoomed(rig: Rig, pairs: Pairs) -> list[Hypothesis]:
 
 
 def _degrees(rig: Rig, pairs: Pairs) -> list[Hypothesis]:
-    """Rotation vectors in degrees, taken for radians, with the lost whole turns that suit points best.
+    """Search for rotation vectors in degrees that were taken for radians, with the lost whole turns that fit
+    best.
 
-    Not where a drift may be what turned the cameras.
+    Returns:
+        One hypothesis; none where a drift may have turned the cameras as far, or cameras are not calibrated.
     """
     first, *others = dict.fromkeys(name for names in pairs for name in names)
     if any((first, other) not in pairs or not rig.pair(first, other).calibrated for other in others):
@@ -366,7 +408,8 @@ def _degrees(rig: Rig, pairs: Pairs) -> list[Hypothesis]:
 
 
 def _off_planes(rig: Rig, names: tuple[str, str], matches: PointMatches) -> Float[Tensor, "k k"]:
-    """Sines of the rays of beta with their epipolar planes, medians, by the turns of alpha and of beta."""
+    """Compute sines of beta's rays with their epipolar planes, medians, for the turns of alpha (rows) and of
+    beta."""
     alpha, beta = rig.pair(*names).cameras
     rays = [normalize(camera.rays(points)[0], dim=-1) for camera, points in zip((alpha, beta), matches)]
     of_alpha, of_beta = (from_degrees(camera.R, torch.tensor(TURNS)) for camera in (alpha, beta))
@@ -378,7 +421,7 @@ def _off_planes(rig: Rig, names: tuple[str, str], matches: PointMatches) -> Floa
 
 
 def _depth_range(rig: Rig, pairs: Pairs) -> list[Hypothesis]:
-    """The depth range of the points, for a rig that has another."""
+    """Return the hypothesis that the rig's depth range is wrong, with the points' range instead."""
     if rig.depth is None or (bounds := depth_seen(rig, pairs)) is None:
         return []
     (near, far), unit = bounds, length_unit(rig)

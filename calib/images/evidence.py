@@ -1,8 +1,8 @@
-"""How well matched points support a hypothesis, by their distances and depths, and better than mere drift.
+"""Support of matched points for a hypothesis, by their distances and depths, and beyond that of mere drift.
 
 Against drift the residuals are normal with the noise of the points, plus a drift of the cameras whose prior
 deviations are those of `parameters.SIGMA` times a scale, plus what lens models leave (`systematic_modes`); to
-first order in the drift. A mistake that a drift explains as well is not a mistake that can be named.
+first order in the drift. A mistake that a drift explains as well is not named.
 """
 
 from __future__ import annotations
@@ -49,25 +49,27 @@ WRONG_SIDE_PENALTY = 100.0
 SCALES = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 4.0)
 """Drifts tried, in units of the prior deviations."""
 RARE = 6.0
-"""Larger drifts are rarer: -2 log probability of a scale s is this many times log(1 + s^2)."""
+"""Factor of log(1 + s^2) in -2 log probability of a drift of scale s: larger drifts are rarer."""
 STEPS = 4
 """Steps of Gauss and Newton to the most probable drift."""
 NO_BETTER = 0.1
-"""... which end once the evidence improves by less."""
+"""Improvement of the evidence below which these steps end."""
 CLIPPED = 30.0
-"""Residuals count as at most so many pixels."""
+"""Largest residual that counts, pixels."""
 
 
 class FitStatistics(NamedTuple):
     """Statistics of matched points under a rig.
 
-    off: median distance in pixels of a point from its epipolar line.
-    misfit: the part of it (root mean square, pixels) that is due to the rig and not to the matches' noise.
-    front: share of the points in front of both cameras, of those whose depth is observable.
-    inside: share of those in front that lie in the rig's depth range; NaN without one.
-    handed: share of the triangles of neighbouring points whose orientation changes between the images, or
-    not, as the rig implies: mirrored images change it.
-    depth: median depth, in the rig's unit, of the points in front; NaN if too few.
+    Attributes:
+        off: median distance of a point from its epipolar line, pixels of beta.
+        misfit: the part of it (root mean square, pixels) due to the rig and not to the matches' noise.
+        front: share of the points in front of both cameras, of those whose depth is observable; NaN for few.
+        inside: share of those in front that lie in the rig's depth range, widened by 2; NaN without a range
+            or for few points.
+        handed: share of the triangles of neighbouring points whose orientation changes between the images, or
+            not, as the rig implies: mirrored images change it.
+        depth: median depth, in the rig's unit, of the points in front; NaN for few.
     """
 
     off: float
@@ -79,12 +81,13 @@ class FitStatistics(NamedTuple):
 
     @property
     def penalised_misfit(self) -> float:
-        """The misfit plus penalties, pixels."""
+        """Misfit in pixels plus `WRONG_SIDE_PENALTY` for each of front, inside and handed that is below a
+        half."""
         wrong = (self.front < 0.5) + (self.inside < 0.5) + (self.handed < 0.5)
         return self.misfit + WRONG_SIDE_PENALTY * wrong
 
     def as_text(self, unit: str = "m") -> str:
-        """The statistics in words, depth in the unit of the rig's lengths."""
+        """Return the statistics in words, with depth in the unit of the rig's lengths."""
         parts = [f"{self.off:.2f} px from the lines, {self.misfit:.2f} px of it due to the rig"]
         if not math.isnan(self.front):
             parts.append(f"{self.front:.0%} in front")
@@ -100,9 +103,11 @@ class FitStatistics(NamedTuple):
 def fit_statistics(
     tried: Sequence[Hypothesis], pairs: Pairs
 ) -> tuple[dict[Hypothesis, FitStatistics], Bool[Tensor, " n"], float]:
-    """The statistics of every hypothesis, from the same points: the inliers of the best of them.
+    """Compute the statistics of every hypothesis from the same points: the inliers of the best of them.
 
-    Those inliers, and the standard deviation of their distances too.
+    Returns:
+        Statistics by hypothesis; a mask of the inliers among all points of all pairs; and the standard
+        deviation of their distances, pixels, at least `LEAST_NOISE`.
     """
     observed = observations([hypothesis.rig for hypothesis in tried], pairs)
     inliers, floor = _inliers(tried, observed.off, pairs)
@@ -127,9 +132,12 @@ def fit_statistics(
 
 
 class PointObservations(NamedTuple):
-    """All points of all pairs (n) under several rigs (k): signed pixels from the line, depth, in front.
+    """All points of all pairs (n) under several rigs (k).
 
-    Unobservable depths are NaN.
+    Attributes:
+        off: signed distance from the epipolar line, pixels of beta, within +-`LARGEST_DISTANCE`.
+        depth: depth in alpha, in the rig's unit; NaN where unobservable.
+        front: mask of the points in front of both cameras.
     """
 
     off: Float[Tensor, "k n"]
@@ -138,13 +146,17 @@ class PointObservations(NamedTuple):
 
 
 def observations(rigs: Sequence[Rig], pairs: Pairs) -> PointObservations:
-    """One pair of cameras after the other, under all rigs, batched by lens model."""
+    """Observe all points of all pairs under each rig, batched by lens model.
+
+    Args:
+        rigs: rigs with the same cameras.
+    """
     parts = [_observations([rig.pair(*names) for rig in rigs], matches) for names, matches in pairs.items()]
     return PointObservations(*(torch.cat(tensors, 1) for tensors in zip(*parts)))
 
 
 def _observations(pairs: Sequence[Pair], matches: PointMatches) -> PointObservations:
-    """Of hypothetical pairs: how far matches are off their lines, their depths, and whether in front."""
+    """Observe one pair's matches under each of several hypothetical pairs."""
     off, depth = torch.zeros(2, len(pairs), len(matches.alpha), dtype=torch.float64)
     front = torch.zeros(off.shape, dtype=torch.bool)
     groups: dict[object, list[int]] = {}
@@ -161,9 +173,12 @@ def _observations(pairs: Sequence[Pair], matches: PointMatches) -> PointObservat
 
 
 def _inliers(tried: Sequence[Hypothesis], off: Tensor, pairs: Pairs) -> tuple[Tensor, float]:
-    """The points consistent with some pose of the cameras, their mean square distance then, square pixels.
+    """Select the points consistent with some pose of the cameras.
 
     The pose is free, so only the lens matters: the best explanation that changes it is used.
+
+    Returns:
+        A mask of the points, and their mean square distance then, square pixels.
     """
     lengths = [len(matches.alpha) for matches in pairs.values()]
     fits = []
@@ -177,7 +192,7 @@ def _inliers(tried: Sequence[Hypothesis], off: Tensor, pairs: Pairs) -> tuple[Te
 
 
 def _beyond_pose(pair: Pair, matches: PointMatches, off: Tensor) -> Tensor:
-    """The residual of the distances after a robust first-order fit of F."""
+    """Return the residual of the distances after a robust first-order fit of F."""
     terms = lines_basis(pair, matches).T
 
     def weigh(rest: Tensor) -> Tensor:
@@ -188,7 +203,10 @@ def _beyond_pose(pair: Pair, matches: PointMatches, off: Tensor) -> Tensor:
 
 
 def _handedness(matches: PointMatches) -> float:
-    """The share of Delaunay triangles of the points in alpha that keep their orientation in beta."""
+    """Return the share of Delaunay triangles of the points in alpha that keep their orientation in beta.
+
+    1 for points that have no triangulation.
+    """
     try:
         corners = torch.from_numpy(Delaunay(matches.alpha.numpy()).simplices).long()
     except QhullError:
@@ -198,7 +216,7 @@ def _handedness(matches: PointMatches) -> float:
 
 
 def _mirrors(rig: Rig, names: tuple[str, str]) -> bool:
-    """Whether exactly one of two cameras is that of a mirrored image."""
+    """Return True if exactly one of two cameras is that of a mirrored image."""
     views = [rig[name] for name in names]
     return sum(isinstance(v, LensView) and bool(v.K[:2, :2].det() < 0) for v in views) == 1
 
@@ -207,11 +225,17 @@ def _mirrors(rig: Rig, names: tuple[str, str]) -> bool:
 class DriftEvidence:
     """A rig with the drift that fits matched points best.
 
-    cost: -2 log evidence of the rig and that drift by the points used. Smaller is better; differences count.
-    distances: of all points by a drift, in standard deviations of their noise. z: the drift. r, J, B: the
-    distances, were there no drift, and their derivatives by the drift and by what lens models leave; linear
-    about z. scale: of the drift. fixed: the part of the cost that does not depend on the distances. clipped:
-    the largest distance that counts.
+    Attributes:
+        cost: -2 log evidence of the rig and that drift by the points used; smaller is better, and only
+            differences count.
+        distances: function from a drift to all points' distances, in standard deviations of their noise.
+        z: the drift, in prior deviations.
+        r: distances without drift, by the linear model about z.
+        J: derivatives of the distances by the drift.
+        B: derivatives of the distances by what lens models leave.
+        scale: scale of the drift's prior deviations.
+        fixed: part of the cost that does not depend on the distances.
+        clipped: largest distance that counts.
     """
 
     cost: float
@@ -225,8 +249,12 @@ class DriftEvidence:
     clipped: float
 
     @classmethod
-    def of(cls, rig: Rig, pairs: Pairs, used: Bool[Tensor, " n"], noise: float) -> DriftEvidence:
-        """By those of the points that are used; `noise`: standard deviation of their distances, pixels."""
+    def from_points(cls, rig: Rig, pairs: Pairs, used: Bool[Tensor, " n"], noise: float) -> DriftEvidence:
+        """Fit the drift of a rig to those of the points that are `used`.
+
+        Args:
+            noise: standard deviation of the points' distances, pixels.
+        """
         parameters = free_parameters(rig, cameras_of(rig, pairs), free=UNCERTAIN)
 
         def distances(z: Tensor) -> list[Tensor]:
@@ -254,14 +282,16 @@ class DriftEvidence:
         return evidence
 
     def by(self, used: Bool[Tensor, " n"]) -> float:
-        """The cost by other points, of this drift or of the best by them to first order: the better."""
+        """Return the cost by other points, of this drift or of the best by them to first order: the lower
+        one."""
         return min(self._at(z, used) for z in (self.z, self._refitted(used)))
 
     def _refitted(self, used: Bool[Tensor, " n"]) -> Tensor:
         return _drift(self.r[used], self.J[used], self.B[used], self.scale)[2]
 
     def _at(self, z: Tensor, used: Bool[Tensor, " n"]) -> float:
-        """The cost of a drift by the points' distances as they are then; infinite where there are none."""
+        """Return the cost of a drift by the points' distances as they are then; infinite where there are
+        none."""
         r, J, B = Evaluated.at(z, self.distances).values[used], self.J[used], self.B[used]
         left = _drift(r.clamp(-self.clipped, self.clipped), J[:, :0], B, self.scale)[0]
         volume = _drift(r, J, B, self.scale)[1]
@@ -270,9 +300,11 @@ class DriftEvidence:
 
 
 def _drift(r: Tensor, J: Tensor, B: Tensor, scale: float) -> tuple[float, float, Tensor]:
-    """-2 log evidence by residuals r + J z + B b with z normal, of deviation `scale`, and b; most probable z.
+    """Compute -2 log evidence by residuals r + J z + B b with z normal, of deviation `scale`, and b; and the
+    best z.
 
-    The evidence comes in two parts: by what is left of the residuals, and the log determinant.
+    Returns:
+        The part of the evidence left in the residuals, the log determinant, and the most probable z.
     """
     columns = torch.cat([scale * J, B], 1)
     information = columns.T @ columns + torch.eye(columns.shape[1], dtype=r.dtype)
@@ -282,7 +314,11 @@ def _drift(r: Tensor, J: Tensor, B: Tensor, scale: float) -> tuple[float, float,
 
 
 def _rotation_to_plausible_depth(rig: Rig, pairs: Pairs) -> float:
-    """The rotation, in prior deviations, that brings half the points in front and into the depth range."""
+    """Return the rotation, in prior deviations, that brings half the points in front and into the depth
+    range.
+
+    0 without pairs that are related by poses.
+    """
     near, far = (0.0, math.inf) if rig.depth is None else (float(bound) for bound in rig.depth)
     rotations = []
     for names, matches in pairs.items():

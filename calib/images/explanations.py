@@ -1,11 +1,11 @@
 """Explanations of the points matched between two images, and what these leave undetermined.
 
-Points that one homography explains, and lenses, which bend images smoothly, fit an F through any epipole:
-those on one plane, those of cameras at one place, however unlike their focal lengths, and those of a scene
-far away (Hartley and Zisserman, section 11.9; Chum, Werner and Matas 2005). Their lines and depth would be an
-arbitrary choice. Where points do move along lines beyond any homography, lines are determined, but lengths
-only as multiples of the baseline, and without focal lengths not the proportions of depth either: the
-bas-relief ambiguity (Belhumeur, Kriegman and Yuille 1999).
+Points that one homography and smooth lenses explain fit an F through any epipole: those on one plane, those
+of cameras at one place, however different their focal lengths, and those of a scene far away (Hartley and
+Zisserman, section 11.9; Chum, Werner and Matas 2005). Their lines and depth would be an arbitrary choice.
+Where points do move along lines beyond any homography, lines are determined, but lengths only as multiples of
+the baseline, and without focal lengths not the proportions of depth either: the bas-relief ambiguity
+(Belhumeur, Kriegman and Yuille 1999).
 """
 
 from __future__ import annotations
@@ -25,17 +25,20 @@ from .matches import LOCALISED, PointMatches
 from .residuals import FEW, displacements
 
 OFF = 4.0
-"""Points are off an explanation by more than this many standard deviations of the points' noise."""
+"""Distance, in standard deviations of the points' noise, beyond which a point is off an explanation."""
 STEPS = 20
 """Weightings of the fit of a homography and lenses."""
 
 
 class Explanation(NamedTuple):
-    """The simplest explanation of a pair's points within their noise, and its evidence.
+    """The simplest explanation of a pair's points within their noise, with its evidence.
 
-    H: the homography nearest to most points. points: their number. beyond, wrong: how many are off H and
-    smooth lenses along the lines of F, and how many off these lines. noise: standard deviation of the
-    distances from the lines, pixels of beta.
+    Attributes:
+        H: homography nearest to most points, beta from alpha.
+        points: number of the points.
+        beyond: number of points off H and smooth lenses, along the lines of F.
+        wrong: number of points off these lines.
+        noise: standard deviation of the distances from the lines, pixels of beta.
     """
 
     H: Float[Tensor, "3 3"]
@@ -46,11 +49,15 @@ class Explanation(NamedTuple):
 
     @property
     def has_lines(self) -> bool:
-        """Whether the points determine epipolar lines: many move along them, far more than lie off them."""
+        """True if the points determine epipolar lines: many move along them, far more than lie off them."""
         return self.beyond >= max(self.wrong + FEW, 2 * self.wrong)
 
     def as_text(self, *, focal_lengths: bool = False) -> str:
-        """The explanation that is taken and what it leaves open; with or without known focal lengths."""
+        """Return the explanation taken and what it leaves undetermined, in words.
+
+        Args:
+            focal_lengths: True if focal lengths are known, which fixes the proportions of depth.
+        """
         if not self.has_lines:
             return (
                 f"one homography explains {self.points - self.beyond} of {self.points} points to "
@@ -65,10 +72,19 @@ class Explanation(NamedTuple):
 
 
 def explain(matches: PointMatches, pair: Pair) -> Explanation:
-    """Compare one homography with the pair's F, which fits as well, by undistorted points.
+    """Compare one homography with the pair's F as explanations of undistorted points.
 
-    Counted are points that are off the homography along the lines of F, against those off the lines: noise
-    and wrong matches put as many there.
+    Points off the homography along the lines of F are counted against those off the lines, where noise and
+    wrong matches put as many.
+
+    Args:
+        matches: undistorted points, of which F fits most.
+
+    Returns:
+        The explanation; H is the identity if no homography fits.
+
+    Raises:
+        ValueError: for a pair without F or cameras.
     """
     x, y = (points.double() for points in matches)
     H = _fit_to_most(x, y)
@@ -91,7 +107,8 @@ def _fit_to_most(x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"]) -> Float[Tens
 
 
 def _beyond(H: Tensor, x: Tensor, y: Tensor, pair: Pair) -> Float[Tensor, "n 2"]:
-    """Displacements of beta's points that no homography near H and no smooth lenses of the views explain."""
+    """Compute displacements of beta's points that no homography near H and no smooth lenses of the views
+    explain."""
     moved = to_homogeneous(x) @ H.T
     there, w = moved[:, :2] / moved[:, 2:], moved[:, 2:, None]
     J = (H[:2, :2] - there[:, :, None] * H[2:, :2]) / w

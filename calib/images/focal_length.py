@@ -1,10 +1,10 @@
 """A common focal length of two cameras of one kind, from matched points alone, where these determine it.
 
 F has seven degrees of freedom and a pose five, so that two views determine a focal length unless their axes
-are nearly parallel or meet at equal distances (Hartley and Zisserman, section 19.3.1). What else is unknown
-of the cameras takes its share of the residuals: principal points, a radial term, what it leaves of the
-lenses, and how unlike both focal lengths are. Parameters are in units of their prior standard deviations, as
-in `least_squares`.
+are nearly parallel or meet at equal distances (Hartley and Zisserman, section 19.3.1). The unknown rest of
+the cameras takes its share of the residuals: principal points, a radial term, what it leaves of the lenses,
+and the ratio of the focal lengths. Parameters are in units of their prior standard deviations, as in
+`least_squares`.
 """
 
 from __future__ import annotations
@@ -29,38 +29,50 @@ from .residuals import HELD_OUT, PARTS, displacements, held_out_parts, nearer, p
 from .self_calibration import FOCAL_SHARE, initial_poses
 
 SIGMA = {"focal": 0.5, "ratio": 0.01, "pose": 3.0, "centre": 0.03, "radial": 0.1, "systematic": 0.3}
-"""Prior standard deviations: of the focal length as a share of the one assumed (the log of), and of the ratio
-of both; radians, and of a baseline of 1; of principal points as a share of the longer side; of the radial
-term at half the longer side; of the smooth displacements that it leaves, pixels at the image's corner."""
+"""Prior standard deviations: of the logarithm of the focal length relative to the assumed one, and of the
+ratio of both; of the pose in radians, with a baseline of 1; of principal points as a share of the longer
+side; of the radial term at half the longer side; of the smooth displacements that it leaves, pixels at the
+image's corner."""
 SEARCHED = (0.5, 1.0, 2.0)
-"""Multiples of the assumed focal length from which the fit starts; from the two best poses at each."""
+"""Multiples of the assumed focal length from which the fit starts, each from its two best poses."""
 STEPS = 30
 POINTS = 500
-"""Points that are used: more hardly determine it better."""
+"""Number of points used at most: more hardly determine it better."""
 LARGEST_DEVIATION = 0.25
-"""A focal length is found if its relative standard deviation is no larger than this,"""
+"""Largest relative standard deviation of a focal length that is determined."""
 SIGNIFICANT = 3.0
-"""if it differs from the one assumed by this many, and if held-out points are nearer their lines with it."""
+"""Least difference from the assumed focal length, in standard deviations, of one that is determined; held-out
+points must also be nearer their lines with it."""
 BEHIND = 0.5
-"""Share of points that may lie behind a camera: of mirrored poses all do."""
+"""Largest share of points behind a camera: of mirrored poses all are."""
 
 
 @torch_in_one_thread()
 def common_focal_length(views: Mapping[str, View], link: Link, matches: PointMatches) -> FocalFit | None:
-    """The focal length that two cameras (alpha, beta) of one image size share, if the points determine it.
+    """Estimate the focal length that two cameras (alpha, beta) of one image size share, if the points
+    determine it.
 
-    Square pixels are taken for granted. None where the points do not tell it from the focal length that is
-    assumed, or not well, and for views of unlike sizes, a mirrored one, or points that no pose has in front
-    of both cameras.
+    Pixels are taken to be square.
+
+    Args:
+        views: the two views by name, alpha first; only their sizes are used.
+        link: F between the views, from which poses start.
+        matches: matched points, pixels.
+
+    Returns:
+        The fit; None where the points do not distinguish it from the assumed focal length, or not well, and
+        for views of different sizes, a mirrored one, or points that no pose has in front of both cameras.
     """
     fit = fit_focal_length(views, link, matches)
     return fit if fit is not None and fit.found else None
 
 
 def fit_focal_length(views: Mapping[str, View], link: Link, matches: PointMatches) -> FocalFit | None:
-    """The most probable of the fits from several focal lengths and poses, whether or not points determine it.
+    """Fit a common focal length from several starts, whether or not the points determine it.
 
-    None for views of unlike sizes, a mirrored one, or points that no pose has in front of both cameras.
+    Returns:
+        The most probable fit; None for views of different sizes, a mirrored one, or points that no pose has
+        in front of both cameras.
     """
     hw, hw_beta = (view.hw for view in views.values())
     if hw != hw_beta or _is_mirrored(matches):
@@ -85,7 +97,7 @@ def fit_focal_length(views: Mapping[str, View], link: Link, matches: PointMatche
 
 
 def _is_mirrored(matches: PointMatches) -> bool:
-    """Whether beta's points are best fitted by a map that mirrors: no pose has such lines."""
+    """Return True if beta's points are best fitted by an affine map that mirrors: no pose has such lines."""
     x = torch.cat([matches.alpha, torch.ones_like(matches.alpha[:, :1])], -1)
     return float(torch.linalg.det(torch.linalg.lstsq(x, matches.beta).solution[:2])) <= 0
 
@@ -94,8 +106,14 @@ def _is_mirrored(matches: PointMatches) -> bool:
 class TwoViews:
     """Two cameras of one size, a pose of beta from which changes count, and the points.
 
-    z: change of the log focal length, of the ratio's, rotation (3), baseline's direction (2), principal
-    points (4), radial terms (their mean, half their difference), displacements (8).
+    A change z has the log focal length, the log ratio, rotation (3), direction of the baseline (2), principal
+    points (4), radial terms (their mean and half their difference) and displacements (8), all in prior
+    deviations.
+
+    Attributes:
+        hw: height and width of both images, pixels.
+        pose: beta from alpha, with a baseline of 1.
+        points: matched points, pixels.
     """
 
     hw: HW
@@ -104,7 +122,7 @@ class TwoViews:
 
     @cached_property
     def sigma(self) -> Float[Tensor, " k"]:
-        """Of each component."""
+        """Prior standard deviation of each component of z."""
         centre, pose = SIGMA["centre"] * max(self.hw), SIGMA["pose"]
         parts = [SIGMA["focal"], SIGMA["ratio"], *[pose] * 5, *[centre] * 4, SIGMA["radial"]]
         left = [SIGMA["systematic"] / math.hypot(*self.hw) * 2, *[SIGMA["systematic"]] * 8]
@@ -112,37 +130,37 @@ class TwoViews:
 
     @cached_property
     def basis(self) -> Float[Tensor, "3 3"]:
-        """Columns: two directions across the baseline, and its own."""
+        """Matrix whose columns are two directions across the baseline, and the baseline's own."""
         across = torch.linalg.svd(self.pose.t[None]).Vh[1:]
         return torch.cat([across, self.pose.t[None]]).T
 
     @cached_property
     def centred(self) -> list[Tensor]:
-        """Points about the images' centres."""
+        """Points of alpha and of beta relative to the images' centres, pixels."""
         h, w = self.hw
         return [x - x.new_tensor([(w - 1) / 2, (h - 1) / 2]) for x in self.points]
 
     @cached_property
     def smooth(self) -> list[Tensor]:
-        """Smooth displacements of the points, (n, 2, 4)."""
+        """Smooth displacements of the points of alpha and of beta, (n, 2, 4), pixels."""
         return [displacements(self.hw, x) for x in self.points]
 
     def length(self, z: Tensor) -> Tensor:
-        """Of alpha, pixels."""
+        """Compute alpha's focal length after a change, pixels."""
         return FOCAL_SHARE * max(self.hw) * (self.sigma[0] * z[0]).exp()
 
     def moved(self, z: Tensor) -> Pose:
-        """The pose after a change, its baseline of length 1."""
+        """Compute the pose after a change, with a baseline of length 1."""
         change = self.sigma * z
         t = self.basis @ torch.cat([change[5:7], torch.ones_like(change[:1])])
         return Pose(rotation_from_vector(change[2:5]) @ self.pose.R, t / t.norm())
 
     def residuals(self, z: Float[Tensor, " k"]) -> list[Tensor]:
-        """The distances, in one part."""
+        """Return the distances as a list of one part, as `least_squares` takes them."""
         return [self.distances(z)]
 
     def distances(self, z: Float[Tensor, " k"]) -> Float[Tensor, " n"]:
-        """Sampson distances of the points after a change, pixels."""
+        """Compute the Sampson distances of the points after a change, pixels."""
         change, pose = self.sigma * z, self.moved(z)
         f = self.length(z)
         rays = []
@@ -160,11 +178,15 @@ class TwoViews:
         return (b * line).sum(-1) / torch.cat(slopes, -1).square().sum(-1).clamp(min=1e-24).sqrt()
 
     def fitted(self, z: Tensor, *, fixed: int = 0) -> Tensor:
-        """The most probable change, from z on; the first `fixed` components stay."""
+        """Compute the most probable change, starting at z.
+
+        Args:
+            fixed: number of leading components that keep their values.
+        """
         return most_probable(self.residuals, z, torch.eye(len(z), dtype=z.dtype)[:, fixed:], steps=STEPS)
 
     def is_ahead(self, z: Tensor) -> bool:
-        """Whether no more of the points are behind a camera than `BEHIND`."""
+        """Return True unless more than `BEHIND` of the points lie behind a camera."""
         alpha = Camera(
             hw=self.hw, K=intrinsics(float(self.length(z)), self.hw), cam_from_world=Pose.identity()
         )
@@ -174,24 +196,30 @@ class TwoViews:
 
 @dataclass(frozen=True)
 class FocalFit:
-    """The most probable change z of two views, and what it says of their focal length."""
+    """The most probable change of two views, and the focal length that it implies.
+
+    Attributes:
+        views: the two views.
+        z: the change, in prior deviations.
+    """
 
     views: TwoViews
     z: Float[Tensor, " k"]
 
     @property
     def length(self) -> float:
-        """Pixels."""
+        """Focal length of alpha, pixels."""
         return float(self.views.length(self.z))
 
     @property
     def change(self) -> float:
-        """Of the logarithm, from the one that is assumed."""
+        """Logarithm of the focal length relative to the assumed one."""
         return float(self.views.sigma[0] * self.z[0])
 
     @cached_property
     def deviation(self) -> float:
-        """Relative, of the focal length: by the points' noise, or a jackknife over parts of the image."""
+        """Relative standard deviation of the focal length: by the points' noise or, if larger, a jackknife
+        over parts of the image."""
         residuals, z = self.views.residuals, self.z
         covariance = posterior_covariance(residuals, z)
         shifts = shifts_left_out(residuals, z, parts_of(self.views.hw, self.views.points.alpha))[:, 0]
@@ -199,7 +227,8 @@ class FocalFit:
         return float(self.views.sigma[0] * torch.maximum(covariance[0, 0], jackknife).sqrt())
 
     def is_nearer(self) -> bool:
-        """Whether points are nearer to lines than by the focal length assumed, in fits that held them out."""
+        """Return True if held-out points are significantly nearer their lines than with the assumed focal
+        length."""
         points, fold = self.views.points, held_out_parts(self.views.points)
         distances = torch.zeros(2, len(fold), dtype=torch.float64)
         for held_out in range(HELD_OUT):
@@ -212,6 +241,6 @@ class FocalFit:
 
     @property
     def found(self) -> bool:
-        """Whether the points tell it from the focal length that is assumed, and determine it well."""
+        """True if the points distinguish the focal length from the assumed one and determine it well."""
         well = self.deviation <= LARGEST_DEVIATION and abs(self.change) >= SIGNIFICANT * self.deviation
         return well and self.is_nearer()

@@ -40,11 +40,15 @@ from .residuals import median_off, split
 
 
 class UncalibratedRig(NamedTuple):
-    """An uncalibrated rig, with statistics of each of its links.
+    """An uncalibrated rig, with statistics of each of its links by the names (alpha, beta).
 
-    fits: with the points that agree, and how far they are from the rough map. distance: median distance of
-    held-out points from their lines, pixels of beta. by_focal: whether focal lengths were used. explained:
-    what the points determine. matches: all points.
+    Attributes:
+        rig: views related by links; named `OPEN` if the points of some link leave its lines undetermined.
+        fits: links with the points that agree, and the points' distance from the rough map.
+        distance: median distance of held-out points from their lines, pixels of beta.
+        by_focal: True where the given focal lengths were used.
+        explained: what the points determine.
+        matches: all consistent matches.
     """
 
     rig: Rig
@@ -55,12 +59,17 @@ class UncalibratedRig(NamedTuple):
     matches: dict[tuple[str, str], PointMatches]
 
     def as_text(self) -> str:
-        """One line per link, and one on lenses if there are any."""
+        """Return one line per link, and one on lenses if there are any."""
         lines = [f"{a} > {b}: {self.describe(a, b)}" for a, b in self.fits]
         return "\n".join([*lines, *filter(None, [describe_lenses(self.rig)])])
 
     def describe(self, a: str, b: str) -> str:
-        """The explanation taken of a link's points and what it leaves open, and how well its lines fit."""
+        """Return a sentence on a link: its explanation, what that leaves undetermined, and how well its lines
+        fit.
+
+        Raises:
+            KeyError: for cameras without a link.
+        """
         explained = self.explained[a, b].as_text(focal_lengths=self.by_focal[a, b])
         if not self.explained[a, b].has_lines:
             return explained
@@ -80,15 +89,26 @@ def rig_from_images(
     alpha: str | None = None,
     matches: Pairs | None = None,
 ) -> UncalibratedRig:
-    """An uncalibrated rig of the cameras that took these images (C, H, W), good enough to fuse with.
+    """Make an uncalibrated rig of the cameras that took these images, good enough to fuse with.
 
-    F of every two cameras with a common field of view (of `alpha` and each other one, if it is given) by
-    MAGSAC++ (Barath et al. 2020), and a rough map. With rough focal lengths, in pixels, of both cameras an
-    essential matrix is fitted too, with five degrees of freedom instead of seven: it is used where it fits
-    held-out points better. All F are then fitted jointly, with lenses, and accepted on the same condition.
-    Points that one homography explains leave the lines open (`Explanation`): that homography is then the map.
-    `matches` of pairs of images are taken in place of those that would be found. Raises ValueError, one line:
-    as `match_cameras`, too few points, a focal length of no camera.
+    For every two cameras with a common field of view, F is fitted by MAGSAC++ (Barath et al. 2020) and a
+    rough map by the points. With the focal lengths of both an essential matrix is fitted too, with five
+    degrees of freedom instead of seven; it is used where it fits held-out points better. All F are then
+    fitted jointly, with lenses, and accepted on the same condition. Points that one homography explains leave
+    the lines undetermined (`Explanation`): that homography is then the map.
+
+    Args:
+        images: one image (C, H, W) in 0..1 per camera, by name.
+        focal: rough focal lengths in pixels by camera; None or missing ones are unknown.
+        alpha: match only this camera with each other one; None for every two cameras.
+        matches: points of pairs of images used instead of matching these.
+
+    Returns:
+        The rig with statistics of its links.
+
+    Raises:
+        ValueError: in one line, for images as of `match_cameras`, too few points, or a focal length that is
+            not positive or of no camera.
     """
     focal = dict(focal or {})
     for name, length in focal.items():
@@ -124,7 +144,14 @@ def rig_from_images(
 
 
 def link_of_points(rig: Rig, pair: tuple[str, str], points: PointMatches) -> Link:
-    """F and a map of a pair by its points: the homography that explains them all, if one does."""
+    """Fit F and a rough map of a pair to its points.
+
+    Returns:
+        The link; its map is the homography that explains all points, if one does.
+
+    Raises:
+        ValueError: for points that no F fits, or fewer than `ENOUGH` that agree with it.
+    """
     link = fit_link(points, fit_fundamental(points), within=AGREE).link
     explained = explain(points, rig.replace(links={pair: link}).pair(*pair))
     return link if explained.has_lines else link.replace(H=explained.H)
@@ -133,7 +160,11 @@ def link_of_points(rig: Rig, pair: tuple[str, str], points: PointMatches) -> Lin
 def _fundamental(
     matches: PointMatches, K: Tensor | None, K_beta: Tensor | None
 ) -> tuple[Tensor, float, bool]:
-    """F of all points; held-out points' median distance if fitted to the rest; whether by focal lengths."""
+    """Fit F to all points, by focal lengths if held-out points are nearer then.
+
+    Returns:
+        F, the median distance of held-out points if fitted to the rest, and True if focal lengths were used.
+    """
     (used,), (held_out,) = (list(pairs.values()) for pairs in split([{("", ""): matches}]))
     fits: dict[bool, Callable[[PointMatches], Tensor]] = {False: fit_fundamental}
     if K is not None and K_beta is not None:

@@ -1,8 +1,8 @@
-"""Matches between unlike bands where it is roughly known where a point is: patches whose structure agrees.
+"""Matches between different bands where each point's place is roughly known: patches with the same structure.
 
 Descriptors of features hardly match where leaves are dark in red and bright in near infrared. A patch's
 correlation, squared, does not depend on the sign of its contrast, and the search is confined to a window
-around what is expected.
+around the expected place.
 """
 
 from __future__ import annotations
@@ -19,15 +19,16 @@ from torch import Tensor
 from .matches import PointMatches, contrast_equalised
 
 POINTS = 1500
-"""Corners of alpha at most."""
+"""Largest number of corners of alpha."""
 SPACING = 8
-"""Their least distance, pixels."""
+"""Least distance of corners, pixels."""
 PATCH = 20
 """Pixels from a patch's middle to its edge."""
 ALIKE = 0.4
-"""The least squared correlation of patches that match."""
+"""Least squared correlation of patches that match."""
 DISTINCT = 0.9
-"""A second peak's squared correlation is at most this share of the first's, like Lowe's ratio test (2004)."""
+"""Largest squared correlation of a second peak, as a share of the first one's, like Lowe's ratio
+test (2004)."""
 PEAK = 3
 """Pixels around a peak that are part of it."""
 
@@ -40,9 +41,19 @@ def guided_matches(
     window: int,
     shown: tuple[Bool[Tensor, "h w"], Bool[Tensor, "hb wb"]],
 ) -> PointMatches:
-    """Corners of alpha with the patch most like theirs in `window` pixels of a homography's place in beta.
+    """Match corners of alpha with the most similar patch within `window` pixels of a homography's place in
+    beta.
 
-    Images are to be alike in scale and orientation. `shown` says what of each image a camera recorded.
+    Images must have the same scale and orientation.
+
+    Args:
+        alpha: image (C, H, W) in 0..1.
+        beta: image (C, H, W) in 0..1.
+        beta_from_alpha: homography of pixels.
+        shown: masks of the pixels that each camera recorded; patches with other pixels are not used.
+
+    Returns:
+        Whole pixels of alpha and positions in beta to a fraction of a pixel; possibly none.
     """
     alpha_image, beta_image = (contrast_equalised(image) for image in (alpha, beta))
     solid = np.ones((2 * PATCH + 1, 2 * PATCH + 1), np.uint8)
@@ -71,7 +82,8 @@ def _most_alike(
     there: NDArray[np.float64],
     window: int,
 ) -> NDArray[np.float64] | None:
-    """The position in beta of the patch most like that around a pixel; None where none is clearly so."""
+    """Find the position in beta of the patch most similar to that around a pixel; None where none is clearly
+    so."""
     (column, row), (left, top) = (np.rint(p).astype(int) for p in (x, there - window))
     patch = alpha[row - PATCH : row + PATCH + 1, column - PATCH : column + PATCH + 1]
     first, last = np.maximum([left, top], PATCH), np.array([left, top]) + 2 * window
@@ -94,7 +106,8 @@ def _most_alike(
 
 
 def _vertex(values: NDArray[np.float32]) -> float:
-    """Where a parabola through three values has its vertex, from the middle one."""
+    """Return the offset from the middle of three values to the vertex of their parabola, within
+    half a step."""
     before, middle, after = map(float, values)
     curvature = before - 2 * middle + after
     return float(np.clip(0.5 * (before - after) / curvature, -0.5, 0.5)) if curvature < 0 else 0.0

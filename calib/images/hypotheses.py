@@ -1,6 +1,6 @@
 """The usual mistakes in rigs: a table of hypotheses, each with the rig that is right if it holds.
 
-What was done to images and the rig does not state (rotation, resizing, cropping) is done to the rig's camera.
+A change of images that the rig does not state (rotation, resizing, cropping) is applied to the rig's camera.
 """
 
 from __future__ import annotations
@@ -30,30 +30,34 @@ UNITS = {
     1e2: "metres taken for centimetres",
 }
 SHIFTS = {"half-pixel shift": 0.5, "one-pixel shift": 1.0}
-"""A drift of a calibrated camera's principal point does the same."""
+"""Shifts of pixels by kind; a drift of a calibrated camera's principal point has the same effect."""
 OFF_CENTRE, FAR_OFF = 0.05, 0.15
-"""Principal points within this of the middle of the image, as a share of its longer side, are plausible, and
-beyond the second are not."""
+"""Distance of a principal point from the image's middle, as a share of the longer side, up to which it is
+plausible, and beyond which it is not."""
 SHORTEST_FOCAL = 0.2
-"""Focal lengths are not shorter, as a share of the image's longer side: they are in another unit."""
+"""Least focal length in pixels, as a share of the image's longer side: shorter ones are in another unit."""
 TRANSPOSE = torch.eye(3, dtype=torch.float64)[[1, 0, 2]]
-"""Exchanges x and y."""
+"""Matrix that exchanges x and y."""
 OPENGL = Pose(torch.diag(torch.tensor([1, -1, -1], dtype=torch.float64)), torch.zeros(3, dtype=torch.float64))
-"""From the axes of OpenGL and Blender, y upwards and z backwards."""
+"""Pose from the axes of OpenGL and Blender, y upwards and z backwards."""
 TURNS = tuple(range(-29, 29))
 """Whole turns, in radians, that may be missing from a rotation vector in degrees: it is at most 180 long."""
 
 Change = Callable[[Rig, Sequence[str]], Rig]
-"""The rig in which some cameras are changed."""
+"""Function from a rig and names of cameras to the rig in which these are changed."""
 Group = tuple[Sequence[str], str]
-"""Names of cameras, and what they are called together."""
+"""Names of cameras, and their common label."""
 
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """A possible mistake: its kind ("resized", "units", ...), description, and the rig that is right then.
+    """A possible mistake, with the rig that is right if it was made. Instances compare by identity.
 
-    approximate: that rig holds numbers that were estimated.
+    Attributes:
+        kind: kind of mistake, such as "resized" or "units"; "nothing" for the rig as given.
+        words: description in words, without a full stop.
+        rig: the repaired rig.
+        approximate: True if numbers of that rig were estimated.
     """
 
     kind: str
@@ -63,10 +67,13 @@ class Hypothesis:
 
 
 def hypotheses(rig: Rig, sizes: Mapping[str, HW]) -> list[Hypothesis]:
-    """That nothing is wrong, and all single mistakes plausible in a rig whose images have these sizes.
+    """List the rig as given, and the single mistakes plausible in a rig whose images have these sizes.
 
-    Likely ones come first. Where images do not have the sizes that the rig states, only those that explain
-    it.
+    Mistakes whose repair must be estimated from points are left out (`ignored_lens`, `zoomed`, `in_degrees`).
+    Where images do not have the sizes that the rig states, only mistakes that explain the sizes are listed.
+
+    Returns:
+        Hypotheses, "nothing" first, then likely ones before others.
     """
     names = [name for name in rig.names if name in sizes]
     wrong = [name for name in names if rig[name].hw != sizes[name]]
@@ -83,7 +90,7 @@ def hypotheses(rig: Rig, sizes: Mapping[str, HW]) -> list[Hypothesis]:
 
 
 def _is_plausible(rig: Rig, hypothesis: Hypothesis) -> bool:
-    """Whether a rig may hold this mistake, by its numbers alone.
+    """Return True if a rig may hold this mistake, by its numbers alone.
 
     Another size and exchanged axes change K by more than a drift does, and take principal points away from
     the middles of images, not towards them. By points alone a drift is taken for such a mistake now and then:
@@ -98,45 +105,47 @@ def _is_plausible(rig: Rig, hypothesis: Hypothesis) -> bool:
 
 
 def _beyond_drift(K: Tensor, changed_K: Tensor) -> bool:
-    """Whether a focal length or a principal point differs by more than `LARGEST_CHANGE` prior deviations."""
+    """Return True if a focal length or a principal point differs by more than `LARGEST_CHANGE` prior
+    deviations."""
     focal = (changed_K / K - 1).diagonal()[:2].abs().max() / SIGMA["focal"]
     centre = (changed_K - K)[:2, 2].norm() / SIGMA["centre"]
     return bool(torch.maximum(focal, centre) > LARGEST_CHANGE)
 
 
 def implausible(rig: Rig) -> list[str]:
-    """The cameras whose principal point or focal length no image of their size has."""
+    """List the cameras whose principal point or focal length no image of their size has."""
     views = [(name, view) for name, view in rig.cameras.items() if isinstance(view, LensView)]
     return [name for name, view in views if _centre_offset(view) > FAR_OFF or is_short(view)]
 
 
 def is_plausible(rig: Rig, names: Sequence[str]) -> bool:
-    """Whether these cameras' principal points and focal lengths are usual ones of their images."""
+    """Return True if these cameras' principal points and focal lengths are usual ones of their images."""
     views = [view for name in names if isinstance(view := rig[name], LensView)]
     return all(_centre_offset(view) <= OFF_CENTRE and not is_short(view) for view in views)
 
 
 def is_short(view: LensView) -> bool:
-    """Whether the focal length is too short to be in pixels of such an image."""
+    """Return True if the focal length is too short to be in pixels of such an image."""
     return focal_length_of(view) < SHORTEST_FOCAL * max(view.hw)
 
 
 def focal_length_of(view: LensView) -> float:
-    """The mean focal length, pixels, also of images that were rotated or mirrored."""
+    """Return the mean focal length, pixels, also of images that were rotated or mirrored."""
     return float(view.K[:2, :2].det().abs().sqrt())
 
 
 def _centre_offset(view: LensView) -> float:
-    """Of the principal point from the middle of the image, as a share of its longer side."""
+    """Return the distance of the principal point from the middle of the image, as a share of its
+    longer side."""
     middle = view.K.new_tensor([view.hw[1] - 1, view.hw[0] - 1]) / 2
     return float((view.K[:2, 2] - middle).norm()) / max(view.hw)
 
 
 def ignored_lens(rig: Rig, bare: Sequence[str], k1: float) -> Hypothesis:
-    """Distortion was ignored, and is about `k1` in all these cameras, which have none.
+    """Build the hypothesis that distortion of about `k1` was ignored in all these cameras, which have none.
 
-    With k2 = 1.5 k1^2, as lenses tend to have it (a fisheye's r = theta has 1.8, ordinary wide ones about
-    1.3): one parameter, and one to one at any radius.
+    k2 is 1.5 k1^2, as lenses tend to have it (a fisheye's r = theta has 1.8, ordinary wide ones about 1.3):
+    one parameter, and one to one at any radius.
     """
     words = f"distortion ignored: about k1 = {k1:.3f} in {', '.join(map(repr, bare))}"
     lens = Distortion("brown-conrady", torch.tensor([k1, 1.5 * k1**2, 0, 0], dtype=torch.float64))
@@ -145,7 +154,11 @@ def ignored_lens(rig: Rig, bare: Sequence[str], k1: float) -> Hypothesis:
 
 
 def from_degrees(R: Float[Tensor, "3 3"], turns: Int[Tensor, "*b"]) -> Float[Tensor, "*b 3 3"]:
-    """The rotations whose vector was in degrees, so many turns longer, and was taken for radians."""
+    """Compute the rotations whose vector was in degrees and was taken for radians, with whole turns added.
+
+    Args:
+        turns: number of turns to add to the vector's length.
+    """
     vector = rotation_vector(R)
     angle = vector.norm()
     whole = torch.deg2rad(angle + 2 * math.pi * turns)[..., None]
@@ -153,7 +166,10 @@ def from_degrees(R: Float[Tensor, "3 3"], turns: Int[Tensor, "*b"]) -> Float[Ten
 
 
 def zoomed(rig: Rig, names: Sequence[str], factor: float) -> Hypothesis:
-    """The focal lengths of these cameras are `factor` times as long: in another unit, or by another zoom."""
+    """Build the hypothesis that the focal lengths of these cameras are `factor` times as long.
+
+    They were in another unit, or the image was zoomed.
+    """
     who = ", ".join(map(repr, names))
     short = all(is_short(rig[name]) for name in names)
     words = f"focal length of {who} in millimetres" if short else f"image of {who} zoomed or cropped"
@@ -168,7 +184,11 @@ def zoomed(rig: Rig, names: Sequence[str], factor: float) -> Hypothesis:
 
 
 def in_degrees(rig: Rig, turns: Mapping[str, int]) -> Hypothesis:
-    """Rotation vectors of cameras were in degrees, taken for radians; `turns` of each are missing."""
+    """Build the hypothesis that rotation vectors in degrees were taken for radians.
+
+    Args:
+        turns: whole turns missing from the vector of each camera, by name.
+    """
     cameras = dict(rig.cameras)
     for name, missing in turns.items():
         pose = Pose(from_degrees(rig[name].R, torch.tensor(missing)), rig[name].t)
@@ -186,11 +206,18 @@ ROTATIONS = {
     "mirrored about the diagonal (rows and columns exchanged)": (0, True),
     "mirrored about the other diagonal": (2, True),
 }
-"""Rotations and mirrorings of an image: quarter turns, after an exchange of x and y or not."""
+"""Rotations and mirrorings of an image: quarter turns, and True if x and y are exchanged first."""
 
 
 def rotated_view(view: View, words: str) -> tuple[Float[Tensor, "3 3"], HW]:
-    """A of the pixels, x' ~ A x, and the new size after one of `ROTATIONS`."""
+    """Compute the pixel map and image size of a view after one of `ROTATIONS`.
+
+    Returns:
+        A of x' ~ A x, and the new height and width.
+
+    Raises:
+        KeyError: for `words` that are not in `ROTATIONS`.
+    """
     turns, exchanged = ROTATIONS[words]
     hw = view.hw[::-1] if exchanged else view.hw
     A = rot90_matrix(hw, turns)
@@ -198,7 +225,7 @@ def rotated_view(view: View, words: str) -> tuple[Float[Tensor, "3 3"], HW]:
 
 
 def swap(rig: Rig, a: str, b: str) -> Rig:
-    """The rig in which two names have exchanged their cameras."""
+    """Return the rig in which two names have exchanged their cameras, links included."""
     other = {a: b, b: a}
     cameras = {n: rig[other.get(n, n)] for n in rig.names}
     links = {(other.get(i, i), other.get(j, j)): link for (i, j), link in rig.links.items()}
@@ -206,13 +233,17 @@ def swap(rig: Rig, a: str, b: str) -> Rig:
 
 
 def on_cameras(rig: Rig, names: Iterable[str], change: Callable[[Camera], Camera]) -> Rig:
-    """The rig with the calibrated ones among some cameras changed."""
+    """Return the rig with the calibrated ones among these cameras changed."""
     changed = {n: change(c) for n in names if isinstance(c := rig[n], Camera)}
     return rig.replace(cameras={**rig.cameras, **changed})
 
 
 def on_pixels(rig: Rig, names: Iterable[str], change: Callable[[str, View], tuple[Tensor, HW]]) -> Rig:
-    """The rig with the pixels of some cameras transformed: x' ~ A x, and the new size."""
+    """Return the rig with the pixels of these cameras transformed.
+
+    Args:
+        change: function from a name and its view to A of x' ~ A x and the new size.
+    """
     for name in names:
         rig = rig.transformed(name, *change(name, rig[name]))
     return rig
@@ -223,12 +254,12 @@ def _poses(change: Callable[[Pose], Pose]) -> Change:
 
 
 def _same_size(A: Tensor) -> Change:
-    """x' ~ A x of the pixels of cameras whose image sizes stay."""
+    """Return the change that maps pixels by x' ~ A x and keeps image sizes."""
     return partial(on_pixels, change=lambda _, view: (A, view.hw))
 
 
 def _partly_scaled(A: Float[Tensor, "3 3"], columns: slice, camera: Camera) -> Camera:
-    """The camera with these columns of K for pixels x' ~ A x."""
+    """Return the camera with these columns of K for pixels x' ~ A x."""
     K = camera.K.clone()
     K[:2, columns] = (A.to(K) @ K)[:2, columns]
     return camera.replace(K=K)
@@ -241,14 +272,14 @@ def _opposite_lens(camera: Camera) -> Camera:
 
 
 def _mirrored(axis: str, rotated: bool, pose: Pose) -> Pose:
-    """The pose with an axis the other way, in the translation or in the rotation, too."""
+    """Return the pose with an axis reversed in the translation and, if `rotated`, in the rotation too."""
     S = torch.ones(3).to(pose.t)
     S["xyz".index(axis)] = -1
     return Pose(S[:, None] * pose.R * S if rotated else pose.R, S * pose.t)
 
 
 def _reversed_angles(order: str, pose: Pose) -> Pose:
-    """The pose whose rotation is by the same angles about the axes in the opposite order."""
+    """Return the pose whose rotation is by the same angles about the axes in the opposite order."""
     angles = Rotation.from_matrix(pose.R.detach().cpu().numpy()).as_euler(order.upper())
     R = Rotation.from_euler(order[::-1].upper(), angles[::-1]).as_matrix()
     return Pose(torch.from_numpy(R).to(pose.R), pose.t)
@@ -297,7 +328,7 @@ POSES: dict[tuple[str, str], Callable[[Pose], Pose]] = {
         for order in ("xyz", "zyx", "yxz", "zxy", "xzy", "yzx")
     },
 }
-"""Mistakes in a pose, and what undoes them."""
+"""Mistakes in a pose by kind and words, with the function that undoes each."""
 EXCHANGED = {
     "x and y exchanged in focal lengths and principal point of {}": partial(
         on_cameras,
@@ -312,17 +343,17 @@ CURVED = {
 OPPOSITE = {
     "distortion of {} with the wrong sign (the inverse map)": partial(on_cameras, change=_opposite_lens)
 }
-"""Of a `Distortion`: of another camera model's numbers a sign may be part of what they are."""
+"""Mistake of a `Distortion` alone: in other camera models a sign may be part of the numbers' meaning."""
 FITS: dict[str, Callable[[HW, HW], Tensor]] = {
     "resized": resize_matrix,
     "cropped about its middle": lambda old, new: shift_matrix((old[1] - new[1]) / 2, (old[0] - new[0]) / 2),
     "cropped at the right and the bottom": lambda old, new: shift_matrix(0, 0),
 }
-"""How an image may have come to another size."""
+"""Ways in which an image may have come to another size, with the map of its pixels."""
 
 
 def _of_numbers(rig: Rig, names: Sequence[str]) -> Iterator[Hypothesis]:
-    """Mistakes in a rig's numbers, or of images that keep their sizes."""
+    """Yield mistakes in a rig's numbers, or of images that keep their sizes."""
     every = _groups(names)
     calibrated = [name for name in names if isinstance(rig[name], Camera)]
     for (kind, words), change in POSES.items():
@@ -359,7 +390,7 @@ def _of_numbers(rig: Rig, names: Sequence[str]) -> Iterator[Hypothesis]:
 
 
 def _of_sizes(rig: Rig, wrong: Sequence[str], sizes: Mapping[str, HW]) -> Iterator[Hypothesis]:
-    """Explanations of image sizes other than those that the rig states."""
+    """Yield explanations of image sizes other than those that the rig states."""
     label = ", ".join(map(repr, wrong))
 
     def resized(matrix: Callable[[HW, HW], Tensor]) -> Rig:
@@ -374,7 +405,7 @@ def _of_sizes(rig: Rig, wrong: Sequence[str], sizes: Mapping[str, HW]) -> Iterat
 
 
 def _rotated(rig: Rig, groups: Sequence[Group]) -> Iterator[Hypothesis]:
-    """Images rotated or mirrored after calibration, whether or not the sizes allow it."""
+    """Yield images rotated or mirrored after calibration, whether or not the sizes allow it."""
     for words in ROTATIONS:
         change = partial(on_pixels, change=lambda _, view, words=words: rotated_view(view, words))
         yield from _of_groups(rig, groups, "rotated or mirrored", {f"image of {{}} {words}": change})
@@ -383,12 +414,16 @@ def _rotated(rig: Rig, groups: Sequence[Group]) -> Iterator[Hypothesis]:
 def _of_groups(
     rig: Rig, groups: Sequence[Group], kind: str, changes: Mapping[str, Change]
 ) -> Iterator[Hypothesis]:
-    """A kind of mistake in each group of cameras: by words, {} for the cameras, what undoes it."""
+    """Yield one kind of mistake in each group of cameras.
+
+    Args:
+        changes: the change that undoes it, by words with {} for the cameras.
+    """
     for names, label in groups:
         for words, change in changes.items():
             yield Hypothesis(kind, words.format(label), change(rig, names))
 
 
 def _groups(names: Sequence[str]) -> list[Group]:
-    """All cameras together, then one by one; with a label."""
+    """List all cameras together, then one by one, each with a label; nothing for no cameras."""
     return [(names, "all cameras"), *(([name], f"'{name}'") for name in names)] if names else []

@@ -1,4 +1,4 @@
-"""Where cameras of one body are, lenses and, roughly, orientations known: from one image of each.
+"""Positions of cameras of one body with known lenses and roughly known orientations, from one image of each.
 
 The tags of many multispectral cameras state everything but translations. With orientations known, every match
 says that one triple product with the baseline is zero: all pairs together give all centres, up to one scale
@@ -27,26 +27,36 @@ from .self_calibration import depth_bounds
 WINDOW = 0.09
 """Largest displacement between parallel views, as a share of the longer side: 15 mm at .15 m, 60 degrees."""
 NEAR = 4.0
-"""Points this many pixels from a baseline's line are consistent with it: orientations are known to .2 deg."""
+"""Distance in pixels up to which a point is consistent with a baseline: orientations are known to 0.2
+degrees."""
 SHARE = 0.4
-"""A baseline counts if at least this share of a pair's matches agrees with it: of wrong ones up to .3 do."""
+"""Least share of a pair's matches that must agree with a baseline: of wrong ones up to 0.3 do."""
 TRIALS = 500
-"""Directions of each baseline that are tried (Fischler and Bolles 1981)."""
+"""Number of directions tried for each baseline (Fischler and Bolles 1981)."""
 SIGMA = {"rotation": math.radians(0.5), "translation": 0.3}
-"""Standard deviations: of orientations, radians; of translations as a share."""
+"""Standard deviations: of orientations, radians; of translations, as a share of the longest baseline."""
 ROUNDS = (4.0, 2.0, 2.0)
-"""Pixels from their lines up to which matches are used, in one refinement after the other."""
+"""Distances in pixels up to which matches are used, in one refinement after the other."""
 
 
 def centres_found(
     rig: Rig, images: Images, shown: Mapping[str, Bool[Tensor, "_ _"]], *, alpha: str
 ) -> tuple[Rig, dict[str, tuple[int, float]]]:
-    """The rig of pinhole cameras with translations, and orientations refined; of each beta how many points,
-    and their median distance from their lines, pixels.
+    """Estimate translations of pinhole cameras, and refine their orientations, from one image of each.
 
     Alpha is at the origin, and the baseline of the first beta is 1, unless the rig states translations, whose
-    scale is kept. `shown` says what of each image its camera recorded. Cameras that match with none are left
-    out. Raises ValueError if none matches.
+    scale is kept. Cameras that match with none are left out.
+
+    Args:
+        images: one image (C, H, W) in 0..1 per camera, by name.
+        shown: masks of the pixels that each camera recorded, by name.
+
+    Returns:
+        The rig with its depth range; and for each beta the number of its points and their median distance
+        from their lines, pixels.
+
+    Raises:
+        ValueError: if no camera matches with alpha, or no points have parallax.
     """
     stated = {name: float(rig.pair(alpha, name).beta_from_alpha.t.norm()) for name in rig.betas(alpha)}
     pairs: dict[tuple[str, str], PointMatches] = {}
@@ -75,8 +85,11 @@ def centres_found(
 
 
 def _normals(rig: Rig, a: str, b: str, matches: PointMatches) -> Float[Tensor, "n 3"]:
-    """What is perpendicular to the baseline, of each match, in the rig's frame; times the focal length, so
-    that the product with a baseline of length 1 is about a distance in pixels."""
+    """Compute a vector perpendicular to the baseline for each match, in the rig's frame, times the focal
+    length.
+
+    Its product with a baseline of length 1 is then about a distance in pixels.
+    """
     one, two = _rays(rig, a, b, matches)
     return float(rig[b].K[0, 0]) * torch.linalg.cross(one, two)
 
@@ -84,7 +97,7 @@ def _normals(rig: Rig, a: str, b: str, matches: PointMatches) -> Float[Tensor, "
 def _rays(
     rig: Rig, a: str, b: str, matches: PointMatches
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """The matches' rays in the rig's frame, of both cameras."""
+    """Compute the matches' rays in the rig's frame, of both cameras."""
     one, two = (
         map_homogeneous(rig[name].R.mT @ torch.linalg.inv(rig[name].K), x.double())
         for name, x in ((a, matches.alpha), (b, matches.beta))
@@ -93,7 +106,8 @@ def _rays(
 
 
 def _consistent(rig: Rig, a: str, b: str, matches: PointMatches) -> PointMatches | None:
-    """The matches that one direction of the baseline explains; None if that is no large share of them."""
+    """Select the matches that one direction of the baseline explains; None if they are too few or no large
+    share."""
     if len(matches.alpha) < ENOUGH:
         return None
     normals = _normals(rig, a, b, matches)
@@ -110,7 +124,11 @@ def _consistent(rig: Rig, a: str, b: str, matches: PointMatches) -> PointMatches
 def _matched(
     rig: Rig, alpha: str, pairs: dict[tuple[str, str], PointMatches]
 ) -> tuple[Rig, dict[tuple[str, str], PointMatches]]:
-    """The cameras that pairs connect with alpha, and their pairs. Raises ValueError if there are none."""
+    """Select the cameras that pairs connect with alpha, and their pairs.
+
+    Raises:
+        ValueError: if there are none.
+    """
     names = {alpha}
     for _ in pairs:
         names |= {name for pair in pairs if names & set(pair) for name in pair}
@@ -123,7 +141,8 @@ def _matched(
 
 
 def _with_centres(rig: Rig, alpha: str, pairs: Mapping[tuple[str, str], PointMatches]) -> Rig:
-    """The rig with the centres that all matches agree on: alpha's is the origin, most points are in front."""
+    """Return the rig with the centres that all matches agree on, alpha's at the origin, most
+    points in front."""
     index = {name: i for i, name in enumerate(rig.betas(alpha))}
     rows = []
     for (a, b), matches in pairs.items():
@@ -153,7 +172,7 @@ def _with_centres(rig: Rig, alpha: str, pairs: Mapping[tuple[str, str], PointMat
 def _points_ahead(
     rig: Rig, pair: tuple[str, str], matches: PointMatches, centres: Mapping[str, Tensor]
 ) -> float:
-    """How many more matches are in front of both cameras than behind."""
+    """Count how many more matches are in front of both cameras than behind."""
     a, b = pair
     one, two = _rays(rig, a, b, matches)
     baseline = (centres[b] - centres[a]).expand_as(one)
@@ -162,7 +181,11 @@ def _points_ahead(
 
 
 def _depths(rig: Rig, near: Mapping[tuple[str, str], PointMatches]) -> tuple[float, float]:
-    """The range of depths that all pairs' points have, extended. Raises ValueError without parallax."""
+    """Return the range of depths that all pairs' points have, extended.
+
+    Raises:
+        ValueError: without parallax.
+    """
     every = [depth_bounds(Rig({name: rig[name] for name in pair}), m) for pair, m in near.items()]
     bounded = [bounds for bounds in every if bounds is not None]
     if not bounded:

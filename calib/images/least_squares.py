@@ -1,8 +1,8 @@
 """Most probable parameters by residuals and a normal prior: damped Gauss-Newton, reweighted to Cauchy's loss.
 
 Parameters are in units of their prior standard deviations, so that the prior's covariance is 1. The first
-ones are free; the rest are considered: uncertain, so that they explain what they may, but they never change
-the rig.
+ones are free; the rest are considered: uncertain, so that they explain their share, but they never change the
+rig.
 """
 
 from __future__ import annotations
@@ -24,46 +24,57 @@ from .residuals import PARTS
 LOG = logging.getLogger(__name__)
 
 LARGEST_POSTERIOR = 0.9
-"""A parameter is fixed if its posterior standard deviation stays above this share of the prior's."""
+"""Largest posterior deviation of a free parameter, as a share of the prior's; beyond it the parameter is
+fixed."""
 STEPS = 40
 FURTHER_STEPS = 6
-"""About so many follow, wherever a fit is: they are fewer than `STEPS` in most."""
+"""Number of steps assumed to follow, for the progress shown: most fits end before `STEPS`."""
 CONVERGED = 5e-3
-"""Iteration ends at a step of this many prior deviations."""
+"""Largest step, in prior deviations, at which the iteration ends."""
 DAMPING = 1e-3
-"""Of the first step."""
+"""Damping of the first step."""
 LEAST_NOISE = 0.03
 """Lower bound of the noise of matched points, pixels."""
 
 Residuals = Callable[[Tensor], Sequence[Tensor]]
-"""In parts, such as pairs of cameras: derivatives by what a part does not depend on are not computed."""
+"""Function from parameters to residuals in parts, such as pairs of cameras: derivatives by what a part does
+not depend on are not computed."""
 
 
 class Evaluated(NamedTuple):
-    """Residuals at z, a variable of which they are functions, to be differentiated there if wanted."""
+    """Residuals at a point, still functions of it, to be differentiated there if wanted.
+
+    Attributes:
+        z: the point, requiring gradients.
+        parts: residuals, one tensor per part.
+    """
 
     z: Float[Tensor, " k"]
     parts: Sequence[Tensor]
 
     @classmethod
     def at(cls, z: Float[Tensor, " k"], residuals: Residuals) -> Evaluated:
-        """The residuals at z."""
+        """Evaluate the residuals at z."""
         z = z.detach().requires_grad_()
         return cls(z, residuals(z))
 
     @property
     def values(self) -> Float[Tensor, " m"]:
-        """All of them, as constants."""
+        """All residuals in one tensor, detached."""
         return torch.cat([residuals.detach() for residuals in self.parts])
 
 
 class Solution(NamedTuple):
-    """The free parameters z, which of them were observable, and their covariance, in prior deviations.
+    """The free parameters of a fit, with their covariance, in prior deviations.
 
-    directions: (n, m), z is a sum of these columns; along the others the images do not determine it. full:
-    the most probable values of free and considered parameters without that restriction. gained: the variance
-    of depth that the changes lose, relative to depth squared. known: the deviation of depth that is left if
-    the full solution is right.
+    Attributes:
+        z: the free parameters.
+        active: mask of the observable ones; the others are 0.
+        covariance: posterior covariance of the free parameters, the prior's for fixed ones.
+        directions: columns of which z is a combination; along others the images do not determine it.
+        full: most probable free and considered parameters without that restriction.
+        gained: variance of depth that the changes lose, relative to depth squared.
+        known: relative deviation of depth that is left if the full solution is right.
     """
 
     z: Float[Tensor, " n"]
@@ -76,10 +87,16 @@ class Solution(NamedTuple):
 
 
 def solve(residuals: Residuals, count: int, considered: int = 0) -> Solution:
-    """The most probable z under a normal prior of variance 1, with unobservable parameters fixed.
+    """Compute the most probable parameters under a normal prior of variance 1, with unobservable ones fixed.
 
-    Free parameters whose standard deviation stays above `LARGEST_POSTERIOR` are reset to 0 and the others
-    solved for again. `residuals` takes `count` free parameters and then the `considered` ones.
+    Free parameters whose deviation stays above `LARGEST_POSTERIOR` are reset to 0 and the others solved for
+    again.
+
+    Args:
+        residuals: function of `count` free parameters followed by the `considered` ones.
+
+    Returns:
+        The solution; its `directions` span the observable parameters.
     """
     total = count + considered
     active = torch.ones(total, dtype=torch.bool)
@@ -103,9 +120,16 @@ def shifts_left_out(
     parts: Int[Tensor, " m"],
     kept: Bool[Tensor, " k"] | None = None,
 ) -> Float[Tensor, "g n"]:
-    """Changes of those parameters `kept`, all unless stated, without one of the `PARTS` x `PARTS` parts.
+    """Compute changes of parameters when one of the `PARTS` x `PARTS` parts of the image is left out.
 
-    `parts` says in which of them each residual is. To first order, from the most probable z on.
+    To first order, from the most probable z on.
+
+    Args:
+        parts: part in which each residual is.
+        kept: mask of the parameters that may change; None for all.
+
+    Returns:
+        One row per part, in prior deviations.
     """
     r, J = jacobian(residuals, z)
     J = J if kept is None else J[:, kept]
@@ -120,17 +144,23 @@ def shifts_left_out(
 
 
 def posterior_covariance(residuals: Residuals, z: Float[Tensor, " k"]) -> Float[Tensor, "k k"]:
-    """Of all parameters, at the most probable z."""
+    """Compute the covariance of all parameters at the most probable z, in prior deviations."""
     return torch.linalg.inv(_normal_equations(*jacobian(residuals, z), z)[0])
 
 
 def most_probable(
     residuals: Residuals, z: Float[Tensor, " k"], basis: Float[Tensor, "k m"], *, steps: int = STEPS
 ) -> Float[Tensor, " k"]:
-    """The most probable parameters z + basis y, from z on, by damped steps.
+    """Compute the most probable parameters z + basis y, from z on, by damped steps.
 
     Undamped steps shortened until the cost falls would stop short where some parameters are hardly
     observable, as poses by a flat scene are.
+
+    Args:
+        steps: largest number of steps; no error if they do not suffice.
+
+    Returns:
+        The parameters, detached, in prior deviations.
     """
     numbers = itertools.count(1)
 
@@ -157,23 +187,24 @@ def most_probable(
 
 
 def cost(r: Float[Tensor, " m"], z: Float[Tensor, " k"], scale: float) -> float:
-    """Minus twice the log probability of z and residuals of this scale, Cauchy's loss."""
+    """Compute minus twice the log probability of z and of residuals of this scale, by Cauchy's loss."""
     return float((r / scale).square().log1p().sum() + z.square().sum())
 
 
 def noise_scale(r: Tensor) -> float:
-    """The scale of the residuals: the deviation of normal ones of their median size."""
+    """Compute the scale of the residuals: the deviation of normal ones of their median size, at least
+    `LEAST_NOISE`."""
     return normal_deviation(r, LEAST_NOISE)
 
 
 def _weight(r: Tensor) -> Tensor:
-    """What the square of each residual counts: Cauchy's weights over the noise's variance."""
+    """Return the weight of each squared residual: Cauchy's weights over the noise's variance."""
     scale = noise_scale(r)
     return cauchy(r, scale) / scale**2
 
 
 def _normal_equations(r: Tensor, J: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
-    """J^T W J + I and -(J^T W r + z), reweighted for Cauchy's loss."""
+    """Return J^T W J + I and -(J^T W r + z), reweighted for Cauchy's loss."""
     information, slope = normal_equations(J.T, r, _weight(r))
     return information + torch.eye(len(z), dtype=z.dtype), -(slope + z)
 
@@ -181,16 +212,19 @@ def _normal_equations(r: Tensor, J: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
 def jacobian(
     residuals: Residuals, z: Float[Tensor, " n"]
 ) -> tuple[Float[Tensor, " m"], Float[Tensor, "m n"]]:
-    """The residuals at z and their derivatives, for many values of few parameters.
+    """Compute residuals and their derivatives, for many values of few parameters.
 
     The gradient of u . f in z is linear in u; its derivatives in u are the columns of the Jacobian. An entry
     of the gradient that is exactly 0 is of a parameter on which no value depends.
+
+    Returns:
+        The residuals (m) and their Jacobian (m, n), detached.
     """
     return _differentiated(Evaluated.at(z, residuals))
 
 
 def _differentiated(evaluated: Evaluated) -> tuple[Tensor, Tensor]:
-    """The residuals and their derivatives, as `jacobian`."""
+    """Compute the residuals and their derivatives, as `jacobian`."""
     rows = []
     for residuals in evaluated.parts:
         u = torch.linspace(1, 2, len(residuals), dtype=residuals.dtype, requires_grad=True)

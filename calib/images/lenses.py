@@ -18,7 +18,7 @@ TERMS = 4
 
 
 def with_lenses(rig: Rig) -> Rig:
-    """The rig with a lens without distortion for those of the views that are linked and have no lens."""
+    """Return the rig with a lens without distortion for those linked views that have no lens."""
     for name in dict.fromkeys(name for pair in rig.links for name in pair):
         if not isinstance(view := rig[name], LensView):
             K = intrinsics(max(view.hw) / 2, view.hw)
@@ -28,7 +28,10 @@ def with_lenses(rig: Rig) -> Rig:
 
 
 def with_distortion(rig: Rig) -> Rig:
-    """The rig with a lens without distortion for those of its calibrated cameras that have none."""
+    """Return the rig with a lens without distortion for those of its calibrated cameras that have none.
+
+    The rig itself if every calibrated camera has one.
+    """
     for name, view in rig.cameras.items():
         if isinstance(view, Camera) and view.distortion is None:
             rig = rig.with_camera(name, view.replace(distortion=_no_distortion()))
@@ -40,7 +43,8 @@ def _no_distortion() -> Distortion:
 
 
 def with_lens_of(camera: Camera, view: LensView) -> Camera:
-    """A pinhole camera with the lens of a view of the same centre, its terms in units of another length."""
+    """Return a pinhole camera with the lens of a view of the same centre, its terms converted to the camera's
+    unit."""
     assert isinstance(view.distortion, Distortion)
     factor = float(camera.K[0, 0] / view.K[0, 0])
     powers = factor ** view.distortion.coefficients.new_tensor([2, 4, 1, 1])
@@ -49,7 +53,7 @@ def with_lens_of(camera: Camera, view: LensView) -> Camera:
 
 
 def describe_lenses(rig: Rig) -> str:
-    """A sentence on the lenses of uncalibrated views; empty if there are none."""
+    """Return a sentence on the lenses of uncalibrated views; empty if there are none."""
     distorted = [
         f"{name} by up to {float(largest_distortion(view)):.1f} px"
         for name, view in rig.cameras.items()
@@ -59,7 +63,7 @@ def describe_lenses(rig: Rig) -> str:
 
 
 def largest_distortion(view: LensView) -> Float[Tensor, ""]:
-    """The largest distortion beyond that of the nearest homography, pixels."""
+    """Compute the largest distortion of a lens beyond that of the nearest homography, pixels."""
     x = coarse_grid(view.hw).reshape(-1, 2)
     undistorted, valid = view.to(torch.float64).undistort(x)
     x, undistorted = x[valid], undistorted[valid]

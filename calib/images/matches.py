@@ -25,10 +25,10 @@ from .patch_matching import refine_points
 LOG = logging.getLogger(__name__)
 
 RATIO = 0.75
-"""The best match must be this much nearer than the second best (Lowe 2004, section 7.1)."""
+"""Largest distance of the best match as a share of the second best one's (Lowe 2004, section 7.1)."""
 FEATURES = 6000
 MATCHED_AT_ONCE = 1024
-"""Features whose distances from all of the other image are held at once."""
+"""Number of features whose distances from all of the other image are held at once."""
 ENOUGH = 20
 """Least number of consistent matches for any conclusion."""
 LOCALISED = 1 / 3
@@ -36,43 +36,51 @@ LOCALISED = 1 / 3
 LOCALISATION_BOUNDS = (0.15, 0.2, 0.3, np.inf)
 """Bounds of the standard deviation of points, pixels, estimated from the residuals of patches around them."""
 WELL_LOCALISED = 40
-"""If this many points meet a bound, the others are left out."""
+"""Number of points that must meet a bound for the others to be left out."""
 MANY = 60
-"""With fewer consistent matches, mirrored images are tried."""
+"""Number of consistent matches below which mirrored images are tried."""
 AGREE = 5.0
 """Largest distance, in pixels, of a consistent match from its line: lenses distort lines."""
 MATCHING_SHARE = 0.8
-"""The share of the time, roughly, that images take to be matched before something is fitted to the points."""
+"""Rough share of the time that matching takes before something is fitted to the points."""
 STILL = 0.05
-"""Images in which nine points in ten move less than this, in pixels, are the same image."""
+"""Motion in pixels of nine points in ten below which two images are the same image."""
 
 
 class PointMatches(NamedTuple):
-    """Points (x, y) of alpha, and their positions in beta."""
+    """Matched points of two images.
+
+    Attributes:
+        alpha: points (x, y) of alpha, pixels.
+        beta: their positions in beta, pixels.
+    """
 
     alpha: Float[Tensor, "n 2"]
     beta: Float[Tensor, "n 2"]
 
     def only(self, kept: Bool[Tensor, " n"]) -> PointMatches:
-        """The matches selected by a mask."""
+        """Return the matches selected by a mask."""
         return PointMatches(self.alpha[kept], self.beta[kept])
 
 
 Pairs = Mapping[tuple[str, str], PointMatches]
 """Matches of pairs of cameras, by their names (alpha, beta)."""
 Images = Mapping[str, Float[Tensor, "_ _ _"]]
-"""An image (C, H, W) of each camera, by name."""
+"""One image (C, H, W) per camera, by name."""
 
 
 def cameras_of(rig: Rig, pairs: Iterable[tuple[str, str]]) -> list[str]:
-    """The cameras of some pairs, in the rig's order."""
+    """List the cameras of these pairs, in the rig's order."""
     among = {name for pair in pairs for name in pair}
     return [name for name in rig.names if name in among]
 
 
 def image_sizes(images: Mapping[str, Tensor]) -> dict[str, tuple[int, int]]:
-    """Height and width of each camera's image. Raises ValueError, one line, for fewer than two images, and
-    for what is no float image (C, H, W)."""
+    """Return height and width of each camera's image.
+
+    Raises:
+        ValueError: in one line, for fewer than two images, and for one that is no float image (C, H, W).
+    """
     if len(images) < 2:
         raise ValueError("matching needs the images of two cameras or more: give --image NAME=FILE for each")
     for name, image in images.items():
@@ -83,18 +91,30 @@ def image_sizes(images: Mapping[str, Tensor]) -> dict[str, tuple[int, int]]:
 
 
 def match_points(alpha: Float[Tensor, "_ h w"], beta: Float[Tensor, "_ hb wb"]) -> PointMatches:
-    """Mutually nearest SIFT features of both images' luminance that pass the ratio test.
+    """Match mutually nearest SIFT features of both images' luminance that pass the ratio test.
 
     Contrast is equalised (CLAHE). Where patches around them correlate, beta's points are refined by least
     squares.
+
+    Args:
+        alpha: image (C, H, W) in 0..1.
+        beta: image (C, H, W) in 0..1.
+
+    Returns:
+        The matches, in double precision; not yet checked against epipolar lines, possibly none.
     """
     return _match(detect_features(alpha), detect_features(beta))
 
 
 class SiftFeatures(NamedTuple):
-    """SIFT features of one image: points (x, y), sizes (pixels) and directions (radians), their descriptors.
+    """SIFT features of one image.
 
-    image: its luminance, contrast equalised, in which they were detected.
+    Attributes:
+        points: positions (x, y), pixels.
+        sizes: diameters, pixels.
+        directions: orientations, radians.
+        descriptors: descriptors of 128 numbers, one row a feature.
+        image: luminance with equalised contrast in which they were detected.
     """
 
     points: NDArray[np.float64]
@@ -105,7 +125,7 @@ class SiftFeatures(NamedTuple):
 
 
 def detect_features(image: Float[Tensor, "_ h w"]) -> SiftFeatures:
-    """SIFT features of an image's luminance, its contrast equalised."""
+    """Detect SIFT features of an image's luminance, with equalised contrast."""
     even = contrast_equalised(image)
     sift = cv2.SIFT.create(FEATURES, enable_precise_upscale=True)
     keypoints, descriptors = sift.detectAndCompute(even, np.empty(0, np.uint8))
@@ -118,14 +138,21 @@ def detect_features(image: Float[Tensor, "_ h w"]) -> SiftFeatures:
 
 
 def contrast_equalised(image: Float[Tensor, "_ h w"]) -> UInt8[NDArray, "h w"]:
-    """An image's luminance, or the mean of bands other than three, its contrast equalised (CLAHE)."""
+    """Compute an image's luminance, or the mean of bands other than three, with equalised contrast (CLAHE).
+
+    Args:
+        image: image (C, H, W) in 0..1.
+
+    Returns:
+        Bytes (H, W), on the CPU.
+    """
     values = image.detach().cpu().movedim(0, -1).float().contiguous().numpy()
     grey = cv2.cvtColor(values, cv2.COLOR_RGB2GRAY) if image.shape[0] == 3 else values.mean(-1)
     return cv2.createCLAHE(3, (8, 8)).apply(np.rint(grey.clip(0, 1) * 255).astype(np.uint8))
 
 
 def _match(a: SiftFeatures, b: SiftFeatures) -> PointMatches:
-    """Points of the mutually nearest features, beta's refined by patches around them."""
+    """Match the mutually nearest features, beta's points refined by patches around them."""
     if len(a.points) < 2 or len(b.points) < 2:
         return PointMatches(*torch.zeros(2, 0, 2, dtype=torch.float64))
     forward, backward = _nearest(a.descriptors, b.descriptors), _nearest(b.descriptors, a.descriptors)
@@ -140,7 +167,8 @@ def _match(a: SiftFeatures, b: SiftFeatures) -> PointMatches:
 
 
 def _well_localised(deviation: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """The best localised points, by the first bound that leaves `WELL_LOCALISED` of them; or else all."""
+    """Return a mask of the best localised points, by the first bound that leaves `WELL_LOCALISED` of them; or
+    all."""
     for bound in LOCALISATION_BOUNDS:
         if (kept := deviation < bound).sum() >= WELL_LOCALISED:
             return kept
@@ -148,12 +176,20 @@ def _well_localised(deviation: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def match_cameras(images: Images, *, alpha: str | None = None) -> dict[tuple[str, str], PointMatches]:
-    """Matches between the images of every two cameras that are consistent with some fundamental matrix.
+    """Match the images of every two cameras, and keep matches consistent with some fundamental matrix.
 
-    With `alpha`, only between that camera's image and each of the others, alpha first.
-    Where there are few, the second image is tried mirrored, to which features are not invariant. Pairs with
-    fewer than 20 are left out. Raises ValueError, one line, if no pair is left, as `image_sizes`, for equal
-    images, and without one of `alpha`.
+    Where there are few, the second image is tried mirrored, to which features are not invariant.
+
+    Args:
+        images: one image (C, H, W) in 0..1 per camera, by name.
+        alpha: match only this camera's image with each of the others, alpha first; None for every two.
+
+    Returns:
+        Matches by pair of names; pairs with fewer than `ENOUGH` are left out.
+
+    Raises:
+        ValueError: in one line, for images as of `image_sizes`, hardly any texture, two equal images, no
+            image of `alpha`, or if no pair is left.
     """
     image_sizes(images)
     if alpha is not None and alpha not in images:
@@ -188,7 +224,7 @@ def match_cameras(images: Images, *, alpha: str | None = None) -> dict[tuple[str
 
 
 def _agreeing(a: SiftFeatures, b: SiftFeatures, image: Tensor) -> PointMatches:
-    """The consistent matches; of the mirrored image if those are more."""
+    """Return the consistent matches; those of the mirrored image if they are more."""
     unmirrored = agreeing(_match(a, b))
     if len(unmirrored.alpha) >= MANY:
         return unmirrored
@@ -198,7 +234,11 @@ def _agreeing(a: SiftFeatures, b: SiftFeatures, image: Tensor) -> PointMatches:
 
 
 def agreeing(matches: PointMatches) -> PointMatches:
-    """Matches that some fundamental matrix puts within `AGREE` pixels of their lines; none if few."""
+    """Select matches that some fundamental matrix puts within `AGREE` pixels of their lines.
+
+    Returns:
+        The consistent matches; none if there are fewer than `ENOUGH` or no matrix fits.
+    """
     if len(matches.alpha) >= ENOUGH:
         with suppress(ValueError):
             return near_lines(matches, fit_fundamental(matches), within=AGREE)
@@ -206,7 +246,14 @@ def agreeing(matches: PointMatches) -> PointMatches:
 
 
 def agreeing_pairs(pairs: Pairs) -> dict[tuple[str, str], PointMatches]:
-    """Consistent matches of pairs that have enough, from elsewhere. Raises ValueError if none has."""
+    """Select consistent matches of pairs that have enough, from matches of another source.
+
+    Returns:
+        Matches by pair of names; the other pairs are left out.
+
+    Raises:
+        ValueError: if no pair has `ENOUGH`.
+    """
     agreed = {names: agreeing(matches) for names, matches in pairs.items()}
     kept = {names: matches for names, matches in agreed.items() if len(matches.alpha) >= ENOUGH}
     if not kept:
@@ -219,21 +266,22 @@ def agreeing_pairs(pairs: Pairs) -> dict[tuple[str, str], PointMatches]:
 
 
 def near_lines(matches: PointMatches, F: Float[Tensor, "3 3"], *, within: float) -> PointMatches:
-    """The matches within some pixels of their epipolar line in beta."""
+    """Select the matches within so many pixels of their epipolar line in beta."""
     return matches.only(line_distance(matches, F) <= within)
 
 
 def line_distance(matches: PointMatches, F: Float[Tensor, "3 3"]) -> Float[Tensor, " n"]:
-    """Distance of each match from its epipolar line, in beta's pixels."""
+    """Compute the distance of each match from its epipolar line, in beta's pixels."""
     return epipolar_distance(F.to(matches.alpha), *matches).abs()
 
 
 class FittedLink(NamedTuple):
     """A link fitted to matches.
 
-    link: F, and a similarity H that is centred on the points along their lines.
-    matches: the consistent ones.
-    displacement: pixels of beta along their lines, to either side of H x, that contain 98% of them.
+    Attributes:
+        link: F, and a similarity H that is centred on the points along their lines.
+        matches: the consistent matches.
+        displacement: pixels of beta along their lines, to either side of H x, that contain 98 % of them.
     """
 
     link: Link
@@ -242,9 +290,15 @@ class FittedLink(NamedTuple):
 
 
 def fit_link(matches: PointMatches, F: Float[Tensor, "3 3"], *, within: float = 6.0) -> FittedLink:
-    """Improve `F`, and fit a rough map, by the matches within some pixels of their lines.
+    """Improve F, and fit a rough map, by the matches within so many pixels of their lines.
 
-    F by MAGSAC++ (Barath et al. 2020) to 1 px. Raises ValueError for fewer than 20 consistent matches.
+    F is fitted by MAGSAC++ (Barath et al. 2020) to 1 px; the given one stays if fewer than `ENOUGH` are near.
+
+    Returns:
+        The link with the matches within 3 px of its lines.
+
+    Raises:
+        ValueError: for fewer than `ENOUGH` consistent matches, or no similarity that fits them.
     """
     near = near_lines(matches, F, within=within)
     fitted = fit_fundamental(near) if len(near.alpha) >= ENOUGH else F
@@ -252,13 +306,28 @@ def fit_link(matches: PointMatches, F: Float[Tensor, "3 3"], *, within: float = 
 
 
 def with_map(pair: Pair, matches: PointMatches) -> FittedLink:
-    """The pair's F, unchanged, with a rough map of points near their lines. Raises ValueError if too few."""
+    """Fit a rough map of points near their lines to the pair's F, which stays.
+
+    Args:
+        matches: distorted points; those within 3 px of their lines are used.
+
+    Returns:
+        The link with these matches, undistorted.
+
+    Raises:
+        ValueError: for fewer than `ENOUGH` of these, no similarity that fits them, or a pair without F or
+            cameras.
+    """
     F = pair.fundamental
     return _with_rough_map(near_lines(undistort_matches(pair, matches), F, within=3), F)
 
 
 def _with_rough_map(matches: PointMatches, F: Tensor) -> FittedLink:
-    """H by RANSAC to 30 px, then shifted along the mean direction of the lines into the points' middle."""
+    """Fit H by RANSAC to 30 px, then shift it along the mean direction of the lines into the points' middle.
+
+    Raises:
+        ValueError: for fewer than `ENOUGH` matches, or no similarity that fits them.
+    """
     if len(matches.alpha) < ENOUGH:
         raise ValueError(
             f"only {len(matches.alpha)} points seen in both images agree with F: does it belong to them?"
@@ -281,13 +350,19 @@ def _with_rough_map(matches: PointMatches, F: Tensor) -> FittedLink:
 
 
 def undistort_matches(pair: Pair, matches: PointMatches) -> PointMatches:
-    """The undistorted points, without those outside the domain of the lens models."""
+    """Return the undistorted points, without those outside the domain of the lens models."""
     (x, x_valid), (y, y_valid) = pair.alpha.undistort(matches.alpha), pair.beta.undistort(matches.beta)
     return PointMatches(x, y).only(x_valid & y_valid)
 
 
 def depths_near_lines(pair: Pair, matches: PointMatches, *, within: float) -> Float[Tensor, " m"]:
-    """Depths in alpha, metres, of those points that are within some pixels of their lines and in front."""
+    """Triangulate the depths in alpha of those points that are within so many pixels of their lines and in
+    front.
+
+    Returns:
+        Depths in the rig's unit (metres), of these points alone; points too far for their depth to be known
+        are left out.
+    """
     undistorted = PointMatches(pair.alpha.undistort(matches.alpha)[0], pair.beta.undistort(matches.beta)[0])
     near = matches.only(line_distance(undistorted, pair.fundamental) <= within)
     cameras = [camera.to(torch.float64) for camera in pair.cameras]
@@ -296,10 +371,14 @@ def depths_near_lines(pair: Pair, matches: PointMatches, *, within: float) -> Fl
 
 
 def seen_depths(pair: Pair, matches: PointMatches) -> tuple[float, float]:
-    """Depth bounds of matched points, metres in front of alpha: 0.9 of the nearest to 1.25 of the farthest.
+    """Estimate the depth bounds of matched points, in the rig's unit, in front of alpha.
 
-    Nearest and farthest without the outermost 2% of the points. Raises ValueError for fewer than 20 points in
-    front.
+    Returns:
+        0.9 of the nearest and 1.25 of the farthest depth, without the outermost 2 % of the points to either
+        side.
+
+    Raises:
+        ValueError: for fewer than `ENOUGH` points in front.
     """
     depth = depths_near_lines(pair, matches, within=3.0)
     if len(depth) < ENOUGH:
@@ -311,7 +390,11 @@ def seen_depths(pair: Pair, matches: PointMatches) -> tuple[float, float]:
 
 
 def depth_seen(rig: Rig, pairs: Pairs) -> tuple[float, float] | None:
-    """`seen_depths` of all pairs related by their poses, together; None if none has enough points."""
+    """Estimate the depth bounds of all pairs related by their poses, together.
+
+    Returns:
+        Near and far, as of `seen_depths`; None if no pair has enough points.
+    """
     depths = []
     for names, matches in pairs.items():
         if (pair := rig.pair(*names)).calibrated and pair.link is None:
@@ -321,7 +404,14 @@ def depth_seen(rig: Rig, pairs: Pairs) -> tuple[float, float] | None:
 
 
 def fit_fundamental(matches: PointMatches) -> Float[Tensor, "3 3"]:
-    """F by MAGSAC++ (Barath et al. 2020) to 1 px, or else by RANSAC. Raises ValueError if none fits."""
+    """Fit F, beta from alpha, by MAGSAC++ (Barath et al. 2020) to 1 px, or else by RANSAC.
+
+    Returns:
+        F with y^T F x = 0 for pixels x of alpha and y of beta, in double precision.
+
+    Raises:
+        ValueError: if none fits.
+    """
     x, y = (points.numpy() for points in matches)
     F = None
     for method in (cv2.USAC_MAGSAC, cv2.FM_RANSAC):
@@ -338,9 +428,9 @@ def _percentiles(values: Tensor, share: float) -> tuple[float, float]:
 
 
 def _nearest(a: NDArray[np.float32], b: NDArray[np.float32]) -> Int[Tensor, " n"]:
-    """For each row of `a` the nearest of `b` if it passes the ratio test, else -1.
+    """Return for each row of `a` the index of the nearest of `b` if it passes the ratio test, else -1.
 
-    By matrix products, as they are several times faster than OpenCV's matcher; of SIFT's whole numbers they
+    By matrix products, as they are several times faster than OpenCV's matcher; for SIFT's whole numbers they
     are exact.
     """
     others = torch.from_numpy(b)

@@ -1,4 +1,4 @@
-"""Free parameters of a rig with prior standard deviations, and the rig after a change of them."""
+"""Free parameters of a rig with prior standard deviations, and the rig after they change."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SIGMA = {"rotation": math.radians(0.5), "translation": 0.01, "focal": 0.01, "cen
 """Default standard deviations: radians, a share of the longest baseline, a share of the focal length, pixels
 of the principal point, and a share of `typical_coefficients`."""
 LARGEST_CHANGE = 4.0
-"""Prior standard deviations by which a parameter may change: beyond, the rig is not the prior's."""
+"""Largest plausible change of a parameter in prior deviations: beyond it the rig is not the prior's."""
 UNCERTAIN = ("rotation", "translation", "focal", "centre")
 """Kinds of parameters that are uncertain even where they are not free."""
 ALIASES = {"principal_point": "centre", "focal_length": "focal"}
@@ -32,19 +32,24 @@ UNITS = {
     "centre": ("px", 1.0),
 }
 FOCAL_CORRELATION = 0.995
-"""Of fx and fy: pixels keep their shape, to a tenth of the focal length's deviation."""
+"""Correlation of fx and fy: pixels keep their shape, to a tenth of the focal length's deviation."""
 LENS_SIGMA = 0.2
-"""That share for uncalibrated lenses, whose unit is half the longer side of the image."""
+"""The share of `typical_coefficients` for uncalibrated lenses, whose unit is half the image's longer side."""
 LINK_SIGMA = 0.1
-"""Of the seven degrees of freedom of an F in coordinates of about -1 to 1: an uninformative prior."""
+"""Standard deviation of the seven degrees of freedom of an F in coordinates of about -1 to 1:
+uninformative."""
 
 
 @dataclass(frozen=True)
 class FreeParameter:
-    """One parameter vector: "camera.rotation" and so on, or "alpha > beta" for an F.
+    """One parameter vector of a rig.
 
-    sigma: prior standard deviations. correlation: between neighbouring components (fx and fy change
-    together). unit, factor: the unit for display and the factor that converts to it.
+    Attributes:
+        name: "camera.rotation" and so on, or "alpha > beta" for an F.
+        sigma: prior standard deviations, in the rig's units.
+        unit: unit for display.
+        factor: factor that converts to that unit.
+        correlation: prior correlation between components, as fx and fy change together.
     """
 
     name: str
@@ -55,13 +60,13 @@ class FreeParameter:
 
     @cached_property
     def root(self) -> Float[Tensor, "k k"]:
-        """A lower triangular root of the prior covariance: the change is root z."""
+        """Lower triangular root of the prior covariance: the change is root z."""
         eye = torch.eye(len(self.sigma), dtype=torch.float64)
         correlation = torch.where(eye > 0, eye, self.correlation)
         return self.sigma[:, None] * torch.linalg.cholesky(correlation)
 
     def label(self, index: int) -> str:
-        """The name of one component."""
+        """Return the name of one component, such as "left.rotation x"."""
         axes = AXES.get(self.name.rpartition(".")[2])
         return f"{self.name} {axes[index]}" if axes else f"{self.name} {index + 1}"
 
@@ -69,12 +74,21 @@ class FreeParameter:
 def free_parameters(
     rig: Rig, names: Sequence[str], *, free: Iterable[str], sigma: Mapping[str, float] | None = None
 ) -> list[FreeParameter]:
-    """The free parameters of some cameras, the first keeping its pose: only relative poses are observable.
+    """List the free parameters of these cameras.
 
-    `free` holds kinds ("rotation", "translation", "focal", "centre" or "principal_point", "distortion"), or
-    patterns over "camera.kind". `sigma` overrides the standard deviations of `SIGMA` by kind. A link between
-    two of the cameras has its F free, and uncalibrated lenses are free. Raises ValueError for a pattern that
-    matches nothing.
+    The first camera keeps its pose, as only relative poses are observable. A link between two of the cameras
+    has its F free, and lenses of uncalibrated views are free.
+
+    Args:
+        free: kinds ("rotation", "translation", "focal", "centre" or "principal_point", "distortion"), or
+            patterns over "camera.kind".
+        sigma: standard deviations by kind that override `SIGMA`; None for none.
+
+    Returns:
+        One parameter vector per camera and kind, then one per link; possibly none.
+
+    Raises:
+        ValueError: for a pattern that matches nothing, or a `sigma` of an unknown kind or not positive.
     """
     stated = {ALIASES.get(k, k): v for k, v in (sigma or {}).items()}
     if wrong := [k for k, v in stated.items() if k not in SIGMA or not v > 0]:
@@ -99,9 +113,15 @@ def free_parameters(
 def considered_parameters(
     rig: Rig, names: Sequence[str], free: Sequence[FreeParameter], *, sigma: Mapping[str, float] | None
 ) -> list[FreeParameter]:
-    """These cameras' poses, focal lengths and principal points that are not free but uncertain all the same.
+    """List these cameras' poses, focal lengths and principal points that are uncertain but not free.
 
     Their uncertainty counts, but they are not changed.
+
+    Returns:
+        One parameter vector per camera and kind.
+
+    Raises:
+        ValueError: for a `sigma` of an unknown kind or not positive.
     """
     fixed = {f.name for f in free}
     parameters = free_parameters(rig, names, free=UNCERTAIN, sigma=sigma)
@@ -111,7 +131,11 @@ def considered_parameters(
 
 
 def apply_change(rig: Rig, parameters: Sequence[FreeParameter], z: Float[Tensor, " n"]) -> Rig:
-    """The rig after a change of each component by z standard deviations; differentiable in z."""
+    """Return the rig after a change of each component by z prior deviations; differentiable in z.
+
+    Args:
+        z: all components of `parameters`, one vector after the other.
+    """
     parts = z.split([len(u.sigma) for u in parameters])
     values = {u.name: u.root.to(deviations) @ deviations for u, deviations in zip(parameters, parts)}
     links = {
@@ -139,7 +163,7 @@ def _matching(parameters: Sequence[str], free: Iterable[str]) -> list[str]:
 
 
 def _free_parameter(rig: Rig, name: str, like: Tensor, sigma: Mapping[str, float]) -> FreeParameter:
-    """A parameter with its prior deviation, in its own unit and as it is shown."""
+    """Return a parameter with its prior deviation, in its own unit and in that for display."""
     camera, _, kind = name.rpartition(".")
     size = torch.full((like.shape[-1],), sigma[kind], dtype=torch.float64)
     view = rig[camera]
@@ -158,7 +182,8 @@ def _free_parameter(rig: Rig, name: str, like: Tensor, sigma: Mapping[str, float
 
 
 def _perturbed_link(link: Link, value: Tensor | None, rig: Rig, names: tuple[str, str]) -> Link:
-    """F after seven small changes: rotations of both sets of singular vectors, the second singular value."""
+    """Return F after seven small changes: rotations of both sets of singular vectors, the second singular
+    value."""
     if value is None:
         return link
     K, K_beta = (intrinsics(max(rig[name].hw) / 2, rig[name].hw).to(link.F) for name in names)

@@ -16,24 +16,35 @@ HALF_PATCH = 7
 """Patches are 15 x 15 pixels of the coarser image."""
 STEPS = 12
 CONVERGED = 0.01
-"""Iteration ends when nine points in ten move by less than this, pixels."""
+"""Motion in pixels of nine points in ten below which the iteration ends."""
 LEAST_CORRELATION = 0.85
 """Least correlation of patches that are accepted."""
 LARGEST_SHIFT = 2.0
-"""Patches that move farther than this, in pixels, are rejected as false matches."""
+"""Largest shift of a patch, pixels; those that move farther are rejected as false matches."""
 
 Array = np.ndarray
 
 
 class RefinedPoints(NamedTuple):
-    """Positions in beta, and their standard deviation along the worse axis, pixels; inf where rejected."""
+    """Refined positions in beta.
+
+    Attributes:
+        y: positions (x, y) in beta, pixels.
+        deviation: standard deviation along the worse axis, pixels; inf where rejected.
+    """
 
     y: Float[np.ndarray, "n 2"]
     deviation: Float[np.ndarray, " n"]
 
 
 class PatchWarps(NamedTuple):
-    """Values of alpha's patches; positions in beta; affine maps (pixels of beta per step in the patch)."""
+    """Patches of alpha with their affine maps into beta.
+
+    Attributes:
+        values: samples of alpha's patches, one row a patch.
+        y: positions in beta, pixels.
+        A: affine maps, pixels of beta per step in the patch.
+    """
 
     values: Float[np.ndarray, "n p"]
     y: Float[np.ndarray, "n 2"]
@@ -47,7 +58,18 @@ def refine_points(
     y: Float[np.ndarray, "n 2"],
     beta_from_alpha: Float[np.ndarray, "n 2 2"],
 ) -> RefinedPoints:
-    """Refine `y` for points `x` of alpha, by rough maps between neighbourhoods; unchanged where rejected."""
+    """Refine positions in beta of points of alpha by least-squares matching of patches.
+
+    Args:
+        alpha: bytes (H, W).
+        beta: bytes (H, W).
+        x: points of alpha, pixels.
+        y: rough positions in beta, pixels.
+        beta_from_alpha: rough affine maps between neighbourhoods of the points.
+
+    Returns:
+        The positions, unchanged where rejected, with their deviations.
+    """
     if not len(x):
         return RefinedPoints(y, np.zeros(0))
     step = np.maximum(1.0, 1 / np.sqrt(np.abs(np.linalg.det(beta_from_alpha))))[:, None, None]
@@ -77,8 +99,12 @@ def _sampled(image: Array, x: Array) -> Array:
 def _step(
     warps: PatchWarps, images: list[Array], around: Array, weights: Array
 ) -> tuple[PatchWarps, Array, Array, Array]:
-    """The patches after a step, their correlation before it, how far they moved, and the standard deviation
-    of their positions by the residuals (worse axis, pixels)."""
+    """Take one step of all patches.
+
+    Returns:
+        The patches after it, their correlation before it, how far they moved, and the standard deviation of
+        their positions by the residuals (worse axis, pixels).
+    """
     weight = weights / weights.sum()
     positions = warps.y[:, None] + around @ warps.A.swapaxes(1, 2)
     sampled, across, down = (_sampled(p, positions) for p in images)

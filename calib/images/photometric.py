@@ -19,30 +19,37 @@ from arraygeom import Positions, Rig, Segments, pixel_grid
 from arraygeom.fields import recorded_field
 
 Attend = Callable[[Tensor, Tensor, Tensor, Segments | Positions], Any]
-"""Attention from queries to keys and values along a field, `pat.attention.attend_with_statistics`: of what it
-returns, `value` (1, D, h, w) is the weighted one, and `peak` (1, h, w) the largest weight."""
+"""Attention from queries to keys and values along a field, `pat.attention.attend_with_statistics`: of its
+result, `value` (1, D, h, w) is the weighted value, and `peak` (1, h, w) the largest weight."""
 LARGEST = 480
-"""Images are reduced to this many pixels along their longer side."""
+"""Longer side in pixels to which images are reduced."""
 PIXELS = 6000
 """Approximate number of alpha pixels used, on a grid."""
 SHARPNESS = 20.0
 """The inner product of two equal descriptors."""
 WINDOW = 9
-"""Values are relative to mean and deviation in windows this wide, for invariance to exposure and filters."""
+"""Side in pixels of the windows by whose mean and deviation values are normalised, for invariance to exposure
+and filters."""
 EVEN = 0.02
-"""Deviations below this, of images in 0..1, are noise."""
+"""Deviation, of images in 0..1, below which a window has only noise."""
 
 
 class PhotometricImage(NamedTuple):
-    """An image, reduced: features (1, D, h, w), values (1, 1, h, w), a grid (r, c, 2) of query pixels."""
+    """A reduced image, ready for attention.
+
+    Attributes:
+        keys: features (1, D, h, w).
+        values: values (1, 1, h, w), in local standard deviations.
+        grid: query pixels (r, c, 2), as (x, y).
+    """
 
     keys: Tensor
     values: Tensor
     grid: Tensor
 
     @classmethod
-    def of(cls, image: Float[Tensor, "_ _ _"]) -> PhotometricImage:
-        """An image reduced, with patches as features."""
+    def from_image(cls, image: Float[Tensor, "_ _ _"]) -> PhotometricImage:
+        """Reduce an image (C, H, W) in 0..1, with patches as features."""
         grey = _reduced(image)
         h, w = grey.shape[-2:]
         step = max(1, round((h * w / PIXELS) ** 0.5))
@@ -52,10 +59,17 @@ class PhotometricImage(NamedTuple):
 def photometric_errors(
     rig: Rig, views: Mapping[str, PhotometricImage], names: tuple[str, str], attend: Attend
 ) -> tuple[Float[Tensor, "h w"], Bool[Tensor, "h w"]]:
-    """The error of attention's value against alpha's, at the pixels of the grid, and its validity.
+    """Compute the error of attention's value against alpha's, at the pixels of the grid.
 
     Differentiable in the rig. Errors are weighted by the square root of attention's largest weight, its
     confidence.
+
+    Args:
+        views: reduced images by camera.
+        names: alpha and beta.
+
+    Returns:
+        The errors (r, c), in local standard deviations, 0 where invalid; and the mask of valid pixels.
     """
     alpha, beta = names
     for name in names:
@@ -72,7 +86,8 @@ def photometric_errors(
 
 
 def patches(grey: Float[Tensor, "1 1 h w"]) -> Float[Tensor, "1 25 h w"]:
-    """Patches of 5 x 5 pixels, without mean, normalised: the inner product is their scaled correlation."""
+    """Compute normalised patches of 5 x 5 pixels without mean: their inner product is their scaled
+    correlation."""
     h, w = grey.shape[-2:]
     around = unfold(pad(grey, (2, 2, 2, 2), mode="replicate"), 5).view(1, 25, h, w)
     around = around - around.mean(1, keepdim=True)
@@ -81,7 +96,7 @@ def patches(grey: Float[Tensor, "1 1 h w"]) -> Float[Tensor, "1 25 h w"]:
 
 
 def structure(grey: Float[Tensor, "1 1 h w"]) -> Float[Tensor, "1 1 h w"]:
-    """Each pixel's difference from the local mean, in local standard deviations."""
+    """Compute each pixel's difference from the local mean, in local standard deviations."""
     mean, square = (_local_mean(p) for p in (grey, grey.square()))
     return (grey - mean) / (square - mean.square()).clamp(min=0).add(EVEN**2).sqrt()
 

@@ -13,7 +13,14 @@ from .lenses import describe_lenses
 
 @dataclass(frozen=True)
 class ParameterChange:
-    """The change of a parameter vector and its posterior standard deviation, in the unit for display."""
+    """Change of a parameter vector with its posterior standard deviation.
+
+    Attributes:
+        name: name of the parameter vector, as of `FreeParameter`.
+        amount: change of each component, in `unit`.
+        deviation: posterior standard deviation of each, in `unit`.
+        unit: unit for display; "F" for a fundamental matrix.
+    """
 
     name: str
     amount: tuple[float, ...]
@@ -28,7 +35,12 @@ class ParameterChange:
 
 
 class LineStatistics(NamedTuple):
-    """Distances of points from their lines: their number and their median, pixels."""
+    """Distances of points from their lines.
+
+    Attributes:
+        points: number of the points.
+        median: median distance, pixels of beta.
+    """
 
     points: int
     median: float
@@ -38,7 +50,13 @@ class LineStatistics(NamedTuple):
 
 
 class PhotometricResult(NamedTuple):
-    """The photometric error on held-out pixels before and after its minimisation, and whether accepted."""
+    """Result of the minimisation of the photometric error.
+
+    Attributes:
+        before: mean absolute error on held-out pixels before.
+        after: the same after.
+        accepted: True if the result was used.
+    """
 
     before: float
     after: float
@@ -47,13 +65,18 @@ class PhotometricResult(NamedTuple):
 
 @dataclass(frozen=True)
 class Refinement:
-    """The result of a refinement.
+    """Result of a refinement.
 
-    rig: the refined one if `accepted`, else the given one. changes: its differences. unobservable: parameters
-    that the images do not determine. held_out: statistics of the points held out, before and after. depth:
-    what happens to depth, for calibrated cameras. objections: why the result should not be accepted. kept:
-    the parameters of combinations that would change depth without being determined. photometric: the
-    photometric error, if it was minimised.
+    Attributes:
+        rig: the refined rig if `accepted`, else the given one.
+        accepted: True if the refined rig is used.
+        changes: changes of the parameters; empty if not accepted.
+        unobservable: names of parameters that the images do not determine.
+        held_out: statistics of the held-out points, before and after.
+        depth: change of depth; None for uncalibrated rigs and too few points of observable depth.
+        objections: reasons not to accept the result, in words.
+        kept: parameters in combinations that would change depth without being determined.
+        photometric: result of the photometric stage; None if it was not run.
     """
 
     rig: Rig
@@ -67,7 +90,7 @@ class Refinement:
     photometric: PhotometricResult | None = None
 
     def as_text(self) -> str:
-        """The changes, the distances of held-out points and what happens to depth, as text."""
+        """Return the changes, the distances of held-out points and the change of depth as lines of text."""
         original, refined = self.held_out
         verdict = "accepted all the same" if self.accepted else "not accepted"
         lines = [

@@ -5,12 +5,12 @@ The free parameters z, in units of their prior standard deviations (of a calibra
     sum_i log(1 + (r_i(z) / s)^2) + sum_k z_k^2
 
 with r the Sampson distances of matched points (Hartley & Zisserman 11.4.3) and s the scale of the points'
-noise: Gauss-Newton steps on automatic derivatives through `arraygeom`, reweighted (Cauchy's loss). What is
-not free (other parameters of the cameras, and what their lens models leave) is uncertain all the same and
-takes its share of the residuals. Parameters that the images do not determine keep their values, and so do
-combinations of them that would change depth without the images determining it (`depth_change`). Held-out
-points, the prior and the uncertainty of depth decide whether the result is accepted. Its posterior is then
-the prior of a second fit, to the photometric error of the fusion: see `photometric`.
+noise: Gauss-Newton steps on automatic derivatives through `arraygeom`, reweighted (Cauchy's loss). The rest
+(other parameters of the cameras, and what their lens models leave) is uncertain all the same and takes its
+share of the residuals. Parameters that the images do not determine keep their values, and so do combinations
+of them that would change depth without the images determining it (`depth_change`). Held-out points, the prior
+and the uncertainty of depth decide whether the result is accepted. Its posterior is then the prior of a
+second fit, to the photometric error of the fusion: see `photometric`.
 """
 
 from __future__ import annotations
@@ -73,22 +73,23 @@ LOG = logging.getLogger(__name__)
 
 FREE = ("rotation", "centre")
 EXTRA_FREE = ("focal", "translation")
-"""Freed too if held-out points improve."""
+"""Kinds of parameters that are freed too if held-out points improve."""
 SYSTEMATIC = 0.3
 """Prior deviation, pixels at the image's corner, of each smooth displacement that a lens model leaves."""
 LARGEST_DISTANCE, OF_OWN = 1.0, 3.0
-"""A refined rig is refused whose held-out points lie farther from their lines than this, in pixels (median),
-and than this many times their distance from the lines of an F fitted to them."""
+"""Largest median distance of held-out points from their lines, in pixels, and as a multiple of their distance
+from the lines of an F fitted to them; a refined rig beyond both is refused."""
 AT_BEST = 1.1
-"""No more is freed where held-out points are within this factor of their distance from such lines."""
+"""Factor of held-out points' distance from the lines of an F fitted to them within which no more is freed."""
 MOST_BEHIND = 0.5
-"""Share of the points that may lie behind a camera: some wrong matches always do."""
+"""Largest share of points behind a camera: some wrong matches always are."""
 UNCHANGED = 1e-3
-"""Relative deviation of depth within which a pattern of depth stays."""
+"""Relative deviation of depth within which a pattern of depth keeps its value."""
 CORRELATED_PIXELS = 10.0
-"""Photometric errors of this many neighbouring pixels count as one measurement."""
+"""Number of neighbouring pixels whose photometric errors count as one measurement."""
 ROUNDS, EVALUATIONS = 8, 13
-"""Iterations of the photometric minimisation, and how often it evaluates the error of all pairs, roughly."""
+"""Iterations of the photometric minimisation, and its rough number of evaluations of the error of
+all pairs."""
 LEFT_OUT_SIGMA = 1.0
 """Prior deviation of lens terms that may have been left out, as a share of typical ones."""
 
@@ -104,14 +105,27 @@ def refine(
     force: bool = False,
     matches: Sequence[Pairs] | None = None,
 ) -> Refinement:
-    """Refine a rig by points matched in frames, each an image of every camera; or by given `matches` of them.
+    """Refine a rig by points matched in frames, each with images of two or more of its cameras.
 
-    The first camera that has images keeps its pose. `free` and `sigma` are those of
-    `parameters.free_parameters`; F of links is always free, and views known by F alone are given lenses if
-    held-out points improve. With two frames or more, whole frames are held out, else parts of the image. With
-    `attend` the photometric error of the fusion is then minimised, with the posterior of the points as its
-    prior. `force` accepts a result in spite of objections. Raises ValueError, one line: a camera that the rig
-    lacks, an image of another size than the rig states, equal images, too few points.
+    The first camera that has images keeps its pose. F of links is always free, and views known by F alone are
+    given lenses if held-out points improve. With two frames or more, whole frames are held out, else parts of
+    the image.
+
+    Args:
+        frames: one image (C, H, W) in 0..1 per camera, by name, of the rig's sizes.
+        free: kinds or patterns, as of `parameters.free_parameters`.
+        sigma: prior standard deviations by kind, as there.
+        attend: attention by which the photometric error of the fusion is then minimised, with the posterior
+            of the points as its prior; None leaves that stage out.
+        force: accept a result in spite of objections.
+        matches: points of each frame used instead of matching its images.
+
+    Returns:
+        The refined rig if accepted, else the given one, with changes and objections.
+
+    Raises:
+        ValueError: in one line, for no frame, a camera that the rig lacks, an image of another size than the
+            rig states, equal images, too few points, or nothing free.
     """
     if not frames:
         raise ValueError("no frame: give images of two cameras or more")
@@ -147,13 +161,22 @@ def refine_matches(
     force: bool = False,
     keep_depth: bool = True,
 ) -> Refinement:
-    """`refine` from matched points, without the photometric error.
+    """Refine a rig by matched points, without the photometric error.
 
-    Without `keep_depth` the rig's depths are only assumed: they may change in any way, and nothing is
-    refused.
+    Args:
+        frames: matched points of each frame, by pair of names.
+        keep_depth: if False, the rig's depths are only assumed: they may change in any way, and nothing is
+            refused.
+
+    Returns:
+        As of `refine`.
+
+    Raises:
+        ValueError: for a rig that relates none of the pairs, points of which none are left to use, or nothing
+            free.
     """
     if not keep_depth:
-        problem = RefinementProblem.of(rig, free, frames=frames, sigma=sigma)
+        problem = RefinementProblem.from_frames(rig, free, frames=frames, sigma=sigma)
         return problem.report(problem.solve_freely(), force=True)
     fit, solution = fitted(rig, frames, free=free, sigma=sigma)
     return fit.report(solution, force=force)
@@ -162,9 +185,15 @@ def refine_matches(
 def fitted(
     rig: Rig, frames: Sequence[Pairs], *, free: Iterable[str], sigma: Mapping[str, float] | None
 ) -> tuple[RefinementProblem, Solution]:
-    """The fit and its solution, with additional free parameters if held-out points improve.
+    """Fit a rig to matched points, with more free parameters if held-out points improve.
 
     Those are focal lengths and translations, if `free` is the default, and lenses of views known by F.
+
+    Returns:
+        The problem that was solved, and its solution.
+
+    Raises:
+        ValueError: as `refine_matches`.
     """
     free = tuple(free)
     candidates = [(rig, free)]
@@ -172,7 +201,9 @@ def fitted(
         candidates.append((rig, (*FREE, *EXTRA_FREE)))
     if (with_lens := with_lenses(rig)) is not rig:
         candidates.append((with_lens, free))
-    problems = [RefinementProblem.of(*candidate, frames=frames, sigma=sigma) for candidate in candidates]
+    problems = [
+        RefinementProblem.from_frames(*candidate, frames=frames, sigma=sigma) for candidate in candidates
+    ]
     with part(0, 1 / len(problems)):
         best = problems[0], problems[0].solve()
     for i, problem in enumerate(problems[1:], 1):
@@ -186,7 +217,8 @@ def fitted(
 
 
 def _at_its_best(fit: RefinementProblem, solution: Solution) -> bool:
-    """Whether held-out points of calibrated cameras are as near to their lines as to those of their own F."""
+    """Return True if held-out points of calibrated cameras are as near their lines as those of an F fitted to
+    them."""
     if fit.rig.links:
         return False
     rig = fit.after(solution.z)
@@ -195,7 +227,15 @@ def _at_its_best(fit: RefinementProblem, solution: Solution) -> bool:
 
 @dataclass(frozen=True)
 class RefinementProblem:
-    """A rig, its free parameters, those uncertain though not free, and the points used and held out."""
+    """A rig with its parameters and the points for its refinement.
+
+    Attributes:
+        rig: the rig before.
+        parameters: free parameters.
+        used: points to fit, by pair.
+        held_out: points to judge by, by pair.
+        considered: parameters that are uncertain though not free.
+    """
 
     rig: Rig
     parameters: tuple[FreeParameter, ...]
@@ -204,7 +244,7 @@ class RefinementProblem:
     considered: tuple[FreeParameter, ...] = ()
 
     @classmethod
-    def of(
+    def from_frames(
         cls,
         rig: Rig,
         free: Iterable[str],
@@ -212,7 +252,11 @@ class RefinementProblem:
         frames: Sequence[Pairs],
         sigma: Mapping[str, float] | None = None,
     ) -> RefinementProblem:
-        """Raises ValueError if nothing is free."""
+        """Split the frames' points into used and held-out ones, and list the free and considered parameters.
+
+        Raises:
+            ValueError: if nothing is free, no pair is related by the rig, or no points are left to use.
+        """
         used, held_out = split([related(rig, pairs) for pairs in frames])
         names = cameras_of(rig, (*used, *held_out))
         parameters = free_parameters(rig, names, free=free, sigma=sigma)
@@ -224,7 +268,8 @@ class RefinementProblem:
         return cls(rig, tuple(parameters), used, held_out, tuple(considered))
 
     def after(self, z: Float[Tensor, " n"]) -> Rig:
-        """The rig after a change of z, in standard deviations; of considered parameters too if z has them."""
+        """Return the rig after a change of z, in prior deviations; of considered parameters too if z has
+        them."""
         parameters = (*self.parameters, *self.considered)[
             : len(self.parameters) if len(z) == self.count else None
         ]
@@ -232,19 +277,21 @@ class RefinementProblem:
 
     @property
     def count(self) -> int:
-        """The number of free parameters."""
+        """Number of free parameters."""
         return sum(len(u.sigma) for u in self.parameters)
 
     @property
     def uncertain(self) -> int:
-        """The number of free and considered parameters of cameras."""
+        """Number of free and considered parameters of cameras."""
         return self.count + sum(len(u.sigma) for u in self.considered)
 
     def solve(self) -> Solution:
-        """The posterior given the used points, without changes of depth that they do not determine.
+        """Compute the posterior given the used points, without changes of depth that these do not determine.
 
-        If depth still changes by more than they determine it, without any change of depth that can be
-        avoided.
+        If depth still changes by more than they determine it, every avoidable change of depth is left out.
+
+        Returns:
+            The solution, in prior deviations; `directions` span the changes made.
         """
         systematic = systematic_columns(self.rig, self.used)
         log_step(LOG, 0, "refining %d parameters by %d points", self.count, len(systematic))
@@ -262,13 +309,13 @@ class RefinementProblem:
         return determined
 
     def solve_freely(self) -> Solution:
-        """The posterior given the used points, whatever happens to depth."""
+        """Compute the posterior given the used points, however depth changes."""
         return solve(lambda z: sampson_of_pairs(self.after(z), self.used), self.count)
 
     def _determined(self, solution: Solution, residuals: Residuals, *, keep_depth: bool = False) -> Solution:
-        """The solution without the modes of depth that the points do not determine.
+        """Return the solution without the modes of depth that the points do not determine.
 
-        Repeated with the modes at the solution found, as those of the given rig hold only near it.
+        Repeated with the modes at that solution, as those of the given rig hold only near it.
         """
         if not bool(solution.active.any()):
             return solution
@@ -301,7 +348,8 @@ class RefinementProblem:
         residuals: Residuals,
         log_depth: Residuals,
     ) -> Solution:
-        """The most probable `active` parameters that leave these patterns of depth as they were."""
+        """Return the solution with the most probable `active` parameters that keep these patterns
+        of depth."""
         start = torch.zeros_like(solution.full)
         before = Evaluated.at(start[: self.count], log_depth).values
         noise = noise_scale(Evaluated.at(solution.full, residuals).values)
@@ -316,7 +364,15 @@ class RefinementProblem:
         return solution._replace(z=full[: self.count])
 
     def report(self, solution: Solution, *, force: bool = False) -> Refinement:
-        """A solution's changes, and whether held-out points, the prior and depth's uncertainty support it."""
+        """Report a solution's changes, and whether held-out points, the prior and depth's uncertainty support
+        it.
+
+        Args:
+            force: accept it in spite of objections.
+
+        Returns:
+            The refinement; its rig is the given one unless accepted.
+        """
         refined = self.after(solution.z)
         before, after = (line_distances(rig, self.held_out) for rig in (self.rig, refined))
         depth = self._depth_change(refined, solution)
@@ -351,7 +407,8 @@ class RefinementProblem:
         )
 
     def _no_nearer(self, before: Tensor, solution: Solution) -> str:
-        """The objection that points are no nearer to their lines, and what else to free if that is why."""
+        """Return the objection that points are no nearer to their lines, and what else to free if that is the
+        reason."""
         text = "held-out points are no nearer to their lines"
         kinds = dict.fromkeys(u.name.rpartition(".")[2] for u in self.considered)
         if not kinds.keys() & set(FREE):  # else all that can be freed was tried
@@ -362,9 +419,10 @@ class RefinementProblem:
         return f"{text} by what is free alone: leave out --free, or free {', '.join(kinds)} too"
 
     def _explained_by_lenses(self, distances: Tensor) -> list[str]:
-        """An objection if other lenses, with the same poses, put held-out points as near to their lines.
+        """Return an objection if other lenses, with the same poses, put held-out points as near to their
+        lines.
 
-        Images do not tell the two apart then, and the poses would change depth.
+        Images do not distinguish the two then, and the poses would change depth.
         """
         if any(u.name.endswith(".distortion") for u in self.parameters) or self.rig.links:
             return []
@@ -383,7 +441,8 @@ class RefinementProblem:
         ]
 
     def _depth_change(self, refined: Rig, solution: Solution) -> DepthChange | None:
-        """None for uncalibrated rigs and for too few points whose depth is observable."""
+        """Return the change of depth; None for uncalibrated rigs and for too few points whose depth is
+        observable."""
         if (values := log_depths(self.after, [self.rig], self.used)) is None:
             return None
         _, G = jacobian(values, torch.zeros(self.uncertain, dtype=torch.float64))
@@ -393,7 +452,7 @@ class RefinementProblem:
 
 
 def _contradictions(parameters: Sequence[FreeParameter], z: Tensor) -> list[str]:
-    """An objection for each parameter vector that changes by more than its prior allows."""
+    """Return an objection for each parameter vector that changes by more than its prior allows."""
     contradictions = []
     for u, change_of in zip(parameters, z.split([len(u.sigma) for u in parameters])):
         change = u.root @ change_of
@@ -410,7 +469,12 @@ def _contradictions(parameters: Sequence[FreeParameter], z: Tensor) -> list[str]
 
 
 def systematic_columns(rig: Rig, pairs: Pairs) -> Float[Tensor, "m s"]:
-    """Derivatives of all distances by what the calibrated cameras' lens models leave, in prior deviations."""
+    """Compute derivatives of all distances by what the calibrated cameras' lens models leave.
+
+    Returns:
+        One row a point, four columns a camera, in pixels per prior deviation (`SYSTEMATIC`); 0 for pairs
+        known by F.
+    """
     names = [name for name in cameras_of(rig, pairs) if isinstance(rig[name], Camera)]
     columns = {name: slice(4 * i, 4 * i + 4) for i, name in enumerate(names)}
     parts = []
@@ -429,13 +493,16 @@ def polish(
     """Minimise the photometric error of the fusion, with the solution of the points as its prior.
 
     Errors are scaled by their own deviation and count as one measurement per `CORRELATED_PIXELS` pixels, as
-    neighbours are correlated. Accepted if the error on held-out pixels falls and held-out points are not
-    significantly worse.
+    neighbours are correlated.
+
+    Returns:
+        The solution, and the errors; accepted if the error on held-out pixels falls and held-out points are
+        not significantly worse.
     """
     rig = fit.after(solution.z)
     depth = depth_seen(rig, fit.used) if rig.depth is None else rig.depth
     base = replace(fit, rig=fit.rig.replace(depth=depth))
-    views = [{name: PhotometricImage.of(image) for name, image in frame.items()} for frame in frames]
+    views = [{name: PhotometricImage.from_image(image) for name, image in frame.items()} for frame in frames]
     root = solution.directions
     done, total = count(), EVALUATIONS * len(views) * len(fit.used)
 
@@ -465,7 +532,7 @@ def polish(
 
 
 def _with_maps(rig: Rig, pairs: Pairs) -> Rig:
-    """The rig with a rough map for links that have none, by their points."""
+    """Return the rig with a rough map for links that have none, by their points."""
     links = dict(rig.links)
     for names, matches in pairs.items():
         if names in links and links[names].H is None and len(matches.alpha) >= ENOUGH:
@@ -483,7 +550,8 @@ def _changes(parameters: Sequence[FreeParameter], solution: Solution) -> Iterabl
 
 
 def _kept(parameters: Sequence[FreeParameter], solution: Solution) -> Iterable[str]:
-    """As many parameters as combinations that keep their values: those with the largest part in them.
+    """Yield as many parameters as there are combinations that keep their values: those with the largest part
+    in them.
 
     They are the same for any basis of these combinations: pivots of an orthogonal decomposition.
     """

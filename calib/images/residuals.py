@@ -1,8 +1,8 @@
 """Residuals of matched points under a rig: epipolar distances, depths, and whether they are in front.
 
-And which points to fit, which to hold out, and which part of the image they are in.
-Distances are in pixels of the distorted images, through any lens, and differentiable in the rig.
-A batch of rigs (*b) takes the same points for each, or points (*b, n, 2).
+The module also chooses points to fit and to hold out, and the part of the image that each is in. Distances
+are in pixels of the distorted images, through any lens, and differentiable in the rig. A batch of rigs (*b)
+takes the same points for each, or points (*b, n, 2).
 """
 
 from __future__ import annotations
@@ -22,10 +22,13 @@ from .matches import Pairs, PointMatches, fit_fundamental, line_distance, undist
 
 
 class EpipolarResiduals(NamedTuple):
-    """Signed distances in pixels, one per match, and their validity.
+    """Signed epipolar distances in pixels, one per match.
 
-    sampson: from the nearest pair of points that fits (Hartley & Zisserman 11.4.3), in both images together.
-    line: from the epipolar line (the curve, through a lens), in beta.
+    Attributes:
+        sampson: distance from the nearest pair of points that fits (Hartley & Zisserman 11.4.3), in both
+            images together.
+        line: distance from the epipolar line (the curve, through a lens), in beta.
+        valid: mask of the matches whose pixels have rays.
     """
 
     sampson: Float[Tensor, "*b n"]
@@ -34,9 +37,12 @@ class EpipolarResiduals(NamedTuple):
 
 
 class MatchDepths(NamedTuple):
-    """Depth in alpha (metres) of matched points, whether in front of both cameras, and observable.
+    """Depth of matched points, one per match.
 
-    Of uncalibrated pairs no depth is observable, nor a number.
+    Attributes:
+        depth: depth in alpha, in the rig's unit (metres); NaN for uncalibrated pairs.
+        front: mask of the points in front of both cameras.
+        observable: mask of the points with enough parallax; False for uncalibrated pairs.
     """
 
     depth: Float[Tensor, "*b n"]
@@ -47,30 +53,44 @@ class MatchDepths(NamedTuple):
 LEAST_PARALLAX = 2.0
 """Least angle between rays, in pixels, at which their depth is observable."""
 FEW = 10
-"""Least number of points for a share."""
+"""Least number of points for a share to be stated."""
 HELD_OUT = 4
-"""One in this many points or frames is held out."""
+"""Number of points or frames of which one is held out."""
 CELL = 24
-"""Points are held out by squares of this many pixels of alpha, so that neighbours are in the same part."""
+"""Side in pixels of alpha's squares by which points are held out, so that neighbours are in the same part."""
 SIGNIFICANT = 2.0
 """Standard errors by which the distances of held-out points must decrease."""
 TRIMMED = 0.85
-"""The share of the points, those nearest to their lines, that statistics use."""
+"""Share of the points, those nearest to their lines, that statistics use."""
 PARTS = 3
-"""The jackknife leaves out one of so many by so many parts of the image."""
+"""Number of rows and of columns of parts of the image, one of which the jackknife leaves out."""
 
 
 def epipolar_residuals(pair: Pair, matches: PointMatches) -> EpipolarResiduals:
-    """The algebraic error x_beta^T F x_alpha divided by its gradient in the pixels, which counts as constant.
+    """Compute the algebraic error x_beta^T F x_alpha divided by its gradient in the pixels, taken as
+    constant.
 
     With cameras, rays replace pixels and E replaces F, so that lenses are respected to first order in the
-    distance. Raises ValueError if neither cameras nor F are known.
+    distance.
+
+    Returns:
+        Signed distances in pixels, differentiable in the rig, with their validity.
+
+    Raises:
+        ValueError: if neither cameras nor F are known.
     """
     return _residuals(pair, matches)[0]
 
 
 def residuals_and_depths(pair: Pair, matches: PointMatches) -> tuple[EpipolarResiduals, MatchDepths]:
-    """The residuals and, by the same rays, the depths; these not differentiable."""
+    """Compute the epipolar residuals and, by the same rays, the depths, which are detached.
+
+    Returns:
+        As of `epipolar_residuals`, and depths in alpha.
+
+    Raises:
+        ValueError: if neither cameras nor F are known.
+    """
     residuals, (a, b) = _residuals(pair, matches)
     return residuals, _depths(pair, a.detach(), b.detach(), residuals.valid)
 
@@ -88,7 +108,14 @@ def _residuals(pair: Pair, matches: PointMatches) -> tuple[EpipolarResiduals, tu
 
 
 def within_lenses(rig: Rig, pairs: Pairs) -> dict[tuple[str, str], PointMatches]:
-    """The matches whose points have rays through their cameras' lens models; all of a pair with few such."""
+    """Select the matches whose points have rays through their cameras' lens models.
+
+    Returns:
+        Matches by pair; all of a pair with fewer than 2 `FEW` such ones.
+
+    Raises:
+        ValueError: for pairs with neither cameras nor F.
+    """
     kept = {}
     for names, matches in pairs.items():
         valid = epipolar_residuals(rig.pair(*names), matches).valid
@@ -97,13 +124,28 @@ def within_lenses(rig: Rig, pairs: Pairs) -> dict[tuple[str, str], PointMatches]
 
 
 def sampson_of_pairs(rig: Rig, pairs: Pairs) -> list[Float[Tensor, " n"]]:
-    """Sampson distances of the points of each pair, pixels; 0 where a pixel has no ray."""
+    """Compute Sampson distances of the points of each pair, pixels; 0 where a pixel has no ray.
+
+    Returns:
+        One tensor per pair, differentiable in the rig.
+
+    Raises:
+        ValueError: for pairs with neither cameras nor F.
+    """
     parts = [epipolar_residuals(rig.pair(*names), matches) for names, matches in pairs.items()]
     return [torch.where(of_pair.valid, of_pair.sampson, 0.0) for of_pair in parts]
 
 
 def match_depths(rig: Rig, pairs: Pairs) -> MatchDepths:
-    """Of all points of all pairs: depths where rays are closest to each other, differentiable in the rig."""
+    """Compute depths of all points of all pairs, where rays are closest to each other; differentiable in the
+    rig.
+
+    Returns:
+        Depths in alpha, the pairs' points one after the other.
+
+    Raises:
+        ValueError: for pairs with neither cameras nor F.
+    """
     depths = []
     for names, matches in pairs.items():
         pair = rig.pair(*names)
@@ -113,7 +155,7 @@ def match_depths(rig: Rig, pairs: Pairs) -> MatchDepths:
 
 
 def _depths(pair: Pair, a: Tensor, b: Tensor, valid: Tensor) -> MatchDepths:
-    """Depths of the points at which two rays are nearest to one another; NaN for pairs known by F."""
+    """Compute depths of the points at which two rays are nearest to one another; NaN for pairs known by F."""
     if not pair.calibrated or pair.link is not None:
         never = torch.zeros_like(valid)
         return MatchDepths(torch.full_like(a[..., 2], torch.nan), never, never)
@@ -129,15 +171,21 @@ def _depths(pair: Pair, a: Tensor, b: Tensor, valid: Tensor) -> MatchDepths:
 
 
 def share(chosen: Bool[Tensor, " n"]) -> float:
-    """The share of points that are chosen; NaN for few points."""
+    """Return the share of points that are chosen; NaN for fewer than `FEW` points."""
     return float(chosen.double().mean()) if len(chosen) >= FEW else math.nan
 
 
 def systematic_modes(pair: Pair, matches: PointMatches) -> tuple[Float[Tensor, "n m"], Float[Tensor, "n m"]]:
-    """Derivatives of the Sampson distances by smooth displacements of alpha's points, and of beta's.
+    """Compute derivatives of the Sampson distances by smooth displacements of alpha's points, and of beta's.
 
     The displacements are what a lens model leaves, each 1 pixel at the image's corner: radial, of third and
     fifth order, and decentred along x and along y.
+
+    Returns:
+        Four columns for alpha and four for beta, one row a match; 0 where a pixel has no ray.
+
+    Raises:
+        ValueError: for a pair with neither cameras nor F.
     """
     alpha, beta = (x.detach().requires_grad_() for x in matches)
     with torch.enable_grad():
@@ -152,7 +200,11 @@ def systematic_modes(pair: Pair, matches: PointMatches) -> tuple[Float[Tensor, "
 
 
 def displacements(hw: HW, points: Float[Tensor, "n 2"]) -> Float[Tensor, "n 2 4"]:
-    """Those of `systematic_modes`, at points (x, y) of an image of this size."""
+    """Compute the smooth displacements of `systematic_modes` at points (x, y) of an image of this size.
+
+    Returns:
+        Pixels (x, y) of each of the four displacements.
+    """
     h, w = hw
     p = (points - points.new_tensor([(w - 1) / 2, (h - 1) / 2])) / (0.5 * math.hypot(h, w))
     x, y = p.unbind(-1)
@@ -164,7 +216,15 @@ def displacements(hw: HW, points: Float[Tensor, "n 2"]) -> Float[Tensor, "n 2 4"
 
 
 def lines_basis(pair: Pair, matches: PointMatches) -> Float[Tensor, "n 8"]:
-    """Derivatives of the line distances by the eight degrees of freedom of F (of E, for rays) up to scale."""
+    """Compute derivatives of the line distances by the eight degrees of freedom of F (of E, for rays) up to
+    scale.
+
+    Returns:
+        One row a match; 0 where a pixel has no ray.
+
+    Raises:
+        ValueError: for a pair with neither cameras nor F.
+    """
     alpha, beta = (x.detach().requires_grad_() for x in matches)
     with torch.enable_grad():
         rays, F, _ = _rays(pair, alpha, beta)
@@ -177,7 +237,14 @@ def lines_basis(pair: Pair, matches: PointMatches) -> Float[Tensor, "n 8"]:
 
 
 def related(rig: Rig, pairs: Pairs) -> dict[tuple[str, str], PointMatches]:
-    """Those of the pairs the rig relates: calibrated ones and those with an F. Raises ValueError if none."""
+    """Select those of the pairs that the rig relates: calibrated ones and those with an F.
+
+    Returns:
+        Matches by pair of names.
+
+    Raises:
+        ValueError: if there are none.
+    """
     relations = {
         names: m
         for names, m in pairs.items()
@@ -191,14 +258,15 @@ def related(rig: Rig, pairs: Pairs) -> dict[tuple[str, str], PointMatches]:
 
 
 def stack_key(pair: Pair) -> tuple[object, ...]:
-    """What pairs must have in common to be stacked: calibrated or known by F, and their lens models."""
+    """Return what pairs must have in common to be stacked: calibrated or known by F, and their
+    lens models."""
     lenses = (view.distortion if isinstance(view, LensView) else None for view in (pair.alpha, pair.beta))
     kinds = (None if lens is None else (lens.model, lens.coefficients.shape[-1]) for lens in lenses)
     return (pair.calibrated and pair.link is None, *kinds)
 
 
 def stacked(pairs: Sequence[Pair]) -> Pair:
-    """A batch of pairs of one `stack_key`; image sizes are those of the first."""
+    """Stack pairs of one `stack_key` into a batch; image sizes are those of the first."""
     link = None
     if pairs[0].link is not None:
         link = stack([Link(pair.fundamental) for pair in pairs])
@@ -216,7 +284,7 @@ def _stacked(views: Sequence[View]) -> View:
 
 
 def _for_each(pair: Pair, matches: PointMatches) -> tuple[Tensor, Tensor]:
-    """The points expanded to a batch of rigs."""
+    """Expand the points to a batch of rigs."""
     numbers = (
         pair.link.F if pair.link is not None else pair.cameras[0].K if pair.calibrated else pair.fundamental
     )
@@ -225,7 +293,7 @@ def _for_each(pair: Pair, matches: PointMatches) -> tuple[Tensor, Tensor]:
 
 
 def _rays(pair: Pair, x: Tensor, y: Tensor) -> tuple[tuple[Tensor, Tensor], Tensor, Tensor]:
-    """Rays of the pixels and E, or the undistorted pixels and F; and their validity."""
+    """Return rays of the pixels and E, or the undistorted pixels and F; and their validity."""
     if pair.link is not None or not pair.calibrated:
         (a, a_valid), (b, b_valid) = pair.alpha.undistort(x), pair.beta.undistort(y)
         return (to_homogeneous(a), to_homogeneous(b)), pair.fundamental, a_valid & b_valid
@@ -234,7 +302,12 @@ def _rays(pair: Pair, x: Tensor, y: Tensor) -> tuple[tuple[Tensor, Tensor], Tens
 
 
 def own_distance(rig: Rig, pairs: Pairs) -> float:
-    """How near points can be to any lines: median distance, undistorted pixels, from those of their own F."""
+    """Compute how near points can be to any lines: their median distance from the lines of an F fitted to
+    them.
+
+    Returns:
+        Undistorted pixels of beta; 0 if no F fits.
+    """
     distances = []
     for names, matches in pairs.items():
         undistorted = undistort_matches(rig.pair(*names), matches)
@@ -246,33 +319,51 @@ def own_distance(rig: Rig, pairs: Pairs) -> float:
 
 
 def trimmed_square(distance: Float[Tensor, " n"]) -> float:
-    """The mean square of the distances of those points that are nearest to their lines."""
+    """Compute the mean square of the distances of those points that are nearest to their lines, `TRIMMED` of
+    all."""
     squares = distance.square().sort().values
     return float(squares[: max(1, int(TRIMMED * len(squares)))].mean())
 
 
 def nearer(before: Float[Tensor, " n"], after: Float[Tensor, " n"]) -> bool:
-    """Whether distances from the lines decreased significantly: a paired test, distances clipped at 5 px."""
+    """Return True if distances from the lines decreased significantly: a paired test, distances clipped at 5
+    px."""
     gain = before.abs().clamp(max=5) - after.abs().clamp(max=5)
     return float(gain.mean()) > SIGNIFICANT * float(gain.std()) / len(gain) ** 0.5
 
 
 def line_distances(rig: Rig, pairs: Pairs) -> Float[Tensor, " n"]:
-    """Signed distances in pixels of all points from their lines, in beta."""
+    """Compute signed distances of all points from their lines, in beta's pixels, detached.
+
+    Returns:
+        The pairs' points one after the other.
+
+    Raises:
+        ValueError: for pairs with neither cameras nor F.
+    """
     return torch.cat([epipolar_residuals(rig.pair(*n), m).line.detach() for n, m in pairs.items()])
 
 
 def median_off(rig: Rig, pairs: Pairs) -> float:
-    """The median size of these distances, pixels."""
+    """Compute the median absolute distance of all points from their lines, in beta's pixels.
+
+    Raises:
+        ValueError: for pairs with neither cameras nor F.
+    """
     return float(line_distances(rig, pairs).abs().median())
 
 
 def split(
     frames: Sequence[Pairs],
 ) -> tuple[dict[tuple[str, str], PointMatches], dict[tuple[str, str], PointMatches]]:
-    """Points to use and points to hold out: whole frames if several, else squares of alpha's image.
+    """Split points into those to use and those to hold out: whole frames if several, else squares of alpha's
+    image.
 
-    Raises ValueError for points of which none are left to use, as all are in one square.
+    Returns:
+        Matches to use and to hold out, by pair of names.
+
+    Raises:
+        ValueError: for points of which none are left to use, as all are in one square.
     """
     if len(frames) > 1:
         held_out = max(1, len(frames) // HELD_OUT)
@@ -292,7 +383,8 @@ def split(
 
 
 def held_out_parts(matches: PointMatches) -> Int[Tensor, " n"]:
-    """Which of `HELD_OUT` parts, each of squares of alpha, a point is in; the first with any is held out."""
+    """Return which of `HELD_OUT` parts, each of squares of alpha, a point is in; the first with any is held
+    out."""
     column, row = (matches.alpha / CELL).floor().long().unbind(-1)
     return (column + 2 * row) % HELD_OUT
 
@@ -306,18 +398,20 @@ def _joined(frames: Sequence[Pairs]) -> dict[tuple[str, str], PointMatches]:
 
 
 def held_out_pixels(error: Tensor) -> Tensor:
-    """Held-out pixels of a grid: one square of 4 x 4 in `HELD_OUT`."""
+    """Return a mask of the held-out pixels of a grid: one square of 4 x 4 in `HELD_OUT`."""
     rows, columns = (torch.arange(n) // 4 for n in error.shape)
     return (columns + 2 * rows[:, None]) % HELD_OUT == 0
 
 
 def image_parts(rig: Rig, pairs: Pairs) -> Int[Tensor, " n"]:
-    """Which of `PARTS` x `PARTS` parts of alpha's image each point is in."""
+    """Return which of `PARTS` x `PARTS` parts of alpha's image each point is in, the pairs one after the
+    other."""
     return torch.cat([parts_of(rig[alpha].hw, matches.alpha) for (alpha, _), matches in pairs.items()])
 
 
 def parts_of(hw: HW, points: Float[Tensor, "n 2"]) -> Int[Tensor, " n"]:
-    """Which of `PARTS` x `PARTS` parts of an image of this size each point (x, y) is in."""
+    """Return which of `PARTS` x `PARTS` parts of an image of this size each point (x, y) is in,
+    row by row."""
     h, w = hw
     cell = (points * PARTS / points.new_tensor([w, h])).floor().long().clamp(0, PARTS - 1)
     return cell[:, 0] + PARTS * cell[:, 1]

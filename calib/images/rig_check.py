@@ -1,4 +1,4 @@
-"""Whether a rig fits the images that it is used with: a quick look before fusing or drawing."""
+"""Quick check whether a rig fits the images that it is used with, before fusing or drawing."""
 
 from __future__ import annotations
 
@@ -15,23 +15,26 @@ from .matches import Images, Pairs, match_cameras
 from .residuals import median_off, own_distance, related
 
 LARGEST_SIDE = 1000
-"""Images are reduced to this many pixels..."""
+"""Longer side in pixels to which images are reduced..."""
 ROUGH_SIDE = 500
-"""... but first to this many: a rig that fits then is not compared again. That takes a fourth of the time."""
+"""... after a first look at this size: a rig that fits then is not compared again. That takes a fourth of the
+time."""
 MOST_CAMERAS = 4
 BADLY, OF_OWN = 1.5, 3.0
-"""A rig fits badly whose points lie farther from their lines than this, in pixels of the reduced images
-(median), and than this many times their distance from the lines of an F fitted to them."""
+"""Least median distance of points from their lines, in pixels of the reduced images, and as a multiple of
+their distance from the lines of an F fitted to them; a rig beyond both fits badly."""
 OUTSIDE = 0.5
-"""And a rig is wrong with more than this share of points outside (`share_outside`)."""
+"""Share of points outside (`share_outside`) above which a rig is wrong."""
 
 
 class Misfit(NamedTuple):
-    """How badly a rig fits.
+    """Measures of a rig that fits badly.
 
-    off: distance of the matched points from their lines (median, pixels of the reduced images). outside: the
-    share of them behind the cameras or outside the depth range. mistaken: the doctor names a mistake, not a
-    drift. text: a sentence on all this, with the doctor's.
+    Attributes:
+        off: median distance of the matched points from their lines, pixels of the reduced images.
+        outside: share of them behind the cameras or outside the depth range; NaN for few points.
+        mistaken: True if the doctor names a mistake, not a drift.
+        text: a sentence on all this, with the doctor's verdict.
     """
 
     off: float
@@ -41,16 +44,19 @@ class Misfit(NamedTuple):
 
 
 def misfit_warning(rig: Rig, images: Images) -> str | None:
-    """The sentence of `find_misfit`, if any."""
+    """Return the sentence of `find_misfit`; None if the rig fits or nothing can be said."""
     misfit = find_misfit(rig, images)
     return None if misfit is None else misfit.text
 
 
 def find_misfit(rig: Rig, images: Images) -> Misfit | None:
-    """What is wrong if the rig fits one image (C, H, W) of each of two or more cameras badly; else None.
+    """Compare a rig with one image (C, H, W) of each of two or more of its cameras.
 
-    None too where nothing can be said: too few matched points, images of another size, cameras that are not
-    related.
+    Only the first `MOST_CAMERAS` images are used.
+
+    Returns:
+        The misfit if the rig fits badly; None if it fits, and where nothing can be said: too few matched
+        points, images of another size, cameras that are not related.
     """
     some = {name: images[name] for name in list(images.keys())[:MOST_CAMERAS]}
     if len(some) < 2 or any(rig[name].hw != tuple(image.shape[1:]) for name, image in some.items()):
@@ -84,12 +90,12 @@ def find_misfit(rig: Rig, images: Images) -> Misfit | None:
 
 
 def _scale(image: Tensor, largest: int) -> float:
-    """By what an image is reduced."""
+    """Return the factor, at most 1, by which an image is reduced."""
     return min(1.0, largest / max(image.shape[1:]))
 
 
 def _matched(rig: Rig, images: Mapping[str, Tensor], largest: int) -> tuple[Rig, Pairs] | None:
-    """Points matched between images with sides reduced to so many pixels at most; None if too few."""
+    """Match points between images with sides reduced to so many pixels at most; None if too few."""
     reduced = {}
     for name, image in images.items():
         scale = _scale(image, largest)

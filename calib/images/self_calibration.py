@@ -1,8 +1,8 @@
 """Calibrated pairs from images alone: focal lengths given or assumed, poses and the rest from matches.
 
-Points determine the epipolar lines, and those are as good as with a calibration. They do not determine the
-scale of the scene, and focal lengths only poorly: depths are multiples of the baseline, and proportional to
-what is assumed.
+Points determine the epipolar lines, which are as good as with a calibration. They do not determine the scale
+of the scene, and focal lengths only poorly: depths are multiples of the baseline, and proportional to the
+assumed focal length.
 """
 
 from __future__ import annotations
@@ -41,34 +41,34 @@ from .residuals import median_off
 LOG = logging.getLogger(__name__)
 
 FOCAL_SHARE = 1.2
-"""The focal length that is assumed, as a share of the image's longer side: that of a view 45 degrees wide."""
+"""Assumed focal length as a share of the image's longer side: that of a view 45 degrees wide."""
 SIGMA = {"rotation": math.radians(3), "translation": 0.3, "focal": 0.05}
 CENTRE_SHARE = 0.05
-"""Standard deviations of what is assumed: radians, a share of the baseline, of the focal length; of the
-principal point, as a share of the longer side."""
+"""Standard deviation of the principal point, as a share of the longer side. Those in `SIGMA` are radians, a
+share of the baseline, and a share of the focal length."""
 SHORTEST = 1e-12
 """Least length of a baseline of 1 after refinement: the direction of a shorter one is rounding."""
 NEAR_LINE = 2.0
-"""Points this near to their lines, in pixels, are used."""
+"""Distance in pixels from their lines up to which points are used."""
 AS_GOOD = 1.5
 SLACK = 0.1
-"""A calibrated pair is accepted if points are at most `AS_GOOD` times as far from its lines as from those of
-F alone, and `SLACK` pixels more."""
+"""Pixels of tolerance: a calibrated pair is accepted if points are at most `AS_GOOD` times as far from its
+lines as from those of F alone, and `SLACK` pixels more."""
 ALIKE = 8.0
 ALIKE_SLACK = 0.03
-"""Poses whose points are farther from their lines than those of the best by no more than this, over the root
-of the points' number, as a share, and so many pixels more, are alike: points do not distinguish a rotation
-from a translation where they are few or far, nor the side that beta is on. Of those with most points in
-front of the cameras, the smallest rotation is taken."""
+"""Pixels of tolerance: poses count as equal whose points are farther from their lines than those of the best
+by at most the share `ALIKE` / sqrt(number of points), and `ALIKE_SLACK` more. Points do not distinguish a
+rotation from a translation where they are few or far, nor the side that beta is on. Of those with most points
+in front of the cameras, the smallest rotation is taken."""
 OUTLYING = 8.0
-"""Inverse depths this many times their median deviation from the median are of wrong matches."""
+"""Distance from the median inverse depth, in median deviations, beyond which a match is wrong."""
 MARGIN, LEAST_MARGIN = 1.0, 0.12
-"""Depth bounds extend the range of the inverse depths of points by this share of it, and by at least this
-share of beta's longer side, as a disparity: points may all be on one surface, and too wide a range hardly
-costs quality."""
+"""Share of the range of inverse depths by which depth bounds extend it, and the least extension as a
+disparity, a share of beta's longer side: points may all be on one surface, and too wide a range hardly costs
+quality."""
 DENSE_POINTS = 2000
 SPACING = 4
-"""Dense points at most, and their least distance, pixels."""
+"""Least distance of dense points, pixels; `DENSE_POINTS` is their largest number."""
 LEAST_CONFIDENCE = 0.5
 WELL_LOCALISED = 0.3
 """Largest standard deviation of a dense point, pixels."""
@@ -77,9 +77,12 @@ WELL_LOCALISED = 0.3
 class RefinedPair(NamedTuple):
     """A calibrated pair as a rig of two cameras, with the depth range of the points that determine it.
 
-    points: their number. distance: their median distance from their lines, pixels of beta. exact: whether
-    these lines fit as well as those of F alone; if not, the rig is good for rough depths, and the lines are
-    to be F's.
+    Attributes:
+        rig: the two cameras, alpha at the origin, with the depth range of the points.
+        points: number of the points.
+        distance: their median distance from their lines, pixels of beta.
+        exact: True if these lines fit as well as those of F alone; if False, the rig serves for rough depths,
+            and the lines should be those of F.
     """
 
     rig: Rig
@@ -92,12 +95,18 @@ class RefinedPair(NamedTuple):
 def self_calibrated(
     views: Mapping[str, View], link: Link, matches: PointMatches, *, focal: Mapping[str, float]
 ) -> RefinedPair | None:
-    """Alpha and beta, with epipolar lines as near `link`'s as can be; None for points that no
-    poses explain.
+    """Calibrate alpha and beta so that their epipolar lines are as near those of `link` as possible.
 
-    Alpha is at the origin with the principal point in the middle, and the baseline is 1. `focal` has focal
-    lengths in pixels, by camera; others are assumed. Cameras have the lenses of their views; the pair then is
-    not `exact`.
+    Alpha is at the origin with the principal point in the middle, and the baseline is 1. Cameras have the
+    lenses of their views; the pair then is not `exact`.
+
+    Args:
+        views: alpha's and beta's view, by name, alpha first.
+        matches: points of the distorted images.
+        focal: focal lengths in pixels by camera; missing ones are assumed.
+
+    Returns:
+        The pair; None for points that no poses explain.
     """
     alpha, beta = views
     lenses = {
@@ -136,10 +145,16 @@ def self_calibrated(
 def refined_by_depth(
     pair: RefinedPair, images: Images, depth: Float[Tensor, "h w"], confidence: Float[Tensor, "h w"]
 ) -> RefinedPair:
-    """The pair refined by dense matches: where a fusion found alpha's pixels, improved by least squares.
+    """Refine a pair by dense matches: alpha's pixels at the places that a fusion gave them, improved by least
+    squares.
 
-    `images`, `depth` and `confidence` are of the sizes of the pair's cameras. The same pair if there are too
-    few.
+    Args:
+        images: one image (C, H, W) in 0..1 per camera, of the pair's sizes.
+        depth: depth of alpha's pixels, in the pair's unit; NaN where unknown.
+        confidence: confidence of alpha's pixels, 0..1.
+
+    Returns:
+        The refined pair; the same pair if there are too few matches, or it has no parallax.
     """
     matches = dense_matches(pair.rig, images, depth, confidence)
     if len(matches.alpha) < 5 * ENOUGH:
@@ -149,9 +164,11 @@ def refined_by_depth(
 
 
 def joined(pairs: Mapping[str, RefinedPair], scales: Mapping[str, float]) -> Rig:
-    """One rig of pairs with one alpha, by beta; each pair's lengths times its scale. Named `UNSCALED`.
+    """Join pairs with one alpha into one rig named `UNSCALED`, with the depth range of all.
 
-    The depth range is that of all pairs.
+    Args:
+        pairs: pairs by beta's name.
+        scales: factor of each pair's lengths, by beta's name.
     """
     rigs = {name: pair.rig.scaled(scales[name]) for name, pair in pairs.items()}
     first = next(iter(rigs.values()))
@@ -165,7 +182,17 @@ def joined(pairs: Mapping[str, RefinedPair], scales: Mapping[str, float]) -> Rig
 def dense_matches(
     rig: Rig, images: Images, depth: Float[Tensor, "h w"], confidence: Float[Tensor, "h w"]
 ) -> PointMatches:
-    """Points of texture in alpha with their positions in beta, from a depth map, refined by least squares."""
+    """Match points of texture in alpha with beta, from a depth map, refined by least squares.
+
+    Args:
+        rig: two cameras, alpha first.
+        images: one image (C, H, W) in 0..1 per camera, of the rig's sizes.
+        depth: depth of alpha's pixels, in the rig's unit; pixels without finite depth are left out.
+        confidence: confidence of alpha's pixels; those up to `LEAST_CONFIDENCE` are left out.
+
+    Returns:
+        The matches whose position is known to `WELL_LOCALISED` pixels.
+    """
     alpha, beta = (camera.to(torch.float64) for camera in _pair(rig).cameras)
     alpha_image, beta_image = (contrast_equalised(images[name]) for name in rig.names)
     corners = cv2.goodFeaturesToTrack(alpha_image, DENSE_POINTS, 1e-4, SPACING)
@@ -185,9 +212,10 @@ def dense_matches(
 
 
 def depth_bounds(rig: Rig, matches: PointMatches) -> tuple[float, float] | None:
-    """Near and far of the matched points of a rig of two cameras, extended; far may be infinite.
+    """Estimate near and far of the matched points of a rig of two cameras, extended.
 
-    None for points without parallax.
+    Returns:
+        Depths in the rig's unit, far possibly infinite; None for fewer than `ENOUGH` points with parallax.
     """
     pair = _pair(rig)
     inverse = 1 / depths_near_lines(pair, matches, within=NEAR_LINE)
@@ -203,7 +231,8 @@ def depth_bounds(rig: Rig, matches: PointMatches) -> tuple[float, float] | None:
 
 
 def _focal_lengths(views: Mapping[str, View], link: Link, focal: Mapping[str, float]) -> dict[str, float]:
-    """Focal lengths in pixels: as given, or by the ratio of the image scales to the other's, or assumed."""
+    """Return focal lengths in pixels: as given, or by the ratio of the image scales to the other's, or
+    assumed."""
     alpha, beta = views
     ratio = (
         1.0 if link.H is None else float(torch.linalg.det(link.H[:2, :2]).abs().sqrt() / link.H[2, 2].abs())
@@ -216,9 +245,13 @@ def _focal_lengths(views: Mapping[str, View], link: Link, focal: Mapping[str, fl
 def initial_poses(
     matches: PointMatches, link: Link, K: Float[Tensor, "3 3"], K_beta: Float[Tensor, "3 3"]
 ) -> list[Pose]:
-    """Poses of beta, baselines of 1, from which to fit: parallel axes, by F, by an essential matrix.
+    """List poses of beta, with baselines of 1, from which to fit: parallel axes, by F, by an essential
+    matrix.
 
-    Of parallel axes beta is to either side along the direction in which most points differ.
+    With parallel axes beta is to either side along the direction in which most points differ.
+
+    Returns:
+        Two to four poses, beta from alpha.
     """
     R, rays = _upright(link), [torch.linalg.inv(k) for k in (K, K_beta)]
     x, y = (map_homogeneous(inverse, points)[..., :2] for inverse, points in zip(rays, matches))
@@ -236,7 +269,7 @@ def initial_poses(
 
 
 def _upright(link: Link) -> Float[Tensor, "3 3"]:
-    """The rotation about the axis, in steps of 90 degrees, of beta's image against alpha's."""
+    """Return the rotation about the axis, in steps of 90 degrees, of beta's image against alpha's."""
     H = torch.eye(3) if link.H is None else link.H
     steps = round(math.atan2(float(H[1, 0] / H[2, 2]), float(H[0, 0] / H[2, 2])) / (math.pi / 2))
     return rotation_from_vector(torch.tensor([0.0, 0.0, steps * math.pi / 2], dtype=torch.float64))
@@ -245,9 +278,11 @@ def _upright(link: Link) -> Float[Tensor, "3 3"]:
 def _refined_pair(
     rig: Rig, matches: PointMatches, near: PointMatches, *, fixed: Sequence[str] = ()
 ) -> RefinedPair | None:
-    """The pair refined by matches, its distance and depths those of `near`; None without parallax.
+    """Refine a pair by matches, with distance and depths by `near`.
 
-    Nor if the baseline, whose length matches do not determine, is shorter than `SHORTEST` then.
+    Returns:
+        The pair; None without parallax, or if the baseline, whose length matches do not determine, becomes
+        shorter than `SHORTEST`.
     """
     alpha, beta = rig.names
     free = [f"{beta}.{kind}" for kind in (*SIGMA, "centre") if kind not in fixed]

@@ -1,4 +1,4 @@
-"""How well stated certainty holds, and the fit of it: `python -m experiments certainty --middlebury DIR`.
+"""Check of stated certainty, and its fit: `python -m experiments certainty --middlebury DIR`.
 
 Pairs with true disparity are fused under many conditions: how often are matches right that are stated to be
 so with some probability, and how many true positions lie in the interval of 9 of 10? With `--fit FILE` a
@@ -34,7 +34,7 @@ from pat.support.tensor_files import read_tensors, with_weights
 from .conditions import CONDITIONS, save_curves
 
 PIXELS = 6000
-"""Of a pair under a condition that take part, drawn evenly: every pair counts the same."""
+"""Number of pixels of a pair under a condition that take part, drawn evenly: every pair counts the same."""
 BINS = 15
 """Bins of probability by which the calibration error is measured, as is usual (Guo et al. 2017)."""
 FITTED_ON = (
@@ -56,21 +56,32 @@ class Judged(NamedTuple):
 
 
 class Stated(NamedTuple):
-    """What is stated of pixels (n): the probability that the match is right, the interval's half-width."""
+    """Statement on pixels (n).
+
+    Attributes:
+        probability: probability that the match is right.
+        half_width: half-width of the interval, pixels.
+    """
 
     probability: Float[Tensor, " n"]
     half_width: Float[Tensor, " n"]
 
     @classmethod
     def by(cls, network: CertaintyNetwork, numbers: Float[Tensor, "n k"]) -> Stated:
-        """By a network."""
+        """Compute the statement of a network."""
         with torch.no_grad():
             logit, width = network(numbers).unbind(-1)
         return cls(logit.sigmoid(), width.exp())
 
 
 class Reliability(NamedTuple):
-    """By bins of stated probability: its mean, the share that is right, the share of matches in the bin."""
+    """Reliability by bins of stated probability.
+
+    Attributes:
+        stated: mean stated probability of each bin.
+        right: share of right matches of each bin.
+        share: share of all matches in each bin.
+    """
 
     stated: Float[Tensor, " bins"]
     right: Float[Tensor, " bins"]
@@ -78,7 +89,7 @@ class Reliability(NamedTuple):
 
     @classmethod
     def of(cls, probability: Float[Tensor, " n"], right: Bool[Tensor, " n"], bins: int = BINS) -> Reliability:
-        """How often matches are right, by the probability stated for them."""
+        """Compute the share of right matches by stated probability."""
         which = (probability * bins).long().clamp(0, bins - 1)
         count = torch.bincount(which, minlength=bins).double()
         stated, fulfilled = (torch.bincount(which, x.double(), minlength=bins) for x in (probability, right))
@@ -174,7 +185,8 @@ def fitted(pixels: Sequence[Judged], *, steps: int = STEPS) -> CertaintyNetwork:
 
 
 def by_thirds(pixels: Sequence[Judged], *, steps: int = STEPS) -> Callable[[Judged], Stated]:
-    """What fits to two thirds of the pairs state of the others."""
+    """Fit to two thirds of the pairs each, and return the function that states the certainty of
+    the others."""
     pairs = list(grouped(pixels, "pair"))
     networks = [fitted([j for j in pixels if j.pair not in pairs[k::3]], steps=steps) for k in range(3)]
     return lambda one: Stated.by(networks[pairs.index(one.pair) % 3], one.numbers)
@@ -192,14 +204,15 @@ def widened(pixels: Sequence[Judged], *, steps: int = STEPS) -> CertaintyNetwork
 
 
 class Held(NamedTuple):
-    """How it held in a condition: the stated probability, the share of true positions in intervals."""
+    """Result in a condition: the stated probability's reliability, and the share of true positions in
+    intervals."""
 
     stated: Reliability
     covered: float
 
 
 def held(pixels: Sequence[Judged], stating: Callable[[Judged], Stated]) -> dict[str, Held]:
-    """By condition, and over "all"."""
+    """Compute the result by condition, and over "all"."""
     stated = [stating(j) for j in pixels]
 
     def of(some: Sequence[int]) -> Held:

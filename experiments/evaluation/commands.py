@@ -201,7 +201,7 @@ class Certainty(Pairs):
 
 @dataclass
 class OnScenes:
-    """What ablations on layered scenes share."""
+    """Options that ablations on layered scenes share."""
 
     weights: Weights = "pat-supervised"
     without: tuple[str, ...] = ()

@@ -53,10 +53,14 @@ REGIONS = ("whole", "seen", "occluded", "beyond", "cropped")
 
 @dataclass(frozen=True)
 class Condition:
-    """How a pair is recorded, with beta reduced `rate` times.
+    """Condition in which a pair is recorded.
 
-    right: applied to the right image (C, H, W) before it is reduced; alpha: weights of red, green and blue in
-    alpha; beta: applied to beta; noise: of both cameras.
+    Attributes:
+        rate: factor by which beta is reduced.
+        right: function applied to the right image (C, H, W) before it is reduced.
+        alpha: weights of red, green and blue in alpha.
+        beta: function applied to beta.
+        noise: noise level of both cameras; None for none.
     """
 
     rate: int = 2
@@ -134,7 +138,7 @@ CONDITIONS: dict[str, Condition] = {
     "200 electrons": _low_light(200),
     "50 electrons": _low_light(50),
 }
-"""By name. Rows, degrees in pixels and angles of the right image before it is reduced."""
+"""Conditions by name. Rows, degrees in pixels and angles of the right image before it is reduced."""
 
 
 class ConditionRow(NamedTuple):
@@ -154,7 +158,8 @@ class ConditionRow(NamedTuple):
 
 
 def methods_of(network: FusionNetwork, level: NoiseLevel | None) -> dict[str, StereoMethod]:
-    """Those compared: classical, denoised first if there is noise, ours as it is and without corrections."""
+    """Return the methods to compare: classical, denoised first if there is noise, ours with and without
+    corrections."""
     methods: dict[str, StereoMethod] = {"classical": classical}
     if level is None:
         methods["classical, corrected"] = lambda a, b, d: corrected_classical(network, a, b, d)
@@ -280,7 +285,7 @@ def _by_condition(rows: Sequence[ConditionRow]) -> str:
 
 
 def _gains(rows: Sequence[ConditionRow]) -> list[float]:
-    """Of fusion over classical, in one condition: decibels, pair by pair."""
+    """Return the gains of fusion over classical, in one condition: decibels, pair by pair."""
     psnr = {(r.method, r.pair): r.psnr["whole"] for r in rows}
     return [value - psnr["classical", pair] for (method, pair), value in psnr.items() if method == "fusion"]
 

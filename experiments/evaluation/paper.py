@@ -94,7 +94,8 @@ class ShuffledField:
 
 
 def controls(network: FusionNetwork, *, bands: bool = False) -> dict[str, StereoMethod]:
-    """What fusion that uses beta must lose by: no beta (zeros), beta of another scene, shuffled fields."""
+    """Return the controls that fusion must beat if it uses beta: no beta (zeros), beta of another scene,
+    shuffled fields."""
     other = read_image(SAMPLE / f"{BETA}.png")
     fusion = rectified_fusion(network, bands=bands)
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MEASURES = {"psnr": ("gain in PSNR, dB", "{:+.2f}"), "peaks": ("peaks within a pixel, %", "{:.1f}")}
-"""What is drawn, its label, and how it is printed."""
+"""Label and format of each measure drawn."""
 
 
 def write_report(rows: Sequence[Row], out: Path) -> None:
@@ -104,7 +104,7 @@ def _draw(axis: Axes, rows: Sequence[Row], measure: str) -> None:
 
 
 def _drawn(rows: Sequence[Row], field: str, value: float, measure: str) -> list[float]:
-    """What is drawn of each scene of one sweep, where there is something: gains in dB, peaks in percent."""
+    """Return the measure of each scene of one sweep, where there is one: gains in dB, peaks in percent."""
     some = [row for row in rows if (row.field, row.value) == (field, value) and not row.note]
     if measure == "peaks":
         return [100 * row.peaks for row in some]

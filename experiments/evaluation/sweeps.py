@@ -57,7 +57,7 @@ from pat.support.metrics import score
 
 SIZE: HW = (96, 128)
 NEAR, FAR = 2.0, 16.0
-"""Of the scenes, metres."""
+"""Depth range of the scenes, metres."""
 PARALLAX = 24.0
 """Displacement of the nearest points against infinity, alpha's pixels, where it is not what changes."""
 BORDER = 32
@@ -189,7 +189,7 @@ FIELDS: dict[str, ReceptiveField | Way] = {
     "local 5x5": Local(),
     "dense": Dense(),
 }
-"""What is compared by default."""
+"""Fields and ways that are compared by default."""
 
 
 def ablate(
@@ -223,7 +223,7 @@ def ablate(
 
 
 def _numbers(rig: Rig) -> bytes:
-    """What two rigs of equal cameras have in common."""
+    """Return the numbers that two rigs of equal cameras have in common."""
     return b"".join(t.numpy().tobytes() for c in two(rig).pair(ALPHA, BETA).cameras for t in (c.K, c.R, c.t))
 
 
@@ -303,7 +303,7 @@ SWEEPS: dict[str, tuple[str, tuple[float, ...]]] = {
     "focal ratio": ("alpha's focal length over beta's", (1, 1.5, 2, 3, 4)),
     "ahead": ("direction of the baseline, degrees from across to ahead", (0, 30, 60, 90)),
 }
-"""What changes, and the values it takes."""
+"""Label of each sweep, and its values."""
 
 
 def points(sweeps: Sequence[str] = tuple(SWEEPS), *, hw: HW = SIZE) -> Iterator[Point]:

@@ -21,11 +21,11 @@ TITLE = "four mono cameras, three filters, four exposures: more range than any o
 REDUCED = 2 / 5
 DEPTHS, LAYERS, SEED = (2.2, 11.0), 10, 13
 ELECTRONS, READ = 10_500, 4
-"""Of the sensors: electrons at white, and noise of reading in electrons."""
+"""Electrons at white and noise of reading in electrons, of the sensors."""
 DARKEST = 0.004
 """Light on the darkest surface, as part of that on the brightest."""
 OVER = 3.0
-"""How far above alpha's white the brightest surface is."""
+"""Factor of the brightest surface over alpha's white."""
 GENERATOR = "still-life"
 GAIN = 1.5
 """Light of the rendered scene: the lamp is above alpha's white then."""
@@ -62,6 +62,6 @@ def light(stage: SystemScene | RenderedScene, name: str) -> Tensor:
 
 
 def banded(linear: Tensor, response: object) -> Tensor:
-    """What passes a filter, white staying white."""
+    """Return the light that passes a filter, white staying white."""
     assert isinstance(response, Band)
     return record(linear, (Spectral(response),), torch.Generator())

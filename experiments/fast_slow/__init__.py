@@ -22,7 +22,7 @@ REDUCED = 1 / 4
 DEPTHS, LAYERS, SEED = (2.2, 9.0), 9, 14
 FRAMES = 11
 SPEED = 18.0
-"""Of the object, per cent of alpha's width in the time of a slow frame."""
+"""Speed of the object, per cent of alpha's width in the time of a slow frame."""
 GENERATOR = "still-life"
 MOVING = 0.12
 """Seconds in which the ball of the rendered scene crosses the image."""

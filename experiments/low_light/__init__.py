@@ -1,1 +1,1 @@
-"""How the denoisers that ship for low light were trained."""
+"""Training of the denoisers that ship for low light."""

@@ -59,7 +59,7 @@ def train_denoiser(config: DenoiserTraining) -> Path:
 def losses(
     config: DenoiserTraining, bank: PhotoBank, network: LowLightNetwork, start: int
 ) -> Iterator[Tensor]:
-    """Of each step from one on."""
+    """Yield the loss of each step from one on."""
     for step in itertools.count(start):
         g = generator_for(config.seed, "views", step)
         colours = windows(bank, config.batch, config.side, g)

@@ -8,6 +8,6 @@ from .landscape import landscape
 from .still_life import still_life
 
 SCENES: dict[str, Callable[..., Scene]] = {"still-life": still_life, "landscape": landscape}
-"""By name; each takes a seed and a rig."""
+"""Scenes by name; each takes a seed and a rig."""
 
 __all__ = ["SCENES", "landscape", "still_life"]

@@ -25,7 +25,7 @@ from .room import BRASS, FLOOR, OAK, SHELF, WALNUT, furniture
 VIEW = 1.4
 """Metres of the still life that the first camera's image is wide."""
 WIDE = 2.0 * VIEW
-"""What a camera sees at the table, metres, from which on there is a room around it."""
+"""Width of a camera's view at the table, metres, from which on there is a room around it."""
 DOWNWARDS = 13.0
 """Degrees by which the first camera faces downwards."""
 AIM = (0.0, -0.17, 0.2)
@@ -118,7 +118,7 @@ def _books(rng: Generator) -> Iterator[Object]:
 
 
 def _room(rng: Generator) -> Iterator[Object]:
-    """What is around the table: furniture, more books, a tall plant."""
+    """Yield the objects around the table: furniture, more books, a tall plant."""
     yield from furniture()
     for i, (left, right) in enumerate(((-1.2, 0.33), (0.37, 1.16))):
         yield from _row_of_books(rng, f"upper book{i}", -0.70, left, right)

@@ -34,7 +34,7 @@ S, W = TypeVar("S"), TypeVar("W")
 Made = partial[StereoPair]
 """A pair that is made when it is called."""
 RATES = (1, 2, 2, 2, 4, 4, 8)
-"""By which beta is reduced, one of them at random."""
+"""Factors by which beta is reduced, one of them at random."""
 NOISY = 0.15
 """Share of recordings in low light, 50 to 2,000 electrons at white."""
 READ_NOISE = 2.0
@@ -44,7 +44,7 @@ KINDS = ("pairs", "shapes", "photos")
 
 @dataclass(frozen=True, kw_only=True)
 class PairTraining(Recipe):
-    """What is learned from pairs."""
+    """Options of training on pairs."""
 
     photos: tuple[Path, ...] = ()
     """Folders of photographs."""
@@ -62,21 +62,27 @@ class PairTraining(Recipe):
     """Weights of the fusion that what is learned is for."""
 
     def network(self) -> GuidedPAT:
-        """What fuses the pairs."""
+        """Return the network that fuses the pairs."""
         network = load_weights(self.fusion)
         assert isinstance(network, GuidedPAT)
         return network
 
     def pairs(self, kind: str) -> Iterator[Made]:
-        """Those of one of the `KINDS`. Raises ValueError where there are no photographs."""
+        """Yield the pairs of one of the `KINDS`.
+
+        Raises:
+            ValueError: where there are no photographs.
+        """
         made = {"pairs": self._real_pairs, "shapes": self._shape_pairs, "photos": self._photo_pairs}
         return made[kind]()
 
     def kept(
         self, kind: str, make: Callable[[StereoPair, int], Mapping[str, Tensor] | None]
     ) -> list[dict[str, Tensor]]:
-        """What `make` gives of each pair of a kind and its number, computed where the run's folder does not
-        hold it yet; None leaves a pair out."""
+        """Return the results of `make` for each pair of a kind and its number.
+
+        Results that the run's folder does not hold yet are computed; None leaves a pair out.
+        """
         samples = []
         for i, pair in enumerate(self.pairs(kind)):
             file = self.out / kind / f"{i:05}.safetensors"
@@ -95,7 +101,7 @@ class PairTraining(Recipe):
         start: int,
         window: Callable[[S, int, Generator], W],
     ) -> Iterator[tuple[Generator, list[W]]]:
-        """Of each step from one on the randomness, and windows of samples, as many of each kind there is."""
+        """Yield for each step from one on the randomness, and windows of samples, as many of each kind."""
         kinds = [some for some in samples if some]
         for step in itertools.count(start):
             g = generator_for(self.seed, purpose, step)

@@ -1,1 +1,1 @@
-"""The application: commands, explorer, pages, batches, and fusing without a rig."""
+"""Application: commands, explorer, pages, batches, and fusion without a rig."""

@@ -1,4 +1,4 @@
-"""A page showing aligned bands: any two under a slider, composites, and what a camera does not see."""
+"""Web page of aligned bands: any two under a slider, composites, and what a camera does not see."""
 
 from __future__ import annotations
 
@@ -19,14 +19,22 @@ from .report import Facts, data_url, filled_page, rig_drawing, shares_layer
 STRETCH = (1.0, 99.0)
 """Percentiles of a band's values that are shown black and white."""
 COLOURS = {"colour": (650.0, 550.0, 470.0), "infrared composite": (840.0, 660.0, 550.0)}
-"""Nanometres shown as red, green and blue."""
+"""Wavelengths in nanometres shown as red, green and blue."""
 NEAREST = 60.0
-"""Nanometres by which a band's centre may differ from those, at most."""
+"""Largest distance of a band's centre from those wavelengths, nanometres."""
 RED, NEAR_INFRARED = 660.0, 840.0
 
 
 def aligned_page(aligned: Aligned, rig: Rig, facts: Facts) -> str:
-    """The page; it needs no other file and no network."""
+    """Compose the page of an aligned frame, with everything in one HTML file.
+
+    Args:
+        rig: rig of the recorded files.
+        facts: notes, warnings and figures.
+
+    Returns:
+        The HTML.
+    """
     h, w = aligned.depth.shape
     figures = {"size": f"{w} x {h} pixels", "bands": ", ".join(aligned.bands)}
     visible = {name: view.valid for name, view in aligned.items() if name != aligned.alpha}
@@ -42,9 +50,12 @@ def aligned_page(aligned: Aligned, rig: Rig, facts: Facts) -> str:
 
 
 def shown_layers(aligned: Aligned, rig: Rig | None = None) -> dict[str, Float[Tensor, "_ h w"]]:
-    """Each camera's bands, stretched; composites and NDVI (see `ndvi`) if wavelengths allow; known depth.
+    """Make the layers of the page: each camera's bands stretched, composites and NDVI (see `ndvi`) if
+    wavelengths allow, and known depth.
 
-    One of the latter that is called as a camera is, such as "colour", is "derived colour".
+    Returns:
+        Images (1 or 3, h, w), 0..1, by name; a derived layer with a camera's name, such as "colour", is
+        called "derived colour".
     """
     layers, derived = {}, {}
     for name, view in aligned.items():
@@ -64,11 +75,15 @@ def shown_layers(aligned: Aligned, rig: Rig | None = None) -> dict[str, Float[Te
 
 
 def ndvi(aligned: Aligned, rig: Rig | None = None) -> NDArray[np.float32] | None:
-    """(near infrared - red) / their sum (H, W); NaN where a camera does not see the point.
+    """Compute (near infrared - red) / (near infrared + red) of light.
 
-    Of light: of values without the black level, by exposure and gain, as the sensors of `rig` state them for
-    the recorded files; without a rig, of values as they are. None without bands near 840 and 660 nm. Only of
-    reflectance, which a panel of known reflectance gives, is it the index of the literature (Tucker 1979).
+    Black level, exposure and gain are removed as the sensors of `rig` state them for the recorded files;
+    without a rig values count as light. Only reflectance, which a panel of known reflectance gives, yields
+    the index of the literature (Tucker 1979).
+
+    Returns:
+        The index (h, w), -1..1; NaN where a camera does not see the point. None without bands near 840 and
+        660 nm.
     """
     nir, red = (_band_near(aligned, wave) for wave in (NEAR_INFRARED, RED))
     if nir is None or red is None or nir.name == red.name:
@@ -90,7 +105,7 @@ def _light(band: _ShownBand, rig: Rig | None) -> NDArray[np.float32]:
 
 
 class _ShownBand(NamedTuple):
-    """A band of an alignment, and where its camera sees the point."""
+    """Band of an alignment, with a mask of the points that its camera sees."""
 
     camera: str
     name: str
@@ -99,7 +114,7 @@ class _ShownBand(NamedTuple):
 
 
 def _band_near(aligned: Aligned, wave: float) -> _ShownBand | None:
-    """The band whose centre is nearest to a wavelength; None if none is near."""
+    """Band whose centre is nearest to a wavelength; None if none is within `NEAREST`."""
     near = {
         abs(centre - wave): _ShownBand(camera, name, values, view.valid)
         for camera, view in aligned.items()
@@ -120,7 +135,7 @@ def _stretched(values: NDArray[Any], valid: NDArray[np.bool_]) -> Float[Tensor, 
 
 
 def _index_colours(index: NDArray[np.float32]) -> Float[Tensor, "3 h w"]:
-    """-1 brown, 0 pale, 1 green; black where unknown."""
+    """Colours of an index: -1 brown, 0 pale, 1 green; black where unknown."""
     stops = torch.tensor([[0.55, 0.32, 0.04], [0.96, 0.96, 0.86], [0.0, 0.41, 0.22]])
     value = torch.from_numpy(np.nan_to_num(index)).clamp(-1, 1)[..., None]
     brown, green = torch.lerp(stops[1], stops[0], -value), torch.lerp(stops[1], stops[2], value)

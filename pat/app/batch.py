@@ -1,9 +1,9 @@
-"""Many frames, and sequences, from folders to a folder: `pat batch` and `pat sequence`.
+"""Fusion of many frames, and of sequences, from folders to a folder: `pat batch` and `pat sequence`.
 
-Every frame is a task of its own, whose files are swapped in with the list of them (`write_together`);
-`settings.yaml` beside the images says what they were made with, and a job is resumed with the same settings
-only; frames whose images or results are not those of before, by their digests, are made again. One command at
-a time writes to a folder. The colours of a sequence's key frames wait until all frames are there.
+Every frame is one task, whose files are swapped in together with their list (`write_together`).
+`settings.yaml` beside the images records the settings, and a job is resumed only with the same ones; frames
+whose images or results have changed, by their digests, are made again. One command at a time writes to a
+folder. The colours of a sequence's key frames are stored until all frames are done.
 """
 
 from __future__ import annotations
@@ -70,11 +70,27 @@ FIELD_CLASSES = {kind.__name__: kind for kind in (*FIELDS.values(), ThroughLense
 
 @dataclass(frozen=True)
 class Batch:
-    """What is to be fused and how: `files` by camera, the frames in order; `out`, the folder of the results.
+    """Job of fusing many frames.
 
-    Options are as of `save_frame`. A `sequence` is fused as `fuse_sequence` does, else the first
-    frame with the first of every other camera, the second with the second and so on (`frame_matching` finds
-    which these are).
+    Attributes:
+        rig: the rig of the files.
+        files: files by camera, in the order of frames.
+        alpha: camera whose view is fused.
+        out: folder of the results.
+        weights: weights by name or file.
+        sequence: True to fuse in order of time, as `fuse_sequence`; False to fuse the first files of all
+            cameras, then the second ones (`frame_matching` matches them).
+        speed: fastest motion in a sequence, alpha's pixels for each second; None estimates it.
+        settings: settings of fusion.
+        bits: bits of the fused image's values.
+        kind: format of the fused image.
+        alone: True to fuse each frame of a sequence by itself, without warping colour; for comparison.
+        precision: precision of the network's convolutions, as for `load_weights`.
+        strict: True to fail a frame of unfit confidence (`LowConfidenceWarning`).
+
+    Raises:
+        ValueError: for cameras that the rig lacks, no images of alpha, and unequal numbers of images unless
+            `sequence`.
     """
 
     rig: Rig
@@ -88,11 +104,8 @@ class Batch:
     bits: int = 8
     kind: ImageFormat = "png"
     alone: bool = False
-    """Of a sequence: fuse each frame by itself, without warping colour; for comparison."""
     precision: Precision = "float32"
-    """Of the network's convolutions, as of `load_weights`."""
     strict: bool = False
-    """A frame of unfit confidence (`LowConfidenceWarning`) fails."""
 
     def __post_init__(self) -> None:
         for name in self.files:
@@ -107,13 +120,13 @@ class Batch:
 
     @cached_property
     def names(self) -> list[str]:
-        """What alpha's files are called, without suffix; numbers if two are called the same."""
+        """Names of the frames: alpha's files without suffix, or numbers if two are equal."""
         names = [file.stem for file in self.files[self.alpha]]
         return names if len(set(names)) == len(names) else [f"{i:06d}" for i in range(len(names))]
 
     @cached_property
     def dependencies(self) -> str:
-        """What the results depend on, as text."""
+        """Everything that the results depend on, as YAML text."""
         digest = hashlib.sha256(find_weights(self.weights).read_bytes()).hexdigest()
         entries = json.loads(self.to_json())
         files = entries.pop("files")
@@ -127,26 +140,27 @@ class Batch:
 
     @cached_property
     def _of_sequence(self) -> str:
-        """As `inputs`, of all frames of a sequence; empty for frames of their own."""
+        """Digest of settings and all images of a sequence; empty for independent frames."""
         files = {name: list(map(digest, paths)) for name, paths in self.files.items()}
         return _digest([self.dependencies, files]) if self.sequence else ""
 
     def inputs(self, i: int) -> str:
-        """A digest of the settings and of the images a frame is made from: all, in a sequence."""
+        """Return a digest of the settings and the images that frame `i` depends on: all images in
+        a sequence."""
         own = {name: digest(files[i]) for name, files in self.files.items() if not self.sequence}
         return self._of_sequence or _digest([self.dependencies, own])
 
     def list_file(self, i: int) -> Path:
-        """The list of a fused frame's files, which is there when it is made."""
+        """Return the path of a frame's list of files, which exists once the frame is complete."""
         return list_file(self.out, fused_group(self.names[i]))
 
     def _is_made(self, i: int) -> bool:
-        """Whether a frame is there, whole, from these images and settings."""
+        """True if a frame is complete and made from these images and settings."""
         about = read_about(self.out, fused_group(self.names[i]))
         return about is not None and about.get("inputs") == self.inputs(i)
 
     def fused_file(self, i: int) -> Path:
-        """The file of a fused frame."""
+        """Return the path of frame `i`'s fused image."""
         return self.out / f"{self.names[i]}_fused.{self.kind}"
 
     def run(
@@ -158,10 +172,23 @@ class Batch:
         video: float | None = None,
         console: Console | None = None,
     ) -> JobReport:
-        """Fuse all frames. With `video`, its frames a second, fused.mp4 is written when all are there.
+        """Fuse all frames.
 
-        Raises JobError if a frame fails and the job is to stop, ValueError to resume with other settings, and
-        for a folder that another command is writing to, or that cannot be written to.
+        Args:
+            workers: processes that frames are fused in.
+            resume: keep complete frames of the same images and settings.
+            on_error: "stop" at the first frame that fails, or "skip" it.
+            video: frames for each second of fused.mp4, written at the end; None for no video.
+
+        Returns:
+            Frames made, kept and failed.
+
+        Raises:
+            JobError: for a frame that fails with on_error="stop".
+            ValueError: to resume with other settings, a folder in use or not writable, and an invalid video
+                rate.
+            ImportError: for a video without the extra `video`.
+            FileExistsError: for files in the way that no run wrote.
         """
         if video is not None:
             check_video(video)
@@ -190,10 +217,8 @@ class Batch:
             return report
 
     def _begin(self, resume: bool) -> None:
-        """Write the settings and the plan; or, to resume, compare the settings with those before.
-
-        Frames that are not there whole, from these images, are retired.
-        """
+        """Write settings and plan; to resume, compare the settings with the former ones. Incomplete frames
+        are retired."""
         text, file = self.dependencies, self.out / SETTINGS
         changed = _differing(text, file.read_text(encoding="utf-8")) if resume and file.is_file() else []
         if changed:
@@ -218,13 +243,24 @@ class Batch:
         write_text(self.out / KEYS / PLAN, self.to_json())
 
     def to_json(self) -> str:
-        """The batch as text for processes that fuse its frames. Raises ValueError for one's own field."""
+        """Format the batch as JSON text, for processes that fuse its frames.
+
+        Raises:
+            ValueError: for a field of another family than arraygeom's.
+        """
         entries = {entry.name: getattr(self, entry.name) for entry in dataclasses.fields(self)}
         return json.dumps({"format": PLAN_FORMAT, **entries}, default=_plain)
 
     @classmethod
     def from_json(cls, text: str, source: str = PLAN) -> Batch:
-        """The batch of `to_json`'s text. Raises ValueError naming `source`."""
+        """Parse the text of `to_json`.
+
+        Returns:
+            The batch.
+
+        Raises:
+            ValueError: naming `source`, for other text.
+        """
         try:
             entries = json.loads(text, object_hook=_made)
             if entries.pop("format") != PLAN_FORMAT:
@@ -240,7 +276,7 @@ class Batch:
 
     @cached_property
     def fusion(self) -> SequenceFusion:
-        """The sequence, with the images that its frames have in common."""
+        """Fusion of the sequence, with the images that its frames share."""
         frames = {n: ImageFiles(files, self.rig, n, alpha=self.alpha) for n, files in self.files.items()}
         rig, network = developed_rig(self.rig, self.files), _network(self.weights, precision=self.precision)
         return SequenceFusion(network, rig, frames, self.alpha, self.speed, self.settings)
@@ -257,13 +293,24 @@ class Batch:
             raise ValueError(f"{image}: its colour, {error}: begin again without --resume") from None
 
     def fuse_key(self, key: KeyFrame) -> None:
-        """Write the colour of a key frame."""
+        """Fuse and write the colour of a key frame.
+
+        Raises:
+            ValueError: if it cannot be fused.
+        """
         with confidence_checked(strict=self.strict):
             colour = self.fusion.colour(key)
         write_tensors(self._key_file(key), colour._asdict())
 
     def fuse_one(self, i: int, inputs: str = "") -> None:
-        """Write a frame; `inputs`, its `inputs`, if they are known."""
+        """Fuse and write frame `i`.
+
+        Args:
+            inputs: the frame's `inputs`, if known; empty to compute them.
+
+        Raises:
+            ValueError: if it cannot be fused.
+        """
         with limited(self.settings.limit):
             with confidence_checked(strict=self.strict):
                 frame = self._frame(i)
@@ -285,7 +332,8 @@ class Batch:
         return [name for name in self.rig.betas(self.alpha) if name in self.files]
 
     def _propagated_bands(self, frame: Frame) -> list[str]:
-        """As `band_names`, of a frame of several bands that does not say whose confidence is whose."""
+        """Band names, as `band_names`, of a frame of several bands that does not say whose confidence is
+        whose."""
         if not self.sequence or not 1 < len(frame.image) == len(self._betas):
             return []
         frames = [self.fusion.frames[name] for name in self._betas]
@@ -303,7 +351,7 @@ class Batch:
 
 
 def _plain(value: object) -> object:
-    """What is in a plan as JSON has it. Raises ValueError for fields of other families than arraygeom's."""
+    """Convert a value of a plan for JSON. Raises ValueError for fields of other families than arraygeom's."""
     if isinstance(value, Rig):
         return rig_text(value)
     if isinstance(value, Path):
@@ -322,7 +370,7 @@ def _plain(value: object) -> object:
 
 
 def _made(entries: dict[str, Any]) -> Any:
-    """The field or noise level that a part of a plan is of; other entries as they are."""
+    """Rebuild the field or noise level of a part of a plan; other entries stay."""
     if entries.keys() == vars(NoiseLevel()).keys():
         return NoiseLevel(**entries)
     kind = entries.get("kind")
@@ -332,17 +380,17 @@ def _made(entries: dict[str, Any]) -> Any:
 
 
 def fuse_key(plan: Path, key: KeyFrame) -> None:
-    """The task of a key frame."""
+    """Task: fuse a key frame of the batch in the file `plan`."""
     _planned(plan, plan.stat().st_mtime_ns).fuse_key(key)
 
 
 def fuse_one(plan: Path, i: int, inputs: str = "") -> None:
-    """The task of a frame."""
+    """Task: fuse a frame of the batch in the file `plan`."""
     _planned(plan, plan.stat().st_mtime_ns).fuse_one(i, inputs)
 
 
 def _differing(now: str, before: str) -> list[str]:
-    """Names of the settings (YAML) that are not as before."""
+    """Names of settings (YAML) that differ from the former ones."""
     try:
         stated, former = load_yaml(now), load_yaml(before)
     except yaml.YAMLError:
@@ -365,9 +413,17 @@ def _planned(plan: Path, time: int) -> Batch:
 
 
 def find_images(text: str | Path, *, name: str = "") -> list[Path]:
-    """The images of a folder, a pattern such as "a/mono_*.png", or one file; numbers in names count as such.
+    """Find the images of a folder, a pattern such as "a/mono_*.png", or one file.
 
-    Raises FileNotFoundError if there is none, ValueError for a video, and for two of one name.
+    Args:
+        name: camera, for messages.
+
+    Returns:
+        Files in natural order, numbers in names counting as such.
+
+    Raises:
+        FileNotFoundError: if there is none.
+        ValueError: for a video, and two files of one name.
     """
     path = Path(text)
     label = f"{name}: " if name else ""

@@ -1,4 +1,4 @@
-"""What `pat demo` fuses: a rendered scene and a photograph, ideal and as cameras record them; its figure."""
+"""Arrays of `pat demo`, a rendered scene and a photograph, ideal and as cameras record them; its figure."""
 
 from __future__ import annotations
 
@@ -18,15 +18,19 @@ from .sample_array import ALPHA, BETA, SampleArray
 RESPONSE = (0.2, 0.4, 0.4)
 """Weights of red, green and blue in the real mono camera, whose luminance is not Rec. 601's."""
 EXPOSURE = 0.6
-"""Values of the real colour camera over those of the mono camera."""
+"""Ratio of the real colour camera's values to the mono camera's."""
 NOISE = NoiseLevel.of_electrons(300, 2.0)
-"""Of both real cameras."""
+"""Noise of both real cameras."""
 CROP = 4
 """Enlargement of the figure's lower row."""
 
 
 def as_real_cameras(array: SampleArray) -> tuple[SampleArray, dict[str, NoiseLevel]]:
-    """The same array with cameras of another response and exposure, in low light, and the noise of each."""
+    """Simulate an array's images with another response and exposure, in low light.
+
+    Returns:
+        The array, and the noise of each camera.
+    """
     generator = Generator().manual_seed(0)
     ideal = {ALPHA: luminance(array.ground_truth, RESPONSE), BETA: EXPOSURE * array.images[BETA]}
     images = {name: NOISE.recorded(image[None], generator)[0] for name, image in ideal.items()}
@@ -36,10 +40,13 @@ def as_real_cameras(array: SampleArray) -> tuple[SampleArray, dict[str, NoiseLev
 def classical_methods(
     network: FusionNetwork, array: SampleArray, noise: Mapping[str, NoiseLevel] | None
 ) -> dict[str, Tensor]:
-    """The classical fusion: plain; with alpha's response corrected; denoised first; and both.
+    """Run the classical fusion: plain, with alpha's response corrected, denoised first, and both.
 
-    The response is what our fusion finds in the denoised images; these are by non-local means that know the
-    noise. Plain alone where the cameras are ideal.
+    The response is what our fusion finds in the denoised images; these are denoised by non-local means with
+    known noise.
+
+    Returns:
+        Fused images (3, h, w) by method; the plain one alone for ideal cameras (`noise` None).
     """
     rig, images, _ = array
     methods = {"classical": classical(rig, images, ALPHA, BETA)}
@@ -60,7 +67,11 @@ def classical_methods(
 
 
 def save_demo_figure(panels: Mapping[str, Tensor], corner: tuple[int, int], path: Path) -> None:
-    """Images of one size, three in a row, below each a window with a given corner (row, column), enlarged."""
+    """Write a figure of images of one size, three in a row, with an enlarged window of each below.
+
+    Args:
+        corner: (row, column) of the window.
+    """
     h, w = next(iter(panels.values())).shape[-2:]
     top, left = corner
     window = (..., slice(top, top + h // CROP), slice(left, left + w // CROP))

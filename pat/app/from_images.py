@@ -1,4 +1,4 @@
-"""Images without a rig: which is alpha, what the betas give, and the rig, all from the images."""
+"""Arrays from images without a rig: alpha, the betas' bands, and the rig are all derived from the images."""
 
 from __future__ import annotations
 
@@ -41,19 +41,19 @@ from ..networks.weights import load_weights
 LOG = logging.getLogger(__name__)
 
 MATCHED = 1600
-"""Images are reduced to this many pixels along their longer side to match features."""
+"""Pixels of the longer side that images are reduced to for matching features."""
 COARSE = 640
-"""And to this many of alpha for dense matches."""
+"""Pixels of alpha's longer side for dense matches."""
 LINES = 0.45
-"""The share of the time to find a rig that epipolar lines take; the rest is calibration."""
+"""Share of the time to find a rig that epipolar lines take; the rest is calibration."""
 EVEN = 0.004
-"""The standard deviation below which an image is of one colour: a count of 8 bits."""
+"""Standard deviation below which an image is of one colour: a count of 8 bits."""
 WAVELENGTHS = {"edge": 720, "red": 620, "green": 540, "blue": 460}
-"""Nanometres; a red edge is no red."""
+"""Nanometres of colour names; a red edge is no red."""
 COLOURS = ((570, 700), (500, 580), (400, 500))
-"""Nanometres between which three bands are shown as red, green and blue."""
+"""Ranges in nanometres in which three bands are shown as red, green and blue."""
 LONGEST_VISIBLE = 760
-"""Nanometres; bands beyond are not put in order."""
+"""Nanometres beyond which bands are not put in order."""
 
 Images = Mapping[str, Float[Tensor, "_ h w"]]
 Say = Callable[[str], None]
@@ -61,11 +61,16 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class ImageArray:
-    """What images of an array say of it: the rig, which camera is alpha, with which weights to fuse, and how.
+    """Array found from its images.
 
-    rig: of the images as they were developed. recorded: of the files, with their sensors' coding and black
-        level.
-    images: alpha's and those of the betas that are fused. notes: what was found, a line each.
+    Attributes:
+        rig: rig of the developed images.
+        recorded: rig of the files, with their sensors' coding and black level.
+        images: images (c, h, w) of alpha and of the betas to fuse.
+        alpha: name of alpha.
+        weights: name of the weights to fuse with.
+        match_levels: True to match each beta's mean and contrast to alpha's.
+        notes: sentences on what was found.
     """
 
     rig: Rig
@@ -78,7 +83,7 @@ class ImageArray:
 
     @property
     def lasting(self) -> Rig | None:
-        """The rig for other captures of these cameras; None if the images leave its lines and depth open."""
+        """Rig for other captures of these cameras; None if the images leave its lines and depth open."""
         return None if self.recorded.name == OPEN else self.recorded
 
 
@@ -90,11 +95,23 @@ def array_from_images(
     focal: Mapping[str, float] | None = None,
     say: Say = lambda line: None,
 ) -> ImageArray:
-    """The array of one image a camera. `say` is called with each line of what is found, as it is found.
+    """Find the array of one image from each camera.
 
-    `focal`: focal lengths in pixels by camera, instead of those in the files' tags. Raises ValueError, one
-    line: fewer than two images, an image of one colour, images that do not show the same things, a focal
-    length of no camera.
+    Args:
+        sources: files or tensors by camera, or a list of files.
+        alpha: camera whose view is wanted; None for the largest grey image, or else the largest.
+        weights: weights by name; None chooses them by the bands.
+        focal: focal lengths in pixels by camera, in place of those in the files' tags.
+        say: called with each line of what is found.
+
+    Returns:
+        The array.
+
+    Raises:
+        ValueError: in one line, for fewer than two images, an image of one colour, images that do not show
+            the same things, and a focal length of an unknown camera.
+        FileNotFoundError: for a missing file.
+        TypeError: for an image without a name that is no file.
     """
     sources, focal = by_camera(sources), focal or {}
     files = {name: Path(path) for name, path in sources.items() if isinstance(path, str | Path)}
@@ -150,7 +167,15 @@ def _with_sensors(rig: Rig, sensors: Mapping[str, Sensor]) -> Rig:
 
 
 def by_camera(sources: ImageSources) -> Mapping[str, str | Path | Tensor]:
-    """Files or tensors by camera. Raises ValueError for fewer than two, TypeError for one without a name."""
+    """Name the images of a list by camera; a mapping is only checked.
+
+    Returns:
+        Files or tensors by camera.
+
+    Raises:
+        ValueError: for fewer than two images.
+        TypeError: for a tensor without a name.
+    """
     if isinstance(sources, str | Path):
         raise ValueError(f"an array has two images or more, got {sources}: give a list of them")
     if not isinstance(sources, Mapping):
@@ -169,7 +194,7 @@ def by_camera(sources: ImageSources) -> Mapping[str, str | Path | Tensor]:
 def _focal_lengths(
     images: Images, files: Mapping[str, Path], given: Mapping[str, float], note: Say
 ) -> dict[str, float]:
-    """Those given, else those in the files' tags, pixels; of images without either none."""
+    """Focal lengths in pixels, as given or else by the files' tags; cameras without either are absent."""
     by_tags = {n: focal_length(files[n], (x.shape[-2], x.shape[-1])) for n, x in images.items() if n in files}
     lengths = {n: length for n, length in {**by_tags, **given}.items() if length and n in images}
     for name, length in lengths.items():
@@ -178,8 +203,12 @@ def _focal_lengths(
 
 
 def camera_names(paths: Sequence[Path]) -> dict[str, Path]:
-    """Names of cameras for their files: the bands' that their tags state, the files' own without suffix, or
-    the folders', or numbers."""
+    """Name the cameras of files: by the bands in their tags, or their names without suffix, or their folders,
+    or numbers.
+
+    Returns:
+        Files by camera.
+    """
     if states_cameras(paths):
         return named_by_band(paths)
     for names in ([p.stem for p in paths], [p.resolve().parent.name for p in paths]):
@@ -192,9 +221,15 @@ def camera_names(paths: Sequence[Path]) -> dict[str, Path]:
 def frames_of_videos(
     videos: Mapping[str, Path], folder: Path
 ) -> tuple[dict[str, list[Path]], dict[str, float]]:
-    """The frames of videos as image files in a folder, and the frames a second, by camera.
+    """Write the frames of videos as image files into a folder.
 
-    Files have their video's time: a job that is resumed knows by it that they are the same.
+    Files get their video's time: a resumed job recognises them by it.
+
+    Returns:
+        Files, and frames for each second, by camera.
+
+    Raises:
+        ValueError: for a video without frames, or one that cannot be read.
     """
     files: dict[str, list[Path]] = {}
     rates: dict[str, float] = {}
@@ -211,8 +246,8 @@ def frames_of_videos(
 
 
 def _tagged_rig(files: Mapping[str, Path], note: Say) -> Rig | None:
-    """The rig that the images' tags state; None if not every image has such tags. Translations are found
-    later: none has to be stated."""
+    """Rig from the images' tags; None if not every image has such tags. Translations, which tags need not
+    state, are found later."""
     if not states_cameras(list(files.values())):
         return None
     with warnings.catch_warnings(record=True, action="always") as caught:
@@ -226,7 +261,7 @@ def _tagged_rig(files: Mapping[str, Path], note: Say) -> Rig | None:
 
 @stage()
 def _translated_rig(tagged: Rig, images: Images, alpha: str, note: Say) -> tuple[Rig, list[str]]:
-    """The rig of tags with translations and depths by the images, the cameras that match; alpha first."""
+    """Rig of tags with translations and depths from the images, and the cameras that match, alpha first."""
     straight, pinhole = without_lenses(Rig({name: tagged[name] for name in images}), images)
     shown = {name: pixels_between(tagged[name], straight[name])[1][None].float() for name in images}
     lengths = {name: float(straight[name].K[0, 0]) for name in images}
@@ -246,7 +281,7 @@ def _translated_rig(tagged: Rig, images: Images, alpha: str, note: Say) -> tuple
 
 
 def _mapped_rig(tagged: Rig, images: Images, alpha: str, note: Say) -> tuple[Rig, list[str]]:
-    """The cameras of tags without poses: their lenses, and F and a homography by points, where those match.
+    """Cameras of tags without poses: their lenses, and F and a homography by points, where those match.
 
     A scene without parallax, as from a drone, leaves translations open and needs none.
     """
@@ -279,12 +314,22 @@ def _mapped_rig(tagged: Rig, images: Images, alpha: str, note: Say) -> tuple[Rig
 def found_rig(
     images: Images, alpha: str, focal: Mapping[str, float], bands: int | None, note: Say
 ) -> tuple[Rig, list[str]]:
-    """The rig of the cameras of images, and which of them it relates to alpha; alpha comes first in both.
+    """Find the rig of images, and the cameras that it relates to alpha.
 
-    A beta of `bands` is compared with alpha by its luma, others by the combination of bands most like alpha.
+    A beta of `bands` is compared with alpha by its luma, others by the combination of bands most similar to
+    alpha.
 
-    Calibrated, up to a scale, where points matched between alpha and a beta have parallax; else known by F
-    alone.
+    Args:
+        focal: focal lengths in pixels, where known.
+        bands: bands that the network takes as one colour image; None for any.
+        note: called with each line of what is found.
+
+    Returns:
+        The rig, calibrated up to a scale where points matched between alpha and a beta have parallax, else
+        with F alone; and the names of its cameras, alpha first.
+
+    Raises:
+        ValueError: if no image shows enough of what alpha shows.
     """
     factors = {name: min(MATCHED / max(image.shape[-2:]), 1.0) for name, image in images.items()}
     reduced = {name: scaled(image, factors[name]) for name, image in images.items()}
@@ -315,8 +360,11 @@ def found_rig(
 def _observed_focal_lengths(
     uncalibrated: UncalibratedRig, alpha: str, betas: Sequence[str]
 ) -> dict[str, tuple[float, float]]:
-    """Of alpha and the betas of its size, pixels, and its relative deviation: that which the points of a pair
-    determine best; of none where no pair does."""
+    """Focal length, pixels, and its relative deviation, of alpha and the betas of its size, from the
+    best-determined pair.
+
+    Empty if no pair determines it.
+    """
     fits = []
     for name in betas:
         LOG.info("looking for the focal length of %s and %s", alpha, name)
@@ -340,10 +388,10 @@ def _calibrated(
     bands: int | None,
     note: Say,
 ) -> Rig:
-    """The rig of alpha and these betas: calibrated, each pair refined by dense matches at reduced size.
+    """Rig of alpha and these betas, each pair calibrated and refined by dense matches at reduced size.
 
     A pair whose lines no poses fit as well as F alone keeps F's, with the nearest poses for rough depths; one
-    without parallax has F alone. Each is said in a line.
+    without parallax has F alone. Each is reported in a line.
     """
     pairs: dict[str, RefinedPair] = {}
     depths: dict[str, MatchedDepth] = {}
@@ -385,7 +433,7 @@ def _calibrated_pair(
     uncalibrated: UncalibratedRig, alpha: str, name: str, focal: Mapping[str, float], note: Say
 ) -> RefinedPair | None:
     """Alpha and one beta with poses by their points; None without. What they determine and leave open is
-    said."""
+    reported."""
     views = {n: uncalibrated.rig[n] for n in (alpha, name)}
     link, matches = uncalibrated.rig.links[alpha, name], uncalibrated.matches[alpha, name]
     note(f"{alpha} > {name}: {uncalibrated.describe(alpha, name)}")
@@ -404,7 +452,7 @@ def _calibrated_pair(
 def _refined(
     pair: RefinedPair, images: Images, bands: int | None, links: Mapping[tuple[str, str], Link]
 ) -> tuple[RefinedPair, MatchedDepth]:
-    """The pair refined by dense matches at reduced size, unless it has one of these links; their depth."""
+    """Pair refined by dense matches at reduced size, unless it has one of these links; and their depth."""
     alpha, beta = pair.rig.names
     factor = min(COARSE / max(images[alpha].shape[-2:]), 1.0)
     small = {name: scaled(images[name], factor) for name in (alpha, beta)}
@@ -422,21 +470,25 @@ def _refined(
 
 
 def _relative_scale(first: MatchedDepth, other: MatchedDepth) -> float:
-    """The factor that brings another pair's depths to those of the first."""
+    """Factor that brings another pair's depths to those of the first."""
     sure = (first.confidence > 0.5) & (other.confidence > 0.5)
     both = sure & first.depth.isfinite() & other.depth.isfinite()
     return float((first.depth[both] / other.depth[both]).median()) if both.any() else 1.0
 
 
 def resized_rig(rig: Rig, images: Images) -> Rig:
-    """The rig whose cameras are of the images' sizes."""
+    """Return the rig with its cameras resized to the images' sizes."""
     for name in rig.names:
         rig = rig.resize(name, (int(images[name].shape[-2]), int(images[name].shape[-1])))
     return rig
 
 
 def scaled(image: Float[Tensor, "c h w"], factor: float) -> Float[Tensor, "c h2 w2"]:
-    """The image reduced by this factor; of 1 or more, as it is."""
+    """Reduce an image by a factor (bicubic, antialiased), sides at least 16 pixels.
+
+    Returns:
+        The image, clipped to 0..1; the same tensor for a factor of 1 or more.
+    """
     if factor >= 1:
         return image
     hw = [max(round(n * factor), 16) for n in image.shape[-2:]]
@@ -445,14 +497,14 @@ def scaled(image: Float[Tensor, "c h w"], factor: float) -> Float[Tensor, "c h2 
 
 
 def _textured(label: str, image: Float[Tensor, "c h w"]) -> Float[Tensor, "_ h w"]:
-    """The image, one band of it where all are equal. Raises ValueError for an image of one colour."""
+    """Image, reduced to one band if all are equal. Raises ValueError for an image of one colour."""
     if float(image.flatten(1).std(-1, correction=0).amax()) < EVEN:
         raise ValueError(f"{label}: is of one colour, with nothing to match: give another image")
     return image[:1] if len(image) == 3 and not is_in_colour(image) else image
 
 
 def _chosen_alpha(images: Images, alpha: str | None, note: Say) -> str:
-    """Alpha: as asked, or the largest grey image, or the largest of all."""
+    """Alpha as requested, or the largest grey image, or the largest of all."""
     if alpha is not None:
         if alpha not in images:
             raise ValueError(f"--alpha: no camera '{alpha}'; the images' names are {', '.join(images)}")
@@ -472,7 +524,7 @@ def _chosen_alpha(images: Images, alpha: str | None, note: Say) -> str:
 
 
 def _ordered_betas(images: Images, alpha: str, note: Say) -> list[str]:
-    """The betas in the order of their bands: as given where one is in colour, else from red to blue."""
+    """Betas in the order of their bands: as given if one is in colour, else from red to blue."""
     betas = [name for name in images if name != alpha]
     if any(len(images[name]) == 3 for name in betas):
         return betas
@@ -485,20 +537,20 @@ def _ordered_betas(images: Images, alpha: str, note: Say) -> list[str]:
 
 
 def _weights_of(images: Images, alpha: str) -> str:
-    """The name of the shipped weights for alpha and the betas of these images."""
+    """Name of the shipped weights for alpha and the betas of these images."""
     names = [name for name in images if name != alpha]
     bands = [len(images[name]) for name in names]
     return "mono-colour" if 3 in bands or show_colour(names, bands) else "mono-spectral"
 
 
 def show_colour(names: Sequence[str], bands: Sequence[int]) -> bool:
-    """Whether cameras of a band each record, by their names, red, green and blue, in this order."""
+    """Return True if cameras of one band each record, by their names, red, green and blue, in this order."""
     shown = [low <= _wavelength(name) <= high for name, (low, high) in zip(names, COLOURS)]
     return set(bands) == {1} and len(names) == 3 and all(shown)
 
 
 def _wavelength(name: str) -> float:
-    """Nanometres by a camera's name, such as cam_550nm or green; 0 if it does not say."""
+    """Wavelength in nanometres by a camera's name, such as cam_550nm or green; 0 if it does not say."""
     if number := re.search(r"(?<!\d)([3-9]\d\d)(?:\s*nm)?(?!\d)", name):
         return float(number[1]) if float(number[1]) <= LONGEST_VISIBLE else 0.0
     words = re.split(r"[^a-z]+", name.lower())

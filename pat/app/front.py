@@ -1,4 +1,4 @@
-"""The front door: `fuse` and `align`, of images alone or with their rig, as files or tensors."""
+"""Front door: `fuse` and `align`, for images alone or with their rig, as files or tensors."""
 
 from __future__ import annotations
 
@@ -29,7 +29,11 @@ P, T = ParamSpec("P"), TypeVar("T")
 
 
 class _Complete(NamedTuple):
-    """All that fusing and aligning need, once what was not given is found."""
+    """Complete arguments of fusion and alignment.
+
+    Attributes:
+        found: True if the rig was found from the images.
+    """
 
     images: Images
     rig: Rig
@@ -37,11 +41,11 @@ class _Complete(NamedTuple):
     network: FusionNetwork
     settings: FuseSettings
     found: bool
-    """Whether the rig was found from the images."""
 
 
 def _images_first(function: Callable[P, T]) -> Callable[P, T]:
-    """The function, with a TypeError that says the order for a network or a rig in the images' place."""
+    """Decorator that raises a TypeError, which says the order, for a network or a rig in the
+    images' place."""
 
     @wraps(function)
     def checked(*args: P.args, **kwargs: P.kwargs) -> T:
@@ -73,13 +77,13 @@ def fuse(
 ) -> Frame:
     """Fuse one frame at camera `alpha`'s view.
 
-    Without a rig it is found from the images as by `pat fuse`, noise is looked for, and depths are multiples
-    of the baseline. Frames too large for the memory allowed are fused in tiles of alpha, each with the part
-    of every beta that its segments touch, and a halo: equal to the whole to 1e-4. Distorted images are first
-    resampled to pinhole views (`pat.fusion.steps.undistort`), rotated betas made upright, and betas resized
-    to alpha's angular resolution; the result is at alpha's own pixels all the same. Where alpha is known to
-    measure the luminance of linear light and one beta the colours, the result is as bright in that sense
-    (`pat.media.raw.match_luminance`).
+    Without a rig one is estimated from the images as by `pat fuse`, noise is measured, and depths are
+    multiples of the baseline. Frames too large for the memory allowed are fused in tiles of alpha, each with
+    the part of every beta that its segments touch, and a halo: equal to the whole to 1e-4. Distorted images
+    are first resampled to pinhole views (`pat.fusion.steps.undistort`), rotated betas made upright, and betas
+    resized to alpha's angular resolution; the result is at alpha's own pixels all the same. Where alpha is
+    known to measure the luminance of linear light and one beta the colours, the result is as bright in that
+    sense (`pat.media.raw.match_luminance`).
 
     Args:
         images: an image of each camera by name: files, or tensors (C, H, W) in 0..1; or files alone, which
@@ -91,7 +95,7 @@ def fuse(
         settings: what frames of the same cameras have in common.
         corrections: what is known of response and alignment from another frame of the same cameras
             (`corrections_of`), instead.
-        explain: called with a line for each thing that was found and put right.
+        explain: called with a line of text for each detected and corrected problem.
         progress: shows the tiles as they are done.
         announce: called with the plan before the work begins; the time of a large frame is estimated by
             fusing a piece.
@@ -101,8 +105,13 @@ def fuse(
             weights (which `requires_grad_(True)` frees). A match moves along its segment as images and rig
             move the best agreement around it; which match is the best, the alignment and the response are
             constants, and so is what enters or leaves a beta's image: leave its border out of an error.
-            `pat.fusion.gradients.without_gradient` names the parameters that would have none. Else the frame is detached, whatever requires gradients.
-        matcher: what finds the matches of a network that uses some: `pat.matching.match.match`, or your own.
+            `pat.fusion.gradients.without_gradient` names the parameters without a gradient. Else the frame
+            is detached, whatever requires gradients.
+        matcher: the function that matches for a network that uses matches: `pat.matching.match.match`, or
+            your own.
+
+    Returns:
+        The frame of alpha: fused image, depth and confidence at alpha's own pixels.
 
     Raises:
         ValueError: a camera that the rig lacks, an image of another size, a rig whose views do not overlap,
@@ -152,24 +161,29 @@ def align(
     announce: Callable[[Plan], None] | None = None,
     matcher: Matcher = match,
 ) -> Aligned:
-    """Every camera's own values at the pixels of camera `alpha`.
+    """Bring every camera's own values to the pixels of camera `alpha`.
 
-    Arguments that are not named here are as of `fuse`; of the settings `keep_alpha` and `luminance` have no
-    effect. They serve to find where alpha's pixels are in each beta. A pixel counts as occluded where the
-    confidence that beta sees its point, and there, is low.
+    Arguments that are not listed here are as for `fuse`; of the settings `keep_alpha` and `luminance` have no
+    effect. Images, rig and network find the positions of alpha's pixels in each beta. A pixel counts as
+    occluded if the confidence that beta sees its point is low.
 
     Args:
-        network: the one whose confidence is taken, which must use matches.
-        recorded: the values to align, by camera, (C, H, W) of any type, as large as the images; by default
-            the images.
-        interpolation: "nearest" keeps recorded values, "bilinear" and "cubic" are between them; of integers
-            rounded.
-        min_confidence: from which confidence on a camera counts as seeing a point, 0 to 1.
+        network: network whose confidence is used, which must use matches.
+        recorded: values to align by camera, (C, H, W) of any type, as large as the images; None for the
+            images.
+        interpolation: "nearest" keeps recorded values; "bilinear" and "cubic" interpolate, rounded for
+            integers.
+        min_confidence: confidence, 0 to 1, from which a camera counts as seeing a point.
         fill: "none" invents no values; "propagate" gives pixels that a camera does not see its nearest seen
             value.
 
-    Raises ValueError as `fuse`, for a network that uses no matches, and for recorded values that are missing,
-    no numbers, or of another size than the rig says.
+    Returns:
+        Values, masks and positions by camera, with alpha's depth.
+
+    Raises:
+        ValueError: as `fuse`, for a network that uses no matches, and for recorded values that are missing,
+            no numbers, or of another size than the rig says.
+        TypeError: for arguments in the wrong order, and settings of another type.
     """
     known = _known(images, rig, alpha, network, settings, explain)
     return align_frame(
@@ -197,7 +211,7 @@ def _known(
     settings: FuseSettings,
     explain: Callable[[str], None] | None,
 ) -> _Complete:
-    """Images as tensors, the rig, alpha, the network and settings: as given, or found."""
+    """Images as tensors, rig, alpha, network and settings: as given, or found."""
     if not isinstance(settings, FuseSettings):
         raise TypeError(f"settings are a {type(settings).__name__}: give FuseSettings(depth=..., noise=...)")
     say = explain or (lambda line: None)
@@ -234,7 +248,7 @@ def _loaded(network: FusionNetwork | str | Path) -> FusionNetwork:
 
 
 def _with_images(images: ImageSources, rig: Rig, alpha: str) -> tuple[Images, Rig]:
-    """The images, of files developed as the rig says, and the rig that describes them."""
+    """Images, files developed as the rig says, and the rig that describes them."""
     if not isinstance(images, Mapping):
         from .from_images import by_camera
 

@@ -1,4 +1,5 @@
-"""A rig its images contradict: said, and healed for them if they determine it far better than the file."""
+"""Detection of a rig that its images contradict: warn, or refine it for them if they determine it
+far better."""
 
 from __future__ import annotations
 
@@ -25,7 +26,7 @@ from .from_images import MATCHED, resized_rig, scaled
 
 @dataclass(frozen=True)
 class HealingSettings:
-    """Of a frame that heals its own rig."""
+    """Settings for refining a rig by the frame that is fused."""
 
     nearer: float = size(4.0, "How many times nearer to their lines held-out points must come")
     of_own: float = size(
@@ -38,17 +39,27 @@ SETTINGS = HealingSettings()
 
 
 class Healed(NamedTuple):
-    """The rig of image files as these have it, and what was changed, in a line."""
+    """Rig refined by its images.
+
+    Attributes:
+        rig: the rig of the image files.
+        text: sentence on the changes.
+    """
 
     rig: Rig
     text: str
 
 
 def checked_rig(views: ViewFiles, *, heal: bool) -> Healed | None:
-    """The rig healed by its images, if they say clearly more; else None, and a warning if it fits them badly.
+    """Compare a rig with its images, and refine it or warn.
 
-    By a `LowConfidenceWarning` if it is wrong: mistaken by the doctor's verdict, or points are where nothing
-    is seen.
+    Args:
+        heal: True to refine the rig if its images clearly say more.
+
+    Returns:
+        The refined rig; None if it fits or is only warned of. The warning is a `LowConfidenceWarning` if the
+        rig is wrong: mistaken by the doctor's verdict, or matches fall where nothing is seen. Images that
+        cannot be read are left to the fusion.
     """
     try:
         images = dict(views)
@@ -65,9 +76,12 @@ def checked_rig(views: ViewFiles, *, heal: bool) -> Healed | None:
 
 
 def healed_rig(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> Healed | None:
-    """The rig refined by points matched between alpha and the betas, whatever its deviations; None unless
-    held-out points then lie about as near to their lines as to those of an F of their own, and far nearer
-    than before."""
+    """Refine a rig by points matched between alpha and the betas, whatever its deviations.
+
+    Returns:
+        The refined rig; None unless held-out points then lie about as near to their lines as to those of an F
+        fitted to them, and far nearer than before.
+    """
     small = {name: scaled(image, min(MATCHED / max(image.shape[-2:]), 1.0)) for name, image in images.items()}
     reduced = resized_rig(rig.replace(cameras={name: rig[name] for name in (alpha, *small)}), small)
     try:
@@ -93,8 +107,8 @@ def healed_rig(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> Healed | N
 
 
 def _depth_range(rig: Rig, pairs: Pairs) -> tuple[float, float] | None:
-    """The rig's depth range, extended to that of the matched points: a rotation that images correct moves all
-    depths along the segments."""
+    """Depth range of the rig, extended to that of the matched points: a rotation that images correct moves
+    all depths along the segments."""
     every = [depth_bounds(Rig({n: rig[n] for n in names}), matches) for names, matches in pairs.items()]
     ranges = [bounds for bounds in every if bounds is not None]
     if rig.depth is None or not ranges:

@@ -1,4 +1,4 @@
-"""A page that shows a fused frame: one HTML file with everything in it."""
+"""Web page of a fused frame: one HTML file with everything in it."""
 
 from __future__ import annotations
 
@@ -26,22 +26,26 @@ from ..media.figures import colour_depth, reduced
 from ..support.memory import how_many_fit
 
 LONGEST = 1600
-"""Images in the page have at most this many pixels along their longer side."""
+"""Pixels of the longer side of images in the page, at most."""
 QUALITY = 90
-"""Of JPEG."""
+"""Quality of JPEG images."""
 UNCONFIDENT = (230, 30, 120)
-"""The colour that covers pixels without confidence."""
+"""Colour that covers pixels without confidence."""
 LETTER, LINE = 8.0, 16.0
 """Width of a letter and height of a line of the drawing's labels, in its units."""
 PAGE = Path(__file__).with_name("report.html")
 
 
 class Facts(NamedTuple):
-    """What the page says beside the images.
+    """Texts and figures of the page.
 
-    notes: what was found or normalised. warnings: with what to do. seconds, memory (bytes): of the fusion, if
-    known.
-    unit: of depths. classical: the classical baseline at alpha's view, a layer to compare with.
+    Attributes:
+        notes: what was found or normalised.
+        warnings: warnings, with what to do.
+        seconds: duration of the fusion; None if unknown.
+        memory: peak memory in bytes; None if unknown.
+        unit: unit of depths.
+        classical: classical baseline at alpha's view, as a layer to compare with; None for none.
     """
 
     notes: Sequence[str] = ()
@@ -55,9 +59,13 @@ class Facts(NamedTuple):
 def report_page(
     frame: Frame, images: Mapping[str, Float[Tensor, "_ _ _"]], rig: Rig, alpha: str, facts: Facts
 ) -> str:
-    """The page: images under a slider, overlays, the rig, figures; it needs no other file and no network.
+    """Compose the page: images under a slider, overlays, the rig, figures; it needs no other file.
 
-    `images` are alpha's and the betas'.
+    Args:
+        images: images of alpha and the betas.
+
+    Returns:
+        The HTML.
     """
     layers = {f"alpha: {alpha}": images[alpha]}
     layers |= {f"beta: {name}": images[name] for name in rig.betas(alpha) if name in images}
@@ -98,7 +106,17 @@ def filled_page(
     facts: Facts,
     **parts: str,
 ) -> str:
-    """The page with layers to compare and overlays to switch, URLs by name, and its further parts as HTML."""
+    """Fill the page's template.
+
+    Args:
+        layers: URLs of images to compare, by name.
+        overlays: URLs of overlays to switch, by name.
+        figures: values of the table, by title.
+        parts: further parts as HTML, by placeholder.
+
+    Returns:
+        The HTML.
+    """
     h, w = hw
     parts = {"LEGEND": "", **parts, "TITLE": html.escape(title), "RATIO": f"{w} / {h}"}
     rows = [f"<tr><th>{html.escape(key)}<td>{html.escape(value)}" for key, value in figures.items()]
@@ -124,7 +142,7 @@ def filled_page(
 
 
 def rig_drawing(rig: Rig, alpha: str) -> str:
-    """The calibrated cameras from above as an inline SVG: x to the right, z upwards; empty without any."""
+    """Draw the calibrated cameras from above as inline SVG: x to the right, z upwards; empty without any."""
     cameras = {name: camera for name, camera in rig.cameras.items() if isinstance(camera, Camera)}
     if not cameras:
         return ""
@@ -174,14 +192,15 @@ def _figures(frame: Frame, extent: str, facts: Facts) -> dict[str, str]:
 
 
 def data_url(image: Float[Tensor, "c h w"]) -> str:
-    """The URL of an image as JPEG, grey or in colour, of at most `LONGEST` pixels."""
+    """Encode an image of one or three bands as the URL of a JPEG whose longer side is at most `LONGEST`
+    pixels."""
     pixels = to_bytes(reduced(image, LONGEST).detach().cpu().expand(3, -1, -1).flip(0)).transpose(1, 2, 0)
     _, content = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
     return f"data:image/jpeg;base64,{base64.b64encode(content.tobytes()).decode()}"
 
 
 def shares_layer(confidence: Float[Tensor, "h w"]) -> str:
-    """The URL of a PNG that covers pixels the more, the less their confidence."""
+    """Encode a map of 0..1 as the URL of a PNG that covers pixels the more, the lower their value."""
     cover = 1 - reduced(confidence[None].detach().cpu(), LONGEST)
     colour = torch.tensor(UNCONFIDENT[::-1])[:, None, None] / 255
     layers = torch.cat([colour.expand(3, *cover.shape[1:]), 0.85 * cover])
@@ -190,6 +209,6 @@ def shares_layer(confidence: Float[Tensor, "h w"]) -> str:
 
 
 def _listed(title: str, lines: Iterable[str], *, kind: str) -> str:
-    """A section of the page with a list; empty without lines."""
+    """Section of the page with a list; empty without lines."""
     items = "".join(f"<li>{html.escape(line)}" for line in lines)
     return f'<section class="{kind}"><h2>{title}</h2><ul>{items}</ul></section>' if items else ""

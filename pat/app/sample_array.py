@@ -1,4 +1,4 @@
-"""The sample array that ships with the package."""
+"""Sample arrays that ship with the package or with scikit-image."""
 
 from __future__ import annotations
 
@@ -19,7 +19,13 @@ ALPHA, BETA = "mono", "colour"
 
 
 class SampleArray(NamedTuple):
-    """A mono alpha and a colour beta of different focal length and pose, and alpha's view in true colour."""
+    """Mono alpha and colour beta of different focal length and pose.
+
+    Attributes:
+        rig: the rig.
+        images: images (c, h, w) by camera.
+        ground_truth: alpha's view in true colour.
+    """
 
     rig: Rig
     images: dict[str, Tensor]
@@ -27,16 +33,23 @@ class SampleArray(NamedTuple):
 
 
 def load_sample(folder: Path = SAMPLE) -> SampleArray:
-    """The sample array, or another one of a folder with the same files."""
+    """Load the sample array, or another one from a folder with the same files.
+
+    Raises:
+        FileNotFoundError: for a missing file.
+    """
     rig = Rig.load(folder / "rig.yaml")
     images = {name: read_image(folder / f"{name}.png") for name in rig.names}
     return SampleArray(rig, {**images, ALPHA: luminance_of(images[ALPHA])}, read_image(folder / "truth.png"))
 
 
 def load_motorcycle() -> SampleArray:
-    """A real pair that comes with scikit-image, and its published geometry (Scharstein et al., GCPR 2014).
+    """Load a real pair in scikit-image, with its published geometry (Scharstein et al., GCPR 2014).
 
     The left photograph made grey is the mono camera's, the right one at half its size the colour one's.
+
+    Returns:
+        The array; the left photograph is the ground truth.
     """
     from skimage.data import stereo_motorcycle
 

@@ -1,15 +1,15 @@
-"""C3 attention as one operator: checks inputs, brings sampling locations into one form, picks a backend.
+"""C3 attention as one operator: checks inputs, converts sampling locations to one form, selects a backend.
 
-A sample counts if it is valid and lies on beta's area, [-0.5, W - 0.5] x [-0.5, H - 0.5] (to 1e-3 pixels).
-On that area the bilinear look-up takes coordinates clamped to the border's centres, and the nearest one
-takes the pixel on whose area the position lies. An alpha pixel without a sample that counts gets 0
-everywhere, and passes no gradient.
+A sample counts if it is valid and lies on beta's area, [-0.5, W - 0.5] x [-0.5, H - 0.5] (to 1e-3 pixels). On
+that area bilinear look-up clamps coordinates to the border's centres, and nearest look-up takes the pixel
+whose area contains the position. An alpha pixel without a sample that counts gets 0 everywhere, and passes no
+gradient.
 
-Gradients reach query, key, value, bias and the geometry. Which samples count is a constant in the graph: what
-enters or leaves beta's image when a rig moves has no gradient, which is part of the truth near its border. A
-`value` that falls to 0 towards beta's border makes it continuous there. With `nearest` the value and the peak have no
-gradient by the geometry (they are constant almost everywhere); position and spread do, as weighted means of
-the positions.
+Gradients reach query, key, value, bias and the geometry. Which samples count is a constant in the graph: a
+sample that enters or leaves beta's image when a rig moves has no gradient, which is part of the truth near
+its border. A `value` that falls to 0 towards beta's border makes the output continuous there. With `nearest`
+the value and the peak have no gradient by the geometry (they are constant almost everywhere); position and
+spread do, as weighted means of the positions.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ Backend = Literal["auto", "reference", "cpu", "triton", "local"]
 
 DTYPES = (torch.float64, torch.float32, torch.bfloat16, torch.float16)
 CHUNK_SAMPLES = 2**22
-"""How many explicit positions a callable is asked for at a time: 32 MiB of float32 (x, y)."""
+"""Explicit positions that a callable is asked for at a time: 32 MiB of float32 (x, y)."""
 CHUNK_PIXELS = 2**18
-"""How many segments a callable is asked for at a time."""
+"""Segments that a callable is asked for at a time."""
 LOCAL_SERVES = (
     "nearest values, without statistics, their gradients by query, key and value and no other derivatives, "
     "with a constant bias for each sample or none, of `Local` windows of odd size and whole spacing in "
@@ -64,7 +64,7 @@ def attend(
     bias: Tensor | None = None,
     backend: Backend = "auto",
 ) -> Float[Tensor, "b dv ha wa"]:
-    """For each alpha pixel, the values at its samples in beta, weighted by softmax(query . key).
+    """Compute for each alpha pixel the values at its samples in beta, weighted by softmax(query . key).
 
     The scores are plain inner products (the paper's). The output is channels-last in memory.
 
@@ -109,9 +109,17 @@ def attend_with_statistics(
     bias: Tensor | None = None,
     backend: Backend = "auto",
 ) -> Attended:
-    """As `attend`, with the match's expected position, the spread of the weights and the largest of them.
+    """Compute `attend`, and statistics of its weights; arguments and errors as there.
 
-    The statistics are float32 (float64 for float64 inputs) and differentiable, too.
+    Returns:
+        The values, with the match's expected position in beta's pixels, the weights' spread, and the largest
+        weight: float32 (float64 for float64 inputs), and differentiable. All are 0 where no sample counts.
+
+    Raises:
+        ValueError: as `attend`.
+        TypeError: as `attend`.
+        RuntimeError: as `attend`.
+        NotImplementedError: as `attend`.
     """
     return Attended(
         *_attend(query, key, value, locations, samples, interpolation, bias, backend, measured=True)
@@ -130,7 +138,7 @@ def _attend(
     *,
     measured: bool,
 ) -> tuple[Tensor, ...]:
-    """The values, and if `measured` the statistics."""
+    """Values, and if `measured` the statistics."""
     kind = query.device.type
     if torch.is_autocast_enabled(kind):
         query, key, value = (t.to(torch.get_autocast_dtype(kind)) for t in (query, key, value))
@@ -202,13 +210,13 @@ def _attend_local(query: Tensor, key: Tensor, value: Tensor, field: Local, bias:
 
 
 def _lazily_between(query: Tensor, key: Tensor, field: Local | Dense) -> Callable[[Tensor], Locations]:
-    """The field of two views of which only the sizes are known."""
+    """Locations of a field between two views of which only the sizes are known."""
     alpha, beta = (View(hw=(t.shape[2], t.shape[3])) for t in (query, key))
     return lazily(field, Pair(alpha, beta))
 
 
 def _attend_dense(query: Tensor, key: Tensor, value: Tensor, stride: int, bias: Tensor | None) -> Tensor:
-    """Attention to every `stride`-th pixel of beta by torch's own, which keeps no weights."""
+    """Attend to every `stride`-th pixel of beta by torch's own operator, which stores no weights."""
     (b, _, ha, wa), dv = query.shape, value.shape[1]
     q, k, v = (t.flatten(2).mT for t in (query, key[..., ::stride, ::stride], value[..., ::stride, ::stride]))
     bias = _bias(bias, query, k.shape[1])
@@ -217,7 +225,18 @@ def _attend_dense(query: Tensor, key: Tensor, value: Tensor, stride: int, bias: 
 
 
 def sample_positions(locations: Locations, query: Tensor, samples: int | None) -> SamplePositions:
-    """Segments or Positions in the one form that the backends take, in the precision that they count in."""
+    """Convert Segments or Positions to the one form that backends take, in their precision.
+
+    Args:
+        samples: samples of each segment; None for one on each beta pixel of the longest segment.
+
+    Returns:
+        The positions, with a leading batch axis of 1 or b.
+
+    Raises:
+        ValueError: for wrong axes, another device, or a number of samples that contradicts the positions.
+        TypeError: for other types, and a mask that is not bool.
+    """
     if isinstance(locations, Segments):
         points = torch.stack([locations.start, locations.end], -2)
         mask, straight = locations.valid[..., None], True
@@ -256,7 +275,8 @@ def sample_positions(locations: Locations, query: Tensor, samples: int | None) -
 
 
 def samples_for(segments: Segments) -> int:
-    """Enough samples for one on each beta pixel of the longest valid segment."""
+    """Return the number of samples that puts one on each beta pixel of the longest valid segment; 1 if none
+    is valid."""
     what = "the number of samples of the longest segment (give `samples`)"
     needs_numbers(what, segments.start, segments.end)
     lengths = torch.where(segments.valid, segments.length.detach(), 0)
@@ -285,7 +305,7 @@ def _run(inputs: AttentionInputs, backend: Backend, measured: bool) -> Attended:
 
 
 def _missing(*tensors: Tensor | None) -> str:
-    """What is under way that compiled backends have not; empty if nothing."""
+    """Name of a derivative in progress that compiled backends lack; empty if there is none."""
     if torch.compiler.is_compiling():
         return ""
     under_way = transformations()
@@ -297,7 +317,14 @@ def _missing(*tensors: Tensor | None) -> str:
 
 
 def chosen_backend(backend: Backend, device: str) -> str:
-    """The backend that serves; raises if the one asked for cannot."""
+    """Resolve "auto", and check that a backend can serve tensors on a device.
+
+    Returns:
+        "cpu", "triton" or "reference".
+
+    Raises:
+        RuntimeError: if the requested backend cannot serve.
+    """
     triton = importlib.util.find_spec("triton") is not None
     if backend == "auto":
         return "cpu" if device == "cpu" else "triton" if device == "cuda" and triton else "reference"
@@ -318,10 +345,10 @@ def _attend_by_rows(
     bias: Tensor | None,
     run: Callable[..., tuple[Tensor, ...]],
 ) -> tuple[Tensor, ...]:
-    """Asks `locations` for some rows of alpha at a time.
+    """Ask `locations` for some rows of alpha at a time.
 
-    Segments are small: they are gathered for the whole image. Explicit positions are used at once, and
-    asked for again in backward.
+    Segments are small: they are gathered for the whole image. Explicit positions are used at once, and asked
+    for again in backward.
     """
     x, y = pixel_coordinates((query.shape[2], query.shape[3]), dtype=accumulated(query), device=query.device)
 

@@ -1,4 +1,4 @@
-"""Segments as masks of other people's transformers."""
+"""Segments as attention masks for other transformers."""
 
 from __future__ import annotations
 
@@ -10,11 +10,18 @@ from arraygeom.segments import Segments
 
 
 def segment_block_mask(segments: Segments, hw: HW, *, radius: float = 0.5, block: int = 128) -> BlockMask:
-    """For `flex_attention`: alpha's pixels (Ha, Wa), row by row, attend to beta's in `radius` px of segments.
+    """Make a `flex_attention` mask: alpha's pixels, row by row, attend to beta's pixels near their segments.
 
-    `segments` (Ha, Wa) or, of a batch, (B, Ha, Wa); keys are beta's H W pixels, row by row. `block` is that
-    of the mask. A query without such a key gets zeros. Torch asks for all pairs of pixels at once: for
-    features of some thousand pixels. `Segments.mask` is the same, dense, for scaled_dot_product_attention.
+    Args:
+        segments: segments (Ha, Wa), or (B, Ha, Wa) for a batch.
+        hw: size of beta; keys are its H W pixels, row by row.
+        radius: largest distance of a key from the segment, pixels.
+        block: block size of the mask.
+
+    Returns:
+        The mask. Queries without a key in reach get zeros. Torch evaluates all pairs of pixels: meant for
+        features of some thousand pixels. `Segments.mask` is the same, dense, for
+        scaled_dot_product_attention.
     """
     batch = segments.valid.shape[0] if segments.valid.ndim > 2 else None
     parts = (segments.start, segments.end, segments.valid)

@@ -1,7 +1,7 @@
-"""C3 attention on the CPU: drives the compiled loops with as many threads as torch may use.
+"""C3 attention on the CPU: runs the compiled loops on as many threads as torch may use.
 
 The threads are a plain pool, for which the loops release Python's lock: idle ones sleep, so that they do not
-take the cores from torch's own. Nothing depends on how many there are: each output number is made by one
+take the cores from torch's own. Results do not depend on their number: each output number is made by one
 thread in an order that the inputs alone give.
 """
 
@@ -30,9 +30,16 @@ SCRATCH_TAPS = 2**20
 
 
 def forward(inputs: AttentionInputs, measured: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Values (b, dv, ha, wa), channels last; statistics (b, ha, wa, 4), of no length if not `measured`; log
-    of the sum of exponentials (b, ha, wa); nothing, where the GPU's has the samples of the largest
-    weights."""
+    """Compute attention of prepared inputs.
+
+    Args:
+        measured: True to compute statistics.
+
+    Returns:
+        Values (b, dv, ha, wa), channels last in memory; statistics (b, ha, wa, 4): x, y, spread, peak (empty
+        if not `measured`); log of the sum of exponentials (b, ha, wa), -inf where no sample counts; and an
+        empty tensor, where the GPU backend has the samples of largest weight.
+    """
     query = inputs.query
     b, _, ha, wa = query.shape
     counted = accumulated(query)
@@ -48,9 +55,15 @@ def forward(inputs: AttentionInputs, measured: bool) -> tuple[Tensor, Tensor, Te
 def forward_local(
     query: Tensor, key: Tensor, value: Tensor, field: Local, bias: Tensor | None
 ) -> tuple[Tensor, Tensor]:
-    """Values (b, dv, h, w), channels first, of windows of a whole number of pixels around the same pixel of
-    a view of the same size, the nearest look-up, float32; and the logarithm of the sum of exponentials
-    (b, h, w), inf where nothing counts. `bias`: (samples), the same for all; -inf costs nothing."""
+    """Attend to windows around the same pixel of a view of equal size: nearest look-up, float32.
+
+    Args:
+        bias: (samples), equal for all pixels, or None; samples of -inf are skipped.
+
+    Returns:
+        Values (b, dv, h, w), channels first; log of the sum of exponentials (b, h, w), inf where no sample
+        counts.
+    """
     planes = [_planes(x) for x in (query, key, value)]
     out = np.empty_like(planes[2])
     logsum = np.empty((len(out), *out.shape[2:]), np.float32)
@@ -66,7 +79,15 @@ def backward_local(
     upstream: Tensor,
     wanted: Sequence[bool],
 ) -> tuple[Tensor, ...]:
-    """Gradients by query, key and value, 0 where not `wanted`, from what `forward_local` gave."""
+    """Differentiate `forward_local` by query, key and value.
+
+    Args:
+        outputs: results of `forward_local`.
+        upstream: gradient by the values.
+
+    Returns:
+        Three gradients; zeros where not `wanted`.
+    """
     planes, wide = [_planes(x) for x in inputs], _planes(upstream)
     sums = _planes(torch.stack([outputs[1], (upstream * outputs[0]).sum(1)], 1))
     gradients = [np.zeros_like(x) for x in planes]
@@ -82,7 +103,7 @@ def _planes(images: Tensor) -> np.ndarray:
 def _by_rows(
     kernel: Callable[..., None], images: Iterable[tuple], height: int, field: Local, bias: Tensor | None
 ) -> None:
-    """Run one of the loops of windows for each of some images, some rows at a time."""
+    """Run one of the window loops for each image, some rows at a time."""
     of_samples = np.zeros(field.size**2, np.float32) if bias is None else _planes(bias)
     window = of_samples, np.flatnonzero(of_samples != -np.inf), field.size, round(field.spacing)
     rows = [partial(kernel, *image, *window) for image in images]
@@ -95,11 +116,17 @@ def backward(
     cotangents: tuple[Tensor, Tensor],
     wanted: Sequence[bool],
 ) -> tuple[Tensor, ...]:
-    """Gradients by query, key, value (channels last), points and bias; of no length where not wanted.
+    """Differentiate `forward` by query, key, value, points and bias.
 
-    `saved` are statistics and logsum of forward, `cotangents` those of values and statistics. A piece of
-    alpha at a time, in two steps: its pixels are shared among the threads for all that belongs to alpha; then
-    the channels are, for the additions to beta's pixels.
+    One piece of alpha at a time, in two steps: first pixels are shared among the threads, for all gradients
+    of alpha; then channels are, for the additions to beta's pixels.
+
+    Args:
+        saved: statistics and log sums of `forward`.
+        cotangents: gradients by values and statistics.
+
+    Returns:
+        Five gradients, images channels last in memory; empty where not `wanted`.
     """
     query, key, value, positions, *_ = inputs
     b, d, ha, wa = query.shape
@@ -149,13 +176,13 @@ def backward(
 
 
 def _flat(tensor: Tensor) -> np.ndarray:
-    """The numbers as the kernels know them."""
+    """Flat numpy array of a tensor, for the kernels."""
     return tensor.detach().reshape(-1).numpy()
 
 
 def _new(*shape: int, dtype: torch.dtype) -> Tensor:
-    """An uninitialised tensor. Of numpy's memory, which asks for huge pages: first touching torch's pages of
-    4 KiB took an eighth of forward's time."""
+    """Uninitialised tensor in numpy's memory, which asks for huge pages: first touching torch's pages of 4
+    KiB took an eighth of forward's time."""
     if not math.prod(shape):
         return torch.empty(shape, dtype=dtype)
     return torch.from_numpy(np.empty(math.prod(shape) * dtype.itemsize, np.uint8)).view(dtype).view(shape)
@@ -193,7 +220,7 @@ def _call(inputs: AttentionInputs) -> kernels.Call:
 
 
 def _shares(first: int, last: int, call: kernels.Call) -> list[kernels.Share]:
-    """One for each thread that finds something to do."""
+    """Work shares, one for each thread that is needed."""
     samples, number = call.geometry.samples, call.geometry.fractions.dtype
     size, counter = max(1, PIECE_SAMPLES // samples), np.zeros(1, np.int64)
     channels = max(call.channels, call.value_channels)
@@ -204,7 +231,7 @@ def _shares(first: int, last: int, call: kernels.Call) -> list[kernels.Share]:
 
 
 def _tap_list(pixels: int, call: kernels.Call) -> kernels.TapList:
-    """For as many pixels as go into `SCRATCH_TAPS`, or as there are."""
+    """Tap list for as many pixels as fit into `SCRATCH_TAPS`."""
     geometry = call.geometry
     stride = (geometry.samples * (1 if geometry.nearest else 4) // kernels.LANES + 2) * kernels.LANES
     pixels = min(pixels, max(64, SCRATCH_TAPS // stride))
@@ -220,7 +247,7 @@ def _tap_list(pixels: int, call: kernels.Call) -> kernels.TapList:
 def _channel_tasks(
     taps: kernels.TapList, weights: np.ndarray, last: int, x: np.ndarray, channels: int, out: Tensor
 ) -> list[Callable[[], None]]:
-    """One task for each block of channels; how wide the blocks are changes no bit of the result."""
+    """Tasks for blocks of channels; their width changes no bit of the result."""
     if not out.numel():
         return []
     lanes = kernels.LANES

@@ -30,11 +30,15 @@ PIXELS = 8
 LEAST = tl.constexpr(LEAST_DEVIATION)
 SLACK = tl.constexpr(EDGE_SLACK)
 FIXED_BITS = 61
-"""How much of an int64 a sum of fixed point numbers may take."""
+"""Bits of an int64 that a sum of fixed point numbers may take."""
 
 
 def forward(inputs: AttentionInputs, measured: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """As `cpu.forward`, with the sample of the largest weight (b, ha, wa)."""
+    """Compute attention as `cpu.forward`, on the GPU.
+
+    Returns:
+        As `cpu.forward`, and last the sample of largest weight (b, ha, wa), int32.
+    """
     query = inputs.query
     b, _, ha, wa = query.shape
     counted = accumulated(query)
@@ -53,7 +57,14 @@ def backward(
     cotangents: tuple[Tensor, Tensor],
     wanted: Sequence[bool],
 ) -> tuple[Tensor, ...]:
-    """As `cpu.backward`; `saved` are statistics, logsum, the best samples, and the values."""
+    """Differentiate `forward` as `cpu.backward`, on the GPU.
+
+    Args:
+        saved: statistics, log sums, best samples, and values of `forward`.
+
+    Returns:
+        Five gradients; empty where not `wanted`.
+    """
     query, key, value, positions, *_ = inputs
     b, _, ha, wa = query.shape
     counted = accumulated(query)
@@ -98,10 +109,10 @@ def backward(
 def _scales(
     query: Tensor, key: Tensor, value: Tensor, upstream: Tensor, statistics_upstream: Tensor
 ) -> Tensor:
-    """By which key's and value's gradients are multiplied so that their sums fit into fixed point.
+    """Factors for key's and value's gradients that make their sums fit into fixed point.
 
-    The weights of a pixel sum to 1, so that the gradients by its scores sum to no more than twice the
-    largest gradient by a weight.
+    The weights of a pixel sum to 1, so that the gradients by its scores sum to no more than twice the largest
+    gradient by a weight.
     """
     pixels = query.shape[0] * query.shape[2] * query.shape[3]
     diagonal = float(key.shape[2] ** 2 + key.shape[3] ** 2) ** 0.5
@@ -146,13 +157,13 @@ def _call(inputs: AttentionInputs) -> tuple:
 
 
 def compiled(function):
-    """triton.jit, of the bare function: a checker of types that tests put around it cannot be compiled."""
+    """Compile a function by triton.jit, without the type checker that tests wrap around it."""
     return triton.jit(unwrap(function))
 
 
 @compiled
 def _sample(points, mask, fractions, place, alive, height, width, i, samples, STRAIGHT):
-    """Sample i of some pixels: x, y and whether it counts."""
+    """Position (x, y) of sample i of some pixels, and True where it counts."""
     if STRAIGHT:
         x0 = tl.load(points + 4 * place, mask=alive, other=0)
         y0 = tl.load(points + 4 * place + 1, mask=alive, other=0)
@@ -172,7 +183,7 @@ def _sample(points, mask, fractions, place, alive, height, width, i, samples, ST
 
 @compiled
 def _cell(x, y, height, width, NEAREST):
-    """The four pixels around (x, y), as offsets from the first, and how far between them it lies."""
+    """The four pixels around (x, y), as offsets from the first, and the fractions of the way between them."""
     if NEAREST:
         right = tl.minimum(tl.maximum(tl.floor(x + 0.5).to(tl.int64), 0), width - 1)
         down = tl.minimum(tl.maximum(tl.floor(y + 0.5).to(tl.int64), 0), height - 1)
@@ -212,7 +223,7 @@ def _blend(a, b, c, d, u, v):
 
 @compiled
 def _blended(image, pixel, across, below, u, v, channel, D, live, NEAREST, NUMBER):
-    """The image at the samples."""
+    """Image values at the samples."""
     a = _rows(image, pixel, channel, D, live, NUMBER)
     if NEAREST:
         return a
@@ -224,7 +235,8 @@ def _blended(image, pixel, across, below, u, v, channel, D, live, NEAREST, NUMBE
 
 @compiled
 def _places(pixels, alpha_pixels, height, width, PIXELS: tl.constexpr, SHARED):
-    """Some alpha pixels: their indices, which exist, where their geometry is, and beta's first pixel."""
+    """Indices of some alpha pixels, which of them exist, the place of their geometry, and beta's
+    first pixel."""
     p = tl.program_id(0).to(tl.int64) * PIXELS + tl.arange(0, PIXELS)
     place = p % alpha_pixels if SHARED else p
     return p, p < pixels, place, p // alpha_pixels * height * width
@@ -232,8 +244,8 @@ def _places(pixels, alpha_pixels, height, width, PIXELS: tl.constexpr, SHARED):
 
 @compiled
 def _update(x, y, w, keep, mass, mean_x, mean_y, squared, NUMBER):
-    """Running sums with one more sample of weight w, after the earlier ones are multiplied by `keep`: mass,
-    mean position, and squared distances from it."""
+    """Running sums (mass, mean position, squared distances) after one more sample of weight w, with earlier
+    ones multiplied by `keep`."""
     mass = mass * keep + w
     share = tl.where(mass > 0, w / tl.where(mass > 0, mass, 1.0), 0.0).to(NUMBER)
     dx, dy = x - mean_x, y - mean_y
@@ -313,7 +325,7 @@ def _forward(
 
 @compiled
 def _add(out, pixel, weight, x, channel, D, live, scale, FIXED):
-    """Adds weight x to pixels of an image."""
+    """Add weight x to pixels of an image."""
     address = out + pixel[:, None] * D + channel[None, :]
     add = weight[:, None] * x
     if FIXED:
@@ -336,7 +348,8 @@ def _add_around(out, pixel, across, below, u, v, weight, x, channel, D, live, sc
 
 @compiled
 def _upstream(statistics, statistics_upstream, p, alive, NUMBER):
-    """Of some pixels: mean x, y, spread, peak; the gradients by x, y and peak, and by spread over it."""
+    """Statistics of some pixels (mean x, y, spread, peak), and gradients by x, y, peak, and by spread over
+    it."""
     mean_x = tl.load(statistics + 4 * p, mask=alive, other=0)
     mean_y = tl.load(statistics + 4 * p + 1, mask=alive, other=0)
     spread = tl.load(statistics + 4 * p + 2, mask=alive, other=0)

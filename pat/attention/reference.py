@@ -26,14 +26,17 @@ from arraygeom.segments import sample_fractions
 
 BAND_BYTES = 2**27
 LEAST_DEVIATION = 1e-4
-"""A deviation (pixels) below this reads 0: it is rounding, and its derivative noise."""
+"""Deviation in pixels below which it is set to 0: it is rounding, and its derivative noise."""
 
 
 class SamplePositions(NamedTuple):
-    """Sampling locations in one form: `points` (p, Ha, Wa, n, 2), `mask` (p, Ha, Wa, n or 1), p 1 or batch.
+    """Sampling locations in one form; the batch axis p is 1 or b.
 
-    `straight` False: the n points are the samples. True: n is 2, start and end of a segment of `samples`
-    samples.
+    Attributes:
+        points: (p, ha, wa, n, 2): the n samples, or for `straight` the start and end of a segment.
+        mask: (p, ha, wa, n or 1), True for valid samples.
+        samples: samples of each pixel.
+        straight: True for segments.
     """
 
     points: Tensor
@@ -42,7 +45,7 @@ class SamplePositions(NamedTuple):
     straight: bool
 
     def positions(self) -> Tensor:
-        """All samples, (p, r, w, l, 2)."""
+        """Return all samples, (p, r, w, l, 2), in beta's pixels."""
         if not self.straight:
             return self.points
         start, end = self.points.unbind(-2)  # p r w 2
@@ -51,9 +54,16 @@ class SamplePositions(NamedTuple):
 
 
 class AttentionInputs(NamedTuple):
-    """What is attended to and where: `query` (b, d, Ha, Wa), `key` (b, d, Hb, Wb) and `value` (b, dv, Hb, Wb)
-    of one dtype and device, the samples' positions, `bias` (b, Ha, Wa, l) or None, and whether look-ups are
-    nearest."""
+    """Inputs of the backends, checked.
+
+    Attributes:
+        query: (b, d, ha, wa).
+        key: (b, d, hb, wb), of the query's dtype and device, as is `value`.
+        value: (b, dv, hb, wb).
+        positions: positions of the samples.
+        bias: (b, ha, wa, l), added to the scores; None for none.
+        nearest: True for nearest look-up, False for bilinear.
+    """
 
     query: Tensor
     key: Tensor
@@ -64,12 +74,13 @@ class AttentionInputs(NamedTuple):
 
 
 class Attended(NamedTuple):
-    """The outputs of C3 attention for each alpha pixel. Where no sample counts, everything is 0.
+    """Outputs of C3 attention for each alpha pixel; 0 where no sample counts.
 
-    value: (B, Dv, Ha, Wa), the weighted mean of the values.
-    position: (B, 2, Ha, Wa), the expected (x, y) of the match, in beta's pixels.
-    deviation: (B, Ha, Wa), root of the expected squared distance of the samples from `position`, in pixels.
-    peak: (B, Ha, Wa), the largest weight.
+    Attributes:
+        value: (b, dv, ha, wa), weighted mean of the values.
+        position: (b, 2, ha, wa), expected (x, y) of the match, beta's pixels.
+        deviation: (b, ha, wa), root of the expected squared distance of the samples from `position`, pixels.
+        peak: (b, ha, wa), largest weight.
     """
 
     value: Tensor
@@ -79,7 +90,11 @@ class Attended(NamedTuple):
 
 
 def attend(inputs: AttentionInputs) -> Attended:
-    """The formula, some rows of alpha at a time."""
+    """Evaluate the formula, some rows of alpha at a time.
+
+    Returns:
+        Values and statistics.
+    """
     query, positions, bias = inputs.query, inputs.positions, inputs.bias
     counted = accumulated(query)
 
@@ -101,7 +116,7 @@ def attend(inputs: AttentionInputs) -> Attended:
 
 
 def log_sum(inputs: AttentionInputs) -> Tensor:
-    """log sum_l exp(score_l) over what counts, (b, r, w); 0 where nothing does. All keys are gathered."""
+    """Compute log sum_l exp(score_l) over samples that count, (b, r, w); 0 without any. Gathers all keys."""
     query = inputs.query.permute(0, 2, 3, 1)
     score, counts, _ = _scores(inputs._replace(query=query, key=channels_last(inputs.key)))
     some = counts.any(-1)
@@ -109,17 +124,17 @@ def log_sum(inputs: AttentionInputs) -> Tensor:
 
 
 def accumulated(tensor: Tensor) -> torch.dtype:
-    """The type of sums of such numbers."""
+    """Return the type in which numbers of a tensor's type are summed: float64 for float64, else float32."""
     return torch.float64 if tensor.dtype == torch.float64 else torch.float32
 
 
 def channels_last(image: Tensor) -> Tensor:
-    """(b, d, h, w) to (b, h, w, d); a copy only if it does not lie in memory like that."""
+    """Permute (b, d, h, w) to a contiguous (b, h, w, d); a copy only if memory has another order."""
     return image.permute(0, 2, 3, 1).contiguous()
 
 
 def _band(inputs: AttentionInputs) -> Attended:
-    """Images are channels last: (b, r, w, d) and (b, h, w, d)."""
+    """Attention of a band; images are channels last: (b, r, w, d) and (b, h, w, d)."""
     score, counts, xy = _scores(inputs)
     weight = _softmax(score, counts)
     out = torch.einsum("brwl,brwld->brwd", weight, _look_up(inputs)(inputs.value, xy))
@@ -127,7 +142,7 @@ def _band(inputs: AttentionInputs) -> Attended:
 
 
 def _scores(inputs: AttentionInputs) -> tuple[Tensor, Tensor, Tensor]:
-    """Scores (b, r, w, l), which count, and where samples are, (0, 0) if they do not; channels last."""
+    """Scores (b, r, w, l), mask of the samples that count, positions of these; channels last."""
     q, key, positions = inputs.query, inputs.key, inputs.positions
     b, r, w, _ = q.shape
     xy = positions.positions().to(q.dtype)  # p r w l 2
@@ -142,14 +157,14 @@ def _look_up(inputs: AttentionInputs) -> Callable[[Tensor, Tensor], Tensor]:
 
 
 def _nearest(image: Tensor, xy: Tensor) -> Tensor:
-    """(b, h, w, d) at (b, ..., 2): (b, ..., d), of the pixel on whose area the position lies."""
+    """Look-up of (b, h, w, d) at (b, ..., 2) in the pixel whose area contains the position: (b, ..., d)."""
     x, y = (xy.detach() + 0.5).floor().long().unbind(-1)
     h, w = image.shape[1:3]
     return _pick(image, x.clamp(0, w - 1), y.clamp(0, h - 1))
 
 
 def _bilinear(image: Tensor, xy: Tensor) -> Tensor:
-    """(b, h, w, d) at (b, ..., 2): (b, ..., d); beyond the border's centres the border's value."""
+    """Bilinear look-up of (b, h, w, d) at (b, ..., 2): (b, ..., d); the border's value beyond its centres."""
     h, w = image.shape[1:3]
     x0, x1, u = _cell(xy[..., 0], w)
     y0, y1, v = _cell(xy[..., 1], h)
@@ -167,14 +182,15 @@ def _cell(c: Tensor, n: int) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _pick(image: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    """The channels at integer pixels: (b, h, w, d) at (b, ...) gives (b, ..., d)."""
+    """Channels at integer pixels: (b, h, w, d) at (b, ...) gives (b, ..., d)."""
     b, h, w, d = image.shape
     first = (torch.arange(b, device=x.device) * (h * w)).view(b, *[1] * (x.dim() - 1))
     return image.reshape(b * h * w, d)[first + y * w + x]
 
 
 def _softmax(score: Tensor, counts: Tensor) -> Tensor:
-    """Over the last axis, of what counts; all zeros where nothing does, with zero gradients."""
+    """Softmax over the last axis, restricted to samples that count; all zeros without any, with zero
+    gradients."""
     top = torch.where(counts, score.detach(), -torch.inf).amax(-1, keepdim=True)
     top = torch.where(top.isfinite(), top, 0)
     e = torch.where(counts, torch.where(counts, score - top, 0).exp(), 0)

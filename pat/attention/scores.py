@@ -1,5 +1,5 @@
-"""What a loss needs of C3 attention without its weights: the log of each pixel's sum of exponentials, the
-mean score along its segment, and the position of the largest weight.
+"""Quantities of C3 attention for losses, without its weights: log of the sum of exponentials, mean score, and
+position of the largest weight.
 
 Nothing is gathered: memory is that of the query, the key and one image of alpha's size. The weight of a
 sample with the score s is exp(s - log_sum).
@@ -22,11 +22,20 @@ from .attend import Interpolation, Locations, attend, attend_with_statistics, ch
 from .reference import Attended, AttentionInputs
 
 SHARPENED = 1e4
-"""Queries times this give nearly all weight to the largest score."""
+"""Factor of queries that gives nearly all weight to the largest score."""
 
 
 class Compared(NamedTuple):
-    """A query (B, D, Ha, Wa), key and value (B, D, Hb, Wb), at `locations`, all as `attend` takes them."""
+    """Features under comparison, in the form that `attend` takes.
+
+    Attributes:
+        query: (b, d, ha, wa).
+        key: (b, d, hb, wb).
+        value: (b, dv, hb, wb).
+        locations: segments, or a function that returns locations.
+        samples: samples of each segment.
+        interpolation: "bilinear" or "nearest".
+    """
 
     query: Tensor
     key: Tensor
@@ -36,7 +45,7 @@ class Compared(NamedTuple):
     interpolation: Interpolation
 
     def attended(self) -> Attended:
-        """C3 attention, with its statistics."""
+        """Compute C3 attention with its statistics."""
         return attend_with_statistics(
             *(self.query, self.key, self.value, self.locations),
             samples=self.samples,
@@ -45,13 +54,21 @@ class Compared(NamedTuple):
 
     @property
     def segments(self) -> Segments:
-        """The locations (B or 1, Ha, Wa). Raises ValueError for explicit positions."""
+        """Locations as segments (b or 1, ha, wa).
+
+        Raises:
+            ValueError: for explicit positions.
+        """
         if not isinstance(self.locations, Segments):
             raise ValueError("a loss on attention needs straight segments: choose a straight field")
         return self.locations
 
     def strided(self, stride: int) -> Compared:
-        """Of every `stride`-th row and column of alpha alone."""
+        """Keep every `stride`-th row and column of alpha.
+
+        Raises:
+            ValueError: for explicit positions.
+        """
         sparse = (..., slice(None, None, stride), slice(None, None, stride))
         start, end, valid = self.segments.start, self.segments.end, self.segments.valid
         few = Segments(start[(*sparse, slice(None))], end[(*sparse, slice(None))], valid[sparse])
@@ -59,10 +76,14 @@ class Compared(NamedTuple):
 
 
 def log_sum(compared: Compared) -> Float[Tensor, "b ha wa"]:
-    """log sum_l exp(query . key(x_l)) over the samples that count; of no meaning where none does.
+    """Compute log sum_l exp(query . key(x_l)) over the samples that count.
 
-    Differentiable by query, key and positions: once, or where positions require a gradient any number of
-    times, by the formula, which gathers all keys.
+    Returns:
+        (b, ha, wa); meaningless where none counts. Differentiable by query and key once, and where positions
+        require a gradient by these too, any number of times: by the formula, which gathers all keys.
+
+    Raises:
+        ValueError: for explicit positions.
     """
     query, key, value, _, _, interpolation = compared
     positions = sample_positions(compared.segments, query, compared.samples)
@@ -73,7 +94,11 @@ def log_sum(compared: Compared) -> Float[Tensor, "b ha wa"]:
 
 
 def mean_score(compared: Compared) -> Float[Tensor, "b ha wa"]:
-    """The mean of the scores of a pixel's samples that count; 0 where none does."""
+    """Compute the mean score of a pixel's samples that count; 0 where none does.
+
+    Returns:
+        (b, ha, wa), differentiable.
+    """
     query, key, _, locations, samples, interpolation = compared
     nothing = torch.zeros_like(query), torch.zeros_like(key)
     even = attend(*nothing, key, locations, samples=samples, interpolation=interpolation)
@@ -82,7 +107,12 @@ def mean_score(compared: Compared) -> Float[Tensor, "b ha wa"]:
 
 @torch.no_grad()
 def peak_position(compared: Compared) -> Float[Tensor, "b 2 ha wa"]:
-    """Where the largest weight is, (x, y) in beta's pixels; 0 if no sample counts. Equal ones: their mean."""
+    """Find the position of the largest weight.
+
+    Returns:
+        (x, y) in beta's pixels, (b, 2, ha, wa), without gradient; the mean of equal ones, 0 if no sample
+        counts.
+    """
     query, key, _, locations, samples, interpolation = compared
     sharp = query.float() * SHARPENED
     arguments = sharp, key.float(), key[:, :1].float(), locations
@@ -90,7 +120,8 @@ def peak_position(compared: Compared) -> Float[Tensor, "b 2 ha wa"]:
 
 
 class _LogSum(Function):
-    """Its gradient by the query: the attended key; by the key: that of attended values, query upstream."""
+    """Log of the sum of exponentials. Gradient by the query: the attended key; by the key: that of attended
+    values for the query times upstream."""
 
     @staticmethod
     def forward(

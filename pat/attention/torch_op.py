@@ -29,8 +29,15 @@ OPTIONS = "int samples, bool straight, bool nearest, bool measured, str backend,
 
 
 def attend(inputs: AttentionInputs, *, measured: bool, backend: str, strict: bool) -> Attended:
-    """As `reference.attend`, by the `cpu` or the `triton` backend; without statistics if not `measured`.
-    `strict`: no second order by the reference."""
+    """Compute attention by the `cpu` or the `triton` backend, with gradients.
+
+    Args:
+        measured: False leaves out the statistics, whose fields then hold an empty tensor.
+        strict: True refuses gradients of gradients instead of using the reference.
+
+    Returns:
+        Values and statistics.
+    """
     query, key, value, positions, bias, nearest = inputs
     if is_plain(query, key, value, positions.points, bias):
         out, statistics, *_ = compiled(backend).forward(inputs, measured)
@@ -45,7 +52,8 @@ def attend(inputs: AttentionInputs, *, measured: bool, backend: str, strict: boo
 
 
 def is_plain(*operands: Tensor | None) -> bool:
-    """Whether nothing but numbers is asked for, so that the kernels can be called without torch's dispatcher.
+    """Return True if no gradient or transformation is in progress, so that kernels can bypass torch's
+    dispatcher.
 
     An operator's first call imports torch's compiler, which takes a second.
     """
@@ -53,12 +61,12 @@ def is_plain(*operands: Tensor | None) -> bool:
 
 
 def wants_gradient(*operands: Tensor | None) -> bool:
-    """Whether autograd records what is done with some of the operands."""
+    """Return True if autograd records operations on some of the operands."""
     return torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in operands)
 
 
 def is_seen_by_autograd_alone(*operands: Tensor | None) -> bool:
-    """Whether nothing else of torch has to see each operation, and the operands are plain tensors."""
+    """Return True if the operands are plain tensors and no mode but autograd has to see each operation."""
     return not followed() and all(type(t) in (Tensor, Parameter) for t in operands if t is not None)
 
 
@@ -70,8 +78,14 @@ def attend_local(
     bias: Tensor | None,
     again: Callable[[Tensor, Tensor, Tensor], Tensor],
 ) -> Tensor:
-    """As `cpu.forward_local`, with gradients by query, key and value, and gradients of these by `again`: the
-    same values of the three by the general operator."""
+    """Compute `cpu.forward_local` with gradients by query, key and value.
+
+    Args:
+        again: computes the values of the three by the general operator, for gradients of gradients.
+
+    Returns:
+        Values (b, dv, h, w).
+    """
     if not wants_gradient(query, key, value):
         return compiled("cpu").forward_local(query, key, value, field, bias)[0]
     return _AttendLocal.apply(query, key, value, field, bias, again)
@@ -99,7 +113,7 @@ class _AttendLocal(torch.autograd.Function):
 
 
 def compiled(backend: str) -> ModuleType:
-    """The module of a backend, imported when first needed: compilers take their time to load."""
+    """Import the module of a backend when first needed: compilers take time to load."""
     if backend == "cpu":
         from pat.attention import cpu
 
@@ -118,7 +132,7 @@ def _attend(*given: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 
 def _inputs(tensors: Any, form: Any) -> AttentionInputs:
-    """The inputs of `INPUTS`, and the first three of `OPTIONS`."""
+    """Attention inputs from `INPUTS` and the first three of `OPTIONS`."""
     (query, key, value, points, mask, bias), (samples, straight, nearest) = tensors, form
     positions = SamplePositions(points, mask, samples, straight)
     return AttentionInputs(query, key, value, positions, bias, nearest)

@@ -47,8 +47,8 @@ OUTSIDE, OCCLUDED, SEEN = 0, 1, 2
 """Visibility of alpha's pixels in a beta: beyond its edge; occluded or unmatched (low confidence); seen."""
 
 LEAST_CONFIDENCE = 0.5
-"""Confidence from which a point counts as seen: that it is, and at this position, is likelier than not. As
-bands, 36 % of the motorcycle pair's occluded pixels exceed it (docs/results.md)."""
+"""Confidence from which a point counts as seen: that it is, and at this position, is likelier than not.
+Some occluded pixels exceed it: docs/reports/alignment.md, under "occluded pixels filled"."""
 
 SMOOTH = 1.0
 """Pixels by which a disparity between alpha's may differ from the nearest one's, at most: beyond is a depth

@@ -2,10 +2,9 @@
 
 Semi-global matching (Hirschmüller 2008) of luminances both ways, a left-right check, beta's colour
 differences warped to alpha, and corrected by guided regression (He et al. 2013) on alpha's luminance. Unseen
-pixels take the colours of the seen pixels most alike in luminance, texture and place; one edge-aware smoother
-guided by alpha (Min et al. 2014) joins both. The result has alpha's luminance.
-
-The constants were tuned for the mean PSNR of nine pairs of the tune half with beta reduced 2x.
+pixels take the colours of the seen pixels most similar in luminance, texture and place; one edge-aware
+smoother guided by alpha (Min et al. 2014) joins both. The result has alpha's luminance. The constants were
+tuned for the mean PSNR of nine pairs of the tune half with beta reduced 2x.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ Image = NDArray[Any]
 BLOCK = 5
 """Side of the matched block in pixels."""
 CHECK = 1.0
-"""A match fails the left-right check if the two disparities differ by more than this many pixels."""
+"""Largest difference, in pixels, of the two disparities of a match that passes the left-right check."""
 LIKENESS = 0.08
 """Difference of luminances at which the weight of a match falls to 1 / e."""
 INCONSISTENT = 0.5
@@ -46,7 +45,7 @@ REGRESSION_RADIUS, REGRESSION_FLOOR = 3, 3e-3
 
 
 EXAMPLES = 8
-"""Seen pixels whose colours an unseen one takes, in the mean."""
+"""Number of seen pixels whose mean colour an unseen one takes."""
 SEEN = 0.5
 """Weight above which a pixel counts as seen; unseen ones weigh `UNSEEN` in the last smoothing."""
 UNSEEN = 0.2
@@ -56,7 +55,14 @@ UNRECTIFIABLE = "the cameras look along the line between them: such a pair canno
 
 
 def classical_baseline(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> Float[Tensor, "_ h w"]:
-    """`classical` with the one colour beta, or with each beta that records one band, bands concatenated."""
+    """Fuse by `classical` with the one colour beta, or with each beta that records one band.
+
+    Returns:
+        The fused bands, those of several betas concatenated, 0..1.
+
+    Raises:
+        ValueError: as `classical`.
+    """
     betas = [name for name in rig.betas(alpha) if name in images]
     if images[betas[0]].shape[0] == 3:
         return classical(rig, images, alpha, betas[0])
@@ -66,9 +72,14 @@ def classical_baseline(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> Fl
 def classical_view(
     rig: Rig, images: Mapping[str, Tensor], alpha: str, *, longest: int
 ) -> Float[Tensor, "_ h w"]:
-    """`classical_baseline` at alpha's own view, reduced to at most `longest` pixels along its longer side.
+    """Fuse by `classical_baseline` at alpha's own view, reduced to at most `longest` pixels along its longer
+    side.
 
-    Raises ValueError for cameras that are not calibrated, and for those that cannot be rectified.
+    Returns:
+        The fused bands at alpha's pixels, lenses included.
+
+    Raises:
+        ValueError: for cameras that are not calibrated, and for those that cannot be rectified.
     """
     if names := [name for name in images if not isinstance(rig[name], Camera)]:
         raise ValueError(
@@ -83,11 +94,18 @@ def classical_view(
 
 
 def classical(rig: Rig, images: Mapping[str, Tensor], alpha: str, beta: str) -> Float[Tensor, "_ h w"]:
-    """Beta's colours, or its one band, at alpha's view, for two pinholes with any pose and a depth range.
+    """Bring beta's colours, or its one band, to alpha's view, for two pinholes with any pose and a depth
+    range.
 
     Both are rectified to one image plane with about alpha's resolution and matched there for depths near to
-    far; the colour differences (for one band: what beta has more than alpha) are warped back to alpha. Values
-    0..1. Raises ValueError for lenses, and for cameras that look along the line between them.
+    far; the colour differences (for one band: the excess of beta over alpha) are warped back to alpha.
+
+    Returns:
+        Three bands with alpha's luminance, or one, 0..1.
+
+    Raises:
+        ValueError: for lenses, no depth range, and for cameras that look along the line between them or have
+            one centre.
     """
     pair, mono, other = rig.pair(alpha, beta), luminance_of(images[alpha]), images[beta]
     if pair.has_lens:
@@ -109,11 +127,19 @@ def classical(rig: Rig, images: Mapping[str, Tensor], alpha: str, beta: str) -> 
 def classical_fusion(
     alpha: Float[Tensor, "1 h w"], beta: Float[Tensor, "3 hb wb"], max_disparity: float
 ) -> Float[Tensor, "3 h w"]:
-    """Alpha in beta's colours, for a (near-)rectified pair with alpha on the left.
+    """Bring beta's colours to alpha, for a (near-)rectified pair with alpha on the left.
 
-    beta may have another size than alpha, as long as both show the same field: the point at (x, y) in alpha
-    is at (x - d, y) in beta enlarged to alpha's size, 0 <= d <= `max_disparity`, in alpha's pixels. Values
-    0..1. Raises ValueError for a disparity that is not positive.
+    Beta may have another size than alpha, as long as both show the same field: the point at (x, y) in alpha
+    is at (x - d, y) in beta enlarged to alpha's size, 0 <= d <= `max_disparity`.
+
+    Args:
+        max_disparity: largest disparity, in alpha's pixels.
+
+    Returns:
+        Red, green and blue with alpha's luminance, 0..1.
+
+    Raises:
+        ValueError: for a `max_disparity` that is not positive.
     """
     if not max_disparity > 0:
         raise ValueError(f"max_disparity must be positive, got {max_disparity}")
@@ -124,9 +150,13 @@ def classical_fusion(
 
 
 def non_local_means(image: Float[Tensor, "c h w"], deviation: float) -> Float[Tensor, "c h w"]:
-    """scikit-image's non-local means for noise of known deviation (Buades et al. 2005; Darbon et al. 2008).
+    """Denoise an image by scikit-image's non-local means for noise of known deviation (Buades et al. 2005;
+    Darbon et al. 2008).
 
     Patches of 5 x 5 pixels within 6 pixels, h = 0.8 deviations, as its documentation advises.
+
+    Returns:
+        The image without noise, not clipped.
     """
     from skimage.restoration import denoise_nl_means
 
@@ -144,12 +174,16 @@ def non_local_means(image: Float[Tensor, "c h w"], deviation: float) -> Float[Te
 
 
 def denoised_knowing(image: Float[Tensor, "c h w"], level: NoiseLevel) -> Float[Tensor, "c h w"]:
-    """`non_local_means` for the mean deviation of a noise level; 0..1."""
+    """Denoise an image by `non_local_means` for the mean deviation of a noise level.
+
+    Returns:
+        The image without noise, 0..1.
+    """
     return non_local_means(image, float(level.deviation(image[None]).mean())).clamp(0, 1)
 
 
 class _Plane(NamedTuple):
-    """A common image plane: where alpha's and beta's pixels are in it, its size, its disparities."""
+    """A common image plane: maps of alpha's and beta's pixels into it, its size, its largest disparity."""
 
     from_alpha: NDArray[np.float64]
     from_beta: NDArray[np.float64]
@@ -158,7 +192,7 @@ class _Plane(NamedTuple):
 
 
 def _rectified_plane(pair: Pair) -> _Plane:
-    """Both cameras rotated so that x runs along the baseline (Fusiello et al. 2000).
+    """Rotate both cameras so that x runs along the baseline (Fusiello et al. 2000).
 
     `arraygeom.rectify` rotates each camera half way (Bouguet) and keeps one image size: other pixels, and the
     figures reported so far would change. Here the plane holds all of alpha at about its own resolution, and
@@ -190,7 +224,8 @@ def _rectified_plane(pair: Pair) -> _Plane:
 
 
 def _rectifying_rotation(R: NDArray, t: NDArray) -> NDArray[np.float64]:
-    """From alpha's axes to axes with x along the baseline and z near the mean of both optical axes."""
+    """Return the rotation from alpha's axes to axes with x along the baseline and z near the mean of both
+    optical axes."""
     baseline = R.T @ t
     if not np.linalg.norm(baseline) > 0:
         raise ValueError("both cameras have the same centre (t is zero): there is no depth to match")
@@ -208,7 +243,8 @@ def _project(H: NDArray, points: NDArray) -> tuple[NDArray[np.float64], NDArray[
 
 
 class _Correspondence(NamedTuple):
-    """Where `mono`'s pixels are in the other image, and whether and how consistently they are found there."""
+    """Positions of `mono`'s pixels in the other image, with masks of visible pixels and weights of consistent
+    ones."""
 
     columns: Image
     rows: Image
@@ -219,7 +255,7 @@ class _Correspondence(NamedTuple):
 def _correspondence(
     soft: Image, other: Image, guide: NDArray[np.uint8], inside: Image, max_disparity: float
 ) -> _Correspondence:
-    """`other` is luminance normalised to mono's, `inside` is 1 where it has content."""
+    """Match `other`, luminance normalised to mono's; `inside` is 1 where it has content."""
     columns, rows = _grid(soft.shape)
     ours, consistent = checked_disparity(to_bytes(soft), to_bytes(other), max_disparity)
     diffused = filled(ours[None], consistent.astype(np.float32) + 1e-5, guide, DISPARITY_FILL)[0]
@@ -231,7 +267,11 @@ def _correspondence(
 def checked_disparity(
     left: NDArray[np.uint8], right: NDArray[np.uint8], max_disparity: float
 ) -> tuple[Image, NDArray[np.bool_]]:
-    """Disparity of left (h, w) by OpenCV's semi-global matching, and where the left-right check holds."""
+    """Compute the disparity of left (h, w) by OpenCV's semi-global matching, with a left-right check.
+
+    Returns:
+        Disparity in pixels, negative where unknown, and a mask of the pixels that pass the check.
+    """
     ours = raw_disparity(left, right, max_disparity)
     # Seen from beta, alpha's points lie to the right: mirrored, to the left again.
     theirs = raw_disparity(right[:, ::-1], left[:, ::-1], max_disparity)[:, ::-1]
@@ -243,7 +283,8 @@ def checked_disparity(
 def _warped_chroma(
     mono: Image, colours: Image, inside: Image, max_disparity: float, sharpness: float
 ) -> Image:
-    """Colour differences (R - Y, B - Y) of `colours` at `mono`'s pixels; both (h, w) on one rectified grid.
+    """Compute colour differences (R - Y, B - Y) of `colours` at `mono`'s pixels; both (h, w) on one rectified
+    grid.
 
     `inside` is 1 where `colours` has content; `sharpness` is their resolution over mono's.
     """
@@ -259,7 +300,7 @@ def _warped_chroma(
 
 
 def _warped_band(mono: Image, band: Image, inside: Image, max_disparity: float, sharpness: float) -> Image:
-    """What `band` has more than `mono`, at `mono`'s pixels; both (h, w) on one rectified grid."""
+    """Compute the excess of `band` over `mono` at `mono`'s pixels; both (h, w) on one rectified grid."""
     soft, guide = _softened(mono, sharpness), to_bytes(mono)
     match = _correspondence(soft, _normalised(band, mono, inside), guide, inside, max_disparity)
     difference = (_sampled(band, match.columns, match.rows) - soft)[..., None]
@@ -267,7 +308,7 @@ def _warped_band(mono: Image, band: Image, inside: Image, max_disparity: float, 
 
 
 def _softened(mono: Image, sharpness: float) -> Image:
-    """`mono` as sharp as an image of `sharpness` times its resolution enlarged to its size."""
+    """Return `mono` as sharp as an image of `sharpness` times its resolution enlarged to its size."""
     if sharpness >= 1:
         return mono
     height, width = (max(1, round(side * sharpness)) for side in mono.shape)
@@ -276,7 +317,12 @@ def _softened(mono: Image, sharpness: float) -> Image:
 
 
 def raw_disparity(left: NDArray[np.uint8], right: NDArray[np.uint8], max_disparity: float) -> Image:
-    """Semi-global matching, padded because OpenCV leaves `count` columns at the left without disparity."""
+    """Compute disparity by semi-global matching, on padded images: OpenCV leaves columns at the left without
+    one.
+
+    Returns:
+        Disparity of the left image's pixels, pixels; negative where unknown.
+    """
     count = 16 * int(np.ceil((min(max_disparity, left.shape[1]) + 1) / 16))
     costs = {"P1": 8 * BLOCK**2, "P2": 32 * BLOCK**2, "disp12MaxDiff": 1, "preFilterCap": 31}
     matcher = cv2.StereoSGBM.create(0, count, BLOCK, **costs, uniquenessRatio=5, mode=cv2.STEREO_SGBM_MODE_HH)
@@ -285,7 +331,8 @@ def raw_disparity(left: NDArray[np.uint8], right: NDArray[np.uint8], max_dispari
 
 
 def _normalised(luma: Image, mono: Image, weight: Image) -> Image:
-    """`luma` with mono's mean and standard deviation, so that cameras of unlike exposure can be compared."""
+    """Return `luma` with mono's mean and standard deviation, so that cameras of different exposure can be
+    compared."""
     mean, deviation = _mean_and_deviation(luma, weight)
     wanted_mean, wanted_deviation = _mean_and_deviation(mono, weight)
     gain = wanted_deviation / deviation if deviation > 1e-3 else 1.0
@@ -299,9 +346,9 @@ def _mean_and_deviation(plane: Image, weight: Image) -> tuple[float, float]:
 
 
 def _regressed(chroma: Image, luma: Image, residual: Image) -> Image:
-    """Chroma corrected along its local regression on luminance by the detail of alpha that beta's lacks.
+    """Correct chroma along its local regression on luminance by the detail of alpha that beta's lacks.
 
-    This is the guided filter's linear model; it gives back the detail that beta lost by its resolution.
+    This is the guided filter's linear model; it restores the detail that beta lost by its resolution.
     """
     mean = _box(luma)
     variance: Image = _box(luma * luma) - mean * mean
@@ -311,7 +358,7 @@ def _regressed(chroma: Image, luma: Image, residual: Image) -> Image:
 
 
 def _blended(values: Image, weight: Image, mono: Image, guide: NDArray[np.uint8]) -> Image:
-    """Values (h, w, c), replaced where their weight is low by those of alike and of connected pixels."""
+    """Replace values (h, w, c) of low weight by those of similar and of connected pixels."""
     planes = np.ascontiguousarray(values.transpose(2, 0, 1), np.float32)
     seen = weight > SEEN
     examples = _by_examples(planes, seen, mono)
@@ -325,7 +372,8 @@ def _blended(values: Image, weight: Image, mono: Image, guide: NDArray[np.uint8]
 
 
 def _by_examples(values: Image, seen: NDArray[np.bool_], mono: Image) -> Image:
-    """Values (c, h, w), unseen ones the mean of the seen ones nearest in luminance, texture and place."""
+    """Replace unseen values (c, h, w) by the mean of the seen ones nearest in luminance, texture
+    and place."""
     columns, rows = _grid(mono.shape)
     texture = [np.sqrt(np.maximum(_mean(mono * mono, r) - _mean(mono, r) ** 2, 0)) for r in (2, 6)]
     what = [mono * 12, _mean(mono, 2) * 10, _mean(mono, 6) * 5, texture[0] * 12, texture[1] * 8]
@@ -350,7 +398,7 @@ def _recoloured(alpha: Float[Tensor, "1 h w"], chroma: Image) -> Float[Tensor, "
 
 
 def _planes(image: Float[Tensor, "c h w"]) -> Image:
-    """(H, W, C) for OpenCV."""
+    """Return an image as (H, W, C) for OpenCV."""
     return np.ascontiguousarray(image.detach().cpu().float().numpy().transpose(1, 2, 0))
 
 
@@ -364,7 +412,7 @@ def _grid(shape: tuple[int, ...]) -> tuple[Image, Image]:
 
 
 def _resized(colours: Image, hw: torch.Size) -> Image:
-    """OpenCV's resize obeys c' = (c + 0.5) s - 0.5."""
+    """Resize colours by OpenCV, which obeys c' = (c + 0.5) s - 0.5."""
     smaller = colours.shape[0] > hw[0]
     return cv2.resize(colours, (hw[1], hw[0]), interpolation=cv2.INTER_AREA if smaller else cv2.INTER_CUBIC)
 
@@ -374,7 +422,7 @@ def _sampled(image: Image, columns: Image, rows: Image, how: int = cv2.INTER_CUB
 
 
 def _warped(image: Image, H: NDArray, wh: tuple[int, int]) -> Image:
-    """The image warped by x' ~ H x; its border is repeated beyond."""
+    """Warp an image by x' ~ H x; its border is repeated beyond."""
     return cv2.warpPerspective(image, H, wh, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
 
 

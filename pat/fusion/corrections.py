@@ -1,8 +1,8 @@
-"""What cameras and rig are off by, found once a frame from a fusion of reduced images.
+"""Errors of cameras and rig, estimated once a frame from a fusion of reduced images.
 
 A pre-pass matches the images at half the size or less, without a network. Where its matches are reliable,
-alpha's response is fitted (`pat.matching.radiometry`), and how far beta lies across its search segments
-(`pat.matching.epipolar_offset`). Both are put right before the frame is fused.
+alpha's response is fitted (`pat.matching.radiometry`), and beta's distance across its search segments
+(`pat.matching.epipolar_offset`). Both are corrected before the frame is fused.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class PrePassSettings:
-    """Of the matching of reduced images before a frame is matched."""
+    """Settings of the matching of reduced images before a frame is matched."""
 
     pixels: int = size(400_000, "Alpha's pixels in the pre-pass, at most")
     small: int = size(50_000, "Alpha's pixels below which the pre-pass is at full size")
@@ -52,6 +52,11 @@ class PrePassSettings:
         0.1, "First value tried: by how much a match must be better than others, as of `BetaMatches.facts`"
     )
     passes: int = size(3, "Pre-passes at most: matches are better where what was found is put right")
+    matched: float = tuned(
+        0.3,
+        "Share of alpha's pixels reliably matched, below which vignetting is not looked for, and less of its "
+        "variance need be explained: Middlebury's tune half has .55 at least, plain scenes .26 at most",
+    )
     settled: float = size(0.25, "Pixels by which the largest displacement changes, up to which passes end")
 
 
@@ -60,16 +65,26 @@ SETTINGS = PrePassSettings()
 
 @dataclass(frozen=True)
 class Corrections:
-    """Alpha's response, and the misalignment of each beta by camera (none: all are right)."""
+    """Alpha's response, and the misalignment of each beta.
+
+    Attributes:
+        response: response of alpha in terms of beta's bands.
+        misalignments: misalignment by camera; empty if none is to be corrected.
+    """
 
     response: Response
     misalignments: Mapping[str, Misalignment] = field(default_factory=dict)
 
     def applied(self, inputs: Inputs, hw: HW) -> Inputs:
-        """The inputs put right; `hw` is alpha's size without padding.
+        """Return the corrected inputs.
 
-        Cameras of the same place may be one beta in one frame, and several in another. Raises ValueError for
-        misalignments of other cameras.
+        Cameras of the same place may be one beta in one frame, and several in another.
+
+        Args:
+            hw: alpha's size without padding.
+
+        Raises:
+            ValueError: for misalignments of other cameras.
         """
         cameras = [camera for names in inputs.cameras for camera in names]
         if self.misalignments and set(cameras) != set(self.misalignments):
@@ -86,11 +101,15 @@ class Corrections:
         return replace(inputs, betas=betas, sees_luma=self.response.explains)
 
     def of_betas(self, inputs: Inputs) -> list[Misalignment]:
-        """The misalignment of each beta, in order."""
+        """Return the misalignment of each beta, in order."""
         return [self.misalignments.get(names[0], Misalignment()) for names in inputs.cameras]
 
     def described(self, hw: HW) -> list[str]:
-        """A line for each thing that is put right; `hw` is alpha's size."""
+        """Return a line of text for each correction.
+
+        Args:
+            hw: alpha's size.
+        """
         lines = [] if self.response.is_rec601 else [str(self.response)]
         if self.response.exchanged:
             lines.append(
@@ -104,7 +123,7 @@ class Corrections:
         return lines
 
     def undone(self, frame: Frame) -> Frame:
-        """The fused frame, whose bands give alpha as the response says."""
+        """Return the fused frame with its bands changed so that they give alpha as the response states."""
         return frame if self.response.is_rec601 else frame._replace(image=self.response.undone(frame.image))
 
 
@@ -112,10 +131,16 @@ class Corrections:
 def find_corrections(
     network: FusionNetwork, frame: FrameInputs, response: ResponseSpec, *, align: bool
 ) -> Corrections:
-    """Alpha's response if it is to be fitted, and the betas' misalignments if these are asked for.
+    """Estimate alpha's response if it is to be fitted, and the betas' misalignments if `align`.
 
-    A response is fitted for RGB betas. Nothing is found for a network without matches. Raises ValueError for
-    a stated response that is not three weights, none negative, or where there is no RGB beta.
+    A response is fitted for RGB betas only; nothing is estimated for a network without matches.
+
+    Returns:
+        The corrections; the stated or the Rec. 601 response where none is fitted.
+
+    Raises:
+        ValueError: for a stated response that is not three weights, none negative, or where there is no RGB
+            beta.
     """
     rgb = any(map(_is_rgb, frame.inputs.betas))
     if not isinstance(response, str | Response) and not rgb:
@@ -148,7 +173,7 @@ def _named(cameras: Iterable[str]) -> str:
 
 
 def expected_work(frame: FrameInputs, response: ResponseSpec, *, align: bool) -> float:
-    """About how much work `find_corrections` is, as a share of fusing the frame: mostly two passes."""
+    """Estimate the work of `find_corrections`, as a share of fusing the frame: mostly two passes."""
     return 2 * min(SETTINGS.pixels / math.prod(frame.hw), 1.0) if align or response == "fit" else 0.0
 
 
@@ -157,7 +182,7 @@ def _is_rgb(beta: Beta) -> bool:
 
 
 def _reduced_frame(frame: FrameInputs) -> FrameInputs:
-    """The frame at a half, a quarter, ... of its size."""
+    """Return the frame at a half, a quarter, ... of its size."""
     pixels, inputs = math.prod(frame.hw), frame.inputs
     factor = 1 if pixels < SETTINGS.small else 2
     while pixels > SETTINGS.pixels * factor**2:
@@ -192,11 +217,10 @@ def _reduced_field(
 
 
 class _Matches(NamedTuple):
-    """What one beta shows at its matches: all (h, w) or (c, h, w), at the size of the pre-pass; after
-    `before` what `fit_misalignment` takes.
+    """Values of one beta at its matches: all (h, w) or (c, h, w), at the size of the pre-pass.
 
-    `before` are beta's own bands, blurred; `luma` is that of the corrected beta, as bright and sharp as
-    `alpha`.
+    After `before` come the arguments of `fit_misalignment`. `before` are beta's own bands, blurred; `luma` is
+    that of the corrected beta, as bright and sharp as `alpha`.
     """
 
     before: Float[Tensor, "c h w"]
@@ -208,13 +232,14 @@ class _Matches(NamedTuple):
 
     @property
     def place(self) -> Float[Tensor, "h w 2"]:
-        """The matches in beta's width and height, from its middle."""
+        """Positions of the matches in beta's width and height, from its middle."""
         h, w = self.luma.shape
         return (self.position + 0.5) / self.position.new_tensor([w, h]) - 0.5
 
 
 def _of_beta(alpha: Tensor, before: Beta, beta: Beta, matches: BetaMatches, hw: HW) -> _Matches:
-    """What corrections are fitted to: a beta's blurred bands at alpha's pixels, alpha, and sure matches."""
+    """Return the data for corrections: a beta's blurred bands at alpha's pixels, alpha, and
+    reliable matches."""
     h, w = hw
     positions, valid = matches.positions(beta.field.straight, (beta.image.shape[-2], beta.image.shape[-1]))
     where = positions[0, :h, :w]
@@ -239,4 +264,8 @@ def _fitted(frame: FrameInputs, matches: list[_Matches]) -> Response:
     colour = [(m, m.weight > 0) for m in matches if len(m.before) == 3]
     points = [of_beta.before[:, counts] for of_beta, counts in colour]
     places = [of_beta.place[counts] for of_beta, counts in colour]
-    return fit(torch.cat(points, 1), torch.cat([soft[counts] for _, counts in colour]), torch.cat(places))
+    alphas = torch.cat([soft[counts] for _, counts in colour])
+    matched = float(torch.stack([counts for _, counts in colour]).any(0).double().mean())
+    enough = min(matched / SETTINGS.matched, 1.0)
+    found = fit(torch.cat(points, 1), alphas, torch.cat(places), vignetting=enough == 1)
+    return found._replace(explained=min(found.explained / max(enough, 1e-9), 1.0))

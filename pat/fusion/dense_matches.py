@@ -1,4 +1,5 @@
-"""Depth by dense matches of one beta alone, no image: what finding a rig refines it by."""
+"""Depth by dense matches of one beta alone, without a fused image, for refining a rig that is being
+estimated."""
 
 from __future__ import annotations
 
@@ -33,11 +34,16 @@ from .tiles import fused_in_tiles
 from .views import Views
 
 AROUND = [step / 2 for step in range(-6, 7)]
-"""Pixels along the segment from a match, one of which is on beta's image where the match says something."""
+"""Pixels along the segment from a match, one of which must be on beta's image for the match to count."""
 
 
 class MatchedDepth(NamedTuple):
-    """Depth (H, W) at alpha's pixels, NaN where unknown, and its confidence, as of `Frame`."""
+    """Depth at alpha's pixels by matches.
+
+    Attributes:
+        depth: (H, W), in the rig's unit; NaN where unknown.
+        confidence: (H, W), as of `Frame`.
+    """
 
     depth: Float[Tensor, "h w"]
     confidence: Float[Tensor, "h w"]
@@ -55,11 +61,15 @@ class MatchesAlone:
         self.bands = bands
 
     def working_bytes(self, alpha: int, betas: Sequence[int]) -> float:
-        """None beside the matches."""
+        """Return 0: no memory beside the matches."""
         return 0.0
 
     def __call__(self, inputs: Inputs, matches: Matches | None = None) -> FusionOutput:
-        """Alpha's image and the matches. Raises ValueError without them."""
+        """Return alpha's image with the matches' positions and confidences.
+
+        Raises:
+            ValueError: without matches.
+        """
         positions, confidences = [], []
         for beta, matched in zip(inputs.betas, required(matches, inputs).betas):
             hw = beta.image.shape[-2], beta.image.shape[-1]
@@ -75,10 +85,17 @@ class MatchesAlone:
 @without_autocast()
 @torch.no_grad()
 def matched_depth(images: Images, rig: Rig, *, alpha: str, bands: int | None) -> MatchedDepth:
-    """Depth at alpha's pixels by matches. With `bands`, the number of beta's, alpha is compared with their
-    luma; with None with the combination of them that is most like it.
+    """Compute depth at alpha's pixels by matches, without a fused image.
 
-    Raises ValueError as `fuse_frame` for images that do not fit the rig, and views that do not overlap.
+    Args:
+        bands: number of beta's bands, with whose luma alpha is compared; None to compare the combination of
+            bands that is most similar.
+
+    Returns:
+        Depth and confidence at alpha's pixels.
+
+    Raises:
+        ValueError: as `fuse_frame`, for images that do not fit the rig, and views that do not overlap.
     """
     network = MatchesAlone(bands)
     views = Views.of(rig, images, alpha=alpha)

@@ -1,4 +1,4 @@
-"""From the positions that a network finds in the betas to depth at alpha's pixels."""
+"""Depth at alpha's pixels from the positions that a network returns for the betas."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ from .inputs import Placement
 
 @dataclass(frozen=True)
 class DepthSettings:
-    """Of the depth of fused pixels."""
+    """Settings of the depth of fused pixels."""
 
     unseen: float = size(1e-4, "Confidence up to which beta does not see the point, and gives no depth")
 
 
 SETTINGS = DepthSettings()
 DEVIATIONS = 1.645
-"""Physics: so many standard deviations to either side of a normal distribution's mean are 9 of 10 cases."""
+"""Physics: standard deviations to either side of a normal distribution's mean that hold 9 of 10 cases."""
 
 
 def _within(
     where: Float[Tensor, "n 2"], segments: Segments, which: Bool[Tensor, "h w"]
 ) -> Float[Tensor, "n 2"]:
-    """Positions of some of alpha's pixels, moved along their segment to its end if beyond it."""
+    """Move positions of some of alpha's pixels along their segment to its end if beyond it."""
     h, w = which.shape
     start, end, valid = (t[0, :h, :w][which] for t in (segments.start, segments.end, segments.valid))
     start, end = start.to(where), end.to(where)
@@ -52,10 +52,13 @@ def _within(
 
 
 def certain(output: FusionOutput, matches: Matches | None, inputs: Inputs) -> FusionOutput:
-    """A network's result with the certainty of the matches it was given, where that is known, for its own.
+    """Replace a network's confidence and deviation by the certainty of the matches it was given, where known.
 
-    Where segments are around what is known of each pixel, the higher of the two: a match there is hardly
-    better than the few others, which certainty takes for doubt.
+    Where segments are around a known depth of each pixel, the higher confidence counts: a match there is
+    hardly better than the few others, which certainty takes for doubt.
+
+    Returns:
+        The network's output with these.
     """
     if matches is None:
         return output
@@ -77,12 +80,18 @@ def certain(output: FusionOutput, matches: Matches | None, inputs: Inputs) -> Fu
 def measured_depth(
     output: FusionOutput, inputs: Inputs, placements: list[Placement], hw: HW, corner: tuple[int, int]
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Depth (h, w) from the calibrated betas, weighted by confidence in inverse depth, NaN where unknown; the
-    half-width of its interval, as of `Frame`; and the image's confidence.
+    """Compute depth from the calibrated betas, weighted by confidence in inverse depth.
 
     A position whose depth is beyond the bounds that were searched counts as the end of its segment: a pixel
-    beyond the far end may otherwise stand for any distance. `corner` is the (x, y) of the inputs' first
-    pixel in alpha; `hw` their size without padding.
+    beyond the far end may otherwise stand for any distance.
+
+    Args:
+        hw: size of the inputs without padding.
+        corner: (x, y) of the inputs' first pixel in alpha.
+
+    Returns:
+        Depth (h, w), NaN where unknown; the half-width of its interval, as of `Frame`; and the image's
+        confidence.
     """
 
     def of_rows(tile: Tile) -> tuple[Tensor, ...]:
@@ -103,7 +112,7 @@ def _measured(
     hw: HW,
     corner: tuple[int, int],
 ) -> tuple[Tensor, ...]:
-    """`measured_depth` of some rows."""
+    """Compute `measured_depth` of some rows."""
     h, w = hw
     like = output.position[0]
     x = (pixel_grid(hw, dtype=like.dtype, device=like.device) + like.new_tensor(corner)).reshape(-1, 2)

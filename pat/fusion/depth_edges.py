@@ -1,8 +1,8 @@
-"""Depth whose edges are alpha's: beside them, the weighted median of what is around.
+"""Depth with alpha's edges: beside them, the weighted median of the depth around.
 
-Matching compares squares, and is off by pixels beside an edge of depth. There each pixel takes the depth that
-is the median of those around, weighted by how alike alpha is there (Ma, He, Wei, Sun and Wu, Constant time
-weighted median filtering for stereo matching and beyond, 2013).
+Matching compares squares, and is off by pixels beside an edge of depth. There each pixel takes the median
+depth of those around, weighted by their similarity in alpha (Ma, He, Wei, Sun and Wu, Constant time weighted
+median filtering for stereo matching and beyond, 2013).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from .inputs import FrameInputs
 
 @dataclass(frozen=True)
 class EdgeSettings:
-    """Of depth beside its edges."""
+    """Settings of depth beside its edges."""
 
     radius: int = size(5, "Pixels to each side of what counts around a pixel")
     near: int = size(2, "Pixels to an edge of depth up to which depth is chosen anew")
@@ -39,16 +39,22 @@ class EdgeSettings:
 
 SETTINGS = EdgeSettings()
 ROWS, STRIP = 512, 16
-"""Size: rows of a part, and of what a thread takes of it at a time."""
+"""Size: rows of a part, and those of it that a thread takes at a time."""
 
 
 def beside_edges(
     depth: Float[Tensor, "h w"], frame: Frame, frame_inputs: FrameInputs
 ) -> Float[Tensor, "h w"]:
-    """A frame's depth, near its edges that of a pixel beside that looks alike in alpha.
+    """Replace a frame's depth near its edges by that of a nearby pixel that looks similar in alpha.
 
-    An edge is where inverse depth changes by more than the width of its interval. Not where the search was
-    around what is known of each pixel. Gradients are those of the pixel whose depth is taken.
+    An edge is a change of inverse depth by more than the width of its interval. Gradients are those of the
+    pixel whose depth is taken.
+
+    Args:
+        depth: depth of the frame, NaN where unknown.
+
+    Returns:
+        Depth (H, W); as given where the search was around a known depth of each pixel.
     """
     has_depth = depth.isfinite() & (frame.confidence > 0)
     if any(beta.around for beta in frame_inputs.inputs.betas) or not bool(has_depth.any()):

@@ -9,7 +9,7 @@ from arraygeom.runtime.compiled import compiled
 
 @compiled(inline="always")
 def below(some, share, n, most):
-    """The sum of the shares of the first n values up to `most`."""
+    """Return the sum of the shares of the first n values up to `most`."""
     total = np.int32(0)
     for i in range(n):
         total += share[i] * np.int32(some[i] <= most)
@@ -18,11 +18,12 @@ def below(some, share, n, most):
 
 @compiled(nogil=True, cache=True)
 def weighted_medians(values, alpha, where, weights, radius, top, bottom, out):
-    """Into rows `top` to `bottom` of `out` (h, w): the number of the pixel whose value is the weighted median
-    of those around, in a square of this `radius`; its own where not `where`. NaN does not count.
+    """Write, for rows `top` to `bottom`, the number of the pixel with the weighted median of the values
+    around.
 
-    `weights`, integers, are by 255ths of the difference in alpha. Values that are nearer to each other than a
-    4096th of the range around count as one.
+    `out` (h, w) has the pixel's own number outside `where`. The window is a square of this `radius`; NaN does
+    not count. `weights`, integers, are by 255ths of the difference in alpha. Values that are nearer to each
+    other than a 4096th of the range around count as one.
     """
     height, width = values.shape
     some = np.empty((2 * radius + 1) ** 2, np.float32)

@@ -24,7 +24,7 @@ from .inputs import FrameInputs, Placement
 
 @dataclass(frozen=True)
 class FillSettings:
-    """Of the depth of pixels whose own match is not certain."""
+    """Settings of the depth of pixels whose own match is not certain."""
 
     share: float = tuned(
         0.4,
@@ -47,17 +47,21 @@ class FillSettings:
 
 SETTINGS = FillSettings()
 ROWS, HALO = 512, 128
-"""Size: rows of a part, and beside it that its planes see: matches there count a sixth of those at hand."""
+"""Size: rows of a part, and rows beside it that its planes see: matches there count a sixth of
+those nearby."""
 
 
 def background_filled(frame: Frame, frame_inputs: FrameInputs) -> Float[Tensor, "h w"]:
-    """Depth that is far less certain than around it replaced by that of the plane through the background.
+    """Replace depth that is far less certain than around it by that of the plane through the background.
 
-    What a beta does not see is occluded: farther away than what is beside it, along the segments' rows or
-    columns. Planes of inverse depth are fitted to matches weighted by confidence; what lies beyond an edge of
-    alpha or a step of depth is far away (Gastal and Oliveira, Domain transform, 2011). What is unknown stays
-    NaN. Betas on several sides see what is occluded in one of them: depth is then as it is; so it is where it
-    is known from elsewhere. Planes end at the bounds that were searched. No gradient passes through planes.
+    A point that a beta does not see is occluded: farther away than its neighbours along the segments' rows or
+    columns. Planes of inverse depth are fitted to matches weighted by confidence; a point beyond an edge of
+    alpha or a step of depth is far away (Gastal and Oliveira, Domain transform, 2011). Planes end at the
+    bounds that were searched. No gradient passes through planes.
+
+    Returns:
+        Depth (H, W), NaN where it was unknown; unchanged where betas on several sides see occluded points,
+        and where segments were around a known depth.
     """
     depth, confidence, inputs = frame.depth, frame.confidence, frame_inputs.inputs
     if any(beta.around for beta in inputs.betas):
@@ -86,7 +90,7 @@ def background_filled(frame: Frame, frame_inputs: FrameInputs) -> Float[Tensor, 
 
 
 def _searched(placements: Sequence[Placement]) -> tuple[float, float]:
-    """The least and the greatest inverse depth that was looked for; any, where nothing says."""
+    """Return the least and the greatest inverse depth that was searched; any where not stated."""
     stated = [place.pair.depth for place in placements if place.pair.calibrated]
     ranges = [(float(far), float(near)) for near, far in filter(None, stated)]
     if not ranges or len(ranges) < len(stated):
@@ -103,7 +107,8 @@ def _filled_rows(
     unit: float,
     bounds: tuple[float, float],
 ) -> Float[Tensor, "h w"]:
-    """Depth of matches and planes; planes are computed for every second pixel, in units of inverse depth.
+    """Compute depth by matches and planes, which are computed for every second pixel, in units of inverse
+    depth.
 
     `least` is the confidence from which matches count before any plane is known; `bounds` are planes', in
     these units.
@@ -126,17 +131,18 @@ def _filled_rows(
 
 
 def _far_by_depth(inverse: Plane) -> list[Plane]:
-    """A guide whose changes of 1 are steps of depth: what lies beyond them does not count."""
+    """Return a guide whose changes of 1 are steps of depth: points beyond them do not count."""
     return [inverse / SETTINGS.step]
 
 
 def _far_by_slope(inverse: Plane) -> list[Plane]:
-    """A guide whose changes of 1 are those of slopes, by a half-width in two pixels: planes are whole."""
+    """Return a guide whose changes of 1 are those of slopes, by a half-width in two pixels:
+    planes are whole."""
     return [np.diff(inverse, axis=axis, append=inverse.take([-1], axis)) for axis in (0, 1)]
 
 
 def _background(inverse: Float[Tensor, "h w"], kept: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-    """The farther of the nearest kept ones to either side; as it is where a row has none."""
+    """Return the farther of the nearest kept values to either side; the value itself where a row has none."""
     alone = torch.where(kept, inverse, torch.nan)
     beside = torch.fmin(*(nearest_known(alone, kept, -1, back) for back in (False, True)))
     return torch.where(beside.isnan(), inverse, beside)

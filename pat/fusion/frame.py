@@ -15,20 +15,21 @@ from torch.nn.functional import interpolate
 from ..media.figures import colour_depth
 
 SHOWN = 480
-"""Pixels of a notebook's picture of a frame, along its longer side: three of them are as wide as a page."""
+"""Longer side in pixels of a notebook's picture of a frame: three of them are as wide as a page."""
 
 
 class Frame(NamedTuple):
     """A fused frame at alpha's view.
 
-    image: (C, H, W), in alpha's coding, not cut to 0..1.
-    depth: (H, W), metres along alpha's axis, or its rays (`measured_along`); NaN where no calibrated beta
-        sees the point.
-    confidence: (H, W), the probability that every band's beta sees the point and its position is right to a
-        pixel.
-    half_width: (H, W), 1/metres: in 9 of 10 pixels the true inverse depth is within it of 1 / depth; NaN
-        where that is.
-    by_band: (C, H, W), the confidence of each band alone, where each is another beta's; else None.
+    Attributes:
+        image: (C, H, W), in alpha's coding, not clipped to 0..1.
+        depth: (H, W), metres along alpha's axis, or its rays (`measured_along`); NaN where no calibrated beta
+            sees the point.
+        confidence: (H, W), the probability that every band's beta sees the point and its position is right to
+            a pixel.
+        half_width: (H, W), 1/metres: in 9 of 10 pixels the true inverse depth is within it of 1 / depth; NaN
+            where depth is.
+        by_band: (C, H, W), the confidence of each band alone, where each is another beta's; else None.
     """
 
     image: Float[Tensor, "c h w"]
@@ -39,7 +40,8 @@ class Frame(NamedTuple):
 
     @property
     def depth_interval(self) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
-        """The nearest and farthest depth (metres; infinite too) around the true one in 9 of 10 pixels."""
+        """Nearest and farthest depth (metres; possibly infinite) around the true one in 9 of 10 pixels; NaN
+        where unknown."""
         inverse = 1 / self.depth
         farthest = inverse - self.half_width
         beyond = farthest <= 0
@@ -47,18 +49,20 @@ class Frame(NamedTuple):
         return 1 / (inverse + self.half_width), farthest
 
     def mapped(self, change: Callable[[Tensor], Tensor]) -> Frame:
-        """The frame whose every part is changed, such as moved to another device."""
+        """Return the frame with a function applied to each tensor, such as one that moves it to another
+        device."""
         return Frame(*(tensor if tensor is None else change(tensor) for tensor in self))  # type: ignore[arg-type]
 
     def __repr__(self) -> str:
-        """Sizes, the range of depth and the mean confidence, in a line."""
+        """Return sizes, the range of depth and the mean confidence, in a line."""
         bands, h, w = self.image.shape
         finite = self.depth[self.depth.isfinite()]
         depth = f"depth {finite.min():.3g} to {finite.max():.3g}" if len(finite) else "depth unknown"
         return f"Frame({w}x{h}, {bands} bands, {depth}, mean confidence {self.confidence.mean():.2f})"
 
     def _repr_png_(self) -> bytes:
-        """For notebooks: the image and, beside it, depth (red is near) and confidence, as a PNG file."""
+        """Return the image and, beside it, depth (red is near) and confidence, as a PNG file for
+        notebooks."""
         confidence = self.confidence[None].expand(3, -1, -1)
         parts = picture_of(self.image).expand(3, -1, -1), colour_depth(self.depth), confidence
         factor = min(SHOWN / max(self.image.shape[-2:]), 1.0)
@@ -71,5 +75,5 @@ class Frame(NamedTuple):
 
 
 def picture_of(image: Float[Tensor, "c h w"]) -> Float[Tensor, "d h w"]:
-    """An image of one channel or three: the mean of any other number of bands."""
+    """Return an image of one channel or three: the mean of any other number of bands."""
     return image if len(image) in (1, 3) else image.mean(0, keepdim=True)

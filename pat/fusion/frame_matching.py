@@ -1,6 +1,6 @@
-"""Which image files of cameras are of one frame: by their names, numbers or times in these, or in order.
+"""Image files of cameras matched to frames: by their names, numbers or times in these, or in order.
 
-A camera that missed a frame would else shift all that follow.
+A camera that missed a frame would otherwise shift all that follow.
 """
 
 from __future__ import annotations
@@ -14,24 +14,33 @@ from statistics import median
 from arraygeom.runtime.warned import warn
 
 LEAST_WHOLE = 0.5
-"""Of all frames, those that every camera has: of fewer, names agree by chance, as those of a sequence may."""
+"""Least share of all frames that every camera must have: of fewer, names agree by chance, as those of a
+sequence may."""
 LISTED = 5
-"""Names of missing frames in a message."""
+"""Number of names of missing frames in a message."""
 
 Files = Mapping[str, Sequence[Path]]
 Keys = dict[str, list[Hashable]]
-"""What a file's name says of its frame, by camera, in the order of the files."""
+"""Keys of files' frames, by camera, in the order of the files."""
 
 
 class MissingFramesWarning(UserWarning):
-    """Frames that are not there of every camera, or that no name relates."""
+    """Warning of frames that some camera lacks, or that no name relates."""
 
 
 def matched_frames(files: Files) -> dict[str, list[Path]]:
-    """The files of the frames that every camera has, in order.
+    """Return the files of the frames that every camera has, in order.
 
-    Warns of frames that some camera lacks, and where nothing but their order relates files. Raises ValueError
-    if nothing relates them and their numbers differ. A camera of one file is left as it is.
+    Warns of frames that some camera lacks, and where nothing but their order relates files.
+
+    Args:
+        files: files of each camera, in order.
+
+    Returns:
+        As many files per camera, by name; as given if one has a single file.
+
+    Raises:
+        ValueError: if nothing relates the files and their numbers differ.
     """
     files_of = {name: list(paths) for name, paths in files.items()}
     if min(map(len, files_of.values())) < 2:
@@ -68,7 +77,7 @@ def warn_of_gaps(files: Files) -> None:
 
 
 def _frames(files: Mapping[str, Sequence[Path]], keys: Keys) -> list[dict[str, Path]]:
-    """The files of each frame by camera, in the order of the keys."""
+    """Return the files of each frame by camera, in the order of the keys."""
     frames: dict[Hashable, dict[str, Path]] = {}
     for name, paths in files.items():
         for key, path in zip(keys[name], paths):
@@ -97,7 +106,7 @@ def _names(files: Files) -> Keys:
 
 
 def _endings(files: Files) -> Keys | None:
-    """Names without what all of a camera begin with."""
+    """Return names without their common beginning, by camera."""
     keys: Keys = {}
     for name, paths in files.items():
         columns = zip(*(path.stem for path in paths))
@@ -107,7 +116,8 @@ def _endings(files: Files) -> Keys | None:
 
 
 def _numbers(files: Files) -> Keys | None:
-    """Numbers in names that differ between a camera's files; of one, times that are nearly equal are equal.
+    """Return numbers in names that differ between a camera's files; of single ones, nearly equal times as
+    equal.
 
     None where two files of a camera have the same, or some have other numbers of numbers.
     """
@@ -124,7 +134,7 @@ def _numbers(files: Files) -> Keys | None:
 
 
 def _common_times(times: Mapping[str, Sequence[float]]) -> Keys:
-    """Each time as the first of those of other cameras that are less than half an interval from it."""
+    """Return each time as the first of those of other cameras that are less than half an interval from it."""
     intervals = [median(b - a for a, b in pairwise(sorted(row))) for row in times.values() if len(row) > 1]
     near = min(intervals, default=float("inf")) / 2
     common: dict[tuple[str, float], float] = {}

@@ -1,4 +1,4 @@
-"""Images of one camera in the order of time: read when they are asked for, cached, without noise."""
+"""Images of one camera in the order of time: read when they are asked for, cached, denoised."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .low_light import noisy_view
 from .views import read_view
 
 CACHED = 96 * 2**20
-"""Bytes of images cached of each camera: 25 grey frames of 1280x800."""
+"""Bytes of images cached per camera: 25 grey frames of 1280x800."""
 
 
 @runtime_checkable
@@ -24,18 +24,19 @@ class Frames(Protocol):
     """Images (C, H, W) of one camera in the order of time: a list, or read when asked for (`ImageFiles`)."""
 
     def __len__(self) -> int:
-        """How many."""
+        """Return the number of images."""
         ...
 
     def __getitem__(self, i: int, /) -> Tensor:
-        """One of them."""
+        """Return image `i`."""
         ...
 
 
 class ImageFiles:
     """Image files of one camera, read and developed (`pat.media.raw`) when asked for.
 
-    `alpha` names the camera to whose scale of light the images are brought.
+    Args:
+        alpha: camera to whose scale of light the images are brought.
     """
 
     def __init__(self, paths: Sequence[Path], rig: Rig, name: str, *, alpha: str) -> None:
@@ -46,14 +47,20 @@ class ImageFiles:
         return len(self.paths)
 
     def __getitem__(self, i: int, /) -> Tensor:
-        """Raises FileNotFoundError or ValueError naming camera and file."""
+        """Read and develop image `i`.
+
+        Raises:
+            FileNotFoundError: for a missing file, with camera and file.
+            ValueError: for a file that cannot be read or does not fit the rig, with camera and file.
+        """
         return read_view(self.rig, self.name, self.paths[i], like=self.like)
 
 
 class CachedFrames:
-    """Frames, those asked for last cached, up to `CACHED` bytes: neighbours in time need them again.
+    """Frames with a cache of the last used ones, up to `CACHED` bytes: neighbours in time need them again.
 
-    Those of alpha are without noise, if its level is given.
+    Args:
+        level: noise level of the images, which are then denoised; None leaves them.
     """
 
     def __init__(self, frames: Frames, level: NoiseLevel | None = None) -> None:

@@ -26,7 +26,7 @@ def without_gradient(
     settings: FuseSettings = FuseSettings(),
     free: tuple[str, ...] = ("*",),
 ) -> dict[str, tuple[str, ...]]:
-    """The parameters without a gradient: of the fused "image", and of its "depth".
+    """Name the parameters without a gradient: of the fused "image", and of its "depth".
 
     Fuses the images at no more than 96 pixels a side, as `fuse_frame` with these arguments would; `free` are
     patterns of `Rig.parameters`. A parameter is named if no pixel's derivative by it is anything but 0: of a

@@ -1,4 +1,4 @@
-"""From views to a network's inputs: padded images, each field evaluated once for every pixel of alpha."""
+"""Views to a network's inputs: padded images, each field evaluated once for every pixel of alpha."""
 
 from __future__ import annotations
 
@@ -30,9 +30,13 @@ LOG = logging.getLogger(__name__)
 
 
 class Placement(NamedTuple):
-    """How a beta is related to alpha.
+    """Relation of a beta to alpha.
 
-    `points` says where alpha's pixels are when beta records: elsewhere only if they move (`Moved`).
+    Attributes:
+        pair: alpha and the beta.
+        points: function from alpha's pixels to their positions in alpha when beta records: others only if
+            they move (`Moved`).
+        bounds: quantity that the depth range bounds.
     """
 
     pair: Pair
@@ -41,19 +45,30 @@ class Placement(NamedTuple):
 
     @property
     def has_track(self) -> bool:
-        """Whether positions in beta give depth by a straight track that is the search segment's line."""
+        """True if positions in beta give depth by a straight track that is the search segment's line."""
         return self.pair.calibrated and self.pair.link is None and not self.pair.has_lens
 
     def track(self, x: Float[Tensor, "*n 2"]) -> Track:
-        """The tracks in beta of alpha's pixels, of pinholes."""
+        """Return the tracks in beta of alpha's pixels, of pinholes.
+
+        Raises:
+            ValueError: unless both cameras are calibrated and without lenses.
+        """
         return pinhole_track(self.pair, self.points(x))
 
     def depth(
         self, x: Float[Tensor, "n 2"], x_beta: Float[Tensor, "n 2"], deviation: Float[Tensor, " n"]
     ) -> Depth:
-        """The depth of what alpha's pixels see at beta's pixels, or its distance if `bounds` are of that.
+        """Compute the depth of the points that alpha's pixels and beta's pixels see, or its distance if
+        `bounds` are such.
 
         Through lenses within the pair's depth range.
+
+        Args:
+            deviation: standard deviation of `x_beta` along the segment, pixels.
+
+        Returns:
+            Depth with its standard deviation and validity.
         """
         pair, x = self.pair, self.points(x)
         on_curve = partial(ray_depth, pair, bounds=self.bounds)
@@ -69,7 +84,13 @@ class Placement(NamedTuple):
 
 
 class FrameInputs(NamedTuple):
-    """A network's inputs, padded to whole multiples; each beta's place; alpha's size without padding."""
+    """A network's inputs for a frame.
+
+    Attributes:
+        inputs: images and fields, padded to whole multiples.
+        placements: relation of each beta to alpha.
+        hw: alpha's size without padding.
+    """
 
     inputs: Inputs
     placements: list[Placement]
@@ -79,9 +100,13 @@ class FrameInputs(NamedTuple):
 def prepared(
     network: FusionNetwork, views: Views, steps: Sequence[FusionStep]
 ) -> tuple[FrameInputs, list[Undo]]:
-    """The network's inputs after these steps, and how a frame is taken back to the views, last step first.
+    """Apply steps to views, and make the network's inputs of them.
 
-    Raises ValueError as `frame_inputs`, and for images of another precision than the network's weights.
+    Returns:
+        The inputs, and the functions that take a frame back to the views, last step first.
+
+    Raises:
+        ValueError: as `frame_inputs`, and for images of another precision than the network's weights.
     """
     check_precision(views, network)
     LOG.info("preparing %d images", len(views.images))
@@ -93,9 +118,13 @@ def prepared(
 
 
 def frame_inputs(network: FusionNetwork, views: Views) -> FrameInputs:
-    """The inputs of a network for views that are prepared for it.
+    """Make the inputs of a network from views that are prepared for it.
 
-    Raises ValueError if alpha's pixels have no valid search segment in a beta: views that do not overlap.
+    Returns:
+        The inputs, with alpha's size without padding.
+
+    Raises:
+        ValueError: if alpha's pixels have no valid search segment in a beta: views that do not overlap.
     """
     m, hw = network.multiple, views.rig[views.alpha].hw
     alpha, *images = (padded(views.images[name][None], m) for name in (views.alpha, *views.betas))
@@ -128,7 +157,7 @@ def frame_inputs(network: FusionNetwork, views: Views) -> FrameInputs:
 
 
 def bytes_beside(inputs: Inputs, images: Iterable[Tensor]) -> float:
-    """Memory of images whose pixels are not those of the inputs: the caller's."""
+    """Return the memory of images whose pixels are not those of the inputs, bytes: the caller's."""
     held = inputs.alpha, *(beta.image for beta in inputs.betas)
     addresses = {image.untyped_storage().data_ptr() for image in held}
     parts = {image.untyped_storage().data_ptr(): image.nbytes for image in images}
@@ -136,7 +165,10 @@ def bytes_beside(inputs: Inputs, images: Iterable[Tensor]) -> float:
 
 
 def points_of(field: ReceptiveField) -> Callable[[Tensor], Tensor]:
-    """Where a field looks for alpha's pixels, in alpha's own: elsewhere if they move, within a band too."""
+    """Return the function from alpha's pixels to the positions, in alpha, for which a field searches.
+
+    Others than the pixels only if they move, within a band too.
+    """
     if isinstance(field, Widened):
         return points_of(field.field)
     if not isinstance(field, Moved):
@@ -146,13 +178,14 @@ def points_of(field: ReceptiveField) -> Callable[[Tensor], Tensor]:
 
 
 def bounds_of(field: ReceptiveField) -> Literal["depth", "distance"]:
-    """What a field's depth range is of."""
+    """Return the quantity that a field's depth range bounds."""
     inner = innermost(field)
     return inner.bounds if isinstance(inner, Curved) else "depth"
 
 
 def measured_along(views: Views) -> Literal["depth", "distance"]:
-    """What the depth of a frame of these views is: along alpha's axis, or the distance along its rays."""
+    """Return the kind of depth of a frame of these views: "depth" along alpha's axis or "distance" along its
+    rays."""
     if takes_pinhole_views(views):
         return "depth"
     fields = (views.fields.get(name) or default_field(views.pair(name)) for name in views.betas)
@@ -160,6 +193,6 @@ def measured_along(views: Views) -> Literal["depth", "distance"]:
 
 
 def padded(image: Tensor, multiple: int) -> Tensor:
-    """The image continued at the bottom and the right to whole multiples."""
+    """Return an image extended at the bottom and the right to whole multiples, by its last row and column."""
     h, w = image.shape[-2:]
     return pad(image, (0, -w % multiple, 0, -h % multiple), mode="replicate")

@@ -1,4 +1,4 @@
-"""Fusion of noisy views: denoised before they are matched, joined with what betas recorded once fused."""
+"""Fusion of noisy views: denoised before they are matched, joined with the betas' recordings after fusion."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ from .views import Views
 LOG = logging.getLogger(__name__)
 
 Noise = Literal["estimate", "auto"] | Mapping[str, NoiseLevel]
-"""The noise level of each camera that has noise, or that they are to be estimated from the images: in any
-case, or where an image shows noise plainly (auto)."""
+"""Noise level of each camera that has noise, or "estimate" to estimate it from the images, or "auto" to do so
+only where an image shows noise plainly."""
 
 
 @dataclass(frozen=True)
 class LowLightSettings:
-    """Of fusion with noise."""
+    """Settings of fusion with noise."""
 
     least_deviation: float = physics(
         1.5 / 255, "Images whose noise has a smaller standard deviation, in the mean, are left as they are"
@@ -63,13 +63,19 @@ class LowLightSettings:
 SETTINGS = LowLightSettings()
 
 in_tiles = partial(chunked, rows=1024, halo=128, axis=(-2, -1))
-"""Denoises images in tiles of this side, with so much seen around them, pixels."""
+"""Function that denoises images in tiles of this side, with so many pixels around them."""
 shipped_denoiser = cache(load_denoiser)
-"""The network that ships with the package, read once."""
+"""Function that returns the network that ships with the package, read once."""
 
 
 class NoisyView(NamedTuple):
-    """A view as recorded but unbiased, without noise, and that noise's standard deviation; (1, C, H, W)."""
+    """A noisy view, each tensor (1, C, H, W).
+
+    Attributes:
+        recorded: values as recorded, but unbiased.
+        denoised: values without noise.
+        deviation: standard deviation of the noise.
+    """
 
     recorded: Tensor
     denoised: Tensor
@@ -78,10 +84,13 @@ class NoisyView(NamedTuple):
 
 @dataclass(frozen=True)
 class LowLight:
-    """Views as given, without noise, and those that had some: (1, C, H, W) by camera, recorded but unbiased.
+    """Views as given and denoised, and those that had noise.
 
-    If no view had noise, nothing is asked of them, and they are without images. `seconds_left` is about how
-    long the correction will take.
+    Attributes:
+        given: views as given; without images if no view had noise.
+        views: views without noise; without images if no view had noise.
+        noisy: noisy views by camera.
+        seconds_left: estimated time of the correction, seconds.
     """
 
     given: Views
@@ -90,12 +99,13 @@ class LowLight:
     seconds_left: float = 0.0
 
     def described(self) -> str:
-        """Which views are denoised, and by how much they deviate."""
+        """Return a sentence on the denoised views and their deviations."""
         texts = (f"{name} {255 * float(view.deviation.mean()):.0f}/255" for name, view in self.noisy.items())
         return f"noise shows plainly and is removed: {', '.join(texts)}; --noise none leaves it"
 
     def kept(self, hw: HW, betas: int) -> float:
-        """Bytes held until the frame of this size is corrected: views, its pixels' places in each beta."""
+        """Return the bytes held until the frame of this size is corrected: views, its pixels' positions in
+        each beta."""
         if not self.noisy:
             return 0.0
         images = [*self.given.images.values(), *self.views.images.values()]
@@ -112,13 +122,20 @@ class LowLight:
         *,
         keep_alpha: bool = False,
     ) -> Frame:
-        """A frame fused from the denoised views, with what betas recorded: brightness and colours.
+        """Add the brightness and colours that betas recorded to a frame fused from the denoised views.
 
-        `matched` is where its pixels are in each beta, x and y, and the confidence of that. `steps` were
-        taken before it was fused, but for radiometry: values keep their scale; they are not undone yet.
-        `response` says what brings betas to alpha's exposure.
-        With `keep_alpha` the luma is alpha's as recorded. Betas that are not all RGB are denoised one by one
-        alone, and brightness is alpha's alone where no combination of beta's bands is what alpha sees.
+        Betas that are not all RGB are only denoised one by one, and brightness is alpha's alone where no
+        combination of beta's bands is similar to alpha.
+
+        Args:
+            matched: positions of its pixels in each beta, x and y, with their confidence.
+            steps: steps taken before it was fused, except radiometry: values keep their scale; they are not
+                undone yet.
+            response: response that brings betas to alpha's exposure.
+            keep_alpha: True for the luma of alpha as recorded.
+
+        Returns:
+            The frame; as given if no view was noisy.
         """
         if not self.noisy:
             return frame
@@ -137,14 +154,14 @@ class LowLight:
         return frame._replace(image=image)
 
     def prepared(self, steps: Sequence[FusionStep]) -> dict[str, NoisyView]:
-        """Every view as recorded, denoised, and its deviation, after the steps before it is fused."""
+        """Return every view as recorded, denoised, and its deviation, after the steps before it is fused."""
         quiet = {n: NoisyView(x[None], x[None], 0 * x[None]) for n, x in self.views.images.items()}
         views = {**quiet, **self.noisy}
         parts = [self._stepped({name: view[i][0] for name, view in views.items()}, steps) for i in range(3)]
         return {name: NoisyView(*(images[name][None] for images in parts)) for name in parts[0]}
 
     def _grain(self, steps: Sequence[FusionStep]) -> Mapping[str, Float[Tensor, "c h w"]]:
-        """White noise of unit deviation in each beta after the steps, of which some smooth it."""
+        """Return white noise of unit deviation in each beta after the steps, of which some smooth it."""
         middle, scale = 0.5, 0.1  # images are within 0..1
         drawn = {
             name: middle + scale * normal(image.shape, image, generator_for(0, name))
@@ -161,9 +178,13 @@ class LowLight:
 
 
 def denoised_views(views: Views, noise: Noise | None) -> tuple[Views, LowLight]:
-    """Views without noticeable noise, and what was recorded; without `noise` all as they are.
+    """Denoise the views that have noticeable noise.
 
-    Raises ValueError for a camera that is not among the views.
+    Returns:
+        The views, and the noisy ones for the correction; the views as given if `noise` is None or too small.
+
+    Raises:
+        ValueError: for a camera that is not among the views, or a `noise` of another kind.
     """
     begin = time.perf_counter()
     noisy: dict[str, NoisyView] = {}
@@ -183,7 +204,7 @@ def denoised_views(views: Views, noise: Noise | None) -> tuple[Views, LowLight]:
 
 
 def warn_of_noise(name: str, image: Float[Tensor, "c h w"], view: NoisyView) -> None:
-    """Warn if the noise that is stated of an image is far more than it shows."""
+    """Warn if the noise that is stated for an image is far more than it shows."""
     shown = NoiseLevel.estimated(image[None])
     deviations = view.deviation, shown.deviation(image[None])
     stated, measured = (255 * float(deviation.mean()) for deviation in deviations)
@@ -196,7 +217,7 @@ def warn_of_noise(name: str, image: Float[Tensor, "c h w"], view: NoisyView) -> 
 
 
 def shown_noise(image: Float[Tensor, "c h w"]) -> float:
-    """The standard deviation of the noise that the middle of an image shows."""
+    """Estimate the standard deviation of the noise in the middle of an image."""
     side = SETTINGS.middle
     top, left = (max(n - side, 0) // 2 for n in image.shape[-2:])
     middle = image[None, :, top : top + side, left : left + side].detach().clamp(0, 1)
@@ -204,7 +225,7 @@ def shown_noise(image: Float[Tensor, "c h w"]) -> float:
 
 
 def check_noise(noise: Noise | None) -> None:
-    """Raise ValueError for what is no noise."""
+    """Raise ValueError for a value that is no noise."""
     if noise is None or noise in ("estimate", "auto"):
         return
     if not (isinstance(noise, Mapping) and all(isinstance(level, NoiseLevel) for level in noise.values())):
@@ -215,7 +236,11 @@ def check_noise(noise: Noise | None) -> None:
 
 
 def noise_levels(images: Mapping[str, Tensor], noise: Noise | None) -> Mapping[str, NoiseLevel]:
-    """The level of each camera that has noise: as stated, or estimated from its image (C, H, W)."""
+    """Return the level of each camera that has noise: as stated, or estimated from its image (C, H, W).
+
+    Raises:
+        ValueError: for a `noise` of another kind.
+    """
     check_noise(noise)
     if noise == "auto" and max(map(shown_noise, images.values())) < SETTINGS.plain:
         return {}
@@ -225,7 +250,7 @@ def noise_levels(images: Mapping[str, Tensor], noise: Noise | None) -> Mapping[s
 
 
 def noisy_view(image: Float[Tensor, "c h w"], level: NoiseLevel) -> NoisyView | None:
-    """An image as recorded but unbiased, and without its noise; None if there is hardly any."""
+    """Return an image as recorded but unbiased, and denoised; None if there is hardly any noise."""
     deviation = level.deviation(image[None])
     if float(deviation.mean()) <= SETTINGS.least_deviation:
         return None
@@ -234,7 +259,7 @@ def noisy_view(image: Float[Tensor, "c h w"], level: NoiseLevel) -> NoisyView | 
 
 
 def exposed(view: NoisyView, response: Response) -> NoisyView:
-    """A beta at alpha's exposure; its deviation by the difference that one deviation makes."""
+    """Return a beta at alpha's exposure; its deviation by the difference that one deviation makes."""
     if response.is_rec601:
         return view
     more, less = (response.exposed(view.denoised + sign * view.deviation) for sign in (1, -1))
@@ -246,7 +271,11 @@ def exposed(view: NoisyView, response: Response) -> NoisyView:
 def denoised(
     image: Float[Tensor, "b c h w"], deviation: Float[Tensor, "b c h w"]
 ) -> Float[Tensor, "b c h w"]:
-    """An image without noise of this standard deviation; bands other than three are denoised one by one."""
+    """Denoise images with noise of this standard deviation; bands other than three are denoised one by one.
+
+    Returns:
+        Images without noise, in their own type, detached.
+    """
     network, dtype = shipped_denoiser(), image.dtype
     image, deviation = image.float(), deviation.float()
     if image.shape[1] == 3:
@@ -256,7 +285,13 @@ def denoised(
 
 
 class Brightness(NamedTuple):
-    """What alpha would have seen of a beta, its deviation, and grain of unit deviation: (1, 1, H, W)."""
+    """Brightness that alpha would have seen in a beta, each tensor (1, 1, H, W).
+
+    Attributes:
+        recorded: brightness as recorded.
+        deviation: its standard deviation.
+        grain: its noise at unit deviation.
+    """
 
     recorded: Tensor
     deviation: Tensor
@@ -264,7 +299,11 @@ class Brightness(NamedTuple):
 
 
 def brightness(view: NoisyView, grain: Float[Tensor, "1 3 h w"], response: Response) -> Brightness:
-    """Of an RGB beta at alpha's exposure, whose bands have noise of their own each."""
+    """Compute the brightness of an RGB beta at alpha's exposure, whose bands have independent noise.
+
+    Args:
+        grain: noise of unit deviation in each band.
+    """
     weights = response.weights.to(view.recorded)[:, None, None]
     deviation = (weights * view.deviation).square().sum(1, keepdim=True).sqrt()
     recorded, mixed = ((weights * image).sum(1, keepdim=True) for image in (view.recorded, grain))
@@ -275,7 +314,14 @@ def brightness(view: NoisyView, grain: Float[Tensor, "1 3 h w"], response: Respo
 def brightness_change(
     alpha: NoisyView, betas: Sequence[Brightness], matched: Float[Tensor, "n 3 h w"]
 ) -> Float[Tensor, "1 h w"]:
-    """What the betas' recordings change in alpha's denoised brightness, of one after another."""
+    """Compute the change of alpha's denoised brightness by the betas' recordings, of one after another.
+
+    Args:
+        matched: positions of alpha's pixels in each beta, x and y, with their confidence.
+
+    Returns:
+        Values to add to each band, (1, H, W).
+    """
 
     def changed(estimate: Tensor, *planes: Tensor) -> Tensor:
         first, deviation, *other = (plane[0] for plane in planes)
@@ -293,7 +339,14 @@ def brightness_change(
 def colours_averaged(
     image: Float[Tensor, "3 h w"], betas: Sequence[NoisyView], matched: Float[Tensor, "n 3 h w"]
 ) -> Float[Tensor, "3 h w"]:
-    """The image fused from denoised views with means of its colours and of those that RGB betas recorded."""
+    """Average colours of the image fused from denoised views with those that RGB betas recorded.
+
+    Args:
+        matched: positions of alpha's pixels in each beta, x and y, with their confidence.
+
+    Returns:
+        The image; as given without noise in the betas.
+    """
     beta, confidence = warped(betas, matched)
     deviation = float(beta.deviation.mean())
     if not deviation:
@@ -308,7 +361,11 @@ def colours_averaged(
 def warped(
     betas: Sequence[NoisyView], matched: Float[Tensor, "n 3 h w"]
 ) -> tuple[NoisyView, Float[Tensor, "1 1 h w"]]:
-    """All betas at alpha's pixels, mixed by their confidences; and the confidence of the mixture."""
+    """Warp all betas to alpha's pixels, mixed by their confidences.
+
+    Returns:
+        The mixture, and its confidence.
+    """
     positions, confidence = matched[:, :2].movedim(1, -1), matched[:, 2]
     images = [
         torch.cat([sample(plane, x[None]).values for plane in beta]) for beta, x in zip(betas, positions)

@@ -1,6 +1,6 @@
-"""Whose luminance the fused image has, alpha's or a colour beta's in alpha's detail, and whose chroma.
+"""Luminance of the fused image, alpha's or a colour beta's in alpha's detail, and its chroma.
 
-Where no combination of beta's bands is what alpha sees, as with near infrared, alpha's brightness in beta's
+Where no combination of beta's bands is similar to alpha, as with near infrared, alpha's brightness in beta's
 colours is of neither camera: leaves are pale, skin is flat. An alpha in colour has its own chroma where betas
 do not see.
 """
@@ -32,7 +32,7 @@ SHARES: dict[Luminance, float] = {"alpha": 1.0, "mix": 0.5, "beta": 0.0}
 
 @dataclass(frozen=True)
 class OwnColourSettings:
-    """Of a fused image whose alpha was recorded in colour."""
+    """Settings of a fused image whose alpha was recorded in colour."""
 
     unseen: float = size(0.2, "Confidence up to which alpha's own colours are taken")
     seen: float = size(0.5, "And from which the betas'")
@@ -44,7 +44,7 @@ OWN_COLOUR = OwnColourSettings()
 
 
 def check_luminance(network: FusionNetwork, kept: Luminance, *, noisy: bool) -> None:
-    """Raises ValueError for a word that is none of `SHARES`, and where beta's luminance is not available."""
+    """Raise ValueError for a word that is not in `SHARES`, and where beta's luminance is not available."""
     if kept not in SHARES:
         raise ValueError(f"luminance is one of {', '.join(SHARES)}; got {kept!r}")
     if kept == "alpha":
@@ -60,7 +60,11 @@ def check_luminance(network: FusionNetwork, kept: Luminance, *, noisy: bool) -> 
 
 
 def with_alpha_detail(frame: Frame, alpha: Float[Tensor, "1 h w"]) -> Frame:
-    """A frame of beta's luminance with the detail that alpha has and beta has not."""
+    """Add to a frame of beta's luminance the detail that alpha has and beta lacks.
+
+    Returns:
+        The frame with this image.
+    """
     luma = luminance(frame.image)[None]
     alpha_luma, beta_luma = alpha[None].to(luma), torch.nan_to_num(luma)
     normalisation = Normalisation.of(alpha_luma, beta_luma)
@@ -70,9 +74,12 @@ def with_alpha_detail(frame: Frame, alpha: Float[Tensor, "1 h w"]) -> Frame:
 
 
 def with_own_colours(frame: Frame, alpha: Float[Tensor, "3 h w"]) -> Frame:
-    """A fused frame, chroma alpha's own where confidence is low, as the betas' cameras show such colours.
+    """Replace a fused frame's chroma by alpha's own where confidence is low, converted to the betas' colours.
 
-    Luminance stays. How the betas show alpha's colours is found where they see the same points.
+    Luminance stays. The conversion of alpha's colours is fitted where the betas see the same points.
+
+    Returns:
+        The frame with this image.
     """
     alpha = alpha.to(frame.image)
     step = max(int((frame.confidence.numel() / OWN_COLOUR.pixels) ** 0.5), 1)

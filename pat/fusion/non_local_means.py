@@ -1,7 +1,7 @@
-"""Means over pixels with alike surroundings: non-local means (Buades et al. 2005) of two images' colours.
+"""Means over pixels with similar surroundings: non-local means (Buades et al. 2005) of two images' colours.
 
-What a network makes of noisy views still has some of their noise. Pixels that are alike in its image are
-averaged: the colours that it has there, and those that betas recorded.
+A network's image of noisy views still has some of their noise. Pixels that are similar in it are averaged:
+its own colours there, and those that betas recorded.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from ..support.settings import size, tuned
 
 @dataclass(frozen=True)
 class NonLocalMeansSettings:
-    """Of means over pixels that are alike."""
+    """Settings of means over similar pixels."""
 
     scale: float = tuned(
         0.18, "Middlebury, tune half: scale of unlikeness over the root of the noise's deviation"
@@ -42,10 +42,17 @@ def averaged_with_alike(
     confidence: Float[Tensor, "1 h w"],
     deviation: float,
 ) -> Float[Tensor, "3 h w"]:
-    """An image with the mean colour of what is alike near each pixel: of its own, and of beta's recorded.
+    """Replace an image's colour by the mean over similar pixels nearby, of its own and of beta's recorded
+    colour.
 
-    Luma stays. `beta` are its values at alpha's pixels, which count as much as the image's own where
-    `confidence` is 1, with noise of this standard deviation in the mean.
+    Luma stays.
+
+    Args:
+        beta: beta's values at alpha's pixels, which count as much as the image's own where `confidence` is 1.
+        deviation: mean standard deviation of beta's noise.
+
+    Returns:
+        The image with this chroma, detached.
     """
     luma, counts = luminance(image), confidence.square()
     image_chroma, beta_chroma = ((colours - luminance(colours))[[0, 2]] for colours in (image, beta))
@@ -57,11 +64,14 @@ def averaged_with_alike(
 def sums_of_alike(
     guide: Float[Tensor, "c h w"], values: Float[Tensor, "k h w"], scale: float, radius: int
 ) -> Float[Tensor, "k h w"]:
-    """For each pixel the weighted sums of the values at the pixels at most `radius` rows and columns away.
+    """Compute for each pixel the weighted sums of the values at pixels up to `radius` rows and columns away.
 
     The weight is about exp(-d / scale^2), where d is the mean square difference of the guide's 3 x 3 patches
-    around both. Beyond the edges images are mirrored. All in float32 on the CPU, on as many threads as torch
-    may use; back on the values' device.
+    around both. Beyond the edges images are mirrored. Computed in float32 on the CPU, on as many threads as
+    torch may use.
+
+    Returns:
+        Sums on the values' device, detached.
     """
     h, w = guide.shape[-2:]
     around = radius + 1

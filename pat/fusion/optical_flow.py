@@ -20,7 +20,7 @@ from ..support.settings import tuned
 
 @dataclass(frozen=True)
 class FlowSettings:
-    """Of optical flow between frames."""
+    """Settings of optical flow between frames."""
 
     astray: float = tuned(
         1.0, "Source not recorded: flow that does not lead back to so many pixels has a weight below 1 / e"
@@ -31,16 +31,24 @@ SETTINGS = FlowSettings()
 
 
 class Flow(NamedTuple):
-    """Motion of each pixel between two frames: (2, H, W) pixels in x and y, its weight (H, W), 0 to 1."""
+    """Motion of each pixel between two frames.
+
+    Attributes:
+        step: (2, H, W), pixels in x and y.
+        weight: (H, W), 0 to 1.
+    """
 
     step: Float[Tensor, "2 h w"]
     weight: Float[Tensor, "h w"]
 
 
 def flow_between(a: Float[Tensor, "1 h w"], b: Float[Tensor, "1 h w"]) -> Flow:
-    """Dense inverse search (Kroeger et al. 2016) from frame a to b, weighted by consistency and likeness.
+    """Compute optical flow from frame a to b by dense inverse search (Kroeger et al. 2016).
 
-    Values of b are first brought to a's mean: light that flickers is no motion.
+    Values of b are first brought to a's mean: flickering light is no motion.
+
+    Returns:
+        The flow, weighted by forward-backward consistency and photometric similarity; 0 off the image.
     """
     b = b * (a.mean() / b.mean().clamp(min=1e-6))
     there, back = _steps(a, b), _steps(b, a)
@@ -54,14 +62,15 @@ def flow_between(a: Float[Tensor, "1 h w"], b: Float[Tensor, "1 h w"]) -> Flow:
 
 
 def warped(image: Float[Tensor, "c h w"], step: Float[Tensor, "2 h w"]) -> Float[Tensor, "c h w"]:
-    """The image sampled where each pixel goes, bilinearly; outside the frame its nearest pixel."""
+    """Sample an image at each pixel's target, bilinearly; outside the frame its nearest pixel."""
     h, w = image.shape[-2:]
     x = pixel_grid((h, w)) + step.movedim(0, -1)
     return sample(image[None], x[None], extended=True).values[0]
 
 
 def _steps(a: Tensor, b: Tensor) -> Float[Tensor, "2 h w"]:
-    """The flow of frames extended to two of OpenCV's patches a side: it refuses smaller ones, or crashes."""
+    """Compute the flow of frames extended to two of OpenCV's patches a side: it refuses smaller ones, or
+    crashes."""
     h, w = a.shape[-2:]
     engine = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     least = 2 * engine.getPatchSize()

@@ -1,11 +1,11 @@
 """Sequences: every frame of alpha in the colours of betas with clocks of their own.
 
-Colour is fused at key frames, those of alpha nearest in time to what a beta recorded, where each beta is
-searched where the points of alpha were at its own time (`Moved`), with a margin for the uncertainty of that
+Colour is fused at key frames, those of alpha nearest in time to a beta's frame, where each beta is searched
+where the points of alpha were at its own time (`Moved`), with a margin for the uncertainty of that
 (`Widened`). From the key frames before and after, it is warped to each frame along the motion between alpha's
 own frames, and mixed by time, confidence, and the weight of the motion. So colour does not flicker from frame
-to frame as single fusions do, and a frame depends on nothing but images: any one can be made alone, in any
-order, with the same result.
+to frame as single fusions do, and a frame depends on nothing but images: any one can be computed alone, in
+any order, with the same result.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class SequenceSettings:
-    """Of sequences of cameras with frames of their own."""
+    """Settings of sequences of cameras with frames of their own."""
 
     synchronous: float = physics(0.05, "Gaps shorter than this part of alpha's frame time count as none")
     unknown_motion: float = physics(
@@ -64,8 +64,13 @@ SETTINGS = SequenceSettings()
 
 
 class KeyColour(NamedTuple):
-    """What fusion adds to alpha at a key frame (C, H, W), with confidence (H, W), and inverse depth (0:
-    unknown) with its half-width as of `Frame` (2, H, W)."""
+    """Colour of a key frame.
+
+    Attributes:
+        added: values that fusion adds to alpha, (C, H, W).
+        confidence: (H, W).
+        inverse_depth: inverse depth (0: unknown) with its half-width as of `Frame`, (2, H, W).
+    """
 
     added: Float[Tensor, "c h w"]
     confidence: Float[Tensor, "h w"]
@@ -74,9 +79,18 @@ class KeyColour(NamedTuple):
 
 @dataclass(frozen=True)
 class SequenceFusion:
-    """A sequence to fuse: `colour` of its key frames, and any `frame`.
+    """A sequence to fuse: the `colour` of its key frames, and any `frame`.
 
-    What it is made of is as `fuse_sequence` has it.
+    Attributes:
+        network: network as of `fuse`.
+        rig: cameras with `frame_rate` and `time_offset`.
+        frames: frames by camera name, in the order of time; cached.
+        alpha: camera whose frames are wanted.
+        speed: largest speed of motion, pixels of alpha a second; None for a quarter of the motion seen.
+        settings: settings of fusion.
+
+    Raises:
+        ValueError: for a negative speed.
     """
 
     network: FusionNetwork
@@ -93,27 +107,41 @@ class SequenceFusion:
 
     @property
     def timeline(self) -> Timeline:
-        """When the frames were recorded."""
+        """Times at which the frames were recorded."""
         return Timeline(self.rig, {name: len(frames) for name, frames in self.frames.items()}, self.alpha)
 
     def recorded(self, i: int) -> Float[Tensor, "1 h w"]:
-        """Alpha's frame."""
+        """Return alpha's frame in grey, as recorded.
+
+        Raises:
+            ValueError: for an image of other bands than one or three.
+        """
         return grey_alpha(self.alpha, self.frames[self.alpha][i])
 
     def grey(self, i: int) -> Float[Tensor, "1 h w"]:
-        """Alpha's frame, without noise if that is known or estimated: what colours follow."""
+        """Return alpha's frame in grey, denoised if its noise is known or estimated; colours follow its
+        motion."""
         return grey_alpha(self.alpha, self._quiet[i])
 
     def base(self, i: int) -> Float[Tensor, "1 h w"]:
-        """What colours are added to: with `keep_alpha` alpha's frame as recorded."""
+        """Return the image to which colours are added: with `keep_alpha` alpha's frame as recorded, else
+        `grey`."""
         return self.recorded(i) if self.settings.keep_alpha else self.grey(i)
 
     def alone(self, i: int) -> Frame:
-        """The frame fused alone with the betas nearest in time, motion or not: to compare warping with."""
+        """Fuse a frame alone with the betas nearest in time, for comparison with warping.
+
+        Returns:
+            The frame.
+        """
         return self._fused(i, self.timeline.at(i), {}, alone=True)
 
     def colour(self, key: KeyFrame) -> KeyColour:
-        """Fuse a key frame, each beta searched where alpha's points are at its time."""
+        """Fuse a key frame, each beta searched where alpha's points are at its time.
+
+        Returns:
+            Its colour, with confidence and depth.
+        """
         fields, weight = {}, torch.ones(self.rig[self.alpha].hw)
         for name, i in key.betas.items():
             fields[name], certain = self._field(name, key.alpha, self.timeline.time(name, i))
@@ -123,10 +151,17 @@ class SequenceFusion:
         return KeyColour(frame.image - self.base(key.alpha), frame.confidence * weight, inverse)
 
     def frame(self, i: int, keys: Sequence[KeyFrame], fetch: Callable[[KeyFrame], KeyColour | None]) -> Frame:
-        """Any frame, its colour warped from the key frames around it.
+        """Compute any frame, its colour warped from the key frames around it.
 
-        `fetch` gives a key frame's colour, or None for one that could not be fused. Raises ValueError if none
-        could.
+        Args:
+            keys: the key frames.
+            fetch: function that returns a key frame's colour, or None for one that could not be fused.
+
+        Returns:
+            The frame.
+
+        Raises:
+            ValueError: if none of the key frames around it could be fused.
         """
         grey = self.grey(i)
         fetched = ((key, fetch(key)) for key in self._around(i, keys))
@@ -136,19 +171,19 @@ class SequenceFusion:
         return mixed(self.base(i), sources)
 
     def keys_of(self, frames: Iterable[int]) -> list[KeyFrame]:
-        """The key frames that some frames get their colour from."""
+        """Return the key frames from which some frames get their colour."""
         keys = self.timeline.key_frames()
         wanted = {key.alpha for i in frames for key in self._around(i, keys)}
         return [key for key in keys if key.alpha in wanted]
 
     def _around(self, i: int, keys: Sequence[KeyFrame]) -> list[KeyFrame]:
-        """The key frames within reach, or the nearest one."""
+        """Return the key frames within reach, or the nearest one."""
         gaps = {k.alpha: abs(self._time(k.alpha) - self._time(i)) for k in keys}
         longest = max(SETTINGS.intervals * self.timeline.interval * (1 - 1e-9), min(gaps.values()))
         return [k for k in keys if gaps[k.alpha] <= longest]
 
     def _warped(self, i: int, grey: Tensor, key: KeyFrame, colour: KeyColour) -> tuple[float, KeyColour]:
-        """How near a key frame is in time, 0 to 1, and its colour, warped to a frame."""
+        """Return the nearness in time of a key frame, 0 to 1, and its colour, warped to a frame."""
         gap = abs(self._time(key.alpha) - self._time(i))
         nearness = max(1 - gap / (SETTINGS.intervals * self.timeline.interval), 1e-3)
         if key.alpha == i:
@@ -166,7 +201,7 @@ class SequenceFusion:
         return self.timeline.time(self.alpha, i)
 
     def _field(self, name: str, index: int, time: float) -> tuple[ReceptiveField, Tensor]:
-        """The field of a beta that records at `time`, and the weight of the motion until then."""
+        """Return the field of a beta that records at `time`, and the weight of the motion until then."""
         field = self._given_field(name) or straight_field(self.rig.pair(self.alpha, name))
         weight = torch.ones(self.rig[self.alpha].hw)
         steps = (time - self._time(index)) * self.timeline.rate(self.alpha)
@@ -188,8 +223,11 @@ class SequenceFusion:
     def _fused(
         self, i: int, betas: Mapping[str, int], fields: Mapping[str, ReceptiveField], *, alone: bool = False
     ) -> Frame:
-        """Alpha's frame with those of betas. Levels are matched over several frames, or in this one if it is
-        alone or its noise, which is of images as recorded, is to be removed."""
+        """Fuse alpha's frame with those of betas.
+
+        Levels are matched over several frames, or in this one if it is alone or its noise, which is of images
+        as recorded, is to be removed.
+        """
         images = {name: self.frames[name][j] for name, j in betas.items()}
         alone = alone or self.settings.noise is not None
         match_levels = self.settings.match_levels
@@ -218,13 +256,13 @@ class SequenceFusion:
         )
 
     def _given_field(self, name: str) -> ReceptiveField | None:
-        """A beta's field, where one is given."""
+        """Return a beta's field, where one is given."""
         field = self.settings.field
         return field.get(name) if isinstance(field, Mapping) else field
 
     @cached_property
     def _corrections(self) -> Corrections:
-        """What is put right in every frame: found once, near the middle, so that nothing flickers.
+        """Corrections of every frame, estimated once, near the middle, so that nothing flickers.
 
         Betas that did not record at alpha's time are not aligned: motion too moves points off their segments.
         """
@@ -233,7 +271,7 @@ class SequenceFusion:
 
     @cached_property
     def _noise(self) -> Mapping[str, NoiseLevel] | None:
-        """The noise of each camera, stated or estimated once, near the middle; None without denoising."""
+        """Noise of each camera, stated or estimated once, near the middle; None without denoising."""
         noise = self.settings.noise
         if not isinstance(noise, str):
             return noise
@@ -242,13 +280,15 @@ class SequenceFusion:
 
     @cached_property
     def _quiet(self) -> Frames:
-        """Alpha's frames, without noise if it has some."""
+        """Frames of alpha, denoised if it has noise."""
         frames, level = self.frames[self.alpha], (self._noise or {}).get(self.alpha)
         return frames if level is None else CachedFrames(frames, level)
 
     def _at_middle(self, find: Callable[[KeyFrame], T], otherwise: T) -> T:
-        """What is found at the key frame nearest to the middle whose images can be read: what cannot is
-        reported when it is fused."""
+        """Return a function's result at the key frame nearest to the middle whose images can be read.
+
+        An error is reported when that frame is fused.
+        """
         keys = self.timeline.key_frames()
         for key in sorted(keys, key=lambda key: abs(key.alpha - keys[len(keys) // 2].alpha)):
             try:
@@ -258,7 +298,7 @@ class SequenceFusion:
         return otherwise
 
     def _images_at(self, key: KeyFrame) -> dict[str, Tensor]:
-        """Alpha's image and those of the betas, as recorded."""
+        """Return alpha's image and those of the betas, as recorded."""
         betas = {name: self.frames[name][j] for name, j in key.betas.items()}
         return {self.alpha: self.recorded(key.alpha), **betas}
 
@@ -275,7 +315,8 @@ class SequenceFusion:
         )
 
     def _levels(self, names: Iterable[str], i: int) -> tuple[Moments, dict[str, Moments]]:
-        """Moments of alpha's and of each beta's images over several key frames, so as not to flicker."""
+        """Return moments of alpha's and of each beta's images over several key frames, so as not
+        to flicker."""
         keys = self.timeline.key_frames()
         nearest = min(range(len(keys)), key=lambda k: abs(keys[k].alpha - i))
         around = keys[max(nearest - SETTINGS.neighbours, 0) : nearest + SETTINGS.neighbours + 1]
@@ -287,17 +328,19 @@ class SequenceFusion:
 
 
 def readable(read: Callable[[int], Tensor], numbers: Iterable[int]) -> Iterator[Tensor]:
-    """Those of some images that can be read: what cannot is reported when it is fused."""
+    """Yield the images that can be read; an error is reported when that frame is fused."""
     for i in numbers:
         with suppress(OSError, ValueError):
             yield read(i)
 
 
 def mixed(base: Float[Tensor, "1 h w"], sources: Sequence[tuple[float, KeyColour]]) -> Frame:
-    """Alpha's frame with the sources' colours, weighted by nearness in time and confidence.
+    """Mix the sources' colours into alpha's frame, weighted by nearness in time and confidence.
 
-    Confidence is the sources' own weighted mean, lowered where sources that are weighed about the same
-    disagree.
+    Confidence is the sources' own weighted mean, lowered where sources of about the same weight disagree.
+
+    Returns:
+        The frame.
     """
     weights = torch.stack([nearness * (s.confidence + SETTINGS.floor) for nearness, s in sources])
     share = (weights / weights.sum(0))[:, None]
@@ -325,16 +368,20 @@ def fuse_sequence(
     """Fuse every frame of alpha, in order, as they are asked for.
 
     Args:
-        frames: by camera name, in the order of time. Cameras without are left out.
-        rig: cameras with `frame_rate` (a second) and `time_offset` (seconds after a common clock).
-        alpha: the camera whose frames are wanted.
-        network: as of `fuse`, and so are settings; response, alignment and noise are found once, at the key
-            frame in the middle.
-        speed: how fast things move at most, pixels of alpha a second, for the room that fields leave where a
-            beta did not record at a key frame's time. By default a quarter of the motion seen between alpha's
-            frames.
+        frames: frames by camera name, in the order of time. Cameras without are left out.
+        rig: cameras with `frame_rate` (per second) and `time_offset` (seconds after a common clock).
+        alpha: camera whose frames are wanted.
+        network: network as of `fuse`.
+        speed: largest speed of motion, pixels of alpha a second, for the margin of fields where a beta did
+            not record at a key frame's time. None for a quarter of the motion seen between alpha's frames.
+        settings: as of `fuse`; response, alignment and noise are estimated once, at the key frame in the
+            middle.
 
-    Raises ValueError for frame rates that are not known and for recordings that do not overlap in time.
+    Yields:
+        Frames at alpha's pixels.
+
+    Raises:
+        ValueError: for frame rates that are not known and for recordings that do not overlap in time.
     """
     job = SequenceFusion(network, rig, frames, alpha, speed, settings)
     keys = job.timeline.key_frames()

@@ -1,4 +1,4 @@
-"""What is done to views before they are fused, and undone to the fused frame afterwards.
+"""Steps applied to views before they are fused, and undone on the fused frame afterwards.
 
 A step takes views and returns them changed, with a function that takes the fused frame back.
 """
@@ -50,7 +50,12 @@ Undo = Callable[[Frame], Frame]
 
 
 class StepResult(NamedTuple):
-    """Views after a step, and how to take the fused frame back to those before it."""
+    """Result of a step.
+
+    Attributes:
+        views: views after it.
+        undo: function that takes the fused frame back to the views before it.
+    """
 
     views: Views
     undo: Undo = lambda frame: frame
@@ -60,7 +65,12 @@ FusionStep = Callable[[Views], StepResult]
 
 
 def steps_for(network: FusionNetwork, *, normalise: bool, joined: bool = True) -> list[FusionStep]:
-    """The steps that a network needs, in order; betas are `joined` unless each is wanted by itself."""
+    """List the steps that a network needs, in order.
+
+    Args:
+        normalise: True to bring betas to alpha's mean and standard deviation.
+        joined: False if each beta is wanted by itself.
+    """
     resize = [partial(equal_resolution, network)] if network.equal_resolution else []
     radiometry = [partial(normalise_betas, undone=not network.keeps_luminance)] if normalise else []
     together = [partial(join, network.joins_bands)] if joined else []
@@ -68,11 +78,17 @@ def steps_for(network: FusionNetwork, *, normalise: bool, joined: bool = True) -
 
 
 def undistort(views: Views) -> StepResult:
-    """Pinhole views in place of views with lenses (up to 62 degrees off axis), unless a field goes through
-    lenses, or a camera has no pinhole view.
+    """Replace views with lenses by pinhole views, up to 62 degrees off axis.
 
-    Undone, the frame is at alpha's own pixels: the fusion's difference from alpha is resampled and added to
-    alpha's own image, and what the pinhole view leaves out has confidence 0.
+    Unchanged if a field goes through lenses, or a camera has no pinhole view. Undone, the frame is at alpha's
+    own pixels: the fusion's difference from alpha is resampled and added to alpha's own image, and pixels
+    outside the pinhole view have confidence 0.
+
+    Returns:
+        The views, and the function that undoes the step.
+
+    Raises:
+        ValueError: for an image without a pixel inside its lens's range.
     """
     if not takes_pinhole_views(views):
         return StepResult(views)
@@ -85,15 +101,20 @@ def undistort(views: Views) -> StepResult:
 
 
 def takes_pinhole_views(views: Views) -> bool:
-    """Whether `undistort` changes views."""
+    """Return True if `undistort` changes views."""
     cameras = [views.rig[name] for name in views.images]
     through_lenses = any(isinstance(innermost(f), Curved | ThroughLenses) for f in views.fields.values())
     return any(map(has_lens, cameras)) and all(c.has_pinhole_view for c in cameras) and not through_lenses
 
 
 def linear_luminance(views: Views) -> StepResult:
-    """The views as they are; undone, a frame in RGB betas' colours is as bright as alpha's camera saw it, if
-    that measured the luminance of light (`match_luminance`)."""
+    """Leave the views; undone, a frame in RGB betas' colours is as bright as alpha's camera saw it.
+
+    Only if alpha measured the luminance of light (`match_luminance`).
+
+    Returns:
+        The views, and the function that undoes the step.
+    """
     alpha, sensor = views.own, views.rig[views.alpha].sensor
     if sensor.response != LIGHT or 3 not in [len(views.images[name]) for name in views.betas]:
         return StepResult(views)
@@ -101,7 +122,11 @@ def linear_luminance(views: Views) -> StepResult:
 
 
 def upright(views: Views) -> StepResult:
-    """Betas rotated by about a quarter or half a turn against alpha are rotated back."""
+    """Rotate back betas that are rotated by about a quarter or half a turn against alpha.
+
+    Returns:
+        The views; there is nothing to undo.
+    """
     for name in views.betas:
         if k := quarter_turns(views.pair(name)):
             rotated = views.images[name].rot90(k, (-2, -1))
@@ -110,7 +135,14 @@ def upright(views: Views) -> StepResult:
 
 
 def equal_resolution(network: FusionNetwork, views: Views) -> StepResult:
-    """Betas at about alpha's angular resolution where views meet, less large parts alpha cannot see."""
+    """Resize betas to about alpha's angular resolution where views meet.
+
+    A calibrated beta that would be enlarged is first cropped to the part that search segments touch, if that
+    is much smaller.
+
+    Returns:
+        The views; there is nothing to undo.
+    """
     for name in views.betas:
         views = _cropped(network, views, name)
         image = of_size(views.images[name], hw_at_alphas_resolution(views.pair(name)))
@@ -121,7 +153,8 @@ def equal_resolution(network: FusionNetwork, views: Views) -> StepResult:
 
 
 def _cropped(network: FusionNetwork, views: Views, name: str) -> Views:
-    """A calibrated beta less what no search segment touches, if much: it would be enlarged for nothing.
+    """Crop a calibrated beta to the part that search segments touch, if much smaller: it would be enlarged
+    for nothing.
 
     Not where the field may depend on the images' sizes.
     """
@@ -139,10 +172,14 @@ def _cropped(network: FusionNetwork, views: Views, name: str) -> Views:
 
 
 def normalise_betas(views: Views, *, undone: bool = False) -> StepResult:
-    """Each beta with alpha's mean and standard deviation: for cameras of other exposures or filters.
+    """Give each beta alpha's mean and standard deviation: for cameras of other exposures or filters.
 
-    `undone`: bands have their own scale in the result, as measurements need it; else that is as bright as
-    alpha.
+    Args:
+        undone: True to give bands their own scale in the result, as measurements need it; else that is as
+            bright as alpha.
+
+    Returns:
+        The views, and the function that undoes the step.
     """
     in_one_exposure = views.replace({n: normalised(views.images[n], views.own) for n in views.betas})
     if not undone:
@@ -155,14 +192,23 @@ def normalise_betas(views: Views, *, undone: bool = False) -> StepResult:
 def with_own_levels(
     frame: Frame, bands: Sequence[int], alpha_level: Moments, beta_levels: Sequence[Moments]
 ) -> Frame:
-    """A frame whose bands, so many of each beta, have alpha's level, with each at its beta's own."""
+    """Return a frame whose bands, so many of each beta, have each its beta's own level in place
+    of alpha's."""
     parts = zip(frame.image.split(list(bands)), beta_levels, strict=True)
     return frame._replace(image=torch.cat([alpha_level.matched(planes, scale) for planes, scale in parts]))
 
 
 def join(which: JoinsBands, views: Views) -> StepResult:
-    """Betas that differ at most in sensors as one of several bands, under the first one's name; undone, bands
-    in the rig's order."""
+    """Join betas that differ at most in sensors to one of several bands, under the first one's name.
+
+    Undone, bands are in the rig's order.
+
+    Args:
+        which: kind of joining, as of `co_located`.
+
+    Returns:
+        The views, and the function that undoes the step.
+    """
     names, bands = views.betas, {name: len(views.images[name]) for name in views.betas}
     groups = co_located(views.rig, names, views.fields, which)
     if len(groups) == len(names) or (which == "neighbours" and 3 in bands.values()):
@@ -181,9 +227,13 @@ def join(which: JoinsBands, views: Views) -> StepResult:
 
 
 def co_located(rig: Rig, names: Sequence[str], fields: Fields, which: JoinsBands) -> list[list[str]]:
-    """The betas in groups with the same K, R, t, lens and size, and the same field.
+    """Group the betas with the same K, R, t, lens and size, and the same field.
 
-    `which` says whether such are joined only if they follow each other, or all, or none.
+    Args:
+        which: "neighbours" to group only those that follow each other, "all", or "no" for none.
+
+    Returns:
+        Groups of names, in order.
     """
     groups: list[list[str]] = []
     for name in names:
@@ -198,7 +248,14 @@ def co_located(rig: Rig, names: Sequence[str], fields: Fields, which: JoinsBands
 
 
 def without_lenses(rig: Rig, images: Images) -> tuple[Rig, dict[str, Tensor]]:
-    """The rig and its images with pinhole views, not cameras with lenses; see `arraygeom.pinhole_view`."""
+    """Replace cameras with lenses, and their images, by pinhole views; see `arraygeom.pinhole_view`.
+
+    Returns:
+        The rig and the images.
+
+    Raises:
+        ValueError: for an image without a pixel inside its lens's range.
+    """
     straight = dict(images)
     for name, image in images.items():
         camera = rig[name]
@@ -210,19 +267,19 @@ def without_lenses(rig: Rig, images: Images) -> tuple[Rig, dict[str, Tensor]]:
 
 
 def has_lens(view: View) -> TypeGuard[LensView]:
-    """Whether a camera's pixels are not those of a pinhole."""
+    """Return True if a camera's pixels are not those of a pinhole."""
     return isinstance(view, LensView) and view.distortion is not None
 
 
 def undone(frame: Frame, undo: Sequence[Undo]) -> Frame:
-    """A frame taken back to what it was before the steps."""
+    """Return a frame taken back to the views before the steps."""
     for back in undo:
         frame = back(frame)
     return frame
 
 
 def _for_pinhole(field: ReceptiveField | None, lens: View, pinhole: View) -> ReceptiveField | None:
-    """The field for the pinhole view of alpha: displacements are between pixels of that, too."""
+    """Return the field for the pinhole view of alpha: displacements are between pixels of that, too."""
     if not (isinstance(field, Moved | Widened) and has_lens(lens)):
         return field
     within = _for_pinhole(field.field, lens, pinhole)
@@ -240,7 +297,7 @@ def _for_pinhole(field: ReceptiveField | None, lens: View, pinhole: View) -> Rec
 
 
 def _distorted(frame: Frame, straight: Tensor, original: Tensor, pinhole: View, lens: View) -> Frame:
-    """The frame at the pixels of alpha's own image."""
+    """Return the frame at the pixels of alpha's own image."""
     if not has_lens(lens):
         return frame
     assert isinstance(pinhole, LensView)
@@ -260,7 +317,8 @@ def _distorted(frame: Frame, straight: Tensor, original: Tensor, pinhole: View, 
 
 
 def of_size(image: Float[Tensor, "c h w"], hw: HW) -> Float[Tensor, "c h2 w2"]:
-    """An image made so large, by cubic interpolation; as it is if it is."""
+    """Return an image of this size, by cubic interpolation, clipped to 0..1; the image itself if it has that
+    size."""
     if image.shape[-2:] == hw:
         return image
     resized = interpolate(image[None], size=hw, mode="bicubic", align_corners=False, antialias=True)
@@ -268,8 +326,10 @@ def of_size(image: Float[Tensor, "c h w"], hw: HW) -> Float[Tensor, "c h2 w2"]:
 
 
 def hw_at_alphas_resolution(pair: Pair) -> HW:
-    """The size of beta's image with pixels of about alpha's size where the views meet; its own if they
-    nearly are."""
+    """Return the size of beta's image with pixels of about alpha's size where the views meet.
+
+    Its own size if its pixels are nearly so.
+    """
     scale, (h, w) = resolution_ratio(pair), pair.beta.hw
     if 0.8 < scale < 1.25:
         return pair.beta.hw
@@ -277,14 +337,16 @@ def hw_at_alphas_resolution(pair: Pair) -> HW:
 
 
 def resolution_ratio(pair: Pair) -> float:
-    """Pixels of beta to one of alpha, by the pair's rough homography at alpha's middle; 1 if undefined."""
+    """Return pixels of beta per pixel of alpha, by the pair's rough homography at alpha's middle; 1 if
+    undefined."""
     steps = _steps_in_beta(pair)
     area = 0.0 if steps is None else abs(float(torch.linalg.det(steps)))
     return math.sqrt(area) if area > 0 else 1.0
 
 
 def quarter_turns(pair: Pair) -> int:
-    """How many quarter turns (see `Camera.rot90`) make beta's image upright as alpha's is, 0 to 3."""
+    """Return the number of quarter turns (see `Camera.rot90`), 0 to 3, that make beta's image upright like
+    alpha's."""
     steps = _steps_in_beta(pair)
     if steps is None:
         return 0
@@ -293,7 +355,8 @@ def quarter_turns(pair: Pair) -> int:
 
 
 def _steps_in_beta(pair: Pair) -> Float[Tensor, "2 2"] | None:
-    """What a pixel right and one down from alpha's middle are in beta, by the pair's rough homography."""
+    """Return the steps in beta of a pixel right and one down from alpha's middle, by the pair's rough
+    homography."""
     h, w = pair.alpha.hw
     middle = torch.tensor([[(w - 1) / 2, (h - 1) / 2]], dtype=torch.float64)
     steps = torch.cat([middle, middle + torch.tensor([[1.0, 0.0], [0.0, 1.0]], dtype=torch.float64)])

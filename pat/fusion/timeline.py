@@ -1,4 +1,4 @@
-"""When the cameras of a sequence recorded, and the frames of alpha that get colour from betas."""
+"""Recording times of the cameras of a sequence, and the frames of alpha that get colour from betas."""
 
 from __future__ import annotations
 
@@ -11,7 +11,12 @@ from arraygeom.runtime.warned import warn
 
 
 class KeyFrame(NamedTuple):
-    """A frame of alpha that betas colour: its number, and for each beta that of the frame nearest in time."""
+    """A frame of alpha that betas colour.
+
+    Attributes:
+        alpha: its number.
+        betas: number of the frame nearest in time, for each beta.
+    """
 
     alpha: int
     betas: dict[str, int]
@@ -19,9 +24,15 @@ class KeyFrame(NamedTuple):
 
 @dataclass(frozen=True)
 class Timeline:
-    """When a sequence's frames were recorded: `name`'s frame i at time_offset + i / frame_rate, seconds.
+    """Recording times of a sequence's frames: `name`'s frame i at time_offset + i / frame_rate, seconds.
 
-    Raises ValueError for a camera without a frame rate, or without frames.
+    Attributes:
+        rig: the cameras, with frame rates.
+        counts: number of frames of each camera.
+        alpha: name of alpha.
+
+    Raises:
+        ValueError: for a camera without a frame rate, or without frames.
     """
 
     rig: Rig
@@ -43,31 +54,33 @@ class Timeline:
 
     @property
     def betas(self) -> list[str]:
-        """The betas that have frames."""
+        """Betas that have frames."""
         return [name for name in self.rig.betas(self.alpha) if name in self.counts]
 
     def rate(self, name: str) -> float:
-        """Frames a second."""
+        """Return a camera's frames per second."""
         return self.rig[name].sensor.frame_rate or 1.0
 
     def time(self, name: str, i: int) -> float:
-        """When frame i was recorded, seconds of the rig's clock."""
+        """Return the time at which frame i was recorded, seconds of the rig's clock."""
         return self.rig[name].sensor.time_offset + i / self.rate(name)
 
     def nearest(self, name: str, time: float) -> int:
-        """The frame recorded nearest to a time."""
+        """Return the number of the frame recorded nearest to a time."""
         i = round((time - self.rig[name].sensor.time_offset) * self.rate(name))
         return min(max(i, 0), self.counts[name] - 1)
 
     @property
     def interval(self) -> float:
-        """The time between key frames, seconds."""
+        """Time between key frames, seconds."""
         return 1 / min(max(self.rate(name) for name in self.betas), self.rate(self.alpha))
 
     def key_frames(self) -> list[KeyFrame]:
-        """Key frames: for each of the fastest beta the nearest of alpha, if that is within half an interval.
+        """List the key frames: for each frame of the fastest beta the nearest of alpha, if within half an
+        interval.
 
-        Raises ValueError for a beta without a frame near any of them: then the recordings do not overlap.
+        Raises:
+            ValueError: for a beta without a frame near any of them: the recordings do not overlap.
         """
         fastest = max(self.betas, key=self.rate)
         gains: dict[int, float] = {}
@@ -101,5 +114,5 @@ class Timeline:
                 )
 
     def at(self, index: int) -> dict[str, int]:
-        """For each beta its frame nearest in time to alpha's frame `index`."""
+        """Return for each beta the number of its frame nearest in time to alpha's frame `index`."""
         return {name: self.nearest(name, self.time(self.alpha, index)) for name in self.betas}

@@ -1,1 +1,1 @@
-"""The researcher's room: synthesis, data, training, evaluation, the farm and their commands."""
+"""Research tools: synthesis, data, training, evaluation, the rendering farm, and their commands."""

@@ -1,4 +1,4 @@
-"""Commands for the development of networks: evaluate, ablate, data, render, train, settings."""
+"""Commands for developing networks: evaluate, ablate, data, render, train, settings."""
 
 from __future__ import annotations
 
@@ -36,7 +36,15 @@ class StereoSets:
     weights: Weights = "mono-colour"
 
     def sets(self) -> dict[str, Iterable[StereoPair]]:
-        """The pairs by data set, once all folders are open and what is written can be."""
+        """Open the folders of stereo pairs, and check that results can be written.
+
+        Returns:
+            The pairs, read on demand, by data set.
+
+        Raises:
+            ValueError: if no folder is given, or one has no pair.
+            FileNotFoundError: for a missing folder.
+        """
         from .evaluation.stereo import DATA_SETS
 
         folders = {name: getattr(self, name) for name in DATA_SETS if getattr(self, name) is not None}
@@ -62,7 +70,11 @@ class Evaluate(StereoSets):
     """Folder for scores.md, scores.csv and, for each data set, a strip of images a pair."""
 
     def run(self) -> None:
-        """Write and print the scores. Raises ValueError for no images, and for rates below 1."""
+        """Score all methods on all pairs; write and print the scores.
+
+        Raises:
+            ValueError: if there are no images, or a rate is below 1.
+        """
         from ..networks.weights import load_weights
         from .evaluation import protocols, stereo
 
@@ -73,13 +85,17 @@ class Evaluate(StereoSets):
         self.write(rows, stereo.sets_markdown(rows))
 
     def sets(self) -> dict[str, Iterable[StereoPair]]:
-        """The same. Raises ValueError for rates below 1."""
+        """Open the stereo pairs, by data set; see `StereoSets.sets`.
+
+        Raises:
+            ValueError: for no rates, or a rate below 1, and as `StereoSets.sets`.
+        """
         if not self.rates or min(self.rates) < 1:
             raise ValueError(f"--rates: {' '.join(map(str, self.rates))}: give whole numbers from 1 up")
         return super().sets()
 
     def write(self, rows: Mapping[str, Sequence[StereoRow]], text: str) -> None:
-        """Write scores.md and scores.csv, and print the text."""
+        """Write scores.md and scores.csv, and print `text`."""
         from arraygeom.runtime.atomic import write_text
 
         from .evaluation.stereo import StereoRow
@@ -94,10 +110,10 @@ class Evaluate(StereoSets):
 
 @dataclass
 class Ablate:
-    """What calibration is worth: families of receptive fields compared by one network.
+    """Compare families of receptive fields by one network: the gain from calibration.
 
-    On layered scenes with exact positions, of unrectified rigs with focal lengths 1 to 3 times beta's; or on
-    scenes of your own rig.
+    Scenes are layered, with exact positions, of unrectified rigs with focal lengths 1 to 3 times beta's; or
+    rendered scenes of your own rig.
 
     Example: pat lab ablate --rendered scenes --weights runs/mine/best.safetensors
     """
@@ -113,13 +129,17 @@ class Ablate:
     """Height and width of both images. The family `dense` compares each pixel with each: it takes longer than
     all others together, and is left out where that does not fit into 2 GiB, as at 240 x 320."""
     seed: int = 0
-    """Of the scenes."""
+    """Random seed of the scenes."""
     field: FieldName = "auto"
     out: Out = Path("out/ablate")
     """Folder for ablation.md, ablation.csv and ablation.png."""
 
     def run(self) -> None:
-        """Write and print the table. Raises ValueError for less than one scene."""
+        """Compare the families; write and print the table.
+
+        Raises:
+            ValueError: for fewer than one scene, and options of layered scenes next to --rendered.
+        """
         from ..networks.weights import load_weights
         from .evaluation.ablation import FieldFamily, ablate, families, layered_cases, rendered_cases
 
@@ -151,7 +171,12 @@ class DataInfo:
     folder: RenderedFolder
 
     def run(self) -> None:
-        """Print the summary. Raises ValueError for a folder that `pat lab render` did not write."""
+        """Print the summary.
+
+        Raises:
+            FileNotFoundError: for a missing folder.
+            ValueError: for a folder that `pat lab render` did not write.
+        """
         from .farm.job import summarise
 
         print(summarise(self.folder))
@@ -190,7 +215,12 @@ class Render:
     """The file's `blender.generator`, if it is code of your own: the file alone does not run it."""
 
     def run(self) -> None:
-        """Render what is missing; exit status 1 if the job is not complete then."""
+        """Render the missing scenes; exits with status 1 if some are still missing afterwards.
+
+        Raises:
+            ValueError: for code named in the file and not in --generator, and as `pat.lab.farm.job.render`.
+            SystemExit: with status 1, if a scene failed.
+        """
         from .farm.job import RenderConfig, Shard, render
 
         config = RenderConfig.load(self.config)
@@ -225,13 +255,24 @@ class Train:
 
     @classmethod
     def parse(cls, arguments: list[str], prog: str) -> Train:
-        """The command from its arguments; its options are those of the recipe."""
+        """Parse the command's arguments; its options are the entries of the recipe.
+
+        Returns:
+            The command, ready to run.
+
+        Raises:
+            ValueError: naming the entry, for a recipe that cannot be used.
+        """
         from .training.config import command_line
 
         return cls(config=command_line(arguments, prog))
 
     def run(self) -> None:
-        """Train, or continue a run that stopped. Raises ValueError for a recipe that its data do not suit."""
+        """Train, or continue a run that stopped, and print the weights' file.
+
+        Raises:
+            ValueError: for a recipe that its data do not suit.
+        """
         from .training.loop import train
 
         say(f"written: {train(self.config)}")
@@ -239,21 +280,21 @@ class Train:
 
 @dataclass
 class Settings:
-    """List the numbers that matching, fusion and networks were given: value, kind, and where each is from.
+    """List the settings of matching, fusion and networks: value, kind, and reason of each.
 
-    Kinds: *physics* follows from what is measured, *size* says how much is done at a time, *tuned* was
-    chosen.
+    Kinds: *physics* follows from a measurement, *size* is the amount of work at a time, *tuned* was chosen on
+    images.
 
     Example: pat lab settings --kind tuned
     """
 
     kind: Literal["physics", "size", "tuned", "all"] = "all"
-    """Those of one kind alone."""
+    """Kind of settings to list."""
 
     rooms: ClassVar[tuple[str, ...]] = ("pat.matching", "pat.fusion", "pat.networks")
 
     def run(self) -> None:
-        """Print a line for each."""
+        """Print a line for each setting, and their number."""
         from ..support.settings import all_settings
 
         entries = [s for s in all_settings(*self.rooms) if self.kind in ("all", s.kind)]
@@ -277,7 +318,12 @@ class Import:
     """Weights file to write."""
 
     def run(self) -> None:
-        """Write the weights. Raises FileNotFoundError or ValueError for a file that is no such checkpoint."""
+        """Convert the checkpoint and write the weights.
+
+        Raises:
+            FileNotFoundError: for a missing file.
+            ValueError: for a file that is no such checkpoint.
+        """
         from ..networks.authors import read_authors
         from ..networks.paper import PAT
         from ..networks.weights import save_weights

@@ -1,1 +1,1 @@
-"""Where the pixels of alpha are in each beta, and what the betas show there."""
+"""Positions of alpha's pixels in each beta, and the bands of the betas there."""

@@ -1,9 +1,9 @@
-"""How certain matches are: the probability of each, and how far from it the true position may be.
+"""Certainty of matches: the probability of each, and the likely distance of the true position from it.
 
-Both are read off what matching found: its facts at a pixel and around it, what the choice between disparities
-says of its own, how much disparities differ there, by how much one image had to be blurred to be compared,
-and what facts the pair's consistent matches have. A small network does it, which was fitted to pairs with
-true disparity (`python -m experiments certainty`). It knows nothing of the image but by the choice, so it
+Both are computed from the results of matching: its facts at a pixel and around it, the statements of the
+choice between disparities, the differences of disparities there, the blur by which one image had to be made
+comparable, and the facts of the pair's consistent matches. A small network does it, which was fitted to pairs
+with true disparity (`python -m experiments certainty`). It uses nothing of the image but by the choice, so it
 holds for any network that uses the matches.
 """
 
@@ -35,7 +35,7 @@ FITTED = Path(__file__).with_name("certainty.safetensors")
 
 @dataclass(frozen=True)
 class CertaintySettings:
-    """What certainty is read off."""
+    """Settings of the network's inputs and outputs."""
 
     around: tuple[int, int] = size((2, 6), "Radii, at half the size, in which facts are averaged")
     apart: tuple[int, int] = size((1, 4), "Radii, at full size, in which disparities are compared")
@@ -46,11 +46,12 @@ class CertaintySettings:
 
 SETTINGS = CertaintySettings()
 MEASURED = 3 * (1 + len(SETTINGS.around)) + len(SETTINGS.apart) + 4 + 2
-"""How many numbers of a pixel certainty is read off."""
+"""Number of inputs of a pixel."""
 
 
 class CertaintyNetwork(nn.Sequential):
-    """Of each pixel's numbers the logit of the probability, and the logarithm of the half-width."""
+    """Network from each pixel's numbers to the logit of the probability, and the logarithm of the
+    half-width."""
 
     def __init__(self) -> None:
         width = SETTINGS.width
@@ -60,22 +61,25 @@ class CertaintyNetwork(nn.Sequential):
 
 @cache
 def fitted_network() -> CertaintyNetwork:
-    """The one that ships."""
+    """Return the network that ships, loaded once."""
     return with_weights(CertaintyNetwork(), FITTED)
 
 
 @torch.no_grad()
 def with_certainty(matches: Matches) -> Matches:
-    """The matches, with the certainty of each, once the choice has said what it thinks of them.
+    """Add the certainty of each match, after the choice has stated its own.
 
-    Of matches on which several betas agree, whose certainty alone was known before: a beta sees a point only
-    if both say so.
+    For matches on which several betas agree, whose certainty alone was known before, a beta sees a point only
+    if both state so.
+
+    Returns:
+        The matches with `certainty`, detached.
     """
     return Matches(tuple(replace(beta, certainty=_certainty(beta)) for beta in matches.betas))
 
 
 def _certainty(matches: BetaMatches) -> Float[Tensor, "b 2 h2 w2"]:
-    """Confidence, and half of the interval of disparity, by the fitted network, in pieces."""
+    """Compute confidence, and half of the interval of disparity, by the fitted network, in pieces."""
     typical, (h, w) = typical_facts(matches), matches.disparity.shape[-2:]
     bare = replace(matches, colours=None, certainty=None)
     network = deepcopy(fitted_network()).to(matches.facts)  # another thread may need it in another precision
@@ -93,14 +97,18 @@ def _certainty(matches: BetaMatches) -> Float[Tensor, "b 2 h2 w2"]:
 
 
 def typical_facts(matches: BetaMatches) -> Float[Tensor, "b 2"]:
-    """By how much the pair's consistent matches are better than others, and their cost, in the mean."""
+    """Compute the mean margin and cost of the pair's consistent matches."""
     consistent = (matches.facts[:, :1] < CONSISTENT).to(matches.facts)
     some = consistent.mean((-2, -1)).clamp(min=1e-3)
     return (matches.facts[:, 1:] * consistent).mean((-2, -1)) / some
 
 
 def measured(matches: BetaMatches, typical: Float[Tensor, "b 2"]) -> Float[Tensor, "b n h2 w2"]:
-    """The `MEASURED` numbers of each pixel, at half the size; `typical` is of the whole frame."""
+    """Compute the `MEASURED` numbers of each pixel, at half the size.
+
+    Args:
+        typical: `typical_facts` of the whole frame.
+    """
     assert matches.stated is not None
     facts = [matches.facts, *(box_mean(matches.facts, radius) for radius in SETTINGS.around)]
     ranges = (max_pool2d(_range(matches.surface, radius), FINE) for radius in SETTINGS.apart)
@@ -112,7 +120,7 @@ def measured(matches: BetaMatches, typical: Float[Tensor, "b 2"]) -> Float[Tenso
 
 
 def _range(x: Float[Tensor, "b 1 h w"], radius: int) -> Float[Tensor, "b 1 h w"]:
-    """The greatest less the least value within squares around each pixel."""
+    """Return the greatest less the least value within squares around each pixel."""
     window = np.ones((2 * radius + 1,) * 2, np.uint8)
     ranges = [cv2.dilate(plane, window) - cv2.erode(plane, window) for plane in numpy_of(x[:, 0])]
     return torch.from_numpy(np.stack(ranges))[:, None].to(x)

@@ -1,12 +1,12 @@
-"""Which disparity a pixel has: that found there, or one found beside it.
+"""Choice of a pixel's disparity: that matched there, or one of a pixel beside it.
 
-Semi-global matching is wrong beside edges of depth, in what beta does not see, and where nothing is to be
-compared; and nearly always the right disparity is that of a pixel not far off. So each pixel has candidates:
+Semi-global matching is wrong beside edges of depth, in regions that beta does not see, and where there is no
+texture; and nearly always the right disparity is that of a pixel not far off. So each pixel has candidates:
 its own, those of pixels around it at fixed distances, and the nearest consistent ones in its row and its
-column. A U-Net gives their scores by what alpha shows, what matching found, and how alike alpha is to beta at
-each. It was trained on what matching finds in pairs with true disparity (`experiments.choice`), all with
-alpha on the left: there surfaces hide in beta what is to their left. Elsewhere planes are turned before, so
-that it is to their left, too.
+column. A U-Net computes their scores from alpha, the results of matching, and the similarity of alpha and
+beta at each. It was trained on matches of pairs with true disparity (`experiments.choice`), all with alpha on
+the left: there surfaces hide points of beta to their left. Elsewhere planes are turned first, so that it is
+to their left, too.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ FITTED = Path(__file__).with_name("choice.safetensors")
 
 @dataclass(frozen=True)
 class ChoiceSettings:
-    """Between what is chosen, and by what."""
+    """Settings of the candidates and of the network."""
 
     around: tuple[int, ...] = size((2, 5, 10), "Distances, in pixels, of those around a pixel")
     scales: tuple[float, float] = size(
@@ -59,14 +59,19 @@ SETTINGS = ChoiceSettings()
 AROUND = [(s * y, s * x) for s in SETTINGS.around for y, x in ((0, 1), (0, -1), (1, 0), (-1, 0))]
 CANDIDATES = 1 + 4 + len(AROUND)
 STRIP = 16
-"""Size: rows, at half the size, that a thread compares at a time."""
+"""Size: number of rows, at half the size, that a thread compares at a time."""
 FACTS = 7
-"""Facts of matching, those that are typical of the pair, and the blurs of its views, at half the size."""
+"""Number of facts at half the size: those of matching, those that are typical of the pair, and the blurs of
+its views."""
 
 
 class Choice(nn.Module):
-    """Scores of candidates; the logit of that beta sees the point and the best one is right to a pixel, and
-    the logarithm of how far it may be off, pixels."""
+    """Network of the candidates' scores, the logit of the best one's probability, and the logarithm of its
+    error.
+
+    The probability is that beta sees the point and the best candidate is right to a pixel; the error is in
+    pixels.
+    """
 
     def __init__(self, widths: tuple[int, ...] = SETTINGS.widths) -> None:
         super().__init__()
@@ -74,28 +79,34 @@ class Choice(nn.Module):
         nn.init.zeros_(self.unet.last.weight)
 
     def forward(self, inputs: Float[Tensor, "b i h2 w2"]) -> Float[Tensor, "b n 4 h2 w2"]:
-        """By `features`, of 2 x 2 pixels."""
+        """Compute scores, logit and logarithm of the error from `features`, for 2 x 2 pixels at a time."""
         return self.unet(inputs).unflatten(1, (CANDIDATES + 2, FINE * FINE))
 
 
 @cache
 def fitted_choice() -> Choice:
-    """The one that ships."""
+    """Return the network that ships, loaded once."""
     return with_weights(Choice(), FITTED)
 
 
 def chosen(inputs: Inputs, matches: Matches, network: Choice | None = None) -> Matches:
-    """The matches in each beta, with the disparity of each pixel's candidate of the highest score.
+    """Choose the disparity of each pixel's candidate of the highest score, in each beta.
 
-    Where each segment is around what is known of its own pixel, disparities of others say nothing: the choice
-    states how certain a match is, and changes none.
+    Where each segment is around a known depth of its own pixel, disparities of others mean nothing: the
+    choice states the certainty of a match, and changes none.
+
+    Args:
+        network: network of the scores; None for the one that ships.
+
+    Returns:
+        The matches with `chosen` and `stated`, detached.
     """
     best = network or fitted_choice()
     return Matches(tuple(_chosen(*one, best) for one in zip(inputs.by_beta, matches.betas)))
 
 
 def _chosen(inputs: Inputs, matches: BetaMatches, network: Choice) -> BetaMatches:
-    """The matches with the candidate of the highest score at each pixel, in pieces."""
+    """Choose the candidate of the highest score at each pixel, in pieces."""
     typical = typical_facts(matches)
     weight = network.unet.last.weight
     if (weight.dtype, weight.device) != (matches.facts.dtype, matches.facts.device):
@@ -119,7 +130,8 @@ def _chosen(inputs: Inputs, matches: BetaMatches, network: Choice) -> BetaMatche
 def _answered(
     k: int, views: ComparedViews, segments: Segments, matches: BetaMatches, typical: Tensor, network: Choice
 ) -> tuple[Float[Tensor, "b 1 h w"], Float[Tensor, "b 2 h2 w2"]]:
-    """The disparity chosen, and what is stated of it, all turned so many quarter turns for the network."""
+    """Return the disparity chosen, and the statements about it, all turned so many quarter turns for the
+    network."""
 
     def turned(x: Tensor, by: int = k, sides: tuple[int, int] = (-2, -1)) -> Tensor:
         return x.rot90(by, sides) if k else x  # turned by nothing it would be a copy
@@ -143,14 +155,17 @@ def _answered(
 
 
 def quarter_turns(segments: Segments) -> Int[Tensor, "b h w"]:
-    """By how many quarter turns (`Tensor.rot90`), 0 to 3, a segment's near end comes to be left of its far
-    end, as in rectified views whose alpha is on the left."""
+    """Compute the quarter turns (`Tensor.rot90`), 0 to 3, after which a segment's near end is left of its far
+    end.
+
+    That is the order of rectified views whose alpha is on the left.
+    """
     x, y = Extent.of(segments).towards.unbind(-1)
     return (torch.atan2(0 - y, 0 - x) / (math.pi / 2)).round().to(torch.int8) % 4  # not -0: points are 0
 
 
 def candidates(matches: BetaMatches) -> Float[Tensor, "b n h w"]:
-    """Disparities of each pixel to choose from; the first is its own."""
+    """Compute the disparities of each pixel's candidates; the first is its own."""
     disparity = matches.disparity
     consistent = enlarged(matches.facts[:, :1] < CONSISTENT)
     along = [nearest_known(disparity, consistent, axis, back) for axis in (-2, -1) for back in (False, True)]
@@ -167,7 +182,15 @@ def features(
     options: Float[Tensor, "b n h w"],
     typical: Float[Tensor, "b 2"],
 ) -> Float[Tensor, "b i h2 w2"]:
-    """What the scores are by, padded to whole multiples; `typical` facts are of the whole frame."""
+    """Compute the network's inputs, padded to whole multiples.
+
+    Args:
+        options: disparities of the candidates.
+        typical: `typical_facts` of the whole frame.
+
+    Returns:
+        Channels of 2 x 2 pixels, at half the size.
+    """
     extent, (h, w) = Extent.of(segments), options.shape[-2:]
     half = _at_half(matches, typical)
     sides = [-(-n // SETTINGS.multiple) * SETTINGS.multiple // FINE for n in (h, w)]
@@ -188,7 +211,7 @@ def features(
 
 
 def _at_half(matches: BetaMatches, typical: Tensor) -> Float[Tensor, "b 7 h2 w2"]:
-    """The `FACTS` of each pixel, about -.4 to .6."""
+    """Return the `FACTS` of each pixel, about -.4 to .6."""
     blurs = torch.tensor(matches.comparison.whole.blurs).T.to(typical) / SETTINGS.blur
     same = torch.cat([typical, blurs], 1)[..., None, None].expand(-1, -1, *matches.facts.shape[-2:])
     return torch.cat([matches.facts, same], 1) - 0.4

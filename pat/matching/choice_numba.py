@@ -7,23 +7,23 @@ import numpy as np
 from arraygeom.runtime.compiled import compiled
 
 COLUMNS = 32
-"""Columns whose numbers are written at a time: they stay in a core's first cache."""
+"""Number of columns whose numbers are written at a time: they stay in a core's first cache."""
 
 
 @compiled(inline="always")
 def soft(x):
-    """x for small ones, at most 1."""
+    """Return x for small x, with absolute values of at most 1."""
     return x / (np.float32(1) + abs(x))
 
 
 @compiled(nogil=True, cache=True)
 def compared(alpha, beta, end, towards, candidates, scales, out):
-    """Into `out` (h / 2, w / 2, 4 + 8 n), 2 x 2 pixels as channels: `alpha` (h, w); of its candidates (n,
-    h, w), disparities the first of which is the pixel's own, by how much they differ from that; by how much
-    alpha is brighter than `beta` there; and whether the first is on beta. Where h or w are less than
-    `out` is, the last row or column again.
+    """Write the comparisons of alpha and beta at each candidate, 2 x 2 pixels as channels.
 
-    `scales` are the differences of disparity and of brightness that count as a half, 1 at most.
+    Into `out` (h / 2, w / 2, 4 + 8 n): `alpha` (h, w); the difference of each candidate's disparity (n, h, w)
+    from the first one's, which is the pixel's own; the excess of alpha's brightness over `beta` there; and 1
+    where the first is on beta. Beyond h or w the last row or column is repeated. `scales` are the differences
+    of disparity and of brightness that count as a half, 1 at most.
     """
     n, height, width = candidates.shape
     rows, columns = beta.shape

@@ -1,4 +1,4 @@
-"""Beta's bands at alpha's view by matches: bright as alpha, with its detail, diffused where not seen."""
+"""Beta's bands at alpha's view by matches: as bright as alpha, with its detail, diffused where not seen."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from arraygeom import Segments
 from arraygeom.runtime.chunks import chunked
 
 from ..media.colour import to_bytes
@@ -30,7 +31,8 @@ from .spectral_mix import SpectralMix
 
 @dataclass(frozen=True)
 class ColourTransferSettings:
-    """Brightness is 0 to 1. Middlebury and SYNTIM are the pairs of their tune halves."""
+    """Settings of the transfer. Brightness is 0 to 1. Middlebury and SYNTIM are the pairs of their tune
+    halves."""
 
     alike: float = tuned(
         2.0, "Middlebury, tune half: added to the logit of a match's confidence where brightness agrees"
@@ -60,22 +62,27 @@ class ColourTransferSettings:
     most_detail: float = size(0.2, "Differences of brightness beyond this are no detail that beta lost")
 
     def detail(self, difference: Tensor) -> Tensor:
-        """What of a difference of brightness is detail that beta lost."""
+        """Return the part of a difference of brightness that is detail that beta lost."""
         return difference.clamp(-self.most_detail, self.most_detail)
 
 
 SETTINGS = ColourTransferSettings()
 LEAST = 1e-3
-"""Size: the least weight of a pixel in a fill."""
+"""Size: least weight of a pixel in a fill."""
+DIRECTIONS = 8
+"""Size: spacing, in rows and columns, of the segments whose directions are averaged."""
 
 
 class MatchStatistics(NamedTuple):
-    """Of a frame's consistent matches: of each piece of a large frame they would differ, and borders show.
+    """Statistics of a frame's consistent matches: those of each piece of a large frame would differ, and
+    borders show.
 
-    matches: (B, 1, 1, 1), how many, and one.
-    colour: (B, C, 1, 1), beta's bands minus alpha, in the mean.
-    level: (4, B, 1, 1, 1), means of beta's brightness and of its square, and of alpha and of its square.
-    explained, noise: (B, 1, 1, 1), as of `explained_share` and `colour_noise`.
+    Attributes:
+        matches: number of matches, plus one, (B, 1, 1, 1).
+        colour: mean of beta's bands minus alpha, (B, C, 1, 1).
+        level: means of beta's brightness and of its square, and of alpha and of its square, (4, B, 1, 1, 1).
+        explained: as of `explained_share`, (B, 1, 1, 1).
+        noise: as of `colour_noise`, (B, 1, 1, 1).
     """
 
     matches: Tensor
@@ -95,8 +102,16 @@ class MatchStatistics(NamedTuple):
         valid: Tensor,
         consistent: Tensor,
     ) -> MatchStatistics:
-        """Those of alpha, which is as sharp as beta in `soft`, and of what beta shows at its matches: bands,
-        what they combine to, and its brightness."""
+        """Compute the statistics of matches.
+
+        Args:
+            soft: alpha, as sharp as beta.
+            values: beta's bands at its matches.
+            combined: the combination of these bands.
+            brightness: beta's brightness at its matches.
+            valid: mask of the matches that are on beta.
+            consistent: 1 where a match is consistent.
+        """
         both = valid * consistent
         count = both.sum((-2, -1), keepdim=True) + 1
         colour = (both * (values - alpha)).sum((-2, -1), keepdim=True) / count
@@ -111,25 +126,30 @@ class MatchStatistics(NamedTuple):
         return one._replace(noise=colour_noise(unlike, soft, both * likeness(unlike)))
 
     def leveled(self, brightness: Tensor) -> Tensor:
-        """Beta's brightness, where matches are consistent with alpha's mean and standard deviation."""
+        """Return beta's brightness with alpha's mean and standard deviation over consistent matches."""
         means, squares = self.level[::2], self.level[1::2]
         measured, wanted = map(Moments, means, (squares - means.square()).clamp(min=1e-12).sqrt())
         return measured.matched(brightness, wanted, NORMALISATION.largest_gain).to(brightness)
 
     @classmethod
     def mean(cls, pieces: Sequence[MatchStatistics]) -> MatchStatistics:
-        """Those of a frame, by those of its pieces."""
+        """Combine the statistics of pieces to those of a frame."""
         counts = torch.stack([piece.matches for piece in pieces])
         share = counts / counts.sum(0)
         return cls(*(torch.stack([w * x for w, x in zip(share, each)]).sum(0) for each in zip(*pieces)))
 
 
 def transferred(inputs: Inputs, matches: Matches) -> Matches:
-    """The matches with `colours`: beta's bands at them, also for matches from elsewhere.
+    """Transfer beta's bands to alpha's view, also for matches from another source.
 
     Of betas that agree on depth, those that have all of the result's bands share their fills; any other has
-    its own. With gradients if images or fields have some and gradients are recorded. Raises ValueError for
-    matches of another size or number of betas.
+    its own. With gradients if images or fields have some and gradients are recorded.
+
+    Returns:
+        The matches with `colours`, of a large frame as float16.
+
+    Raises:
+        ValueError: for matches of another size or number of betas.
     """
     matches.check(inputs)
     large = len(inputs.pieces) > 1
@@ -153,10 +173,13 @@ def transferred(inputs: Inputs, matches: Matches) -> Matches:
 
 
 def _fills(inputs: Inputs, carried: Sequence[tuple[Tensor, Tensor, Tensor]]) -> list[Tensor]:
-    """The fills of each beta, from its bands and their weight, over the whole frame: pieces of one would find
-    other examples, and their borders would show. Betas that stand in for each other share theirs."""
+    """Compute the fills of each beta, from its bands and their weight, over the whole frame.
+
+    Pieces of one would find other examples, and their borders would show. Betas that stand in for each other
+    share theirs.
+    """
     sharing = [inputs.can_agree and inputs.shows_all_bands(beta) for beta in inputs.betas]
-    regressed = inputs.bands is None
+    regressed, of_betas = inputs.bands is None, [directions_of(beta.field.straight) for beta in inputs.betas]
     shared: Tensor | None = None
     if any(sharing):
         some = [one for one, shares in zip(carried, sharing) if shares]
@@ -165,17 +188,28 @@ def _fills(inputs: Inputs, carried: Sequence[tuple[Tensor, Tensor, Tensor]]) -> 
             1 + LEAST - each
         )  # odds: colours of weak matches hardly count beside others
         mixed = (weights * torch.stack([bands.float() for bands, _, _ in some])).sum(0) / weights.sum(0)
-        shared = filled_from(mixed, inputs.alpha, each.amax(0), regressed=regressed)
+        mean = np.mean([one for one, shares in zip(of_betas, sharing) if shares], 0)
+        shared = filled_from(mixed, inputs.alpha, each.amax(0), mean, regressed=regressed)
     return [
         shared
         if shares and shared is not None
-        else filled_from(one[0], inputs.alpha, one[1], regressed=regressed)
-        for one, shares in zip(carried, sharing)
+        else filled_from(one[0], inputs.alpha, one[1], directions, regressed=regressed)
+        for one, shares, directions in zip(carried, sharing, of_betas)
     ]
 
 
+def directions_of(segments: Segments) -> Float[NDArray, "2 2"]:
+    """Compute the mean outer product of the unit vectors along valid segments; half the identity
+    without any."""
+    some = (segments.end - segments.start)[..., ::DIRECTIONS, ::DIRECTIONS, :].detach().double()
+    some = some[segments.valid[..., ::DIRECTIONS, ::DIRECTIONS]]
+    units = some[some.norm(dim=-1) > LEAST].cpu().numpy()
+    units = units / np.linalg.norm(units, axis=-1, keepdims=True)
+    return units.T @ units / len(units) if len(units) else np.eye(2) / 2
+
+
 def _statistics_of_frame(inputs: Inputs, matches: Matches) -> list[MatchStatistics]:
-    """Those of each beta, over all pieces, in turn."""
+    """Compute the statistics of each beta, over all pieces, in turn."""
     pieces = ((inputs.cut(piece.outer), matches.cut(piece.outer)) for piece in inputs.pieces)
     of_pieces = [
         [transferred_bands(piece.alpha, *one)[-1] for one in zip(piece.betas, there.betas)]
@@ -192,8 +226,15 @@ def transferred_bands(
     *,
     sees_luma: bool = True,
 ) -> tuple[Tensor, Tensor, Tensor, MatchStatistics]:
-    """The first three `Colours` of a beta, and the statistics by which they are made: of these pixels, unless
-    they are given."""
+    """Compute the first three `Colours` of a beta.
+
+    Args:
+        statistics: statistics to use; None for those of these pixels.
+        sees_luma: True if alpha sees about the luma of RGB betas.
+
+    Returns:
+        Bands minus alpha, weight and likeness at alpha's pixels; and the statistics.
+    """
     if matches.comparison.mix is not None:
         return _colours_of_bands(alpha, beta, matches, matches.comparison.mix, statistics)
     return matched_colours(alpha, beta, matches, statistics, sees_luma=sees_luma)
@@ -207,9 +248,13 @@ def matched_colours(
     *,
     sees_luma: bool = True,
 ) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 1 h w"], Float[Tensor, "b 1 h w"], MatchStatistics]:
-    """Beta's bands minus alpha at the matches, colour as in alpha's light if that sees about the luma of
-    colours, with the detail that alpha has and beta has not; weight, likeness and statistics, as of
-    `transferred_bands`."""
+    """Compute beta's bands minus alpha at the matches, with the detail that alpha has and beta lacks.
+
+    Colour is as in alpha's light if that sees about the luma of colours.
+
+    Returns:
+        Bands, weight, likeness and statistics, as of `transferred_bands`.
+    """
     guide, normalisation = combined_bands(beta.image), matches.comparison.whole
     bands, planes = beta.image.shape[1], torch.cat([beta.image, guide, normalisation.normalised(guide)], 1)
     sampled, valid = at_matches(planes, beta.field.straight, matches.disparity)
@@ -237,8 +282,11 @@ def matched_colours(
 def _colours_of_bands(
     alpha: Tensor, beta: Beta, matches: BetaMatches, mix: SpectralMix, statistics: MatchStatistics | None
 ) -> tuple[Tensor, Tensor, Tensor, MatchStatistics]:
-    """The bands minus alpha at matches that the mix has found, with the detail that alpha has and they have
-    not; weight, likeness and statistics, as of `transferred_bands`."""
+    """Compute the bands minus alpha at matches by a mix, with the detail that alpha has and they lack.
+
+    Returns:
+        Bands, weight, likeness and statistics, as of `transferred_bands`.
+    """
     values, valid = at_matches(beta.image, beta.field.straight, matches.disparity)
     brightness, soft = mix.of(values), matches.comparison.whole.softened(alpha)
     gain = mix.gain[:, None, None, None].to(alpha)
@@ -258,10 +306,11 @@ def _colours_of_bands(
 def _scaled_to_alpha(
     colour: Tensor, brightness: Tensor, alpha: Tensor, weight: Tensor, power: float
 ) -> tuple[Tensor, Tensor]:
-    """Colour differences (B, C, H, W) and brightness of beta, larger where alpha is brighter around a pixel.
+    """Return colour differences (B, C, H, W) and brightness of beta, larger where alpha is brighter around a
+    pixel.
 
-    What a lens or the light makes brighter keeps its saturation, a reflection does not: the power is in
-    between; and 0 where alpha sees something else, as near infrared: there the ratio is of materials.
+    Light or a lens that makes a surface brighter keeps its saturation, a reflection does not: the power is in
+    between; and 0 where alpha sees another spectrum, such as near infrared: there the ratio is of materials.
     """
     least, most = 1e-3, SETTINGS.most_brighter
     alpha_mean, beta_mean = (
@@ -274,10 +323,14 @@ def _scaled_to_alpha(
 def match_weight(
     alike: Float[Tensor, "b 1 h w"], matches: BetaMatches, valid: Tensor
 ) -> Float[Tensor, "b 1 h w"]:
-    """Weight of a match's colours, 0 to 1.
+    """Compute the weight of a match's colours, 0 to 1.
 
     The photometric likeness, halved where the left-right check fails. Where certainty is known, the geometric
     mean of that and of the probability that the match is right, given the likeness.
+
+    Args:
+        alike: photometric likeness, 0 to 1.
+        valid: mask of the matches that are on beta.
     """
     checked = alike * (1 + is_consistent(matches.facts)) / 2
     if matches.certainty is None:
@@ -290,16 +343,25 @@ def filled_from(
     colour: Float[Tensor, "b c h w"],
     alpha: Float[Tensor, "b 1 h w"],
     weight: Float[Tensor, "b 1 h w"],
+    directions: Float[NDArray, "2 2"],
     *,
     regressed: bool = False,
 ) -> Float[Tensor, "b fills c h w"]:
-    """Colours of pixels that beta does not see, by nearest examples; if `regressed` after the regression on
-    brightness over what is connected in alpha, above which the examples are."""
+    """Fill in the colours of pixels that beta does not see, by nearest examples.
+
+    Args:
+        directions: as of `directions_of`, for the search of examples.
+        regressed: True to compute the regression on brightness over connected regions of alpha first, above
+            which the examples are.
+
+    Returns:
+        One fill, or the regression and the fill, at all pixels.
+    """
     planes = zip(numpy_of(colour), numpy_of(alpha[:, 0]), numpy_of(weight[:, 0]), to_bytes(alpha[:, 0]))
     fills = []
     for bands, brightness, w, guide in planes:
         base = [_diffused(bands, brightness, w + LEAST, guide)] if regressed else []
-        nearest = by_examples(bands - sum(base), brightness, w) + sum(base)
+        nearest = by_examples(bands - sum(base), brightness, w, directions) + sum(base)
         fills.append(np.stack([*base, nearest]))
     return torch.from_numpy(np.stack(fills)).to(alpha)
 
@@ -308,8 +370,15 @@ def filled_from(
 def colour_noise(
     unlike: Float[Tensor, "b 1 h w"], texture: Float[Tensor, "b 1 h w"], weight: Float[Tensor, "b 1 h w"]
 ) -> Float[Tensor, "b 1 1 1"]:
-    """The variance of noise in colour at the matches, of all bands, from the difference of brightness
-    (`unlike`): what of it is fine, beyond what sampling changes of fine texture."""
+    """Estimate the variance of noise in colour at the matches, of all bands.
+
+    It is that of the fine part of the difference of brightness (`unlike`), beyond the change of fine texture
+    by sampling.
+
+    Args:
+        texture: brightness of alpha.
+        weight: pixels count where it is above a half.
+    """
     parts, radius = torch.cat([unlike, texture], 1), SETTINGS.detail_radius
     fine = box_mean((parts - box_mean(parts, radius)).square(), radius)
     fine = torch.where(weight > 0.5, fine, torch.nan)[..., ::4, ::4].flatten(2)
@@ -319,7 +388,8 @@ def colour_noise(
 
 
 def _without_noise(colour: Tensor, brightness: Tensor, noise: Tensor) -> Tensor:
-    """Colour (B, C, H, W) nearer its local regression on brightness, the noisier the rest (Lee 1980)."""
+    """Return colour (B, C, H, W) nearer its local regression on brightness, the noisier the rest
+    (Lee 1980)."""
     local = LocalMoments.within(SETTINGS.detail_radius, colour, brightness)
     slope = local.slope(SETTINGS.floor)
     fitted = local.bands + slope * (brightness - local.image)
@@ -328,7 +398,7 @@ def _without_noise(colour: Tensor, brightness: Tensor, noise: Tensor) -> Tensor:
 
 
 def _each_detailed(colour: Tensor, brightness: Tensor, alpha: Tensor, radii: Sequence[int]) -> Tensor:
-    """`_detailed`, each of the batch with its own radius."""
+    """Apply `_detailed` to each of the batch with its own radius."""
     radii = [radii[0]] if len(set(radii)) == 1 else radii
     parts = zip(*(x.tensor_split(len(radii)) for x in (colour, brightness, alpha)), radii)
     return torch.cat([_detailed(c, b, a, radius) for c, b, a, radius in parts])
@@ -337,7 +407,8 @@ def _each_detailed(colour: Tensor, brightness: Tensor, alpha: Tensor, radii: Seq
 def _detailed(
     colour: Tensor, brightness: Tensor, alpha: Tensor, radius: int = SETTINGS.detail_radius
 ) -> Tensor:
-    """Colour (B, C, H, W) moved along its local regression on brightness by what alpha's has beyond it."""
+    """Move colour (B, C, H, W) along its local regression on brightness by the excess of alpha's
+    brightness."""
 
     def of(colour: Tensor, brightness: Tensor, alpha: Tensor) -> Tensor:
         return colour + local_slope(colour, brightness, radius) * SETTINGS.detail(alpha - brightness)
@@ -350,11 +421,14 @@ def local_slope(
     brightness: Float[Tensor, "b 1 h w"],
     radius: int = SETTINGS.detail_radius,
 ) -> Float[Tensor, "b c h w"]:
-    """The slope of the regression of colour on brightness around each pixel.
+    """Compute the slope of the regression of colour on brightness around each pixel.
 
-    The guided filter's linear model (He et al. 2013): it gives back the detail that beta lost by its
+    The guided filter's linear model (He et al. 2013): it restores the detail that beta lost by its
     resolution. The less of colour's variance the regression explains, the flatter it is: few of a window's
     pixels are independent, so that even noise seems to be explained in part.
+
+    Args:
+        radius: pixels to either side of a window.
     """
     local = LocalMoments.within(radius, colour, brightness)
     variances = (local.variance_of_image + 1e-6) * (local.variance_of_bands + 1e-6)
@@ -365,10 +439,11 @@ def local_slope(
 def _diffused(
     colour: NDArray, brightness: NDArray, weight: NDArray, guide: NDArray[np.uint8]
 ) -> NDArray[np.float32]:
-    """Colour (c, h, w) by its weighted regression on brightness (h, w) over what is connected in the guide.
+    """Compute colour (c, h, w) by its weighted regression on brightness (h, w) over connected regions of the
+    guide.
 
-    The moments of the guided filter (He et al. 2013), diffused instead of averaged over a window: what no
-    beta sees has colour that varies with brightness as it does nearby.
+    The moments of the guided filter (He et al. 2013), diffused instead of averaged over a window: a region
+    that no beta sees has colour that varies with brightness as it does nearby.
     """
     how = SETTINGS.fill, DISPARITY_FILL[1]
     sums = [weight, *(weight * p for p in (brightness, brightness**2, *colour))]

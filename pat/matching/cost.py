@@ -1,4 +1,4 @@
-"""What two pixels cost: how unlike they are by the order of brightness around them, and by brightness itself.
+"""Cost of two pixels: their difference in the order of brightness around them, and in brightness itself.
 
 Another cost is another file with these names: `planes_of` prepares an image (numbers, 64-bit words, a few
 channels a pixel), `pixel_of` takes a pixel of that, `dissimilarity` compares two, and `UNSEEN` and `NOWHERE`
@@ -19,12 +19,12 @@ from ..support.settings import physics, tuned
 
 @dataclass(frozen=True)
 class CensusSettings:
-    """The numbers of this cost, whose unit is a bit of the census."""
+    """Settings of this cost, whose unit is a bit of the census."""
 
     brightness: float = tuned(30.0, "Source not recorded: what a difference of 1 in brightness costs")
     truncated: float = tuned(20.0, "Source not recorded: what brightness costs at most")
     unseen: int = physics(24, "About half of the bits: a label beyond beta's edge, where the point may be")
-    nowhere: int = physics(80, "More than any other cost, 48 + `truncated`: of a label that is not on beta")
+    nowhere: int = physics(80, "More than any other cost: of a label that is not on beta")
 
 
 SETTINGS = CensusSettings()
@@ -33,7 +33,7 @@ UNSEEN, NOWHERE = np.uint8(SETTINGS.unseen), np.uint8(SETTINGS.nowhere)
 
 
 def planes_of(image: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.uint64]]:
-    """What `dissimilarity` compares of an image's pixels (h, w): brightness and census."""
+    """Compute the planes of an image's pixels (h, w) that `dissimilarity` compares: brightness and census."""
     bits = np.empty(image.shape, np.uint64)
     census(image, bits)
     return image, bits
@@ -41,20 +41,20 @@ def planes_of(image: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[
 
 @compiled(inline="always")
 def pixel_of(planes, i):
-    """What is compared of a pixel: of planes as `planes_of` gives them, but flat."""
+    """Return the compared numbers of a pixel, from planes as of `planes_of`, but flat."""
     return planes[0][i], planes[1][i]
 
 
 @compiled(inline="always")
 def dissimilarity(alpha, beta):
-    """The cost of a pixel of alpha and one of beta, less than `NOWHERE`."""
+    """Return the cost of a pixel of alpha and one of beta, less than `NOWHERE`."""
     apart = min(abs(alpha[0] - beta[0]) * BRIGHTNESS, TRUNCATED)
     return np.uint8(_count(alpha[1] ^ beta[1])) + np.uint8(apart)
 
 
 @compiled(inline="always")
 def _count(bits):
-    """Ones among 64 bits."""
+    """Return the number of ones among 64 bits."""
     bits = bits - ((bits >> np.uint64(1)) & np.uint64(0x5555555555555555))
     bits = (bits & np.uint64(0x3333333333333333)) + ((bits >> np.uint64(2)) & np.uint64(0x3333333333333333))
     bits = (bits + (bits >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
@@ -63,7 +63,7 @@ def _count(bits):
 
 @compiled(nogil=True, cache=True)
 def census(image, out):
-    """One bit for each of the 48 pixels around: whether it is darker (Zabih and Woodfill 1994)."""
+    """Write one bit for each of the 48 pixels around: 1 if it is darker (Zabih and Woodfill 1994)."""
     height, width = image.shape
     # A row around at a time, continued by three pixels to either side: then the loop along it is of vectors.
     row = np.empty(width + 6, image.dtype)

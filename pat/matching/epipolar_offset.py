@@ -1,8 +1,8 @@
-"""How far beta's points lie off their search segments: a camera that moved a little since its calibration.
+"""Distance of beta's points across their search segments: a camera that moved a little since its calibration.
 
 The displacement across the segments is modelled as affine in alpha's pixels: a shift, a rotation about the
 optical axis, another angle of view. It is fitted robustly to displacements of small windows (Lucas and Kanade
-1981), each freed of what it is off along its segment.
+1981), each freed of its displacement along its segment.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ Image = NDArray[Any]
 
 @dataclass(frozen=True)
 class AlignmentSettings:
-    """Lengths are pixels of the images given, brightness is 0 to 1. Middlebury is its tune half."""
+    """Settings of the fit. Lengths are pixels of the images given, brightness is 0 to 1. Middlebury is its
+    tune half."""
 
     blur: float = tuned(
         1.0, "Middlebury, tune half: deviation of the blur before gradients, and before a response is fitted"
@@ -50,11 +51,16 @@ SETTINGS = AlignmentSettings()
 
 @dataclass(frozen=True)
 class Misalignment:
-    """The displacement across the segments, in widths of alpha: `shift` + `across` u + `down` v.
+    """Displacement across the segments, in widths of alpha: `shift` + `across` u + `down` v.
 
-    (u, v) is a pixel's place from the middle of alpha, in widths of alpha. Beta has about alpha's angular
-    resolution. Across is where along the segment from its end, turned by a right angle from x towards y,
-    points.
+    (u, v) is a pixel's position from the middle of alpha, in widths of alpha. Beta has about alpha's angular
+    resolution. Across is the direction along the segment from its end, turned by a right angle from x towards
+    y.
+
+    Attributes:
+        shift: displacement in the middle of alpha.
+        across: change per width of alpha to the right.
+        down: change per width of alpha downwards.
     """
 
     shift: float = 0.0
@@ -65,18 +71,26 @@ class Misalignment:
         return Misalignment(self.shift + other.shift, self.across + other.across, self.down + other.down)
 
     def at(self, x: Float[Tensor, "*n 2"], hw: HW) -> Float[Tensor, "*n"]:
-        """The displacement of alpha's pixels, in pixels."""
+        """Compute the displacement of alpha's pixels, pixels of alpha.
+
+        Args:
+            hw: alpha's size without padding.
+        """
         u, v = ((x[..., i] + 0.5) / hw[1] - 0.5 * hw[1 - i] / hw[1] for i in range(2))
         return hw[1] * (self.shift + self.across * u + self.down * v)
 
     def largest(self, hw: HW) -> float:
-        """The largest displacement of any pixel, in pixels."""
+        """Compute the largest displacement of any pixel, pixels of alpha."""
         h, w = hw
         corners = torch.tensor([[0, 0], [w - 1, 0], [0, h - 1], [w - 1, h - 1]], dtype=torch.float64)
         return float(self.at(corners, hw).abs().max())
 
     def applied(self, field: FieldOnGrid, hw: HW) -> FieldOnGrid:
-        """The field with its segments displaced; `hw` is alpha's size without padding."""
+        """Return the field with its segments displaced; a field of explicit positions stays.
+
+        Args:
+            hw: alpha's size without padding.
+        """
         if self == Misalignment() or field.pixels is None:
             return field
         return field.displaced(lambda locations, x: self.at(x, hw)[..., None] * normals(locations))
@@ -90,10 +104,16 @@ def fit_misalignment(
     normal: Float[Tensor, "h w 2"],
     weight: Float[Tensor, "h w"],
 ) -> Misalignment:
-    """How far across its segments beta is, from matches; none if that explains the images hardly better.
+    """Estimate the displacement of beta across its segments, from matches.
 
-    `alpha` and `beta` are of equal brightness and sharpness; `position` are the matches in beta, `weight` is
-    0 to 1.
+    Args:
+        alpha: brightness, as bright and sharp as `beta`.
+        position: positions of alpha's pixels in beta, by the matches.
+        normal: unit vectors across the segments.
+        weight: weight of each match, 0 to 1.
+
+    Returns:
+        The misalignment; none for too little texture, or if it explains the images hardly better.
     """
     arrays = (t.detach().cpu().float().numpy() for t in (alpha, beta, position, normal, weight))
     views = _Windows.of(*arrays)
@@ -114,7 +134,7 @@ def fit_misalignment(
 
 
 class _Windows(NamedTuple):
-    """Blurred images, beta's gradients, and what the displacement depends on (3, h, w)."""
+    """Blurred images, beta's gradients, and the terms on which the displacement depends (3, h, w)."""
 
     alpha: Image
     beta: Image
@@ -135,7 +155,7 @@ class _Windows(NamedTuple):
         return cls(alpha_soft, beta_soft, (horizontal, vertical), position, normal, weight, design)
 
     def _sampled(self, coefficients: NDArray[np.float64]) -> tuple[Image, Image, Image, Image]:
-        """Beta and its gradients at the displaced matches, and the weight of those inside beta."""
+        """Sample beta and its gradients at the displaced matches, with the weight of those inside beta."""
         displaced = self.position + np.tensordot(coefficients, self.design, 1)[..., None] * self.normal
         columns, rows = (np.ascontiguousarray(displaced[..., i], np.float32) for i in range(2))
         height, width = self.beta.shape
@@ -150,13 +170,13 @@ class _Windows(NamedTuple):
         return cv2.blur(product, side) / (cv2.blur(weight, side) + 1e-6)
 
     def residual(self, coefficients: NDArray[np.float64]) -> float:
-        """The mean difference of the images where these match, freed of its mean in each window."""
+        """Return the mean difference of the images where these match, freed of its mean in each window."""
         value, _, _, weight = self._sampled(coefficients)
         rest = self.alpha - value
         return float((weight * np.abs(rest - self._mean(rest, weight))).sum() / max(weight.sum(), 1.0))
 
     def step(self, coefficients: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """By how much the coefficients should change; None for too little texture."""
+        """Return the change of the coefficients by one step; None for too little texture."""
         value, gx, gy, weight = self._sampled(coefficients)
         across = gx * self.normal[..., 0] + gy * self.normal[..., 1]
         along_segment = gx * self.normal[..., 1] - gy * self.normal[..., 0]
@@ -178,7 +198,7 @@ class _Windows(NamedTuple):
 
 
 def _robust_plane(design: NDArray, values: NDArray, weight: NDArray) -> NDArray[np.float64]:
-    """Weighted least squares with Cauchy's weights."""
+    """Solve weighted least squares with Cauchy's weights."""
     terms, wanted, counts = (torch.from_numpy(x).double() for x in (design, values, weight))
 
     def weigh(rest: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Colour of unseen pixels by example: that of the seen pixels most alike in brightness, texture and place.
+"""Colour of unseen pixels by example: that of the seen pixels most similar in brightness, texture and place.
 
 Nearest neighbours among alpha's own seen pixels (Welsh et al. 2002 colour a grey image so, by another one).
 """
@@ -23,11 +23,12 @@ Plane = NDArray[np.float32]
 class ExampleSettings:
     """Settings of the search for examples. Lengths are pixels of alpha."""
 
-    neighbours: int = size(16, "Examples of a pixel; half or twice as many do as well")
-    scale: float = tuned(10.0, "Middlebury, tune half: weight of brightness, its means and its deviations")
+    neighbours: int = size(5, "Examples of a pixel; half or twice as many do as well")
     radii: tuple[int, int] = size((2, 6), "Radii of the windows of means and deviations")
-    place: float = tuned(
-        110.0, "Middlebury, tune half: pixels whose distance counts as a difference of brightness of .1"
+    place: tuple[float, float] = tuned(
+        (1200.0, 1800.0),
+        "Middlebury, tune half: pixels whose distance counts as much as black beside white, across "
+        "the searched segments and along them: what is occluded is long across",
     )
     seen: float = size(0.5, "Weight above which a pixel counts as seen")
     sources: int = size(60_000, "Seen pixels searched at most")
@@ -36,17 +37,27 @@ class ExampleSettings:
 
 SETTINGS = ExampleSettings()
 EVERY = (slice(None, None, 2),) * 2
-"""Size: every second pixel is looked up."""
+"""Size: every second pixel is searched for."""
 
 
 def by_examples(
-    colour: Float[NDArray, "c h w"], alpha: Float[NDArray, "h w"], weight: Float[NDArray, "h w"]
+    colour: Float[NDArray, "c h w"],
+    alpha: Float[NDArray, "h w"],
+    weight: Float[NDArray, "h w"],
+    directions: Float[NDArray, "2 2"],
 ) -> Float[NDArray, "c h w"]:
-    """Colour with the pixels of low weight replaced by the mean of their nearest seen pixels.
+    """Replace the colour of pixels of low weight by the mean of their nearest seen pixels.
 
-    `weight` (0 to 1) is how far a pixel's colour is its own. Every second pixel in each direction is looked
-    up among such pixels, and what is between them is interpolated. Where fewer are seen than a mean takes,
-    colour is returned as it is.
+    Every second pixel in each direction is searched for among such pixels, and pixels between them are
+    interpolated.
+
+    Args:
+        weight: 0 to 1; a pixel counts as seen above a half.
+        directions: mean outer product of the unit vectors (x, y) along the segments that were searched;
+            examples count as nearer along these.
+
+    Returns:
+        Colour at all pixels; as given where fewer are seen than a mean takes.
     """
     seen = weight > SETTINGS.seen
     near = cv2.dilate((~seen).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
@@ -56,7 +67,7 @@ def by_examples(
     sources[::step, ::step] = seen_there[::step, ::step]
     if np.count_nonzero(sources) < SETTINGS.neighbours or not asked.any():
         return colour
-    features = [(plane[sources], plane[asked]) for plane in _features(alpha)]
+    features = [(plane[sources], plane[asked]) for plane in _features(alpha, directions)]
     known, wanted = (np.stack(planes, 1) for planes in zip(*features))
     tree = cKDTree(known, compact_nodes=False, balanced_tree=False)
     _, index = tree.query(wanted, k=SETTINGS.neighbours, eps=SETTINGS.error)
@@ -71,25 +82,27 @@ def by_examples(
 
 
 def _between(plane: Plane, hw: tuple[int, int]) -> Plane:
-    """A plane of every second pixel, from the first, at all pixels, by linear interpolation."""
+    """Enlarge a plane of every second pixel, from the first, to all pixels, by linear interpolation."""
     back = np.array([[0.5, 0, 0], [0, 0.5, 0]], np.float32)
     how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     between: Plane = cv2.warpAffine(plane, back, (hw[1], hw[0]), flags=how, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[assignment]
     return between
 
 
-def _features(alpha: Plane) -> Iterator[Plane]:
-    """Brightness, its means and standard deviations in windows, and place, scaled so that distances compare,
-    of every second pixel."""
+def _features(alpha: Plane, directions: Float[NDArray, "2 2"]) -> Iterator[Plane]:
+    """Yield brightness, its means and standard deviations in windows, and place, of every second pixel.
+
+    They are scaled so that distances compare.
+    """
     alpha = np.ascontiguousarray(alpha, np.float32)
-    scale = np.float32(SETTINGS.scale)
-    yield scale * alpha[EVERY]
-    sides = [(2 * r + 1,) * 2 for r in SETTINGS.radii]
-    means = [cv2.boxFilter(alpha, -1, side) for side in sides]
-    for mean in means:
-        yield scale * mean[EVERY]
-    for mean, side in zip(means, sides):
-        square = cv2.boxFilter(alpha * alpha, -1, side)
-        yield scale * np.sqrt(np.maximum(square - mean * mean, 0))[EVERY]
-    for indices in np.indices(alpha[EVERY].shape, dtype=np.float32):
-        yield indices * np.float32(2 / SETTINGS.place)
+    yield alpha[EVERY]
+    for radius in SETTINGS.radii:
+        side = (2 * radius + 1,) * 2
+        mean, square = cv2.boxFilter(alpha, -1, side), cv2.boxFilter(alpha * alpha, -1, side)
+        yield mean[EVERY]
+        yield np.sqrt(np.maximum(square - mean * mean, 0))[EVERY]
+    across, along = (1 / pixels**2 for pixels in SETTINGS.place)
+    metric = across * np.eye(2) + (along - across) * directions
+    rows, columns = 2 * np.indices(alpha[EVERY].shape, dtype=np.float32)
+    for x, y in np.linalg.cholesky(metric).T.astype(np.float32):
+        yield x * columns + y * rows

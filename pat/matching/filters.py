@@ -18,7 +18,13 @@ from arraygeom.fields.protocol import compilable
 
 
 def blurred(images: Float[Tensor, "b 1 h w"], blurs: Sequence[float]) -> Float[Tensor, "b 1 h w"]:
-    """Each blurred with its standard deviation in pixels; 0: as it is."""
+    """Blur each image by a Gaussian with its standard deviation in pixels; 0 leaves it.
+
+    With gradients if the images have some.
+
+    Returns:
+        Images of the same shape.
+    """
 
     def one(image: Tensor, blur: float) -> Tensor:
         if not blur:
@@ -35,7 +41,8 @@ def blurred(images: Float[Tensor, "b 1 h w"], blurs: Sequence[float]) -> Float[T
 
 
 def box_mean(x: Tensor, radius: int) -> Tensor:
-    """Means of planes (*b, h, w) over squares of side 2 `radius` + 1, as far as these are on the image."""
+    """Compute means of planes (*b, h, w) over squares of side 2 `radius` + 1, as far as these are on the
+    image."""
     side = 2 * radius + 1
     if compilable(x) and not x.requires_grad:
         return _box_mean_of_numbers(x, radius)
@@ -44,7 +51,7 @@ def box_mean(x: Tensor, radius: int) -> Tensor:
 
 
 def _box_mean_of_numbers(x: Tensor, radius: int) -> Tensor:
-    """The same by OpenCV's running sums: a third of the time."""
+    """Compute the same by OpenCV's running sums, in a third of the time."""
     planes = x.detach().contiguous().flatten(0, -3).numpy()
     before = (np.minimum(np.arange(n), radius) for n in planes.shape[1:])
     rows, columns = (some + some[::-1] + 1 for some in before)
@@ -59,7 +66,12 @@ def _box_mean_of_numbers(x: Tensor, radius: int) -> Tensor:
 class LocalMoments(NamedTuple):
     """Moments of bands (B, C, H, W) and an image (B, 1, H, W) within squares around each pixel.
 
-    `bands` and `image` are the means.
+    Attributes:
+        bands: means of the bands.
+        image: means of the image.
+        variance_of_bands: variances of the bands.
+        variance_of_image: variances of the image.
+        covariance: covariances of each band with the image.
     """
 
     bands: Tensor
@@ -72,7 +84,7 @@ class LocalMoments(NamedTuple):
     def within(
         cls, radius: int, bands: Float[Tensor, "b c h w"], image: Float[Tensor, "b 1 h w"]
     ) -> LocalMoments:
-        """Those within squares of so many pixels to either side."""
+        """Compute the moments within squares of so many pixels to either side."""
         mean = partial(box_mean, radius=radius)
         centre, middle = mean(bands), mean(image)
         variation = (mean(bands.square()) - centre.square()).clamp(min=0)
@@ -80,19 +92,37 @@ class LocalMoments(NamedTuple):
         return cls(centre, middle, variation, variance, mean(bands * image) - centre * middle)
 
     def slope(self, floor: float) -> Float[Tensor, "b c h w"]:
-        """The slope of the bands' regression on the image, whose variance is regularised by the floor."""
+        """Return the slope of the bands' regression on the image, whose variance is regularised
+        by the floor."""
         return self.covariance / (self.variance_of_image + floor)
 
 
 def filled(planes: NDArray, weight: NDArray, guide: NDArray, how: tuple[float, float]) -> NDArray:
-    """The weighted mean of planes (c, h, w) over what is connected in the guide. Weights are positive."""
+    """Compute the weighted mean of planes (c, h, w) over connected regions of the guide.
+
+    Args:
+        weight: positive weight (h, w) of each pixel.
+        guide: bytes (h, w).
+        how: strength of smoothing, and 8-bit difference of an edge.
+
+    Returns:
+        Planes at all pixels.
+    """
     total, *sums = smoothed([weight, *(plane * weight for plane in planes)], guide, how)
     return np.stack([plane / total for plane in sums])
 
 
 def smoothed(planes: Sequence[NDArray], guide: NDArray[np.uint8], how: tuple[float, float]) -> list[NDArray]:
-    """Planes smoothed where the guide shows no edge. One after the other: the smoother is not for several
-    threads, but has its own."""
+    """Smooth planes where the guide shows no edge.
+
+    One after the other: the smoother is not for several threads, but has its own.
+
+    Args:
+        how: strength of smoothing, and 8-bit difference of an edge.
+
+    Returns:
+        Planes in float32.
+    """
     smoother = cv2.ximgproc.createFastGlobalSmootherFilter(guide, *how)
     return [smoother.filter(np.ascontiguousarray(plane, np.float32)) for plane in planes]
 
@@ -100,7 +130,10 @@ def smoothed(planes: Sequence[NDArray], guide: NDArray[np.uint8], how: tuple[flo
 def nearest_known(
     x: Float[Tensor, "*b h w"], valid: Bool[Tensor, "*b h w"], axis: int, back: bool
 ) -> Float[Tensor, "*b h w"]:
-    """The value of the nearest known pixel before (or after) along an axis; the pixel's own if none is."""
+    """Return the value of the nearest known pixel before (or, if `back`, after) along an axis.
+
+    The pixel's own value if there is none.
+    """
     if back:
         return nearest_known(x.flip(axis), valid.flip(axis), axis, False).flip(axis)
     index = torch.arange(x.shape[axis], device=x.device).view(-1, *[1] * (-1 - axis))
@@ -109,5 +142,5 @@ def nearest_known(
 
 
 def numpy_of(x: Tensor) -> NDArray[np.float32]:
-    """A float32 copy on the CPU, in one piece."""
+    """Return a contiguous float32 array on the CPU, detached."""
     return np.ascontiguousarray(x.detach().cpu().numpy(), np.float32)

@@ -1,4 +1,4 @@
-"""What is matched and fused: alpha's image, and each beta's image and field of alpha's pixels in it."""
+"""Inputs of matching and fusion: alpha's image, and each beta's image and field of alpha's pixels in it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ from ..support.settings import size
 
 @dataclass(frozen=True)
 class InputsSettings:
-    """Of the pieces in which large frames are matched at full size, the same whatever memory is allowed."""
+    """Settings of the pieces in which large frames are matched at full size, the same for any
+    memory limit."""
 
     halo: int = size(128, "Their halo, pixels")
     at_once: int = size(1_200_000, "Pixels of alpha matched at once")
@@ -33,13 +34,17 @@ SETTINGS = InputsSettings()
 
 @dataclass(frozen=True)
 class Beta:
-    """One beta's image (B, C, H, W) and the field of alpha's pixels in it.
+    """One beta's image with the field of alpha's pixels in it.
 
-    `offset` is the (x, y) of its first pixel in the whole image, other than (0, 0) for a part of an image.
-    `cameras` are the names of those whose bands it shows, one after another.
-    `track` gives the tracks of alpha's pixels (*n, 2) in the image of a calibrated beta. With `around` each
-    segment is around what is known of its own pixel: positions along the segments of two pixels are not to be
-    compared.
+    Attributes:
+        image: (B, C, H, W).
+        field: segments or positions of alpha's pixels.
+        offset: (x, y) of its first pixel in the whole image; other than (0, 0) for a part of an image.
+        track: function from alpha's pixels (*n, 2) to their tracks in the image; None for an uncalibrated
+            beta.
+        around: True if each segment is around a known depth of its own pixel: positions along the segments of
+            two pixels cannot be compared.
+        cameras: names of the cameras whose bands it shows, one after another.
     """
 
     image: Float[Tensor, "b c h w"]
@@ -52,14 +57,18 @@ class Beta:
 
 @dataclass(frozen=True)
 class Inputs:
-    """Alpha's image (B, C, H, W) and the betas, which may be of any sizes.
+    """Alpha's image and the betas, which may be of any sizes.
 
-    Parts of betas are cut at whole multiples of `multiple` pixels, `beta_halo` pixels around the segments.
-    `luminance` is alpha's share of the result's, for networks that keep it; the rest is beta's. `bands` are
-    those of the result: so many, whose luminance (the mean, if they are not three) is what alpha sees, or
-    None: those of all betas, of which alpha may see any combination. `sees_luma` is whether RGB betas' luma
-    is about what alpha sees, as far as is known: not in the near infrared.
-    `learned`: the networks of choice and certainty take part in matching.
+    Attributes:
+        alpha: image (B, C, H, W).
+        betas: the betas.
+        multiple: pixels at whose multiples parts of betas are cut.
+        beta_halo: pixels around the segments that parts of betas include.
+        luminance: alpha's share of the result's luminance, for networks that keep it; the rest is beta's.
+        bands: number of the result's bands, whose luminance (the mean, if they are not three) alpha sees;
+            None for the bands of all betas, of which alpha may see any combination.
+        learned: True if the networks of choice and certainty take part in matching.
+        sees_luma: True if alpha sees about RGB betas' luma, as far as is known: not in the near infrared.
     """
 
     alpha: Float[Tensor, "b c h w"]
@@ -73,7 +82,7 @@ class Inputs:
 
     @classmethod
     def of(cls, alpha: Tensor, images: Sequence[Tensor], fields: Sequence[FieldOnGrid]) -> Inputs:
-        """Alpha with each beta's image and field, in order."""
+        """Return inputs of alpha with each beta's image and field, in order."""
         return cls(alpha, tuple(Beta(image, field) for image, field in zip(images, fields, strict=True)))
 
     @property
@@ -83,26 +92,29 @@ class Inputs:
 
     @property
     def cameras(self) -> list[tuple[str, ...]]:
-        """The names of each beta's cameras; of betas without any, their numbers from 1."""
+        """Names of each beta's cameras; of betas without any, their numbers from 1."""
         return [beta.cameras or (str(number),) for number, beta in enumerate(self.betas, 1)]
 
     @property
     def nbytes(self) -> int:
-        """Memory of images and fields."""
+        """Memory of images and fields, bytes."""
         return self.alpha.nbytes + sum(beta.image.nbytes + beta.field.nbytes for beta in self.betas)
 
     @property
     def pieces(self) -> list[Tile]:
-        """The pieces in which a frame is matched: one, or those with the least work of a size that fits into
-        memory (`InputsSettings`)."""
+        """Pieces in which a frame is matched: one, or those with the least work of a size that fits into
+        memory."""
         if math.prod(self.hw) <= SETTINGS.at_once:
             return [whole(self.hw)]
         sides = sides_by_work(self.hw, SETTINGS.halo, self.multiple, SETTINGS.at_once)
         return list(tiles_of(self.hw, sides[0], SETTINGS.halo))
 
     def in_pieces(self, make: Callable[..., Any], *more: Any) -> Any:
-        """Planes (..., h, w), or several, put together from what is made of each piece of these inputs, and
-        of what is given besides, cut alike."""
+        """Apply a function to each piece of these inputs, and of `more`, cut alike, and assemble the results.
+
+        Returns:
+            Planes (..., h, w), one or several, as the function returns.
+        """
         pieces = self.pieces
         if len(pieces) == 1:
             return make(self, *more)
@@ -111,15 +123,17 @@ class Inputs:
 
     @property
     def can_agree(self) -> bool:
-        """Whether all betas, of which there are several or one `around` what is known, are calibrated and
-        have straight fields, of one frame."""
+        """True if all betas are calibrated and have straight fields, of one frame.
+
+        There must be several, or one with segments `around` a known depth.
+        """
         fields = [beta.field.pixels for beta in self.betas]
         one = len(self.alpha) == 1 and all(field is not None and len(field.valid) == 1 for field in fields)
         several = len(fields) > 1 or any(beta.around for beta in self.betas)
         return several and one and all(beta.track is not None for beta in self.betas)
 
     def shows_all_bands(self, beta: Beta) -> bool:
-        """Whether the beta is one of several of which some show all bands of the result, and shows them."""
+        """Return True if the beta is one of several and shows all bands of the result."""
         return len(self.betas) > 1 and beta.image.shape[1] == self.bands
 
     @property
@@ -128,7 +142,8 @@ class Inputs:
         return [replace(self, betas=(beta,)) for beta in self.betas]
 
     def cut(self, box: Box) -> Inputs:
-        """A part of alpha, (top, bottom, left, right), with the part of each beta that its segments touch."""
+        """Return a part of alpha, (top, bottom, left, right), with the part of each beta that its segments
+        touch."""
         top, bottom, left, right = box
         return replace(
             self,
@@ -137,7 +152,8 @@ class Inputs:
         )
 
     def touched(self, beta: Beta, box: Box, step: int = 2) -> Box:
-        """The part of a beta the segments of every `step`-th pixel of a box of alpha touch, with the halo."""
+        """Return the part of a beta that the segments of every `step`-th pixel of a box of alpha touch, with
+        the halo."""
         hw = beta.image.shape[-2], beta.image.shape[-1]
         return box_around(_ends_in(beta.field, box, step), hw, self.beta_halo, self.multiple)
 
@@ -156,7 +172,8 @@ def track_in(
     scale: float,
     offset: tuple[float, float],
 ) -> Callable[[Tensor], Track]:
-    """Tracks of pixels that are those of `whole(x)` in alpha, in pixels of beta times a scale plus offset."""
+    """Return tracks of pixels x that are `whole(x)` in alpha, in pixels of beta times a scale
+    plus an offset."""
 
     def changed(v: Tensor) -> Tensor:
         return torch.cat([scale * v[..., :2] + v.new_tensor(offset) * v[..., 2:], v[..., 2:]], -1)
@@ -165,15 +182,21 @@ def track_in(
 
 
 def ends_of(locations: Segments | Positions) -> Float[Tensor, "n 2"]:
-    """The ends of valid segments, or the positions that count."""
+    """Return the ends of valid segments, or the positions that count."""
     if isinstance(locations, Positions):
         return locations.xy[locations.mask]
     return torch.cat([locations.start[locations.valid], locations.end[locations.valid]])
 
 
 def box_around(points: Float[Tensor, "n 2"], hw: HW, halo: int, multiple: int) -> Box:
-    """The part of an image around points (x, y), or what is nearest to them, with a halo, corners at whole
-    multiples or the end."""
+    """Return the part of an image around points (x, y), with a halo and corners at whole multiples or the
+    end.
+
+    Points off the image count as the nearest pixel.
+
+    Returns:
+        Rows and columns: top, bottom, left, right.
+    """
     if not len(points):
         return 0, multiple, 0, multiple
     points = points.clamp(min=0).minimum(
@@ -185,8 +208,10 @@ def box_around(points: Float[Tensor, "n 2"], hw: HW, halo: int, multiple: int) -
 
 
 def _ends_in(field: FieldOnGrid, box: Box, step: int) -> Float[Tensor, "n 2"]:
-    """The ends of the segments of every `step`-th pixel of a box; of positions, the corners of what each row
-    touches, asked for row by row."""
+    """Return the ends of the segments of every `step`-th pixel of a box.
+
+    Of positions, the corners of the box that each row touches, asked for row by row.
+    """
     top, bottom, left, right = box
     rows, columns = torch.arange(top, bottom, step), torch.arange(left, right, step)
     if field.pixels is None:

@@ -1,4 +1,4 @@
-"""Photometric similarity of two views, by which matches, colours and motion are weighed."""
+"""Photometric similarity of two views, by which matches, colours and motion are weighted."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .filters import box_mean
 
 @dataclass(frozen=True)
 class LikenessSettings:
-    """Brightness is 0 to 1."""
+    """Settings of the similarity. Brightness is 0 to 1."""
 
     unlike: float = tuned(0.07, "Middlebury: difference of brightness at which likeness is 1 / e")
 
@@ -24,5 +24,10 @@ UNLIKE = SETTINGS.unlike
 
 
 def likeness(difference: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b 1 h w"]:
-    """1 where two images are equally bright around a pixel, 0 where they are not."""
+    """Compute photometric similarity: 1 where two images are equally bright around a pixel, 0 where they are
+    not.
+
+    Args:
+        difference: difference of brightness.
+    """
     return torch.exp(-(box_mean(difference.abs(), 1) / UNLIKE).square())

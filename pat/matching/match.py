@@ -1,4 +1,4 @@
-"""The door of this room: `match` says where alpha's pixels are in each beta, and what betas show there."""
+"""The entry of this room: `match` finds alpha's pixels in each beta, and the betas' bands there."""
 
 from __future__ import annotations
 
@@ -30,15 +30,25 @@ LOG = logging.getLogger(__name__)
 
 
 Matcher = Callable[[Inputs], Matches]
-"""What `fuse` asks for matches of inputs, sides whole multiples of `inputs.multiple`: `match` or yours."""
+"""Function that `fuse` calls to match inputs, with sides at whole multiples of `inputs.multiple`: `match` or
+your own."""
 
 
 def match(inputs: Inputs, choice: Choice | None = None) -> Matches:
-    """Match alpha with every beta, say how certain each match is, and transfer the betas' bands to alpha's
-    view; with gradients as `transferred`, and of the positions. `choice` is another one than ships. Without
-    `inputs.learned` matches have no certainty, and are semi-global ones with a left-right check.
+    """Match alpha with every beta, estimate the certainty of each match, and transfer the betas' bands to
+    alpha's view.
 
-    Raises ValueError for a beta whose field is not of straight segments, and for an alpha of odd sides.
+    With gradients as `transferred`, and of the positions. Without `inputs.learned` matches have no certainty,
+    and are semi-global ones with a left-right check.
+
+    Args:
+        choice: network of the choice between disparities; None for the one that ships.
+
+    Returns:
+        The matches, with `colours`.
+
+    Raises:
+        ValueError: for a beta whose field is not of straight segments, and for an alpha of odd sides.
     """
     if any(side % FINE for side in inputs.hw):
         h, w = inputs.hw
@@ -58,14 +68,22 @@ def match(inputs: Inputs, choice: Choice | None = None) -> Matches:
 
 
 def located(inputs: Inputs) -> Matches:
-    """Where alpha's pixels are in each beta, no colours; of several calibrated betas, where all agree."""
+    """Match alpha's pixels in each beta, without colours; for several calibrated betas, where all agree.
+
+    Returns:
+        The matches, detached, without choice or certainty.
+    """
     of_each = in_each_beta(inputs)
     return agreed(inputs, of_each) if inputs.can_agree else of_each
 
 
 @torch.no_grad()
 def in_each_beta(inputs: Inputs) -> Matches:
-    """The matches in each beta as if it were the only one."""
+    """Match each beta as if it were the only one.
+
+    Returns:
+        The matches, detached.
+    """
     of_betas = []
     for number, one in enumerate(inputs.by_beta, 1):
         LOG.info("matching beta %d of %d", number, len(inputs.betas))
@@ -74,8 +92,12 @@ def in_each_beta(inputs: Inputs) -> Matches:
 
 
 def located_in_one(inputs: Inputs) -> BetaMatches:
-    """Semi-global matches in the one beta: at half the size for the whole frame, then at full size around
-    those."""
+    """Match the one beta semi-globally: at half the size for the whole frame, then at full size around those
+    matches.
+
+    Returns:
+        The matches.
+    """
     comparison = Comparison.of(inputs.alpha, inputs.betas[0].image, seen_mix(inputs))
     halves = comparison.half_views(inputs.alpha, inputs.betas[0].image)
     half = matched_at_half_size(halves, inputs.betas[0].field.of_blocks(FINE))
@@ -90,8 +112,11 @@ def located_in_one(inputs: Inputs) -> BetaMatches:
 
 
 def seen_mix(inputs: Inputs) -> SpectralMix | None:
-    """The combination of the one beta's bands that is most like alpha, on reduced images; None, for luma,
-    where the result's bands are known or there is one alone."""
+    """Estimate the combination of the one beta's bands that is most similar to alpha, on reduced images.
+
+    Returns:
+        The combination; None, for luma, where the result's bands are known or the beta has one band.
+    """
     alpha, (beta,) = inputs.alpha, inputs.betas
     if inputs.bands is not None or beta.image.shape[1] == 1:
         return None
@@ -110,10 +135,15 @@ def coarse_mix(
     blocks: Segments,
     factor: int,
 ) -> SpectralMix:
-    """The combination of beta's bands that is most like alpha, found on images reduced by `factor`.
+    """Estimate the combination of beta's bands that is most similar to alpha, on images reduced by `factor`.
 
-    `segments` (B or 1, h / factor, w / factor) and `blocks` (half as many) are of the centres of blocks of
-    alpha's pixels, in pixels of the whole beta.
+    Args:
+        segments: segments (B or 1, h / factor, w / factor) of the centres of blocks of alpha's pixels, in
+            pixels of the whole beta.
+        blocks: the same of half as many blocks.
+
+    Returns:
+        The combination.
     """
     coarse_alpha, bands = avg_pool2d(alpha, factor), avg_pool2d(beta, factor)
     comparison = Comparison.of(coarse_alpha, bands, SpectralMix.equal(bands))

@@ -1,4 +1,4 @@
-"""Results of matching: where alpha's pixels are in each beta, and the bands of the beta there."""
+"""Results of matching: positions of alpha's pixels in each beta, and the bands of the beta there."""
 
 from __future__ import annotations
 
@@ -21,24 +21,25 @@ from .semi_global import CONSISTENT
 
 
 def is_consistent(facts: Float[Tensor, "b 3 h2 w2"]) -> Float[Tensor, "b 1 h w"]:
-    """1 where the match is consistent."""
+    """Return 1 where the match is consistent, at full size."""
     return enlarged((facts[:, :1] < CONSISTENT).to(facts))
 
 
 CHANNELS = {"disparity": 1, "chosen": 1, "facts": 3, "stated": 2, "certainty": 2}
-"""Channels of each plane of `BetaMatches`."""
+"""Number of channels of each plane of `BetaMatches`."""
 AT_HALF_SIZE = ("facts", "stated", "certainty")
 
 
 class Colours(NamedTuple):
     """Bands of one beta carried to alpha's view, each minus alpha.
 
-    bands: (B, C, H, W), at the match, with the detail that alpha has and beta has not.
-    weight: (B, 1, H, W), how far `bands` count as those of the point that alpha sees, 0 to 1.
-    likeness: (B, 1, H, W), photometric similarity of alpha and beta at the match, 0 to 1; 1 where alpha does
-        not see luma.
-    fills: (B, F, C, H, W), the bands by nearest examples at pixels that beta does not see; before it, where
-        the bands' spectra are not known, their local regression on brightness.
+    Attributes:
+        bands: (B, C, H, W), at the match, with the detail that alpha has and beta lacks.
+        weight: (B, 1, H, W), share to which `bands` count as those of the point that alpha sees, 0 to 1.
+        likeness: (B, 1, H, W), photometric similarity of alpha and beta at the match, 0 to 1; 1 where alpha
+            does not see luma.
+        fills: (B, F, C, H, W), the bands by nearest examples at pixels that beta does not see; before it,
+            where the bands' spectra are not known, their local regression on brightness.
     """
 
     bands: Tensor
@@ -47,8 +48,12 @@ class Colours(NamedTuple):
     fills: Tensor
 
     def cut(self, box: Box, shared: dict[int, Tensor]) -> Colours:
-        """The part at alpha's (top, bottom, left, right); fills that several betas share are shared there,
-        too, by `shared`, keyed by the whole."""
+        """Return the part at alpha's (top, bottom, left, right).
+
+        Args:
+            shared: fills that were cut before, by the id of the whole: fills that several betas share stay
+                shared.
+        """
         index = (..., *slices(box))
         fills = shared.setdefault(id(self.fills), self.fills[index])
         return Colours(self.bands[index], self.weight[index], self.likeness[index], fills)
@@ -58,19 +63,20 @@ class Colours(NamedTuple):
 class BetaMatches:
     """Matches of alpha's H x W pixels in one beta.
 
-    disparity: (B, 1, H, W), the distance of the match from the end of its segment, pixels of beta; where no
-        match passes the left-right check, diffused from where one does.
-    facts: (B, 3, H / 2, W / 2), the left-right error, the margin over other candidates, and the cost; each 0
-        to 1.
-    comparison: the images that were compared.
-    chosen: (B, 1, H, W), the disparity of the surface that alpha sees, which may be occluded in beta; of
-        several betas, the one on which they agree; None before it is chosen.
-    stated: (B, 2, H / 2, W / 2), the choice network's logit that its disparity is right, and the logarithm
-        of its error, pixels; None before one is chosen.
-    certainty: (B, 2, H / 2, W / 2), the probability that beta sees the point and the match is within a pixel
-        of it, and the half-width, in pixels of beta, of the interval around the match that holds the true
-        position in 9 of 10 cases; None where it is not known.
-    colours: beta's bands at the matches; None before they are carried over.
+    Attributes:
+        disparity: (B, 1, H, W), the distance of the match from the end of its segment, pixels of beta; where
+            no match passes the left-right check, diffused from where one does.
+        facts: (B, 3, H / 2, W / 2), the left-right error, the margin over other candidates, and the cost;
+            each 0 to 1.
+        comparison: the images that were compared.
+        chosen: (B, 1, H, W), the disparity of the surface that alpha sees, which may be occluded in beta; of
+            several betas, the one on which they agree; None before it is chosen.
+        stated: (B, 2, H / 2, W / 2), the choice network's logit that its disparity is right, and the
+            logarithm of its error, pixels; None before one is chosen.
+        certainty: (B, 2, H / 2, W / 2), the probability that beta sees the point and the match is within a
+            pixel of it, and the half-width, in pixels of beta, of the interval around the match that holds
+            the true position in 9 of 10 cases; None where it is not known.
+        colours: beta's bands at the matches; None before they are carried over.
     """
 
     disparity: Tensor
@@ -88,27 +94,40 @@ class BetaMatches:
 
     @property
     def surface(self) -> Float[Tensor, "b 1 h w"]:
-        """The disparity of the surface that alpha sees, as far as it is known: the chosen one."""
+        """Disparity of the surface that alpha sees: the chosen one, or the match's before one is chosen."""
         return self.disparity if self.chosen is None else self.chosen
 
     @property
     def confidence(self) -> Float[Tensor, "b 1 h w"]:
-        """The probability that beta sees the point and the match is right, 0 to 1: from `certainty`, else
-        whether the match passes the left-right check."""
+        """Probability that beta sees the point and the match is right, 0 to 1, from `certainty`.
+
+        Without certainty 1 where the match passes the left-right check, else 0.
+        """
         if self.certainty is None:
             return is_consistent(self.facts)
         return interpolate(self.certainty[:, :1].float(), scale_factor=FINE, mode="bilinear").to(self.facts)
 
     @property
     def carried(self) -> Colours:
-        """The colours. Raises ValueError before they are carried over."""
+        """The colours.
+
+        Raises:
+            ValueError: before they are carried over.
+        """
         if self.colours is None:
             raise ValueError("these matches have no colours: give them their images' by `transferred`")
         return self.colours
 
     def positions(self, segments: Segments, hw: HW) -> tuple[Float[Tensor, "b h w 2"], Bool[Tensor, "b h w"]]:
-        """Match positions (x, y) in a beta of this size, by the segments of alpha's pixels, and whether each
-        lies on it."""
+        """Compute match positions (x, y) in a beta of this size.
+
+        Args:
+            segments: segments of alpha's pixels.
+            hw: size of the beta.
+
+        Returns:
+            Positions in beta's pixels, and a mask of those on it.
+        """
         where = matches(segments, self.surface, beyond_edge=True)
         return where, segments.valid & on_image(where, hw)
 
@@ -144,7 +163,7 @@ class BetaMatches:
             )
 
     def cut(self, box: Box, shared: dict[int, Tensor] | None = None) -> BetaMatches:
-        """The part at alpha's (top, bottom, left, right), all even."""
+        """Return the part at alpha's (top, bottom, left, right), all even."""
         whole, half = slices(box), slices([n // FINE for n in box])
         planes = {name: getattr(self, name) for name in CHANNELS if getattr(self, name) is not None}
         cut: dict[str, Any] = {
@@ -156,18 +175,22 @@ class BetaMatches:
 
 @dataclass(frozen=True)
 class Matches:
-    """Those of each beta, in order."""
+    """Matches of each beta, in order.
+
+    Attributes:
+        betas: matches in each beta.
+    """
 
     betas: tuple[BetaMatches, ...]
 
     @property
     def hw(self) -> HW:
-        """Size of the alpha that they are of."""
+        """Size of the alpha to which they belong."""
         return self.betas[0].hw
 
     @property
     def nbytes(self) -> int:
-        """Memory held, of a large frame: colours as float16, fills that betas share counted once."""
+        """Memory held for a large frame, bytes: colours as float16, fills that betas share counted once."""
         colours = [beta.colours for beta in self.betas if beta.colours is not None]
         fills = {id(one.fills): one.fills.numel() for one in colours}
         own = sum(plane.numel() for one in colours for plane in one[:3])
@@ -175,12 +198,13 @@ class Matches:
         return 2 * (own + sum(fills.values())) + sum(planes)
 
     def cut(self, box: Box) -> Matches:
-        """The part at alpha's (top, bottom, left, right). Fills that several betas share stay shared."""
+        """Return the part at alpha's (top, bottom, left, right). Fills that several betas share
+        stay shared."""
         shared: dict[int, Tensor] = {}
         return Matches(tuple(beta.cut(box, shared) for beta in self.betas))
 
     def check(self, inputs: Inputs) -> None:
-        """Raises ValueError unless they are of so many betas, and `BetaMatches.check` has no objection."""
+        """Raise ValueError unless they belong to inputs with so many betas, and pass `BetaMatches.check`."""
         size, betas = self.hw if self.betas else (0, 0), len(inputs.betas)
         if size != inputs.hw or len(self.betas) != betas:
             (h, w), (height, width) = size, inputs.hw

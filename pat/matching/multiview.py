@@ -1,10 +1,11 @@
 """Several betas of one scene: their matches agree on one inverse depth for each pixel of alpha.
 
-What one beta cannot see another can. Each beta is matched alone; of the inverse depths that they propose for
-a pixel, the one that most others support is taken, and where no match is consistent it is diffused. From it
-follow where the pixel is in every beta, and, by a depth buffer, which betas see it. For the depth of what
-alpha sees what was chosen for each beta is proposed, and supports as far as it is certain; for where colours
-are from, what was found in each. Colours of betas that stand in for each other may be at their own matches.
+A point that one beta cannot see another can. Each beta is matched alone; of the inverse depths that they
+propose for a pixel, the one that most others support is taken, and where no match is consistent it is
+diffused. The pixel's positions in every beta follow from it, and, by a depth buffer, the betas that see it.
+For the depth of the surface that alpha sees, the disparity chosen for each beta is proposed, and supports as
+far as it is certain; for the origin of colours, the match in each. Colours of betas that stand in for each
+other may be at their own matches.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ from .semi_global import CONSISTENT, DISPARITY_FILL
 
 @dataclass(frozen=True)
 class MultiviewSettings:
-    """Of the agreement of several betas."""
+    """Settings of the agreement of several betas."""
 
     farthest: float = size(
         8.0, "Half-size pixels between disparities that are 1 in the facts, as in semi-global matching"
@@ -58,24 +59,29 @@ class MultiviewSettings:
 
 SETTINGS = MultiviewSettings()
 NEAR = CONSISTENT * SETTINGS.farthest
-"""A beta supports an inverse depth that is less than this many of its pixels from its own match."""
+"""Distance in its pixels from a beta's own match within which it supports an inverse depth."""
 
 STRIP = 1 << 16
-"""Alpha's pixels compared at a time, in rows: what is computed on the way stays in a core's cache."""
+"""Number of alpha's pixels compared at a time, in rows: intermediate results stay in a core's cache."""
 
 
 class Ambiguity(NamedTuple):
-    """What two betas' inverse depths of alpha's pixels may differ by: own = scale other + plane (x, y, 1).
+    """Difference that two betas' inverse depths of alpha's pixels may have: own = scale other + plane (x, y,
+    1).
 
     As far as it is known from the images alone, the geometry of two views is known up to this (Hartley,
-    Zisserman 2004, chapter 10). Cameras that were found by pairs do not agree on depth but by it.
+    Zisserman 2004, chapter 10). Cameras that were calibrated by pairs agree on depth only by it.
+
+    Attributes:
+        scale: factor of the other's inverse depth.
+        plane: coefficients of x, y and 1.
     """
 
     scale: float
     plane: tuple[float, float, float]
 
     def of(self, track: Track, x: Float[Tensor, "*n 2"]) -> Track:
-        """A beta's tracks as functions of the other's inverse depth, of alpha's pixels `x`."""
+        """Return a beta's tracks as functions of the other's inverse depth, of alpha's pixels `x`."""
         px, py, p = self.plane
         return Track(track.a + (px * x[..., :1] + py * x[..., 1:] + p) * track.b, self.scale * track.b)
 
@@ -85,8 +91,16 @@ NO_AMBIGUITY = Ambiguity(1.0, (0.0, 0.0, 0.0))
 
 @dataclass(frozen=True)
 class MatchedBeta:
-    """One beta at alpha's pixels, (h, w): segments, tracks, matches, their facts, and by how much they
-    support an inverse depth (0: they propose none)."""
+    """One beta at alpha's pixels, (h, w).
+
+    Attributes:
+        segments: search segments.
+        track: tracks by inverse depth.
+        disparity: matches, pixels from the segments' ends.
+        facts: facts of the matches, (3, h, w).
+        weight: amount by which they support an inverse depth; 0 if they propose none.
+        hw: size of the beta.
+    """
 
     segments: Segments
     track: Track
@@ -99,7 +113,8 @@ class MatchedBeta:
     def of(
         cls, beta: Beta, matches: BetaMatches, rows: tuple[int, int], ambiguity: Ambiguity = NO_AMBIGUITY
     ) -> MatchedBeta:
-        """Of a beta with a track and its own matches, at some rows of alpha: from an even to an even one."""
+        """Read a beta with a track and its own matches, at some rows of alpha: from an even to an
+        even one."""
         (top, bottom), pixels = rows, beta.field.straight
         half = slice(top // FINE, bottom // FINE)
         start, end = (x[0, top:bottom].double() for x in (pixels.start, pixels.end))
@@ -119,48 +134,53 @@ class MatchedBeta:
 
     @cached_property
     def extent(self) -> Extent:
-        """That of the segments."""
+        """Lengths and directions of the segments."""
         return Extent.of(self.segments)
 
     @cached_property
     def _end(self) -> Float[Tensor, "h w"]:
-        """How far along their own directions the segments' ends are from beta's first pixel."""
+        """Distance of the segments' ends along their own directions from beta's first pixel."""
         (x, y), (u, v) = self.segments.end.unbind(-1), self.extent.towards.unbind(-1)
         return torch.addcmul(x * u, y, v)
 
     @property
     def inverse_depth(self) -> tuple[Float[Tensor, "h w"], Bool[Tensor, "h w"]]:
-        """Of the matches, and where these propose one."""
+        """Inverse depths of the matches, and a mask of those that propose one."""
         x = self.segments.end + self.disparity[..., None] * self.extent.towards
         depth = depth_from_track(self.track, x)
         valid = depth.valid & self.segments.valid & (self.weight > 0)
         return torch.where(valid, 1 / torch.where(valid, depth.depth, 1.0), 0.0), valid
 
     def _seen(self, inverse_depth: Float[Tensor, "h w"]) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
-        """Beta's pixels as by `Track.at`, x and y apart, which takes a fraction of the time."""
+        """Return beta's pixels as by `Track.at`, x and y apart, which takes a fraction of the time."""
         parts = zip(self.track.a.unbind(-1), self.track.b.unbind(-1))
         x, y, z = (torch.addcmul(p, inverse_depth, d) for p, d in parts)
         z = torch.where(z > FRONT, z, 1.0)
         return x / z, y / z
 
     def disparity_of(self, inverse_depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-        """How far along its segment from the end the point of an inverse depth is, pixels; not clipped."""
+        """Return the distance of the point of an inverse depth from its segment's end, pixels;
+        not clipped."""
         (x, y), (u, v) = self._seen(inverse_depth), self.extent.towards.unbind(-1)
         return torch.addcmul(x * u, y, v) - self._end
 
     def depth_buffer(self) -> Float[Tensor, " n"]:
-        """The nearest inverse depth at each pixel of half of beta's size (alpha's pixels leave no holes in
-        it), row by row, and one more for what is outside: all empty."""
+        """Return an empty depth buffer: the nearest inverse depth at each pixel of half of beta's size, row
+        by row.
+
+        Alpha's pixels leave no holes at that size. One more element is for points outside.
+        """
         return self.disparity.new_zeros(math.prod(-(-n // FINE) for n in self.hw) + 1)
 
     def enter(self, inverse_depth: Float[Tensor, "h w"], buffer: Float[Tensor, " n"]) -> None:
-        """Enter points into a depth buffer."""
+        """Enter points into a depth buffer, in place."""
         buffer.scatter_reduce_(0, self._index(inverse_depth).flatten(), inverse_depth.flatten(), "amax")
 
     def hidden(
         self, inverse_depth: Float[Tensor, "h w"], buffer: Float[Tensor, " n"]
     ) -> Float[Tensor, "h w"]:
-        """By how many pixels the nearest point at the same pixel of beta differs; infinite off the image."""
+        """Return the distance in pixels of the nearest point at the same pixel of beta; infinite off the
+        image."""
         index = self._index(inverse_depth)
         (x, y), (u, v) = self._seen(buffer[index]), self._seen(inverse_depth)
         apart = torch.hypot(x - u, y - v)  # not along the segments: around a known depth they may be points
@@ -174,10 +194,12 @@ class MatchedBeta:
 
 
 class Agreement(NamedTuple):
-    """What the matches of all betas agree on, at alpha's pixels.
+    """Result on which the matches of all betas agree, at alpha's pixels.
 
-    inverse_depth: (1, h, w); known: (1, h, w), whether any match is consistent; facts: (2, h / 2, w / 2),
-    margin and cost of the matches that were taken.
+    Attributes:
+        inverse_depth: (1, h, w).
+        known: (1, h, w), mask of the pixels at which any match is consistent.
+        facts: (2, h / 2, w / 2), margin and cost of the matches that were taken.
     """
 
     inverse_depth: Tensor
@@ -186,7 +208,7 @@ class Agreement(NamedTuple):
 
     @classmethod
     def of(cls, views: Sequence[MatchedBeta], like: Tensor) -> Agreement:
-        """The inverse depth that is supported best, in the type of another tensor."""
+        """Compute the inverse depth with most support, in the type of `like`."""
         proposals = [view.inverse_depth for view in views]
         weights = torch.stack([valid * view.weight for view, (_, valid) in zip(views, proposals)])
         near = [[(v.disparity_of(w) - v.disparity).abs() < NEAR for v in views] for w, _ in proposals]
@@ -205,8 +227,13 @@ class Agreement(NamedTuple):
 
 
 def agreed(inputs: Inputs, matches: Matches) -> Matches:
-    """The matches of each beta, with `disparity` and `facts` from the inverse depths on which all agree; and
-    if one was chosen for each alone, `chosen` from those on which these agree."""
+    """Replace `disparity` and `facts` of each beta by those of the inverse depths on which all betas agree.
+
+    If one was chosen for each beta, `chosen` is replaced by that of the inverse depths on which these agree.
+
+    Returns:
+        The matches.
+    """
     of_betas = [replace(one, chosen=None) for one in matches.betas]
     between = ambiguities(inputs, of_betas)
 
@@ -223,9 +250,17 @@ def agreed(inputs: Inputs, matches: Matches) -> Matches:
 
 @torch.no_grad()
 def with_likeliest_colours(inputs: Inputs, own: Matches, agreed: Matches) -> Matches:
-    """What betas agree on. But of betas that show all bands of the result, whose colours stand in for each
-    other's, `disparity`, where colours are from, is their own match, or where all agree if beta is more like
-    alpha there; and `facts` are of their own matches."""
+    """Return the agreed matches, with the origin of colours at the own match where beta is more similar
+    there.
+
+    Only for betas that show all bands of the result, whose colours stand in for each other's: `disparity` is
+    their own match, or the agreed one if beta is more similar to alpha there; and `facts` are of their own
+    matches.
+
+    Args:
+        own: matches of each beta alone.
+        agreed: matches on which all agree.
+    """
     betas = list(agreed.betas)
     for i, (one, found, same) in enumerate(zip(inputs.by_beta, own.betas, agreed.betas)):
         if inputs.shows_all_bands(inputs.betas[i]):
@@ -234,7 +269,8 @@ def with_likeliest_colours(inputs: Inputs, own: Matches, agreed: Matches) -> Mat
 
 
 def _likelier(piece: Inputs, own: BetaMatches, agreed: BetaMatches) -> Float[Tensor, "b 1 h w"]:
-    """Of a piece with one beta, the disparity of each pixel at which beta is more like alpha."""
+    """Return, of a piece with one beta, the disparity of each pixel at which beta is more similar
+    to alpha."""
     (beta,) = piece.betas
     alpha, other, *_ = own.comparison.views(piece.alpha, beta.image)
     mine, theirs = (
@@ -246,7 +282,8 @@ def _likelier(piece: Inputs, own: BetaMatches, agreed: BetaMatches) -> Float[Ten
 def _of_all(
     inputs: Inputs, views: Sequence[Callable[[tuple[int, int]], MatchedBeta]], initial: Sequence[BetaMatches]
 ) -> Iterator[BetaMatches]:
-    """The matches of each beta from the inverse depths on which all agree; `views` are by rows of alpha."""
+    """Return the matches of each beta from the inverse depths on which all agree; `views` are by rows of
+    alpha."""
     height, width = inputs.hw
     strips = spans(height, max(STRIP // width // FINE, 1) * FINE)
     parts = [Agreement.of([at(rows) for at in views], inputs.alpha) for rows in strips]
@@ -256,7 +293,11 @@ def _of_all(
 
 
 def ambiguities(inputs: Inputs, of_betas: Sequence[BetaMatches]) -> list[Ambiguity]:
-    """Of each beta against that whose matches tell most: none unless clearly more pixels agree with one."""
+    """Estimate the ambiguity of each beta against that with the most informative matches.
+
+    Returns:
+        One per beta, in order; none unless clearly more pixels agree with one.
+    """
     step = max(inputs.hw[0] // SETTINGS.sampled_rows // FINE, 1) * FINE
     rows = [(top, top + FINE) for top in range(0, inputs.hw[0], step)]
     sampled = [_Sampled.of(inputs.betas[i], of_betas[i], rows) for i in range(len(of_betas))]
@@ -268,8 +309,11 @@ def ambiguities(inputs: Inputs, of_betas: Sequence[BetaMatches]) -> list[Ambigui
 
 
 class _Sampled(NamedTuple):
-    """The inverse depths of a beta's matches at some of alpha's pixels, where they are known, and by how many
-    of its pixels a point moves if its inverse depth rises by one."""
+    """Inverse depths of a beta's matches at some of alpha's pixels.
+
+    With a mask of the known ones, and the pixels of beta by which a point moves if its inverse depth rises by
+    one.
+    """
 
     w: Tensor
     known: Tensor
@@ -287,7 +331,7 @@ class _Sampled(NamedTuple):
         return cls(*(torch.cat(planes) for planes in zip(*parts)))
 
     def against(self, other: _Sampled, x: Tensor, y: Tensor) -> Ambiguity:
-        """The ambiguity with which most pixels agree."""
+        """Return the ambiguity with which most pixels agree."""
         both = self.known & other.known
         measured, w, rise, x, y = (plane[both] for plane in (self.w, other.w, self.pixels_per_w, x, y))
         if len(measured) < SETTINGS.sampled_rows:
@@ -310,7 +354,8 @@ class _Sampled(NamedTuple):
 def _most_agreed(
     terms: Float[Tensor, "n k"], measured: Float[Tensor, " n"], rise: Tensor
 ) -> Float[Tensor, " k"]:
-    """The factors of the terms with which most of what is measured agrees; then by least squares of that."""
+    """Return the factors of the terms with which most measured values agree; then by least
+    squares of these."""
     n, k = terms.shape
     size = terms.abs().amax(0).clamp(min=1e-12)
     scaled = terms / size
@@ -329,12 +374,12 @@ def _most_agreed(
 def _agree(
     terms: Tensor, measured: Tensor, rise: Tensor, solutions: Float[Tensor, "k m"]
 ) -> Float[Tensor, "n m"]:
-    """1 where a solution is less than `NEAR` pixels from what is measured."""
+    """Return 1 where a solution is less than `NEAR` pixels from the measured value."""
     return ((terms @ solutions - measured[:, None]).abs() * rise[:, None] < NEAR).to(measured)
 
 
 def _dense(agreement: Agreement, inputs: Inputs) -> Agreement:
-    """Inverse depth diffused to where no match is consistent, and without outliers."""
+    """Diffuse inverse depth to where no match is consistent, and remove outliers."""
     guide = to_bytes(inputs.alpha[0, 0])
     plane, valid = numpy_of(agreement.inverse_depth), agreement.known.cpu().numpy()
 
@@ -355,7 +400,7 @@ def _of_beta(
     strips: list[tuple[int, int]],
     initial: BetaMatches,
 ) -> BetaMatches:
-    """The matches of the beta whose rows `view_of` gives."""
+    """Return the matches of the beta whose rows `view_of` returns."""
     buffer = view_of(strips[0]).depth_buffer()
     for top, bottom in strips:
         view_of((top, bottom)).enter(agreement.inverse_depth[0, top:bottom].to(buffer), buffer)

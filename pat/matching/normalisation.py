@@ -26,7 +26,7 @@ LEAST_WEIGHT = 1e-6
 
 @dataclass(frozen=True)
 class NormalisationSettings:
-    """How far one image is brought to another's brightness and sharpness."""
+    """Settings of the normalisation of one image's brightness and sharpness to another's."""
 
     largest_gain: float = size(4.0, "Of brightness; images that differ by more show different things")
     blurs: tuple[float, ...] = size(
@@ -39,22 +39,27 @@ SETTINGS = NormalisationSettings()
 
 
 class Moments(NamedTuple):
-    """Mean and standard deviation of images, over their last three dimensions, which are kept."""
+    """Mean and standard deviation of images, over their last three dimensions, which are kept.
+
+    Attributes:
+        mean: mean.
+        deviation: standard deviation.
+    """
 
     mean: Tensor
     deviation: Tensor
 
     def gain(self, wanted: Moments, largest: float) -> Tensor:
-        """The factor that makes the standard deviation the wanted one."""
+        """Return the factor that makes the standard deviation the wanted one, at most `largest`."""
         return (wanted.deviation / self.deviation.clamp(min=1e-6)).clamp(max=largest)
 
     def matched(self, image: Tensor, wanted: Moments, largest_gain: float = math.inf) -> Tensor:
-        """An image of these moments, with the wanted ones; not cut to 0..1."""
+        """Return an image of these moments with the wanted ones; not clipped to 0..1."""
         return (image - self.mean) * self.gain(wanted, largest_gain) + wanted.mean
 
 
 def moments(image: Float[Tensor, "*b c h w"], weight: Float[Tensor, "*b 1 h w"] | None = None) -> Moments:
-    """The moments of whole images, or where the weight is."""
+    """Compute the moments of whole images, or of the pixels with weight."""
     if weight is None:
         deviation, mean = torch.std_mean(image, (-3, -2, -1), keepdim=True)
         return Moments(mean, deviation)
@@ -69,23 +74,27 @@ def normalised(
     *,
     largest_gain: float = math.inf,
 ) -> Float[Tensor, "*b c h w"]:
-    """The image with another's mean and standard deviation.
+    """Return an image with another's mean and standard deviation.
 
-    With a weight, where that is: both show the same point at a pixel there. Statistics of whole images mean
-    little where these show different parts of a scene.
+    Statistics of whole images mean little where these show different parts of a scene.
+
+    Args:
+        weight: weight of pixels at which both show the same point, for images of one size; None for whole
+            images.
+        largest_gain: largest factor of the standard deviation.
     """
     return moments(image, weight).matched(image, moments(like, weight), largest_gain)
 
 
 def mean_moments(images: Iterable[Float[Tensor, "c h w"]]) -> Moments:
-    """The means of several images' moments."""
+    """Compute the means of several images' moments."""
     return Moments(*(torch.stack(tensors).mean(0) for tensors in zip(*map(moments, images))))
 
 
 def explained_share(
     image: Float[Tensor, "b 1 h w"], of: Float[Tensor, "b 1 h w"], weight: Float[Tensor, "b 1 h w"]
 ) -> Float[Tensor, "b 1 1 1"]:
-    """The share of one image's variance another explains where weighted, 0 if one is the other's negative.
+    """Compute the share of one image's variance that another explains where weighted, 0 if they are opposite.
 
     Small for an alpha in the near infrared: its detail says little of visible colours.
     """
@@ -100,8 +109,14 @@ def _weighted_mean(image: Tensor, weight: Tensor) -> Float[Tensor, "*b 1 1 1"]:
 
 
 class ComparedViews(NamedTuple):
-    """Alpha and beta for comparison, (B, 1, ., .), equally bright and sharp; alpha in 8 bits (B, h, w); and
-    the standard deviation, in pixels, by which each alpha was blurred to be as sharp as beta."""
+    """Alpha and beta for comparison, equally bright and sharp.
+
+    Attributes:
+        alpha: (B, 1, h, w).
+        beta: (B, 1, hb, wb).
+        guides: alpha in 8 bits, (B, h, w).
+        blurs: standard deviation, in pixels, by which each alpha was blurred to be as sharp as beta.
+    """
 
     alpha: Tensor
     beta: Tensor
@@ -110,10 +125,11 @@ class ComparedViews(NamedTuple):
 
 
 class Normalisation(NamedTuple):
-    """How beta's brightness is normalised to alpha's, and how either is then blurred, for each of a batch.
+    """Normalisation of beta's brightness to alpha's, and blur of the sharper one, for each of a batch.
 
-    level: (3, B, 1, 1, 1): what is subtracted from beta, the factor, what is added.
-    blurs: standard deviations for alpha, and for beta, in pixels; 0 for the one that is not the sharper.
+    Attributes:
+        level: (3, B, 1, 1, 1), the value subtracted from beta, the factor, the value added.
+        blurs: standard deviations for alpha, and for beta, in pixels; 0 for the one that is not the sharper.
     """
 
     level: Tensor
@@ -121,22 +137,23 @@ class Normalisation(NamedTuple):
 
     @classmethod
     def of(cls, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b 1 hb wb"]) -> Normalisation:
-        """What makes the means and standard deviations the same, and then the sharpness."""
+        """Estimate the normalisation that makes means and standard deviations equal, and then the
+        sharpness."""
         measured, wanted = moments(beta), moments(alpha)
         level = torch.stack([measured.mean, measured.gain(wanted, SETTINGS.largest_gain), wanted.mean])
         return cls(level, equalising_blurs(alpha, measured.matched(beta, wanted, SETTINGS.largest_gain)))
 
     def normalised(self, beta: Tensor) -> Tensor:
-        """Beta's brightness (or that of a part of it) with alpha's mean and standard deviation."""
+        """Return beta's brightness (or that of a part of it) with alpha's mean and standard deviation."""
         mean, factor, middle = self.level.to(beta)
         return (beta - mean) * factor + middle
 
     def softened(self, alpha: Tensor) -> Tensor:
-        """Alpha (or a part of it), no sharper than beta."""
+        """Return alpha (or a part of it), no sharper than beta."""
         return blurred(alpha, self.blurs[0])
 
     def views(self, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b 1 hb wb"]) -> ComparedViews:
-        """Alpha and beta's brightness, or parts of them, as they are compared."""
+        """Return alpha and beta's brightness, or parts of them, as they are compared."""
         other = blurred(self.normalised(beta), self.blurs[1])
         return ComparedViews(self.softened(alpha), other, to_bytes(alpha[:, 0]), self.blurs[0])
 
@@ -145,9 +162,12 @@ class Normalisation(NamedTuple):
 def equalising_blurs(
     image: Float[Tensor, "b 1 h w"], other: Float[Tensor, "b 1 hb wb"]
 ) -> tuple[list[float], list[float]]:
-    """Standard deviations to blur either with until it is as sharp as the other; 0 for the less sharp.
+    """Compute standard deviations that blur either image to the sharpness of the other; 0 for the less sharp.
 
     Detail that only one has cannot be matched.
+
+    Returns:
+        Pixels for each image of the batch, of `image` and of `other`.
     """
     image_sharpness, other_sharpness = ([_sharpness(p) for p in images] for images in (image, other))
     return [_equal_blur(p, s) for p, s in zip(image, other_sharpness)], [
@@ -156,7 +176,8 @@ def equalising_blurs(
 
 
 def _equal_blur(image: Float[Tensor, "1 h w"], wanted: float) -> float:
-    """The blur after which an image is so sharp: sharpness falls exponentially between two of the blurs."""
+    """Return the blur after which an image is so sharp: sharpness falls exponentially between two of the
+    blurs."""
     less, before = 0.0, _sharpness(image)
     if before <= wanted:
         return less
@@ -169,19 +190,23 @@ def _equal_blur(image: Float[Tensor, "1 h w"], wanted: float) -> float:
 
 
 def _sharpness(image: Float[Tensor, "1 h w"]) -> float:
-    """The mean second difference of the means of 2 x 2 pixels: of fine detail, which blur takes first, and
-    where noise counts less than from pixel to pixel. First differences are of coarser detail, too. None along
-    a side of less than 6 pixels."""
+    """Return the mean second difference of the means of 2 x 2 pixels; 0 along a side of less than 6 pixels.
+
+    It is of fine detail, which blur takes first, and where noise counts less than from pixel to pixel. First
+    differences are of coarser detail, too.
+    """
     half = avg_pool2d(image, FINE)
     differences = (half.diff(n=2, dim=axis).abs() for axis in (-1, -2))
     return sum(float(difference.mean()) for difference in differences if difference.numel()) + 1e-9
 
 
 class Comparison(NamedTuple):
-    """What of a beta's bands is compared with alpha, and how that is brought to alpha's level and sharpness.
+    """Combination of a beta's bands that is compared with alpha, and its normalisation to alpha.
 
-    mix: the combination of bands that alpha sees; None: Rec. 601 luma of three bands, the mean of others.
-    whole, half: how the combination is normalised, and the same at half the size.
+    Attributes:
+        mix: combination of bands that alpha sees; None for Rec. 601 luma of three bands, the mean of others.
+        whole: normalisation of the combination.
+        half: the same at half the size.
     """
 
     mix: SpectralMix | None
@@ -192,28 +217,28 @@ class Comparison(NamedTuple):
     def of(
         cls, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b c hb wb"], mix: SpectralMix | None = None
     ) -> Comparison:
-        """That of whole images of even sides, by this mix."""
+        """Estimate the comparison of whole images of even sides, by this mix."""
         other = combined_bands(beta, mix)
         half = Normalisation.of(avg_pool2d(alpha, 2), avg_pool2d(other, 2))
         return cls(mix, Normalisation.of(alpha, other), half)
 
     def combined(self, beta: Float[Tensor, "b c hb wb"]) -> Float[Tensor, "b 1 hb wb"]:
-        """The combination of beta's bands, or of a part of it."""
+        """Return the combination of beta's bands, or of a part of it."""
         return combined_bands(beta, self.mix)
 
     def views(self, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b c hb wb"]) -> ComparedViews:
-        """Alpha and the combination of beta's bands, or parts of them, as they are compared."""
+        """Return alpha and the combination of beta's bands, or parts of them, as they are compared."""
         return self.whole.views(alpha, self.combined(beta))
 
     def half_views(self, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b c hb wb"]) -> ComparedViews:
-        """The same at half the size."""
+        """Return the same at half the size."""
         return self.half.views(avg_pool2d(alpha, 2), avg_pool2d(self.combined(beta), 2))
 
 
 def combined_bands(
     beta: Float[Tensor, "b c h w"], mix: SpectralMix | None = None
 ) -> Float[Tensor, "b 1 h w"]:
-    """The bands as this mix combines them; without one Rec. 601 luma of three bands, the mean of others."""
+    """Combine the bands by a mix; without one return Rec. 601 luma of three bands, the mean of others."""
     if mix is not None:
         return mix.of(beta)
     return luminance(beta) if beta.shape[1] == 3 else beta.mean(1, keepdim=True)

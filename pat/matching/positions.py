@@ -1,4 +1,4 @@
-"""Where matches are: positions along search segments, from their far ends, and what beta shows there."""
+"""Positions of matches: along search segments, from their far ends, and the bands of beta there."""
 
 from __future__ import annotations
 
@@ -13,24 +13,29 @@ from arraygeom import Segments
 from arraygeom.sampling import on_image, sample
 
 FINE = 2
-"""Matching is done on images this many times smaller."""
+"""Factor by which images are reduced for matching."""
 
 
 class Extent(NamedTuple):
-    r"""Lengths of segments (\*n), and unit vectors from end to start (\*n, 2)."""
+    r"""Lengths and directions of segments.
+
+    Attributes:
+        length: lengths (*n), pixels.
+        towards: unit vectors from end to start (*n, 2); zero where a segment is a point.
+    """
 
     length: Tensor
     towards: Tensor
 
     @classmethod
     def of(cls, segments: Segments) -> Extent:
-        """That of segments; the vector is zero where one is a point."""
+        """Compute the lengths and directions of segments."""
         length = segments.length
         return cls(length, (segments.start - segments.end) / torch.where(length > 0, length, 1.0)[..., None])
 
 
 def reduced(segments: Segments, factor: int) -> Segments:
-    """The same segments in pixels of a beta that is `factor` times smaller."""
+    """Return the same segments in pixels of a beta that is `factor` times smaller."""
     start, end = ((x + 0.5) / factor - 0.5 for x in (segments.start, segments.end))
     return Segments(start, end, segments.valid)
 
@@ -42,10 +47,13 @@ def matches(
     beyond_edge: bool = False,
     extent: Extent | None = None,
 ) -> Float[Tensor, "b h w 2"]:
-    """Where alpha pixels of segments (B or 1, H, W) match, `disparity` from the ends, in beta's pixels.
+    """Compute the positions of matches, `disparity` from the ends of segments (B or 1, H, W), in beta's
+    pixels.
 
-    Disparity may be at half the size. Not beyond the segments' near ends, unless `beyond_edge`. `extent` is
-    the segments', if it is known.
+    Args:
+        disparity: pixels of beta; may be at half the size.
+        beyond_edge: True to allow positions beyond the segments' near ends.
+        extent: extent of the segments; None to compute it.
     """
     length, towards = extent or Extent.of(segments)
     if disparity.shape[-2:] != length.shape[-2:]:
@@ -60,8 +68,12 @@ def at_matches(
     disparity: Float[Tensor, "b 1 _ _"],
     extent: Extent | None = None,
 ) -> tuple[Float[Tensor, "b c h w"], Bool[Tensor, "b 1 h w"]]:
-    """What beta shows at the matches, at its edge where these are beyond it, and where they are not: those of
-    segments that are not valid are nowhere, and what is shown for them says nothing."""
+    """Sample beta at the matches; beyond its edge, at the edge.
+
+    Returns:
+        Bands at alpha's pixels, and a mask of the matches that are on beta. Matches of invalid segments are
+        nowhere, and their bands mean nothing.
+    """
     hw, middle = (beta.shape[-2], beta.shape[-1]), matches(segments, disparity, extent=extent).to(beta)
     position = middle.reshape(len(beta), -1, 2)
     inside = position.clamp(min=0).minimum(position.new_tensor([hw[1] - 1, hw[0] - 1]))
@@ -72,11 +84,11 @@ def at_matches(
 
 
 def normals(segments: Segments) -> Float[Tensor, "*n 2"]:
-    """Unit vectors across the segments; zero where a segment is a point."""
+    """Compute unit vectors across the segments; zero where a segment is a point."""
     direction = Extent.of(segments).towards
     return torch.stack([-direction[..., 1], direction[..., 0]], -1)
 
 
 def enlarged(x: Tensor) -> Tensor:
-    """Planes (*b, h, w) of half the size at full size: each value four times."""
+    """Enlarge planes (*b, h, w) of half the size to full size: each value four times."""
     return x.repeat_interleave(FINE, -1).repeat_interleave(FINE, -2)

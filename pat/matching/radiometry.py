@@ -1,4 +1,4 @@
-"""Which combination of an RGB beta's bands alpha sees; of any bands: `spectral_mix`.
+"""The combination of an RGB beta's bands that alpha sees; of any bands: `spectral_mix`.
 
 The network compares alpha with Rec. 601 luma of an RGB beta and keeps alpha as the result's luma. A real mono
 sensor weighs red, green and blue otherwise, and another exposure or tone curve makes beta darker or flatter.
@@ -28,9 +28,9 @@ from ..support.settings import physics, size, tuned
 
 @dataclass(frozen=True)
 class ResponseSettings:
-    """What is expected of cameras, and of light, which differs between two views of a surface.
+    """Settings of the expectations of cameras, and of light, which differs between two views of a surface.
 
-    Widths of what cameras do are standard deviations, not chosen on images.
+    Widths of cameras' properties are standard deviations, not chosen on images.
     """
 
     sensor: tuple[float, float, float] = physics(
@@ -78,16 +78,19 @@ class ResponseSettings:
 
 SETTINGS = ResponseSettings()
 HUES = torch.tensor(OPPONENT[1:], dtype=torch.float64).T
-"""What weights may change by while their sum stays, (3, 2), of unit length."""
+"""Directions in which weights may change while their sum stays, (3, 2), of unit length."""
 
 
 class Response(NamedTuple):
-    """alpha = weights . (gain * shaded beta^gamma).
+    """Response of alpha: alpha = weights . (gain * shaded beta^gamma).
 
-    The weights' sum is 1, where they are not stated otherwise.
-    explained: the share of alpha's variance at the matches that this explains, 0 to 1.
-    shading: coefficients of `_shading_terms` in the logarithm of a gain that beta's vignetting asks for; none
-        without.
+    Attributes:
+        weights: weights of red, green and blue; their sum is 1.
+        gain: factor of beta's brightness.
+        gamma: power of beta's brightness.
+        explained: share of alpha's variance at the matches that this explains, 0 to 1.
+        shading: coefficients of `_shading_terms` in the logarithm of a gain that corrects beta's vignetting;
+            empty without.
     """
 
     weights: Float[Tensor, "3"]
@@ -98,22 +101,22 @@ class Response(NamedTuple):
 
     @classmethod
     def rec601(cls) -> Response:
-        """Alpha is the luma of beta."""
+        """Return the response of an alpha that is the luma of beta."""
         return cls(torch.tensor(REC601, dtype=torch.float64))
 
     @property
     def is_rec601(self) -> bool:
-        """Whether images need not be changed."""
+        """True if images need not be changed."""
         return self.gain == self.gamma == 1.0 and not self.shading and self.weights.tolist() == list(REC601)
 
     @property
     def explains(self) -> bool:
-        """Whether this is about what alpha sees."""
+        """True if this is about the combination that alpha sees."""
         return self.explained >= SETTINGS.explained
 
     @property
     def exchanged(self) -> bool:
-        """Whether alpha is the luma of beta with red and blue exchanged, and not that of beta as it is."""
+        """True if alpha is the luma of beta with red and blue exchanged, and not that of beta as it is."""
         luma = self.weights.new_tensor(REC601)
         off, other = ((luma - weights).abs().max() for weights in (self.weights, self.weights.flip(0)))
         return self.explains and bool(other < SETTINGS.exchanged < off / 2)
@@ -126,17 +129,18 @@ class Response(NamedTuple):
         return f"alpha is {red:.2f} R + {green:.2f} G + {blue:.2f} B{gain}{gamma}{shading}"
 
     def of_alpha(self, alpha: Float[Tensor, "*b 1 h w"]) -> Float[Tensor, "*b 1 h w"]:
-        """Alpha on the scale of `of_beta`'s luma."""
+        """Return alpha on the scale of `of_beta`'s luma."""
         total = float(self.weights.sum())
         return alpha if total == 1 else alpha / total
 
     def of_beta(self, beta: Float[Tensor, "*b 3 h w"]) -> Float[Tensor, "*b 3 h w"]:
-        """Beta at alpha's exposure, sheared along grey so that its Rec. 601 luma is what alpha sees."""
+        """Return beta at alpha's exposure, sheared along grey so that its Rec. 601 luma is the combination
+        that alpha sees."""
         scaled = self.exposed(beta)
         return scaled + self._shear(scaled)
 
     def exposed(self, beta: Float[Tensor, "*b 3 h w"]) -> Float[Tensor, "*b 3 h w"]:
-        """Beta at alpha's exposure, in its own colours."""
+        """Return beta at alpha's exposure, in its own colours."""
         even = beta * self._brightening(beta) if self.shading else beta
         return self.gain * (even if self.gamma == 1 else even.clamp(min=0) ** self.gamma)
 
@@ -147,7 +151,7 @@ class Response(NamedTuple):
         return (terms.new_tensor(self.shading) @ terms).exp().reshape(h, w).to(beta)
 
     def undone(self, image: Float[Tensor, "*b 3 h w"]) -> Float[Tensor, "*b 3 h w"]:
-        """The fused image sheared back: the weights' combination of its colours is alpha."""
+        """Return the fused image sheared back: the weights' combination of its colours is alpha."""
         return image - self._shear(image)
 
     def _shear(self, image: Tensor) -> Tensor:
@@ -156,11 +160,15 @@ class Response(NamedTuple):
 
 
 ResponseSpec = Literal["fit", "rec601"] | tuple[float, float, float] | Response
-"""What is known of alpha's response: its weights of red, green and blue, or that it is to be fitted."""
+"""Statement on alpha's response: its weights of red, green and blue, or that it is to be fitted."""
 
 
 def stated_response(weights: Sequence[float]) -> Response:
-    """The response of an alpha that is weights . beta. Raises ValueError unless three, none negative."""
+    """Return the response of an alpha that is weights . beta.
+
+    Raises:
+        ValueError: unless there are three weights, none negative or infinite, not all 0.
+    """
     values = torch.tensor([float(w) for w in weights], dtype=torch.float64)
     if values.shape != (3,) or not bool((values >= 0).all() & (values.sum() > 0) & values.isfinite().all()):
         shares = tuple(weights)
@@ -169,7 +177,11 @@ def stated_response(weights: Sequence[float]) -> Response:
 
 
 def given_response(response: ResponseSpec) -> Response:
-    """The response that is given, Rec. 601's if it is to be fitted. Raises ValueError for what is none."""
+    """Return the stated response, or Rec. 601's if it is to be fitted.
+
+    Raises:
+        ValueError: for a value of another kind.
+    """
     if isinstance(response, Response):
         return response
     if not isinstance(response, str):
@@ -183,16 +195,26 @@ def fit(
     bands: Float[Tensor, "3 n"],
     alpha: Float[Tensor, " n"],
     where: Float[Tensor, "n 2"] | None = None,
+    *,
+    vignetting: bool = True,
 ) -> Response:
-    """The most probable response, by points: weights, gain, gamma and vignetting are each as usual or not.
-
-    `where` are the points in beta, in its width and height, from its middle: with them vignetting is found
-    too. Rec. 601's where there are too few points, or where a combination of bands does not explain alpha.
+    """Estimate the most probable response by matched points: weights, gain, gamma and vignetting.
 
     Each explanation is judged by its evidence, the probability of alpha under all responses that it allows
-    (MacKay 1992): what allows more must explain more. Light differs between the views as a smooth function of
-    colour and place, and with brightness (a Gaussian process, by which Kennedy and O'Hagan 2001 model what a
-    model lacks).
+    (MacKay 1992): an explanation that allows more must explain more. Light differs between the views as a
+    smooth function of colour and place, and with brightness (a Gaussian process, by which Kennedy and O'Hagan
+    2001 model the lack of a model).
+
+    Args:
+        bands: beta's bands at the points.
+        alpha: alpha at the points.
+        where: positions of the points in beta, in its width and height, from its middle, with which
+            vignetting is estimated; None without.
+        vignetting: False to leave vignetting out.
+
+    Returns:
+        The response; Rec. 601's where there are too few points, or where no combination of bands explains
+        alpha.
     """
     most, fewest = SETTINGS.points
     step = max(alpha.numel() // most, 1)
@@ -206,7 +228,7 @@ def fit(
     luma, any_weights = (groups.most_probable(kinds) for kinds in (LUMA, KINDS))
     response = points.held(luma, any_weights)
     explained = max(luma.explained, any_weights.explained)
-    if where is not None:
+    if where is not None and vignetting:
         luma, any_weights = (groups.most_probable(kinds, vignetted=True) for kinds in (LUMA, KINDS))
         explained = max(explained, luma.explained, any_weights.explained)
         shaded = points.held(luma, any_weights)
@@ -226,7 +248,8 @@ class _Points(NamedTuple):
     place: Float[Tensor, "n 2"]
 
     def held(self, luma: Response, any_weights: Response) -> Response:
-        """The response with any weights if it holds against that with luma's, else that, else Rec. 601's.
+        """Return the response with any weights if it holds against that with luma's, else that, else Rec.
+        601's.
 
         Weights that need no exposure are held against luma as recorded, not against one exposed to fit.
         """
@@ -238,9 +261,9 @@ class _Points(NamedTuple):
         return any_weights if unlike and self.hold(any_weights, simpler) else exposed
 
     def hold(self, response: Response, simpler: Response) -> bool:
-        """Whether a response explains alpha clearly better than a simpler one, and all over the image.
+        """Return True if a response explains alpha clearly better than a simpler one, and all over the image.
 
-        Things of few hues, and shading that differs between the cameras, make wrong weights fit somewhat
+        Scenes of few hues, and shading that differs between the cameras, make wrong weights fit somewhat
         better in some places: the gain must be large, and many times its standard error over blocks. For
         points without a place the gain alone counts.
         """
@@ -266,13 +289,19 @@ class _Points(NamedTuple):
 
 
 def _shading_terms(where: Float[Tensor, "n 2"]) -> Float[Tensor, "5 n"]:
-    """What vignetting, off its centre too, is made of: 0 in the middle of the image."""
+    """Return the terms of vignetting, off its centre too: 0 in the middle of the image."""
     u, v = where.unbind(-1)
     return torch.stack([u, v, u * u, u * v, v * v])
 
 
 class _Kind(NamedTuple):
-    """A kind of response: weights, whether they may be others about these, and whether the gain is free."""
+    """A kind of response.
+
+    Attributes:
+        weights: weights of the bands.
+        others: True if the weights may differ from these.
+        gain: True if the gain is free.
+    """
 
     weights: tuple[float, float, float]
     others: bool
@@ -281,8 +310,8 @@ class _Kind(NamedTuple):
     def evidence(
         self, gram: Float[Tensor, "g m m"], further: Float[Tensor, " s"]
     ) -> tuple[Float[Tensor, " g"], Float[Tensor, "g m-1"]]:
-        """The logarithm of alpha's probability, up to a constant, if beta has each gamma, and the most
-        probable coefficients.
+        """Return the logarithm of alpha's probability for each gamma, up to a constant, and the best
+        coefficients.
 
         `gram`: the inner products of bands, shading and alpha, whitened; `further`: the expected shading.
         """
@@ -310,14 +339,14 @@ class _Kind(NamedTuple):
         return -misfit / 2, coefficients
 
     def prior(self, gammas: Float[Tensor, " g"]) -> Float[Tensor, " g"]:
-        """The logarithm of the probability of this kind, by each gamma: 1 where the gain is."""
+        """Return the logarithm of the probability of this kind, by each gamma: 1 where the gain is."""
         unusual = (self.weights != REC601) + self.gain
         others = torch.exp(-(gammas.log() / SETTINGS.bend).square() / 2) * (gammas != 1)
         share = SETTINGS.rare * others / others.sum() * self.gain
         return torch.where(gammas == 1, 1 - SETTINGS.rare, share).log() + unusual * math.log(SETTINGS.rare)
 
     def response(self, coefficients: Tensor, gamma: float, explained: float) -> Response:
-        """The response of this kind that has these coefficients of the bands."""
+        """Return the response of this kind that has these coefficients of the bands."""
         gain = float(coefficients.sum()) if self.gain else 1.0
         weights = coefficients / gain if self.others else coefficients.new_tensor(self.weights)
         return Response(weights, gain, gamma, explained)
@@ -328,13 +357,13 @@ KINDS = tuple(
     for weights, others in ((REC601, False), ((1 / 3, 1 / 3, 1 / 3), False), (SETTINGS.sensor, True))
     for gain in (False, True)
 )
-"""Luma, a sensor without filters, or any other; beta exposed as alpha, or otherwise. The first of each is
-as usual."""
+"""Luma, a sensor without filters, or any other; beta exposed as alpha, or otherwise. The first of each is the
+usual one."""
 LUMA = tuple(kind for kind in KINDS if kind.weights == REC601)
 
 
 class _Explanation(NamedTuple):
-    """A response, the logarithm of its probability, and the shading that it asks for further."""
+    """A response, the logarithm of its probability, and the remaining shading."""
 
     evidence: float
     response: Response
@@ -342,12 +371,18 @@ class _Explanation(NamedTuple):
 
 
 class _Groups(NamedTuple):
-    """Means of points that are alike in colour and place.
+    """Means of points that are similar in colour and place.
 
-    points: bands and `_shading_terms` of each point, (8, p); share: of its group's weight; group: which it is
-    in. Of groups y: alpha; level: alpha as a smooth function of colour and place; terms: of `_shading_terms`;
-    counts: of points, wrong ones too; variance: of a group's points about what is smooth; spread: the
-    covariance of y's errors, which are light that differs and noise, as its Cholesky factor.
+    Attributes:
+        points: bands and `_shading_terms` of each point, (8, p).
+        share: share of each point of its group's weight.
+        group: number of each point's group.
+        y: alpha of each group.
+        level: alpha as a smooth function of colour and place.
+        terms: `_shading_terms` of each group.
+        counts: number of points, wrong ones too.
+        variance: variance of a group's points about the smooth function.
+        spread: covariance of y's errors, which are differing light and noise, as its Cholesky factor.
     """
 
     points: Float[Tensor, "8 p"]
@@ -362,7 +397,7 @@ class _Groups(NamedTuple):
 
     @classmethod
     def of(cls, x: Tensor, y: Tensor, where: Tensor) -> _Groups:
-        """Of points. Those are wrong that no smooth function of colour and place explains."""
+        """Group points. Points are wrong if no smooth function of colour and place explains them."""
         grey, least = x.mean(0), SETTINGS.least
         design = torch.cat([x, x * grey, x * grey.square(), _shading_terms(where) * grey])
         ridge = 1e-6 * len(y) * torch.eye(len(design)).to(y)
@@ -389,15 +424,17 @@ class _Groups(NamedTuple):
         return cls(points, share, group, means[5], level, terms, counts, variance, spread)
 
     def most_probable(self, kinds: Sequence[_Kind], *, vignetted: bool = False) -> Response:
-        """The most probable response of these kinds, with vignetting or without."""
+        """Return the most probable response of these kinds, with vignetting or without."""
         shading = self.y.new_zeros(len(self.terms))
         for _ in range(SETTINGS.steps if vignetted else 0):
             shading = shading + self.explained_by(shading, kinds, vignetted=True).further
         return self.explained_by(shading, kinds, vignetted=vignetted).response
 
     def explained_by(self, shading: Tensor, kinds: Sequence[_Kind], *, vignetted: bool) -> _Explanation:
-        """The most probable response of these kinds, without a gamma and with one, this shading taken out of
-        beta; if vignetted, with the shading that is left."""
+        """Return the most probable response of these kinds after this shading is removed from beta.
+
+        Without a gamma and with one; if vignetted, with the shading that is left.
+        """
         gammas = self.y.new_tensor(SETTINGS.gammas)
         _, gram = self._modelled(gammas, shading, vignetted)
         drawn = -shading if vignetted else shading[:0]
@@ -421,7 +458,7 @@ class _Groups(NamedTuple):
     def _most_probable(
         self, gamma: Float[Tensor, ""], kind: _Kind, shading: Tensor, vignetted: bool
     ) -> Float[Tensor, ""]:
-        """The gamma of most evidence near this one, by parabolas through the logarithms of three."""
+        """Return the gamma of most evidence near this one, by parabolas through the logarithms of three."""
         drawn = -shading if vignetted else shading[:0]
         for step in SETTINGS.closer:
             x = gamma.log() + step * torch.arange(-1.0, 2.0).to(gamma)
@@ -434,8 +471,10 @@ class _Groups(NamedTuple):
     def _modelled(
         self, gammas: Float[Tensor, " g"], shading: Tensor, vignetted: bool
     ) -> tuple[Float[Tensor, "g k n"], Float[Tensor, "g m m"]]:
-        """What alpha is made of if beta has each gamma: bands and, if vignetted, further shading; and the
-        inner products of these and alpha, whitened."""
+        """Return the terms of alpha for each gamma, and the inner products of these and alpha, whitened.
+
+        The terms are bands and, if vignetted, further shading.
+        """
         gammas, (bands, terms) = gammas[:, None, None], self.points.split([3, 5])
         bands = self.share * (bands * (shading @ terms).exp()) ** gammas
         bands = bands.new_zeros(*bands.shape[:2], len(self.y)).index_add_(-1, self.group, bands)
@@ -445,8 +484,11 @@ class _Groups(NamedTuple):
         return model, white.mT @ white
 
     def _explained_by(self, model: Float[Tensor, " n"]) -> float:
-        """The share of alpha's variance that a model of the groups explains. Wrong matches among a group's
-        points hardly count, but a group of none but unlikely ones is a material that alpha sees otherwise."""
+        """Return the share of alpha's variance that a model of the groups explains.
+
+        Wrong matches among a group's points hardly count, but a group of none but unlikely ones is a material
+        that alpha sees otherwise.
+        """
         unlike = self.y - self.counts @ self.y / self.counts.sum()
         parts = (self.counts @ (residual.square() + self.variance) for residual in (self.y - model, unlike))
         left, whole = map(float, parts)
@@ -454,8 +496,10 @@ class _Groups(NamedTuple):
 
 
 def _grouped(points: Float[Tensor, "k n"], most: int) -> Int[Tensor, " n"]:
-    """Which of at most so many groups points are in, of points near each other: halves of halves, each cut
-    across where it is widest."""
+    """Return the number of each point's group, of at most `most`, of points near each other.
+
+    Groups are halves of halves, each cut across where it is widest.
+    """
     parts = [torch.arange(points.shape[1])]
     for _ in range(int(math.log2(min(most, points.shape[1] // SETTINGS.points_of_group)))):
         ordered = [

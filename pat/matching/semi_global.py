@@ -1,9 +1,9 @@
 """Semi-global matching along the search segments, before attention samples around the matches.
 
 Attention decides for each alpha pixel alone. Where a surface has little texture that is not enough: there,
-semi-global matching (Hirschmüller 2008) asks for depths that change little from one pixel to the next. Its
+semi-global matching (Hirschmüller 2008) prefers depths that change little from one pixel to the next. Its
 labels are positions along each pixel's own segment, so it works for any rig with straight fields, rectified
-or not: all labels of a segment at half the size, and at full size those of a window around what that found.
+or not: all labels of a segment at half the size, and at full size those of a window around these matches.
 Without gradients.
 """
 
@@ -38,7 +38,7 @@ from .positions import FINE, Extent
 
 @dataclass(frozen=True)
 class SemiGlobalSettings:
-    """The numbers of a run of semi-global matching; penalties are in the unit of `cost`."""
+    """Settings of a run of semi-global matching; penalties are in the unit of `cost`."""
 
     step: float = tuned(12.0, "Source not recorded: penalty of neighbours' labels that differ by one")
     jump: float = tuned(100.0, "Source not recorded: of those that differ by more, where alpha has no edge")
@@ -63,39 +63,48 @@ CONSISTENT, DISPARITY_FILL = HALF_SIZE.consistent, HALF_SIZE.fill
 
 
 class HalfSizeMatches(NamedTuple):
-    """Matches at half size: `disparity` (B, 1, H / 2, W / 2) in pixels of beta; facts as of `BetaMatches`."""
+    """Matches at half size.
+
+    Attributes:
+        disparity: (B, 1, H / 2, W / 2), pixels of beta.
+        facts: as of `BetaMatches`.
+    """
 
     disparity: Tensor
     facts: Tensor
 
     def cut(self, box: Box) -> HalfSizeMatches:
-        """The part at alpha's (top, bottom, left, right), all even."""
+        """Return the part at alpha's (top, bottom, left, right), all even."""
         half = (..., *slices([n // FINE for n in box]))
         return HalfSizeMatches(*(plane[half] for plane in self))
 
 
 class Windows(NamedTuple):
-    """The labels of each pixel: one or two runs of `labels` labels, from `first` (B, h, w, runs), int32. Two
-    runs of at most 5, which do not overlap."""
+    """Labels of each pixel: one or two runs of consecutive labels, which do not overlap.
+
+    Attributes:
+        first: first labels (B, h, w, runs), int32.
+        labels: labels per run; at most 5 if there are two runs.
+    """
 
     first: NDArray[np.int32]
     labels: int
 
     @classmethod
     def all(cls, geometry: _Geometry) -> Windows:
-        """All labels of the longest segment, and one more."""
+        """Return all labels of the longest segment, and one more."""
         first = np.broadcast_to(np.int32(0), (*geometry.length.shape, 1))
         return cls(first, int(max(geometry.length.max(), 0)) + 2)
 
     @property
     def lanes(self) -> tuple[int, int]:
-        """How many runs there are, and in how many lanes each is computed."""
+        """Number of runs, and number of lanes in which each is computed."""
         runs = self.first.shape[-1]
         return runs, kernels.NARROW if runs == 2 else -(-self.labels // kernels.LANES) * kernels.LANES
 
 
 class _Geometry(NamedTuple):
-    """Segments as the kernels want them, in pixels of the reduced beta: (B, h, w, ...), float32.
+    """Segments in the form of the kernels, in pixels of the reduced beta: (B, h, w, ...), float32.
 
     `cut` is 1 where a segment may go on beyond beta's edge.
     """
@@ -107,7 +116,14 @@ class _Geometry(NamedTuple):
 
 
 def matched_at_half_size(views: ComparedViews, blocks: Segments) -> HalfSizeMatches:
-    """Matches of views at half size; `blocks`: the segments of their pixels, in those of the whole beta."""
+    """Match views at half size.
+
+    Args:
+        blocks: segments of their pixels, in pixels of the whole beta.
+
+    Returns:
+        The matches, detached.
+    """
     alpha, beta = views.alpha, views.beta
     geometry = geometry_of(blocks, len(alpha), (FINE * beta.shape[-2], FINE * beta.shape[-1]))
     del blocks
@@ -116,9 +132,16 @@ def matched_at_half_size(views: ComparedViews, blocks: Segments) -> HalfSizeMatc
 
 
 def geometry_of(segments: Segments, batch: int, hw: tuple[int, int], factor: int = FINE) -> _Geometry:
-    """In pixels of a beta so many times smaller. An invalid segment's length is negative: it has no pixel.
+    """Convert segments to pixels of a beta `factor` times smaller, for the kernels.
 
-    Segments that start beyond the centres of beta's outermost pixels may have been cut there.
+    An invalid segment's length is negative: it has no pixel. Segments that start beyond the centres of beta's
+    outermost pixels may have been cut there.
+
+    Args:
+        hw: size of the beta in pixels of the segments.
+
+    Returns:
+        Arrays for each of the batch.
     """
     length, towards = Extent.of(segments)
     last = segments.start.new_tensor([hw[1] - 1, hw[0] - 1])
@@ -137,11 +160,16 @@ def matched_by_labels(
     settings: SemiGlobalSettings,
     facts: int = 3,
 ) -> tuple[Float[Tensor, "b h w"], Float[Tensor, "b h w facts"]]:
-    """Semi-global matching of the labels in each pixel's window: disparity, and the first so many of the
-    facts of `BetaMatches` (1 or 3).
+    """Match views semi-globally over the labels in each pixel's window.
 
-    Where matching back from beta disagrees, disparity is diffused from where it does not, within what is
-    connected in alpha.
+    Where matching back from beta disagrees, disparity is diffused from where it agrees, within connected
+    regions of alpha.
+
+    Args:
+        facts: number of facts to compute, 1 or 3.
+
+    Returns:
+        Disparity in pixels of the beta given, and the first facts of `BetaMatches`.
     """
     alpha, beta = (numpy_of(image[:, 0]) for image in (views.alpha, views.beta))
     disparity, measured = _matched_blocks(alpha, beta, geometry, windows, settings, facts)
@@ -154,11 +182,11 @@ def matched_by_labels(
 
 
 class _Image(NamedTuple):
-    """What the blocks of one image are matched by, and where what they find goes.
+    """Inputs and outputs of the blocks of one image.
 
-    `views` are planes of alpha's size: brightness, first labels, geometry, and what `cost` compares; `other`
-    are the flat planes that it compares them with, of a beta of `hw`. `results`: disparity, facts, and pixels
-    of beta. `claims` are tables of `winners`.
+    `views` are planes of alpha's size: brightness, first labels, geometry, and the planes of `cost`; `other`
+    are the flat planes with which it compares them, of a beta of `hw`. `results`: disparity, facts, and
+    pixels of beta. `claims` are tables of `winners`.
     """
 
     views: tuple[NDArray, ...]
@@ -176,7 +204,7 @@ def _matched_blocks(
     settings: SemiGlobalSettings,
     facts: int,
 ) -> tuple[NDArray, NDArray]:
-    """Disparity (B, h, w) in pixels of the beta given, and so many facts (B, h, w, facts)."""
+    """Return disparity (B, h, w) in pixels of the beta given, and so many facts (B, h, w, facts)."""
     (_, *hw), (_, rows, columns) = alpha.shape, beta.shape
     disparity, place = np.empty(alpha.shape, np.float32), np.empty(alpha.shape, np.int32)
     measured = np.empty((*alpha.shape, facts), np.float32)
@@ -198,12 +226,13 @@ def _matched_blocks(
 
 
 def flat(planes: Sequence[NDArray]) -> tuple[NDArray, ...]:
-    """Planes (h, w, ...) as lists of pixels."""
+    """Return planes (h, w, ...) as lists of pixels."""
     return tuple(plane.reshape(-1, *plane.shape[2:]) for plane in planes)
 
 
 def _boxes(hw: Sequence[int], along: NDArray, labels: int, settings: SemiGlobalSettings) -> list[Tile]:
-    """Blocks and margins: as high as an image with few costs, else longer along the segments than across."""
+    """Return blocks and margins: as high as an image with few costs, else longer along the segments than
+    across."""
     side, margin = settings.block, settings.margin
     if hw[0] * (side + 2 * margin) * labels <= settings.most_costs:
         return list(tiles_of(hw, (hw[0], side), margin))
@@ -213,8 +242,11 @@ def _boxes(hw: Sequence[int], along: NDArray, labels: int, settings: SemiGlobalS
 
 
 def _block(image: _Image, box: Tile, windows: Windows, settings: SemiGlobalSettings) -> None:
-    """What is found of a block. What its pixels claim of beta goes into one of the tables, of which each is
-    of one thread at a time; what all claim is the least of them."""
+    """Match a block and write its results.
+
+    The claims of its pixels on beta go into one of the tables, each of which is used by one thread at a time;
+    the least of them is the claim of all.
+    """
     inner, outer = map(slices, box)
     guide, first, end, along, length, cut, *alpha_planes = (
         np.ascontiguousarray(x[outer]) for x in image.views

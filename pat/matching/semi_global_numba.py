@@ -27,28 +27,31 @@ NO_LABEL = np.uint8(255)
 EDGE = np.float32(4 / 255)
 """Difference of alpha's neighbours that halves the larger penalty."""
 FARTHEST = np.float32(8)
-"""A difference of labels in the left-right check counts as at most this."""
+"""Largest difference of labels in the left-right check."""
 ONE = np.float32(1.0)
 HALF = np.float32(0.5)
 PARTS = 16
 """Sums of costs are whole 16ths in 16 bits: twice as many as floats go through memory in the same time."""
 UNRELATED = np.float32(0.2)
-"""What the second best costs, in the unit of the facts, where a segment has no other label: margins are those
-of right matches then, .16 to .29 on Middlebury, and none of wrong ones, which cost .26 to .29."""
+"""Cost of the second best, in the unit of the facts, where a segment has no other label: margins are those of
+right matches then, .16 to .29 on Middlebury, and none of wrong ones, which cost .26 to .29."""
 WALL = np.int16(30000)
-"""More than a sum of costs along a path can be, in parts."""
+"""Value above any sum of costs along a path, in parts."""
 
 
 @compiled(inline="always")
 def _halves(first, runs, lane):
-    """The first labels of both halves of the vector of a pixel's lanes that begins at `lane`."""
+    """Return the first labels of both halves of the vector of a pixel's lanes that begins at `lane`."""
     return (first[0] + lane, first[0] + lane + NARROW) if runs == 1 else (first[0], first[1])
 
 
 @compiled(inline="always")
 def _places(end, along, low, high, last, rows, columns, out):
-    """Where a vector of labels, whose halves begin at `low` and `high`, is in beta, pixels counted row by
-    row; -1 for those that are not on it or beyond the last."""
+    """Write the pixels of a vector of labels in beta, counted row by row; -1 for those off it or beyond the
+    last.
+
+    The vector's halves begin at `low` and `high`.
+    """
     for k in range(LANES):
         label = np.float32(low + k if k < NARROW else high + k - NARROW)
         column = np.int32(np.floor(end[0] + label * along[0] + HALF))
@@ -59,13 +62,13 @@ def _places(end, along, low, high, last, rows, columns, out):
 
 @compiled(inline="always")
 def _count_within(length, first, count):
-    """How many labels of a run are on a segment."""
+    """Return the number of a run's labels that are on a segment."""
     return min(max(int(np.floor(length + HALF)) + 1 - first, 0), count)
 
 
 @compiled(nogil=True, cache=True)
 def costs(alpha, beta, first, count, end, along, length, cut, rows, columns, out):
-    """Cost of alpha's pixel and beta's by label: out (h, w, runs, lanes), of flat `cost` planes.
+    """Write the cost of alpha's pixel and beta's by label: out (h, w, runs, lanes), of flat `cost` planes.
 
     The label l lies l pixels from `end` along the unit vectors `along`; those beyond `length` are nowhere,
     or, where it is beta's edge that cuts the segment, not seen.
@@ -92,7 +95,7 @@ def costs(alpha, beta, first, count, end, along, length, cut, rows, columns, out
 
 @instruction(lambda cost, i: Vector(types.int16))
 def _costs_at(code, cost, i: index):
-    """The costs of a pixel's lanes from an index on, in parts."""
+    """Load the costs of a pixel's lanes from an index on, in parts."""
     stored = code.get(code.kinds[0], cost, i)
     wide = code.zext(stored, ir.VectorType(ir.IntType(16), LANES))
     return code.mul(wide, wide.type([PARTS] * LANES))
@@ -100,14 +103,14 @@ def _costs_at(code, cost, i: index):
 
 @instruction(lambda path, i, j: Vector(types.int16))
 def _load_halves(code, path, i: index, j: index):
-    """Half a vector from either index."""
+    """Load half a vector from either index."""
     low, high = (code.get(code.kinds[0], path, start, NARROW) for start in (i, j))
     return code.shuffle(low, high, [*range(LANES)])
 
 
 @instruction(lambda *_: types.void)
 def _store_halves(code, path, i: index, j: index, vector):
-    """Stores half a vector at either index."""
+    """Store half a vector at either index."""
     for start, lanes in ((i, range(NARROW)), (j, range(NARROW, LANES))):
         code.put(code.kinds[0], path, start, code.shuffle(vector, None, [*lanes]))
 
@@ -117,14 +120,17 @@ def _lesser(code, a, b):
 
 
 _less = instruction(lambda a, b: a)(_lesser)
-"""The lesser of two, lane by lane; of what is not negative."""
+"""Return the lesser of two, lane by lane, of values that are not negative."""
 _subtract = instruction(lambda a, b: a)(lambda code, a, b: code.sub(a, b))
 
 
 @instruction(lambda path, small: path)
 def _spread(code, path, small):
-    """Of two runs, each in half a vector: what their labels, and those beside them, cost a neighbour that has
-    not a penalty for a jump. One lane farther on, so that lane 0 is of the label before the run."""
+    """Return the costs of two runs' labels, and those beside them, for a neighbour without the penalty of a
+    jump.
+
+    Each run is in half a vector. One lane farther on, so that lane 0 is of the label before the run.
+    """
     back = [[half + (k - n) % NARROW for half in (0, NARROW) for k in range(NARROW)] for n in (1, 2)]
     one_back, two_back = (code.shuffle(path, None, lanes) for lanes in back)
     return _lesser(code, one_back, code.add(_lesser(code, two_back, path), small))
@@ -132,8 +138,11 @@ def _spread(code, path, small):
 
 @instruction(lambda *_: types.UniTuple(types.int64, 4))
 def _shifts(code, here, there, reach: index):
-    """From the neighbour's first labels to a pixel's, or so far that they have no labels in common, not even
-    beside them: to the first and second from the first and second, and from the second and first."""
+    """Return the shifts from the neighbour's first labels to a pixel's, at most `reach`.
+
+    To the first and second from the first and second, and from the second and first. Beyond `reach` they have
+    no labels in common, not even beside them.
+    """
     a, b = (code.get(kind, pointer, ir.IntType(64)(0), 2) for kind, pointer in zip(code.kinds, (here, there)))
     a, b = code.shuffle(a, None, [0, 1, 0, 1]), code.shuffle(b, None, [0, 1, 1, 0])
     most = code.repeat(code.trunc(reach, ir.IntType(32)), 4)
@@ -146,7 +155,7 @@ def _shifts(code, here, there, reach: index):
 
 @instruction(lambda path: path.scalar)
 def _least(code, path):
-    """The least of a vector's lanes."""
+    """Return the least of a vector's lanes."""
     kind = ir.FunctionType(path.type.element, [path.type])
     name = f"llvm.vector.reduce.umin.v{LANES}i16"
     return code.call(cgutils.get_or_insert_function(code.module, kind, name), [path])
@@ -154,14 +163,16 @@ def _least(code, path):
 
 @compiled(inline="always")
 def _jumps(guide, beside, small, large, out):
-    """Penalties of labels that differ by more than one, between pixels of alpha's brightness; in parts."""
+    """Write penalties of labels that differ by more than one, between pixels of alpha's
+    brightness; in parts."""
     for i in range(len(guide)):
         out[i] = np.int16(max(small + ONE, large / (ONE + abs(guide[i] - beside[i]) / EDGE)) * PARTS + HALF)
 
 
 @compiled(nogil=True, cache=True)
 def aggregate(cost, guide, first, count, small, large, total):
-    """Sum over eight semi-global paths (Hirschmüller 2008), in parts: total (h, w, runs, lanes), int16.
+    """Write the sum over eight semi-global paths (Hirschmüller 2008), in parts: total (h, w, runs, lanes),
+    int16.
 
     Penalties of neighbours whose labels differ by one (small), and by more (large, where alpha shows no
     edge).
@@ -183,11 +194,12 @@ def aggregate(cost, guide, first, count, small, large, total):
 
 @compiled(error_model="numpy")
 def _sweep(way, shape, planes, guide, reach, pad, small, large, paths, fewest, jumps):
-    """Four paths at once, so that costs and sums go through memory twice in all: from the pixel before in the
-    row, and from three of the row before. With `way` 1 rows and columns are taken from the last.
+    """Add four paths at once, so that costs and sums go through memory twice in all.
 
-    Paths lie where those of pixels were that are no longer needed: in each row 0, 1, or 2 slots before where
-    they lay in the one before, so that what a pixel reads is one slot from what it writes.
+    They come from the pixel before in the row, and from three of the row before. With `way` 1 rows and
+    columns are taken from the last. Paths lie where those of pixels were that are no longer needed: in each
+    row 0, 1, or 2 slots before their place in the one before, so that the slots that a pixel reads are one
+    from those it writes.
     """
     height, width, runs, lanes = shape
     cost, first, total = pointers(planes)
@@ -223,7 +235,8 @@ def _sweep(way, shape, planes, guide, reach, pad, small, large, paths, fewest, j
 
 @compiled(inline="always")
 def _advance(context, p, q, before, now, jump, is_first):
-    """A path from pixel q, in slot `before`, to pixel p, in slot `now`, and its costs to the sums."""
+    """Advance a path from pixel q, in slot `before`, to pixel p, in slot `now`, and add its costs to the
+    sums."""
     cost, first, total, paths, fewest, runs, lanes, pad, reach, penalty = context
     base, leap, lowest = splat(fewest[before]), splat(np.int16(fewest[before] + jump)), splat(WALL)
     stride = lanes + pad
@@ -241,10 +254,11 @@ def _advance(context, p, q, before, now, jump, is_first):
 
 @compiled(inline="always")
 def _reached(paths, start, ours, theirs, reach, stride, runs, penalty):
-    """What a vector of a pixel's labels cost if they come from a neighbour's without a jump; the path of the
-    neighbour begins at `start`, its runs `stride` apart. `ours` and `theirs` are the first labels of both.
+    """Return the costs of a vector of a pixel's labels if they come from a neighbour's without a jump.
 
-    Around a path are walls, so that what is read for labels that the neighbour has not is more than any jump.
+    The path of the neighbour begins at `start`, its runs `stride` apart. `ours` and `theirs` are the first
+    labels of both. Around a path are walls, so that values read for labels that the neighbour lacks are more
+    than any jump.
     """
     if runs == 1:
         here = start + min(max(ours[0] - theirs[0], -reach), reach)
@@ -258,8 +272,11 @@ def _reached(paths, start, ours, theirs, reach, stride, runs, penalty):
 
 @compiled(inline="always")
 def _keep(paths, start, stride, runs, penalty, path):
-    """Keep a vector of a path for `_reached`. Of two runs, what labels beside cost is known here already:
-    then a pixel after it reads 4 half vectors instead of 12, which takes half the time."""
+    """Store a vector of a path for `_reached`.
+
+    Of two runs, the costs of labels beside are computed here already: then a pixel after it reads 4 half
+    vectors instead of 12, which takes half the time.
+    """
     if runs == 1:
         store(paths, start, path)
     else:
@@ -268,14 +285,13 @@ def _keep(paths, start, stride, runs, penalty, path):
 
 @compiled(nogil=True, cache=True)
 def winners(total, first, count, segments, hw, corner, large, claims, labels):
-    """Of each pixel of a part that begins at a corner: the best label, to a fraction (disparity); facts
-    (h, w, 1 or 3): the whole label, its margin to the second best (`UNRELATED` if there is none), and its
-    cost; where it is in beta, pixels counted row by row (positions; rows * columns: not on it). `total` is in
-    parts, the larger penalty `large` the unit of the facts.
+    """Write the best label of each pixel of a part that begins at a corner, with its facts and position.
 
+    `labels` are disparity, the best label to a fraction; facts (h, w, 1 or 3): the whole label, its margin to
+    the second best (`UNRELATED` if there is none), and its cost; and positions in beta, pixels counted row by
+    row (rows * columns: not on it). `total` is in parts, the larger penalty `large` the unit of the facts.
     `claims`, of each pixel of beta and one more, keeps the least cost with which a pixel of alpha matches it,
-    and that pixel's label: 16 bits of either. `segments` are end, along, length and cut, as of `costs`;
-    `labels` are disparity, facts and positions.
+    and that pixel's label: 16 bits of either. `segments` are end, along, length and cut, as of `costs`.
     """
     (end, along, length, cut), (rows, columns), (top, left) = segments, hw, corner
     disparity, facts, positions = labels
@@ -326,7 +342,7 @@ def winners(total, first, count, segments, hw, corner, large, claims, labels):
 
 @compiled(inline="always")
 def _lowest(costs, first, last):
-    """The least of costs from `first` to before `last`."""
+    """Return the least of costs from `first` to before `last`."""
     least = WALL
     for i in range(first, last):
         least = min(least, costs[i])
@@ -335,14 +351,16 @@ def _lowest(costs, first, last):
 
 @compiled(inline="always")
 def _rounding(end, along, label):
-    """How far along its segment a label's pixel of beta, its rounded position, is from that position."""
+    """Return the distance along its segment of a label's pixel of beta, its rounded position, from that
+    position."""
     x, y = end[0] + label * along[0], end[1] + label * along[1]
     return (np.floor(x + HALF) - x) * along[0] + (np.floor(y + HALF) - y) * along[1]
 
 
 @compiled(inline="always")
 def _between(total, best, last):
-    """How far the best is from the label, by the two lines of equal slope through it and its neighbours."""
+    """Return the offset of the minimum from the label, by the two lines of equal slope through it and its
+    neighbours."""
     if not 0 < best < last:
         return np.float32(0)
     before, after = np.float32(total[best - 1]), np.float32(total[best + 1])
@@ -352,9 +370,11 @@ def _between(total, best, last):
 
 @compiled(nogil=True, cache=True)
 def costs_at(alpha, beta, places, out):
-    """Cost of alpha's pixel and beta's at each of its places, pixels of beta counted row by row (-1: none):
-    out (h, w, 1, lanes), of which those after the last place have no label. `alpha` and `beta` are flat
-    planes of `cost`."""
+    """Write the cost of alpha's pixel and beta's at each of its places: out (h, w, 1, lanes).
+
+    Places are pixels of beta counted row by row (-1: none). Lanes after the last place have no label. `alpha`
+    and `beta` are flat planes of `cost`.
+    """
     height, width, labels = places.shape
     for y in range(height):
         for x in range(width):

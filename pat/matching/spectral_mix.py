@@ -1,7 +1,7 @@
-"""Which combination of any bands of beta alpha sees.
+"""The combination of any bands of beta that alpha sees.
 
-Alpha is explained as offset + weights . beta around each pixel, and how alpha's detail adds to
-each is found too. All sums over such bands are of sorted summands, so that their order cannot matter at all.
+Alpha is explained as offset + weights . beta around each pixel, and the addition of alpha's detail to each is
+estimated too. All sums over such bands are of sorted summands, so that their order cannot matter at all.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from .likeness import UNLIKE
 
 @dataclass(frozen=True)
 class MixSettings:
-    """Brightness is 0 to 1."""
+    """Settings of the combination. Brightness is 0 to 1."""
 
     equal: float = size(
         1e-4, "Share of the bands' mean variance by which the combination is drawn to equal parts"
@@ -46,12 +46,16 @@ SETTINGS = MixSettings()
 
 
 class SpectralMix(NamedTuple):
-    """The combination of C bands most like alpha, for each of a batch: offset + sum of weights times bands.
+    """The combination of C bands most similar to alpha, for each of a batch: offset + sum of weights times
+    bands.
 
-    slopes: (B, C), by how much each band rises where the combination rises by 1 from one pixel to the next;
-        less if that explains alpha badly.
-    gain: (B), 0 to 1: how far what alpha has beyond the combination is the bands' error, and not another
-        spectrum. 0 for one band, where that cannot be known.
+    Attributes:
+        weights: (B, C).
+        offset: (B).
+        slopes: (B, C), rise of each band where the combination rises by 1 from one pixel to the next; less if
+            that explains alpha badly.
+        gain: (B), 0 to 1: share of alpha's excess over the combination that is the bands' error, and not
+            another spectrum. 0 for one band, where that cannot be known.
     """
 
     weights: Float[Tensor, "b c"]
@@ -61,7 +65,7 @@ class SpectralMix(NamedTuple):
 
     @classmethod
     def equal(cls, bands: Float[Tensor, "b c _ _"]) -> SpectralMix:
-        """The mean of the bands."""
+        """Return the mean of the bands."""
         ones = torch.ones(bands.shape[:2], dtype=torch.float64, device=bands.device)
         return cls(ones / bands.shape[1], 0 * ones[:, 0], ones, 0 * ones[:, 0])
 
@@ -72,31 +76,35 @@ class SpectralMix(NamedTuple):
         alpha: Float[Tensor, "b 1 h w"],
         weight: Float[Tensor, "b 1 h w"],
     ) -> SpectralMix:
-        """The one most like alpha by weighted least squares, around each pixel's surroundings; twice, the
-        second time without outliers."""
+        """Fit the combination most similar to alpha by weighted least squares, relative to each pixel's
+        surroundings.
+
+        Twice, the second time without outliers.
+        """
         parts = [_mix(*tensors) for tensors in zip(bands.double(), alpha.double(), weight.double())]
         return cls(*(torch.stack(tensors) for tensors in zip(*parts)))
 
     def of(self, bands: Float[Tensor, "b c h w"]) -> Float[Tensor, "b 1 h w"]:
-        """The combination of these bands."""
+        """Return the combination of these bands."""
         products = self.weights[:, :, None, None] * bands.double()
         total = products.sort(1).values.sum(1, keepdim=True) + self.offset[:, None, None, None]
         return total.to(bands)
 
     def rises(self, like: Tensor) -> Float[Tensor, "b c 1 1"]:
-        """The slopes."""
+        """Return the slopes, in the type of `like`."""
         return self.slopes[:, :, None, None].to(like)
 
     def reconciled(
         self, bands: Float[Tensor, "b c h w"], alpha: Float[Tensor, "b 1 h w"]
     ) -> Float[Tensor, "b c h w"]:
-        """The bands corrected so that their combination is nearer to alpha, by as much as it is reliable."""
+        """Return the bands corrected so that their combination is nearer to alpha, as far as it
+        is reliable."""
         step = self.gain[:, None, None, None].to(bands) * self.rises(bands)
         return bands + step * (alpha - self.of(bands))
 
 
 def _mix(bands: Tensor, alpha: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Weights, offset, slopes and gain for bands (C, h, w) and alpha (1, h, w)."""
+    """Return weights, offset, slopes and gain for bands (C, h, w) and alpha (1, h, w)."""
     order = bands.flatten(1).sum(1).argsort()
     weight = weight + 1e-6
     x, y = (_beyond_local_mean(planes, weight).flatten(1) for planes in (bands[order], alpha))
@@ -119,7 +127,8 @@ def _mix(bands: Tensor, alpha: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, 
 
 
 def _combination(x: Tensor, y: Tensor, weight: Tensor) -> RobustFit:
-    """Weights (C) by which bands x (C, n) make y (n), both about 0, drawn to equal; then without outliers."""
+    """Return weights (C) by which bands x (C, n) make y (n), both about 0, drawn to equal; then without
+    outliers."""
     share, mean = weight / weight.sum(), x.mean(0)
     scale = (share @ y.square()).sqrt() / (share @ mean.square()).sqrt().clamp(min=1e-3)
     equal = scale.expand(len(x)) / len(x)
@@ -136,13 +145,15 @@ def _combination(x: Tensor, y: Tensor, weight: Tensor) -> RobustFit:
 
 
 def _beyond_local_mean(planes: Tensor, weight: Tensor) -> Tensor:
-    """Planes (c, h, w) less their weighted mean in wide squares: light and lenses of views differ, slowly."""
+    """Return planes (c, h, w) less their weighted mean in wide squares: light and lenses of views differ,
+    slowly."""
     radius = max(planes.shape[-2:]) // SETTINGS.wide
     return planes - box_mean(planes * weight, radius) / box_mean(weight, radius)
 
 
 def _smooth_misfit(rest: Tensor, share: Tensor) -> Tensor:
-    """Root mean square of the rest (1, h, w) around each pixel: matches' errors, at edges, average out."""
+    """Return the root mean square of the rest (1, h, w) around each pixel: matches' errors, at edges, average
+    out."""
     total = box_mean(share, SETTINGS.smooth).clamp(min=1e-12)
     smooth = box_mean(share * rest, SETTINGS.smooth) / total
     return (share * smooth.square()).sum().sqrt()

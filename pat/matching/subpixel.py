@@ -1,4 +1,4 @@
-"""Where alpha's pixels are in beta: semi-global matching at half size, then at full size over few labels.
+"""Positions of alpha's pixels in beta: semi-global matching at half size, then at full size over few labels.
 
 At half the size an object's edge is some two pixels off and a slope is in steps. Here each pixel chooses, at
 full size, between labels around the least and around the greatest disparity of its neighbourhood at half the
@@ -34,7 +34,7 @@ FULL_SIZE = SemiGlobalSettings(step=20.0, jump=80.0, margin=48)
 
 @dataclass(frozen=True)
 class SubpixelSettings:
-    """The numbers of matching at full size, and to a fraction of a pixel."""
+    """Settings of matching at full size, and to a fraction of a pixel."""
 
     run: int = size(5, "Labels in a run, of which each pixel has two")
     neighbourhood: int = size(5, "Side of the neighbourhood at half the size, pixels")
@@ -62,8 +62,16 @@ SETTINGS = SubpixelSettings()
 def matched_at_full_size(
     views: ComparedViews, segments: Segments, half: Float[Tensor, "b 1 h2 w2"]
 ) -> tuple[Float[Tensor, "b 1 h w"], Float[Tensor, "b 1 h2 w2"]]:
-    """Disparity to a fraction of a pixel from that at half the size, and how far matching back from beta
-    disagrees, 0 to 1, at half the size. Where it disagrees, disparity is diffused from where it does not."""
+    """Match to a fraction of a pixel, from the disparity at half the size.
+
+    Where matching back from beta disagrees, disparity is diffused from where it agrees.
+
+    Args:
+        half: disparity at half the size, pixels of beta.
+
+    Returns:
+        Disparity in pixels of beta, and the left-right error, 0 to 1, at half the size.
+    """
     alpha, beta = views.alpha, views.beta
     geometry = geometry_of(segments, len(alpha), (beta.shape[-2], beta.shape[-1]), factor=1)
     windows = Windows(np.stack([_runs(plane) for plane in numpy_of(half[:, 0])]), SETTINGS.run)
@@ -76,10 +84,12 @@ def matched_at_full_size(
 def _precise(
     views: ComparedViews, segments: Segments, disparity: Tensor, consistent: Tensor, rough: Tensor
 ) -> Float[Tensor, "b 1 h w"]:
-    """Disparity to a fraction of a pixel: where that of half the size (`rough`) is near, the mean of both;
-    from there a step of least squares of the brightness around each pixel (Lucas and Kanade 1981); and the
-    result on planes within surfaces. The less sharp beta is, the wider are windows, and the farther may steps
-    be."""
+    """Refine disparity to a fraction of a pixel.
+
+    Where that of half the size (`rough`) is near, the mean of both; from there a step of least squares of the
+    brightness around each pixel (Lucas and Kanade 1981); and the result on planes within surfaces. The less
+    sharp beta is, the wider are windows, and the farther may steps be.
+    """
     alpha, beta, guides, blurs = views
     near = consistent & ((disparity - rough).abs() < SETTINGS.same)
     start = torch.where(near, (disparity + rough) / 2, disparity)
@@ -97,7 +107,8 @@ def _precise(
 
 
 def _surfaces(disparity: Plane, weight: Plane, brightness: NDArray[np.uint8], edge: float) -> Plane:
-    """Disparity on planes through it, within what neither alpha nor such a change of disparity parts."""
+    """Return disparity on planes through it, within regions that neither alpha nor such a change of disparity
+    parts."""
     (h, w), every, whole = disparity.shape, (slice(None, None, FINE),) * 2, disparity
     for _ in range(SETTINGS.surfaces):
         guide = np.stack([brightness[every] / np.float32(255), whole[every] / np.float32(edge)], -1)
@@ -106,7 +117,11 @@ def _surfaces(disparity: Plane, weight: Plane, brightness: NDArray[np.uint8], ed
 
 
 def following(inputs: Inputs, matches: Matches) -> Matches:
-    """The matches, which follow images and segments that have gradients."""
+    """Give the matches gradients, where images and segments have gradients.
+
+    Returns:
+        The matches, of the same values.
+    """
     betas, alpha = [], inputs.alpha
     for beta, one in zip(inputs.betas, matches.betas):
         segments = beta.field.straight
@@ -121,7 +136,8 @@ def following(inputs: Inputs, matches: Matches) -> Matches:
 def with_gradients(
     views: ComparedViews, segments: Segments, disparity: Float[Tensor, "b 1 h w"]
 ) -> Float[Tensor, "b 1 h w"]:
-    """The same disparity, with gradients of where brightness along the segments agrees best at each pixel.
+    """Return the same disparity with gradients of the best agreement of brightness along the segments at each
+    pixel.
 
     By the implicit function theorem: there the least squares' step is zero, and stays so if the match moves
     by as much as images and segments move the step.
@@ -131,14 +147,15 @@ def with_gradients(
 
 
 def _step(views: ComparedViews, segments: Segments, disparity: Tensor) -> Float[Tensor, "b 1 h w"]:
-    """One step towards the best agreement, pixels; its gradients hold where it is zero."""
+    """Return one step towards the best agreement, pixels; its gradients hold where it is zero."""
     rise, rest = _compared(views.alpha, views.beta, segments, disparity)
     common, slope = _agreement(rise.detach(), rest, SETTINGS.gradient_radius)
     return common / (slope.detach() + SETTINGS.flat)
 
 
 def _agreement(rise: Tensor, rest: Tensor, radius: int) -> tuple[Tensor, Tensor]:
-    """What rise and rest have in common within squares, and the rise's own, both less their means around."""
+    """Return the product of rise and rest within squares, and the square of the rise, both less their means
+    around."""
     rise, rest = (values - box_mean(values, 2 * radius) for values in (rise, rest))
     common, slope = box_mean(torch.cat([rise * rest, rise.square()], 1), radius).split(1, 1)
     return common, slope
@@ -147,8 +164,8 @@ def _agreement(rise: Tensor, rest: Tensor, radius: int) -> tuple[Tensor, Tensor]
 def _compared(
     alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b 1 hb wb"], segments: Segments, disparity: Tensor
 ) -> tuple[Float[Tensor, "b 1 h w"], Float[Tensor, "b 1 h w"]]:
-    """Of each pixel: how much brighter beta is a pixel farther along its segment than at its match, and how
-    much brighter alpha is than beta there."""
+    """Return the rise of beta's brightness per pixel along its segment at each match, and alpha's excess over
+    beta there."""
     across, down = (torch.gradient(beta, dim=side)[0] for side in (3, 2))
     still = Segments(segments.start.detach(), segments.end.detach(), segments.valid)
     extent = Extent.of(segments)
@@ -164,8 +181,11 @@ def _compared(
 
 
 def _runs(half: NDArray[np.float32]) -> NDArray[np.int32]:
-    """First labels (h, w, 2) of both runs at full size, from disparity at half the size: around the least of
-    its neighbourhood and around the greatest, or, where these are near each other, one beside the other."""
+    """Return first labels (h, w, 2) of both runs at full size, from disparity at half the size.
+
+    They are around the least of its neighbourhood and around the greatest, or, where these are near each
+    other, one beside the other.
+    """
     window, run = np.ones((SETTINGS.neighbourhood,) * 2, np.uint8), SETTINGS.run
     extremes = (f(half, window).repeat(FINE, 0).repeat(FINE, 1) for f in (cv2.erode, cv2.dilate))
     low, high = (np.rint(plane).astype(np.int32) - run // 2 for plane in extremes)

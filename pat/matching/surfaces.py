@@ -1,7 +1,7 @@
-"""Planes through what is known around each pixel, as far as a guide connects it.
+"""Planes through known values around each pixel, as far as a guide connects it.
 
-Moments are gathered by the domain transform (Gastal and Oliveira 2011): what lies beyond an edge of the guide
-is far away. Planes are found for every second pixel.
+Moments are gathered by the domain transform (Gastal and Oliveira 2011): a point beyond an edge of the guide
+is far away. Planes are fitted for every second pixel.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from . import surfaces_numba as kernels
 from .positions import FINE
 
 Plane = NDArray[np.float32]
-"""One number a pixel (h, w)."""
+"""Numbers of the pixels (h, w)."""
 
 
 @dataclass(frozen=True)
 class SurfaceSettings:
-    """Of planes."""
+    """Settings of planes."""
 
     level: float = tuned(
         0.005, "Middlebury, tune half: variance of position, over reach^2, below which planes are level"
@@ -36,7 +36,14 @@ SETTINGS = SurfaceSettings()
 
 
 class Planes(NamedTuple):
-    """Of every second pixel: value, slopes a pixel to the right and down, and the mean weight around."""
+    """Planes of every second pixel.
+
+    Attributes:
+        value: value at the pixel.
+        right: slope per pixel to the right.
+        down: slope per pixel downwards.
+        around: mean weight around.
+    """
 
     value: Plane
     right: Plane
@@ -45,10 +52,12 @@ class Planes(NamedTuple):
 
     @classmethod
     def through(cls, values: Plane, weight: Plane, guide: NDArray[np.float32], reach: float) -> Planes:
-        """Planes through weighted values (h, w) of every second pixel, by least squares.
+        """Fit planes through weighted values (h, w) of every second pixel, by least squares.
 
-        Values count to `reach` pixels around; a change of 1 in the guide (h, w, c) is as far. No weight is
-        around what none reaches.
+        Values count to `reach` pixels around; a change of 1 in the guide (h, w, c) is as far.
+
+        Returns:
+            The planes; pixels that no value reaches have no weight around.
         """
         reach /= FINE
         values, weight = (np.ascontiguousarray(plane, np.float32) for plane in (values, weight))
@@ -62,12 +71,16 @@ class Planes(NamedTuple):
         return cls(*planes)
 
     def at_pixels(self, hw: HW) -> Plane:
-        """The values at all pixels."""
+        """Return the values at all pixels."""
         out = np.empty(hw, np.float32)
         kernels.at_pixels(*self[:3], out)
         return out
 
 
 def repeated(plane: Plane, hw: HW) -> Plane:
-    """What is known of every second pixel for those to its right and below it, too."""
+    """Repeat a plane of every second pixel for those to its right and below it, too.
+
+    Returns:
+        The plane at all pixels.
+    """
     return plane.repeat(FINE, 0).repeat(FINE, 1)[: hw[0], : hw[1]]

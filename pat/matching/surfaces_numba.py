@@ -13,9 +13,10 @@ TINY = np.finfo(np.float32).tiny
 
 @compiled(nogil=True, cache=True)
 def weighted_terms(values, weight, centre, reach, out):
-    """Into out (3, h, w, 4): weights; weights times x, y, x x, x y, y y, z, x z, y z and themselves; and 0.
+    """Write the terms of planes into out (3, h, w, 4).
 
-    x and y are counted from the middle in `reach` pixels, z from `centre`.
+    Weights; weights times x, y, x x, x y, y y, z, x z, y z and themselves; and 0. x and y are counted from
+    the middle in `reach` pixels, z from `centre`.
     """
     (height, width), centre, reach = values.shape, np.float32(centre), np.float32(reach)
     one, two, three = out
@@ -32,8 +33,10 @@ def weighted_terms(values, weight, centre, reach, out):
 
 @compiled(nogil=True, cache=True)
 def planes_through(one, two, three, centre, reach, level, out):
-    """Into out (4, h, w): value, slopes a pixel to the right and down, and the mean weight, by smoothed
-    `weighted_terms`."""
+    """Write planes into out (4, h, w), from smoothed `weighted_terms`.
+
+    Value, slopes a pixel to the right and down, and the mean weight.
+    """
     (height, width), centre, reach = one.shape[:2], np.float32(centre), np.float32(reach)
     level = np.float32(level)
     for r in range(height):
@@ -54,7 +57,7 @@ def planes_through(one, two, three, centre, reach, level, out):
 
 @compiled(nogil=True, cache=True)
 def at_pixels(value, right, down, out):
-    """Planes of every second pixel at all pixels, `out` (h, w)."""
+    """Write planes of every second pixel at all pixels, `out` (h, w)."""
     height, width = out.shape
     for r in range(height):
         for c in range(width):

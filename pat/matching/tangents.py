@@ -4,7 +4,7 @@ Where a pixel's positions follow each other along a curve they are labels like t
 matching at half the size finds one, among neighbours that agree. Positions without an order (a window, the
 nearest pixels, all) have no neighbours to agree with: the best one of each pixel is taken alone. The line
 through the match along the curve then is the pixel's search segment, in pixels of arc from its last position,
-and what follows is as for any segment.
+and all further steps are as for any segment.
 """
 
 from __future__ import annotations
@@ -37,23 +37,35 @@ ORDERED = 0.95
 """Share of pixels whose steps from one position to the next hardly ever go back, from which positions are a
 curve: those of a window and of a whole image go back at the end of each row."""
 SEAM = 2
-"""How often those of a curve go back: onto the other side of a whole sphere's image, and on from there."""
+"""Number of times that positions of a curve go back: onto the other side of a whole sphere's image, and on
+from there."""
 LEAST_MARGIN = 0.02
 """Margin of a match to the second best, as of `BetaMatches.facts`, up to which it is filled from its
-neighbours. *size*: what follows matches again, around it."""
+neighbours. *size*: later steps match again, around it."""
 HALF_WINDOW = 8.0
-"""Of a match in a set of positions: how far its segment goes to either side, pixels. *size*"""
+"""Pixels to either side to which the segment of a match in a set of positions extends. *size*"""
 AT_ONCE = 1 << 21
-"""Positions that are asked for at once."""
+"""Number of positions that are evaluated at once."""
 
 
 def along_tangents(
     alpha: Float[Tensor, "1 1 h w"], guide: Float[Tensor, "1 1 hb wb"], field: FieldOnGrid, name: str = "beta"
 ) -> FieldOnGrid:
-    """One rig's field of positions as segments through its matches in the one beta; images' sides are even.
+    """Convert one rig's field of positions to segments through its matches in the one beta.
 
     Warns of positions that have no order. The label of each pixel is a constant; positions keep their
     gradients.
+
+    Args:
+        alpha: image of even sides.
+        guide: beta's brightness, of even sides.
+        name: beta's name in the warning.
+
+    Returns:
+        The field of segments.
+
+    Raises:
+        TypeError: for a field that gives segments for some pixels and positions for others.
     """
     grid = _BlockCentres(field, (alpha.shape[-2] // FINE, alpha.shape[-1] // FINE))
     ordered = grid.ordered()
@@ -76,13 +88,17 @@ def along_tangents(
 
 @dataclass(frozen=True)
 class _BlockCentres:
-    """The positions of the centres of alpha's blocks of two by two pixels, asked for some rows at a time."""
+    """Positions of the centres of alpha's blocks of two by two pixels, evaluated some rows at a time."""
 
     field: FieldOnGrid
     hw: HW
 
     def at(self, rows: slice, columns: slice) -> Positions:
-        """The positions (h, w, L) of a part."""
+        """Return the positions (h, w, L) of a part.
+
+        Raises:
+            TypeError: if the field gives segments there.
+        """
         h, w = self.hw
         grid = (pixel_grid((h, w), dtype=torch.float64)[rows, columns] + 0.5) * FINE - 0.5
         locations = self.field.at(grid.reshape(-1, 2))
@@ -93,15 +109,15 @@ class _BlockCentres:
 
     @property
     def rows(self) -> int:
-        """How many are asked for at once."""
+        """Number of rows that are evaluated at once."""
         return max(1, AT_ONCE // (self.hw[1] * self.field.samples))
 
     def by_rows(self) -> list[slice]:
-        """Rows that are asked for at once."""
+        """Return the rows that are evaluated at once, in turn."""
         return [slice(*span) for span in spans(self.hw[0], self.rows)]
 
     def ordered(self) -> bool:
-        """Whether a pixel's positions follow each other along a curve."""
+        """Return True if a pixel's positions follow each other along a curve."""
         locations = self.at(slice(None, None, 8), slice(None, None, 8))
         if locations.xy.shape[-2] < 3:
             return False
@@ -112,12 +128,12 @@ class _BlockCentres:
         return bool(some.any()) and float(((back & counts).sum(-1) <= SEAM)[some].double().mean()) >= ORDERED
 
     def tangents(self, labels: Tensor) -> Segments:
-        """The lines through the labels' positions along the curves, as long as these."""
+        """Return the lines through the labels' positions along the curves, as long as these."""
         parts = [_tangents(self.at(rows, slice(None)), labels[rows]) for rows in self.by_rows()]
         return Segments(*(torch.cat(tensors) for tensors in zip(*parts)))
 
     def chosen(self, labels: Tensor) -> Segments:
-        """Segments along x around the positions of whole labels, which a median makes agree with their
+        """Return segments along x around the positions of whole labels, which a median makes agree with their
         neighbours."""
         parts = []
         for rows in self.by_rows():
@@ -133,7 +149,7 @@ class _BlockCentres:
 
 
 def _labels(alpha: Tensor, guide: Tensor, grid: _BlockCentres, *, ordered: bool) -> NDArray:
-    """The label of each block of alpha."""
+    """Compute the label of each block of alpha."""
     half_alpha, half_guide = avg_pool2d(alpha, FINE), avg_pool2d(guide, FINE)
     views = Normalisation.of(half_alpha, half_guide).views(half_alpha, half_guide)
     a, b = (numpy_of(p[0, 0]) for p in views[:2])
@@ -163,7 +179,7 @@ def _labels(alpha: Tensor, guide: Tensor, grid: _BlockCentres, *, ordered: bool)
 
 
 def _places(grid: _BlockCentres, box: tuple[slice, ...], hw: tuple[int, ...]) -> NDArray[np.int32]:
-    """Where positions are in the reduced beta, pixels counted row by row; -1 for those that do not count."""
+    """Return positions in the reduced beta, pixels counted row by row; -1 for those that do not count."""
     (h, w), (rows, columns) = hw, box
     parts, at_once = [], max(1, AT_ONCE // (w * grid.field.samples))
     for top, bottom in spans(rows.stop - rows.start, at_once):
@@ -175,7 +191,7 @@ def _places(grid: _BlockCentres, box: tuple[slice, ...], hw: tuple[int, ...]) ->
 
 
 def _best(total: NDArray[np.int16]) -> tuple[NDArray, NDArray]:
-    """The label of the least sum, and by how much it is less than those not beside it."""
+    """Return the label of the least sum, and its margin to the least of those not beside it."""
     best = total.argmin(-1)
     beside = np.abs(np.arange(total.shape[-1]) - best[..., None]) <= 1
     second = np.where(beside, np.iinfo(np.int16).max, total).min(-1).astype(np.float32)
@@ -183,7 +199,7 @@ def _best(total: NDArray[np.int16]) -> tuple[NDArray, NDArray]:
 
 
 def _tangents(positions: Positions, labels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Start, end and validity of the lines of a part."""
+    """Return start, end and validity of the lines of a part."""
     xy, mask = positions.xy, positions.mask
     count, labels = mask.shape[-1], labels.to(mask.device)
     number = torch.arange(count, device=mask.device)

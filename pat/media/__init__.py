@@ -1,1 +1,1 @@
-"""Images, raw counts, colour, video and figures: reading, writing, conversions."""
+"""Reading, writing and conversion of images, raw counts, colour, depth maps, video and figures."""

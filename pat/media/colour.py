@@ -1,4 +1,4 @@
-"""Luminance, chroma and the sRGB transfer function: one definition of each."""
+"""Luminance, chroma and the sRGB transfer function, each defined once."""
 
 from __future__ import annotations
 
@@ -15,13 +15,19 @@ REC601 = (0.299, 0.587, 0.114)
 REC709 = (0.2126, 0.7152, 0.0722)
 """Weights of red, green and blue in luminance, on linear values (ITU-R BT.709)."""
 OPPONENT = ((3**-0.5, 3**-0.5, 3**-0.5), (2**-0.5, 0.0, -(2**-0.5)), (6**-0.5, -2 * 6**-0.5, 6**-0.5))
-"""Brightness and two colour differences, orthogonal and of unit length, of red, green and blue."""
+"""Opponent colours of RGB: brightness and two colour differences, orthogonal and of unit length."""
 
 
 def luminance(
     rgb: Float[Tensor, "*b 3 h w"], weights: tuple[float, float, float] = REC601
 ) -> Float[Tensor, "*b 1 h w"]:
-    """Rec. 601 luma of sRGB, .299 R + .587 G + .114 B, as MATLAB's rgb2gray and OpenCV; or other weights."""
+    """Compute the weighted sum of red, green and blue, by default Rec. 601 luma of sRGB values.
+
+    Default: .299 R + .587 G + .114 B, as in MATLAB's rgb2gray and OpenCV; `REC709` weights suit linear light.
+
+    Returns:
+        One channel of the same size.
+    """
     red, green, blue = (weight * plane for weight, plane in zip(weights, rgb.split(1, -3)))
     return red + green + blue
 
@@ -29,7 +35,11 @@ def luminance(
 def to_luma_chroma(
     rgb: Float[Tensor, "*b 3 h w"],
 ) -> tuple[Float[Tensor, "*b 1 h w"], Float[Tensor, "*b 2 h w"]]:
-    """Luminance Y and the colour differences (R - Y, B - Y), which are zero for grey."""
+    """Split RGB into luma and colour differences.
+
+    Returns:
+        Rec. 601 luma Y, and (R - Y, B - Y), which are zero for grey.
+    """
     luma = luminance(rgb)
     return luma, torch.cat([rgb[..., 0:1, :, :], rgb[..., 2:3, :, :]], -3) - luma
 
@@ -37,7 +47,11 @@ def to_luma_chroma(
 def from_luma_chroma(
     luma: Float[Tensor, "*b 1 h w"], chroma: Float[Tensor, "*b 2 h w"]
 ) -> Float[Tensor, "*b 3 h w"]:
-    """The inverse of `to_luma_chroma`; not clipped to 0..1. Its luminance is `luma`, whatever the chroma."""
+    """Compose RGB from luma and colour differences: the inverse of `to_luma_chroma`.
+
+    Returns:
+        RGB, not clipped to 0..1; its luma is `luma` for any chroma.
+    """
     red_weight, green_weight, blue_weight = REC601
     red, blue = chroma[..., 0:1, :, :], chroma[..., 1:2, :, :]
     green = -(red_weight * red + blue_weight * blue) / green_weight
@@ -45,43 +59,52 @@ def from_luma_chroma(
 
 
 def luminance_of(image: Float[Tensor, "_ h w"]) -> Float[Tensor, "_ h w"]:
-    """The luminance of an RGB image; any other image itself."""
+    """Return the luma (1, h, w) of an RGB image; an image of another number of channels is returned
+    unchanged."""
     return luminance(image) if image.shape[0] == 3 else image
 
 
 def linear_from_srgb(values: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-    """Linear light of sRGB-encoded values (IEC 61966-2-1); the curve's linear part continues below zero."""
+    """Decode sRGB values to linear light (IEC 61966-2-1); the curve's linear part continues below zero.
+
+    Returns:
+        Linear light of the same shape, 1 at white.
+    """
     toe = values <= 0.04045
     return torch.where(toe, values / 12.92, ((torch.where(toe, 0.5, values) + 0.055) / 1.055) ** 2.4)
 
 
 def srgb_from_linear(light: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-    """The sRGB encoding of linear light: the inverse of `linear_from_srgb`."""
+    """Encode linear light as sRGB values: the inverse of `linear_from_srgb`."""
     toe = light <= 0.04045 / 12.92
     return torch.where(toe, 12.92 * light, 1.055 * torch.where(toe, 0.5, light) ** (1 / 2.4) - 0.055)
 
 
 def srgb_image(light: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-    """Linear light as an ordinary image: clipped to 0..1, sRGB-encoded."""
+    """Encode linear light as an ordinary image: clipped to 0..1, then sRGB-encoded."""
     return srgb_from_linear(light.clamp(0, 1))
 
 
 def to_bytes(values: Float[Tensor, "*b"] | Float[NDArray, "*b"]) -> NDArray[np.uint8]:
-    """Values 0..1, clipped, as 8-bit counts, rounded to nearest (halves to even)."""
+    """Convert values 0..1 to 8-bit counts: clipped, rounded to nearest (halves to even)."""
     array = values.detach().cpu().numpy() if isinstance(values, Tensor) else values
     return np.rint(np.clip(np.asarray(array, np.float32), 0, 1) * 255).astype(np.uint8)
 
 
 BRIGHT = 0.99
-"""The share of pixels that are at most as bright as the brightest that counts."""
+"""Quantile of brightness that stands for an image's brightest part."""
 ORDINARY = (0.2, 1.25)
-"""Linear light of that brightest pixel, 1 is white, in images that are left as they are."""
+"""Range of linear light at that quantile (1 is white) within which an image needs no gain."""
 WANTED = 0.8
-"""Its light in images that are not."""
+"""Linear light that a gain brings that quantile to."""
 
 
 def exposure_gain(image: Float[Tensor, "c h w"]) -> float:
-    """The factor of linear light that makes a dark or overexposed image sensibly bright; 1 for others."""
+    """Gain in linear light that gives a dark or overexposed sRGB image ordinary brightness.
+
+    Returns:
+        The factor; 1 for an image of ordinary brightness, and for one that is black.
+    """
     light = linear_from_srgb(luminance_of(image).mean(0)).flatten()
     brightest = float(light[:: max(light.numel() // 100_000, 1)].quantile(BRIGHT))
     if ORDINARY[0] <= brightest <= ORDINARY[1] or brightest <= 1e-4:
@@ -90,7 +113,11 @@ def exposure_gain(image: Float[Tensor, "c h w"]) -> float:
 
 
 def exposed(image: Float[Tensor, "c h w"], gain: float) -> Float[Tensor, "c h w"]:
-    """The image with its linear light times a factor."""
+    """Multiply an sRGB image's linear light by a factor.
+
+    Returns:
+        The sRGB image, not clipped; the same tensor for a gain of 1.
+    """
     if gain == 1:
         return image
     return chunked(lambda rows: srgb_from_linear(gain * linear_from_srgb(rows)), image)

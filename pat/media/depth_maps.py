@@ -1,4 +1,4 @@
-"""Depth maps from files (PFM, TIFF, and PNG of 16 bits), and to point clouds (PLY)."""
+"""Depth maps read from files (PFM, TIFF, 16-bit PNG), and written as point clouds (PLY)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from .headers import HW
 from .images import read_recorded
 
 MILLIMETRE = 0.001
-"""Metres of a count in maps of whole numbers: depth cameras (RealSense, ZED, Kinect) count millimetres."""
+"""Metres for each count in integer maps: depth cameras (RealSense, ZED, Kinect) count millimetres."""
 PLY_HEADER = """ply
 format binary_little_endian 1.0
 element vertex {count}
@@ -37,11 +37,20 @@ VERTEX = np.dtype([("X", "<f4", 3), ("colour", "u1", 3)])
 
 
 def read_depth(path: str | Path, *, hw: HW | None = None, scale: float | None = None) -> Float[Tensor, "h w"]:
-    """Depth z in metres (H, W), float32; NaN where it is not positive and finite.
+    """Read a depth map from a PFM, TIFF or 16-bit PNG file.
 
-    `scale` is metres of one unit of the file: by default 1 of float files, and of whole numbers what a
-    depth_16.png from `pat fuse` states, else `MILLIMETRE`. Raises FileNotFoundError, and ValueError for what
-    is no depth map, or has another size than `hw`.
+    Args:
+        hw: expected (height, width); None accepts any.
+        scale: metres for each unit of the file; None takes 1 for float files, and for integers the scale that
+            a depth_16.png of `pat fuse` states, or else `MILLIMETRE`.
+
+    Returns:
+        Depth z in metres (h, w), float32; NaN where the file's value is not positive and finite.
+
+    Raises:
+        FileNotFoundError: for a missing file.
+        ValueError: for a file that is no depth map (several channels, 8 bits, no positive value), or has
+            another size.
     """
     path = Path(path)
     if not path.is_file():
@@ -68,7 +77,8 @@ def read_depth(path: str | Path, *, hw: HW | None = None, scale: float | None = 
 
 
 def _pfm(path: Path) -> NDArray[np.float32]:
-    """A grey PFM file: "Pf", width and height, scale (negative: little-endian), rows from the bottom up."""
+    """Read a grey PFM file: "Pf", width and height, scale (negative for little-endian), rows from the bottom
+    up."""
     content = path.read_bytes()
     head = re.match(rb"Pf\s+(\d+)\s+(\d+)\s+([+-]?[0-9]*\.?[0-9]+(?:[eE][+-]?[0-9]+)?)(?:\r\n|\s)", content)
     if head is None:
@@ -83,7 +93,7 @@ def _pfm(path: Path) -> NDArray[np.float32]:
 
 
 def _stated_scale(path: Path) -> float | None:
-    """Metres of a count as `write_depth` states them in a PNG file; None in other files."""
+    """Metres for each count as `write_depth` states them in a PNG file; None in other files."""
     with Image.open(path) as image:
         said = re.match(r"depth: ([0-9.e+-]+) counts a metre", str(image.info.get("Description", "")))
     return None if said is None else 1 / float(said[1])
@@ -97,10 +107,15 @@ def write_points(
     *,
     along: Literal["depth", "distance"] = "depth",
 ) -> int:
-    """Write the pixels of known depth as a coloured point cloud (binary PLY), atomically; returns how many.
+    """Write the pixels of known depth as a coloured point cloud (binary PLY), atomically.
 
-    Coordinates are the camera's: x right, y down, z ahead, in the unit of the depth, which is `along` the
-    axis, or the distance along the ray. An image of one band is grey.
+    Args:
+        depth: metres; pixels that are not finite are left out.
+        image: values 0..1; grey for one channel, otherwise the first three are colours.
+        along: "depth" for z along the optical axis, "distance" for the length of the ray.
+
+    Returns:
+        The number of points. Their coordinates are the camera's, x right, y down, z ahead, in metres.
     """
     has_depth = depth.isfinite()
     x = pixel_grid(camera.hw, dtype=torch.float64)[has_depth]
@@ -121,6 +136,10 @@ def write_points(
 def at_distance(
     camera: Camera, x: Float[Tensor, "*n 2"], distance: Float[Tensor, "*n"]
 ) -> Float[Tensor, "*n 3"]:
-    """World points of pixels at a distance along their rays, metres; NaN for those without a ray."""
+    """Compute world points of pixels at a distance along their rays.
+
+    Returns:
+        Points (n, 3) in metres; NaN for pixels without a ray (outside the lens model).
+    """
     rays = world_rays(camera, x)
     return torch.where(rays.valid[..., None], rays.origin + distance[..., None] * rays.direction, torch.nan)

@@ -1,4 +1,4 @@
-"""Figures: depth in colours, panels of images side by side, and files of both."""
+"""Figures: coloured depth, panels of images side by side, and their files."""
 
 from __future__ import annotations
 
@@ -24,7 +24,11 @@ if TYPE_CHECKING:
 
 
 def colour_depth(depth: Float[Tensor, "h w"]) -> Float[Tensor, "3 h w"]:
-    """Inverse depth in colours, from its 1st to its 99th percentile; unknown depth is black."""
+    """Colour a depth map by inverse depth, from its 1st to its 99th percentile.
+
+    Returns:
+        RGB image 0..1; near is red, far is dark blue, unknown depth (not finite) is black.
+    """
     depth = depth.detach().cpu()
     has_depth = depth.isfinite()
     inverse = torch.where(has_depth, 1 / torch.where(has_depth, depth, 1.0), 0.0)
@@ -41,7 +45,11 @@ def colour_depth(depth: Float[Tensor, "h w"]) -> Float[Tensor, "3 h w"]:
 
 
 def reduced(image: Float[Tensor, "c h w"], longest: int) -> Float[Tensor, "c h2 w2"]:
-    """The image with at most `longest` pixels along its longer side."""
+    """Reduce an image so that its longer side has at most `longest` pixels (bicubic, antialiased).
+
+    Returns:
+        The smaller image; the same tensor if it is small enough.
+    """
     factor = longest / max(image.shape[-2:])
     if factor >= 1:
         return image
@@ -50,7 +58,14 @@ def reduced(image: Float[Tensor, "c h w"], longest: int) -> Float[Tensor, "c h2 
 
 
 def figure_file(path: Path) -> Path:
-    """The path. Raises ValueError unless its name ends in a format of figures."""
+    """Check that a figure's name ends in a format that matplotlib writes.
+
+    Returns:
+        The path.
+
+    Raises:
+        ValueError: for another suffix.
+    """
     from matplotlib.backend_bases import FigureCanvasBase
 
     if path.suffix[1:].lower() not in FigureCanvasBase.get_supported_filetypes():
@@ -59,7 +74,11 @@ def figure_file(path: Path) -> Path:
 
 
 def save_figure(figure: Figure, path: Path, *, dpi: int = 110) -> Path:
-    """Write a figure atomically; returns the path."""
+    """Write a matplotlib figure atomically.
+
+    Returns:
+        The path.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     FigureCanvasAgg(figure)
@@ -69,17 +88,22 @@ def save_figure(figure: Figure, path: Path, *, dpi: int = 110) -> Path:
 
 
 TITLE, GAP = 28, 10
-"""Pixels of a title's line above each panel, and beside it."""
+"""Pixels of a title line above each panel, and between panels."""
 
 
 def draw_panels(
     panels: Mapping[str, Float[Tensor, "_ _ _"]], *, columns: int, width: float = 10.0
 ) -> Image.Image:
-    """One image, `width` times 110 pixels wide, of images by title, row by row, each scaled to its column.
+    """Draw images side by side with titles, row by row, each scaled to its cell.
 
-    Titles, of one line or several, are made small enough for the longest to fit.
+    Args:
+        panels: images (c, h, w), values 0..1, by title; a title may have several lines, and the font shrinks
+            until the longest fits. The first image sets the cells' shape.
+        columns: panels in a row.
+        width: width of the figure, in units of 110 pixels.
 
-    By Pillow: matplotlib takes a second and a half to import and draw as much.
+    Returns:
+        One RGB image. Drawn by Pillow, as matplotlib takes a second and a half.
     """
     wide = round(110 * width) // columns - GAP
     h, w = next(iter(panels.values())).shape[-2:]
@@ -104,6 +128,6 @@ def draw_panels(
 
 
 def save_panels(panels: Mapping[str, Float[Tensor, "_ _ _"]], path: Path, *, columns: int) -> None:
-    """`draw_panels`, 16 inches wide, written atomically."""
+    """Write the image of `draw_panels`, 16 units wide, atomically."""
     with write_atomically(path) as temporary:
         draw_panels(panels, columns=columns, width=16).save(temporary, compress_level=3)

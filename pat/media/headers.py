@@ -1,4 +1,4 @@
-"""What an image file's head states: its size before anything is decoded, orientation, focal length."""
+"""Headers of image files, read before anything is decoded: size, orientation, focal length."""
 
 from __future__ import annotations
 
@@ -23,18 +23,22 @@ _ORIENTATION = 274
 _EXIF, _FOCAL, _FOCAL_35MM, _WIDTH, _HEIGHT = 0x8769, 0x920A, 0xA405, 0xA002, 0xA003
 _PLANE_RESOLUTION, _PLANE_UNIT = 0xA20E, 0xA210
 _DIAGONAL_35MM = 43.267
-"""Of 36 x 24 mm."""
+"""Diagonal of 36 x 24 mm, in mm."""
 _MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
-"""Units of the sensor's resolution: inch, cm, mm, micrometre."""
+"""Millimetres of the EXIF units of a sensor's resolution: inch, cm, mm, micrometre."""
 _FILES: dict[bytes, Any] = {b"\xff\xd8": JpegImageFile, b"RI": WebPImageFile, b"BM": BmpImageFile}
-"""By their first bytes. Not `Image.open`, which refuses sizes that are expected here."""
+"""Pillow's readers by a file's first bytes. `Image.open` would refuse large images that are expected here."""
 
 
 class ImageHeader(NamedTuple):
-    """Stored (height, width), orientation tag (1 to 8; else 1), bits a value of TIFF, PNG, PNM (else 0).
+    """Header of an image file.
 
-    `tag` is where a TIFF file has its orientation: byte offset and struct format; None without one, and in
-    other files. `white` is the largest value that a PNM file states (else 0).
+    Attributes:
+        hw: stored (height, width).
+        orientation: EXIF orientation tag, 1 to 8; 1 where there is none.
+        bits: bits of a value in TIFF, PNG and PNM files; 0 for others.
+        tag: byte offset and struct format of a TIFF file's orientation; None for other files and without one.
+        white: largest value that a PNM file states; 0 for others.
     """
 
     hw: HW
@@ -45,12 +49,16 @@ class ImageHeader(NamedTuple):
 
     @property
     def upright(self) -> HW:
-        """(height, width) with the orientation applied."""
+        """(height, width) after the orientation is applied."""
         return self.hw[::-1] if self.orientation >= 5 else self.hw
 
 
 def image_header(content: bytes) -> ImageHeader | None:
-    """The header of a PNG, TIFF, JPEG, PNM, BMP or WebP file; None for other and for damaged files."""
+    """Parse the header of a PNG, TIFF, JPEG, PNM, BMP or WebP file from its bytes.
+
+    Returns:
+        The header; None for another format and for a damaged file.
+    """
     try:
         if content.startswith(PNG):
             return _png(content)
@@ -65,14 +73,14 @@ def image_header(content: bytes) -> ImageHeader | None:
 
 
 def _png(content: bytes) -> ImageHeader:
-    """By hand: Pillow decodes the image to find a tag behind it."""
+    """Parse a PNG header by hand: Pillow decodes the whole image to find a tag behind it."""
     width, height = struct.unpack_from(">II", content, 16)
     tags = [content[start + 8 : end - 4] for kind, start, end in png_chunks(content) if kind == b"eXIf"]
     return ImageHeader((height, width), _exif_orientation(tags[-1] if tags else b""), content[24])
 
 
 def _pnm(content: bytes) -> ImageHeader | None:
-    """By hand: Pillow does not state the largest value."""
+    """Parse a PNM header by hand: Pillow does not report the largest value."""
     gap = rb"(?:\s|#[^\n]*\n)+"
     largest = gap + rb"(\d{1,5})" if content[1:2] in b"2356" else rb"()"
     form = rb"P[1-6]" + gap + rb"(\d{1,9})" + gap + rb"(\d{1,9})" + largest + rb"\s"
@@ -92,7 +100,7 @@ def _tiff(content: bytes) -> ImageHeader | None:
 
 
 def _exif_orientation(exif: bytes) -> int:
-    """Of an Exif block; 1 if it is damaged."""
+    """Orientation in an EXIF block; 1 if the block is damaged."""
     tags = Image.Exif()
     try:
         tags.load(exif)
@@ -106,10 +114,14 @@ def _known(orientation: object) -> int:
 
 
 def focal_length(path: str | Path, hw: HW) -> float | None:
-    """The focal length in pixels of an image of this size, by its file's EXIF tags; None if they do not say.
+    """Read a photograph's focal length from its EXIF tags.
 
-    By the sensor's resolution or, without that, by the focal length's equivalent on 35 mm film. The file's
-    first image may be a thumbnail, as raw files have one.
+    Args:
+        hw: size of the image that the focal length is wanted for; the file's first image may be a thumbnail.
+
+    Returns:
+        Focal length in pixels, from the sensor's resolution or else the 35 mm equivalent; None if the tags do
+        not state it or the file cannot be read.
     """
     try:
         with Image.open(path) as image:

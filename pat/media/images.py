@@ -1,7 +1,7 @@
-"""Image files.
+"""Image files: reading and atomic writing.
 
-An image in memory is a float tensor (C, H, W), 0..1, with the encoding of the file (sRGB for ordinary
-images), colours in the order red, green, blue. Files are written atomically.
+An image in memory is a float tensor (C, H, W), 0..1, in the file's encoding (sRGB for ordinary images), with
+colours in the order red, green, blue.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from torch import Tensor
 
 from arraygeom.runtime.atomic import write_atomically
 from arraygeom.runtime.chunks import ROWS, spans
+from arraygeom.runtime.extras import install_line
 from arraygeom.runtime.image_bytes import (
     JPEG,
     MINISBLACK,
@@ -43,30 +44,30 @@ from .profiles import in_srgb, with_srgb_profile
 from .suffixes import RAW_SUFFIXES
 
 FEW_BITS = (8, 10, 12, 14)
-"""Bits of cameras that may be stored in 16 bits as they are."""
+"""Bits of cameras whose counts may be stored unscaled in 16 bits."""
 HIGHLIGHTS = 0.98 * 2**14
-"""The largest value of an image that has highlights, of 14 bits."""
+"""Value above which a largest count suggests highlights of a 14-bit camera."""
 CHANNELS = "give a grey (1) or RGB (3) image"
 KINDS = "save it with 8 or 16 bits without sign, or as float 0..1"
 DECODED = ("bool", "uint8", "uint16", "float32", "float64")
-"""Types of a TIFF file's values which OpenCV reads, and which are usable."""
+"""Types of values in TIFF files that OpenCV reads and that are accepted."""
 
 GREY_WITH_ALPHA = 4
-"""The type of colour in a PNG file's header, its byte 25."""
+"""Colour type (byte 25 of a PNG file) of grey with alpha."""
 MOST_PIXELS = 2**28
-"""Images with more are read only where their size is expected: some 3 GiB in colour."""
+"""Pixels above which an image is read only if its size is expected: some 3 GiB in colour."""
 
 _DEFLATED = [cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_ADOBE_DEFLATE]
 _HEIF = tuple(b"ftyp" + brand for brand in (b"heic", b"heix", b"mif1", b"msf1", b"heim", b"heis"))
 
 
 Images = Mapping[str, Any]
-"""Images (C, H, W) by camera: a dict, or what reads them when asked for (`pat.fusion.views.ViewFiles`).
+"""Images (C, H, W) by camera: a dict, or a mapping that reads them on access (`pat.fusion.views.ViewFiles`).
 
-Not `Mapping[str, Tensor]`: what checks types would read one.
+Not `Mapping[str, Tensor]`: a type checker at run time would read one.
 """
 ImageSources = Mapping[str, Any] | Sequence[str | Path]
-"""An image file or tensor (C, H, W) in 0..1 of each camera by name; or files alone, which name cameras."""
+"""Image files or tensors (C, H, W) in 0..1 by camera name; or a list of files, which name the cameras."""
 
 
 def read_image(
@@ -77,23 +78,29 @@ def read_image(
     hw: HW | None = None,
     orientation: Literal["apply", "ignore"] = "apply",
 ) -> Float[Tensor, "c h w"]:
-    """The image in a PNG, TIFF, JPEG, PNM, BMP, WebP or HEIC: grey (1, H, W) or RGB (3, H, W), float32, 0..1.
+    """Read an image file: PNG, TIFF, JPEG, PNM, BMP, WebP, HEIC (extra `heic`) or camera raw (extra `raw`).
 
-    HEIC, which needs the extra `heic`, has 8 bits here and is rotated as its own header says. Raw files of
-    cameras (DNG and others), which need the extra `raw`, are developed to sRGB by LibRaw. An image of 8 bits
-    with another colour profile is converted to sRGB, with a warning; its profile is ignored with
-    `orientation="ignore"`, and so are those of images of 16 bits.
-    8-bit values are divided by 255 and 16-bit ones by 65535, or by 2^bits - 1: a 12-bit camera that stores
-    0..4095 in 16 bits needs `bits=12`. TIFF files that pack 10, 12 or 14 bits a value, and PNM files, which
-    state the largest, need nothing. Float files must hold 0..1. A wholly opaque alpha channel is dropped.
-    `name` (such as a camera's) goes in front of messages.
+    8-bit counts are divided by 255, 16-bit ones by 65535 or 2^bits - 1; TIFF files that pack 10, 12 or 14
+    bits, and PNM files, state their own white. Float files must hold 0..1. An opaque alpha channel is
+    dropped. HEIC is reduced to 8 bits and rotated as its header says; raw files are developed to sRGB by
+    LibRaw. An 8-bit image with another colour profile is converted to sRGB with a warning; profiles of 16-bit
+    images, and all with `orientation="ignore"`, are ignored.
 
-    An orientation tag (EXIF, TIFF) is applied, with a warning, as viewers and OpenCV's `imread` do; with
-    `orientation="ignore"` the pixels are as stored, as raw images need it. `hw` is the expected (height,
-    width), which is compared before anything is decoded.
+    Args:
+        name: prefix of messages, such as a camera's name.
+        bits: bits that the camera counts in, for a 12-bit camera that stores 0..4095 in 16 bits; None for the
+            file's own.
+        hw: expected (height, width), compared before decoding; None accepts up to `MOST_PIXELS`.
+        orientation: "apply" turns the image by its EXIF or TIFF tag, with a warning; "ignore" keeps pixels as
+            stored.
 
-    Raises FileNotFoundError for a missing file, ValueError for one that is not a usable image, has another
-    size than expected, or is larger than `MOST_PIXELS` where no size is.
+    Returns:
+        Grey (1, h, w) or RGB (3, h, w), float32, 0..1.
+
+    Raises:
+        FileNotFoundError: for a missing file.
+        ValueError: for a file that is no usable image, is larger than `MOST_PIXELS` or not of size `hw`, or
+            whose extra is not installed.
     """
     label = f"{name}: {path}" if name else f"{path}"
     planes, white = _planes(Path(path), label, hw, orientation)
@@ -107,9 +114,15 @@ def read_recorded(
     hw: HW | None = None,
     orientation: Literal["apply", "ignore"] = "apply",
 ) -> NDArray[Any]:
-    """Values (C, H, W) of an image file in its own type and counts; else, and in errors, as `read_image`.
+    """Read an image file's values without scaling; files, options and errors as in `read_image`.
 
-    Those of a TIFF or PNM file that states a lower white are as its camera counted them.
+    Returns:
+        Values (c, h, w) in the file's own type, uint8, uint16 or float, RGB order; TIFF and PNM files with a
+        lower white hold the camera's counts.
+
+    Raises:
+        FileNotFoundError: for a missing file.
+        ValueError: as `read_image`; float values outside 0..1 are not refused here.
     """
     label = f"{name}: {path}" if name else f"{path}"
     return np.ascontiguousarray(_planes(Path(path), label, hw, orientation)[0])
@@ -118,7 +131,7 @@ def read_recorded(
 def _planes(
     path: Path, label: str, hw: HW | None, orientation: Literal["apply", "ignore"]
 ) -> tuple[NDArray, int]:
-    """The values (C, H, W) as stored, upright, and the white that a TIFF or PNM file states (else 0)."""
+    """Values (C, H, W) as stored, upright, and the white that a TIFF or PNM file states (else 0)."""
     if not path.is_file():
         raise FileNotFoundError(f"{label}: no such image: check the path")
     content = _png_of_raw(path, label) if path.suffix.lower() in RAW_SUFFIXES else path.read_bytes()
@@ -146,15 +159,18 @@ def write_image(
     unknown: bool = False,
     profile: bool = False,
 ) -> None:
-    """Write a grey or RGB image atomically, in the format its name ends in (.png, .tif, .jpg, .exr).
+    """Write a grey or RGB image atomically, in the format of its suffix (.png, .tif, .jpg; .exr with extra
+    `synthesis`).
 
-    8 and 16 bits are rounded, after values are clipped to 0..1; 32 bits (.tif and .exr only) keep floats as
-    they are. With `profile`, PNG and JPEG files in colour say by an ICC profile that they are sRGB.
-    An .exr file needs the extra `synthesis`.
+    Args:
+        image: floats (1 or 3, h, w), in 0..1.
+        bits: 8 or 16: values are clipped to 0..1 and rounded; 32 (.tif and .exr only): floats as they are.
+        unknown: True allows NaN and infinity in 32-bit files.
+        profile: True adds an sRGB profile to JPEG files and to PNG files in colour.
 
-    Raises ValueError for an image of whole numbers, with another number of channels or with values that are
-    not finite (allowed with `unknown`, for maps of 32 bits in which some pixels are not known), and for a
-    format that cannot hold it.
+    Raises:
+        ValueError: for an image of integers, another number of channels, values that are not finite, or a
+            format that cannot hold it.
     """
     path = Path(path)
     if not image.is_floating_point():
@@ -175,7 +191,8 @@ def write_image(
 
 
 def has_many_bits(path: Path) -> bool:
-    """Whether an image file has more than 8 bits a value."""
+    """Return True for an image file with more than 8 bits a value, and for raw files; False if missing or
+    unreadable."""
     if path.suffix.lower() in RAW_SUFFIXES:
         return True
     header = image_header(path.read_bytes()) if path.is_file() else None
@@ -183,7 +200,7 @@ def has_many_bits(path: Path) -> bool:
 
 
 def _png_of_heif(path: Path, label: str, hw: HW | None) -> bytes:
-    """The image of a HEIC or HEIF file, upright, as a PNG file; its size is compared before it is decoded."""
+    """Convert a HEIC or HEIF file to the bytes of a PNG, upright; its size is compared before decoding."""
     pillow_heif = _of_extra("pillow_heif", "heic", f"{label}: reading HEIC", ", or save it as PNG")
     problem = f"{label}: not a HEIC image that can be read (%s): save it as PNG"
     try:
@@ -199,7 +216,7 @@ def _png_of_heif(path: Path, label: str, hw: HW | None) -> bytes:
 
 
 def _png_of_raw(path: Path, label: str) -> bytes:
-    """A camera's raw file as PNG: developed to sRGB in 16 bits with the camera's white balance, upright."""
+    """Develop a camera's raw file to the bytes of a PNG: 16-bit sRGB, the camera's white balance, upright."""
     rawpy = _of_extra("rawpy", "raw", f"{label}: reading raw files", ", or save it as TIFF")
     how = {"use_camera_wb": True, "no_auto_bright": True, "output_bps": 16, "gamma": (2.4, 12.92)}
     try:
@@ -211,7 +228,7 @@ def _png_of_raw(path: Path, label: str) -> bytes:
 
 
 def _applied(header: ImageHeader, orientation: str, label: str) -> int:
-    """The orientation to apply, 1 for none; a tag is reported either way."""
+    """Orientation to apply, 1 for none; warns of a tag in either case."""
     if header.orientation == 1:
         return 1
     if orientation == "ignore":
@@ -236,7 +253,7 @@ def _check_header(got: HW, wanted: HW | None, label: str) -> None:
 
 
 def _upright(values: NDArray, orientation: int) -> NDArray:
-    """The image that a viewer shows for an EXIF orientation."""
+    """Turn values as a viewer does for an EXIF orientation."""
     if orientation >= 5:
         values = values.swapaxes(0, 1)
     # After the transposition of 5 to 8.
@@ -246,9 +263,9 @@ def _upright(values: NDArray, orientation: int) -> NDArray:
 
 
 def _decode(content: bytes, header: ImageHeader, label: str) -> tuple[NDArray, int]:
-    """Values as stored, and the largest possible one where a TIFF or PNM file states it; else 0.
+    """Decode values as stored; with the largest possible value where a TIFF or PNM file states it, else 0.
 
-    OpenCV shifts those of TIFF files up to 16 bits, and scales those of 8 bits in PNM files of text to 255.
+    OpenCV shifts TIFF values of fewer than 16 bits up, and scales 8-bit values of text PNM files to 255.
     """
     values = decoded(_without_orientation(content, header))
     page = first_tiff_page(content) if content[:4] in TIFF else None
@@ -268,10 +285,10 @@ def _decode(content: bytes, header: ImageHeader, label: str) -> tuple[NDArray, i
 
 
 def _as_tiff_states(values: NDArray | None, page: Any, content: bytes, label: str) -> NDArray | None:
-    """Values as a TIFF file's tags state them, where OpenCV does not heed these.
+    """Correct OpenCV's reading of a TIFF file by the file's tags.
 
-    It gives the first of several bands that are no colours, and mixes planes and takes white for black in
-    images of more than 8 bits.
+    OpenCV returns the first of several bands that are no colours; beyond 8 bits it mixes planes and takes
+    white for black.
     """
     bands, grey = page.samplesperpixel, page.photometric in (MINISWHITE, MINISBLACK)
     if bands not in (1, 3, 4) or (bands == 4 and grey):
@@ -286,7 +303,7 @@ def _as_tiff_states(values: NDArray | None, page: Any, content: bytes, label: st
 
 
 def _without_orientation(content: bytes, header: ImageHeader) -> bytes:
-    """A TIFF file's bytes with orientation 1: OpenCV applies that of TIFF files alone, whatever is asked."""
+    """Bytes of a TIFF file with orientation 1: OpenCV always applies the tag in TIFF files."""
     if header.tag is None or header.orientation == 1:
         return content
     place, form = header.tag
@@ -296,13 +313,17 @@ def _without_orientation(content: bytes, header: ImageHeader) -> bytes:
 
 
 def _log_level(level: int) -> int:
-    """Set OpenCV's log level; returns the former one. OpenCV 5 has the function in another module."""
+    """Set OpenCV's log level and return the former one. OpenCV 5 has the function in another module."""
     logging = cv2 if hasattr(cv2, "setLogLevel") else getattr(cv2.utils, "logging")  # noqa: B009
     return int(logging.setLogLevel(level))
 
 
 def decoded(content: bytes, flags: int = cv2.IMREAD_UNCHANGED) -> NDArray | None:
-    """What OpenCV makes of a file's bytes, without its own messages; None for a damaged file."""
+    """Decode an image file's bytes by OpenCV without its messages.
+
+    Returns:
+        Values (h, w) or (h, w, channels), blue first, type as stored; None for a damaged file.
+    """
     if content[:2] == JPEG and flags == cv2.IMREAD_UNCHANGED:
         with suppress(Exception):  # damaged, which `decodable` says
             if (colours := jpeg_colours(content)) is not None:
@@ -317,8 +338,19 @@ def decoded(content: bytes, flags: int = cv2.IMREAD_UNCHANGED) -> NDArray | None
 
 
 def decoded_photograph(path: Path, flags: int, *, least: int = 1) -> NDArray | None:
-    """What OpenCV makes of an image file, 8 bits; None if it is none, has a side under `least` or too many
-    pixels."""
+    """Decode an image file to 8 bits by OpenCV.
+
+    Args:
+        flags: OpenCV's IMREAD flags.
+        least: least pixels of a side.
+
+    Returns:
+        Values, uint8, blue first; None if it is no image, has a side under `least`, or has more than
+        `MOST_PIXELS`.
+
+    Raises:
+        OSError: if the file cannot be read.
+    """
     content = path.read_bytes()
     header = image_header(content)
     if header is None or min(header.hw) < least or header.hw[0] * header.hw[1] > MOST_PIXELS:
@@ -331,7 +363,7 @@ def decoded_photograph(path: Path, flags: int, *, least: int = 1) -> NDArray | N
 
 
 def _opaque(values: NDArray, content: bytes, label: str, white: int) -> NDArray:
-    """Values without an alpha channel, which OpenCV gives to three equal bands where a PNG file is grey."""
+    """Values without alpha channel; OpenCV repeats grey in three equal bands when a PNG has alpha."""
     if values.ndim == 2 or values.shape[2] == 3:
         return values
     if values.shape[2] != 4:
@@ -357,7 +389,7 @@ def _unit_range(planes: NDArray, label: str, bits: int | None, white: int) -> ND
 
 
 def _counts(planes: NDArray, label: str, bits: int | None, white: int) -> NDArray[np.float32]:
-    """Whole numbers as 0..1. Raises ValueError for values beyond the bits that are stated."""
+    """Scale integers to 0..1. Raises ValueError for values beyond the stated bits."""
     stored, largest = max(white.bit_length(), 8), int(planes.max())
     if bits and bits > stored:
         raise ValueError(
@@ -384,17 +416,24 @@ def _counts(planes: NDArray, label: str, bits: int | None, white: int) -> NDArra
 
 
 def exr_writer(path: Path) -> Any:
-    """The package OpenEXR, to write to `path`. Raises ValueError where it is not installed."""
+    """Import the package OpenEXR, for writing to `path`.
+
+    Returns:
+        The module.
+
+    Raises:
+        ValueError: naming the extra, if it is not installed.
+    """
     return _of_extra("OpenEXR", "synthesis", f"{path}: writing EXR")
 
 
 def _of_extra(module: str, extra: str, purpose: str, advice: str = "") -> Any:
-    """An optional module. Raises ValueError, which says what to install, or to do, where there is none."""
+    """Import an optional module. Raises ValueError with the command to install it."""
     try:
         return import_module(module)
     except ImportError:
         package = module.replace("_", "-")
-        install = f"pip install 'arraygeom-pat[{extra}]'"
+        install = install_line(module, extra)
         raise ValueError(f"{purpose} needs the package {package}: {install}{advice}") from None
 
 
@@ -410,7 +449,8 @@ def _write_exr(path: Path, planes: NDArray, bits: int) -> None:
 
 
 def _encode(path: Path, colours: NDArray, bits: int) -> bytes:
-    """An image file's bytes, by the path's suffix. Raises ValueError for one that cannot hold it."""
+    """Encode an image in the format of the path's suffix. Raises ValueError for a format that
+    cannot hold it."""
     suffix = path.suffix.lower()
     if suffix in (".jpg", ".jpeg") and bits != 8:
         raise ValueError(f"{path}: JPEG holds 8 bits, not {bits}: write .png or .tif")

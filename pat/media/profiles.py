@@ -1,4 +1,4 @@
-"""Colour profiles (ICC): images are converted to sRGB when read, and say that they are sRGB when written."""
+"""ICC colour profiles: images are converted to sRGB when read, and labelled as sRGB when written."""
 
 from __future__ import annotations
 
@@ -15,20 +15,28 @@ from PIL import Image, ImageCms
 from arraygeom.runtime.warned import warn
 
 _JPEG_PART = 65_000
-"""Bytes of a profile in one segment of a JPEG file, at most."""
+"""Bytes of a profile that fit in one segment of a JPEG file."""
 
 
 @cache
 def srgb_profile() -> bytes:
-    """The ICC profile of sRGB, the same whenever it is made: bytes 24 to 35 are the date of its making."""
+    """Return the bytes of an ICC profile of sRGB, with a fixed date (bytes 24 to 35) so that files are
+    reproducible."""
     made = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
     return made[:24] + struct.pack(">6H", 2000, 1, 1, 0, 0, 0) + made[36:]
 
 
 def in_srgb(values: NDArray, content: bytes, label: str) -> NDArray:
-    """Values (H, W) or (H, W, 3; blue first) of image file `content`, made sRGB if its profile is another.
+    """Convert decoded values to sRGB if their file has another colour profile.
 
-    Warns that they were; or that they were not, for 16 bits and for profiles that cannot be used.
+    Args:
+        values: (h, w) or (h, w, 3) with blue first.
+        content: bytes of the image file.
+        label: prefix of warnings.
+
+    Returns:
+        Values in sRGB. With a warning instead, unchanged values of 16 bits, or with a profile that cannot be
+        used.
     """
     profile = _embedded(content)
     if profile is None:
@@ -51,7 +59,7 @@ def in_srgb(values: NDArray, content: bytes, label: str) -> NDArray:
 
 
 def _embedded(content: bytes) -> bytes | None:
-    """The ICC profile in an image file; None without one."""
+    """ICC profile in an image file; None without one."""
     if not any(mark in content for mark in (b"iCCP", b"ICC_PROFILE", b"ICCP", b"acsp")):
         return None
     try:
@@ -74,7 +82,12 @@ def _converted(values: NDArray, profile: ImageCms.ImageCmsProfile) -> NDArray:
 
 
 def with_srgb_profile(content: bytes, suffix: str) -> bytes:
-    """The bytes of a PNG or JPEG file in colour with the profile of sRGB; of other files as they are."""
+    """Add an sRGB profile to the bytes of an image file.
+
+    Returns:
+        The bytes of a PNG file in colour or a JPEG file with the profile; of other files unchanged. A grey
+        JPEG gets it, too.
+    """
     if suffix == ".png" and content[25] in (2, 6):
         body = b"iCCP" + b"sRGB\0\0" + zlib.compress(srgb_profile())
         chunk = struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body))

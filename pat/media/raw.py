@@ -1,7 +1,7 @@
-"""Raw camera images -> images to fuse, by the rig's counts, filter pattern, exposure and encoding.
+"""Development of raw camera images by the rig's counts, filter pattern, exposure and encoding.
 
-Images to fuse are sRGB-encoded, on alpha's scale of light: where exposures and gains are known, a surface has
-one value in all of them. Ordinary images, which the rig describes no further, are unchanged.
+Developed images are sRGB-encoded, on alpha's scale of light: with known exposures and gains a surface has one
+value in all of them. Ordinary images, of which the rig states nothing more, stay unchanged.
 """
 
 from __future__ import annotations
@@ -25,10 +25,16 @@ from .colour import linear_from_srgb, luminance, srgb_from_linear
 def develop(
     image: Float[Tensor, "c h w"], sensor: Sensor, *, like: Sensor | None = None
 ) -> Float[Tensor, "c2 h w"]:
-    """The image sRGB-encoded: black level subtracted, demosaiced, light on `like`'s scale.
+    """Develop an image to sRGB: subtract the black level, demosaic, scale light to another camera's exposure.
 
-    `image` holds counts over 2^bits - 1. Values are at least 0, and exceed 1 where the light is
-    above white on `like`'s scale. Exposures are used only where both are known.
+    Args:
+        image: counts over 2^bits - 1.
+        sensor: the camera that recorded it.
+        like: sensor whose scale of light is wanted; None for its own. Exposures count only if both are known.
+
+    Returns:
+        sRGB values, 3 channels for a filter mosaic; at least 0 after a black level was subtracted, above 1
+        where light exceeds white.
     """
     factor = _light(sensor, like or sensor)
     if sensor.black_level:
@@ -44,26 +50,31 @@ def develop(
 
 
 def recorded_bands(values: Any, sensor: Sensor) -> Any:
-    """Values (C, H, W) of a file; one band of three equal ones of a camera that is in grey by the rig."""
+    """Reduce three equal bands to one for a camera that the rig declares grey.
+
+    Returns:
+        Values (1, h, w) in that case; otherwise `values` unchanged.
+    """
     grey = len(values) == 3 and sensor.response not in (None, "rgb")
     return values[:1] if grey and all((values[0] == band).all() for band in values[1:]) else values
 
 
 LIGHT = "luminance of light"
-"""The response of developed images known to be the sRGB-encoded luminance of linear light.
+"""Response of developed images known to be sRGB-encoded luminance of linear light.
 
-Ordinary grey images may be the luma of sRGB values instead, which differs where colours are saturated."""
+Ordinary grey images may be the luma of sRGB values instead, which differs for saturated colours.
+"""
 
 
 def developed(sensor: Sensor) -> Sensor:
-    """The sensor of developed images: sRGB values, no counts, no filter pattern."""
+    """Return the sensor of developed images: sRGB values, no counts, no filter pattern, gain 1."""
     measured = sensor.response == "mono" and sensor.coding == "linear"
     plain = dataclasses.replace(sensor, coding="srgb", bayer=None, bits=None, black_level=0.0, gain=1.0)
     return dataclasses.replace(plain, response=LIGHT) if measured else plain
 
 
 def developed_rig(rig: Rig, names: Iterable[str]) -> Rig:
-    """The rig of the developed images of these cameras."""
+    """Return the rig with the named cameras' sensors replaced by those of developed images."""
     for name in names:
         rig = rig.with_camera(name, rig[name].replace(sensor=developed(rig[name].sensor)))
     return rig
@@ -72,10 +83,13 @@ def developed_rig(rig: Rig, names: Iterable[str]) -> Rig:
 def match_luminance(
     image: Float[Tensor, "3 h w"], alpha: Float[Tensor, "1 h w"], sensor: Sensor
 ) -> Float[Tensor, "3 h w"]:
-    """The fused image with alpha's luminance of light, if alpha's camera measured that (`LIGHT`).
+    """Shift a fused image so that the luminance of its light is alpha's, if alpha's camera measured light.
 
-    Fusion gives an image whose sRGB values have alpha's as their luma. Here all three are shifted by the same
-    amount until the luminance of their light is alpha's: by 0.045 for saturated purple of middle brightness.
+    Fusion gives sRGB values whose luma is alpha's. Where `sensor.response` is `LIGHT`, all three values of a
+    pixel are shifted equally until luminance agrees: by 0.045 for saturated purple of middle brightness.
+
+    Returns:
+        The shifted RGB image, not clipped; `image` itself for another response.
     """
     if sensor.response != LIGHT:
         return image
@@ -83,7 +97,8 @@ def match_luminance(
 
 
 def _missing(image: Tensor, light: Tensor) -> Tensor:
-    """The shift of sRGB values giving this luminance of light; Newton on a convex function, from above."""
+    """Shift of sRGB values that gives this luminance of light, by Newton's method on a convex function from
+    above."""
     shift = torch.zeros_like(light)
     for _ in range(4):
         value = image + shift
@@ -94,10 +109,16 @@ def _missing(image: Tensor, light: Tensor) -> Tensor:
 
 
 def demosaiced(raw: Float[Tensor, "1 h w"], pattern: str) -> Float[Tensor, "3 h w"]:
-    """Colours of a raw image behind a colour filter mosaic, interpolated along edges (OpenCV, in 16 bits).
+    """Interpolate a Bayer mosaic along edges (OpenCV, in 16 bits).
 
-    Red and blue are green plus the median of their differences from it over 3x3 pixels (Freeman, US patent
-    4,724,395): false-colour fringes at fine detail would otherwise be propagated to alpha.
+    Red and blue are green plus the 3x3 median of their difference from it (Freeman, US patent 4,724,395),
+    which removes false-colour fringes.
+
+    Args:
+        pattern: OpenCV's name of the mosaic, such as "RG".
+
+    Returns:
+        RGB image of the same size, clipped to 0..1, without gradient.
     """
     code = getattr(cv2, f"COLOR_Bayer{pattern}2RGB_EA")
     counts = np.rint(raw[0].clamp(0, 1).cpu().numpy().astype(np.float64) * 65535).astype(np.uint16)
@@ -109,12 +130,12 @@ def demosaiced(raw: Float[Tensor, "1 h w"], pattern: str) -> Float[Tensor, "3 h 
 
 
 def light_of(sensor: Sensor, like: Sensor) -> float:
-    """The value (1 is white) that `sensor` records, grey or green, of light that is 1 on `like`'s scale."""
+    """Return the value that `sensor` records (1 is white), in grey or green, for 1 on `like`'s scale."""
     return 1 / _light(sensor, like)[1]
 
 
 def _light(sensor: Sensor, like: Sensor) -> tuple[float, float, float]:
-    """Factors of linear red, green and blue; a grey image takes the middle one."""
+    """Factors of linear red, green and blue; a grey image takes the second."""
     exposure = like.exposure / sensor.exposure if like.exposure and sensor.exposure else 1.0
     wanted = _gains(like)[1]
     r, g, b = (exposure * wanted / gain for gain in _gains(sensor))

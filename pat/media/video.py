@@ -1,4 +1,4 @@
-"""Frames to a video file, and from one."""
+"""Video files: writing and reading frames."""
 
 from __future__ import annotations
 
@@ -20,10 +20,17 @@ from .colour import to_bytes
 
 
 def write_video(path: str | Path, frames: Iterable[Float[Tensor, "c h w"]], *, rate: float = 25.0) -> None:
-    """Write images (grey or RGB, sRGB values, clipped to 0..1) as H.264 (.mp4, .mkv), atomically.
+    """Write images as an H.264 video (.mp4, .mkv), atomically.
 
-    An odd last row or column is left out: 4:2:0 has none. Raises ValueError for no frames, frames of
-    different sizes or under 2 x 2, and other suffixes, and as `check_video`.
+    Args:
+        frames: grey or RGB images, sRGB values, clipped to 0..1; an odd last row or column is left out, as
+            4:2:0 needs even sides.
+        rate: frames for each second.
+
+    Raises:
+        ImportError: without the extra `video`.
+        ValueError: for no frames, frames of different sizes or under 2 x 2, another suffix, or a rate outside
+            .001 to 1000.
     """
     path = Path(path)
     if path.suffix.lower() not in (".mp4", ".mkv"):
@@ -51,9 +58,11 @@ def write_video(path: str | Path, frames: Iterable[Float[Tensor, "c h w"]], *, r
 
 
 def check_video(rate: float) -> None:
-    """Raise, before frames are made, what writing them would.
+    """Check before frames are made that a video can be written.
 
-    ImportError without the extra `video`, ValueError for a rate that players do not show.
+    Raises:
+        ImportError: without the extra `video`.
+        ValueError: for a rate outside .001 to 1000 frames a second.
     """
     with needs("video", "writing video"):
         import av  # noqa: F401
@@ -62,9 +71,11 @@ def check_video(rate: float) -> None:
 
 
 class Video(NamedTuple):
-    """The frames of a video file, 0..1, read as they are asked for, and how many there are a second.
+    """Frames of a video file, read as they are asked for.
 
-    They are RGB (3, H, W), or grey (1, H, W) if the first is (`is_grey`).
+    Attributes:
+        frames: images 0..1, RGB (3, h, w), or grey (1, h, w) if the first is grey (`is_grey`).
+        rate: frames for each second.
     """
 
     frames: Iterator[Float[Tensor, "c h w"]]
@@ -72,7 +83,15 @@ class Video(NamedTuple):
 
 
 def read_video(path: str | Path) -> Video:
-    """A video of any format that OpenCV reads. Raises FileNotFoundError, or ValueError for no video."""
+    """Open a video file of any format that OpenCV reads.
+
+    Returns:
+        Its frames, decoded on demand, and their rate. A file damaged further on ends early without an error.
+
+    Raises:
+        FileNotFoundError: for a missing file.
+        ValueError: for a file that is no readable video.
+    """
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such video: check the path")
@@ -84,13 +103,15 @@ def read_video(path: str | Path) -> Video:
 
 
 GREY_ROUNDED = 4 / 255
-"""Codecs round the colour of grey to this: MPEG-4 in OpenCV's conversion to 3 counts of 255."""
+"""Colour difference to which codecs round grey: for MPEG-4 in OpenCV's conversion, 3 counts of 255."""
 CONTRAST = 10.0
-"""A picture shows that it is grey if its brightness differs by this many times more: a black one does not."""
+"""Ratio of brightness range to colour difference above which a picture counts as grey: a black
+one does not."""
 
 
 def is_grey(image: Float[Tensor, "3 h w"]) -> bool:
-    """Whether a decoded picture of any contrast has no colour but a codec's rounding."""
+    """Return True for a decoded picture with contrast whose colours differ by no more than a codec's
+    rounding."""
     differences = image.amax(0) - image.amin(0)
     low, high = image[1].aminmax()
     return float(differences.max()) < min(GREY_ROUNDED, float(high - low) / CONTRAST)

@@ -26,7 +26,13 @@ PREFIX = "module."
 
 
 class Authors(NamedTuple):
-    """A checkpoint: its configuration here, the weights by their names here, and what else the file says."""
+    """A checkpoint of the paper's authors, converted.
+
+    Attributes:
+        config: configuration of the PAT here.
+        state: weights by their names here.
+        facts: text of the file on its recipe, epoch and PSNR.
+    """
 
     config: PATConfig
     state: dict[str, Tensor]
@@ -34,10 +40,15 @@ class Authors(NamedTuple):
 
 
 def read_authors(path: str | Path) -> Authors:
-    """A checkpoint of theirs, of any number of inputs and any upscale factor.
+    """Read an authors' checkpoint, of any number of inputs and any upscale factor.
 
-    Raises FileNotFoundError for no file; ValueError for one that would run code, is cut short, or holds
-    another network, naming the first weight that does not fit.
+    Returns:
+        Configuration, weights and facts.
+
+    Raises:
+        FileNotFoundError: for a missing file.
+        ValueError: for a file that would run code, is cut short, or holds another network; the text names the
+            first weight that does not fit.
     """
     content = _loaded(Path(path))
     state = content.get("state_dict", content) if isinstance(content, Mapping) else None
@@ -53,7 +64,15 @@ def read_authors(path: str | Path) -> Authors:
 
 
 def load_authors(path: str | Path) -> PAT:
-    """The network of an authors' checkpoint (best.pth.tar), ready to use. Raises as `read_authors`."""
+    """Load the network of an authors' checkpoint (best.pth.tar).
+
+    Returns:
+        The network, for evaluation, its weights without gradients.
+
+    Raises:
+        FileNotFoundError: for a missing file.
+        ValueError: as `read_authors`.
+    """
     read = read_authors(path)
     network = PAT(read.config)
     network.load_state_dict(read.state)
@@ -61,7 +80,11 @@ def load_authors(path: str | Path) -> PAT:
 
 
 def config_of(state: Mapping[str, Tensor]) -> PATConfig:
-    """The configuration that weights with their names are of. Raises ValueError naming what is missing."""
+    """Derive the configuration of the network that weights by their authors' names belong to.
+
+    Raises:
+        ValueError: for missing weights, by name, and for sizes beyond 1 to 1024.
+    """
     betas = sum(re.fullmatch(r"pam\.b2s\.\d+\.weight", name) is not None for name in state)
     for name in ("init_feature.0.weight", "upscale.4.weight", "upscale.7.weight"):
         if name not in state or state[name].dim() != 4:
@@ -83,9 +106,13 @@ def config_of(state: Mapping[str, Tensor]) -> PATConfig:
 
 
 def renamed(weights: Mapping[str, Tensor], config: PATConfig) -> dict[str, Tensor]:
-    """Weights with their names as those of a PAT of this configuration.
+    """Rename weights by their authors' names to those of a PAT of this configuration.
 
-    Raises ValueError naming the first that is missing, too many, or of another shape.
+    Returns:
+        Weights by name, in float32.
+
+    Raises:
+        ValueError: for the first weight that is missing, too many, of another shape, or not finite.
     """
     with torch.device("meta"):
         wanted = {name: tuple(t.shape) for name, t in PAT(config).state_dict().items()}
@@ -107,7 +134,7 @@ def renamed(weights: Mapping[str, Tensor], config: PATConfig) -> dict[str, Tenso
 
 
 def _names(betas: int) -> Iterator[tuple[str, str]]:
-    """Their name of each weight, and ours."""
+    """Yield the authors' name of each weight, and the name here."""
     yield "init_feature.0.weight", "features.0.weight"
     for layer in (2, 4, 6):
         yield from _block(f"init_feature.{layer}", f"features.{layer}")
@@ -136,7 +163,7 @@ def _block(theirs: str, ours: str) -> Iterator[tuple[str, str]]:
 
 
 def _loaded(path: Path) -> Any:
-    """What the file holds, read without running anything of it."""
+    """Return the content of the file, read without running any code in it."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     # Their psnr is a number of numpy's: these two make one, and nothing else.

@@ -1,9 +1,9 @@
-"""Noise taken out of groups of alike blocks, like BM3D (Dabov et al. 2007), from a network's estimate.
+"""Noise removed from groups of similar blocks, like BM3D (Dabov et al. 2007), from a network's estimate.
 
-Blocks of 8 x 8 pixels are stacked with those most alike near them. A cosine transform of each and a Hadamard
-transform over the stack gather what they have in common in few coefficients, and noise spreads over all of
-them. Coefficients are weighted by how strong they are in an earlier estimate (Wiener's filter). What another
-camera recorded of the same points is added likewise (`seen_by_another`).
+Blocks of 8 x 8 pixels are stacked with the most similar ones near them. A cosine transform of each and a
+Hadamard transform over the stack gather their common content in few coefficients, and noise spreads over all
+of them. Coefficients are weighted by their strength in an earlier estimate (Wiener's filter). Another
+camera's recording of the same points is added likewise (`seen_by_another`).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from .denoiser import opponent, opponent_deviation, rgb_of_opponent
 
 @dataclass(frozen=True)
 class BM3DSettings:
-    """Of the filter of alike blocks (Dabov et al. 2007)."""
+    """Settings of the filter of similar blocks (Dabov et al. 2007)."""
 
     side: int = size(8, "Side of a block, pixels")
     step: int = size(4, "Steps between blocks, pixels")
@@ -50,7 +50,7 @@ class BM3DSettings:
 
 SETTINGS = BM3DSettings()
 SIDE, STEP, ALIKE, RADIUS, ROWS = SETTINGS.side, SETTINGS.step, SETTINGS.alike, SETTINGS.radius, SETTINGS.rows
-"""For the compiled loops, which read no attributes."""
+"""Settings as constants for the compiled loops, which read no attributes."""
 AS_RECORDED, KEPT, UNLIKE = SETTINGS.as_recorded, SETTINGS.kept, SETTINGS.unlike
 CELLS = SIDE // STEP
 
@@ -58,7 +58,15 @@ CELLS = SIDE // STEP
 def without_noise(
     network: Callable[..., Tensor], recorded: Float[Tensor, "b c h w"], deviation: Float[Tensor, "b c h w"]
 ) -> Float[Tensor, "b c h w"]:
-    """What a denoiser of `LowLightNetwork` makes of images of one band or of three (RGB), `refined`."""
+    """Denoise images of one band or of three (RGB) by a denoiser of `LowLightNetwork`, and refine its result.
+
+    Args:
+        network: denoiser, called with the images and the deviations.
+        deviation: standard deviation of each value's noise.
+
+    Returns:
+        Images as of `refined`.
+    """
     return refined(network(recorded, deviation), recorded, deviation)
 
 
@@ -67,10 +75,15 @@ def refined(
     recorded: Float[Tensor, "b c h w"],
     deviation: Float[Tensor, "b c h w"],
 ) -> Float[Tensor, "b c h w"]:
-    """A network's estimate of an image of one band or of three (RGB), from what was recorded with noise.
+    """Refine a network's estimate of images of one band or of three (RGB) that were recorded with noise.
 
-    The noise is white and of this standard deviation. Brightness is a mean of the network's and the filtered
-    one; colour is filtered twice.
+    Brightness is a mean of the network's and the filtered one; colour is filtered twice.
+
+    Args:
+        deviation: standard deviation of each value's white noise.
+
+    Returns:
+        Images of the same shape, detached.
     """
     return torch.stack([_refined(*parts) for parts in zip(estimate, recorded, deviation)])
 
@@ -86,7 +99,7 @@ def _refined(estimate: Tensor, recorded: Tensor, deviation: Tensor) -> Float[Ten
 
 
 def _filtered(recorded: Tensor, expected: Tensor, deviation: Tensor) -> Float[Tensor, "c h w"]:
-    """By Wiener's filter; blocks are alike by the first band."""
+    """Filter by Wiener's filter; blocks are similar by the first band."""
     return wiener_filtered(recorded, expected, deviation, torch.lerp(expected[:1], recorded[:1], AS_RECORDED))
 
 
@@ -96,20 +109,29 @@ def wiener_filtered(
     deviation: Float[Tensor, "c h w"],
     guide: Float[Tensor, "g h w"],
 ) -> Float[Tensor, "c h w"]:
-    """An image without white noise of this standard deviation, each band by itself; `expected` estimates it
-    without noise.
+    """Remove white noise from an image, each band separately, by Wiener's filter of groups of similar blocks.
 
-    Blocks are alike where `guide` is. Beyond the edges images are mirrored. Computed in float32 on the CPU,
-    on as many threads as torch may use; back on the image's device.
+    Beyond the edges images are mirrored. Computed in float32 on the CPU, on as many threads as torch may use.
+
+    Args:
+        expected: estimate of the image without noise.
+        deviation: standard deviation of each value's noise.
+        guide: image in which blocks are compared.
+
+    Returns:
+        The filtered image on the image's device, detached.
     """
     return _of_groups(filter_groups, [image, expected, deviation.square()], guide, len(image))
 
 
 class Observation(NamedTuple):
-    """What another camera recorded at an image's pixels, of the same band: each (1, h, w).
+    """Another camera's recording at an image's pixels, of the same band: each (1, h, w).
 
-    `grain` is noise of unit deviation where that camera's is white, as it is when it gets there; `confidence`
-    is that of the positions.
+    Attributes:
+        recorded: values.
+        deviation: standard deviation of their noise.
+        grain: noise of unit deviation, white in that camera, after it is resampled.
+        confidence: confidence of the positions, 0 to 1.
     """
 
     recorded: Tensor
@@ -124,11 +146,18 @@ def seen_by_another(
     deviation: Float[Tensor, "1 h w"],
     other: Observation,
 ) -> Float[Tensor, "1 h w"]:
-    """What another camera's recording of the same points changes in an estimate without noise.
+    """Compute the update of an estimate without noise by another camera's recording of the same points.
 
-    Kalman's update (1960) of each group's coefficients. The estimate's error is that of Wiener's filter for
-    what was `recorded` with noise of this deviation. The other camera blurs (by how much is found), and its
-    noise has a spectrum; the less its positions are certain, the less it counts.
+    Kalman's update (1960) of each group's coefficients. The estimate's error is that of Wiener's filter. The
+    blur of the other camera is estimated, and its noise has a spectrum; the less certain its positions are,
+    the less it counts.
+
+    Args:
+        recorded: values from which the estimate was made.
+        deviation: standard deviation of their noise.
+
+    Returns:
+        Values to add to the estimate, detached.
     """
     taken = torch.lerp(estimate, other.recorded, other.confidence)
     planes = [estimate, taken, deviation.square(), other.deviation.square(), other.confidence]
@@ -137,7 +166,8 @@ def seen_by_another(
 
 
 def _blur_and_spectrum(estimate: Float[Tensor, "1 h w"], other: Observation) -> tuple[np.ndarray, np.ndarray]:
-    """The share of each coefficient of a block that another camera shows, and the power of its grain."""
+    """Estimate the share of each coefficient of a block that another camera shows, and the power of its
+    grain."""
     step = max(round((estimate.numel() / SETTINGS.blocks) ** 0.5), 1)
     planes = torch.stack([estimate, *other[:1], *other[2:]]).float()
     size = [max(SIDE - n, 0) for n in reversed(estimate.shape[-2:])]
@@ -154,7 +184,7 @@ def _blur_and_spectrum(estimate: Float[Tensor, "1 h w"], other: Observation) -> 
 def _of_groups(
     kernel: Callable[..., None], images: Sequence[Tensor], guide: Float[Tensor, "g h w"], bands: int
 ) -> Float[Tensor, "bands h w"]:
-    """What a kernel makes of the groups of blocks that are alike in the guide, put together."""
+    """Apply a kernel to the groups of blocks that are similar in the guide, and blend the results."""
     h, w = guide.shape[-2:]
     margin = SIDE - STEP
     across, down = (-(-(size + margin) // STEP) for size in (w, h))
@@ -185,16 +215,18 @@ def _of_groups(
 _PHASES = np.outer(np.arange(SIDE), 2 * np.arange(SIDE) + 1) * np.pi / (2 * SIDE)
 _LENGTHS = np.where(np.arange(SIDE) > 0, 2, 1)[:, None] ** 0.5
 COSINES = (np.cos(_PHASES) * _LENGTHS / SIDE**0.5).astype(np.float32)
-"""The cosine transform (DCT-II) as an orthogonal matrix. By scipy it would add to the time of every start."""
+"""The cosine transform (DCT-II) as an orthogonal matrix; SciPy's would add to the time of every start."""
 WINDOW = np.outer(np.kaiser(SIDE, 2.0), np.kaiser(SIDE, 2.0)).astype(np.float32)
-"""What a block's pixels count when blocks are put together."""
+"""Weights of a block's pixels when blocks are blended."""
 
 
 @compiled(nogil=True, cache=True, fastmath=True)
 def find_alike(guide, top, alike):
-    """Fill `alike` (rows, columns, ALIKE, 2) with displacements (y, x) of the blocks most alike each one.
+    """Fill `alike` (rows, columns, ALIKE, 2) with displacements (y, x) of the blocks most similar to each
+    one.
 
-    Block (r, k) begins at pixel (STEP (top + r), STEP k), RADIUS pixels inside; the first found is itself.
+    Block (r, k) begins at pixel (STEP (top + r), STEP k), RADIUS pixels inside; the first one of a group is
+    itself.
     """
     rows, columns = alike.shape[:2]
     cells = np.zeros((rows + CELLS - 1, columns + CELLS - 1), np.float32)
@@ -249,7 +281,7 @@ def block_transform(blocks, spare, matrix):
 
 @compiled(inline="always")
 def group_transform(blocks):
-    """Hadamard's transform over the group, in place; its own inverse."""
+    """Apply Hadamard's transform over the group, in place; it is its own inverse."""
     for i in range(SIDE * SIDE):
         width = 1
         while width < ALIKE:
@@ -264,7 +296,7 @@ def group_transform(blocks):
 
 @compiled(inline="always")
 def read_group(plane, y0, x0, alike, matrix, spare, group):
-    """Fill a group with the blocks of a plane, transformed."""
+    """Fill a group with the transformed blocks of a plane."""
     for n in range(ALIKE):
         y, x = y0 + alike[n, 0], x0 + alike[n, 1]
         for i in range(SIDE):
@@ -276,7 +308,7 @@ def read_group(plane, y0, x0, alike, matrix, spare, group):
 
 @compiled(inline="always")
 def mean_of_group(plane, y0, x0, alike):
-    """That of a plane in the middles of a group's blocks."""
+    """Return the mean of a plane in the middles of a group's blocks."""
     mean = np.float32(1e-12)
     for n in range(ALIKE):
         mean += plane[y0 + alike[n, 0] + SIDE // 2, x0 + alike[n, 1] + SIDE // 2] / ALIKE
@@ -285,7 +317,7 @@ def mean_of_group(plane, y0, x0, alike):
 
 @compiled(inline="always")
 def put_back(group, counts, y0, x0, alike, window, out):
-    """Add to `out` (2, rows, w) a group's blocks, which count so much each, and weights."""
+    """Add to `out` (2, rows, w) a group's blocks with a weight, and the weights."""
     for n in range(ALIKE):
         y, x = y0 + alike[n, 0], x0 + alike[n, 1]
         for i in range(SIDE):
@@ -297,7 +329,8 @@ def put_back(group, counts, y0, x0, alike, window, out):
 
 @compiled(nogil=True, cache=True, fastmath=True)
 def filter_groups(image, expected, variance, top, alike, cosines, window, out):
-    """Add to `out` (2, c, rows, w), from its first row of blocks: filtered blocks, weighted, and weights."""
+    """Add to `out` (2, c, rows, w), from its first row of blocks, filtered blocks with weights, and the
+    weights."""
     rows, columns = alike.shape[:2]
     group = np.empty((SIDE * SIDE, ALIKE), np.float32)
     pilot = np.empty((SIDE * SIDE, ALIKE), np.float32)
@@ -327,7 +360,8 @@ def filter_groups(image, expected, variance, top, alike, cosines, window, out):
 def update_groups(
     share, spectrum, estimate, taken, variance, other, confidence, top, alike, cosines, window, out
 ):
-    """Add to `out` (2, 1, rows, w), from its first row of blocks: the weighted updates, and weights."""
+    """Add to `out` (2, 1, rows, w), from its first row of blocks, the updates with weights, and
+    the weights."""
     rows, columns = alike.shape[:2]
     group = np.empty((SIDE * SIDE, ALIKE), np.float32)
     pilot = np.empty((SIDE * SIDE, ALIKE), np.float32)

@@ -1,4 +1,4 @@
-"""The networks' configurations. Torch is not imported: the command line reads them for its options."""
+"""Configurations of the networks. Torch is not imported: the command line reads them for its options."""
 
 from __future__ import annotations
 
@@ -8,17 +8,23 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class PATConfig:
-    """The paper's network by default.
+    """Configuration of PAT; the default is the paper's network.
 
-    `betas` is their number, `in_channels` that of each image (an image with fewer is repeated), `dim` the
-    width D, `scale` the enlargement s by pixel shuffle. `residual` adds the network's answer to alpha instead
-    of replacing it, so that alpha's own detail cannot be lost. `interpolation` is how beta is sampled.
-
-    Where the authors' code has another layout: `block_bias` of residual blocks, `fusion_bias` of the 1x1
-    fusion, and `values_after_block`, values made of the features that keys are made of. `normalised` gives
-    the features one more channel of every image, its luminance with the mean and the contrast of its
-    surroundings taken away: what a grey and a colour camera see alike. `equal_resolution` has betas resized
-    to about alpha's angular resolution first.
+    Attributes:
+        betas: number of betas.
+        in_channels: number of channels of each image; an image of one channel is repeated.
+        out_channels: number of bands of the fused image.
+        dim: width D of the features.
+        scale: enlargement s by pixel shuffle.
+        residual: True to add the network's output to alpha in place of replacing it, so that alpha's own
+            detail cannot be lost.
+        interpolation: interpolation of beta's samples.
+        block_bias: True for biases in residual blocks, which the authors' code has not.
+        fusion_bias: True for a bias of the 1x1 fusion, as the authors' code has.
+        values_after_block: True for values computed from the features of the keys, as in the authors' code.
+        normalised: True for one more input channel of every image: its luminance without the mean and
+            contrast of its surroundings, which a grey and a colour camera see alike.
+        equal_resolution: True to resize betas to about alpha's angular resolution first.
     """
 
     betas: int = 1
@@ -37,10 +43,13 @@ class PATConfig:
 
 @dataclass(frozen=True)
 class GuidedPATConfig:
-    """Bands of the image; None: all of the betas'.
+    """Configuration of GuidedPAT.
 
-    `keep_luminance` lets the network add colour to alpha, never luminance. Without `learned` matching is
-    classical: semi-global with a left-right check, nothing trained, and no stated certainty.
+    Attributes:
+        bands: number of bands of the fused image; None for all bands of the betas.
+        keep_luminance: True if the network adds colour to alpha but never luminance.
+        learned: True for matching with trained networks; False for classical matching, semi-global with a
+            left-right check, without a stated certainty.
     """
 
     bands: int | None = 3
@@ -49,4 +58,4 @@ class GuidedPATConfig:
 
 
 CONFIGS = {"PAT": PATConfig, "GuidedPAT": GuidedPATConfig}
-"""By the name of the network."""
+"""Class of the configuration by name of the network."""

@@ -16,7 +16,7 @@ from ..support.settings import size
 
 @dataclass(frozen=True)
 class DenoiserSettings:
-    """Of what the denoisers are given."""
+    """Settings of the denoisers' inputs."""
 
     multiple: int = size(8, "Images are padded to multiples of this")
     scale: float = size(4.0, "So many times larger deviations are given to networks: about as values")
@@ -27,14 +27,20 @@ SETTINGS = DenoiserSettings()
 
 @dataclass(frozen=True)
 class DenoiserConfig:
-    """Widths of the U-Nets at 1/2, 1/4 and 1/8 size, and their residual blocks at each."""
+    """Configuration of the denoisers' U-Nets.
+
+    Attributes:
+        widths: channels at 1/2, 1/4 and 1/8 size.
+        blocks: number of residual blocks at each size.
+    """
 
     widths: tuple[int, int, int] = (48, 96, 128)
     blocks: int = 2
 
 
 class Denoising(nn.Module):
-    """An image minus its noise, estimated in units of a standard deviation: at 0 it stays as it is."""
+    """A network that subtracts noise, estimated in units of its standard deviation: at 0 an image stays as it
+    is."""
 
     def __init__(self, bands: int, config: DenoiserConfig) -> None:
         super().__init__()
@@ -44,7 +50,14 @@ class Denoising(nn.Module):
     def forward(
         self, image: Float[Tensor, "b c h w"], deviation: Float[Tensor, "b c h w"]
     ) -> Float[Tensor, "b c h w"]:
-        """Of any size."""
+        """Denoise images of any size.
+
+        Args:
+            deviation: standard deviation of each value's noise.
+
+        Returns:
+            Images of the same shape, not clipped.
+        """
         h, w = image.shape[-2:]
         inputs = torch.cat([image - 0.5, SETTINGS.scale * deviation], 1)
         inputs = pad(inputs, (0, -w % SETTINGS.multiple, 0, -h % SETTINGS.multiple), mode="replicate")
@@ -53,22 +66,22 @@ class Denoising(nn.Module):
 
 
 def opponent(rgb: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
-    """Brightness and two colour differences, on orthogonal axes of unit length."""
+    """Compute brightness and two colour differences, on orthogonal axes of unit length."""
     return torch.einsum("ij,bjhw->bihw", rgb.new_tensor(OPPONENT), rgb)
 
 
 def opponent_deviation(deviation: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
-    """The standard deviation of `opponent` bands from those of independent red, green and blue."""
+    """Compute the standard deviation of `opponent` bands from those of independent red, green and blue."""
     return torch.einsum("ij,bjhw->bihw", deviation.new_tensor(OPPONENT).square(), deviation.square()).sqrt()
 
 
 def rgb_of_opponent(bands: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
-    """The inverse of `opponent`."""
+    """Compute red, green and blue from `opponent` bands: its inverse."""
     return torch.einsum("ji,bjhw->bihw", bands.new_tensor(OPPONENT), bands)
 
 
 class LowLightNetwork(nn.Module):
-    """Denoisers of one band and of a colour image."""
+    """Denoisers of one band (`band`) and of a colour image (`colour`)."""
 
     def __init__(self, config: DenoiserConfig = DenoiserConfig()) -> None:
         super().__init__()

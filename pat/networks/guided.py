@@ -2,7 +2,7 @@
 
 Matching (`pat.matching`) gives the bands of each beta at its matches, the weight of each match, and fills for
 the rest. This network joins several betas, adds a fill by attention of alpha to itself
-(`pat.networks.recall`), and smooths what is doubtful. Nothing of it is trained; the confidence and the depth
+(`pat.networks.recall`), and smooths doubtful pixels. Nothing of it is trained; the confidence and the depth
 that come with an image are (`pat.matching.choice`, `pat.matching.certainty`).
 """
 
@@ -51,13 +51,18 @@ class GuidedPAT(nn.Module):
         self.joins_bands: JoinsBands = "all" if config.bands is None else "neighbours"
 
     def working_bytes(self, alpha: int, betas: Sequence[int]) -> float:
-        """Bytes of memory to fuse so many pixels of alpha, beside the inputs."""
+        """Return the bytes of memory to fuse so many pixels of alpha, beside the inputs."""
         return alpha * (280.0 + 60.0 * max(len(betas) - 1, 0))
 
     def forward(self, inputs: Inputs, matches: Matches | None = None) -> FusionOutput:
-        """Fuse alpha (B, 1, H, W) with the betas. The image has the betas' bands.
+        """Fuse alpha (B, 1, H, W) with the betas, by their matches.
 
-        Raises ValueError if these do not add up to the configured number, and without matches.
+        Returns:
+            The image in the betas' bands, with position, deviation and confidence in each beta.
+
+        Raises:
+            ValueError: without matches, for matches of other inputs, and for betas whose bands do not add up
+                to the configured number.
         """
         matches = required(matches, inputs)
         carried = [_as_alpha(m.carried, inputs.alpha) for m in matches.betas]
@@ -72,7 +77,7 @@ class GuidedPAT(nn.Module):
     def _known_bands(
         self, inputs: Inputs, carried: Sequence[Colours], matches: Matches
     ) -> tuple[Float[Tensor, "b c h w"], bool]:
-        """The image, and whether each beta shows all of its bands."""
+        """Compute the image, with True if each beta shows all of its bands."""
         alpha, wanted = inputs.alpha, self.bands
         bands = [one.bands.shape[1] for one in carried]
         parts = len(bands) == 1 or wanted not in bands
@@ -89,10 +94,10 @@ class GuidedPAT(nn.Module):
     def _any_bands(
         self, alpha: Float[Tensor, "b 1 h w"], carried: Colours, matches: BetaMatches
     ) -> Float[Tensor, "b c h w"]:
-        """One beta's bands at alpha's view.
+        """Compute one beta's bands at alpha's view.
 
-        Fills are of each band minus its local regression on alpha: where a band is unlike alpha, its
-        difference from alpha differs even between similar pixels.
+        Fills are of each band minus its local regression on alpha: where a band differs from alpha, its
+        difference from alpha varies even between similar pixels.
         """
         base, mix = carried.fills[:, 0].to(alpha), matches.comparison.mix
         above = carried._replace(bands=carried.bands - base, fills=carried.fills.to(alpha) - base[:, None])
@@ -101,8 +106,14 @@ class GuidedPAT(nn.Module):
 
 
 def completed(alpha: Float[Tensor, "b 1 h w"], carried: Sequence[Colours]) -> Float[Tensor, "b c h w"]:
-    """Bands minus alpha at all pixels, from betas with different bands: carried ones by their weight, else
-    the mean of the nearest examples and of those found by attention, smoothed where weights are low."""
+    """Compute bands minus alpha at all pixels, from betas with different bands.
+
+    Carried values count by their weight; the rest is the mean of the nearest examples and of those by
+    attention, smoothed where weights are low.
+
+    Returns:
+        Bands minus alpha, of all betas in order.
+    """
     colour = _joined([one.bands for one in carried])
     weight = _joined([one.weight.expand_as(one.bands) for one in carried])
     nearest = _joined([one.fills[:, -1].to(colour) for one in carried])
@@ -111,7 +122,7 @@ def completed(alpha: Float[Tensor, "b 1 h w"], carried: Sequence[Colours]) -> Fl
 
 
 def _as_alpha(carried: Colours, alpha: Tensor) -> Colours:
-    """Colours in the type of alpha; a large frame's are kept in half precision."""
+    """Return colours in the type of alpha; a large frame's are kept in half precision."""
     bands, weight, likeness = (plane.to(alpha) for plane in carried[:3])
     return Colours(bands, weight, likeness, carried.fills)
 
@@ -121,7 +132,8 @@ def _joined(bands: Sequence[Tensor]) -> Tensor:
 
 
 def combined(carried: Sequence[Colours]) -> Colours:
-    """Several betas of the same bands as one: the mean of their colours by the odds of their weights."""
+    """Combine several betas of the same bands to one: the mean of their colours by the odds of
+    their weights."""
     if len(carried) == 1:
         return carried[0]
     odds = [c.weight.clamp(LEAST, 1 - LEAST).logit() for c in carried]
@@ -140,8 +152,14 @@ def combined(carried: Sequence[Colours]) -> Colours:
 def where_certain(
     residual: Float[Tensor, "b c h w"], inputs: Inputs, matches: Matches
 ) -> Float[Tensor, "b c h w"]:
-    """Bands minus alpha, replaced by those at the chosen positions as far as these are certain and, up to a
-    pixel, off the matches: matches are often wrong if alpha sees another part of the spectrum."""
+    """Replace bands minus alpha by those at the chosen positions, as far as these are certain.
+
+    A chosen position counts fully from a pixel off the match on: matches are often wrong if alpha sees
+    another part of the spectrum.
+
+    Returns:
+        Bands minus alpha; as given if no beta has all of the bands and a certainty.
+    """
     weights, shown = [], []
     for beta, matched in zip(inputs.betas, matches.betas, strict=True):
         if beta.image.shape[1] == residual.shape[1] and matched.certainty is not None:
@@ -159,7 +177,7 @@ def where_certain(
 def _output_of(
     image: Float[Tensor, "b c h w"], inputs: Inputs, matches: Matches, *, overall: bool
 ) -> FusionOutput:
-    """The image with the position in each beta, its deviation, and its confidence."""
+    """Return the image with the position in each beta, its deviation, and its confidence."""
     position, deviation, confidence = [], [], []
     for beta, matched in zip(inputs.betas, matches.betas):
         segments = beta.field.straight

@@ -25,11 +25,16 @@ from .configs import PATConfig
 from .protocol import FusionOutput, JoinsBands
 
 SURROUNDINGS, FLOOR = 9, 0.01
-"""Side of `normalised`'s windows for means, pixels, and the contrast below which it adds none."""
+"""Side in pixels of `normalised`'s windows, and the contrast below which it amplifies no more."""
 
 
 class QueryAndKey(NamedTuple):
-    """What attention compares of an image: the query (B, D, H, W) of an alpha, the key of a beta."""
+    """Features of an image that attention compares.
+
+    Attributes:
+        query: features (B, D, H, W) of an alpha.
+        key: features (B, D, H, W) of a beta.
+    """
 
     query: Tensor
     key: Tensor
@@ -43,7 +48,7 @@ class PAT(nn.Module):
     """
 
     halo = 80
-    """Features reach 59 pixels and post-fusion 10; the sum, rounded up."""
+    """Pixels: features reach 59 and post-fusion 10; the sum, rounded up."""
     beta_halo = 64
     multiple = 1
     joins_bands: JoinsBands = "no"
@@ -61,12 +66,23 @@ class PAT(nn.Module):
     def forward(self, inputs: Inputs, matches: Matches | None = None) -> FusionOutput:
         """Fuse alpha with the betas, in the order the network was made for; matches are not used.
 
-        Raises ValueError for another number of betas than configured, or channels that do not fit.
+        Returns:
+            The image, enlarged by `config.scale`, with position, deviation and confidence in each beta.
+
+        Raises:
+            ValueError: for another number of betas than configured, or channels that do not fit.
         """
         return self.compare(inputs)[0]
 
     def compare(self, inputs: Inputs) -> tuple[FusionOutput, list[Compared]]:
-        """The fused image, and what attention compares in each beta. Raises as `forward`."""
+        """Fuse, and keep the features that attention compares in each beta.
+
+        Returns:
+            The output as of `forward`, and one comparison per beta.
+
+        Raises:
+            ValueError: as `forward`.
+        """
         if len(inputs.betas) != self.config.betas:
             asked = f"this PAT is made for {self.config.betas} betas, got {len(inputs.betas)}"
             raise ValueError(f"{asked}: give as many cameras beside alpha, or other --weights")
@@ -84,12 +100,16 @@ class PAT(nn.Module):
         return FusionOutput(image, position, deviation, confidence), compared
 
     def query_and_key(self, image: Float[Tensor, "b c h w"], beta: int = 0) -> QueryAndKey:
-        """The image's query if it is alpha's, and its key if it is that of the `beta`-th beta."""
+        """Compute an image's query as alpha's, and its key as that of the `beta`-th beta.
+
+        Raises:
+            ValueError: for channels that do not fit.
+        """
         after = self.engine.before(self.features(self._channels(image)))
         return QueryAndKey(self.engine.query(after), self.engine.key[beta](after))
 
     def working_bytes(self, alpha: int, betas: Sequence[int]) -> float:
-        """Features of all views, measured."""
+        """Return the measured bytes of features of all views."""
         return 1600.0 * (alpha + sum(betas))
 
     def _channels(self, image: Tensor) -> Tensor:
@@ -105,13 +125,14 @@ class PAT(nn.Module):
 
 
 def normalised(image: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b 1 h w"]:
-    """The image less its mean in 9x9 pixels, over its standard deviation there, with a floor of .01."""
+    """Return an image less its mean in 9x9 pixels, over its standard deviation there, with a
+    floor of 0.01."""
     mean, squares = (box_mean(x, SURROUNDINGS // 2) for x in (image, image * image))
     return (image - mean) / ((squares - mean * mean).clamp(min=0) + FLOOR**2).sqrt()
 
 
 class Features(nn.Sequential):
-    """Residual-ASPP features, the same weights for every view (paper, section 3.1)."""
+    """Residual-ASPP features, with the same weights for every view (paper, section 3.1)."""
 
     def __init__(self, config: PATConfig) -> None:
         dim, bias = config.dim, config.block_bias
@@ -127,7 +148,7 @@ class Features(nn.Sequential):
 
 
 class AttentionEngine(nn.Module):
-    """Queries of alpha, keys and values of each beta, C3 over each field."""
+    """Attention from alpha's queries to keys and values of each beta (C3), over each field."""
 
     def __init__(self, config: PATConfig) -> None:
         super().__init__()
@@ -145,7 +166,15 @@ class AttentionEngine(nn.Module):
     def compare(
         self, alpha_features: Tensor, beta_features: Sequence[Tensor], fields: Sequence[FieldOnGrid]
     ) -> list[Compared]:
-        """Alpha's query, each beta's key and value, and where they are compared; of features (b, d, h, w)."""
+        """Compute alpha's query, each beta's key and value, and the locations at which they are compared.
+
+        Args:
+            alpha_features: features (b, d, h, w).
+            beta_features: features (b, d, h, w) of each beta.
+
+        Returns:
+            One comparison per beta.
+        """
         query, how = self.query(self.before(alpha_features)), self.interpolation
         scores = []
         for f, to_key, to_value, field in zip(beta_features, self.key, self.value, fields):
@@ -157,7 +186,7 @@ class AttentionEngine(nn.Module):
 
 
 class PostFusion(nn.Sequential):
-    """1x1 fusion of alpha's and the attended features, four residual blocks, pixel shuffle."""
+    """Fusion of alpha's and the attended features: 1x1 convolution, four residual blocks, pixel shuffle."""
 
     def __init__(self, config: PATConfig) -> None:
         dim, outputs, scale = config.dim, config.out_channels, config.scale

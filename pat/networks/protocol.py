@@ -1,4 +1,4 @@
-"""What a network is given and gives back."""
+"""The protocol of fusion networks: their inputs and outputs."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ from ..matching.matches import Matches
 
 
 class FusionOutput(NamedTuple):
-    """A network's result at alpha's view.
+    """Output of a network at alpha's view.
 
-    image: (B, C, s H, s W), the fused image.
-    position: one (B, 2, H, W) for each beta, where its pixels were found, in beta's pixels.
-    deviation: one (B, H, W) for each beta, the standard deviation of that position, in beta's pixels.
-    confidence: one (B, H, W) for each beta, 0 to 1: that beta sees the point and that its position is right.
-    overall: (B, H, W), the confidence of the image; None: the least of the betas'.
+    Attributes:
+        image: the fused image (B, C, s H, s W).
+        position: position of alpha's pixels in each beta, (B, 2, H, W), beta's pixels.
+        deviation: standard deviation of that position in each beta, (B, H, W), beta's pixels.
+        confidence: probability that each beta sees the point at that position, (B, H, W), 0 to 1.
+        overall: confidence of the image, (B, H, W); None for the least of the betas'.
     """
 
     image: Tensor
@@ -33,7 +34,7 @@ class FusionOutput(NamedTuple):
     overall: Tensor | None = None
 
     def cut(self, box: Box) -> FusionOutput:
-        """The part at (top, bottom, left, right); of an image that is not enlarged."""
+        """Return the part in a box (top, bottom, left, right), of an image that is not enlarged."""
         index = (..., *slices(box))
         position, deviation, confidence = ([t[index] for t in tensors] for tensors in self[1:4])
         overall = None if self.overall is None else self.overall[index]
@@ -45,37 +46,43 @@ JoinsBands = Literal["no", "neighbours", "all"]
 
 @runtime_checkable
 class FusionNetwork(Protocol):
-    """What `fuse` asks of a network: what bands it makes, whether it uses matches, and to be called.
-
-    The rest says in what form the images are to come.
-    """
+    """Network that `fuse` can call: the bands that it makes, its use of matches, and the images that it
+    needs."""
 
     bands: int | None
-    """The bands of its image; None: whatever the betas have."""
+    """Number of bands of its image; None for all bands of the betas."""
     uses_matches: bool
-    """Whether it is called with matches; then its confidence is a trained probability."""
+    """True if it must be called with matches; its confidence is then a trained probability."""
     learned: bool
-    """Whether matching's trained networks take part in its matches."""
+    """True if matching's trained networks take part in its matches."""
     keeps_luminance: bool
-    """Whether the luminance of its image is alpha's."""
+    """True if the luminance of its image is alpha's."""
     halo: int
-    """How far around a pixel alpha's image, and the fields of its pixels, can matter, pixels."""
+    """Pixels around a pixel within which alpha's image, and the fields of its pixels, can matter."""
     beta_halo: int
-    """How far around the segments beta's image can matter, pixels."""
+    """Pixels around the segments within which beta's image can matter."""
     multiple: int
-    """Images are padded to multiples of this, and cut at them."""
+    """Number of pixels to whose multiples images are padded, and at whose multiples they are cut."""
     equal_resolution: bool
-    """Whether betas are to be resized to about alpha's angular resolution."""
+    """True if betas are resized to about alpha's angular resolution first."""
     joins_bands: JoinsBands
-    """Which co-located betas are to come as one of several bands: none, those that follow each other (where
-    the order of the bands matters), or all."""
+    """Co-located betas that are joined to one of several bands: none ("no"), those that follow each other
+    ("neighbours", where the order of the bands matters), or "all"."""
 
     def working_bytes(self, alpha: int, betas: Sequence[int]) -> float:
-        """Memory to fuse so many pixels of alpha with so many of each beta, beside the inputs, measured."""
+        """Return the measured memory to fuse so many pixels of alpha with so many of each beta, beside the
+        inputs, bytes."""
         ...
 
     def __call__(self, inputs: Inputs, matches: Matches | None = None) -> FusionOutput:
-        """Fuse. Raises ValueError without matches if it uses them."""
+        """Fuse the inputs.
+
+        Returns:
+            The image, with position, deviation and confidence in each beta.
+
+        Raises:
+            ValueError: without matches, if it uses them.
+        """
         ...
 
 
@@ -84,30 +91,42 @@ class Comparing(Protocol):
     """A network with C3 attention over its inputs' segments, which training can supervise by geometry."""
 
     betas: int
-    """The number it is made for: one in all bands, or several with a band each."""
+    """Number of betas that it is made for: one in all bands, or several with a band each."""
 
     def compare(self, inputs: Inputs) -> tuple[FusionOutput, list[Compared]]:
-        """Fuse, and what attention compares in each beta."""
+        """Fuse, and keep the features that attention compares in each beta.
+
+        Returns:
+            The output, and one comparison per beta.
+        """
         ...
 
 
 def matched_for(network: FusionNetwork, inputs: Inputs) -> Matches | None:
-    """The matches that a network wants of these inputs, if any."""
+    """Return the matches that a network needs of these inputs; None if it uses none."""
     return match(wanted(network, inputs)) if network.uses_matches else None
 
 
 def wanted(network: FusionNetwork, inputs: Inputs) -> Inputs:
-    """Inputs that say what a network wants of its matches."""
+    """Return the inputs with the bands and the kind of matching that a network needs."""
     return replace(inputs, bands=network.bands, learned=network.learned)
 
 
 def fused_at_once(network: FusionNetwork, inputs: Inputs) -> FusionOutput:
-    """Whole inputs matched, if the network wants that, and fused."""
+    """Fuse whole inputs, matched first if the network uses matches.
+
+    Returns:
+        The network's output.
+    """
     return network(inputs, matched_for(network, inputs))
 
 
 def required(matches: Matches | None, inputs: Inputs) -> Matches:
-    """The matches, if they are of these inputs. Raises ValueError if there are none, or others."""
+    """Return the matches, after checking that they belong to these inputs.
+
+    Raises:
+        ValueError: for None, or matches of other inputs.
+    """
     if matches is None:
         raise ValueError("this network fuses by matches: call it as network(inputs, match(inputs))")
     matches.check(inputs)

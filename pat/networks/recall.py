@@ -1,10 +1,10 @@
-"""Colour by example: C3 attention of alpha to itself, far around.
+"""Colour by example: C3 attention of alpha to itself, over a wide window.
 
-What no beta sees has often the texture of something that one sees. A pixel's query, and another's key, is
-alpha around it at three sizes. The score falls with the squared distance of the two and with how far apart
-the pixels are, and rises with the confidence of what is found. Nothing is trained. It is the non-local mean
-(Buades et al. 2005) of colour, by the compiled attention: no patches are gathered. What is found is smoothed
-within what is alike in alpha, by attention to ever wider neighbourhoods.
+A region that no beta sees often has the texture of one that a beta sees. A pixel's query, and another's key,
+is alpha around it at three sizes. The score falls with the squared distance of the two and with the distance
+of the pixels, and rises with the confidence of the example. Nothing is trained. It is the non-local mean
+(Buades et al. 2005) of colour, by the compiled attention: no patches are gathered. The result is smoothed
+within regions that are similar in alpha, by attention to ever wider neighbourhoods.
 """
 
 from __future__ import annotations
@@ -28,12 +28,13 @@ from ..support.settings import size, tuned
 
 @dataclass(frozen=True)
 class RecallSettings:
-    """Pixels are those of half the size, but for `last`."""
+    """Settings of colour by example. Pixels are those of half the size, except for `last`."""
 
     scales: int = tuned(3, "Middlebury, tune half: sizes of what is around a pixel, radii 2, 4, 8")
-    pixel: float = tuned(0.02, "Middlebury, tune half: standard deviation of what is alike in alpha")
     alike: float = tuned(
-        0.04, "Middlebury, tune half: the same of means around; and where smoothing's weight is 1 / e"
+        0.04,
+        "Middlebury, tune half: standard deviation of what is alike of means around in alpha, half of it "
+        "of a pixel; and where smoothing's weight is 1 / e",
     )
     slope: float = tuned(0.1, "Middlebury, tune half: the same of slopes there")
     distance: float = tuned(10.0, "Middlebury, tune half: pixels at which the weight falls to 1 / e")
@@ -52,14 +53,25 @@ FIELD = Local(2 * SETTINGS.side - 1, spacing=SETTINGS.spacing)
 def by_example(
     alpha: Float[Tensor, "b 1 h w"], colour: Float[Tensor, "b c h w"], confidence: Float[Tensor, "b c h w"]
 ) -> Float[Tensor, "b c h w"]:
-    """The colour of what is seen and looks alike in alpha, smoothed together with colour that is certain."""
+    """Fill in the colour of seen pixels that look similar in alpha, smoothed together with certain colour.
+
+    Args:
+        confidence: confidence of each band's colour, 0 to 1.
+
+    Returns:
+        Colour at all pixels.
+    """
     return fitted(recalled(alpha, colour, confidence), alpha, colour, confidence)
 
 
 def with_less_noise(
     alpha: Float[Tensor, "b 1 h w"], colour: Float[Tensor, "b c h w"], confidence: Float[Tensor, "b c h w"]
 ) -> Float[Tensor, "b c h w"]:
-    """Colour, in part the mean of what is alike in alpha, the less certain a pixel is the more."""
+    """Blend colour with its mean over pixels similar in alpha, the more the less certain a pixel is.
+
+    Returns:
+        Colour of the same shape.
+    """
     smooth = smoothed_within(alpha, colour, SETTINGS.last, confidence)
     return torch.lerp(smooth, colour, confidence)
 
@@ -69,8 +81,13 @@ def recalled(
     colour: Float[Tensor, "b c h w"],
     confidence: Float[Tensor, "b c h w"],
 ) -> Float[Tensor, "b c h/2 w/2"]:
-    """The colour of what is seen and looks alike in alpha. A pixel counts as far as all bands are certain,
-    which several betas may have."""
+    """Average the colour of seen pixels that look similar in alpha.
+
+    A pixel counts as far as all bands are certain, which several betas may have.
+
+    Returns:
+        Colour at half the size.
+    """
     certain = confidence.amin(1, keepdim=True)
     weight, keys = avg_pool2d(certain, 2), surroundings(alpha)
     value = avg_pool2d(colour * certain, 2) / (weight + SETTINGS.least_weight)
@@ -87,8 +104,15 @@ def fitted(
     colour: Float[Tensor, "b c h w"],
     confidence: Tensor,
 ) -> Float[Tensor, "b c h w"]:
-    """What is filled in (B, C, H/2, W/2), smoothed together with colour that is certain, and enlarged;
-    `confidence` is (B, C or 1, H, W)."""
+    """Smooth filled colour together with certain colour, and enlarge it.
+
+    Args:
+        filled: colour (B, C, H/2, W/2) to use where confidence is low.
+        confidence: confidence of `colour`, (B, C or 1, H, W).
+
+    Returns:
+        Colour at full size.
+    """
     certain = avg_pool2d(confidence, 2)
     together = filled * (1 - certain) + avg_pool2d(colour * confidence, 2)
     return enlarge(smoothed_within(alpha, together, SETTINGS.rounds))
@@ -97,8 +121,17 @@ def fitted(
 def smoothed_within(
     alpha: Float[Tensor, "b 1 h w"], colour: Tensor, spacings: Sequence[int], confidence: Tensor | None = None
 ) -> Tensor:
-    """Colour (B, C, H, W), or at half the size, by means over 5 x 5 pixels, so far apart in turn: the more
-    alike in alpha (Tomasi and Manduchi 1998) and the more certain (B, C, H, W), the more a pixel counts."""
+    """Smooth colour by means over 5 x 5 pixels, whose spacing is each of `spacings` in turn.
+
+    A pixel counts the more, the more similar it is in alpha (Tomasi and Manduchi 1998) and the more certain.
+
+    Args:
+        colour: colour (B, C, H, W), or at half the size.
+        confidence: confidence at the size of `colour`; None counts all alike.
+
+    Returns:
+        Colour of the same shape.
+    """
     scaled = alpha * (2**0.5 / SETTINGS.alike)
     pixels = pixel_unshuffle(scaled, alpha.shape[-1] // colour.shape[-1])
     scores = pixels.square().sum(1, keepdim=True) / -2
@@ -111,18 +144,21 @@ def smoothed_within(
 
 
 def nearness() -> Float[Tensor, " n"]:
-    """What is added to the score of each pixel of the field: the less the farther off it is; -inf where none
-    is looked at."""
+    """Compute the score added to each pixel of the field: less the farther away it is, -inf for unused
+    pixels."""
     steps = pixel_grid((FIELD.size,) * 2).flatten(0, 1) - FIELD.size // 2
     looked_at = (steps.abs().amax(-1) <= SETTINGS.side // 2) | (steps % 2 == 0).all(-1)
     return torch.where(looked_at, steps.norm(dim=-1) * (-SETTINGS.spacing / SETTINGS.distance), -torch.inf)
 
 
 def surroundings(alpha: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b d h/2 w/2"]:
-    """Alpha, and how bright it is around and how that changes to the right and downwards, at each radius (a
-    local jet, Koenderink and van Doorn 1987): keys that are near where alpha looks alike."""
+    """Compute keys that are near each other where alpha looks similar, at half the size.
+
+    They hold alpha, its brightness around each pixel and the change of that to the right and downwards, at
+    each radius (a local jet, Koenderink and van Doorn 1987).
+    """
     half = avg_pool2d(alpha - 0.5, 2)  # for small numbers, of which float32 has more digits
-    parts, (h, w) = [half / SETTINGS.pixel], half.shape[-2:]
+    parts, (h, w) = [half / (SETTINGS.alike / 2)], half.shape[-2:]
     for r in (2 << i for i in range(SETTINGS.scales)):
         square = box_mean(half, r)
         beside = pad(square, (r,) * 4, mode="replicate")

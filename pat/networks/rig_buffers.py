@@ -14,9 +14,9 @@ from arraygeom.pixels import floating
 
 
 class RigBuffers(nn.Module):
-    """Holds a rig, camera or pair, whose numbers become buffers: `.to` moves them and `state_dict` has them.
+    """Module that holds a rig, camera or pair as buffers: `.to` moves its numbers and `state_dict` has them.
 
-    Called, it gives the rig. `.half()` and `.bfloat16()` leave its numbers in float32: they hold no pixel
+    Called, it returns the rig. `.half()` and `.bfloat16()` leave its numbers in float32: those hold no pixel
     position.
     """
 
@@ -28,7 +28,7 @@ class RigBuffers(nn.Module):
             self.register_buffer(name, number)
 
     def forward(self) -> Any:
-        """The rig, with the buffers' numbers."""
+        """Return the rig with the buffers' numbers."""
         return pytree.tree_unflatten([self.get_buffer(name) for name in self._names], self._layout)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> RigBuffers:

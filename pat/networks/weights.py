@@ -1,4 +1,4 @@
-"""Weights as safetensors: which network they are for stands in the file, and nothing is unpickled."""
+"""Weights as safetensors: the file states their network, and nothing is unpickled."""
 
 from __future__ import annotations
 
@@ -31,7 +31,8 @@ NETWORKS: Mapping[str, tuple[Any, Any]] = {
 DENOISERS = {"LowLightNetwork": (LowLightNetwork, DenoiserConfig)}
 
 LARGEST, MOST_ENTRIES = 1024, 16
-"""Of the numbers in a configuration, and of a list of them. The largest shipped are 48 and 4."""
+"""Largest number in a configuration, and largest length of a list of them. The largest shipped
+are 48 and 4."""
 
 Precision = Literal["float32", "bfloat16"]
 
@@ -39,9 +40,10 @@ Precision = Literal["float32", "bfloat16"]
 def save_weights(
     network: Network | LowLightNetwork, path: str | Path, *, facts: Mapping[str, str] | None = None
 ) -> None:
-    """Write a network's weights and configuration; the file is written atomically.
+    """Write a network's weights and configuration to a file, atomically.
 
-    `facts` (recipe, seed, figures) are kept beside them, as text.
+    Args:
+        facts: texts (recipe, seed, figures) kept beside them in the file.
     """
     metadata = {
         "format": FORMAT,
@@ -53,14 +55,19 @@ def save_weights(
 
 
 def load_weights(name: str | Path, *, precision: Precision = "float32") -> Network:
-    """The network of a weights file, or of a name that ships with the package, ready for use.
+    """Load the network of a weights file, or of a name that ships with the package.
 
-    With `precision` "bfloat16" its convolutions are in that (attention and matching never are): they take
-    less than half the time on processors that multiply it (AVX-512 BF16, AMX), and the image's PSNR changes
-    by .003 dB. Then parts of a frame are equal to the whole to 1e-3 only.
+    With `precision` "bfloat16" its convolutions are computed in that (attention and matching never are): they
+    take less than half the time on processors that multiply it (AVX-512 BF16, AMX), and the image's PSNR
+    changes by 0.003 dB. Parts of a frame are then equal to the whole to 1e-3 only.
 
-    Raises FileNotFoundError for neither, ValueError for a file that is not of this format or does not fit,
-    for another precision, and for a processor that has not this one.
+    Returns:
+        The network on the CPU, for evaluation, its weights without gradients.
+
+    Raises:
+        FileNotFoundError: for no such file or name.
+        ValueError: for a file that is not of this format, is damaged or does not fit, another precision, or a
+            processor without bfloat16.
     """
     if precision not in get_args(Precision):
         raise ValueError(f"precision is {precision!r}; wanted one of {', '.join(get_args(Precision))}")
@@ -73,7 +80,18 @@ def load_weights(name: str | Path, *, precision: Precision = "float32") -> Netwo
 
 
 def new_network(config: Any, start: Path | None = None) -> Network:
-    """A network, with the weights of a file to start from. Raises ValueError if those are another's."""
+    """Make a network of a configuration.
+
+    Args:
+        start: weights file to start from; None for random weights.
+
+    Returns:
+        The network; with `start`, a network for training with copied weights.
+
+    Raises:
+        FileNotFoundError: for a missing `start`.
+        ValueError: for weights of another network or configuration.
+    """
     network: Network = next(made for made, of in NETWORKS.values() if type(config) is of)(config)
     if start is not None:
         weights = load_weights(start)
@@ -88,14 +106,14 @@ def new_network(config: Any, start: Path | None = None) -> Network:
 
 
 def weights_for(bands: Sequence[int]) -> str:
-    """The name of the shipped weights for betas of these numbers of bands."""
+    """Return the name of the shipped weights for betas of these numbers of bands."""
     return "mono-colour" if all(count == 3 for count in bands) else "mono-spectral"
 
 
 def set_precision(network: nn.Module, precision: Precision, *, compiled: bool = False) -> None:
-    """Let convolutions compute in this precision, and compile them by torch.compile.
+    """Set the precision of a network's convolutions in place, and optionally compile them by torch.compile.
 
-    Not attention, whose search segments are functions that torch.compile would break at.
+    Attention is left out, whose search segments are functions that torch.compile would break at.
     """
     for module in network.children():
         if isinstance(module, (AttentionEngine, nn.ModuleList)):
@@ -107,12 +125,19 @@ def set_precision(network: nn.Module, precision: Precision, *, compiled: bool = 
 
 
 def load_denoiser(path: str | Path = DENOISER) -> LowLightNetwork:
-    """The network that removes noise: the shipped one, or a weights file's. Raises as `load_weights`."""
+    """Load the network that removes noise from a weights file; by default the shipped one.
+
+    Returns:
+        The network for evaluation, its weights without gradients.
+
+    Raises:
+        ValueError: for a file that is missing, not of this format, damaged, or does not fit.
+    """
     return _load(Path(path), DENOISERS)
 
 
 def _load(path: Path, networks: Mapping[str, tuple[Any, Any]]) -> Any:
-    """The network of a file, of one of these kinds, in use."""
+    """Load the network of a file, of one of these kinds."""
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
@@ -140,7 +165,7 @@ def _load(path: Path, networks: Mapping[str, tuple[Any, Any]]) -> Any:
 
 
 def _is_of_pytorch(path: Path) -> bool:
-    """Whether torch.save wrote it: other archives, such as NumPy's, are zip files, too."""
+    """Return True if torch.save wrote the file: other archives, such as NumPy's, are zip files, too."""
     if not zipfile.is_zipfile(path):
         return False
     with zipfile.ZipFile(path) as archive:
@@ -148,7 +173,8 @@ def _is_of_pytorch(path: Path) -> bool:
 
 
 def misfit(network: nn.Module, state: Mapping[str, Tensor]) -> str:
-    """The first tensor missing, too many, or of another shape than the network's; empty if all fit."""
+    """Describe the first tensor missing, too many, or of another shape than the network's; empty
+    if all fit."""
     wanted_shapes, given_shapes = (
         {k: tuple(v.shape) for k, v in s.items()} for s in (network.state_dict(), state)
     )
@@ -159,12 +185,16 @@ def misfit(network: nn.Module, state: Mapping[str, Tensor]) -> str:
 
 
 def shipped() -> tuple[str, ...]:
-    """Names of the weights in the package."""
+    """List the names of the weights in the package, sorted."""
     return tuple(sorted(p.stem for p in SHIPPED.glob("*.safetensors")))
 
 
 def find_weights(name: str | Path) -> Path:
-    """The file of shipped weights, or the path itself. Raises FileNotFoundError if there is neither."""
+    """Return the path of shipped weights by name, or the path itself.
+
+    Raises:
+        FileNotFoundError: if neither exists.
+    """
     for path in (SHIPPED / f"{name}.safetensors", Path(name)):
         if path.is_file():
             return path
@@ -174,7 +204,7 @@ def find_weights(name: str | Path) -> Path:
 def _described(
     path: Path, metadata: Mapping[str, str], networks: Mapping[str, tuple[Any, Any]]
 ) -> tuple[Callable[..., nn.Module], Any]:
-    """The class of the network that a file describes, and its configuration, of plausible numbers."""
+    """Return the class of the network that a file describes, and its configuration, of plausible numbers."""
     if metadata.get("format", "").startswith("pat-checkpoint"):
         raise ValueError(
             f"{path}: a checkpoint of training: the weights are in best.safetensors, a folder above"

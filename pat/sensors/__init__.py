@@ -1,7 +1,7 @@
-"""The forward model: how a camera records an ideal image.
+"""Forward model: the steps by which a camera records an ideal image.
 
-A list of steps is applied in order to images (B, C, H, W) with values 0..1 on any device. Steps with
-randomness draw it from the generator given to `record`, separately for each image of the batch.
+A list of steps is applied in order to images (B, C, H, W) with values 0..1, on any device. Random steps draw
+from the generator given to `record`, separately for each image of the batch.
 """
 
 from .noise_level import NoiseLevel

@@ -1,4 +1,4 @@
-"""How noisy a camera's image is: stated, or estimated from the image."""
+"""Noise of a camera's image: stated, or estimated from the image."""
 
 from __future__ import annotations
 
@@ -16,25 +16,32 @@ from ..media.colour import linear_from_srgb, srgb_from_linear
 from .steps import normal
 
 AddedTo = Literal["light", "values"]
-"""What noise was added to: linear light, encoded as sRGB afterwards, or the values themselves."""
+"""Domain of the noise: linear light, which is sRGB-encoded afterwards, or the values themselves."""
 
 CURVE = 65
-"""Values, and quantiles of the noise, by which the mean and the deviation of what is recorded are known."""
+"""Ideal values, and quantiles of the noise, at which mean and deviation of recorded values are tabulated."""
 SMOOTHED = 7
-"""Side of the window over which the signal is averaged, pixels."""
+"""Side in pixels of the window over which the signal is averaged."""
 SIDE, GROUPS, FEWEST = 12, 16, 40
-"""Of blocks to estimate noise in: their side in pixels, the groups of about equal value, the least size."""
+"""Blocks for the estimate: their side in pixels, number of groups of about equal value, least blocks in a
+group."""
 SMOOTHEST, SHARE = 0.05, 0.677
-"""The quantile of the variances in a group that is taken, and what that is of the variance of white noise
-(from 40,000 blocks of it)."""
+"""Quantile of a group's variances that stands for noise alone, and its ratio to the variance of white noise
+(measured on 40,000 blocks of it)."""
 
 
 @dataclass(frozen=True)
 class NoiseLevel:
-    """Variance of a pixel: `shot` times its value plus `read` squared; values 0..1.
+    """Noise model of a camera: the variance of a pixel of value v is shot · v + read².
 
-    added_to: linear light, encoded as sRGB afterwards, or the values themselves.
-    Numbers, or tensors (B, 1, 1, 1) of a batch.
+    Attributes:
+        shot: variance for each unit of signal, values 0..1; a number, or (B, 1, 1, 1) for a batch.
+        read: standard deviation of the read noise, values 0..1; as `shot`.
+        added_to: "light" for noise in linear light, sRGB-encoded afterwards; "values" for noise in the
+            values.
+
+    Raises:
+        ValueError: for a negative or infinite `shot` or `read`, or another `added_to`.
     """
 
     shot: float | Tensor = 0.0
@@ -51,7 +58,17 @@ class NoiseLevel:
 
     @classmethod
     def of_electrons(cls, electrons: float, read: float = 0.0, added_to: AddedTo = "light") -> NoiseLevel:
-        """The noise of a camera that counts so many electrons at white, with a read noise in electrons."""
+        """Make the noise model of a camera that counts `electrons` at white.
+
+        Args:
+            read: read noise in electrons.
+
+        Returns:
+            The noise level in values 0..1.
+
+        Raises:
+            ValueError: for fewer than 1 electron at white, or a negative read noise.
+        """
         if not electrons >= 1:
             raise ValueError(
                 f"noise: electrons at white must be 1 or more, such as 200, got {electrons:g}: "
@@ -65,11 +82,16 @@ class NoiseLevel:
     @classmethod
     @torch.no_grad()
     def estimated(cls, image: Float[Tensor, "1 c h w"]) -> NoiseLevel:
-        """The noise level of an sRGB image with white noise, from its smoothest parts, by brightness.
+        """Estimate the noise of an sRGB image, taken as white noise, from its smoothest parts at each
+        brightness.
 
-        Blocks in which a second difference varies least hold noise alone; noise of light or of values is
-        taken, as it fits. Noise that a demosaicing, a resampling or a codec has smoothed is underestimated;
-        an image that has fine texture everywhere seems noisier than it is.
+        The smallest second differences of a group of blocks are taken as noise alone; the better fit of noise
+        in light and noise in values is chosen. Noise that demosaicing, resampling or a codec has smoothed is
+        underestimated; fine texture all over the image is taken for noise.
+
+        Returns:
+            The noise level; zero for an image with sides under 14 pixels, or one that is all clipped or
+            without variation.
         """
         if min(image.shape[-2:]) < SIDE + 2:
             return cls()
@@ -80,7 +102,12 @@ class NoiseLevel:
         return min(fits, key=lambda fit: fit[1])[0]
 
     def recorded(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
-        """An ideal sRGB image with noise: electrons counted, read noise added, light clipped to 0..1."""
+        """Add this noise to an ideal sRGB image: Poisson counts plus normal read noise, clipped to 0..1.
+
+        Returns:
+            The noisy image, sRGB-encoded, of the same shape. No gradient reaches `image` where `shot` is
+            above 1e-7.
+        """
         linear = self.added_to == "light"
         light = linear_from_srgb(image) if linear else image
         shot = torch.as_tensor(self.shot).to(light)
@@ -90,15 +117,23 @@ class NoiseLevel:
         return srgb_from_linear(light.clamp(0, 1)) if linear else light.clamp(0, 1)
 
     def deviation(self, image: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
-        """A noisy sRGB image's standard deviation of values, by the mean of the image around each pixel."""
+        """Compute the standard deviation of a noisy sRGB image's values at the mean brightness around each
+        pixel.
+
+        Returns:
+            Deviations of values 0..1, of the image's shape.
+        """
         _, mean, deviation = self._curves(image)
         return _interpolated(_smoothed(image), mean, deviation)
 
     def unbiased(self, image: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
-        """A noisy image whose mean around each pixel is that of the ideal image.
+        """Correct the bias of a noisy image, so that local means are those of the ideal image.
 
-        Light clipped at black is too bright in the mean, and encoded light that is not clipped too dark: with
-        50 electrons at white by up to 0.05 and 0.03. No denoiser that averages values sees that.
+        Clipping at black makes the mean too bright, sRGB encoding makes it too dark: by up to 0.05 and 0.03
+        for 50 electrons at white. Denoisers that average values keep this bias.
+
+        Returns:
+            The corrected sRGB image, of the same shape; not clipped.
         """
         value, mean, _ = self._curves(image)
         return image + _interpolated(_smoothed(_smoothed(image)), mean, value - mean)
@@ -106,7 +141,7 @@ class NoiseLevel:
     def _curves(
         self, like: Tensor
     ) -> tuple[Float[Tensor, "b n"], Float[Tensor, "b n"], Float[Tensor, "b n"]]:
-        """Ideal values, and the mean and the deviation of what is recorded of each; noise taken as normal."""
+        """Ideal values with mean and deviation of their recorded values, for noise taken as normal."""
         value = torch.linspace(0, 1, CURVE, device=like.device).to(like)
         normal = torch.special.ndtri((torch.arange(CURVE, device=like.device).to(like) + 0.5) / CURVE)
         shot, read = (torch.as_tensor(x).to(like).reshape(-1, 1, 1) for x in (self.shot, self.read))
@@ -118,7 +153,8 @@ class NoiseLevel:
 
 
 def _interpolated(x: Tensor, positions: Float[Tensor, "b n"], values: Float[Tensor, "b n"]) -> Tensor:
-    """Values known at increasing positions, at those of x (B, ...); beyond the ends those of the ends."""
+    """Interpolate values given at increasing positions, at the entries of x (B, ...); constant beyond both
+    ends."""
     flat = x.flatten(1).clamp(positions[:, :1], positions[:, -1:])
     i = torch.searchsorted(positions.contiguous(), flat.contiguous()).clamp(1, positions.shape[1] - 1)
     low, high = positions.gather(1, i - 1), positions.gather(1, i)
@@ -132,7 +168,7 @@ def _smoothed(image: Tensor) -> Tensor:
 
 
 def _smoothest(image: Float[Tensor, "1 c h w"]) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
-    """Values, and the noise's variance there: of the blocks of about each value those that vary least."""
+    """Brightness and noise variance of the least varying blocks at each of some brightnesses."""
     inner = image[..., 1:-1, 1:-1]
     rough = avg_pool2d((image.diff(n=2, dim=-1).diff(n=2, dim=-2) / 6).square(), SIDE)
     mean, empty = avg_pool2d(inner, SIDE), avg_pool2d((inner <= 0).to(inner), SIDE)
@@ -147,7 +183,7 @@ def _smoothest(image: Float[Tensor, "1 c h w"]) -> tuple[Float[Tensor, " n"], Fl
 def _fitted(
     added_to: AddedTo, value: Float[Tensor, " n"], variance: Float[Tensor, " n"]
 ) -> tuple[NoiseLevel, float]:
-    """The level by least squares of relative errors, and its mean squared logarithmic error."""
+    """Noise level by least squares of relative errors, and its mean squared logarithmic error."""
     signal, slope = value, torch.ones_like(value)
     if added_to == "light":
         signal = linear_from_srgb(value)

@@ -1,4 +1,4 @@
-"""The steps of a recording: blur, coarser pixels, noise, saturation, digits; and seeds."""
+"""Steps of a recording: blur, coarser pixels, noise, saturation, quantisation; and their seeds."""
 
 from __future__ import annotations
 
@@ -18,22 +18,36 @@ from arraygeom.pixels import HW, resize_matrix
 
 
 class Step(ABC):
-    """One step of the formation of an image."""
+    """Base class of one step in the formation of an image."""
 
     @abstractmethod
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c2 h2 w2"]:
-        """The images after the step."""
+        """Apply the step to images (b, c, h, w), with randomness from `generator`.
+
+        Returns:
+            Images after the step; a step may change channels and size.
+        """
 
     def pixel_matrix(self, hw: HW) -> Float[Tensor, "3 3"]:
-        """A with x_after ~ A x_before for images of height and width `hw` (float64): the identity if the step
-        keeps the grid of pixels."""
+        """Matrix from pixel positions before the step to those after it.
+
+        Args:
+            hw: height and width before the step.
+
+        Returns:
+            A with x_after ~ A x_before, float64; the identity for a step that keeps the pixel grid.
+        """
         return torch.eye(3, dtype=torch.float64)
 
 
 def record(
     image: Float[Tensor, "b c h w"], steps: Sequence[Step], generator: Generator
 ) -> Float[Tensor, "b c2 h2 w2"]:
-    """The images after the steps, applied in order."""
+    """Apply steps to images in order.
+
+    Returns:
+        Images after the last step; `image` itself for no steps.
+    """
     for step in steps:
         image = step.apply(image, generator)
     return image
@@ -41,7 +55,11 @@ def record(
 
 @dataclass(frozen=True)
 class BoxBlur(Step):
-    """Mean over a square of an odd number of pixels; the border is replicated."""
+    """Mean over a square with replicated border.
+
+    Attributes:
+        width: side of the square, an odd number of pixels; others raise ValueError.
+    """
 
     width: int
 
@@ -55,7 +73,11 @@ class BoxBlur(Step):
 
 @dataclass(frozen=True)
 class GaussianBlur(Step):
-    """Uniform Gaussian defocus; sigma in pixels."""
+    """Uniform Gaussian defocus with replicated border, differentiable in sigma.
+
+    Attributes:
+        sigma: standard deviation in pixels; a negative or infinite one raises ValueError.
+    """
 
     sigma: float | Tensor
 
@@ -72,11 +94,13 @@ class GaussianBlur(Step):
 
 @dataclass(frozen=True)
 class Resample(Step):
-    """Another number of pixels for the same field of view: c' = (c + 0.5) s - 0.5.
+    """Change of the number of pixels for the same field of view: c' = (c + 0.5) s - 0.5.
 
-    `to` is a factor (sizes are rounded, and the factor along each axis is what they give) or a (height,
-    width). "area" is what a sensor with larger pixels records: it keeps the mean of the image exactly.
-    "bicubic" is the usual antialiased resize with a = -0.5.
+    Attributes:
+        to: a factor (sizes are rounded, which changes the factor along each axis), or (height, width); not
+            positive raises ValueError.
+        method: "area" models a sensor with larger pixels and keeps the image's mean exactly; "bicubic" is the
+            usual antialiased resize with a = -0.5.
     """
 
     to: float | HW
@@ -103,7 +127,7 @@ class Resample(Step):
 
 
 def _area_weights(old: int, new: int) -> Tensor:
-    """(new, old): the share of each old pixel in each new one, rows adding up to 1."""
+    """Matrix (new, old) with the share of each old pixel in each new one; rows sum to 1."""
     edge = torch.arange(new + 1, dtype=torch.float64) * (old / new)
     pixel = torch.arange(old, dtype=torch.float64)
     overlap = torch.minimum(edge[1:, None], pixel + 1) - torch.maximum(edge[:-1, None], pixel)
@@ -112,11 +136,14 @@ def _area_weights(old: int, new: int) -> Tensor:
 
 @dataclass(frozen=True)
 class Noise(Step):
-    """Shot and read noise, on linear values of which 1 stands for `full_well` electrons; `read` in electrons.
+    """Shot and read noise on linear values.
 
-    Variance in electrons is the signal plus `read`^2. "gaussian" draws from a normal of that variance, and is
-    differentiable; "poisson" counts electrons (whole numbers before the read noise), which differs visibly
-    below about ten of them; its gradient is that of the mean.
+    Attributes:
+        full_well: electrons at value 1, more than 0; other values raise ValueError.
+        read: read noise in electrons, 0 or more.
+        counts: "gaussian" draws from a normal distribution of variance signal + read² and is differentiable;
+            "poisson" counts electrons, which differs visibly below about ten of them, with the gradient of
+            the mean.
     """
 
     full_well: float
@@ -143,7 +170,7 @@ class Noise(Step):
 
 @dataclass(frozen=True)
 class Clip(Step):
-    """Saturation: values clipped to 0..1."""
+    """Saturation: clips values to 0..1."""
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
         return image.clamp(0, 1)
@@ -151,7 +178,11 @@ class Clip(Step):
 
 @dataclass(frozen=True)
 class Quantise(Step):
-    """Clipped to 0..1 and rounded to 2^bits levels. The gradient passes as if nothing were rounded."""
+    """Clipping to 0..1 and rounding to 2^bits levels; gradients pass as if nothing were rounded.
+
+    Attributes:
+        bits: bits of a value, 1 or more; fewer raise ValueError.
+    """
 
     bits: int = 8
 
@@ -167,10 +198,13 @@ class Quantise(Step):
 
 @dataclass(frozen=True)
 class Jitter(Step):
-    """A random gain, gamma and white balance for each image, clipped to 0..1.
+    """Random gain, gamma and white balance for each image of the batch, clipped to 0..1. Meant for sRGB
+    values.
 
-    The logarithms of gain, gamma and of each channel's balance are normal with these standard deviations.
-    Meant for sRGB-encoded values.
+    Attributes:
+        gain: standard deviation of the logarithm of the gain.
+        gamma: standard deviation of the logarithm of gamma.
+        normalisation: standard deviation of the logarithm of each channel's own gain.
     """
 
     gain: float = 0.05
@@ -190,14 +224,18 @@ def _separably(image: Tensor, kernel: Tensor) -> Tensor:
 
 
 def convolved(image: Tensor, kernel: Tensor) -> Tensor:
-    """Each channel with the odd-sized kernel (kh, kw), the border replicated."""
+    """Convolve each channel with an odd-sized kernel (kh, kw); the border is replicated.
+
+    Returns:
+        Images of the same shape. Even sides of the kernel are not supported and fail on the shape.
+    """
     h, w = kernel.shape
     planes = pad(image.flatten(0, 1)[:, None], (w // 2, w // 2, h // 2, h // 2), mode="replicate")
     return conv2d(planes, kernel[None, None]).view(image.shape)
 
 
 def generator_for(seed: int, *names: object, device: torch.device | str = "cpu") -> Generator:
-    """A generator seeded by names, the same on every machine.
+    """Make a random generator seeded by a number and names: the same numbers on every machine.
 
     >>> generator_for(0, "mono", 3).initial_seed() == generator_for(0, "mono", 3).initial_seed()
     True
@@ -208,20 +246,26 @@ def generator_for(seed: int, *names: object, device: torch.device | str = "cpu")
 
 
 def seed_for(seed: int, *names: object) -> int:
-    """A seed of 63 bits from another one and names."""
+    """Derive a seed of 63 bits from another seed and names."""
     digest = hashlib.sha256("/".join(map(str, (seed, *names))).encode()).digest()
     return int.from_bytes(digest[:8], "big") >> 1
 
 
 def normal(shape: Sequence[int], like: Tensor, generator: Generator) -> Tensor:
-    """Standard normal numbers from a generator, on the device of `like`."""
+    """Draw standard normal numbers of a shape from a generator, on the device and of the type of `like`."""
     noise = torch.randn(tuple(shape), generator=generator, device=generator.device, dtype=like.dtype)
     return noise.to(like.device)
 
 
 @dataclass(frozen=True)
 class DegradationCase:
-    """One way in which the two images of a pair are degraded."""
+    """One way to degrade the two images of a pair.
+
+    Attributes:
+        name: name of the case, used in messages.
+        alpha: steps for alpha's image.
+        beta: steps for beta's image.
+    """
 
     name: str
     alpha: tuple[Step, ...] = ()
@@ -229,9 +273,9 @@ class DegradationCase:
 
 
 def paper_cases() -> tuple[DegradationCase, ...]:
-    """The paper's four augmentations for two inputs; each is drawn with probability 1/4.
+    """Return the paper's four augmentations for two inputs, each drawn with probability 1/4.
 
-    The paper does not give the blur; here it is a box of 5 pixels.
+    The paper does not state the blur; here it is a box of 5 pixels.
     """
     reduced = (Resample(0.5, "bicubic"), Resample(2.0, "bicubic"), Clip())
     return (
@@ -243,7 +287,13 @@ def paper_cases() -> tuple[DegradationCase, ...]:
 
 
 class Pairs(NamedTuple):
-    """Degraded images of both cameras, and the case of each pair of the batch."""
+    """Degraded images of both cameras.
+
+    Attributes:
+        alpha: alpha's images.
+        beta: beta's images.
+        case: index of each pair's case.
+    """
 
     alpha: Float[Tensor, "b ca ha wa"]
     beta: Float[Tensor, "b cb hb wb"]
@@ -256,7 +306,14 @@ def augment(
     cases: Sequence[DegradationCase],
     generator: Generator,
 ) -> Pairs:
-    """Degrade each pair of a batch by one of the cases, all equally likely. Sizes must not change."""
+    """Degrade each pair of a batch by one case drawn at random, all equally likely.
+
+    Returns:
+        The degraded images; the inputs stay as they are.
+
+    Raises:
+        ValueError: naming the case, if it changes an image's shape.
+    """
     drawn = torch.randint(len(cases), (len(alpha),), generator=generator, device=generator.device)
     alpha, beta = alpha.clone(), beta.clone()
     for i, case in enumerate(cases):

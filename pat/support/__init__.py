@@ -1,1 +1,1 @@
-"""What the rest shares and that knows no vision: jobs, memory, documents, threads."""
+"""Shared services without computer vision: jobs, memory, documents, threads."""

@@ -1,4 +1,4 @@
-"""The convolutional blocks that the networks are made of, and the precision in which they compute."""
+"""Convolutional blocks of the networks, and the precision that they compute in."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from arraygeom.runtime.chunks import chunked
 from .unshuffle_numba import unshuffle
 
 ROWS = 64
-"""Rows at a time of a U-Net's largest stages."""
+"""Rows that the largest stages of a U-Net compute at a time."""
 
 
 class ResidualBlock(nn.Module):
-    """x + conv(leaky(conv(x))), both 3x3."""
+    """Residual block: x + conv(leaky(conv(x))), both convolutions 3x3."""
 
     def __init__(self, dim: int, *, dilation: int = 1, bias: bool = True) -> None:
         super().__init__()
@@ -32,12 +32,13 @@ class ResidualBlock(nn.Module):
         self.act = nn.LeakyReLU(0.1, inplace=True)
 
     def forward(self, x: Float[Tensor, "b d h w"]) -> Float[Tensor, "b d h w"]:
-        """The same size and channels."""
+        """Return features (b, d, h, w) of the same shape as `x`."""
         return self.second(self.act(self.first(x))).add_(x)
 
 
 class ResidualASPP(nn.Module):
-    """Three atrous groups (dilations 1, 4, 8), each fused by 1x1 convolution and added (Wang et al. 2019)."""
+    """Residual atrous pyramid: three groups of dilations 1, 4, 8, each fused by a 1x1 convolution (Wang et
+    al. 2019)."""
 
     def __init__(self, dim: int, dilations: tuple[int, ...] = (1, 4, 8)) -> None:
         super().__init__()
@@ -49,7 +50,8 @@ class ResidualASPP(nn.Module):
         self.act = nn.LeakyReLU(0.1, inplace=True)
 
     def forward(self, x: Float[Tensor, "b d h w"]) -> Float[Tensor, "b d h w"]:
-        """The same size and channels; each group works on the result of the one before."""
+        """Return features (b, d, h, w) of the same shape as `x`; each group refines the result of the one
+        before."""
         total, y = x, x
         for group, fuse in zip(self.groups, self.fuse):
             assert isinstance(group, nn.ModuleList)
@@ -59,19 +61,35 @@ class ResidualASPP(nn.Module):
 
 
 def conv(inputs: int, outputs: int, *, stride: int = 1) -> nn.Sequential:
-    """A 3x3 convolution and its activation."""
+    """Make a 3x3 convolution followed by leaky ReLU.
+
+    Returns:
+        The two layers in sequence, with padding 1: (b, inputs, h, w) to (b, outputs, h / stride, w / stride).
+    """
     return nn.Sequential(
         nn.Conv2d(inputs, outputs, 3, stride=stride, padding=1), nn.LeakyReLU(0.1, inplace=True)
     )
 
 
 def channels_last(x: Float[Tensor, "b d h w"]) -> Float[Tensor, "b d h w"]:
-    """The same, channels beside each other in memory: convolutions on the CPU take about half the time."""
+    """Return the tensor with the channels of a pixel adjacent in memory: CPU convolutions take half the time.
+
+    Shape and values stay (b, d, h, w).
+    """
     return x.contiguous(memory_format=torch.channels_last)
 
 
 def stacked(*parts: Float[Tensor, "b _ _ _"]) -> Float[Tensor, "b d h w"]:
-    """All parts' channels, `channels_last`; 2x2 pixels of parts twice the size as in `pixel_unshuffle`."""
+    """Concatenate feature maps along channels, in `channels_last` memory.
+
+    Args:
+        parts: tensors of one batch size; each has the smallest part's sides or exactly twice those. The
+            larger ones are first rearranged as by `pixel_unshuffle(·, 2)`, four channels for each one. Other
+            sides are not refused.
+
+    Returns:
+        Tensor (b, d, h, w) of the smallest sides, its channels in the order of the parts.
+    """
     h, w = (min(tensor.shape[side] for tensor in parts) for side in (-2, -1))
     if not all(map(plain, parts)):
         same = (tensor if tensor.shape[-1] == w else pixel_unshuffle(tensor, 2) for tensor in parts)
@@ -88,17 +106,22 @@ def stacked(*parts: Float[Tensor, "b _ _ _"]) -> Float[Tensor, "b d h w"]:
 
 
 def plain(x: Tensor) -> bool:
-    """Whether compiled loops of float32 can take a tensor: nothing asks for its gradient."""
+    """Return True for a float32 tensor on the CPU that needs no gradient: compiled loops accept it."""
     return x.dtype == torch.float32 and compilable(x) and not x.requires_grad
 
 
 def enlarge(x: Float[Tensor, "b d h w"], factor: int = 2) -> Float[Tensor, "b d h*{factor} w*{factor}"]:
-    """Bilinear, by the pixel-area convention c' = (c + 0.5) factor - 0.5."""
+    """Enlarge feature maps bilinearly by an integer factor, where c' = (c + 0.5) factor - 0.5.
+
+    Returns:
+        Tensor (b, d, factor h, factor w).
+    """
     return nn.functional.interpolate(x, scale_factor=factor, mode="bilinear", align_corners=False)
 
 
 class UNet(nn.Module):
-    """Three scales down and up again, `blocks` residual blocks at each, twice as many at the smallest."""
+    """U-Net of three scales with `blocks` residual blocks at each scale, and twice as many at the
+    smallest."""
 
     def __init__(self, inputs: int, widths: tuple[int, ...], outputs: int, *, blocks: int = 1) -> None:
         super().__init__()
@@ -112,7 +135,10 @@ class UNet(nn.Module):
         self.last = nn.Conv2d(a, outputs, 3, padding=1)
 
     def forward(self, x: Float[Tensor, "b i h w"]) -> Float[Tensor, "b o h w"]:
-        """The same size; sides are multiples of 4."""
+        """Return features (b, outputs, h, w) for an input (b, inputs, h, w).
+
+        Both sides must be multiples of 4; others fail inside torch.
+        """
         first = self._in_rows(self.first, x)
         second = self.second(first)
         second = self.back_b(second + enlarge(self.up_b(self.third(second))))
@@ -122,7 +148,8 @@ class UNet(nn.Module):
         return self.last(self.back_a(first + more))
 
     def _in_rows(self, stage: Callable[..., Tensor], *images: Tensor) -> Tensor:
-        """A stage at the largest size, which takes most of the memory, of some rows at a time."""
+        """Run a stage at the largest scale, which needs the most memory, on some rows at a time if no
+        gradient is wanted."""
         if torch.is_grad_enabled():
             return stage(*images)
         return chunked(stage, *images, rows=ROWS, halo=self.halo)
@@ -133,12 +160,12 @@ def _residual(dim: int, count: int) -> list[ResidualBlock]:
 
 
 def _in_turn(blocks: list[ResidualBlock]) -> nn.Module:
-    """One block is itself, as weights of networks with one have it."""
+    """Chain blocks; a single block stays itself, so that the names of its weights match published files."""
     return nn.Sequential(*blocks) if len(blocks) > 1 else blocks[0]
 
 
 def in_bfloat16(module: nn.Module) -> None:
-    """Let a module compute in bfloat16 where autocast does, with float32 output."""
+    """Make a module compute in bfloat16 autocast and return float32. Replaces its `forward` in place."""
     module.forward = partial(_rounded, module)  # copies of a module have their own
 
 
@@ -150,6 +177,6 @@ def _rounded(module: nn.Module, *images: Any) -> Any:
 
 @contextmanager
 def without_autocast() -> Iterator[None]:
-    """Whatever autocast is in effect around: parts that may be less precise say so themselves."""
+    """Context manager that turns autocast off on CPU and GPU, for code that needs full precision."""
     with torch.autocast("cpu", enabled=False), torch.autocast("cuda", enabled=False):
         yield

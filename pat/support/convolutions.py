@@ -1,4 +1,4 @@
-"""Convolutions on all threads, beside compiled loops that leave torch a single one."""
+"""Convolutions on all threads, next to compiled loops that leave torch one thread."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from torch.overrides import TorchFunctionMode
 from arraygeom.runtime.threads import in_parallel, limited_to, threads
 
 WORTH_STRIPS = 10**8
-"""Multiplications of a convolution from which on strips are worth their while: some milliseconds."""
+"""Multiplications in a convolution above which splitting into strips pays: some milliseconds of work."""
 STRIPS = 2
-"""Strips for each thread: other processes may take one's core."""
+"""Strips for each thread: more than one, as other processes may occupy a core."""
 
 
 _SLEEPING = os.environ.get("OMP_WAIT_POLICY", "").upper() == "PASSIVE"
-"""Whether torch's own threads sleep, too, while they wait, as where a command loads it."""
+"""True if torch's own threads sleep while they wait (OMP_WAIT_POLICY=PASSIVE), as in the commands."""
 
 
 @contextmanager
 def convolutions_in_parallel() -> Iterator[None]:
-    """Within `torch_in_one_thread`: compute convolutions on all `threads`.
+    """Context manager that computes `torch.conv2d` on all `threads` inside `torch_in_one_thread`.
 
-    Those without gradients in strips of rows by the pool's threads, which sleep where they wait; others by
-    torch's.
+    Convolutions without gradients are cut into strips of rows for the pool's threads, which sleep while they
+    wait; the others use torch's threads. Results agree with `torch.conv2d` to rounding.
     """
     with _InStrips() if threads() > 1 else nullcontext():
         yield
@@ -49,7 +49,8 @@ class _InStrips(TorchFunctionMode):
 def _convolved(
     x: Tensor, weight: Tensor, bias: Any, stride: Any, padding: Any, dilation: Any, groups: int
 ) -> Tensor:
-    """`torch.conv2d` but for rounding; of one large image in strips of rows, each with the rows around it."""
+    """`torch.conv2d` to rounding; for one large image computed in strips of rows, each with the rows its
+    kernel reaches."""
     further = bias, stride, padding, dilation, groups
     plain = x.device.type == "cpu" and tuple(stride) == (1, 1) and not isinstance(padding, str)
     if not plain or len(x) != 1 or weight[0].numel() * len(weight) * x[0, 0].numel() < WORTH_STRIPS:

@@ -1,4 +1,4 @@
-"""Files of a folder and of those within it, and what the system says of a file."""
+"""Listing of files in folders, and one-line texts of errors."""
 
 from __future__ import annotations
 
@@ -6,14 +6,18 @@ import os
 from pathlib import Path
 
 MOST_SHOWN = 2000
-"""Characters of a message."""
+"""Characters of a message that are shown at most."""
 
 
 def files_below(folder: str | Path, within: frozenset[str] = frozenset()) -> list[Path]:
-    """All regular files in a folder and in those within it, behind symbolic links too, sorted.
+    """List all regular files in a folder and its subfolders, through symbolic links too.
 
-    Links that lead back to a folder that they are `within` (real paths) are not followed. Folders that cannot
-    be read hold nothing, as for `Path.rglob`.
+    Args:
+        folder: the folder; if it cannot be read, or is missing, the list is empty.
+        within: real paths of the folders above, which links may not lead back to.
+
+    Returns:
+        Paths, sorted.
     """
     real = os.path.realpath(folder)
     if real in within:
@@ -27,7 +31,7 @@ def files_below(folder: str | Path, within: frozenset[str] = frozenset()) -> lis
 
 
 def error_text(error: Exception) -> str:
-    """What an error says, in one line: the file and the cause, without the system's number for it."""
+    """Return an error's message in one line; for an OSError the file and the cause, without its errno."""
     text = f"{error}"
     if isinstance(error, OSError) and error.filename:
         text = f"{error.filename}: {error.strerror}"
@@ -35,8 +39,12 @@ def error_text(error: Exception) -> str:
 
 
 def printable(text: str) -> str:
-    """One line for a terminal, whatever others put into it: control characters as escapes, the middle of a
-    very long one left out."""
+    """Make a text safe to print on one terminal line.
+
+    Returns:
+        The text with control characters as escapes; of one longer than `MOST_SHOWN` characters the middle is
+        left out.
+    """
     if len(text) > MOST_SHOWN:
         text = f"{text[: MOST_SHOWN // 2]} ... {text[-MOST_SHOWN // 2 :]}"
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)

@@ -1,8 +1,8 @@
-"""Many tasks in many processes: each writes a file or folder atomically, not again if that is there.
+"""Jobs of many tasks in many processes; each task writes one file or folder and is skipped if that exists.
 
-In this process, in others on this machine, or on the workers of a Dask scheduler. If a process is killed,
-another one repeats the task it was running; a job that is killed as a whole and started again does only what
-is missing. Torch is imported only where tasks run.
+Tasks run in this process, in other processes on this machine, or on the workers of a Dask scheduler. A task
+whose process is killed is repeated by another; a job that is killed and started again does only what is
+missing. Torch is imported only where tasks run.
 """
 
 from __future__ import annotations
@@ -47,9 +47,13 @@ OnError = Literal["stop", "skip"]
 
 
 class Task(NamedTuple):
-    """Work that writes the file `makes` (and others before it); `run(*given)` must be fit to be pickled.
+    """One unit of work of a job.
 
-    Messages name `about`, or else the file that is made.
+    Attributes:
+        makes: file or folder that the task writes last; once it exists the task counts as done.
+        run: picklable function, called as `run(*given)`.
+        given: arguments of `run`.
+        about: name in messages; empty for the name of `makes`.
     """
 
     makes: Path
@@ -59,7 +63,13 @@ class Task(NamedTuple):
 
 
 class TaskOutcome(NamedTuple):
-    """A task's error in one line, or None; its warnings, the last being the error if a filter made it so."""
+    """Result of one task.
+
+    Attributes:
+        makes: the task's file.
+        error: the error in one line; None for success.
+        warnings: warnings raised; the last one is the error itself where a filter turned a warning into it.
+    """
 
     makes: Path
     error: str | None
@@ -68,7 +78,14 @@ class TaskOutcome(NamedTuple):
 
 @dataclass
 class JobReport:
-    """Files made, files already there, the error of each task that failed, and who warned of what."""
+    """Result of a job.
+
+    Attributes:
+        made: files made in this run.
+        kept: files that existed before, whose tasks did not run.
+        failed: error message by the file of the task.
+        warned: files by kind of warning.
+    """
 
     made: list[Path] = field(default_factory=list)
     kept: list[Path] = field(default_factory=list)
@@ -76,7 +93,10 @@ class JobReport:
     warned: dict[str, list[Path]] = field(default_factory=dict)
 
     def warn(self, outcome: TaskOutcome, about: str) -> None:
-        """Pass on a task's warnings, one of each kind: texts that differ in numbers alone are of one kind."""
+        """Repeat a task's warnings in this process, once for each kind. Updates `warned`.
+
+        Warnings that differ in numbers alone are one kind.
+        """
         for warning in outcome.warnings:
             kind = re.sub(r"[\d.]+", "", f"{type(warning).__name__}: {warning}")
             files = self.warned.setdefault(kind, [])
@@ -92,17 +112,24 @@ class JobReport:
 
 
 class JobError(ValueError):
-    """A job cannot or must not go on; what is made stays."""
+    """Error that stops a job; finished files stay."""
 
 
 @dataclass(frozen=True)
 class Workers:
-    """Where tasks run.
+    """Processes that tasks run in.
 
-    `scheduler` is the address of a Dask scheduler ("tcp://host:8786"); without, `count` processes on this
-    machine, or this process itself for 1, unless tasks are to be kept `apart`, as what crashes or hangs.
-    `threads` are torch's in each: results are identical to the bit for the same number. A task of a process
-    of its own may take `timeout` seconds.
+    Attributes:
+        count: processes on this machine; 1 runs tasks in this process unless `apart`.
+        scheduler: address of a Dask scheduler ("tcp://host:8786"), whose workers then run the tasks; None for
+            this machine.
+        threads: torch's threads in each process; results are bit-identical for the same number.
+        apart: True for a separate process even with `count` 1, for tasks that may crash or hang.
+        timeout: seconds a task may take in a separate process; None for no limit. A task in this process has
+            none.
+
+    Raises:
+        ValueError: for a `count` or `threads` below 1.
     """
 
     count: int = 1
@@ -117,7 +144,7 @@ class Workers:
 
 
 HERE = Workers()
-"""This process, one thread."""
+"""This process with one thread."""
 
 
 def run_tasks(
@@ -129,10 +156,21 @@ def run_tasks(
     title: str = "working",
     console: Console | None = None,
 ) -> JobReport:
-    """Run all tasks; with `resume`, only those whose file is missing. Without, such files are removed first.
+    """Run the tasks of a job and report what each became.
 
-    An error of a task (ValueError, OSError) is reported with its file's name and the task skipped, or it
-    stops the job: then JobError is raised, and what is made stays. A task's own JobError always stops it.
+    Args:
+        resume: skip tasks whose file exists; otherwise such files are deleted first.
+        on_error: "stop" raises at a task's first ValueError, OSError or Warning; "skip" prints it and goes
+            on.
+
+    Returns:
+        Files made, kept and failed, and the warnings.
+
+    Raises:
+        JobError: for a failed task with on_error="stop", and for a task's own JobError always; finished files
+            stay.
+        ImportError: for a scheduler where Dask is not installed.
+        ValueError: if no scheduler answers.
     """
     if not resume:
         for task in tasks:
@@ -160,13 +198,17 @@ def run_tasks(
 
 
 LINE_EVERY = 30.0
-"""Seconds between lines of progress where there is no terminal."""
+"""Seconds between lines of progress without a terminal."""
 
 
 def followed(
     outcomes: Iterable[T], *, title: str, total: int, done: int = 0, console: Console
 ) -> Iterator[T]:
-    """The outcomes as they come, counted: as a bar on a terminal, elsewhere as a line now and then."""
+    """Show the progress of outcomes while they are consumed: a bar on a terminal, else a line now and then.
+
+    Yields:
+        Each outcome, unchanged.
+    """
     printed = time.monotonic()
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     further = (TimeRemainingColumn(), TextColumn("{task.fields[status]}", markup=False))
@@ -195,14 +237,14 @@ def _in_this_process(tasks: Iterable[Task], workers: Workers) -> Iterator[TaskOu
 
 
 ENVIRONMENT = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-"""Of processes on this machine."""
+"""Environment variables of processes on this machine."""
 TRIES = 3
-"""How often a task is begun whose process dies or takes too long."""
+"""Attempts at a task whose process dies or takes too long."""
 
 
 def _in_processes(tasks: Sequence[Task], workers: Workers) -> Iterator[TaskOutcome]:
-    """Outcomes as they come. Each process has a thread that waits for it, so that the task is known with
-    which it dies."""
+    """Yield outcomes as they arrive. A thread waits for each process, so that the task is known with which it
+    dies."""
     slots, before, others = threading.local(), dict(os.environ), {*active_children()}
     ended: list[JobError] = []
 
@@ -243,7 +285,7 @@ def _in_processes(tasks: Sequence[Task], workers: Workers) -> Iterator[TaskOutco
 
 
 def _begin() -> None:
-    """Let a process leave interruptions to the one that started it, and end with that one."""
+    """Prepare a worker process: it ignores interrupts, which its parent handles, and ends with its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
@@ -259,9 +301,11 @@ AHEAD = 4
 
 
 def _on_dask(tasks: Sequence[Task], workers: Workers) -> Iterator[TaskOutcome]:
-    """Outcomes as they come; Dask repeats what dead workers were running; what kills several is one too.
+    """Yield outcomes as they arrive. Dask repeats the tasks of dead workers; a task that kills several fails.
 
-    Raises ImportError without Dask, ValueError without scheduler.
+    Raises:
+        ImportError: without Dask.
+        ValueError: without a scheduler.
     """
     if not tasks:
         return
@@ -295,7 +339,7 @@ def _on_dask(tasks: Sequence[Task], workers: Workers) -> Iterator[TaskOutcome]:
 
 
 def _failed(task: Task, future: Future) -> TaskOutcome:
-    """The outcome of a task that has no result. Raises its JobError."""
+    """The outcome of a task without a result. Raises the task's own JobError."""
     error = future.exception()
     if isinstance(error, JobError):
         raise error
@@ -304,9 +348,16 @@ def _failed(task: Task, future: Future) -> TaskOutcome:
 
 
 def attempt(task: Task, threads: int) -> TaskOutcome:
-    """Run a task, unless a worker that died since has done it; errors of what was given become the outcome.
+    """Run a task in this process, unless its file exists, and catch ValueError, OSError and Warning.
 
-    Raises JobError for what would happen to every task.
+    Args:
+        threads: torch's number of threads, which is set for the whole process.
+
+    Returns:
+        The outcome, with the warnings that were raised.
+
+    Raises:
+        JobError: the task's own, for errors that every task would have.
     """
     import torch
 
@@ -329,9 +380,16 @@ def attempt(task: Task, threads: int) -> TaskOutcome:
 
 
 def attempt_on_worker(task: Task, threads: int, timeout: float | None = None) -> TaskOutcome:
-    """`attempt` in a process that does nothing else, and that ends if it takes longer than `timeout` seconds.
+    """Run `attempt` in a process that does nothing else, and keep its freed memory for later tasks.
 
-    Errors that `attempt` does not expect become the outcome, too.
+    Args:
+        timeout: seconds after which the process ends itself; None for no limit.
+
+    Returns:
+        The outcome; errors other than ValueError and OSError become outcomes too.
+
+    Raises:
+        JobError: the task's own.
     """
     from .memory import keep_freed
 
@@ -350,5 +408,5 @@ def attempt_on_worker(task: Task, threads: int, timeout: float | None = None) ->
 
 
 def cores() -> int:
-    """How many cores this process may use."""
+    """Return the number of CPU cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

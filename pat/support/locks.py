@@ -1,4 +1,4 @@
-"""One command at a time in a folder of results; folders that cannot be written to, found before the work."""
+"""Locks on folders of results, and early errors for folders that cannot be written."""
 
 from __future__ import annotations
 
@@ -16,16 +16,18 @@ from .schema import entries_of
 
 LOCK = ".lock"
 OWNER = ".lock.json"
-"""Who holds it: a locked file cannot be read on every system."""
+"""File that says who holds the lock: on some systems a locked file cannot be read."""
 
 
 @contextmanager
 def folder_lock(folder: Path) -> Iterator[None]:
-    """Make the folder, and keep other commands out until the block ends; if left empty it is removed again.
+    """Context manager that makes a folder and keeps other commands out of it.
 
-    The lock is a file locked by the system, and process and host are in another beside it: that of a process
-    of this host, or of a container on it, which is gone counts for nothing. Raises ValueError for a folder
-    that another command holds, or that cannot be written to.
+    The lock is a file locked by the system; a file beside it names the process and the host. The lock of a
+    dead process on this host, or in a container on it, is ignored. A folder left empty is removed again.
+
+    Raises:
+        ValueError: if another command holds the folder, or it cannot be written.
     """
     made = _make(folder)
     try:
@@ -46,7 +48,7 @@ def folder_lock(folder: Path) -> Iterator[None]:
 
 
 def _make(folder: Path) -> list[Path]:
-    """Make the folder and those above; returns the new ones, the innermost first."""
+    """Make a folder and its parents. Returns those that are new, innermost first."""
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -56,7 +58,7 @@ def _make(folder: Path) -> list[Path]:
 
 
 def _locked(folder: Path) -> BaseFileLock:
-    """The folder's lock, held, with this process in the file of its owner."""
+    """Acquire the folder's lock and write this process into the owner's file."""
     lock, owner_file = FileLock(folder / LOCK, timeout=0), folder / OWNER
     try:
         lock.acquire()

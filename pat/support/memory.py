@@ -1,4 +1,4 @@
-"""Memory of this process: amounts as people write them, peaks, and the return of freed memory."""
+"""Memory of this process: parsing of amounts, peak use, limits, and return of freed memory."""
 
 from __future__ import annotations
 
@@ -16,13 +16,21 @@ from threading import Event, Thread
 M_TRIM_THRESHOLD, M_MMAP_MAX, M_ARENA_MAX = -1, -4, -8
 """Options of glibc's mallopt (malloc.h)."""
 NEAR = 0.94
-"""The part of a limit from which freed memory is returned to the system."""
+"""Share of a limit above which freed memory is returned to the system."""
 EVERY = 0.005
-"""Seconds between looks at how much the process has, under a limit."""
+"""Seconds between readings of resident memory under a limit."""
 
 
 def parse_bytes(amount: float | str) -> float:
-    """Bytes of a number, or of text such as "4GiB" or "500 MB". Raises ValueError for other text."""
+    """Parse an amount of memory: a number of bytes, or text such as "4GiB" or "500 MB" (1000s), "MiB"
+    (1024s).
+
+    Returns:
+        Bytes; negative and infinite amounts are not refused.
+
+    Raises:
+        ValueError: for any other text, and NaN.
+    """
     units = {"B": 1, "KB": 1e3, "MB": 1e6, "GB": 1e9, "KIB": 2**10, "MIB": 2**20, "GIB": 2**30}
     text = str(amount)
     number = text.rstrip("BbKkMmGgIi ")
@@ -40,9 +48,12 @@ _keeps = False
 
 
 def keep_freed() -> None:
-    """Keep freed memory for later use: glibc returns large blocks at once, and an eighth of the time of
-    fusing a frame goes into getting them again. Of the whole process: for commands and workers, which are
-    ours."""
+    """Make glibc keep freed memory for later allocations in this process; does nothing elsewhere than on
+    Linux.
+
+    An eighth of the time to fuse a frame goes into getting large blocks back from the system. It applies to
+    the whole process: meant for commands and workers, not for a library's user.
+    """
     options = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
     if options is not None:
         for option, value in ((M_TRIM_THRESHOLD, 2**31 - 1), (M_MMAP_MAX, 0), (M_ARENA_MAX, 1)):
@@ -52,13 +63,22 @@ def keep_freed() -> None:
 
 
 def planned(limit: float | None, memory: float, *, large: bool) -> float | None:
-    """The limit; for a large task what it is planned to take, if that is less: freed memory that is kept
-    (`keep_freed`) comes on top, half as much again for a frame of 12 megapixels."""
+    """Memory limit to plan a task with, in bytes.
+
+    Args:
+        limit: limit that the user gave; None for no limit.
+        memory: bytes that the task is expected to need.
+        large: True for a task whose freed memory would be kept on top, half as much again for 12 megapixels.
+
+    Returns:
+        The smaller of both for a large task after `keep_freed`; otherwise `limit` unchanged.
+    """
     return min(memory, limit or memory) if large and _keeps else limit
 
 
 def give_back() -> None:
-    """Return freed memory to the system: glibc keeps some 300 MiB after a tile; the next may not fit."""
+    """Return freed memory to the system (glibc keeps some 300 MiB after a tile). Does nothing
+    outside Linux."""
     if sys.platform == "linux":
         trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
         if trim:
@@ -66,14 +86,17 @@ def give_back() -> None:
 
 
 ROOM = 0.96
-"""The part of a limit up to which tasks at once may fill it."""
+"""Share of a limit that concurrent tasks may fill."""
 _LIMIT: ContextVar[float | None] = ContextVar("limit", default=None)
 
 
 @contextmanager
 def limited(limit: float | None) -> Iterator[None]:
-    """Within this, `how_many_fit` knows how many bytes the process may take in all, and freed memory is
-    returned to the system when the process comes near that; None: no limit."""
+    """Context manager that states how many bytes the process may take in all, for `how_many_fit`.
+
+    A thread returns freed memory to the system when the process comes near the limit. Nothing enforces it.
+    None: no limit.
+    """
     before, done = _LIMIT.get(), Event()
     token = _LIMIT.set(limit)
     if limit is not None and limit != before:
@@ -86,7 +109,7 @@ def limited(limit: float | None) -> Iterator[None]:
 
 
 def _return_near(most: float, done: Event) -> None:
-    """Return freed memory when a process has more than `most` bytes; less often while it does not help."""
+    """Return freed memory while the process has more than `most` bytes; less often if that does not help."""
     near = False
     while not done.wait(5 * EVERY if near else EVERY):
         near = resident() > most
@@ -96,13 +119,14 @@ def _return_near(most: float, done: Event) -> None:
 
 
 def resident() -> float:
-    """Resident bytes of this process; 0 where the system does not say (Linux does)."""
+    """Return the resident memory of this process in bytes; 0 if the system does not report it."""
     pages = _text(Path("/proc/self/statm")).split()[1:2]
     return float(pages[0]) * os.sysconf("SC_PAGE_SIZE") if pages else 0.0
 
 
 def how_many_fit(nbytes: float) -> int | None:
-    """How many tasks of so many bytes may run at once, at least one; None where there is no limit."""
+    """Return how many tasks of `nbytes` bytes may run at once under `limited`, at least 1; None without a
+    limit."""
     limit = _LIMIT.get()
     if limit is None:
         return None
@@ -113,7 +137,7 @@ def how_many_fit(nbytes: float) -> int | None:
 
 
 def peak_memory(pid: int | str = "self") -> float | None:
-    """Peak resident bytes of a process, by default this; None if the system does not say (Linux does)."""
+    """Return the peak resident memory of a process in bytes; None if the system does not report it."""
     line = re.search(r"VmHWM:\s+(\d+) kB", _text(Path(f"/proc/{pid}/status")))
     return None if line is None else float(line[1]) * 2**10
 

@@ -1,4 +1,4 @@
-"""Errors of an image: PSNR, SSIM; and the confidence interval of a mean."""
+"""Image quality (PSNR, SSIM), and the confidence interval of a mean."""
 
 from __future__ import annotations
 
@@ -16,18 +16,30 @@ SSIM_WINDOW = 11
 
 
 class Score(NamedTuple):
-    """PSNR in dB (infinite for equal images) and SSIM (1 for equal images)."""
+    """Quality of an image against its ground truth.
+
+    Attributes:
+        psnr: peak signal-to-noise ratio in dB for a peak of 1; infinite for equal images.
+        ssim: structural similarity; 1 for equal images.
+    """
 
     psnr: float
     ssim: float
 
 
 def score(image: Float[Tensor, "_ _ _"], ground_truth: Float[Tensor, "_ _ _"]) -> Score:
-    """PSNR over all channels, and the mean SSIM of the channels, by scikit-image; values 0..1.
+    """Compute PSNR over all channels, and scikit-image's SSIM averaged over channels.
 
-    SSIM as in Wang et al. 2004: Gaussian window of sigma 1.5 (11 x 11), K1 = 0.01, K2 = 0.03, population
-    covariance. Nothing is clipped or rounded here. Raises ValueError if the shapes differ or a side is under
-    11 pixels.
+    Args:
+        image: (c, h, w), values 0..1; nothing is clipped or rounded.
+        ground_truth: image of the same shape.
+
+    Returns:
+        PSNR in dB and SSIM of Wang et al. 2004: Gaussian window of sigma 1.5 (11 x 11), K1 = 0.01, K2 = 0.03,
+        population covariance. NaN values give NaN.
+
+    Raises:
+        ValueError: if the shapes differ, or a side is under 11 pixels.
     """
     if image.shape != ground_truth.shape:
         got, wanted = tuple(image.shape), tuple(ground_truth.shape)
@@ -43,9 +55,10 @@ def score(image: Float[Tensor, "_ _ _"], ground_truth: Float[Tensor, "_ _ _"]) -
 
 
 def bootstrap_interval(values: Sequence[float]) -> tuple[float, float]:
-    """The 95 % percentile bootstrap interval of the mean of `values`; (nan, nan) for fewer than two.
+    """Compute the 95 % percentile bootstrap interval of a mean (Efron & Tibshirani 1993, section 13.3).
 
-    Efron & Tibshirani 1993, section 13.3. The same values give the same interval.
+    Returns:
+        Lower and upper bound, the same for the same values; (nan, nan) for fewer than two values.
     """
     if len(values) < 2:
         return math.nan, math.nan

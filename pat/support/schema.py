@@ -1,4 +1,5 @@
-"""Frozen dataclasses to plain documents (for YAML and JSON) and back, with errors that name the entry."""
+"""Conversion of frozen dataclasses to plain documents (YAML, JSON) and back, with errors that
+name the entry."""
 
 from __future__ import annotations
 
@@ -16,9 +17,13 @@ T = TypeVar("T")
 
 
 def to_document(value: Any, *, defaults: bool = False) -> Any:
-    """Dataclasses as mappings, tuples as lists, paths as text, the rest as it is.
+    """Convert dataclasses to mappings, tuples to lists, paths to text, recursively; other values stay.
 
-    Entries at their default are left out, unless `defaults`.
+    Args:
+        defaults: True to include entries that equal their default.
+
+    Returns:
+        The document, ready for YAML or JSON.
     """
     if dataclasses.is_dataclass(value):
         entries = {f: getattr(value, f.name) for f in dataclasses.fields(value)}
@@ -35,15 +40,32 @@ def to_document(value: Any, *, defaults: bool = False) -> Any:
 
 
 def from_document(kind: type[T], document: Any, entry: str = "") -> T:
-    """The dataclass (or other annotated type) that a document describes.
+    """Convert a document to a dataclass, or to another annotated type.
 
-    Raises ValueError naming the entry for unknown keys, missing ones, and values of another type.
+    Args:
+        kind: the type wanted.
+        document: mappings, lists and plain values; text such as "1e3" is accepted for a number.
+        entry: name of the document's place in messages.
+
+    Returns:
+        An instance of `kind`.
+
+    Raises:
+        ValueError: naming the entry, for an unknown key, a missing one, NaN, or a value of another type.
     """
     return typing.cast(T, _read(kind, document, entry))
 
 
 def read_yaml(path: str | Path) -> Any:
-    """The content of a YAML file. Raises FileNotFoundError, and ValueError for a file that is not YAML."""
+    """Read a YAML file.
+
+    Returns:
+        Its content: mappings, lists and plain values; None for an empty file.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: with name and line, if it is not YAML.
+    """
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
@@ -51,7 +73,14 @@ def read_yaml(path: str | Path) -> Any:
 
 
 def parse_yaml(text: str | bytes, name: str) -> Any:
-    """The content of a YAML text, UTF-8. Raises ValueError naming `name` and the line if it is not YAML."""
+    """Parse a YAML text, as UTF-8 if in bytes.
+
+    Returns:
+        Its content: mappings, lists and plain values; None for an empty text.
+
+    Raises:
+        ValueError: with `name` and the line, if it is not YAML.
+    """
     import yaml
 
     from arraygeom.runtime.safe_yaml import load_yaml, yaml_problem
@@ -65,7 +94,11 @@ def parse_yaml(text: str | bytes, name: str) -> Any:
 
 
 def entries_of(path: Path) -> dict[str, Any]:
-    """The entries of a JSON file; none where it is missing, empty or damaged."""
+    """Read the entries of a JSON file.
+
+    Returns:
+        Its mapping; empty if the file is missing, damaged, or holds no mapping.
+    """
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -74,13 +107,13 @@ def entries_of(path: Path) -> dict[str, Any]:
 
 
 def _default(field: dataclasses.Field[Any]) -> Any:
-    """The default of a field; MISSING of one that is required."""
+    """The default of a field; MISSING for a required one."""
     made = field.default_factory
     return field.default if made is dataclasses.MISSING else made()
 
 
 def _read(kind: Any, value: Any, entry: str) -> Any:
-    """A value of a document as a type, by what kind of type it is."""
+    """Convert a value of a document to a type."""
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if dataclasses.is_dataclass(kind):
         return _read_dataclass(kind, value, entry)
@@ -104,7 +137,7 @@ def _short(value: object) -> str:
 
 
 def _read_dataclass(kind: Any, value: Any, entry: str) -> Any:
-    """A mapping as a dataclass. Raises ValueError naming keys that are missing or unknown."""
+    """Convert a mapping to a dataclass. Raises ValueError naming keys that are missing or unknown."""
     fields = {f.name: f for f in dataclasses.fields(kind) if f.init}
     for key in _mapping(value, entry or kind.__name__):
         if key not in fields:
@@ -138,7 +171,8 @@ def _mapping(value: Any, entry: str) -> dict[Any, Any]:
 
 
 def _read_union(arguments: tuple[Any, ...], value: Any, entry: str) -> Any:
-    """The first of several types that fits; if none does, the error of one of the same form."""
+    """Convert to the first fitting one of several types; otherwise raise the error of one of the
+    same form."""
     if value is None and type(None) in arguments:
         return None
     errors = []
@@ -151,7 +185,8 @@ def _read_union(arguments: tuple[Any, ...], value: Any, entry: str) -> Any:
 
 
 def _read_plain(kind: Any, value: Any, entry: str) -> Any:
-    """A number, text or path; text like 1e3 is a number, 2.0 whole. Raises ValueError naming the entry."""
+    """Convert to a number, text or path; text like 1e3 is a number, 2.0 a whole one. Raises ValueError naming
+    the entry."""
     if kind is Any:
         return value
     if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
@@ -173,7 +208,7 @@ _PLAIN = {float: "a number", int: "a whole number", str: "text", bool: "true or 
 
 
 def _is_number(text: str) -> bool:
-    """YAML takes inf for text: it writes .inf."""
+    """True for text that is a number, also inf, which YAML reads as text."""
     try:
         return not math.isnan(float(text))
     except ValueError:
@@ -185,7 +220,7 @@ def _below(entry: str, key: object) -> str:
 
 
 def near(name: object, choices: Iterable[object]) -> str:
-    """The end of a message about an unknown name: the nearest known one, or all of them.
+    """Return the ending of a message about an unknown name: the most similar choice, or all choices.
 
     >>> near("nois", ["noise", "clip"])
     "; did you mean 'noise'?"

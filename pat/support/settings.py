@@ -1,7 +1,7 @@
-"""The numbers that an algorithm was given: each with its kind, and where it is from, in a frozen dataclass.
+"""Settings of the algorithms: numbers in frozen dataclasses, each with its kind and its reason.
 
-*physics*: follows from what is measured or from the recording; *size*: how much is done at a time, changes no
-result worth speaking of; *tuned*: chosen on images, which are named.
+*physics*: follows from a measurement or from the recording; *size*: amount of work at a time, without notable
+influence on results; *tuned*: chosen on images, which are named.
 """
 
 from __future__ import annotations
@@ -21,15 +21,23 @@ def _entry(kind: Kind, value: Any, why: str) -> Any:
 
 
 physics = partial(_entry, "physics")
-"""A field whose value follows from what is measured; `why` says from what."""
+"""Field whose value follows from a measurement; `why` names it."""
 size = partial(_entry, "size")
-"""A field that says how much is done at a time."""
+"""Field for the amount of work at a time."""
 tuned = partial(_entry, "tuned")
-"""A field whose value was chosen; `why` says on what, and what it does."""
+"""Field whose value was tuned; `why` says on what, and what it does."""
 
 
 class SettingEntry(NamedTuple):
-    """One entry of an algorithm's settings: its name, value, kind, and why it is so."""
+    """One entry of an algorithm's settings.
+
+    Attributes:
+        algorithm: name of the settings' class.
+        name: name of the field.
+        value: its value.
+        kind: "physics", "size" or "tuned".
+        why: reason for the value.
+    """
 
     algorithm: str
     name: str
@@ -39,12 +47,16 @@ class SettingEntry(NamedTuple):
 
     @property
     def numbers(self) -> int:
-        """How many numbers the value is."""
+        """Number of values in the entry: the length of a tuple, else 1."""
         return len(self.value) if isinstance(self.value, tuple) else 1
 
 
 def listed(settings: Any) -> Iterator[SettingEntry]:
-    """The entries of an algorithm's settings, in their order. Raises ValueError for one without a kind."""
+    """Yield the entries of an algorithm's settings, in their order.
+
+    Raises:
+        ValueError: for a field without a kind.
+    """
     algorithm = type(settings).__name__
     for entry in fields(settings):
         if "kind" not in entry.metadata:
@@ -53,8 +65,11 @@ def listed(settings: Any) -> Iterator[SettingEntry]:
 
 
 def all_settings(*rooms: str) -> list[SettingEntry]:
-    """The entries of all settings of these packages, such as "pat.matching", in their modules' order; of
-    settings that a room has more than once, what differs from the first."""
+    """Collect the entries of all settings in packages such as "pat.matching", in the order of their modules.
+
+    Returns:
+        The entries; those that several settings of a package share appear once.
+    """
     entries: dict[SettingEntry, None] = {}
     for room in rooms:
         for module in iter_modules(import_module(room).__path__, f"{room}."):

@@ -1,7 +1,6 @@
-"""The steps of long work, shown as they begin.
+"""Progress of long work: each step is shown when it begins.
 
-Modules say them to their loggers, at level INFO: `logging.basicConfig(level=logging.INFO)` shows them in a
-script.
+Modules log their steps at level INFO: `logging.basicConfig(level=logging.INFO)` shows them in a script.
 """
 
 from __future__ import annotations
@@ -16,9 +15,9 @@ from arraygeom.runtime.progress import progress
 
 PACKAGES = ("arraygeom", "calib", "pat")
 EARLIEST = 0.1
-"""Share of a stage that is done before the time left is estimated."""
+"""Share of a stage that must be done before the remaining time is estimated."""
 LEAST = 1.5
-"""Seconds: less is not said."""
+"""Remaining seconds below which none are shown."""
 
 
 class _Shown(logging.Handler):
@@ -33,7 +32,7 @@ class _Shown(logging.Handler):
             self.show(record.getMessage() + self._left())
 
     def _left(self) -> str:
-        """The current stage and the time left in it, if any."""
+        """The current stage with its remaining time, if known."""
         if (now := progress()) is None:
             return ""
         stage, share = now
@@ -48,15 +47,15 @@ class _Shown(logging.Handler):
 
 
 def about(seconds: float) -> str:
-    """A time that is left, roughly."""
+    """Format a remaining time in seconds as rounded text, such as "about 12 s left"."""
     return f"about {seconds:.0f} s left" if seconds < 100 else f"about {seconds / 60:.0f} min left"
 
 
 @contextmanager
 def steps_shown(show: Callable[[str], None]) -> Iterator[None]:
-    """A block in which `show` is called with the line of every step that begins in this thread.
+    """Context manager that calls `show` with one line for every step that begins in this thread.
 
-    Of the innermost block alone.
+    Of nested blocks only the innermost shows.
     """
     loggers = [logging.getLogger(name) for name in PACKAGES]
     before = [(logger.level, logger.handlers[:]) for logger in loggers]

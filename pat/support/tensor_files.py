@@ -1,4 +1,4 @@
-"""Tensors in safetensors files, written atomically."""
+"""Tensors in safetensors files, written atomically and checked by a digest."""
 
 from __future__ import annotations
 
@@ -20,9 +20,10 @@ Network = TypeVar("Network", bound=nn.Module)
 def write_tensors(
     path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None
 ) -> None:
-    """Write tensors atomically, with a digest of them (`undamaged`) beside the metadata.
+    """Write tensors and metadata to a safetensors file, atomically, with a digest of the tensors.
 
-    Raises OSError that names the file if that fails, on a full disk for instance.
+    Raises:
+        OSError: naming the file, if writing fails, for instance on a full disk.
     """
     whole = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     try:
@@ -33,9 +34,15 @@ def write_tensors(
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """The tensors of a file, and its metadata.
+    """Read a safetensors file.
 
-    Raises FileNotFoundError for no file, ValueError, which names it, for one that is damaged or is none.
+    Returns:
+        Its tensors by name, on the CPU, and its metadata.
+
+    Raises:
+        FileNotFoundError: if there is no file.
+        ValueError: naming the path, if it is a folder or a pipe, no safetensors file, or damaged (see
+            `undamaged`).
     """
     if path.exists() and not path.is_file():  # a pipe would be waited for
         raise ValueError(f"{path}: no file, but a folder or a pipe")
@@ -53,7 +60,15 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
 
 
 def with_weights(network: Network, path: Path) -> Network:
-    """The network, ready for use, with the weights of a file. Raises as `read_tensors`, and for others."""
+    """Load a file's weights into a network in place, and set it to evaluation without gradients.
+
+    Returns:
+        The same network.
+
+    Raises:
+        FileNotFoundError: if there is no file.
+        ValueError: naming the file, if it is damaged, or its names or shapes are not this network's.
+    """
     try:
         network.load_state_dict(read_tensors(path)[0])
     except RuntimeError:
@@ -63,17 +78,20 @@ def with_weights(network: Network, path: Path) -> Network:
 
 
 def not_whole(error: Exception) -> str:
-    """What to say of a file that safetensors refuses with this error."""
+    """Return the message for a file that safetensors refuses with `error`."""
     return f"not a safetensors file ({' '.join(str(error).split())}); was it copied whole?"
 
 
 DAMAGED = "its numbers are not those that were written: copy it again"
 DIGEST = "digest"
-"""The entry of the metadata that holds the digest of all tensors."""
+"""Metadata entry that holds the digest of all tensors."""
 
 
 def digest(tensors: Mapping[str, Tensor]) -> str:
-    """A digest of names, shapes and bytes: with a bit changed a file is still a valid safetensors file."""
+    """Return a digest of the names, types, shapes and bytes of tensors, as 32 hexadecimal digits.
+
+    A safetensors file with one changed bit is still valid; this finds it.
+    """
     total = hashlib.blake2b(digest_size=16)
     for name, tensor in sorted(tensors.items()):
         total.update(f"{name} {tuple(tensor.shape)} {tensor.dtype};".encode())
@@ -82,5 +100,5 @@ def digest(tensors: Mapping[str, Tensor]) -> str:
 
 
 def undamaged(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> bool:
-    """Whether a file's tensors are those that were written; also for files from before there were digests."""
+    """Return True if tensors match the digest in their metadata, or the metadata has none (older files)."""
     return DIGEST not in metadata or metadata[DIGEST] == digest(tensors)

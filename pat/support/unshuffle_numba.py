@@ -1,17 +1,21 @@
-"""The compiled loop of `blocks`, in one thread and without Python's lock."""
+"""Compiled loop of `blocks.stacked`, single-threaded and without Python's lock."""
 
 from __future__ import annotations
 
 from arraygeom.runtime.compiled import compiled
 
 COLUMNS = 32
-"""Columns whose channels are interleaved at a time: they stay in a core's first cache."""
+"""Columns interleaved at a time: they stay in a core's first cache."""
 
 
 @compiled(nogil=True, cache=True)
 def unshuffle(upper, lower, out):
-    """The 2x2 pixels of images, of their even and odd rows (c, h, 2 w), as channels of `out` (h, w, 4 c), a
-    few columns at a time."""
+    """Rearrange 2x2 pixels into four channels, written into `out` (h, w, 4 c).
+
+    Args:
+        upper: the image's even rows (c, h, 2 w).
+        lower: its odd rows.
+    """
     channels, (height, width) = len(upper), out.shape[:2]
     for y in range(height):
         for left in range(0, width, COLUMNS):

@@ -177,7 +177,8 @@ def fields_of(one: Drawn) -> list[tuple[str, Any, float | None, float | None]]:
 
 
 def _have_pinhole_views(one: Drawn) -> bool:
-    """Whether each image has a pixel less than 62 degrees off axis; tiny ones of wide lenses may not."""
+    """Return True if each image has a pixel less than 62 degrees off axis; tiny ones of wide
+    lenses may not."""
     try:
         for camera in one.pair.cameras:
             ag.pinhole_view(camera)

@@ -243,7 +243,7 @@ def test_a_pair_says_what_relates_it():
 
 
 def test_a_pair_of_unknown_scale_says_so():
-    """Its lengths were said to be metres."""
+    """Its lengths are not said to be metres."""
     rig = parallel_rig(999.0, (497, 741), {"a": (), "b": (1.0,)}, (2, 5))
     pair = rig.replace(name=UNSCALED).pair("a", "b")
     assert repr(pair).endswith("; baseline 1; 2-5 baselines")
@@ -251,6 +251,6 @@ def test_a_pair_of_unknown_scale_says_so():
 
 
 def test_a_size_in_a_tensor_is_refused():
-    """It was taken, and the camera called itself a batch."""
+    """A size is two integers; a tensor would make the camera a batch."""
     with pytest.raises(ValueError, match=r"hw is tensor.*; wanted \(height, width\) in whole pixels"):
         check_hw(torch.tensor([240, 320]))

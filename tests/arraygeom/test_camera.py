@@ -88,7 +88,7 @@ def test_gradients_of_projection_and_its_inverse():
 
 
 def test_a_pixel_without_a_ray_leaves_gradients_of_the_pose_to_the_others():
-    """The NaN of a pixel outside the lens's range, times no gradient at all, was every gradient of R."""
+    """The NaN of a pixel outside the lens's range does not reach the gradients of R."""
     lens = Distortion("kannala-brandt", torch.zeros(4, dtype=torch.float64))
     w = torch.zeros(3, dtype=torch.float64, requires_grad=True)
     pose = Pose(rotation_from_vector(w), torch.zeros(3, dtype=torch.float64))

@@ -101,7 +101,7 @@ def of_parallel(X):
 
 
 def of_moving(X):
-    """By bisection of the row at which a point is seen, over the image's rows alone."""
+    """Project by bisection of the row at which a point is seen, over the image's rows alone."""
     Rotation = pytest.importorskip("scipy.spatial.transform").Rotation
 
     def at(row):
@@ -121,7 +121,7 @@ def of_moving(X):
 
 
 def of_port(X):
-    """By bisection of the angle in air, traced through the layers by Snell's law."""
+    """Project by bisection of the angle in air, traced through the layers by Snell's law."""
     radius, depth = np.hypot(X[:, 0], X[:, 1]), X[:, 2] - PORT["distance"] - PORT["thickness"]
     low, high = np.zeros(len(X)), np.full(len(X), np.pi / 2)
     for _ in range(80):
@@ -135,7 +135,7 @@ def of_port(X):
 
 
 def of_splines(X, *, spacing, order, pinhole):
-    """By SciPy's B-splines: knots evenly spaced, the middle one at u = 0."""
+    """Project by SciPy's B-splines: knots evenly spaced, the middle one at u = 0."""
     spline = pytest.importorskip("scipy.interpolate").BSpline
     length = np.linalg.norm(X, axis=1)
     some = length + X[:, 2] > 1e-6 * length
@@ -245,7 +245,7 @@ def test_rig_files_hold_a_model_with_its_own_numbers(name, tmp_path):
 
 
 def test_a_model_whose_unproject_is_not_the_inverse_is_odd():
-    """Its segments lay beside what they were of, and nothing said so."""
+    """A model whose two maps disagree is reported: its segments would lie beside the points."""
 
     @dataclass(frozen=True, eq=False, repr=False)
     class NotInverse(Stereographic):
@@ -298,7 +298,7 @@ def test_a_file_that_lacks_a_number_of_its_model_says_which(tmp_path):
 
 @pytest.mark.parametrize("factor", [1000.0, 1e-3])
 def test_another_unit_changes_no_pixel(factor):
-    """Lengths of models stayed as they were: velocities, distances, parallel rays."""
+    """Lengths of models scale with the rig: velocities, distances, parallel rays."""
     t = partial(torch.tensor, dtype=torch.float64)
     moving = RollingShutter(velocity=t([1.0, 0.2, 0.1]), rotation=t([0.1, 0.2, 0.3]), readout=t(0.02))
     port = FlatPort(distance=t(0.05), thickness=t(0.01), glass=t(1.5), water=t(1.33))
@@ -346,7 +346,7 @@ def project(X):
     ],
 )
 def test_a_model_that_returns_something_else_is_refused_with_what_is_wanted(wrong, said):
-    """Each was a traceback from within a field, or a depth of another point."""
+    """A result of another kind is a message that names the model and the expected result."""
 
     @dataclass(frozen=True, eq=False, repr=False)
     class Sloppy(Stereographic):
@@ -402,7 +402,7 @@ def test_a_model_with_rays_that_it_does_not_see_covers_nothing():
 
 
 def test_an_uncalibrated_view_keeps_its_model_in_a_file(tmp_path):
-    """It was written, and refused when read."""
+    """A written file is read again."""
     view = LensView(hw=HW, K=intrinsics(100.0, HW), distortion=Division(number(-0.1)))
     rig = Rig({"a": view, "b": view})
     rig.save(tmp_path / "rig.yaml")

@@ -222,8 +222,8 @@ def test_everything_that_beta_sees_of_a_ray_is_near_a_sample(lens, focal):
 
 
 def test_a_view_without_a_lens_beside_one_with_takes_pixels_of_any_device():
-    """As on a GPU, for which another device stands."""
+    """The meta device stands for a GPU."""
     x = pixel_grid((4, 6), device="meta").reshape(-1, 2)
-    straight = _Straight.of(View(hw=(4, 6)))
+    straight = _Straight.from_view(View(hw=(4, 6)))
     for found, valid in (straight.undistort(x), straight.distort(x)):
         assert found.device.type == valid.device.type == "meta"

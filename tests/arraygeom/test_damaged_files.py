@@ -65,7 +65,7 @@ def matlab_pair() -> dict[str, object]:
 
 @pytest.mark.parametrize("compressed", [False, True])
 def test_damaged_mat_files_are_read_or_refused(compressed, tmp_path):
-    """Of these, scipy alone crashes the process on seed 50, among others."""
+    """SciPy alone crashes the process on some of these, such as seed 50."""
     path = tmp_path / "pair.mat"
     others = {"empty": np.zeros((0, 3)), "cells": np.array([1, "b"], object), "z": np.array([1 + 2j])}
     variables = {"s": matlab_pair(), **others, "t": ["a", "bc"]}
@@ -123,7 +123,7 @@ def test_half_a_character_is_refused(tmp_path):
 
 
 def test_a_megabyte_of_repeated_entries_is_refused_at_once(tmp_path):
-    """It took over a minute: every name was counted in the list of all."""
+    """The time is linear in the number of names."""
     names = ", ".join(f'"{i:05d}": 1' for i in range(70_000))
     (tmp_path / "t.json").write_text(f'{{{names}, {names}, "frames": [{{"transform_matrix": 1}}]}}')
     begin = time.process_time()
@@ -159,7 +159,7 @@ PARTS = [path for path in sorted(FIXTURES.rglob("*")) if path.is_file() and path
 @pytest.mark.timeout(60)
 @pytest.mark.parametrize("part", PARTS, ids=lambda path: f"{path.parent.name}/{path.name}")
 def test_a_pipe_in_place_of_a_part_is_read_by_no_reader(part, tmp_path):
-    """`extrinsics.yml` as a pipe was waited for. What a format can do without is not looked at."""
+    """A pipe as `extrinsics.yml` is not opened; parts that a format can do without are not looked at."""
     if part.suffix == ".yml":
         pytest.importorskip("cv2")
     home = tmp_path / "rig"

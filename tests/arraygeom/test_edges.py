@@ -71,7 +71,7 @@ def test_lenses_are_finite_at_huge_points_in_float32(model, size):
 
 @pytest.mark.parametrize("model", [name for name, (model, _) in MODELS.items() if not model.central])
 def test_cameras_whose_rays_do_not_meet_are_finite_at_huge_points(model):
-    """As far away as they are followed; their values are those of float64 there."""
+    """Up to the distance at which rays are followed, with the values of float64 there."""
     X = torch.tensor([[1e9, 0, 1], [1e18, 1e18, 1e18], [0, 0, 3e38], [1e20, -1e20, -1e20], [1, 1, 1e-20]])
     X.requires_grad_()
     lens = MODELS[model][0].to(torch.float32)
@@ -141,7 +141,7 @@ def test_there_is_no_line_on_the_epipole_nor_of_zero(dtype):
 
 @pytest.mark.parametrize("lens", ["brown-conrady", "kannala-brandt"])
 def test_gradients_of_curves_by_betas_lens_are_those_of_differences(lens):
-    """Of the function as it is computed: where its nodes lie depends on the lens too."""
+    """The differences are of the computed function: positions of its nodes depend on the lens too."""
     rig, c = (
         random_rig(2),
         BARREL.coefficients if lens == "brown-conrady" else torch.tensor([0.05, -0.01, 2e-3, -1e-3]),

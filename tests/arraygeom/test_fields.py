@@ -130,7 +130,7 @@ def test_rectified_runs(side):
 
 
 def test_a_whole_row_begins_at_the_largest_disparity():
-    """Of an alpha on the right, too, whose points are farther right in beta the nearer they are."""
+    """An alpha on the right has its near points farther right in beta."""
     pair, x = Pair(View(hw=(4, 20)), View(hw=(4, 20))), torch.tensor([[10.0, 2.0]])
     s = Rectified(alpha_is="right")(pair, x)
     assert (s.start[0, 0], s.end[0, 0]) == (19, 0)
@@ -213,7 +213,7 @@ def test_whole_images_in_chunks_are_what_single_rows_are():
 
 
 def test_fields_are_asked_where_the_numbers_of_a_link_are():
-    """As on a GPU, for which another device stands."""
+    """The meta device stands for a GPU."""
     asked = []
 
     def field(pair, x):
@@ -241,7 +241,8 @@ def test_ends_that_are_not_finite_are_not_on_a_grid():
 
 
 def test_segments_far_beyond_the_image_are_clipped_to_it():
-    """Matching took as many labels as the longest has pixels: at 10^9 of them the memory was exhausted."""
+    """Matching takes as many labels as the longest segment has pixels: 10^9 of them would exhaust
+    the memory."""
 
     def field(pair, x):
         return Segments(x - x.new_tensor([1e9, 0]), x, x[..., 0] < 6)
@@ -393,7 +394,7 @@ def test_gradients_are_finite_where_only_some_rigs_of_a_batch_are_degenerate():
 
 
 def test_what_a_field_gives_is_asked_wherever_it_is_called():
-    """Widened, sampling locations and drawings were an AttributeError; `fuse` alone said what is wanted."""
+    """Widened, sampling locations, drawings and `fuse` all check a field's result."""
     pair = pair_of(two_cameras())
     x = torch.tensor([[20.0, 20.0], [30.0, 10.0]])
 

@@ -77,7 +77,7 @@ def test_hand_written_pairs(file, format, names, options):
 @pytest.mark.parametrize("file", sorted({path.name for path in FIXTURES.iterdir()} - {"README.md"}))
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-16-le", "utf-16-be"])
 def test_files_are_read_behind_a_mark(file, encoding, tmp_path):
-    """As editors write, and PowerShell what tools print; of some formats it hid the first line."""
+    """Editors, and PowerShell for the output of tools, write a byte order mark."""
     for old in [p for p in FIXTURES.rglob("*") if p.is_file()]:
         new = tmp_path / old.relative_to(FIXTURES)
         new.parent.mkdir(exist_ok=True)
@@ -121,7 +121,7 @@ def test_middlebury():
 
 @pytest.mark.parametrize("least", [-40, -41])
 def test_middlebury_to_infinity(least, tmp_path):
-    """Without disparity points are at infinity: the near bound was dropped too."""
+    """Without disparity points are at infinity; the near bound is kept."""
     text = (FIXTURES / "middlebury.txt").read_text()
     (tmp_path / "calib.txt").write_text(re.sub("vmin *= *10", f"vmin={least}", text))
     near, far = read_rig(tmp_path / "calib.txt").depth
@@ -450,7 +450,7 @@ def test_a_lens_without_focal_length_states_its_scale(tmp_path):
 
 
 def test_opencv_24s_samples_state_their_size(tmp_path):
-    """`image_Width` was not read: twice the principal point was taken."""
+    """`image_Width` is a stated size."""
     K = "<rows>3</rows><cols>3</cols><dt>d</dt><data>500. 0. 300. 0. 500. 250. 0. 0. 1.</data>"
     D = "<rows>5</rows><cols>1</cols><dt>d</dt><data>0. 0. 0. 0. 0.</data>"
     path = tmp_path / "out.xml"

@@ -153,7 +153,7 @@ def test_fisheyes_by_the_files_own_word(word, tmp_path):
 
 
 def test_four_coefficients_without_a_word(tmp_path):
-    """Tangential terms of 0.05 are no Brown lens's; it is said which was taken, and --lens decides."""
+    """Tangential terms of 0.05 are no Brown lens's; a warning states the chosen model, and --lens decides."""
     rig, said = read(tmp_path / "a.yml", opencv(("K1", "D1"), FISHEYE))
     assert rig["left"].distortion.model == "kannala-brandt"
     assert "D1" in said
@@ -288,7 +288,7 @@ def test_eurocs_sensors(place, tmp_path):
 
 @pytest.mark.parametrize("lower", [False, True])
 def test_a_ros_message_as_text(lower, tmp_path):
-    """As `rostopic echo` (ROS 1: K, D) and `ros2 topic echo` (k, d) print it."""
+    """The text of `rostopic echo` (ROS 1: K, D) and `ros2 topic echo` (k, d)."""
     text = (
         'header: \n  seq: 1\n  frame_id: "cam"\nheight: 480\nwidth: 640\ndistortion_model: "plumb_bob"\n'
         "D: [-0.2, 0.1, 0.001, -0.002, 0.0]\nK: [400.0, 0.0, 310.25, 0.0, 404.0, 244.75, 0.0, 0.0, 1.0]\n"

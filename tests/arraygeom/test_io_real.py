@@ -1,4 +1,4 @@
-"""Readers on the files that tools wrote for real cameras: what was observed has to be where the rig says."""
+"""Readers on the files that tools wrote for real cameras: observed points must be where the rig states."""
 
 import bz2
 import csv
@@ -56,7 +56,8 @@ def triangulated(cameras: list[Camera], pixels: list[torch.Tensor]) -> torch.Ten
 
 
 def epipolar_errors(a: Camera, b: Camera, xa: torch.Tensor, xb: torch.Tensor) -> torch.Tensor:
-    """Pixels in b between what was seen and the nearest point of alpha's (possibly curved) epipolar line."""
+    """Return pixels in b between the observed point and the nearest one of alpha's (possibly curved) epipolar
+    line."""
     depths = torch.logspace(-1.5, 3, 1000, dtype=torch.float64) * (a.centre - b.centre).norm()
     X = a.centre + directions(a, xa)[:, None] * depths[:, None]
     projected = b.project(X)

@@ -290,7 +290,7 @@ CUT = {
 
 @pytest.mark.parametrize("format", CUT)
 def test_what_is_cut_away_is_named(format, tmp_path):
-    """Such a camera was left out without a word, or called an empty mapping."""
+    """A camera whose entries are cut off is an error that names them."""
     file, cut, left, wanted = CUT[format]
     assert wanted in refusal(copied(file, tmp_path, re.sub(cut, left, file.read_text())), format)
 
@@ -351,7 +351,7 @@ def test_colmap_models_that_lost_entries(tmp_path):
 
 
 def test_colmap_images_without_lines_of_points(tmp_path):
-    """Every second image was taken for the points of the one above, and left out without a word."""
+    """A file without lines of points is refused, as every second image would be taken for points."""
     file = FIXTURES / "colmap" / "images.txt"
     text = "".join(line for line in file.read_text().splitlines(keepends=True) if line.endswith(".png\n"))
     message = refusal(copied(file, tmp_path, text), "colmap")

@@ -1,4 +1,5 @@
-"""What arraygeom and kornia both have agrees, in values and in gradients; and both sides' cameras convert."""
+"""Functions of both arraygeom and kornia agree in values and in gradients; and both sides'
+cameras convert."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -65,7 +66,7 @@ def up_to_scale(F: Tensor) -> Tensor:
 
 
 def cases(points: int, dtype: torch.dtype = F64) -> dict[str, Parity]:
-    """What both libraries have, for some points that both cameras of RIG see."""
+    """List the functions of both libraries, with points that both cameras of RIG see."""
     X = scene_points(RIG, points)
     x_alpha, x_beta, X = (v.to(dtype) for v in (ALPHA.project(X).x, BETA.project(X).x, X))
     vectors = torch.randn(points, 3, dtype=F64, generator=torch.Generator().manual_seed(1)).to(dtype)

@@ -1,4 +1,4 @@
-"""Random lenses beyond their folds: unflagged answers are right. The table of docs/lenses.md, smaller."""
+"""Random lenses beyond their folds: unflagged answers are right. A smaller docs/reports/lenses.md."""
 
 import numpy as np
 import pytest

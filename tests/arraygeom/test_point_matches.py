@@ -46,7 +46,7 @@ def test_csv(tmp_path, text, between):
 
 @pytest.mark.parametrize("first", ["1.0,abc,3.0,4.0", "1.0,2.0,3.0", "1.0,2.0,3.0,"])
 def test_a_first_line_of_csv_with_numbers_is_no_header(tmp_path, first):
-    """One with a number missing or misspelt was dropped without a word."""
+    """A first line with a number missing or misspelt is an error."""
     (tmp_path / "m.csv").write_text(f"{first}\n5,6,7,8\n")
     with pytest.raises(ValueError, match=f"line '{first}' is not four numbers"):
         read_matches(tmp_path / "m.csv", FILES, SIZES)
@@ -74,7 +74,7 @@ def test_a_damaged_database_is_named(tmp_path, change):
 
 @pytest.mark.parametrize("header", ["id,x0,y0,x1,y1,score", 'score, "Y0", "X0", "Y1", "X1"'])
 def test_a_header_names_the_columns(tmp_path, header):
-    """It was left out, and the first four columns were taken."""
+    """Columns are read by their names, in any order."""
     (tmp_path / "m.csv").write_text(f"{header}\n7,1,2,3,4,.5\n")
     found = read_matches(tmp_path / "m.csv", FILES, SIZES)["mono", "colour"]
     turned = "Y0" in header
@@ -96,7 +96,7 @@ def test_colmap_pairs_are_of_the_cameras_whatever_their_order(tmp_path):
 
 
 def test_images_of_colmap_called_alike_are_told_by_their_folders(tmp_path):
-    """As all rigs' images are: both files were taken for one image, and no matches found between them."""
+    """Images of a rig often have one name in several folders."""
     database(tmp_path / "database.db", names=("mono/1.png", "colour/1.png"))
     files = {name: Path(f"photos/{name}/1.png") for name in FILES}
     found = read_matches(tmp_path / "database.db", files, SIZES)["mono", "colour"]

@@ -44,7 +44,7 @@ def test_the_pose_comes_back_from_f(seed):
 @pytest.mark.parametrize("noise", [0.5, 2.0])
 @pytest.mark.parametrize("seed", range(5))
 def test_the_pose_of_noisy_matches_is_opencvs(seed, noise):
-    """E from F of noisy matches has singular values that differ: no pose was found, or R was no rotation."""
+    """E from F of noisy matches has singular values that differ; R is a rotation all the same."""
     pair, x, y = seen(seed, 200)
     rng = np.random.default_rng(seed)
     x, y = (p + noise * torch.from_numpy(rng.standard_normal(p.shape)) for p in (x, y))

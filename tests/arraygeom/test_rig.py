@@ -189,7 +189,7 @@ def test_what_is_odd_about_a_rig_of_unknown_scale_is_not_in_metres(t, depth):
 
 
 def test_cameras_at_one_position_are_one_sentence():
-    """A camera of five bands whose tags state no translations had ten."""
+    """Five bands whose tags state no translations give one sentence, not one per pair."""
     rig = random_rig(0)
     bands = dict.fromkeys(("blue", "green", "red"), rig["alpha"])
     odd = [s for s in Rig({**bands, "beta": rig["beta"]}).check() if "same position" in s]
@@ -229,7 +229,7 @@ def test_a_pixel_of_depth_is_what_moves_the_point_by_a_pixel(centre, turn, steps
     ("field", "moves"), [(Epipolar(), False), (EpipolarLine(), False), (Curved(9), False), (Curved(9), True)]
 )
 def test_fields_in_another_unit_are_the_same(field, moves, factor):
-    """A line began 0.1 mm from alpha, and infinity was at 100 km, whatever the rig's unit."""
+    """Near and far limits of lines and infinity scale with the rig's unit."""
     rig = random_rig(0).replace(depth=(1.0, math.inf))
     if moves:
         velocity, rotation, readout = (

@@ -145,7 +145,7 @@ def noisy_matches(disparity: torch.Tensor, noise: float) -> tuple[torch.Tensor, 
 
 @pytest.mark.parametrize("noise", [0.1, 0.3, 1.0])
 def test_errors_are_within_three_stated_deviations(noise):
-    """Of 100,000 float32 matches at 1 to 100 px of disparity; those said not to be known count as right."""
+    """100,000 float32 matches at 1 to 100 px of disparity; those stated as unknown count as right."""
     X, x = noisy_matches(uniform(torch.Generator().manual_seed(4), 1, 100, 100_000), noise)
     found = triangulate(wide_pair(torch.float32), x.float(), deviation=noise)
     error = (found.X - X).abs()[..., 2]
@@ -232,7 +232,7 @@ def test_what_is_not_a_number_leaves_no_gradient():
 
 
 def test_depth_along_a_curve_has_the_gradients_of_depth_along_a_line():
-    """Only those of the curve's ends were there."""
+    """Gradients by the position in beta, not only by the curve's ends."""
     cameras = wide_pair()
     x = torch.tensor([[2000.0, 1500.0], [2600.0, 1700.0]], dtype=torch.float64)
     near, far = (torch.tensor(d, dtype=torch.float64) for d in (0.5, 50.0))

@@ -102,7 +102,7 @@ def test_residuals_state_their_median():
 
 @pytest.mark.parametrize("factor", [1e3, 1e-3])
 def test_what_is_drawn_of_the_depth_range_is_the_same_in_another_unit(factor):
-    """Within 30 cm it was drawn however small the rig."""
+    """No limit of the drawing is in metres."""
     rig = random_rig(0).scaled(0.01).replace(depth=(0.2, 0.25))
     drawn = [len(viz.depth_outline(r, viz.calibrated(r), None)) for r in (rig, rig.scaled(factor))]
     assert drawn[0] == drawn[1]

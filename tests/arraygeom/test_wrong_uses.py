@@ -15,7 +15,7 @@ from tests.arraygeom.wrong_uses import SILENT, WRONG
 
 @pytest.fixture(scope="module")
 def answers() -> dict[str, str]:
-    """What users get, without the types that are checked while testing."""
+    """Return the messages that users get, without the types that are checked while testing."""
     command = [sys.executable, "-m", "tests.arraygeom.wrong_uses"]
     done = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True, check=True)
     return json.loads(done.stdout)

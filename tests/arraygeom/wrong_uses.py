@@ -207,7 +207,7 @@ def answer(use: Callable[[], Any]) -> str:
 
 
 def answers(names: Iterable[str] = WRONG) -> dict[str, str]:
-    """What each wrong use gets."""
+    """Return the message of each wrong use."""
     return {name: answer(WRONG[name]) for name in names}
 
 

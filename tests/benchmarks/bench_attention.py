@@ -189,7 +189,7 @@ def matmul_rate(device: str) -> float:
 
 
 def _rates(device: str) -> dict[bool, float]:
-    """Of all threads, and of one."""
+    """Return rates of all threads, and of one."""
     threads = torch.get_num_threads()
     every = matmul_rate(device)
     torch.set_num_threads(1)
@@ -227,7 +227,7 @@ SMALL, LARGE, WHOLE = (128, 256), (256, 512), (3036, 4024)
 
 
 class Job(NamedTuple):
-    """What is measured: a method on images of height and width `ha`, `wa` with `d` channels."""
+    """Measured work: a method on images of height and width `ha`, `wa` with `d` channels."""
 
     device: str
     method: str
@@ -253,7 +253,7 @@ class Job(NamedTuple):
 
 
 def jobs(device: str, quick: bool) -> list[Job]:
-    """What is measured; (a) and (b) where they fit."""
+    """List the measured work; (a) and (b) where they fit."""
     fast = "cpu" if device == "cpu" else "triton"
     own, plain = ([(method, how) for how in ("nearest", "bilinear")] for method in (fast, "reference"))
     both = (False, True)

@@ -80,7 +80,7 @@ def error(rig: Rig, truth: Rig, matches: dict) -> float:
 
 
 class Row(NamedTuple):
-    """A line of the table, the error of depth before and after, and whether the refined rig was accepted."""
+    """A line of the table: the error of depth before and after, and True if the refined rig was accepted."""
 
     line: str
     before: float
@@ -101,7 +101,7 @@ def row(label: str, rig: Rig, bad: Rig, matches: dict, kind: str) -> Row:
 
 
 def summary(what: str, rows: Sequence[Row]) -> str:
-    """How many of the rows were accepted, and how much worse that made depth."""
+    """Count the accepted rows, and those of them whose depth became worse."""
     worse = [100 * (row.after - row.before) for row in rows if row.accepted]
     return (
         f"\n{what}: {len(worse)} of {len(rows)} accepted, which increases depth's error by {max(worse):.1f} "

@@ -30,7 +30,7 @@ HEAD = head("input | status | depth | confidence | peak, MiB")
 
 
 class Came(NamedTuple):
-    """What came of a kind of input; the last line that was said."""
+    """Result of a kind of input, with the last line printed."""
 
     status: int
     depth: bool

@@ -38,7 +38,7 @@ FRAMES = 40
 
 @dataclass(frozen=True)
 class Case:
-    """What is fused."""
+    """A fusion to measure."""
 
     name: str
     wh: tuple[int, int]

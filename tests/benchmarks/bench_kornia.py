@@ -1,6 +1,6 @@
 """arraygeom beside kornia, for what both have: values, gradients, low precision, and the ratio of times.
 
-Run as `python -m tests.benchmarks.bench_kornia`; it writes both into docs/kornia.md.
+Run as `python -m tests.benchmarks.bench_kornia`; it writes both into docs/reports/kornia.md.
 
 The value's difference is the largest over all entries, float64, relative to the largest entry. The gradient's
 error is each library's own, of a random cotangent, against central differences of its own values; second
@@ -31,7 +31,7 @@ from pat.lab.evaluation.tables import markdown_table
 from pat.networks.guided import GuidedPAT
 from tests.arraygeom.rigs import random_rig
 from tests.arraygeom.test_kornia_parity import CASES, Parity, cases
-from tests.benchmarks.printed import DOCS, timed
+from tests.benchmarks.printed import REPORTS, timed
 from tests.transformations.operators import OPERATORS
 
 OUR_PACKAGES = "arraygeom", "pat", "calib"
@@ -46,7 +46,7 @@ def value_difference(case: Parity) -> float:
 
 
 def gradient_error(f: Callable[[Tensor], Tensor], at: Tensor) -> float:
-    """Of a directional derivative against central differences, relative to its size."""
+    """Return the error of a directional derivative against central differences, relative to its size."""
     g = torch.Generator().manual_seed(3)
     leaf = at.clone().requires_grad_()
     value = f(leaf)
@@ -162,11 +162,11 @@ def fused() -> None:
 
 
 def main() -> None:
-    """Print the lists, and put them into docs/kornia.md."""
+    """Print the lists, and put them into docs/reports/kornia.md."""
     torch.set_num_threads(1)
     for name, made in {"table": table(), "calls": counts()}.items():
         print(made)
-        write_block(DOCS / "kornia.md", name, made)
+        write_block(REPORTS / "kornia.md", name, made)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Lens models beside OpenCV, kornia, pycolmap: wrong answers, error, derivatives, vmap, time; docs/lenses.md.
+"""Lens models beside OpenCV, kornia, pycolmap: answers, derivatives, vmap, time; docs/reports/lenses.md.
 
     python -m tests.benchmarks.bench_lenses [--lenses 1000] [--write]
 
@@ -32,7 +32,7 @@ from arraygeom.lenses.model import LensModel
 from docs.update_readme import write_block
 from pat.app.cli.parser import script
 from pat.lab.evaluation.tables import markdown_table
-from tests.benchmarks.printed import DOCS, timed
+from tests.benchmarks.printed import REPORTS, timed
 
 try:
     import pycolmap
@@ -155,7 +155,7 @@ def direction(angle: Array) -> Array:
 
 
 def before_fold(family: Family, c: Array, angle: Array) -> NDArray[np.bool_]:
-    """Whether the formula keeps orientation all the way from the axis."""
+    """Return True if the formula keeps orientation all the way from the axis."""
     h, kept = 1e-6, np.ones(len(angle), bool)
     for share in np.linspace(1 / STEPS, 1, STEPS):
         at = share * angle
@@ -336,7 +336,7 @@ def counted(name: str, library: Library, lenses: Drawn) -> list[str]:
 
 
 def milliseconds(library: Library, lenses: Drawn) -> list[str]:
-    """Of 100,000 points through the first lens."""
+    """Return the milliseconds of 100,000 points through the first lens."""
     seen = lenses.X[lenses.seen]
     X = np.resize(seen, (1, 100_000, 3))
     x = np.resize(lenses.asked[:POINTS][lenses.seen[:POINTS]], (1, 100_000, 2))
@@ -346,7 +346,8 @@ def milliseconds(library: Library, lenses: Drawn) -> list[str]:
 
 
 def derivatives(name: str, library: str) -> list[str]:
-    """Whether second derivatives are right (by differences of first ones), and vmap over points, lenses."""
+    """Return True if second derivatives are right (by differences of first ones), and vmap over points and
+    lenses."""
     if library not in ("arraygeom", "kornia"):
         return ["none", "none"]
     rng = np.random.default_rng(1)
@@ -410,12 +411,12 @@ def rows(lenses: int) -> list[list[str]]:
 
 
 def main(lenses: int = 1000, write: bool = False) -> None:
-    """Print the table, and put it into docs/lenses.md if asked."""
+    """Print the table, and put it into docs/reports/lenses.md if asked."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     made = markdown_table(HEAD, rows(lenses), align="l")
     if write:
-        write_block(DOCS / "lenses.md", "lenses", made)
+        write_block(REPORTS / "lenses.md", "lenses", made)
 
 
 if __name__ == "__main__":

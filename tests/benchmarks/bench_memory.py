@@ -26,7 +26,7 @@ COLUMNS = ("megapixels", "what", "limit, GiB", "plan, GiB", "peak, GiB", "plan /
 
 @dataclass(frozen=True)
 class Case:
-    """What is fused: alpha and so many betas."""
+    """A fusion to measure: alpha and so many betas."""
 
     megapixels: int
     limit: str | None
@@ -128,7 +128,7 @@ def main(megapixels: tuple[int, ...] = tuple(SIDES), only: str | None = None) ->
 
 
 def key_of(line: str) -> tuple[str, ...]:
-    """The cells that say what was fused, and under which limit."""
+    """Return the cells that name the fusion, and its limit."""
     return tuple(line.split(" | ")[:3])
 
 

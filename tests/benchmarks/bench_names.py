@@ -168,7 +168,8 @@ class Judge:
 
 
 def observable(case: Case, bad: Rig) -> bool:
-    """Whether images can show a rig's gross mistake: more than its own misfit, or points where none is."""
+    """Return True if images can show a rig's gross mistake: more than its own misfit, or points where none
+    is."""
     given, wrong = (median_off(rig, case.matches) for rig in (case.rig, bad))
     return wrong > max(given + 0.5, 3 * given) or share_outside(bad, case.matches) > 0.5
 

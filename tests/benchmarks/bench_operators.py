@@ -1,4 +1,4 @@
-"""Multiview operators beside OpenCV, kornia, pycolmap, SciPy: value, gradient, time; docs/lenses.md.
+"""Multiview operators beside OpenCV, kornia, pycolmap, SciPy: value, gradient, time; docs/reports/lenses.md.
 
     python -m tests.benchmarks.bench_operators [--write]
 
@@ -43,7 +43,7 @@ from docs.update_readme import write_block
 from pat.app.cli.parser import script
 from pat.lab.evaluation.tables import markdown_table
 from tests.benchmarks.bench_kornia import gradient_error
-from tests.benchmarks.printed import DOCS, timed
+from tests.benchmarks.printed import REPORTS, timed
 
 try:
     import pycolmap
@@ -268,7 +268,7 @@ HEAD = ("operator", "beside", "value", "gradient error, ours", "theirs", "time, 
 
 
 def main(write: bool = False) -> None:
-    """Print the table, and put it into docs/lenses.md if asked."""
+    """Print the table, and put it into docs/reports/lenses.md if asked."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     lines = []
@@ -277,7 +277,7 @@ def main(write: bool = False) -> None:
             print(" | ".join(row), flush=True)
             lines.append(row)
     if write:
-        write_block(DOCS / "lenses.md", "operators", markdown_table(HEAD, lines, align="l"))
+        write_block(REPORTS / "lenses.md", "operators", markdown_table(HEAD, lines, align="l"))
 
 
 if __name__ == "__main__":

@@ -52,7 +52,8 @@ def jackknifed(fit: Solved) -> np.ndarray:
 
 
 def difference(a: BundleProblem, b: BundleProblem) -> np.ndarray:
-    """Of all free parameters, in the order of the fit's names; rotations to first order."""
+    """Return the difference of all free parameters, in the order of the fit's names; rotations to first
+    order."""
     parts = []
     for name, mask in b.free.items():
         change = intrinsic_values(a.cameras[name]) - intrinsic_values(b.cameras[name])

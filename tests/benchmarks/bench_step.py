@@ -17,11 +17,13 @@ from torch import Tensor
 
 from arraygeom import Pair, Positions, Rectified, View
 from arraygeom.fields.grid import FieldOnGrid
+from docs.update_readme import write_block
 from pat.app.cli.parser import script
+from pat.lab.evaluation.tables import markdown_table
 from pat.matching.inputs import Inputs
 from pat.networks.configs import PATConfig
 from pat.networks.paper import PAT
-from tests.benchmarks.printed import spread
+from tests.benchmarks.printed import REPORTS, spread
 
 HW, BATCH, PART, POSITIONS = (32, 96), 32, 4, 96
 PAPER = PATConfig(dim=64, block_bias=False, fusion_bias=True, values_after_block=True)
@@ -52,8 +54,8 @@ def step(
     return time.process_time() - began
 
 
-def main(steps: int = 3, profile: bool = False) -> None:
-    """Print the table; with `profile` also the operators that take most of a step of ours."""
+def main(steps: int = 3, profile: bool = False, write: bool = False) -> None:
+    """Print the table, and write it to docs/reports/paper.md; with `profile` the longest operators too."""
     torch.set_num_threads(1)
     torch.manual_seed(0)
     network = PAT(PAPER)
@@ -84,9 +86,16 @@ def main(steps: int = 3, profile: bool = False) -> None:
         for name, way in ways.items():
             times[name].append(step(network, adam, images, way))
     base = median(times["gathered, as the authors"])
-    print("| way | s a step | samples a second | times the authors' |\n| --- | ---: | ---: | ---: |")
-    for name, found in times.items():
-        print(f"| {name} | {spread(found, 1)} | {BATCH / median(found):.2f} | {base / median(found):.2f} |")
+    made = markdown_table(
+        ["way", "s a step", "samples a second", "times the authors'"],
+        [
+            [name, spread(found, 1), f"{BATCH / median(found):.2f}", f"{base / median(found):.2f}"]
+            for name, found in times.items()
+        ],
+    )
+    print(made, end="")
+    if write:
+        write_block(REPORTS / "paper.md", "step", made)
     if profile:
         from torch import profiler
 

@@ -81,8 +81,8 @@ def classical(folder: Path, out: Path) -> None:
 
 
 def opencv(folder: Path, out: Path) -> None:
-    """What one writes with OpenCV alone: SGBM on rectified images, its weighted least squares filter, beta
-    warped to alpha, alpha as the luma of the result."""
+    """Fuse as with OpenCV alone: SGBM on rectified images, its weighted least squares filter, beta warped to
+    alpha, alpha as the luma of the result."""
     import cv2
     import numpy as np
 

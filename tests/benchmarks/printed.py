@@ -1,9 +1,10 @@
-"""What benchmarks share: how work is timed, and tables that are printed while they grow."""
+"""Timing of work for benchmarks, and tables that are printed while they grow."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable
+from datetime import date
 from pathlib import Path
 from statistics import median
 
@@ -14,7 +15,7 @@ from arraygeom.runtime.atomic import write_text
 from pat.lab.evaluation.tables import markdown_header
 
 DATA = Path("../shared/data")
-DOCS = Path(__file__).parents[2] / "docs"
+REPORTS = Path(__file__).parents[2] / "docs" / "reports"
 
 
 def head(line: str, *, align: str = "lr") -> str:
@@ -57,4 +58,4 @@ def print_tables(title: str, tables: Iterable[Iterable[str]], out: Path | None) 
             lines.append(row)
         lines.append("")
     if out:
-        write_text(out, f"# {title}\n\n" + "\n".join(lines).rstrip() + "\n")
+        write_text(out, f"# {title}\n\n*Printed on {date.today()}.*\n\n" + "\n".join(lines).rstrip() + "\n")

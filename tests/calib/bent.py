@@ -27,7 +27,7 @@ def photograph_bent(
 def on_bent(
     shape: BoardDeformation, along: Float[np.ndarray, "n 3"], centre: Float[np.ndarray, "3"], size: float
 ) -> Float[np.ndarray, "n 3"]:
-    """Where rays from a centre meet a bent board: positions on it were it flat, by iteration.
+    """Intersect rays from a centre with a bent board: positions on it if it were flat, by iteration.
 
     Rays that pass its plane farther than `size` (metres) from its middle are not followed.
     """

@@ -69,7 +69,7 @@ def board_poses(count, *, seed=0, depth=(0.9, 2.4), tilt=35.0, spread=0.4) -> Po
 
 
 def see(rig, boards, board: Board = BOARD, *, noise=0.0, seed=1) -> dict[str, BoardViews]:
-    """What every camera of a rig sees of the boards, with noise in pixels along x and y."""
+    """Project the boards into every camera of a rig, with noise in pixels along x and y."""
     random = np.random.default_rng(seed)
     views = {}
     for name, camera in rig.cameras.items():

@@ -72,7 +72,7 @@ def seen_points(
 
 
 def rectified_images(seed=0) -> dict[str, torch.Tensor]:
-    """What `rectified_pair` sees of two planes, one above the other, at 60 / 20 = 3 m and 60 / 11 m."""
+    """Render `rectified_pair`'s views of two planes, one above the other, at 60 / 20 = 3 m and 60 / 11 m."""
     wide = texture((HW[0], HW[1] + 60), seed)
     near, far = (wide[..., d : d + HW[1]] for d in (20, 11))
     right = torch.cat([far[:, : HW[0] // 2], near[:, HW[0] // 2 :]], 1)

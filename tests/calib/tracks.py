@@ -92,7 +92,7 @@ def caliscope_views(data: Path) -> dict[str, BoardViews]:
 
 
 def rms_and_mean(problem: BundleProblem) -> tuple[float, float]:
-    """Of the residuals' lengths, pixels."""
+    """Return root mean square and mean of the residuals' lengths, pixels."""
     lengths = np.concatenate([np.linalg.norm(r, axis=1) for r in problem.residuals.values()])
     return float(np.sqrt((lengths**2).mean())), float(lengths.mean())
 

@@ -1,4 +1,4 @@
-"""What the tests of experiments share."""
+"""Fixtures of the tests of experiments."""
 
 from functools import partial
 
@@ -31,5 +31,5 @@ def photos(tmp_path):
 
 @pytest.fixture
 def refusal(refusal):
-    """What a command of the experiments says as it refuses its arguments."""
+    """Return the line with which a command of the experiments refuses its arguments."""
     return partial(refusal, group=Experiments)

@@ -1,4 +1,4 @@
-"""How alignment is measured: offsets of patches, homographies, occlusion, on images whose truth is known."""
+"""Measures of alignment: offsets of patches, homographies, occlusion, on images whose truth is known."""
 
 import cv2
 import numpy as np

@@ -1,4 +1,4 @@
-"""The fit of certainty: what it states holds on pairs that it did not see."""
+"""The fit of certainty: its statements hold on pairs outside the fit."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""What the choice between disparities learns from: true positions, and a step of training."""
+"""Training data of the choice between disparities: true positions, and a step of training."""
 
 import json
 from pathlib import Path
@@ -22,7 +22,7 @@ from pat.support.tensor_files import with_weights, write_tensors
 
 
 def warped(pair):
-    """What right shows at left's pixels moved by the true disparity, and where that is on it."""
+    """Return right's values at left's pixels moved by the true disparity, with a mask of those on it."""
     h, w = pair.left.shape[1:]
     x = torch.arange(w) - pair.disparity.value
     there = x.round().long().clamp(0, w - 1).expand(3, h, w)
@@ -82,7 +82,7 @@ def test_the_nearest_surface_is_seen_and_photographs_where_none_is():
 
 
 def test_varied_pairs_are_of_the_same_scene():
-    """Of another size; disparity with it, and both images in the same other colours."""
+    """Another size scales disparity, and both images have the same other colours."""
     g = torch.Generator().manual_seed(0)
     left = torch.nn.functional.interpolate(torch.rand(1, 3, 40, 56, generator=g), HW, mode="bicubic")[0]
     left = left.clamp(0, 1)

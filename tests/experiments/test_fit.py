@@ -46,7 +46,7 @@ def test_a_run_that_stopped_goes_on_exactly(tmp_path):
 
 
 def test_a_run_of_another_recipe_is_refused_before_anything_is_done(tmp_path):
-    """Samples of pairs that were to be left out were taken as found."""
+    """Samples of pairs that are left out are not taken for existing ones."""
     recipe = Recipe(out=tmp_path / "run", steps=1, batch=1, side=8)
     with recipe.folder():
         (recipe.out / "pairs").mkdir()

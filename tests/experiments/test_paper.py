@@ -68,7 +68,7 @@ def test_falls_are_means_and_extremes():
 
 
 def without_reference(pairs):
-    """How much each control costs, by the weights of the package, at the least of some pairs; dB."""
+    """Return the cost of each control, by the weights of the package, at the least of some pairs; dB."""
     network = load_weights("mono-colour")
     rows = evaluate_pairs(
         pairs, {"fusion": rectified_fusion(network), **controls(network)}, [2], max_disparity=80

@@ -48,7 +48,7 @@ def test_scenes_are_exact_for_every_rig(sweep, bank):
 
 
 def test_a_rig_may_stand_anywhere(bank):
-    """Scenes were before the world's origin, not before alpha."""
+    """Scenes are before alpha, not before the world's origin."""
     rig, turn = point("baseline", 12, hw=HW).rig, torch.tensor([0.2, 1.0, -0.1], dtype=torch.float64)
     world = Pose(rotation_from_vector(turn), 3 * turn)
     moved = {n: c.replace(cam_from_world=c.cam_from_world @ world) for n, c in rig.cameras.items()}

@@ -128,7 +128,7 @@ def test_recordings_are_files_as_cameras_write_them(tiny, tmp_path):
 
 
 def test_near_infrared_is_not_taken_for_a_response(tmp_path):
-    """By a response that explains .6 of it the image was 10 dB worse. Too small an image hides it."""
+    """A response that explains 0.6 of it would make the image 10 dB worse. Too small an image hides it."""
     found = psnr(run_system("visible-nir", tmp_path))
     assert found["fusion"] > found["classical"] + 3
 

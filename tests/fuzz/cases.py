@@ -1,4 +1,5 @@
-"""What is damaged, and what is asked of it: rigs of all formats, images, weights, checkpoints, covariance."""
+"""Damaged files, and the calls that read them: rigs of all formats, images, weights, checkpoints,
+covariance."""
 
 from __future__ import annotations
 
@@ -196,7 +197,7 @@ def convert_and_inspect(path: Path, source: random.Random) -> str:
 
 
 def command(*arguments: str) -> str:
-    """How a command ends: read for status 0, refused for one line and status 2; else what it was."""
+    """Run a command; it must read with status 0, or refuse in one line with status 2."""
     try:
         main(list(arguments))
     except SystemExit as ended:
@@ -291,7 +292,7 @@ def video_seeds(folder: Path) -> Iterator[Seed]:
 
 
 def faults_of_video(video: Video) -> str:
-    """Of its first frames and its rate."""
+    """Return the faults of a video's first frames and its rate."""
     whole = all(frame.isfinite().all() for frame in itertools.islice(video.frames, 100))
     return "" if whole and 0 < video.rate < float("inf") else f"{video.rate} frames a second"
 

@@ -1,6 +1,6 @@
-"""Damaged files of every kind, each in its own process with 4 GiB and 10 s; the table of docs/fuzzing.md.
+"""Damaged files of every kind, each in a process with 4 GiB and 10 s; for docs/reports/fuzzing.md.
 
-    python -m tests.fuzz.run [--only rig] [--share 0.1] [--out docs/fuzzing.md]
+    python -m tests.fuzz.run [--only rig] [--share 0.1] [--out docs/reports/fuzzing.md]
 
 Faults are kept in out/fuzz, with what was printed beside them; exit status 1 if there are any.
 """

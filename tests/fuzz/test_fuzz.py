@@ -64,8 +64,8 @@ def test_the_sandbox_sees(case, verdict, tmp_path, monkeypatch):
 
 
 def measured(log: Path) -> bool:
-    """Whether 200 MiB are measured. The most of some measurements: what the system takes of the parent's
-    memory meanwhile lowers one."""
+    """Return True if 200 MiB are measured, by the largest of some measurements: a single one may
+    be too low."""
     case = partial(sandbox.ended, lambda: "read" if len(bytearray(200 << 20)) else "", log)
     return 190 << 20 < max(case().peak for _ in range(5)) < 230 << 20
 

@@ -42,7 +42,7 @@ Arguments = Callable[[Path], list[str]]
 
 
 def whole(last: str) -> Callable[[Path, list[dict[str, bytes]]], list[str]]:
-    """What is wrong with the files of a folder, of which `last` is written last."""
+    """Return the faults of the files of a folder, of which `last` is written last."""
     return lambda out, versions: mixed(files_of(out), versions, last)
 
 
@@ -70,7 +70,7 @@ def frame_job(folder: Path) -> Job:
 
 
 def batch_job(folder: Path, *more: str, name: str = "batch") -> Job:
-    """Several frames, each as its own files. Those that were there are kept."""
+    """Return a job of several frames, each with its own files. Earlier ones are kept."""
 
     further = more or ("--threads", "1")
 
@@ -224,7 +224,7 @@ def rendering_job(folder: Path, backend: str = "layered", scenes: int = 4) -> Jo
 
 
 def all_jobs(folder: Path) -> Iterator[Job]:
-    """Those of the table."""
+    """Return the jobs of the table."""
     yield conversion_job(folder)
     yield frame_job(folder)
     yield batch_job(folder)

@@ -57,7 +57,7 @@ class Reference(NamedTuple):
 
 
 class Killed(NamedTuple):
-    """What the kills of one way did to a job."""
+    """Result of the kills of one way on a job."""
 
     kills: int
     finished: int
@@ -260,7 +260,7 @@ def files_of(out: Path) -> dict[str, bytes]:
 
 
 def mixed(found: dict[str, bytes], versions: list[dict[str, bytes]], last: str) -> list[str]:
-    """What is wrong with files that belong together: torn, or not of the making of the one written last.
+    """Return the faults of files that belong together: torn, or of another run than the one written last.
 
     Where there is no last one yet, the others only have to be whole.
     """

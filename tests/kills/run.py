@@ -1,6 +1,6 @@
-"""Commands killed at random, inside writes, with their workers and schedulers; the table of docs/kills.md.
+"""Commands killed at random, inside writes, with workers and schedulers; for docs/reports/kills.md.
 
-    python -m tests.kills.run [--only fuse] [--share 0.5] [--out docs/kills.md]
+    python -m tests.kills.run [--only fuse] [--share 0.5] [--out docs/reports/kills.md]
 
 Exit status 1 if anything was lost, torn, left over, or not the same in the end.
 """

@@ -43,7 +43,8 @@ def seen(camera: Camera, samples: int = 3) -> tuple[Tensor, Tensor]:
 
 
 def hit(camera: Camera, x: Tensor) -> tuple[Tensor, Tensor]:
-    """What pixels' rays meet in the world, and how far from their start; 0 for pixels without a ray."""
+    """Return the points where pixels' rays hit the world, and their distances from the starts; 0 for pixels
+    without a ray."""
     rays, valid = camera.rays(x)
     world = camera.cam_from_world.inverse()
     start = world.apply(camera.ray_origins(x))
@@ -89,7 +90,7 @@ class Fused(NamedTuple):
 
 
 def fused_in_the_room(rig: Rig, *, wide: bool) -> Fused:
-    """By the usual weights; of `wide` cameras depth is a distance."""
+    """Fuse by the usual weights; for `wide` cameras depth is a distance."""
     images, truth = recorded(rig)
     X, distance = hit(rig["alpha"], pixel_grid(rig["alpha"].hw, dtype=torch.float64))
     depth = distance if wide else X[..., 2]

@@ -1,4 +1,4 @@
-"""Six cameras as a reader of docs/own_camera.md writes them: no model of the package is used."""
+"""Six cameras as a reader of docs/rigs.md writes them: no model of the package is used."""
 
 import math
 from dataclasses import dataclass

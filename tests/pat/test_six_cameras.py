@@ -73,7 +73,7 @@ def of_sphere(X):
 
 
 def of_shutter(X):
-    """By bisection of the row, over the image's rows alone."""
+    """Project by bisection of the row, over the image's rows alone."""
     low, high = np.full(len(X), -1.0), np.full(len(X), 1.0)
     for _ in range(70):
         row = (low + high) / 2
@@ -86,7 +86,7 @@ def of_shutter(X):
 
 
 def of_port(X):
-    """By bisection of the angle in air."""
+    """Project by bisection of the angle in air."""
     radius, low, high = np.hypot(X[:, 0], X[:, 1]), np.zeros(len(X)), np.full(len(X), np.pi / 2)
     for _ in range(80):
         angle = (low + high) / 2

@@ -1,6 +1,6 @@
-"""Every transformation of torch on every public operator; the table of docs/transformations.md.
+"""Every transformation of torch on every public operator; the table of docs/reports/transformations.md.
 
-    python -m tests.transformations.run [--out docs/transformations.md]
+    python -m tests.transformations.run [--out docs/reports/transformations.md]
 
 An answer is held against central differences, a loop, or the operator itself; it is right, or one error of
 ours.

@@ -1,4 +1,4 @@
-"""What is published, installed into empty environments and used from there; the table of docs/performance.md.
+"""Published files, installed into empty environments and used there; for docs/reports/performance.md.
 
     python -m tests.wheel.run [--python PYTHON ...] [--lowest] [--torch 2.13.0] [--folder out/wheel] [--keep]
 
@@ -168,7 +168,11 @@ def environment(folder: Path, python: str) -> Path:
 
 
 def call(commands: Path, command: str, *words: str | Path, cwd: Path | None = None) -> str:
-    """What a command of an environment prints. Raises subprocess.CalledProcessError with it."""
+    """Return the output of a command of an environment.
+
+    Raises:
+        subprocess.CalledProcessError: with the output, if the command fails.
+    """
     if command == "pip":
         line = [
             commands / "python",

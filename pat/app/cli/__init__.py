@@ -1,1 +1,1 @@
-"""The commands of `pat`: `main` finds the one that is named, and a module holds each family of them."""
+"""Commands of `pat`: `main` runs the one that is named; each module holds a family of them."""

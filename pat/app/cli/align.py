@@ -1,4 +1,4 @@
-"""`pat align`: images of an array in, every camera's own values at one camera's pixels out."""
+"""`pat align`: brings every camera's own values to the pixels of one camera."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Align(Around, Known):
     occluded, 0 beyond the edge), NAME_confidence.png, NAME_positions.npy, depth.tif, visibility.txt and
     index.html."""
     interpolation: Literal["nearest", "bilinear", "cubic"] = "bilinear"
-    """Between recorded values; nearest keeps them."""
+    """Interpolation between recorded values; nearest keeps them."""
     confidence: float = 0.5
     """Confidence, 0 to 1, from which a camera counts as seeing a point: lower keeps more, more mistakes."""
     fill: Literal["none", "propagate"] = "none"
@@ -60,7 +60,12 @@ class Align(Around, Known):
     NAME.tif, instead of one of all bands."""
 
     def run(self) -> None:
-        """Align one frame or several, with the rig that is given or one that is found."""
+        """Align one frame or several, with the given rig or one found from the images.
+
+        Raises:
+            UsageError: for invalid options.
+            ValueError: for images or a rig that cannot be used.
+        """
         image, with_rig = named_images(self.given, self.image, "align")
         options.writable(self.out, folder=True)
         self.settings()
@@ -72,7 +77,7 @@ class Align(Around, Known):
                 self._align(frame)
 
     def _frames_with_rig(self, image: tuple[str, ...]) -> Iterator[_Frame]:
-        """The frames of the rig that is given, which the first one is checked against."""
+        """Frames of the given rig, which is checked against the first one."""
         from ...fusion.frame_matching import matched_frames
         from ...fusion.views import ViewFiles
         from ..healing import checked_rig
@@ -87,7 +92,7 @@ class Align(Around, Known):
             yield _Frame(views.developed, rig, views, one, alpha, name=_name_of(files, alpha, one))
 
     def _frames_without(self) -> Iterator[_Frame]:
-        """The frames of the rig that is found from the first one."""
+        """Frames of the rig that is found from the first one."""
         from ...fusion.frame_matching import matched_frames
         from ...fusion.views import ViewFiles
         from ..batch import find_images
@@ -113,7 +118,7 @@ class Align(Around, Known):
             )
 
     def _align(self, frame: _Frame) -> None:
-        """Align a frame, and write and say what comes of it."""
+        """Align a frame, write its files and print the summary."""
         from arraygeom.io.native import write
         from arraygeom.runtime.together import sweep, write_listed
 
@@ -149,12 +154,12 @@ class Align(Around, Known):
         say(f"written to {self.out}: {', '.join(path.name for path in written)}")
 
     def _refuse_several(self) -> None:
-        """Raise UsageError if something is known, which is of a single frame."""
+        """Raise UsageError for --around with several frames."""
         if self.around is not None:
             raise UsageError("--around", "a single frame: give one image of each camera")
 
     def _aligned(self, frame: _Frame) -> Aligned:
-        """The frame aligned, with the plan and a bar on the terminal."""
+        """Align a frame, with the plan and a bar on the terminal."""
         from ...fusion.aligned_files import RecordedFiles
         from ..front import align
 
@@ -174,7 +179,7 @@ class Align(Around, Known):
             )
 
     def _page(self, aligned: Aligned, frame: _Frame, seconds: float) -> str:
-        """The page index.html."""
+        """HTML of index.html."""
         from ..aligned_page import aligned_page
         from ..report import Facts
 
@@ -185,8 +190,11 @@ class Align(Around, Known):
 
 @dataclass(frozen=True)
 class _Frame:
-    """One frame to align: the rig of its developed images, that of its files, and those; `rig_found` says
-    that the rig was found from the images. The name goes in front of the files'; empty for a single frame."""
+    """One frame to align: rig of its developed images, rig of its files, and both.
+
+    `rig_found` is True if the rig was found from the images. The name is a prefix of output files; empty for
+    a single frame.
+    """
 
     rig: Rig
     recorded: Rig
@@ -199,5 +207,5 @@ class _Frame:
 
 
 def _name_of(files: Mapping[str, Sequence[Path]], alpha: str, one: Mapping[str, Path]) -> str:
-    """The name of a frame among several: that of alpha's file."""
+    """Name of a frame among several: alpha's file without suffix; empty for a single frame."""
     return one[alpha].stem if len(files[alpha]) > 1 else ""

@@ -1,4 +1,4 @@
-"""`pat batch`: many frames of an array's images in, a fused image of each out."""
+"""`pat batch`: fuses many frames of an array, each to one image."""
 
 from __future__ import annotations
 
@@ -47,7 +47,13 @@ class FuseBatch(Fusing):
     """What to do if a frame cannot be fused (a corrupt image, a full disk): stop, or report it and go on."""
 
     def run(self) -> None:
-        """Fuse the frames with the rig that is given or found; exit with status 1 if some fail."""
+        """Fuse the frames with the given rig or one found from the images; exits with status 1 if some fail.
+
+        Raises:
+            UsageError: for invalid options.
+            ValueError: for images or a rig that cannot be used.
+            SystemExit: with status 1, if frames failed.
+        """
         for option, count in {"--workers": self.workers, "--threads": self.threads}.items():
             if count is not None and count < 1:
                 raise UsageError(option, "1 or more", count)
@@ -77,7 +83,7 @@ class FuseBatch(Fusing):
         write_listed(path, text)
 
     def judged_rig(self, recordings: Recordings) -> Recordings:
-        """The recordings with the rig as their first frame healed it."""
+        """Return the recordings with the rig as corrected by their first frame."""
         from ...fusion.views import ViewFiles
 
         views = ViewFiles(recordings.rig, recordings.first, alpha=recordings.alpha)
@@ -114,10 +120,10 @@ class FuseBatch(Fusing):
             sys.exit(1)
 
     def kind_of_job(self) -> dict[str, Any]:
-        """The entries of the job that depend on the command."""
+        """Return the entries of the job that depend on the command."""
         quiet = self.luminance in ("alpha", "recorded")
         return {"settings": self.fuse_settings(noise_by_default=quiet)}
 
     def video_rate(self, recordings: Recordings) -> float | None:
-        """Frames a second of the video that is written; None for none."""
+        """Return the frame rate of the video to write; None for no video."""
         return None

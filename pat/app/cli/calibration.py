@@ -1,4 +1,4 @@
-"""`pat calibrate` and `pat board`: photographs of a board in, a rig out."""
+"""`pat calibrate` and `pat board`: a rig from photographs of a board."""
 
 from __future__ import annotations
 
@@ -56,7 +56,11 @@ class Calibrate:
     """While images are taken: a page (.watch.html) with what was detected and which view would help most."""
 
     def run(self) -> None:
-        """Detect, calibrate and write. Raises ValueError without a board."""
+        """Detect the board, calibrate, and write the rig.
+
+        Raises:
+            ValueError: without a board, for invalid options, and for images that cannot be used.
+        """
         from calib.boards.run import calibrate_photos
 
         if not self.board:
@@ -85,7 +89,7 @@ class Calibrate:
 
         if self.deviation and self.start is None:
             raise ValueError("--deviation needs --start: give the rig whose positions it is about")
-        return StartDeviations.of(options.numbers_by_name(self.deviation, "--deviation"))
+        return StartDeviations.from_numbers(options.numbers_by_name(self.deviation, "--deviation"))
 
     def _watch(self, patterns: dict[str, str]) -> None:
         from calib.boards.run import watch
@@ -117,7 +121,11 @@ class PrintBoard:
     """Sheet to centre the board on; without it the page is as large as the board with its margin."""
 
     def run(self) -> None:
-        """Write the board, and say what to print it on. Raises ValueError for what is no board or paper."""
+        """Write the board, and say what to print it on.
+
+        Raises:
+            ValueError: for a text that is no board, and a sheet that it does not fit on.
+        """
         from calib.boards.target import page_note, parse_board, write_board
 
         say(f"written: {write_board(self.board, options.writable(self.out), paper=self.paper)}")

@@ -1,4 +1,4 @@
-"""`pat demo` and `pat warm-up`: what ships with the package, fused."""
+"""`pat demo` and `pat warm-up`: fusion of what ships with the package."""
 
 from __future__ import annotations
 
@@ -26,7 +26,11 @@ class Demo:
     weights: Weights = "mono-colour"
 
     def run(self) -> None:
-        """Fuse both arrays, and write and print what each method scores."""
+        """Fuse both arrays; write and print the score of each method.
+
+        Raises:
+            FileExistsError: for files in the way that no run wrote.
+        """
         from arraygeom.runtime.together import refuse_others, write_listed, write_together
 
         from ...fusion.fuse import FuseSettings
@@ -76,11 +80,12 @@ class Demo:
 
 
 CORNER = (190, 300)
-"""Row and column of the window of the photograph that the figure shows enlarged."""
+"""Row and column of the photograph's window that the figure enlarges."""
 
 
 def table_of(columns: dict[str, dict[str, str]]) -> str:
-    """PSNR in dB and SSIM by recording and method, in columns; a dash where a method has no use."""
+    """Format PSNR (dB) and SSIM by recording (columns) and method (lines); a dash where a method does not
+    apply."""
     methods = list(next(iter(columns.values())))
     wide = max(map(len, methods)) + 2
     lines = [" " * wide + "".join(f"{name:>18s}" for name in columns)]
@@ -95,7 +100,7 @@ class WarmUp:
     """Compile the kernels `pat fuse` uses, once for this machine, so that no later command waits for it."""
 
     def run(self) -> None:
-        """Compile the kernels by fusing the sample array once: with noise, and as two betas with lenses."""
+        """Compile the kernels by fusing the sample array once, with noise, and as two betas with lenses."""
         import torch
 
         from arraygeom import Distortion

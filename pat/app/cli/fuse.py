@@ -1,4 +1,4 @@
-"""`pat fuse`: one frame of an array's images in, one image out."""
+"""`pat fuse`: fuses one frame of an array to one image."""
 
 from __future__ import annotations
 
@@ -65,7 +65,12 @@ class Fuse(Around, Fusing):
     """Where the frame is fused: auto takes CUDA where there is such a GPU."""
 
     def run(self) -> None:
-        """Fuse the frame, with the rig that is given or one that is found."""
+        """Fuse the frame, with the given rig or one found from the images.
+
+        Raises:
+            UsageError: for invalid options.
+            ValueError: for images or a rig that cannot be used.
+        """
         extras = self._extras = {*self.extras.split(",")}
         if unknown := extras - {*EXTRAS}:
             raise UsageError("--extras", f"some of {', '.join(EXTRAS)}", min(unknown))
@@ -75,11 +80,15 @@ class Fuse(Around, Fusing):
             self._fuse(frame)
 
     def known_files(self) -> list[Path]:
-        """The file of --around."""
+        """Return the file of --around, if given."""
         return [] if self.around is None else [KnownFile.parse(self.around).path]
 
     def frames(self, files: Files) -> Files:
-        """The same. Raises UsageError for several frames."""
+        """Check that there is one image of each camera, and return the files.
+
+        Raises:
+            UsageError: for several frames.
+        """
         if several := [name for name, paths in files.items() if len(paths) > 1]:
             count = len(files[several[0]])
             raise UsageError(
@@ -127,7 +136,7 @@ class Fuse(Around, Fusing):
 
     @property
     def tiles(self) -> Path:
-        """The folder of finished tiles, while not all are there."""
+        """Folder of finished tiles, until all are done."""
         from arraygeom.runtime.together import LISTS
 
         return self.out / LISTS / "tiles"
@@ -135,7 +144,7 @@ class Fuse(Around, Fusing):
     def _fused(
         self, rig: Rig, images: Mapping[str, Tensor], frame: Recordings
     ) -> tuple[Frame, Literal["depth", "distance"]]:
-        """The fused frame, and what its depth is along. Tiles that an earlier command made are taken."""
+        """Fused frame, and what its depth is measured along. Tiles of an earlier command are reused."""
         from ...fusion.inputs import measured_along
         from ...fusion.views import Views
 
@@ -156,7 +165,7 @@ class Fuse(Around, Fusing):
         return fused, along
 
     def _options_of_saving(self, frame: Frame, fused: Rig, recorded: Recordings) -> dict[str, Any]:
-        """Options of `save_frame`; notes what some files will hold."""
+        """Options of `save_frame`; notes the content of some files."""
         from ...fusion.results import band_names, describe_bands, view_of
 
         alpha, points = recorded.alpha, "points" in self._extras
@@ -175,7 +184,7 @@ class Fuse(Around, Fusing):
         }
 
     def _facts(self, rig: Rig, adopted: tuple[str, ...], seconds: float) -> Facts:
-        """What the page says."""
+        """Notes, warnings and figures of the page."""
         from arraygeom.runtime.text import length_unit
 
         from ...support.memory import peak_memory
@@ -188,7 +197,7 @@ class Fuse(Around, Fusing):
     def _page(
         self, frame: Frame, rig: Rig, images: Mapping[str, Tensor], alpha: str, facts: Facts, gain: float
     ) -> str:
-        """The page index.html, with the classical baseline if it is asked for."""
+        """HTML of index.html, with the classical baseline if requested."""
         from ..report import report_page
 
         if "classical" in self._extras:
@@ -196,7 +205,8 @@ class Fuse(Around, Fusing):
         return report_page(frame, images, rig, alpha, facts)
 
     def _classical(self, rig: Rig, images: Mapping[str, Tensor], alpha: str, gain: float) -> Tensor | None:
-        """The classical baseline, bright as the fused image; None, and a line, if cameras do not allow it."""
+        """Classical baseline, as bright as the fused image; None, and a message, if the cameras do not allow
+        it."""
         from ...fusion.classical import classical_view
         from ...media.colour import exposed
         from ..report import LONGEST
@@ -210,7 +220,7 @@ class Fuse(Around, Fusing):
             return None
 
     def _exposed(self, frame: Frame, found: ImageArray | None) -> tuple[Frame, float]:
-        """The frame as bright as is asked for, and how many times as much light that is."""
+        """Frame with the requested brightness, and the factor of light."""
         from ...media.colour import exposed, exposure_gain
         from ...networks.weights import load_weights
 
@@ -231,7 +241,19 @@ def fuse_with_progress(
     device: str = "cpu",
     **further: Any,
 ) -> Frame:
-    """`fuse` with weights by name, the plan and a bar on the terminal. The frame is on the CPU."""
+    """Fuse with weights by name, showing the plan and a bar on the terminal.
+
+    Args:
+        weights: name or file.
+        device: "cpu", "cuda" or "auto".
+        further: further arguments of `fuse`.
+
+    Returns:
+        The frame, on the CPU.
+
+    Raises:
+        ValueError: as `fuse`, and for a GPU that is not available.
+    """
     from ...networks.weights import load_weights
     from ..front import fuse
 
@@ -246,7 +268,7 @@ def fuse_with_progress(
 
 
 def _numbered(tiles: Iterable[Tile], count: int) -> Iterator[Tile]:
-    """The tiles, each said as it begins where there are several."""
+    """Tiles, each logged when it begins if there are several."""
     for i, tile in enumerate(tiles, 1):
         if count > 1:
             LOG.info("tile %d of %d", i, count)

@@ -1,4 +1,4 @@
-"""Options that `pat fuse`, `pat batch` and `pat sequence` share, and an array's images with their rig."""
+"""Options shared by `pat fuse`, `pat batch` and `pat sequence`, and an array's images with their rig."""
 
 from __future__ import annotations
 
@@ -29,8 +29,15 @@ Files = dict[str, list[Path]]
 
 
 class Recordings(NamedTuple):
-    """An array's files by camera, in the order of frames; its rig as they were recorded, and alpha. Where the
-    rig was found from the first images: what was found, and frames a second of videos."""
+    """Images of an array with their rig.
+
+    Attributes:
+        rig: rig of the recorded files.
+        files: files by camera, in the order of frames.
+        alpha: camera whose view is fused.
+        found: array found from the first images; None for a given rig.
+        rates: frames for each second of videos, by camera.
+    """
 
     rig: Rig
     files: Files
@@ -40,7 +47,7 @@ class Recordings(NamedTuple):
 
     @property
     def first(self) -> dict[str, Path]:
-        """The first file of each camera."""
+        """First file of each camera."""
         return {name: paths[0] for name, paths in self.files.items()}
 
 
@@ -63,11 +70,15 @@ class Fusing(Known):
 
     @property
     def kind(self) -> Literal["png", "tif", "exr"]:
-        """The format without bits."""
+        """Format without bits."""
         return self.format[:3]  # type: ignore[return-value]
 
     def fuse_settings(self, **further: Any) -> FuseSettings:
-        """How frames are fused. Raises ValueError for options that are none."""
+        """Make the settings of fusion from the options.
+
+        Raises:
+            ValueError: for invalid options.
+        """
         return self.settings(
             field=options.field_named(self.field),
             align=self.correct,
@@ -77,18 +88,26 @@ class Fusing(Known):
         )
 
     def frames(self, files: Files) -> Files:
-        """The files of the frames that are fused. Raises ValueError for others."""
+        """Select and order the files of the frames to fuse.
+
+        Raises:
+            ValueError: for files that cannot be matched to frames.
+        """
         from ...fusion.frame_matching import matched_frames
 
         return matched_frames(files)
 
     def timed(self, rig: Rig) -> Rig:
-        """The rig with what the command line says of its clocks."""
+        """Return the rig with the command line's clocks; here unchanged."""
         return rig
 
     def named(self, command: str) -> tuple[tuple[str, ...], bool]:
-        """The images NAME=FILE of a rig's cameras, and whether there is a rig. Raises as `named_images`, and
-        ImportError for a format that cannot be written."""
+        """Return the images NAME=FILE of a rig's cameras, and True if there is a rig.
+
+        Raises:
+            ValueError: as `named_images`, and for a format whose extra is not installed.
+            FileNotFoundError: for files that do not exist.
+        """
         if self.kind == "exr":
             from ...media.images import exr_writer
 
@@ -97,9 +116,15 @@ class Fusing(Known):
 
     @contextmanager
     def recordings(self, image: Sequence[str], *, with_rig: bool) -> Iterator[Recordings]:
-        """The images (of `named`) with the rig that is given, or with one that is found; weights are chosen.
+        """Context manager that yields the images (of `named`) with the given rig or one found; it also
+        chooses weights.
 
-        Raises ValueError for options that do not go together, before images are read.
+        Yields:
+            The recordings; frames of videos exist within the block only.
+
+        Raises:
+            ValueError: for options that contradict each other, before images are read, and images that cannot
+                be used.
         """
         self.fuse_settings()
         if with_rig:
@@ -109,7 +134,7 @@ class Fusing(Known):
             yield self._without_rig(Path(folder))
 
     def _with_rig(self, image: Sequence[str]) -> Recordings:
-        """The images of the rig that is given."""
+        """Images of the given rig."""
         if self.focal:
             raise UsageError("--focal", "no rig, which states focal lengths: leave it out")
         rig = self.timed(options.load_rig_or_say_no_image(self.given[0], self.depth))
@@ -119,7 +144,7 @@ class Fusing(Known):
         return Recordings(rig, files, alpha)
 
     def _without_rig(self, folder: Path) -> Recordings:
-        """The images with the rig that is found from the first ones; frames of videos go to a folder."""
+        """Images with the rig found from the first ones; frames of videos go to a folder."""
         from ...support.locks import folder_lock
         from ..batch import find_images
         from ..from_images import camera_names, frames_of_videos
@@ -151,15 +176,19 @@ class Fusing(Known):
         return Recordings(array.recorded, {n: files[n] for n in array.rig.names}, array.alpha, array, rates)
 
     def known_files(self) -> list[Path]:
-        """Further files that are given."""
+        """Return further files that the options name."""
         return []
 
     def refuse_videos(self, videos: Sequence[Path]) -> None:
-        """Raise UsageError for videos, but in a sequence."""
+        """Refuse videos; overridden for sequences.
+
+        Raises:
+            UsageError: always.
+        """
         raise UsageError(f"{videos[0]}", "images; `pat sequence` takes videos")
 
     def _checked(self, files: Files) -> Files:
-        """The files of the frames. Raises ValueError for files where results would go."""
+        """Files of the frames. Raises ValueError for files where results would go."""
         from ...fusion.results import check_no_result
         from ...media.images import has_many_bits
 
@@ -172,8 +201,8 @@ class Fusing(Known):
         return files
 
     def _choose_weights(self, rig: Rig, alpha: str, files: Mapping[str, Path]) -> None:
-        """The weights for any bands, unless asked otherwise, where no beta is meant to be in colour and they
-        do not have three bands in all."""
+        """Choose weights for any bands, unless requested otherwise, if no beta is meant to be in colour and
+        they do not have three bands in all."""
         from ...fusion.views import ViewFiles
         from ...networks.weights import weights_for
 
@@ -187,7 +216,8 @@ class Fusing(Known):
             say(f"weights: {self.weights} (--weights NAME takes others)")
 
     def healed(self, views: ViewFiles) -> Rig:
-        """The rig of views, or the one that these healed, which is written beside the results."""
+        """Return the rig of the views, or the one corrected by their images, which is written beside the
+        results."""
         from arraygeom.io.native import write
         from arraygeom.runtime.together import write_listed
 
@@ -206,15 +236,25 @@ class Fusing(Known):
 
 
 def with_sensor(rig: Rig, name: str, **changes: float) -> Rig:
-    """The rig with some entries of a camera's sensor changed."""
+    """Return the rig with some entries of a camera's sensor changed."""
     return rig.with_camera(name, rig[name].replace(sensor=replace(rig[name].sensor, **changes)))
 
 
 def named_images(paths: Sequence[Path], image: Sequence[str], command: str) -> tuple[tuple[str, ...], bool]:
-    """The images NAME=FILE of a rig's cameras, and whether the first argument is a rig. Imports no torch.
+    """Split a command's arguments into a rig and its images. Imports no torch.
 
-    Images that follow a rig are of the cameras that their names say. Raises ValueError for arguments that do
-    not go together, FileNotFoundError for files that do not exist.
+    Images that follow a rig belong to the cameras that their names say.
+
+    Args:
+        paths: positional arguments.
+        image: values of --image.
+
+    Returns:
+        Images NAME=FILE, and True if the first argument is a rig; empty without a rig.
+
+    Raises:
+        ValueError: for arguments that contradict each other.
+        FileNotFoundError: for files that do not exist.
     """
     if paths and (image or is_rig_file(paths[0])):
         named = (*image, *(f"{path.stem}={path}" for path in paths[1:]))
@@ -241,8 +281,15 @@ def named_images(paths: Sequence[Path], image: Sequence[str], command: str) -> t
 def files_by_camera(
     rig: Rig, alpha: str | None, paths: Sequence[Path], image: Sequence[str]
 ) -> tuple[str, dict[str, list[Path]]]:
-    """Alpha's name, and the image files of each camera of a rig. Raises ValueError without alpha, for names
-    that the rig lacks, and for one image given twice."""
+    """Find the image files of each camera of a rig.
+
+    Returns:
+        Alpha's name, and files by camera.
+
+    Raises:
+        ValueError: without alpha, for names that the rig lacks, and one image given twice.
+        FileNotFoundError: if a camera has no image.
+    """
     from ..batch import find_images
 
     if alpha is None:
@@ -256,7 +303,11 @@ def files_by_camera(
 
 
 def refuse_same(files: Mapping[str, Sequence[Path]]) -> None:
-    """Raise ValueError if the first files of two cameras hold the same."""
+    """Check that the first files of no two cameras are identical.
+
+    Raises:
+        ValueError: if they are.
+    """
     for (a, (first, *_)), (b, (second, *_)) in combinations(files.items(), 2):
         if first.is_file() and second.is_file() and filecmp.cmp(first, second, shallow=False):
             raise ValueError(
@@ -265,6 +316,7 @@ def refuse_same(files: Mapping[str, Sequence[Path]]) -> None:
 
 
 def is_rig_file(path: Path) -> bool:
-    """Whether a file is meant as a rig: neither folder nor pattern, nor named as images and videos are."""
+    """Return True for a path meant as a rig: neither folder nor pattern, nor named like an image
+    or a video."""
     suffixes = IMAGE_SUFFIXES | VIDEO_SUFFIXES
     return not (any(c in path.name for c in "*?[") or path.suffix.lower() in suffixes or path.is_dir())

@@ -1,4 +1,4 @@
-"""The options that `pat fuse`, `pat batch`, `pat sequence` and `pat align` share."""
+"""Options shared by `pat fuse`, `pat batch`, `pat sequence` and `pat align`."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ MatchesFile = Annotated[Path | None, Option("FILE", MATCHES_HELP)]
 
 NOISE = "NAME=ELECTRONS[,READ]|estimate|none"
 OUT_OF_RANGE = 0.9
-"""Share of a depth map outside the rig's depth range from which its unit must be wrong."""
+"""Share of a depth map outside the rig's depth range above which its unit must be wrong."""
 OFF_LINES = 5.0
-"""Pixels between matched points and the rig's lines in the median from which one of them must be wrong."""
+"""Median distance in pixels of matched points from the rig's lines above which one of them must be wrong."""
 
 
 @dataclass
@@ -60,11 +60,19 @@ class Known:
 
     @property
     def correct(self) -> bool:
-        """Whether the rig is corrected where it does not fit."""
+        """True if the rig is corrected where it does not fit."""
         return self.misfit != "warn"
 
     def settings(self, *, noise_by_default: bool = False, **further: Any) -> FuseSettings:
-        """How frames are fused. Raises ValueError for options that are none."""
+        """Make the settings of fusion from the options.
+
+        Args:
+            noise_by_default: True to look for noise without --noise.
+            further: further entries of the settings.
+
+        Raises:
+            ValueError: for invalid options.
+        """
         from ...fusion.fuse import FuseSettings
 
         return FuseSettings(
@@ -77,7 +85,12 @@ class Known:
 
     @contextmanager
     def judged(self) -> Iterator[None]:
-        """A block of work within --max-memory; exit status 3 if the rig does not fit the images."""
+        """Context manager for work within --max-memory; exits with status 3 if the rig does not fit the
+        images.
+
+        Raises:
+            SystemExit: with status 3, if it does not fit.
+        """
         from ...fusion.checks import LowConfidenceWarning, confidence_checked
         from ...support.memory import limited
 
@@ -100,7 +113,14 @@ class Known:
         weights: str | None = None,
         focal: Mapping[str, float] = {},
     ) -> ImageArray:
-        """The array that each camera's first image says, whose levels are then taken."""
+        """Find the array from each camera's first image, and use its levels.
+
+        Returns:
+            The array.
+
+        Raises:
+            ValueError: for images that cannot be used.
+        """
         from ..from_images import array_from_images
 
         first = {name: paths[0] for name, paths in files.items()}
@@ -113,13 +133,19 @@ class Known:
         return array
 
     def note(self, line: str) -> None:
-        """Say a line, and keep it for the page."""
+        """Print a line on standard error, and keep it for the page."""
         say(line)
         self._notes.append(line)
 
 
 class KnownFile(NamedTuple):
-    """What `--around FILE[,scale=METRES][,tolerance=SHARE]` says."""
+    """Parsed value of `--around FILE[,scale=METRES][,tolerance=SHARE]`.
+
+    Attributes:
+        path: depth map or matched points.
+        scale: metres for each unit of the file; None for its default.
+        tolerance: relative error of the depth map; 0 = exact.
+    """
 
     path: Path
     scale: float | None = None
@@ -127,7 +153,11 @@ class KnownFile(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> KnownFile:
-        """The parts of the option's text. Raises UsageError for others."""
+        """Parse the option's text.
+
+        Raises:
+            UsageError: for other text.
+        """
         path, *parts = text.split(",")
         numbers = options.numbers_by_name(parts, "--around")
         if unknown := numbers.keys() - {"scale", "tolerance"}:
@@ -136,13 +166,13 @@ class KnownFile(NamedTuple):
 
     @property
     def is_depth(self) -> bool:
-        """Whether it is a depth map; else matched points."""
+        """True for a depth map, False for matched points."""
         return self.path.suffix.lower() in IMAGE_SUFFIXES | {".pfm"}
 
 
 @dataclass
 class Around:
-    """An option for what is known of one frame."""
+    """Option for known depth or matches of one frame."""
 
     around: Annotated[str | None, Option("FILE")] = None
     """Search around what is known: a depth map of alpha's pixels (PFM, TIFF, 16-bit PNG), or matched points
@@ -153,9 +183,10 @@ class Around:
     def with_known(
         self, rig: Rig, alpha: str, files: Mapping[str, str | Path], field: ReceptiveField | None
     ) -> tuple[Rig, ReceptiveField | Mapping[str, ReceptiveField | None] | None]:
-        """The rig, and the field around what is known, by beta; `field` if nothing is.
+        """Return the rig, and the field around the known depth or matches, by beta; `field` without --around.
 
-        Raises ValueError for options that do not go together, and for what is not of these cameras.
+        Raises:
+            ValueError: for options that contradict each other, and files that do not suit these cameras.
         """
         from arraygeom.rig import with_pixels
 
@@ -171,7 +202,7 @@ class Around:
 
 
 def _around_depth(known: KnownFile, rig: Rig, alpha: str) -> ReceptiveField:
-    """The field around the depth map. Raises ValueError for depths outside the rig's range."""
+    """Field around the depth map. Raises ValueError for depths outside the rig's range."""
     import torch
 
     from arraygeom import Camera
@@ -200,7 +231,7 @@ def _around_depth(known: KnownFile, rig: Rig, alpha: str) -> ReceptiveField:
 def _around_matches(
     path: Path, rig: Rig, alpha: str, files: Mapping[str, str | Path], field: ReceptiveField | None
 ) -> Mapping[str, ReceptiveField | None]:
-    """Each beta's field: around its matches with alpha, if it has some. Raises as `_check_matches`."""
+    """Field of each beta, around its matches with alpha if there are any. Raises as `_check_matches`."""
     from arraygeom import LensView
     from arraygeom.fields import AroundMatches
     from arraygeom.io.point_matches import read_matches

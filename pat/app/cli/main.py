@@ -1,4 +1,4 @@
-"""The command line: `pat COMMAND ...`."""
+"""Command line: `pat COMMAND ...`."""
 
 from __future__ import annotations
 
@@ -58,13 +58,17 @@ class Pat:
 
 
 def command_named(group: Any, name: str) -> Any:
-    """The command or group of commands of a name in a group, imported if that has only its name."""
+    """Return the command or group of that name in a group, imported if only its path is known.
+
+    Raises:
+        KeyError: for an unknown name.
+    """
     command = group.commands[name]
     return resolve_name(command) if isinstance(command, str) else command
 
 
 def command_paths(group: Any = Pat, before: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
-    """The words of every command, such as ("rig", "info")."""
+    """Yield the words of every command, such as ("rig", "info")."""
     for name in group.commands:
         command = command_named(group, name)
         inner = hasattr(command, "commands")
@@ -72,7 +76,14 @@ def command_paths(group: Any = Pat, before: tuple[str, ...] = ()) -> Iterator[tu
 
 
 def main(arguments: list[str] | None = None, *, group: Any = Pat, prog: str = "pat") -> None:
-    """Run `pat`, or another group. Errors in what was given: a line on standard error and exit status 2."""
+    """Run `pat`, or another group of commands.
+
+    Errors in the input are one line on standard error.
+
+    Raises:
+        SystemExit: with status 2 for such errors, 130 for an interrupt, 141 for a broken pipe; others by the
+            commands.
+    """
     arguments = sys.argv[1:] if arguments is None else arguments
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:  # closed: the next file that is opened would take its place
@@ -90,7 +101,7 @@ def main(arguments: list[str] | None = None, *, group: Any = Pat, prog: str = "p
 
 
 def _run(arguments: list[str], group: Any, prog: str, *, debug: bool) -> None:
-    """Run the command; whatever it raises becomes one line and an exit status."""
+    """Run the command; exceptions become one line and an exit status."""
     try:
         with warnings.catch_warnings():
             warnings.showwarning = warn
@@ -109,7 +120,7 @@ def _run(arguments: list[str], group: Any, prog: str, *, debug: bool) -> None:
     except (ValueError, FloatingPointError) as error:
         _fail(error, f"{error}", debug)
     except ImportError as error:
-        remedy = "" if "pip install" in f"{error}" else ": pip install 'arraygeom-pat[all]'"
+        remedy = "" if "pip install" in f"{error}" else ": in a checkout, pip install '.[all]'"
         _fail(error, f"{error}{remedy}", debug)
     except MemoryError as error:
         _fail(error, "out of memory: give smaller images, or --max-memory where there is one", debug)
@@ -142,7 +153,7 @@ def _fail(error: BaseException, text: str, debug: bool) -> NoReturn:
 
 
 def _command(arguments: list[str], group: Any, prog: str) -> Any:
-    """The command that arguments name, options parsed. Raises UsageError for one that does not exist."""
+    """Command that arguments name, with parsed options. Raises UsageError for an unknown one."""
     if "--version" in arguments:
         from importlib.metadata import version
 
@@ -170,7 +181,7 @@ def _command(arguments: list[str], group: Any, prog: str) -> Any:
 
 
 def _help(path: str, group: Any) -> str:
-    """The help of a group of commands: a line for each, from its docstring."""
+    """Help of a group of commands: a line for each, from its docstring."""
     commands = {name: command_named(group, name) for name in group.commands}
     lines = [f"usage: {path} COMMAND ...", "", _first_line(group), "", "commands:"]
     lines += [f"  {name:10s} {_first_line(command)}" for name, command in commands.items()]

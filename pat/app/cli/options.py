@@ -1,6 +1,6 @@
-"""Options that several commands share: their types and help, what NAME=VALUE means, and what is printed.
+"""Options shared by several commands: types and help, parsing of NAME=VALUE, and printing.
 
-Nothing here or in the modules of the commands imports torch before a command runs: `pat --help` is printed at
+Neither this module nor those of the commands import torch before a command runs: `pat --help` is printed at
 once.
 """
 
@@ -34,7 +34,7 @@ WEIGHT_NAMES = tuple(sorted(path.stem for path in SHIPPED.glob("*.safetensors"))
 
 
 FIELD_NAMES = ("epipolar", "line", "homography", "rectified", "nearest", "local", "dense", "curved")
-"""The keys of `arraygeom.fields.FIELDS`, whose import takes torch."""
+"""Keys of `arraygeom.fields.FIELDS`, whose import takes torch."""
 FIELD_HELP = (
     f"Receptive field in the other cameras: {', '.join(FIELD_NAMES)}, or MODULE:OBJECT for your own; "
 )
@@ -43,7 +43,14 @@ FieldName = Annotated[str, Option("NAME", FIELD_HELP)]
 
 
 def response_of(text: str) -> Any:
-    """What `--response fit`, `rec601` or `R,G,B` states. Raises ValueError for anything else."""
+    """Parse `--response fit`, `rec601` or `R,G,B`.
+
+    Returns:
+        The text, or the three weights.
+
+    Raises:
+        ValueError: for other text, and weights that do not sum to about 1.
+    """
     if text in ("fit", "rec601"):
         return text
     try:
@@ -60,9 +67,16 @@ def response_of(text: str) -> Any:
 
 
 def noise_of(texts: Iterable[str], *, by_default: bool = False) -> Any:
-    """The noise of `--noise estimate` or `--noise NAME=ELECTRONS[,READ]`; none: None. Raises ValueError.
+    """Parse `--noise estimate`, `none` or `NAME=ELECTRONS[,READ]`.
 
-    Without, None or, `by_default`, "auto": estimated where it shows plainly.
+    Args:
+        by_default: True to return "auto" (estimate where noise shows plainly) without --noise.
+
+    Returns:
+        "estimate", "auto", noise levels by camera, or None for no denoising.
+
+    Raises:
+        ValueError: for other text.
     """
     from ...sensors import NoiseLevel
 
@@ -104,7 +118,14 @@ Address = Annotated[str | None, Option("ADDRESS")]
 
 
 def rig_first(arguments: Sequence[str], command: Any) -> list[str]:
-    """The arguments with the rig of `--rig RIG` in front, where it stands without the option."""
+    """Move the rig of `--rig RIG` to the front of the arguments, for commands with a positional rig.
+
+    Returns:
+        The arguments.
+
+    Raises:
+        UsageError: for --rig without a value.
+    """
     words = list(arguments)
     if not {"rig", "given", "source"} & {*getattr(command, "__dataclass_fields__", {})}:
         return words
@@ -119,9 +140,17 @@ def rig_first(arguments: Sequence[str], command: Any) -> list[str]:
 
 
 def writable(out: Path, *, folder: bool = False, option: str = "--out") -> Path:
-    """The path of an option, before the work whose result is to be written there.
+    """Check that a path can be written, before the work whose result goes there.
 
-    Raises ValueError if it cannot be: a folder where a file is wanted, a file in its way, no permission.
+    Args:
+        folder: True if a folder is wanted.
+        option: name in messages.
+
+    Returns:
+        The path.
+
+    Raises:
+        ValueError: for a folder where a file is wanted, a file in the way, or no permission.
     """
     if out.exists() and out.is_dir() != folder:
         raise ValueError(
@@ -143,7 +172,14 @@ def writable(out: Path, *, folder: bool = False, option: str = "--out") -> Path:
 
 
 def device_of(name: str) -> str:
-    """ "cpu" or "cuda". Raises ValueError for a GPU that is not there."""
+    """Resolve a device's name.
+
+    Returns:
+        "cpu" or "cuda".
+
+    Raises:
+        ValueError: for "cuda" without a GPU.
+    """
     if name == "cpu":
         return name
     import torch
@@ -156,7 +192,14 @@ def device_of(name: str) -> str:
 
 
 def field_named(name: str) -> ReceptiveField | None:
-    """The receptive field of that name; None for "auto". Raises ValueError for a name that is none."""
+    """Make the receptive field of that name.
+
+    Returns:
+        The field; None for "auto".
+
+    Raises:
+        ValueError: for an unknown name.
+    """
     from arraygeom.fields import named_field
 
     try:
@@ -166,7 +209,15 @@ def field_named(name: str) -> ReceptiveField | None:
 
 
 def load_rig(path: Path, depth: tuple[float, float] | None = None) -> Rig:
-    """The rig of a file, with other depth bounds if given."""
+    """Load the rig of a file, with other depth bounds if given.
+
+    Returns:
+        The rig.
+
+    Raises:
+        FileNotFoundError: for a missing file.
+        ValueError: for a file that is no rig, and invalid bounds.
+    """
     refuse_missing(path, rig=True)
     from arraygeom import Rig
 
@@ -178,7 +229,15 @@ NO_IMAGE = "is no image: images end in .png, .tif, .jpg and the like"
 
 
 def load_rig_or_say_no_image(path: Path, depth: tuple[float, float] | None) -> Rig:
-    """The rig of the first argument, perhaps meant as an image; with other depth bounds if given."""
+    """Load the rig of the first argument as `load_rig`, with a message for a file meant as an image.
+
+    Returns:
+        The rig.
+
+    Raises:
+        FileNotFoundError: for a missing file.
+        ValueError: for a file that is no rig, and invalid bounds.
+    """
     from arraygeom.io.source import UnknownRigFormat
 
     try:
@@ -190,8 +249,11 @@ def load_rig_or_say_no_image(path: Path, depth: tuple[float, float] | None) -> R
 
 
 def refuse_missing(path: Path, *, rig: bool) -> None:
-    """Raise FileNotFoundError for a rig file, or an image, folder or video, that does not exist, before torch
-    is imported to read it."""
+    """Check that a rig file, or an image, folder or video, exists, before torch is imported to read it.
+
+    Raises:
+        FileNotFoundError: if it does not.
+    """
     if path.exists() or (not rig and any(c in path.name for c in "*?[")):
         return
     _, _, file = str(path).partition("=")
@@ -203,20 +265,42 @@ def refuse_missing(path: Path, *, rig: bool) -> None:
 
 
 def files_by_name(texts: Iterable[str], option: str = "--image") -> dict[str, Path]:
-    """Values of a NAME=FILE option. Raises ValueError for other text, and for a name given twice."""
+    """Parse values of a NAME=FILE option.
+
+    Returns:
+        Files by name.
+
+    Raises:
+        ValueError: for other text, and a name given twice.
+    """
     return dict(_once(option, (_named_file(option, text) for text in texts)))
 
 
 def numbers_by_name(texts: Iterable[str], option: str) -> dict[str, float]:
-    """Values of a NAME=NUMBER option. Raises ValueError for other text, and for a name given twice."""
+    """Parse values of a NAME=NUMBER option.
+
+    Returns:
+        Numbers by name.
+
+    Raises:
+        ValueError: for other text, and a name given twice.
+    """
     return dict(_once(option, (_named_number(option, text) for text in texts)))
 
 
 def read_images(rig: Rig, texts: Iterable[str], *, sized: bool = True) -> dict[str, Tensor]:
-    """The images of `--image NAME=FILE` by camera, developed as the rig describes them.
+    """Read the images of `--image NAME=FILE`, developed as the rig describes them.
 
-    Raises ValueError for a camera given twice, or not of the rig, and, if `sized`, for an image of another
-    size.
+    Args:
+        sized: False accepts images of another size than the rig's.
+
+    Returns:
+        Images (c, h, w) by camera.
+
+    Raises:
+        ValueError: for a camera given twice or not of the rig, images that cannot be read or have another
+            size.
+        FileNotFoundError: for a missing file.
     """
     from ...fusion.views import read_view
 
@@ -225,9 +309,14 @@ def read_images(rig: Rig, texts: Iterable[str], *, sized: bool = True) -> dict[s
 
 
 def read_frames(rig: Rig, texts: Iterable[str]) -> list[dict[str, Tensor]]:
-    """Images of `--image NAME=FILE`: the first of every camera make a frame, the second ones the next.
+    """Read images of `--image NAME=FILE` as frames: the first of every camera, then the second ones.
 
-    Raises ValueError for no images, and for cameras with unequal numbers of them.
+    Returns:
+        Images by camera, for each frame.
+
+    Raises:
+        ValueError: for no images, and cameras with unequal numbers of them.
+        FileNotFoundError: for a missing file.
     """
     from ...fusion.views import read_view
 
@@ -244,7 +333,14 @@ def read_frames(rig: Rig, texts: Iterable[str]) -> list[dict[str, Tensor]]:
 
 
 def by_frame(files: Mapping[str, Sequence[Path]]) -> list[dict[str, Path]]:
-    """The first file of each camera, the second of each, and so on. Raises ValueError for unequal numbers."""
+    """Group files by frame: the first file of each camera, then the second ones.
+
+    Returns:
+        Files by camera, for each frame.
+
+    Raises:
+        ValueError: for unequal numbers.
+    """
     counts = {name: len(paths) for name, paths in files.items()}
     if len(set(counts.values())) > 1:
         listed = ", ".join(f"'{name}' {count}" for name, count in counts.items())
@@ -285,18 +381,18 @@ def _once(option: str, pairs: Iterable[tuple[str, T]]) -> Iterator[tuple[str, T]
 
 @cache
 def console() -> Console:
-    """The terminal, for what is not the result: standard error."""
+    """Return the terminal on standard error, for everything but results."""
     from rich.console import Console
 
     return Console(stderr=True, highlight=False)
 
 
 WARNED: list[Warning | str] = []
-"""What a command has warned of, once each."""
+"""Warnings of the command, once each."""
 
 
 def warn(message: Warning | str, *_: Any, **__: Any) -> None:
-    """A warning as one line, without its position in the code; not again if it was said before."""
+    """Print a warning as one line, without its position in the code; not again if it was printed before."""
     if str(message) not in map(str, WARNED):
         WARNED.append(message)
         say(f"pat: warning: {message}", style="yellow")
@@ -309,22 +405,24 @@ def say(text: object, style: str | None = None) -> None:
 
 
 def progress(title: str) -> Callable[[Iterable[T], int], Iterable[T]]:
-    """Wraps items and their number in a bar on the terminal."""
+    """Make a function that shows items and their number as a bar on the terminal."""
     from rich.progress import track
 
     return lambda items, total: track(items, title, total=total, console=console())
 
 
 LINE_EVERY = 10.0
-"""Least seconds between lines of progress where there is no terminal."""
+"""Least seconds between lines of progress without a terminal."""
 
 
 @contextmanager
 def working(title: str) -> Iterator[Callable[[str], None]]:
-    """A block while the terminal shows a title, the present step, and the seconds that have passed.
+    """Context manager during which the terminal shows a title, the current step, and elapsed seconds.
 
-    Gives a function that changes the title. Where there is no terminal, steps are lines, `LINE_EVERY` seconds
-    apart.
+    Without a terminal, steps are lines, `LINE_EVERY` seconds apart.
+
+    Yields:
+        A function that changes the title.
     """
     import time
 
@@ -354,7 +452,11 @@ def working(title: str) -> Iterator[Callable[[str], None]]:
 
 @contextmanager
 def working_by_plan(title: str) -> Iterator[Callable[[Plan], None]]:
-    """A block as of `working`; gives a function that says the plan, and adds its time to the title."""
+    """Context manager as `working`, for work with a plan.
+
+    Yields:
+        A function that prints the plan and adds its duration to the title.
+    """
     with working(title) as retitle:
 
         def announce(plan: Plan) -> None:
@@ -366,7 +468,7 @@ def working_by_plan(title: str) -> Iterator[Callable[[Plan], None]]:
 
 @cache
 def say_when_compiling() -> None:
-    """Say once, in one line, that kernels are compiled, before they are: that takes some seconds."""
+    """Print a line, once, when kernels are about to be compiled, which takes some seconds."""
     from numba.core import event
 
     first = Lock()
@@ -383,7 +485,7 @@ def say_when_compiling() -> None:
 
 
 def print_json(document: Any) -> None:
-    """Print a document as JSON; what is not finite is null."""
+    """Print a document as JSON; numbers that are not finite become null."""
     import json
 
     print(json.dumps(_finite(document), indent=2))

@@ -1,7 +1,7 @@
 """Command lines from dataclasses and functions: an option for each field, of its type, with its docstring.
 
-A field's `Annotated` type may hold an `Option`; a class's `headings` say which fields stand under which
-heading of its help, the others coming first. Imports nothing that takes long.
+A field's `Annotated` type may hold an `Option`; a class's `headings` assign fields to headings of its help,
+the others coming first. Imports nothing that takes long.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ MISSING = dataclasses.MISSING
 
 
 class UsageError(ValueError):
-    """A command line that cannot be run: the option, what it expects, and what came instead, if anything."""
+    """Error for a command line that cannot be run: the option, what it expects, and what it got,
+    if anything."""
 
     def __init__(self, option: str, expected: str, got: object = None) -> None:
         self.option, self.expected, self.got = option, expected, got
@@ -38,8 +39,15 @@ class UsageError(ValueError):
 
 @dataclass(frozen=True)
 class Option:
-    """What the type of a field does not say: the name of its value, help instead of the docstring's, a short
-    name; whether it is an argument without a name, and whether the option is given once for each value."""
+    """Properties of an option that a field's type does not state.
+
+    Attributes:
+        metavar: name of its value in the help.
+        help: help text; None for the field's docstring.
+        short: short name, such as "-o".
+        positional: True for an argument without a name.
+        repeat: True if the option is given once for each value.
+    """
 
     metavar: str | None = None
     help: str | None = None
@@ -64,9 +72,20 @@ def parse(
     base: Any = None,
     description: str = "",
 ) -> T:
-    """What a class or function makes of a command line; `base`, of that class, holds the defaults.
+    """Parse a command line for a class or a function.
 
-    Raises UsageError for what does not fit; `--help` prints and exits.
+    Args:
+        kind: dataclass or function whose fields or parameters are the options; its docstring is the help.
+        arguments: words; None for those of this process.
+        base: instance that holds the defaults, and is copied with changes.
+        description: help text; empty for the docstring.
+
+    Returns:
+        The instance, or the function's result.
+
+    Raises:
+        UsageError: for unknown options and invalid values.
+        SystemExit: after `--help`, which prints.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     parser = _Parser(
@@ -94,7 +113,14 @@ def parse(
 
 
 def script(kind: Callable[..., T], arguments: Sequence[str] | None = None, *, prog: str = "") -> T:
-    """`parse` for a script of its own: what does not fit ends it in one line."""
+    """Parse as `parse`, for a stand-alone script.
+
+    Returns:
+        The instance, or the function's result.
+
+    Raises:
+        SystemExit: with one line, for unknown options and invalid values.
+    """
     try:
         return parse(kind, arguments, prog=prog)
     except UsageError as error:
@@ -109,7 +135,7 @@ def _unknown(word: str, options: list[str]) -> UsageError:
 
 
 def _changed(base: Any, given: Mapping[str, Any]) -> Any:
-    """A dataclass with some entries changed, by their dotted names."""
+    """Copy of a dataclass with some entries changed, by their dotted names."""
     own = {name: value for name, value in given.items() if "." not in name}
     for part in {name.partition(".")[0] for name in given if "." in name}:
         inner = {n.partition(".")[2]: v for n, v in given.items() if n.startswith(f"{part}.")}
@@ -119,7 +145,7 @@ def _changed(base: Any, given: Mapping[str, Any]) -> Any:
 
 @dataclass
 class _Entry:
-    """A field or parameter as an option."""
+    """Field or parameter as an option."""
 
     name: str
     kind: Any
@@ -142,7 +168,7 @@ class _Entry:
 
     @property
     def negated(self) -> str:
-        """The option that says no, such as --no-report and --recording.no-ideal."""
+        """Negative option, such as --no-report and --recording.no-ideal."""
         before, dot, last = self.dashed.rpartition(".")
         return f"--{before}{dot}no-{last}"
 
@@ -152,7 +178,7 @@ class _Entry:
 
     @property
     def help(self) -> str:
-        """The help, with the default where that says something."""
+        """Help text, with the default where that is informative."""
         text = " ".join((self.option.help or self.doc).split())
         value = self.default
         if value not in (None, (), "", MISSING) and not isinstance(value, bool) and "default" not in text:
@@ -198,7 +224,7 @@ class _Append(argparse.Action):
 
 
 def _conversion(kind: Any) -> tuple[Callable[[str], Any], str]:
-    """How a text becomes a value of a type, and what such a value is called."""
+    """Conversion from text to a type, and the name of such a value."""
     if typing.get_origin(kind) is typing.Literal:
         choices = {str(choice): choice for choice in typing.get_args(kind)}
         return partial(_chosen, choices), f"{{{','.join(choices)}}}"
@@ -224,7 +250,7 @@ def _number(kind: Callable[[str], Any], name: str, text: str) -> Any:
 
 
 def _entries(kind: Any, base: Any, before: str = "") -> Iterator[_Entry]:
-    """The options of a class or function, those of dataclasses in it by dotted names."""
+    """Options of a class or function; those of nested dataclasses have dotted names."""
     hints = typing.get_type_hints(kind, include_extras=True)
     if not is_dataclass(kind):
         for name, parameter in inspect.signature(kind).parameters.items():
@@ -243,7 +269,7 @@ def _entries(kind: Any, base: Any, before: str = "") -> Iterator[_Entry]:
 
 
 def field_docs(kind: Any) -> dict[str, str]:
-    """The docstrings that follow a dataclass's fields, and those of the classes it is made from."""
+    """Return the docstrings that follow a dataclass's fields, parents' included, by field."""
     docs: dict[str, str] = {}
     for parent in reversed(kind.__mro__):
         if parent is object:

@@ -1,4 +1,4 @@
-"""`pat show`, `pat explore` and `pat rig ...`: rig files drawn, inspected, converted, checked and refined."""
+"""`pat show`, `pat explore` and `pat rig ...`: draw, inspect, convert, check and refine rig files."""
 
 from __future__ import annotations
 
@@ -51,7 +51,12 @@ class Show:
     lines)."""
 
     def run(self) -> None:
-        """Write the drawings, and warn of a rig that does not fit the images."""
+        """Write the drawings, and warn of a rig that does not fit the images.
+
+        Raises:
+            ValueError: for a rig or images that cannot be used.
+            FileExistsError: for files in the way that no run wrote.
+        """
         from arraygeom import Camera
         from arraygeom.runtime.together import refuse_others, write_together
         from arraygeom.viz import draw_fields, draw_matches, draw_rig
@@ -80,7 +85,7 @@ class Show:
 
 
 def warn_of_misfit(rig: Rig, images: Mapping[str, Tensor]) -> None:
-    """Say so on standard error if a rig fits its images badly."""
+    """Print a warning if a rig fits its images badly."""
     from calib.images.rig_check import misfit_warning
 
     if (warning := misfit_warning(rig, images)) is not None:
@@ -88,7 +93,12 @@ def warn_of_misfit(rig: Rig, images: Mapping[str, Tensor]) -> None:
 
 
 def matched_points(rig: Rig, alpha: str, images: Mapping[str, Tensor]) -> dict[str, tuple[Tensor, Tensor]]:
-    """Points of alpha and each beta that shows enough of the same and the rig relates to alpha, by beta."""
+    """Match points between alpha and each beta that shows enough of the same and that the rig relates to
+    alpha.
+
+    Returns:
+        Points (n, 2) of alpha and of the beta, pixels, by beta.
+    """
     from calib.images.matches import match_cameras
     from calib.images.residuals import related
 
@@ -102,7 +112,15 @@ def matched_points(rig: Rig, alpha: str, images: Mapping[str, Tensor]) -> dict[s
 
 
 def given_matches(path: Path | None, texts: Sequence[str], images: Mapping[str, Tensor]) -> Pairs | None:
-    """The matches of a file between the cameras' images of `--image NAME=FILE`; None without a file."""
+    """Read the matches of a file between the cameras' images of `--image NAME=FILE`.
+
+    Returns:
+        Matches by pair; None without a file.
+
+    Raises:
+        ValueError: for a file that does not suit the images.
+        FileNotFoundError: for a missing file.
+    """
     if path is None:
         return None
     from arraygeom.io.point_matches import read_matches
@@ -145,7 +163,11 @@ class Explore:
     """Open the browser."""
 
     def run(self) -> None:
-        """Serve the explorer, or save its page. Raises ValueError for what it cannot show."""
+        """Serve the explorer, or save its page.
+
+        Raises:
+            ValueError: for a rig or images that it cannot show.
+        """
         from ..explore import opened, serve
 
         if self.save is not None:
@@ -166,7 +188,7 @@ class Explore:
 
 
 MOST_CAMERAS = 12
-"""Of which `pat rig info` describes every pair."""
+"""Number of cameras up to which `pat rig info` describes every pair."""
 
 
 @dataclass
@@ -182,7 +204,11 @@ class Info:
     """Print JSON instead of tables."""
 
     def run(self) -> None:
-        """Print what is odd about the rig, and a line for each camera and each pair."""
+        """Print what is odd about the rig, and a line for each camera and each pair.
+
+        Raises:
+            ValueError: for a file that is no rig, and an unknown alpha.
+        """
         from arraygeom.io import ANY_SCALE, recognise
         from arraygeom.runtime.text import length_unit
         from arraygeom.summary import summarise_cameras, summarise_pairs
@@ -207,7 +233,7 @@ class Info:
 
 
 def warn_of_oddities(rig: Rig) -> None:
-    """Say on standard error what is odd about a rig, but for what reading its file has warned of."""
+    """Print what is odd about a rig, except for what reading its file has warned of."""
     from arraygeom.rig_check import file_oddities
 
     warned = file_oddities(rig)
@@ -217,7 +243,7 @@ def warn_of_oddities(rig: Rig) -> None:
 
 
 def print_tables(cameras: Sequence[CameraSummary], pairs: Sequence[PairSummary], unit: str) -> None:
-    """A table of cameras and, if there are any, one of pairs; lengths in metres or another unit."""
+    """Print a table of cameras and, if there are any, one of pairs; `unit` is the unit of lengths."""
     from rich.console import Console
     from rich.table import Table
 
@@ -255,7 +281,7 @@ class Convert:
     read_as: Annotated[str | None, Option("FORMAT")] = None
     """Format of the source; by default recognised."""
     size: Annotated[tuple[int, int] | None, Option("W H")] = None
-    """Of the images, pixels: for files that state none, or several."""
+    """Size of the images, pixels: for files that state none, or several."""
     lens: Annotated[str | None, Option("MODEL")] = None
     """Lens model of the coefficients, as brown-conrady or kannala-brandt: for files that do not say."""
     refit: bool = False
@@ -264,7 +290,11 @@ class Convert:
     """Format of the target."""
 
     def run(self) -> None:
-        """Write the rig. Raises ValueError for a size the file contradicts, and what OUT cannot hold."""
+        """Read and write the rig.
+
+        Raises:
+            ValueError: for a size that the file contradicts, and a rig that the target format cannot hold.
+        """
         from arraygeom.io import read_rig, write_rig
         from arraygeom.lens_fit import refit_rig
 
@@ -307,7 +337,12 @@ class Doctor:
     """Print JSON instead of text."""
 
     def run(self) -> None:
-        """Print the diagnosis, and write the repaired rig; exit status 4 if several repairs do as well."""
+        """Print the diagnosis, and write the repaired rig; exits with status 4 if several repairs do as well.
+
+        Raises:
+            ValueError: for a rig or images that cannot be used.
+            SystemExit: with status 4, if several repairs do as well.
+        """
         from arraygeom.runtime.atomic import write_atomically
         from calib.images.doctor import diagnose
 
@@ -339,9 +374,9 @@ class Doctor:
 
 
 REFUSED = 4
-"""The exit status of a refinement that is refused though the rig does not fit."""
+"""Exit status of a refused refinement of a rig that does not fit."""
 NEARER = 4.0
-"""How many times nearer to their lines points come then."""
+"""Factor by which points come nearer to their lines in that case."""
 
 
 @dataclass
@@ -372,7 +407,12 @@ class Refine:
     """Write the refined rig in spite of objections."""
 
     def run(self) -> None:
-        """Print what changes, and write the rig; exit status 4 if it is refused though it does not fit."""
+        """Refine the rig, print the changes, and write it; exits with status 4 if it is refused though the
+        old one does not fit.
+
+        Raises:
+            ValueError: for a rig, images or options that cannot be used.
+        """
         from arraygeom.io.native import write
         from arraygeom.runtime.atomic import write_text
         from calib.images.refinement import refine
@@ -407,7 +447,7 @@ class Refine:
         say(f"written: {self.out}")
 
     def _refused(self, refined: Refinement) -> None:
-        """Say why no rig is written, and what to do; ends the command if points come far nearer."""
+        """Say why no rig is written, and what to do; exits if points come far nearer."""
         force = ": --force writes it all the same" if refined.objections else ""
         if not refined.held_out[1].median < refined.held_out[0].median / NEARER:
             return say(f"no rig written{force}")
@@ -437,7 +477,11 @@ class RigFromImages:
     matches: MatchesFile = None
 
     def run(self) -> None:
-        """Write the rig and print its statistics. Raises ValueError for images with too little in common."""
+        """Estimate and write the rig, and print its statistics.
+
+        Raises:
+            ValueError: for images with too little in common.
+        """
         from arraygeom.runtime.text import OPEN
         from calib.images.from_images import rig_from_images
 
@@ -477,7 +521,11 @@ class RigDiff:
     """Picture to write: how far pixels and depths differ, over the images."""
 
     def run(self) -> None:
-        """Print the comparison and the verdict. Raises ValueError for rigs of other cameras."""
+        """Print the comparison and the verdict.
+
+        Raises:
+            ValueError: for rigs of other cameras, no depth range, and options that contradict each other.
+        """
         from calib.boards.rig_diff import draw_difference, rig_difference
         from calib.boards.uncertainty import RigCovariance
 
@@ -512,7 +560,7 @@ class RigDiff:
             say(f"written: {self.out}")
 
     def _on_images(self, a: Rig, b: Rig) -> str:
-        """Which rig's lines points that are matched in the images are nearer to."""
+        """Sentence on which rig's lines are nearer to points matched in the images."""
         from calib.images.matches import match_cameras
         from calib.images.residuals import line_distances, nearer
 

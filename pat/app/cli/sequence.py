@@ -1,4 +1,4 @@
-"""`pat sequence`: frames in order of time, of cameras that need not be synchronised."""
+"""`pat sequence`: fuses frames in order of time, from cameras that need not be synchronised."""
 
 from __future__ import annotations
 
@@ -49,24 +49,28 @@ class FuseSequence(FuseBatch):
     """Fuse each frame alone, without colour along motion: frames flicker."""
 
     def frames(self, files: Files) -> Files:
-        """All files, with a warning where numbers are missing."""
+        """Return all files, with a warning where numbers are missing."""
         from ...fusion.frame_matching import warn_of_gaps
 
         warn_of_gaps(files)
         return files
 
     def refuse_videos(self, videos: Sequence[Path]) -> None:
-        """Videos are sequences."""
+        """Accept videos: they are sequences."""
 
     def timed(self, rig: Rig) -> Rig:
-        """The rig with the command line's frame rates and offsets."""
+        """Return the rig with the command line's frame rates and offsets.
+
+        Raises:
+            ValueError: for a camera that the rig lacks, and text that is no number.
+        """
         for entry, given in {"frame_rate": self.frame_rate, "time_offset": self.time_offset}.items():
             for name, value in options.numbers_by_name(given, f"--{entry.replace('_', '-')}").items():
                 rig = with_sensor(rig, name, **{entry: value})
         return rig
 
     def judged_rig(self, recordings: Recordings) -> Recordings:
-        """The same: first frames of cameras that are not synchronised need not match."""
+        """Return the recordings unchanged: first frames of unsynchronised cameras need not match."""
         return recordings
 
     def _fuse(self, recordings: Recordings) -> None:
@@ -83,11 +87,11 @@ class FuseSequence(FuseBatch):
         super()._fuse(recordings._replace(rig=rig))
 
     def kind_of_job(self) -> dict[str, Any]:
-        """A sequence's entries."""
+        """Return the entries of the job that make it a sequence."""
         further = {"sequence": True, "speed": self.speed, "alone": not self.propagate}
         return {"settings": self.fuse_settings(), **further}
 
     def video_rate(self, recordings: Recordings) -> float | None:
-        """Frames a second: as asked for, or as alpha's video has."""
+        """Return the requested frame rate, or that of alpha's video, or 25; None for no video."""
         rate = self.video if self.video is not None else recordings.rates.get(recordings.alpha, 25.0)
         return rate if rate and self.bits != 32 else None

@@ -1,7 +1,8 @@
-"""The explorer: point at a pixel of alpha, see its segment, samples and match in every beta, move the rig.
+"""Explorer of receptive fields: point at a pixel of alpha, see its segment, samples and match in every beta,
+move the rig.
 
 `explore(rig, images)` is a widget for a cell of a notebook (extra `explore`), `pat explore rig.yaml --image
-...` the same in a page; neither needs a network. `inspect_pixel` does the computation.
+...` the same in a page; neither needs a network connection. `inspect_pixel` does the computation.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """`explore`, which loads its library on first use."""
+    """Load `explore` and its library on first use."""
     if name != "explore":
         raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
     from .widget import explore

@@ -1,4 +1,4 @@
-"""What the explorer draws: a state of the controls in, one plain dictionary out."""
+"""Answers of the explorer: from a state of the controls to one plain dictionary of what is drawn."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ...media.colour import to_bytes
 from .pixel import FAMILIES, WINDOWS, BetaReport, ExplorerScene, ExplorerState, image_pixel, inspect_pixel
 
 Controls = dict[str, Any]
-"""Values of the controls, see `DEFAULTS`; and x, alpha's pixel."""
+"""Values of the controls, see `DEFAULTS`, and x, alpha's pixel."""
 DEFAULTS: Controls = {
     "field": "auto",
     "second": "none",
@@ -34,21 +34,29 @@ DEFAULTS: Controls = {
     "moved": {},
     "clicked": None,
 }
-"""The rig as it is. baseline and focal are factors, rotation is in degrees about the betas' y axes, lens is
-added to their k1, `moved` are steps (right, forward) in alpha's axes by beta, metres; near and far are
-metres. `clicked` is a beta and a pixel of it, whose match becomes alpha's pixel."""
+"""Controls of an unchanged rig.
+
+baseline and focal are factors, rotation is in degrees about the betas' y axes, lens is added to their k1,
+`moved` are steps (right, forward) in alpha's axes by beta, metres; near and far are metres. `clicked` is a
+beta and a pixel of it, whose match becomes alpha's pixel.
+"""
 WIDEST = 640
-"""Pixels of the longer side of an image that is shown."""
+"""Pixels of the longer side of a displayed image."""
 FARTHEST = 1000.0
-"""Metres at which an infinite far is shown until it is changed."""
+"""Metres at which an infinite far bound is displayed until it is changed."""
 SHIPPED = "pat-supervised"
-"""The network whose attention can be chosen where no other is given."""
+"""Network whose attention can be chosen if no other is given."""
 
 
 def answer(scene: ExplorerScene, alpha: str, controls: Controls) -> dict[str, Any]:
-    """The pixel, its depth, each beta's samples, weights and match, or `problem` where none.
+    """Compute what is drawn for a state of the controls.
 
-    Raises ValueError, TypeError, AttributeError or KeyError for controls that cannot be.
+    Returns:
+        Pixel `x`, `depth`, `betas` with samples, weights and match (or a `problem`), and the rig's `top`
+        view, as plain values for JSON.
+
+    Raises:
+        ValueError: or TypeError, AttributeError, KeyError, for impossible controls.
     """
     rig = scene.rig
     scene = scene.with_rig(moved_rig(rig, alpha, controls))
@@ -75,7 +83,14 @@ def answer(scene: ExplorerScene, alpha: str, controls: Controls) -> dict[str, An
 
 
 def clicked(scene: ExplorerScene, alpha: str, controls: Controls) -> tuple[Controls, list[Any]]:
-    """The controls with alpha's pixel that matches a beta's clicked one, and that one's samples in alpha."""
+    """Find the alpha pixel that matches a beta's clicked pixel.
+
+    Returns:
+        The controls with that pixel, and the samples in alpha.
+
+    Raises:
+        ValueError: if no pixel can match.
+    """
     name, column, row = controls["clicked"]
     x = image_pixel(column, row, scene.rig[name].hw)
     inspected = inspect_pixel(scene, explorer_state(scene.rig, alpha, controls).replace(alpha=name, x=x))
@@ -88,7 +103,15 @@ def clicked(scene: ExplorerScene, alpha: str, controls: Controls) -> tuple[Contr
 
 
 def moved_rig(rig: Rig, alpha: str, controls: Controls) -> Rig:
-    """The rig, every calibrated beta moved, rotated about its centre, of another focal length and lens."""
+    """Move every calibrated beta, rotate it about its centre, and change its focal length and lens, as the
+    controls say.
+
+    Returns:
+        The rig; the same one for unchanged controls.
+
+    Raises:
+        ValueError: for a lens without k1, if that is changed.
+    """
     alpha_view, cameras = rig[alpha], dict(rig.cameras)
     if all(controls[name] == DEFAULTS[name] for name in ("baseline", "rotation", "focal", "lens", "moved")):
         return rig
@@ -110,7 +133,11 @@ def moved_rig(rig: Rig, alpha: str, controls: Controls) -> Rig:
 
 
 def with_k1(camera: Camera, k1: float) -> Any:
-    """The camera's lens with another k1. Raises ValueError for a lens that has none."""
+    """Return the camera's lens with `k1` added to its own.
+
+    Raises:
+        ValueError: for a lens without k1.
+    """
     lens = camera.distortion
     if k1 == 0:
         return lens
@@ -124,20 +151,20 @@ def with_k1(camera: Camera, k1: float) -> Any:
 
 
 def has_k1(camera: Camera) -> bool:
-    """Whether the lens slider can change the camera."""
+    """Return True if the lens slider can change the camera."""
     lens = camera.distortion
     return lens is None or (isinstance(lens, Distortion) and lens.model == "brown-conrady")
 
 
 def explorer_state(rig: Rig, alpha: str, controls: Controls) -> ExplorerState:
-    """The state of the controls, for a rig that they have moved."""
+    """Convert the controls to a state, for a rig that they have moved."""
     x = image_pixel(controls["x"][0], controls["x"][1], rig[alpha].hw)
     near, far, weights = (controls[name] for name in ("near", "far", "weights"))
     return ExplorerState(alpha, x, controls["field"], near, far, weights)
 
 
 def drawn(beta: BetaReport) -> dict[str, Any]:
-    """A beta's report in numbers: positions in its pixels, depths in metres."""
+    """Convert a beta's report to plain numbers: positions in its pixels, depths in metres; or a `problem`."""
     if not bool(beta.valid.any()):
         return {"problem": "no part of the segment lies in this image: the views do not overlap here"}
     best = int(beta.weight.argmax())
@@ -152,7 +179,12 @@ def drawn(beta: BetaReport) -> dict[str, Any]:
 
 
 def top_view(rig: Rig, alpha: str) -> list[dict[str, Any]]:
-    """The cameras from above, in alpha's axes: each centre (right, forward) and where it looks; metres."""
+    """List the cameras from above, in alpha's axes: each centre (right, forward) and viewing direction,
+    metres.
+
+    Returns:
+        Plain values; empty if alpha is not calibrated.
+    """
     alpha_view = rig[alpha]
     if not isinstance(alpha_view, Camera):
         return []
@@ -165,17 +197,17 @@ def top_view(rig: Rig, alpha: str) -> list[dict[str, Any]]:
 
 
 def rounded(values: Tensor, digits: int = 2) -> list[Any]:
-    """A list of numbers, short enough for a page."""
+    """Round values to a list of numbers, short enough for a page."""
     return values.double().round(decimals=digits).tolist()
 
 
 def number(value: float) -> float | None:
-    """The number to four digits; None if there is none, as JSON has no NaN."""
+    """Round to four digits; None for a number that is not finite, as JSON has no NaN."""
     return float(f"{value:.4g}") if math.isfinite(value) else None
 
 
 def slider_ranges(rig: Rig) -> list[list[Any]]:
-    """Name, label and (low, high, step, value) of each slider that the rig has a use for."""
+    """List name, label and (low, high, step, value) of each slider that suits the rig."""
     ranges: list[list[Any]] = []
     if rig.depth is not None:
         unit = length_unit(rig)
@@ -193,7 +225,7 @@ def slider_ranges(rig: Rig) -> list[list[Any]]:
 
 
 def choices(scene: ExplorerScene, controls: Controls) -> list[list[Any]]:
-    """Name, label and options of each choice."""
+    """List name, label and options of each choice."""
     fields = [*FAMILIES, *scene.fields]
     unlisted = [name for name in (controls["field"], controls["second"]) if name not in ("none", *fields)]
     weights = [WINDOWS, *(scene.networks or [SHIPPED])]
@@ -206,7 +238,7 @@ def choices(scene: ExplorerScene, controls: Controls) -> list[list[Any]]:
 
 
 def shown_cameras(scene: ExplorerScene, alpha: str) -> list[dict[str, Any]]:
-    """Name, width, height, image and unit of depth of alpha and of each beta with an image, in this order."""
+    """Describe alpha and each beta with an image, in this order: name, size, image and unit of depth."""
     names = [alpha, *(n for n in scene.rig.betas(alpha) if n in scene.images)]
     unit = length_unit(scene.rig)
     return [
@@ -222,7 +254,10 @@ def shown_cameras(scene: ExplorerScene, alpha: str) -> list[dict[str, Any]]:
 
 
 def data_url(image: Tensor) -> str:
-    """An image (C, H, W) as PNG in text, at most `WIDEST` pixels long; grey unless it has three bands."""
+    """Encode an image (c, h, w) as the URL of a PNG whose longer side is at most `WIDEST` pixels.
+
+    Grey unless it has three bands; values are clipped to 0..1.
+    """
     image = image if len(image) == 3 else image.mean(0, keepdim=True).expand(3, -1, -1)
     scale = min(1.0, WIDEST / max(image.shape[1:]))
     if scale < 1:

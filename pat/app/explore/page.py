@@ -1,4 +1,4 @@
-"""The explorer without a browser: what it starts from, what it answers, and itself as a page of one file."""
+"""Explorer without a browser: its initial values, its answers, and itself as a page of one file."""
 
 from __future__ import annotations
 
@@ -22,12 +22,19 @@ from .pixel import WINDOWS, ExplorerScene, shipped_attention
 
 MODULE, PINHOLE = (Path(__file__).with_name(name) for name in ("widget.js", "pinhole.js"))
 GRID = 24
-"""Columns of alpha's pixels whose answers are in a saved page, where the page cannot compute them."""
+"""Columns of alpha's pixels whose answers are stored in a saved page that cannot compute them."""
 
 
 @dataclass
 class Explorer:
-    """A scene, alpha's name and where the controls start; or the error that is shown instead."""
+    """Explorer of a scene, or an error shown in its place.
+
+    Attributes:
+        scene: the scene; None for an error.
+        alpha: name of alpha.
+        controls: initial controls.
+        error: message; empty if there is a scene.
+    """
 
     scene: ExplorerScene | None
     alpha: str
@@ -35,7 +42,8 @@ class Explorer:
     error: str = ""
 
     def answer(self, controls: Controls) -> dict[str, Any]:
-        """What is drawn for a state of the controls."""
+        """Return what is drawn for a state of the controls, or {"error": message}; raises nothing for bad
+        controls."""
         if self.scene is None:
             return {"error": self.error}
         try:
@@ -49,7 +57,7 @@ class Explorer:
             return {"error": str(error)}
 
     def values(self) -> dict[str, Any]:
-        """What the widget starts from."""
+        """Return the widget's initial values, as plain values for JSON."""
         scene = self.scene
         return {
             "cameras": [] if scene is None else shown_cameras(scene, self.alpha),
@@ -61,11 +69,16 @@ class Explorer:
         }
 
     def save(self, path: str | Path, columns: int = GRID) -> None:
-        """Write a page of one file that needs neither a kernel nor a network.
+        """Write a page of one file that needs neither a kernel nor a network connection.
 
-        For calibrated pinholes it computes any pixel and the rig's sliders itself, for the field and weights
-        that are chosen by default; for others it has the answers for a grid of `columns` of alpha's pixels,
-        and no sliders.
+        For calibrated pinholes it computes any pixel and the rig's sliders itself, for the default field and
+        weights; for others it stores the answers for a grid of alpha's pixels, and has no sliders.
+
+        Args:
+            columns: columns of that grid.
+
+        Raises:
+            OSError: if writing fails.
         """
         values = {**self.values(), "choices": []}
         if self.scene is not None and is_pinhole(self.scene.rig) and self.usual:
@@ -78,11 +91,11 @@ class Explorer:
 
     @property
     def usual(self) -> bool:
-        """Whether field, weights and lens are those that a page can compute."""
+        """True if field, weights and lens are those that a page can compute."""
         return all(self.controls[name] == DEFAULTS[name] for name in ("field", "second", "weights", "lens"))
 
     def grid(self, columns: int) -> dict[str, Any]:
-        """Answers for a grid of alpha's pixels by "column,row", and the grid's size."""
+        """Compute answers for a grid of alpha's pixels, by "column,row", with the grid's size."""
         if self.scene is None:
             return {"columns": 1, "rows": 1, "answers": {"0,0": {"error": self.error}}}
         h, w = self.scene.rig[self.alpha].hw
@@ -97,13 +110,13 @@ class Explorer:
 
 
 def is_pinhole(rig: Rig) -> bool:
-    """Whether all cameras are calibrated pinholes and no pair is known otherwise."""
+    """Return True if all cameras are calibrated pinholes, without links, and there is a depth range."""
     pinholes = all(isinstance(c, Camera) and c.distortion is None for c in rig.cameras.values())
     return pinholes and not rig.links and rig.depth is not None
 
 
 def geometry(rig: Rig, alpha: str) -> dict[str, Any]:
-    """The cameras in numbers, for the page's own computation."""
+    """Return the cameras as plain numbers, for the page's own computation."""
     cameras = {
         name: {k: getattr(camera, k).tolist() for k in ("K", "R", "centre")} | {"hw": list(camera.hw)}
         for name, camera in rig.cameras.items()
@@ -115,7 +128,7 @@ def geometry(rig: Rig, alpha: str) -> dict[str, Any]:
 
 
 def page(values: Mapping[str, Any], asks: str) -> str:
-    """The page of the widget, whose questions are answered by `asks`, an expression of pinhole.js."""
+    """Compose the widget's page; `asks`, an expression of pinhole.js, answers its questions."""
     scripts = MODULE.read_text().replace("export default { render };", "") + PINHOLE.read_text()
     # Nothing in a text may end the script, or be taken for a part of the page.
     data, asks = (text.replace("<", "\\u003c") for text in (json.dumps(values), asks))
@@ -144,7 +157,14 @@ def opened(
     fields: Mapping[str, ReceptiveField] | None = None,
     **controls: Any,
 ) -> Explorer:
-    """The explorer of a rig: arguments as of `explore`. What is wrong with them is its `error`."""
+    """Make the explorer of a rig; arguments as for `explore`.
+
+    Returns:
+        The explorer; problems with the arguments are its `error`.
+
+    Raises:
+        TypeError: for an unknown argument.
+    """
     if unknown := controls.keys() - DEFAULTS.keys():
         raise TypeError(f"explore has no argument {', '.join(sorted(unknown))}: {', '.join(DEFAULTS)}")
     networks = {} if network is None or isinstance(network, str) else {"network": network}
@@ -164,7 +184,14 @@ def opened(
 def checked(
     rig: Rig, images: Mapping[str, Tensor] | None, alpha: str | None
 ) -> tuple[Mapping[str, Tensor], str]:
-    """The images and alpha's name. Raises ValueError for what cannot be shown."""
+    """Check rig, images and alpha of an explorer, and fill in defaults.
+
+    Returns:
+        Images, and alpha's name.
+
+    Raises:
+        ValueError: for what cannot be shown.
+    """
     if len(rig.names) < 2:
         raise ValueError("the rig has one camera: a receptive field needs two cameras or more")
     alpha = rig.require(alpha or next((n for n in rig.names if not images or n in images), rig.names[0]))
@@ -181,14 +208,19 @@ SQUARES = 2
 NARROWEST = 1e-3
 """Least tangent of half the room's angle of view: a row of pixels on the axis has none."""
 DEEPEST = 20.0
-"""Depth of the back wall in nearest depths where the rig's farthest is beyond it."""
+"""Largest depth of the back wall, in multiples of the near bound."""
 
 
 def checkered_room(rig: Rig, alpha: str) -> dict[str, Float[Tensor, "1 h w"]]:
-    """Every camera's image (1, h, w) of a box, its back wall far, its side walls seen by alpha from near on.
+    """Render every camera's image of a box: the back wall far, the side walls seen by alpha from near on.
 
-    Squares differ in brightness, so that each has one match. Raises ValueError for a rig without poses or
-    depth range.
+    Squares differ in brightness, so that each has one match.
+
+    Returns:
+        Images (1, h, w) by camera.
+
+    Raises:
+        ValueError: for a rig without poses or depth range.
     """
     cameras = {name: view for name, view in rig.to(torch.float64).cameras.items() if isinstance(view, Camera)}
     if len(cameras) < len(rig.cameras) or rig.depth is None:
@@ -203,7 +235,14 @@ def checkered_room(rig: Rig, alpha: str) -> dict[str, Float[Tensor, "1 h w"]]:
 
 
 def room_image(camera: Camera, alpha: Camera, half: Float[Tensor, "3"]) -> Float[Tensor, "1 h w"]:
-    """The room's image; `half` is half the room's size in alpha's axes, metres, with alpha in its middle."""
+    """Render the room for one camera.
+
+    Args:
+        half: half the room's size in alpha's axes, metres, with alpha in its middle.
+
+    Returns:
+        Image (1, h, w), 0 where the lens has no ray.
+    """
     rays, valid = camera.rays(pixel_grid(camera.hw, dtype=torch.float64))
     R = alpha.R @ camera.R.T
     start = alpha.R @ (camera.centre - alpha.centre)
@@ -218,4 +257,4 @@ def room_image(camera: Camera, alpha: Camera, half: Float[Tensor, "3"]) -> Float
 
 
 HASH = torch.tensor([12.9898, 78.233, 37.719], dtype=torch.float64)
-"""Numbers without a common period, those of the hash."""
+"""Factors of the hash, without a common period."""

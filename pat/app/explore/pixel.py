@@ -1,10 +1,10 @@
-"""The explorer's computation: one alpha pixel and a state of the controls in, everything that is drawn out.
+"""Computation of the explorer: from one alpha pixel and a state of the controls to all that is drawn.
 
-Only one pixel is computed, so that an answer takes milliseconds whatever the images' size; no widget is used
-here. The weights are those of C3 attention: of a network, or with the simplest features, luminance in a
-window around each point, of mean zero and length one, so that scores are normalised correlations. Windows of
-beta are warped by the rough homography, so that cameras of other focal lengths and orientations compare the
-same patch.
+Only one pixel is computed, so that an answer takes milliseconds for any image size; no widget is used here.
+The weights are those of C3 attention: of a network, or of the simplest features, luminance in a window around
+each point, of mean zero and length one, so that scores are normalised correlations. Windows of beta are
+warped by the rough homography, so that cameras of other focal lengths and orientations compare the same
+patch.
 """
 
 from __future__ import annotations
@@ -49,15 +49,20 @@ from ...networks.paper import PAT, QueryAndKey
 from ...networks.weights import load_weights
 
 WINDOWS = "windows"
-"""Weights by the correlation of windows."""
+"""Name of the weights by correlation of windows."""
 
 
 @dataclass(frozen=True)
 class ExplorerState:
     """Values of the controls.
 
-    `x` is alpha's pixel. `near` and `far` (metres) replace the rig's; None keeps them. `weights` are by
-    windows, or by a network of that name.
+    Attributes:
+        alpha: name of alpha.
+        x: alpha's pixel (x, y).
+        family: name of the field; "auto" for the default.
+        near: near bound, metres; None for the rig's.
+        far: far bound, metres; None for the rig's.
+        weights: `WINDOWS`, or the name of a network.
     """
 
     alpha: str
@@ -68,14 +73,17 @@ class ExplorerState:
     weights: str = WINDOWS
 
     def replace(self, **changes: object) -> ExplorerState:
-        """A copy with some values changed."""
+        """Return a copy with some values changed."""
         return dataclasses.replace(self, **changes)  # type: ignore[arg-type]
 
 
 class MatchOffset(NamedTuple):
-    """Where the images match best near the best sample, on the line or beside it, and how well.
+    """Best match of the images near the best sample, on the line or beside it.
 
-    position: in beta's pixels. distance: from the line, pixels. correlation: of the windows there, -1 to 1.
+    Attributes:
+        position: the match, pixels of beta.
+        distance: its distance from the line, pixels.
+        correlation: correlation of the windows there, -1 to 1.
     """
 
     position: Float[Tensor, "2"]
@@ -84,12 +92,17 @@ class MatchOffset(NamedTuple):
 
 
 class BetaReport(NamedTuple):
-    """Sampling locations in one beta for the pixel, and the match.
+    """Samples of the pixel in one beta, and the match.
 
-    xy: samples in beta's pixels; `valid` marks those in the image. ends: start and end where the field is a
-    segment. weight: of each sample, 1 in all. depth: of each sample in metres, NaN where there is none.
-    value: beta's image, weighted. peak: the largest weight. offset: how far the images' own match lies from
-    the line, None without a segment or a clear match.
+    Attributes:
+        xy: samples, pixels of beta.
+        valid: True for samples in the image.
+        ends: start and end of a segment; None for other fields.
+        weight: weight of each sample, summing to 1.
+        depth: depth of each sample, metres; NaN where it has none.
+        value: weighted mean of beta's image.
+        peak: largest weight.
+        offset: best match of the images; None without a segment or a clear match.
     """
 
     xy: Float[Tensor, "l 2"]
@@ -103,7 +116,14 @@ class BetaReport(NamedTuple):
 
 
 class PixelReport(NamedTuple):
-    """A report or a problem for each beta, and the fused colour and depth of the pixel."""
+    """Reports of a pixel.
+
+    Attributes:
+        betas: report by beta.
+        problems: problem by beta that has no report.
+        colour: fused colour.
+        depth: depth by all betas, metres; NaN if unknown.
+    """
 
     betas: dict[str, BetaReport]
     problems: dict[str, str]
@@ -113,10 +133,18 @@ class PixelReport(NamedTuple):
 
 @dataclass(frozen=True)
 class ExplorerScene:
-    """A rig and its images (C, H, W); fields of one's own and networks by name.
+    """Rig and images of the explorer; derived features are computed once.
 
-    The luminances that windows compare are computed once, and so are a network's features when it is first
-    asked.
+    Attributes:
+        rig: the rig.
+        images: images (c, h, w) by camera.
+        fields: further fields by name.
+        networks: further networks by name.
+        guides: luminances for windows, by camera.
+        features: features of networks.
+
+    Raises:
+        ValueError: for an image that does not suit its camera.
     """
 
     rig: Rig
@@ -133,15 +161,24 @@ class ExplorerScene:
             self.guides[name] = grey[None]
 
     def with_rig(self, rig: Rig) -> ExplorerScene:
-        """The same images with a rig that was moved."""
+        """Return the scene with another rig."""
         return dataclasses.replace(self, rig=rig)
 
     def query(self, network: str, alpha: str) -> Tensor:
-        """What a network's attention compares of alpha."""
+        """Return a network's query features of alpha (1, d, h, w).
+
+        Raises:
+            ValueError: for weights that are not of the paper's network.
+        """
         return self._features((network, alpha, None), self.images[alpha], self.rig[alpha].hw).query
 
     def key(self, network: str, alpha: str, beta: str, pair: Pair) -> Tensor:
-        """What it compares of a beta, at alpha's resolution if the network wants that."""
+        """Return a network's key features of a beta (1, d, h, w), at alpha's resolution if the network needs
+        that.
+
+        Raises:
+            ValueError: for weights that are not of the paper's network.
+        """
         hw = hw_at_alphas_resolution(pair) if self._network(network).equal_resolution else pair.beta.hw
         return self._features((network, alpha, beta), self.images[beta], hw).key
 
@@ -149,7 +186,7 @@ class ExplorerScene:
         return self.networks[name] if name in self.networks else shipped_attention(name)
 
     def _features(self, which: tuple[str, str, str | None], image: Tensor, hw: HW) -> QueryAndKey:
-        """Features of an image at a size, of alpha or of a beta; computed again when another is asked for."""
+        """Features of an image of alpha or a beta at a size; computed again when another size is needed."""
         if which not in self.features or self.features[which][0] != hw:
             network, alpha, beta = which
             asked = self._network(network)
@@ -162,7 +199,15 @@ class ExplorerScene:
 
 @cache
 def shipped_attention(name: str) -> PAT:
-    """Weights of the paper's network. Raises ValueError for others."""
+    """Load weights of the paper's network, cached.
+
+    Returns:
+        The network.
+
+    Raises:
+        ValueError: for weights of another network.
+        FileNotFoundError: for unknown weights.
+    """
     network = load_weights(name)
     if not isinstance(network, PAT):
         raise ValueError(f"weights '{name}' are not of the paper's network: its attention alone can be shown")
@@ -170,7 +215,7 @@ def shipped_attention(name: str) -> PAT:
 
 
 DENSE = 2048
-"""Positions of the dense field, roughly."""
+"""Approximate number of positions of the dense field."""
 SIZED: dict[str, Callable[[Pair, Tensor], ReceptiveField]] = {
     "homography": lambda pair, x: HomographyDisplacement(displacement(pair, x)),
     "rectified": lambda pair, x: Rectified(displacement(pair, x), alpha_is="either"),
@@ -179,27 +224,36 @@ SIZED: dict[str, Callable[[Pair, Tensor], ReceptiveField]] = {
     "dense": lambda pair, x: Dense(stride=max(1, math.ceil(math.sqrt(math.prod(pair.beta.hw) / DENSE)))),
     "curved": lambda pair, x: Curved(256),
 }
-"""Families whose extent is that of the depth range at a pixel, or follows from the images' size."""
+"""Families whose extent follows from the depth range at a pixel, or from the images' size."""
 FAMILIES = ("auto", *FIELDS)
-"""Names of the fields: `auto` is the default, which `pat fuse` uses. A state takes MODULE:OBJECT, too."""
+"""Names of the fields: `auto` is the default of `pat fuse`. A state takes MODULE:OBJECT, too."""
 
 
 def chosen_field(pair: Pair, family: str, x: Float[Tensor, "1 2"]) -> ReceptiveField:
-    """The field of a family at a pixel."""
+    """Make the field of a family for a pixel.
+
+    Raises:
+        ValueError: for an unknown family.
+    """
     if family in SIZED:
         return SIZED[family](pair, x)
     return recorded_field(pair) if family == "auto" else named_field(family)
 
 
 def displacement(pair: Pair, x: Float[Tensor, "1 2"]) -> float:
-    """What covers the depth range at this pixel, else a share of beta's longer side."""
+    """Return the displacement from H x that covers the depth range at a pixel, or else a share of beta's
+    longer side; pixels."""
     if pair.link is None and pair.calibrated and pair.depth is not None:
         return max(1.0, float(covering_displacement(pair, x)))
     return LINE_SHARE * max(pair.beta.hw)
 
 
 def with_depths(rig: Rig, state: ExplorerState) -> Rig:
-    """The rig with the state's depths. Raises ValueError if near is beyond far."""
+    """Return the rig with the state's depth bounds.
+
+    Raises:
+        ValueError: for only one bound where the rig has none, and near beyond far.
+    """
     if state.near is None and state.far is None:
         return rig
     if rig.depth is None and (state.near is None or state.far is None):
@@ -210,10 +264,13 @@ def with_depths(rig: Rig, state: ExplorerState) -> Rig:
 
 
 def inspect_pixel(scene: ExplorerScene, state: ExplorerState) -> PixelReport:
-    """The report on the state's pixel in every beta that has an image.
+    """Report on the state's pixel in every beta that has an image.
 
-    Raises ValueError for a rig that the state makes impossible. Errors that concern one beta go to
-    `problems`.
+    Returns:
+        The reports; errors that concern one beta are in `problems`.
+
+    Raises:
+        ValueError: for depth bounds that are impossible.
     """
     rig = with_depths(scene.rig, state)
     betas: dict[str, BetaReport] = {}
@@ -232,12 +289,19 @@ def inspect_pixel(scene: ExplorerScene, state: ExplorerState) -> PixelReport:
 
 
 def pixel_of(state: ExplorerState) -> Float[Tensor, "1 2"]:
-    """The state's pixel, in float64."""
+    """Return the state's pixel, float64."""
     return torch.tensor([state.x], dtype=torch.float64)
 
 
 def beta_report(scene: ExplorerScene, pair: Pair, name: str, state: ExplorerState) -> BetaReport:
-    """A pixel's samples in one beta, their weights, depths. Raises ValueError if the field does not fit."""
+    """Compute a pixel's samples in one beta, with weights and depths.
+
+    Returns:
+        The report.
+
+    Raises:
+        ValueError: if the field does not suit the pair.
+    """
     x = pixel_of(state)
     field = scene.fields.get(state.family) or chosen_field(pair, state.family, x)
     locations = sampling_locations(field, pair, x)
@@ -262,13 +326,13 @@ def beta_report(scene: ExplorerScene, pair: Pair, name: str, state: ExplorerStat
 
 
 ACROSS, STEP = 8, 0.25
-"""How far from the line the images' own match is sought, and to which step, pixels."""
+"""Distance from the line, and step, for the search of the images' own match, pixels."""
 MOST_SAMPLES = 96
-"""Samples on the line, around that of the largest weight, from which it is sought."""
+"""Samples on the line, around that of the largest weight, from which that search starts."""
 CLEAR = 0.8
 """Least correlation of a clear match."""
 BETTER = 0.03
-"""By how much a match beside the line must correlate better than the best one on it."""
+"""Gain in correlation that a match beside the line must have over the best one on it."""
 
 
 def match_offset(
@@ -278,10 +342,12 @@ def match_offset(
     samples: tuple[Float[Tensor, "l 2"], Float[Tensor, " l"]],
     ends: Float[Tensor, "2 2"] | None,
 ) -> MatchOffset | None:
-    """The images' own match near the segment, by the correlation of windows around both pixels.
+    """Find the images' own match near the segment, by the correlation of windows around both pixels.
 
-    Unlike the samples it may lie beside the line, and does if the rig is off. None where nothing matches
-    clearly.
+    Unlike the samples it may lie beside the line, and does if the rig is off.
+
+    Returns:
+        The match; None if nothing matches clearly.
     """
     xy, weight = samples
     if ends is None or not bool((weight > 0).any()) or float((ends[1] - ends[0]).norm()) < 1e-6:
@@ -310,16 +376,16 @@ def match_offset(
 
 
 def ends_of(locations: Segments | Positions) -> Float[Tensor, "2 2"] | None:
-    """Start and end of the first pixel's segment, if it is one."""
+    """Return start and end of the first pixel's segment; None if it has none."""
     if not isinstance(locations, Segments) or not bool(locations.valid[0]):
         return None
     return torch.stack([locations.start[0], locations.end[0]])
 
 
 SHARPNESS = 30.0
-"""What correlations are multiplied with to be scores."""
+"""Factor from correlations to scores."""
 RADIUS = 5
-"""Windows of 11 x 11 pixels are compared."""
+"""Radius of the windows, pixels: 11 x 11 pixels are compared."""
 
 
 def correlations(
@@ -329,7 +395,7 @@ def correlations(
     x: Float[Tensor, "1 2"],
     xy: Float[Tensor, "l 2"],
 ) -> Float[Tensor, " l"]:
-    """Normalised correlations (-1 to 1) of alpha's window at x with beta's at each of xy."""
+    """Compute the normalised correlations (-1 to 1) of alpha's window at x with beta's at each of xy."""
     steps = (pixel_grid((2 * RADIUS + 1, 2 * RADIUS + 1), dtype=x.dtype) - RADIUS).reshape(-1, 2)
     transformed = steps @ jacobian(pair, x).T
     alpha_features = window_features(alpha, x, steps)
@@ -337,7 +403,7 @@ def correlations(
 
 
 def jacobian(pair: Pair, x: Float[Tensor, "1 2"]) -> Float[Tensor, "2 2"]:
-    """The Jacobian at x of the rough transfer to beta; the identity where there is none."""
+    """Return the Jacobian at x of the rough transfer to beta; the identity where there is none."""
     half = x.new_tensor([[0.5, 0.0], [0.0, 0.5]])
     ends = torch.cat([x, x + half, x - half])
     transformed, valid = rough_transfer(pair, ends)
@@ -347,7 +413,7 @@ def jacobian(pair: Pair, x: Float[Tensor, "1 2"]) -> Float[Tensor, "2 2"]:
 def window_features(
     guide: Float[Tensor, "1 1 h w"], x: Float[Tensor, "l 2"], steps: Float[Tensor, "k 2"]
 ) -> Float[Tensor, "l k"]:
-    """The window's values around each point, mean 0 and length 1; 0 where it is flat."""
+    """Sample the window around each point, normalised to mean 0 and length 1; 0 where it is flat."""
     values = sampled(guide, x[:, None] + steps, extended=True)[0]
     values = values - values.mean(-1, keepdim=True)
     length = values.norm(dim=-1, keepdim=True)
@@ -355,11 +421,11 @@ def window_features(
 
 
 FLAT = 1e-4
-"""A window with less contrast than this has no features."""
+"""Contrast (length of the centred window) below which a window has no features."""
 
 
 def softmax(scores: Float[Tensor, " l"], valid: Bool[Tensor, " l"]) -> Float[Tensor, " l"]:
-    """Over the valid samples; all zero without any."""
+    """Compute the softmax over the valid samples; all zero without any."""
     if not bool(valid.any()):
         return torch.zeros_like(scores)
     return torch.where(valid, scores, -torch.inf).softmax(0)
@@ -368,7 +434,8 @@ def softmax(scores: Float[Tensor, " l"], valid: Bool[Tensor, " l"]) -> Float[Ten
 def depths(
     pair: Pair, x: Float[Tensor, "1 2"], xy: Float[Tensor, "l 2"], valid: Bool[Tensor, " l"]
 ) -> Float[Tensor, " l"]:
-    """The depth in alpha of each sample, NaN where it has none or the pair is not calibrated."""
+    """Compute the depth in alpha of each sample, metres; NaN where it has none or the pair is not
+    calibrated."""
     if pair.link is not None or not pair.calibrated:
         return torch.full_like(xy[:, 0], torch.nan)
     pinholes = pair.alpha.has_pinhole_view and pair.beta.has_pinhole_view
@@ -377,7 +444,8 @@ def depths(
 
 
 def joint_depth(betas: Mapping[str, BetaReport]) -> float:
-    """The inverse of the mean inverse depth by all weights, metres; NaN if no sample has a depth."""
+    """Return the inverse of the weighted mean inverse depth of all betas, metres; NaN if no sample has a
+    depth."""
     inverse, total = 0.0, 0.0
     for beta in betas.values():
         has_depth = beta.depth.isfinite()
@@ -389,14 +457,19 @@ def joint_depth(betas: Mapping[str, BetaReport]) -> float:
 def sampled(
     image: Float[Tensor, "1 c h w"], x: Float[Tensor, "*l 2"], extended: bool = False
 ) -> Float[Tensor, " c *l"]:
-    """The image's values at positions, in their precision; the image is not copied."""
+    """Sample an image at positions, in their precision, without copying it."""
     return sample(image, x[None].to(image), extended=extended).values[0].to(x)
 
 
 def fused_colour(
     scene: ExplorerScene, betas: Mapping[str, BetaReport], state: ExplorerState
 ) -> Float[Tensor, " c"]:
-    """Alpha's luminance with the colour differences of the betas in colour, each weighted by its peak."""
+    """Combine alpha's luminance with the colour differences of the betas in colour, each weighted by its
+    peak.
+
+    Returns:
+        RGB; alpha's luminance alone without such betas.
+    """
     alpha_value = sampled(scene.guides[state.alpha], pixel_of(state))[:, 0]
     coloured = [s for s in betas.values() if len(s.value) == 3 and s.peak > 0]
     if not coloured:
@@ -407,6 +480,6 @@ def fused_colour(
 
 
 def image_pixel(x: float, y: float, hw: HW) -> tuple[float, float]:
-    """The centre of the pixel nearest to a point."""
+    """Return the centre of the pixel nearest to a point, inside the image."""
     h, w = hw
     return float(min(max(round(x), 0), w - 1)), float(min(max(round(y), 0), h - 1))

@@ -1,4 +1,4 @@
-"""Serving the explorer to one user of this machine alone, by the standard library."""
+"""Serving of the explorer to one user of this machine alone, by the standard library."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from arraygeom.runtime.safe_yaml import load_json
 from .page import Explorer, page
 
 LARGEST = 1 << 16
-"""Bytes of a question."""
+"""Largest question, bytes."""
 OWN_NAMES = ("localhost", "127.0.0.1")
 """Host names of this machine."""
 
 
 class _Server(ThreadingHTTPServer):
-    """A server of an explorer's page and answers, one answer at a time."""
+    """Server of an explorer's page and answers, one answer at a time."""
 
     def __init__(self, explorer: Explorer, port: int) -> None:
         super().__init__(("127.0.0.1", port), _Handler)
@@ -34,7 +34,7 @@ class _Server(ThreadingHTTPServer):
         self.page = page(explorer.values(), "asksServer()").encode()  # computes what answers would wait for
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """A browser that leaves before it has its answer is no error."""
+        """Ignore browsers that leave before they have their answer."""
         if not isinstance(sys.exception(), ConnectionError):
             super().handle_error(request, client_address)
 
@@ -86,16 +86,22 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Say nothing of each request."""
+        """Log nothing about requests."""
 
 
 def serve(explorer: Explorer, *, port: int = 0, browser: bool = True) -> None:
-    """Serve the explorer to this machine alone until interrupted; port 0 takes a free one.
+    """Serve the explorer to this machine alone until interrupted.
 
     Its address has a token, without which nothing is served: other users of the machine do not know it.
     Requests for other host names than this machine's, or from pages of other origins, are refused: a foreign
-    page whose name is made to resolve to this machine must not read the images. Raises ValueError for a port
-    that is none or in use.
+    page whose name is made to resolve to this machine must not read the images.
+
+    Args:
+        port: port on localhost; 0 takes a free one.
+        browser: True to open the page.
+
+    Raises:
+        ValueError: for an invalid port, or one in use.
     """
     if not 0 <= port <= 65535:
         raise ValueError(f"--port {port}: wanted 1 to 65535, or 0 for a free one")
@@ -116,7 +122,8 @@ def serve(explorer: Explorer, *, port: int = 0, browser: bool = True) -> None:
 
 @contextmanager
 def _opened(address: str) -> Iterator[None]:
-    """The address in a browser, by a file that only this user can read: others see arguments of programs."""
+    """Context manager that opens the address by a file that only this user can read: others see programs'
+    arguments."""
     with TemporaryDirectory() as folder:
         file = Path(folder) / "explorer.html"
         file.write_text(f'<meta http-equiv="refresh" content="0;url={address}">', encoding="utf-8")

@@ -1,4 +1,4 @@
-"""The explorer in one line of a notebook, without a server or a network."""
+"""Explorer in one line of a notebook, without a server or a network connection."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ with needs("explore", "the explorer in a notebook"):
 
 
 class FieldWidget(anywidget.AnyWidget):
-    """Alpha and betas side by side; `controls` come from the browser, `answer` goes to it."""
+    """Widget with alpha and betas side by side; `controls` come from the browser, `answer` goes to it."""
 
     _esm = MODULE
     cameras: Any = traitlets.List().tag(sync=True)
@@ -58,18 +58,24 @@ def explore(
     fields: Mapping[str, ReceptiveField] | None = None,
     **controls: Any,
 ) -> FieldWidget:
-    """The receptive fields of a rig in a cell of a notebook: point at a pixel of alpha, and move the rig.
+    """Show the receptive fields of a rig in a cell of a notebook: point at a pixel of alpha, and move the
+    rig.
 
     Args:
-        images: (C, H, W) by camera name; without any a checkered room is shown.
-        alpha: its name, by default the first camera with an image; x: its pixel, by default the middle.
-        network: whose attention is shown: a network of the paper, or weights such as "pat-supervised";
-            without one, correlations of windows.
-        fields: fields of one's own by name, which can then be chosen.
-        controls: where the controls start: `field` and `second` (names of fields), `weights`, `near` and
-            `far` (metres), `baseline` and `focal` (factors), `rotation` (degrees), `lens` (added to k1),
+        images: (C, H, W) by camera; None for a checkered room.
+        alpha: its name; None for the first camera with an image.
+        x: its pixel; None for the middle.
+        network: network of the paper, or weights such as "pat-supervised", whose attention is shown; None for
+            correlations of windows.
+        fields: further fields by name, which can then be chosen.
+        controls: initial values of the controls: `field` and `second` (names of fields), `weights`, `near`
+            and `far` (metres), `baseline` and `focal` (factors), `rotation` (degrees), `lens` (added to k1),
             `moved` (metres).
 
-    What is wrong with the input is said in the widget. Raises TypeError for an unknown argument.
+    Returns:
+        The widget; problems with the input are shown in it.
+
+    Raises:
+        TypeError: for an unknown argument.
     """
     return FieldWidget(opened(rig, images, alpha=alpha, x=x, network=network, fields=fields, **controls))

@@ -1,4 +1,4 @@
-"""Backward: gradients of what belongs to alpha's pixels, and what `scatter` needs for those of beta's."""
+"""Backward pass: gradients of alpha's pixels, and weights with which `scatter` adds to beta's."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .vectors import fma, from_index, load, mul, splat, store, sub, take, total,
 
 @compiled(nogil=True, cache=True)
 def backward(call, saved, share, taps, gradients):
-    """Gradients of a share of alpha's pixels, and their taps with weights."""
+    """Compute the gradients of a share of alpha's pixels, and their weighted taps; written in place."""
     call, saved, share, taps, gradients = (
         pointers(call),
         pointers(saved),
@@ -34,7 +34,7 @@ def backward(call, saved, share, taps, gradients):
 
 @compiled
 def _backward_block(first, pixels, call, saved, block, taps, gradients):
-    """A block of alpha's pixels."""
+    """Process a block of alpha's pixels."""
     d, dv = call.channels, call.value_channels
     slot = first - taps.first
     block = replaced(block, Taps(from_pixel(taps.tap_count, slot), from_pixel(taps.rows, slot)))
@@ -62,7 +62,7 @@ def _backward_block(first, pixels, call, saved, block, taps, gradients):
 
 @compiled
 def _backward_pixel(p, call, saved, here, gradients):
-    """Pixel p's weights again, and the gradients by them, by the scores, by points and bias."""
+    """Recompute the weights of pixel p, and the gradients by weights, scores, points and bias."""
     n, samples = here.sample_count[0], call.geometry.samples
     statistics = from_index(saved.statistics, saved.step * p)
     upstream = from_index(saved.statistics_upstream, saved.step * p)
@@ -79,7 +79,8 @@ def _backward_pixel(p, call, saved, here, gradients):
 
 @compiled
 def _score_gradient(n, here, statistics, upstream):
-    """From gradients by the weights to gradients by the scores. `slope` holds those of the values."""
+    """Convert gradients by the weights to gradients by the scores. `slope` holds the gradients by the values'
+    weights."""
     nothing = zero(upstream)
     x, y, spread = statistics[0], statistics[1], statistics[2]
     gx, gy, gspread = upstream[0], upstream[1], upstream[2]
@@ -104,7 +105,7 @@ def _score_gradient(n, here, statistics, upstream):
 
 @compiled
 def _position_gradient(p, n, geometry, here, statistics, upstream, out):
-    """Gradients by the positions of the samples, and by the points that made them."""
+    """Gradients by the positions of the samples, and by the points that define them."""
     nothing = zero(upstream)
     centre_x, centre_y, spread = statistics[0], statistics[1], statistics[2]
     gx, gy, gspread = upstream[0], upstream[1], upstream[2]

@@ -1,4 +1,4 @@
-"""Work along the channels: inner products with taps, weighted sums of taps, and additions to them."""
+"""Loops along the channels: inner products with taps, weighted sums of taps, additions to them."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ from .vectors import (
 ROW = 4
 """Vectors of channels that are processed at once."""
 AT_ONCE = 2 if get_host_cpu_features().get("avx512f") else 1
-"""Taps of which so many vectors are summed at once, each with accumulators of its own: as registers allow."""
+"""Taps that are summed at once, each with its own accumulators: as registers allow."""
 CHUNK = 48
-"""Taps that the pixels of a block have in turn, while these lie in the first cache: 16 KiB."""
+"""Taps that the pixels of a block process in turn while these stay in the first cache: 16 KiB."""
 
 
 # ---- one pixel -----------------------------------------------------------------------------------
@@ -114,7 +114,7 @@ def weighted_sum(weights, rows, first, last, image, channels, begin, end, out):
 
 
 def _weighted_sum(n, taps, lanes):
-    """`weighted_sum` for n vectors of channels, with accumulators for some taps at a time."""
+    """Make `weighted_sum` for n vectors of channels, with accumulators for `taps` taps at a time."""
     accumulators = n * taps
 
     @compiled
@@ -136,8 +136,8 @@ _weighted_sum_1 = _weighted_sum(1, 4, NARROW)
 
 @compiled
 def block_products(pixels, counts, x, rows, image, channels, out):
-    """`inner_products` for the pixels of a block. Neighbours touch much the same pixels of beta: at a few of
-    those in turn, which then lie in the first cache."""
+    """Compute `inner_products` for the pixels of a block, some taps in turn: neighbours touch much the same
+    pixels of beta, which then stay in the first cache."""
     for t in range(0, _most(counts, pixels), CHUNK):
         for i in range(pixels):
             last = min(t + CHUNK, of(counts, i)[0])
@@ -146,7 +146,7 @@ def block_products(pixels, counts, x, rows, image, channels, out):
 
 @compiled
 def block_sums(pixels, counts, weights, rows, image, channels, out):
-    """`weighted_sum` likewise, from 0."""
+    """Compute `weighted_sum` for the pixels of a block, from 0, some taps in turn as in `block_products`."""
     for i in range(pixels):
         fill(of(out, i), 0, channels, zero(out.first))
     for c in range(0, channels, ROW * LANES):
@@ -170,11 +170,12 @@ def _most(counts, n):
 
 @compiled(nogil=True, cache=True)
 def scatter(taps, weights, last, x, channels, first_channel, last_channel, out):
-    """out[row, c] += weight x[pixel, c] for all taps of the alpha pixels taps.first .. last: those of a block
-    in turn, as in `block_products`.
+    """Add to beta's pixels: out[row, c] += weight x[pixel, c] for all taps of the alpha pixels taps.first ..
+    last.
 
-    `weights` is a column of `taps`. One caller owns the channels first_channel .. last_channel, so the order
-    of additions, and with it every bit, is the same however many callers share the work.
+    Taps of a block are added in turn, as in `block_products`. `weights` is a column of `taps`. One caller
+    owns the channels first_channel .. last_channel, so the order of additions, and with it every bit, is the
+    same however many callers share the work.
     """
     taps, (weights, x, out) = pointers(taps), pointers((weights, x, out))
     for first in range(0, last - taps.first, BLOCK):
@@ -204,7 +205,7 @@ def _scatter(rows, weights, first, last, x, channels, first_channel, last_channe
 
 
 def _scatter_rows(n, lanes):
-    """`_scatter` for n vectors of channels."""
+    """Make `_scatter` for n vectors of channels."""
 
     @compiled
     def scatter_row(rows, weights, first, last, x, channels, c, out):

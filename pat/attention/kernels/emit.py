@@ -1,4 +1,4 @@
-"""Makes numba intrinsics of functions that emit LLVM's instructions.
+"""Numba intrinsics made of functions that emit LLVM's instructions.
 
 The body of such a function is Python that runs at compile time: a loop in it is unrolled code.
 """
@@ -15,11 +15,11 @@ from numba.extending import intrinsic, models, register_model
 
 LANES = 16
 NARROW = 8
-"""Lanes where there may be few channels."""
+"""Lanes of a vector where there may be few channels."""
 
 
 class Vector(types.Type):
-    """`LANES` numbers, or as many as said, in one register or two."""
+    """Numba type of a vector of `lanes` numbers in one or two registers."""
 
     def __init__(self, scalar, lanes=LANES):
         self.scalar, self.lanes = scalar, lanes
@@ -33,18 +33,23 @@ class _VectorModel(models.PrimitiveModel):
 
 
 def row_of(vector, n):
-    """The type of a row: a tuple of n vectors."""
+    """Return the numba type of a row: a tuple of n vectors."""
     return types.UniTuple(vector, getattr(n, "literal_value", n))
 
 
 class Code:
-    """Emits instructions. `kinds` are numba's types of the intrinsic's arguments, `result` its value's."""
+    """Emitter of instructions.
+
+    Attributes:
+        kinds: numba's types of the intrinsic's arguments.
+        result: numba's type of its value.
+    """
 
     def __init__(self, context, builder, kinds, result):
         self.context, self.builder, self.kinds, self.result = context, builder, kinds, result
 
     def __getattr__(self, name: str) -> Any:
-        """An instruction of LLVM, by its name."""
+        """Return LLVM's instruction of this name."""
         return getattr(self.builder, name)
 
     def offset(self, index, k: int):
@@ -52,31 +57,31 @@ class Code:
         return self.builder.add(index, ir.Constant(index.type, k))
 
     def at(self, address, index):
-        """The number stored at an index."""
+        """Load the number at an index."""
         return self.builder.load(self.builder.gep(address, [index]))
 
     def get(self, array, address, index, lanes=LANES):
-        """The vector stored at an index; `array` is the type of the pointer."""
+        """Load the vector at an index; `array` is the type of the pointer."""
         lane = ir.VectorType(self.context.get_data_type(array.dtype), lanes)
         place = self.builder.bitcast(self.builder.gep(address, [index]), lane.as_pointer())
         return self.builder.load(place, align=array.dtype.bitwidth // 8)
 
     def put(self, array, address, index, vector):
-        """Stores a vector at an index."""
+        """Store a vector at an index."""
         place = self.builder.bitcast(self.builder.gep(address, [index]), vector.type.as_pointer())
         self.builder.store(vector, place, align=array.dtype.bitwidth // 8)
 
     def repeat(self, number, lanes=LANES):
-        """A vector of one number repeated."""
+        """Make a vector of one repeated number."""
         undefined = ir.Constant(ir.VectorType(number.type, lanes), ir.Undefined)
         return self.shuffle(self.insert_element(undefined, number, ir.IntType(32)(0)), None, [0] * lanes)
 
     def shuffle(self, a, b, lanes):
-        """Some lanes of two vectors, or of one."""
+        """Select lanes of two vectors, or of one (`b` None)."""
         return self.shuffle_vector(a, a if b is None else b, _constants(lanes))
 
     def intrinsic(self, name: str, result, args, **options):
-        """Calls an intrinsic of LLVM by its name; `%` stands for the kind of vector."""
+        """Call one of LLVM's intrinsics by its name; `%` stands for the kind of vector."""
         vector = args[-1].type
         full = name.replace("%", f"v{vector.count}{'f64' if vector.element == ir.DoubleType() else 'f32'}")
         function = ir.FunctionType(result, [value.type for value in args])
@@ -87,11 +92,11 @@ class Code:
         return self.intrinsic("llvm.fma.%", a.type, [a, b, c])
 
     def parts(self, value):
-        """The values in a tuple."""
+        """Unpack the values of a tuple."""
         return cgutils.unpack_tuple(self.builder, value)
 
     def pack(self, parts):
-        """A tuple, of the type of the result."""
+        """Pack values into a tuple of the result's type."""
         return self.context.make_tuple(self.builder, self.result, parts)
 
 
@@ -100,9 +105,16 @@ def _constants(lanes):
 
 
 def instruction(result):
-    """Decorates a function (code, *values) that emits the code of an intrinsic; `result` makes its type from
-    those of the arguments. Arguments annotated `index` are 64-bit; those annotated `literal` are numbers at
-    compile time."""
+    """Decorator that makes an intrinsic of a function (code, *values) that emits its code.
+
+    Arguments annotated `index` are 64-bit; those annotated `literal` are numbers at compile time.
+
+    Args:
+        result: function from the arguments' types to the result's type.
+
+    Returns:
+        The decorator.
+    """
 
     def decorate(emit):
         """numba's intrinsic of the function's name, typed by its annotations."""

@@ -1,4 +1,4 @@
-"""Forward: values, statistics, and logarithms of the sums of exponentials."""
+"""Forward pass: values, statistics, and logarithms of the sums of exponentials."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LEAST_DEVIATION = np.float32(1e-4)
 
 @compiled(nogil=True, cache=True)
 def forward(call, share, outputs):
-    """The outputs of a share of alpha's pixels."""
+    """Compute the outputs of a share of alpha's pixels; written in place."""
     call, share, outputs = pointers(call), pointers(share), pointers(outputs)
     begin = share.first + take(share.counter) * share.size
     while begin < share.last:
@@ -32,7 +32,7 @@ def forward(call, share, outputs):
 
 @compiled
 def _forward_block(first, pixels, call, block, outputs):
-    """A block of alpha's pixels."""
+    """Process a block of alpha's pixels."""
     d, dv = call.channels, call.value_channels
     for i in range(pixels):
         here = pixel_of(block, i)
@@ -51,8 +51,8 @@ def _forward_block(first, pixels, call, block, outputs):
 
 @compiled
 def _find_weights(p, call, measured, here):
-    """From the inner products of pixel p's taps to their weights, in the same place; gives the logarithm of
-    the sum of exponentials."""
+    """Convert the inner products of pixel p's taps to their weights, in place. Returns the log of the sum of
+    exponentials."""
     n = here.sample_count[0]
     logsum = zero(here.by_key) - np.float32(np.inf)
     if call.geometry.nearest and n == here.tap_count[0] and n > 0:
@@ -69,7 +69,7 @@ def _find_weights(p, call, measured, here):
 
 @compiled
 def _find_tap_weights(p, n, call, measured, here):
-    """`_find_weights` where each sample has a tap of its own: no need to go from taps to samples and back."""
+    """Compute `_find_weights` where each sample has its own tap, without going to samples and back."""
     by_tap = here.by_key
     if call.biased:
         for j in range(n):
@@ -85,7 +85,7 @@ def _find_tap_weights(p, n, call, measured, here):
 
 @compiled
 def _find_statistics(here, statistics):
-    """Expected position, spread and largest of the weights, which are padded with 0; all 0 without taps."""
+    """Write expected position, spread and largest of the weights (padded with 0); all 0 without taps."""
     nothing = zero(here.x)
     if here.tap_count[0] == 0:
         fill(statistics, 0, 4, nothing)

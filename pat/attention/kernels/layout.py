@@ -1,6 +1,6 @@
-"""What the kernels work on: the inputs of a call and scratch. Tuples of arrays outside, of pointers inside.
+"""Data of the kernels: inputs of a call, and scratch, as tuples of arrays outside and of pointers inside.
 
-What works on pointers counts no references (a fifth of the time otherwise); the caller keeps the arrays.
+Pointers count no references (a fifth of the time otherwise); the caller keeps the arrays alive.
 """
 
 from __future__ import annotations
@@ -39,13 +39,17 @@ LAYOUT = (
     ("query", "number", "channel"),
     ("upstream", "number", "channel"),
 )
-"""The scratch of a block: name, kind, and one for each what of an alpha pixel."""
+"""Scratch of a block: name, kind, and the part of an alpha pixel that has one entry."""
 
 Block = namedtuple("Block", [name for name, _, _ in LAYOUT])  # type: ignore[misc]
 
 
 def block_scratch(samples: int, channels: int, number: np.dtype) -> Block:
-    """Room for a block: an array (BLOCK, length) for each line of `LAYOUT`, a pixel's values side by side."""
+    """Allocate the scratch of a block.
+
+    Returns:
+        An array (BLOCK, length) for each line of `LAYOUT`, the values of a pixel side by side.
+    """
     lengths = {"pixel": 1, "sample": samples + LANES, "tap": 4 * samples + 2 * LANES, "channel": channels}
     ends = {"integer": 0, "number": 0}
     slices = []
@@ -60,7 +64,23 @@ def block_scratch(samples: int, channels: int, number: np.dtype) -> Block:
 
 
 class Geometry(NamedTuple):
-    """Where the samples of a call lie."""
+    """Positions of a call's samples; arrays are flat.
+
+    Attributes:
+        points: ends of segments, or explicit positions, x and y of each pixel in turn.
+        mask: bytes, 1 for each segment or position that counts.
+        fractions: fractions of a segment at its samples, padded by `LANES`.
+        samples: number of samples per pixel.
+        straight: True for segments, False for explicit positions.
+        nearest: True for nearest pixels in place of bilinear interpolation.
+        alpha_pixels: number of alpha's pixels in an image.
+        shared: True if all images of the batch have the same points.
+        height: beta's height.
+        width: beta's width.
+        last_x: number of beta's last column, in the type of computation.
+        last_y: number of beta's last row.
+        slack: pixels beyond the edge at which a sample still counts.
+    """
 
     points: Any
     mask: Any
@@ -78,7 +98,18 @@ class Geometry(NamedTuple):
 
 
 class Call(NamedTuple):
-    """A call's inputs: images, geometry, bias (if `biased`), and the channels of query and value."""
+    """Inputs of a call.
+
+    Attributes:
+        query: alpha's features, flat, channels last.
+        key: beta's features, flat, channels last.
+        value: beta's values, flat, channels last.
+        geometry: positions of the samples.
+        bias: numbers added to the scores.
+        biased: True if there is a bias.
+        channels: number of channels of query and key.
+        value_channels: number of channels of value.
+    """
 
     query: Any
     key: Any
@@ -91,8 +122,15 @@ class Call(NamedTuple):
 
 
 class Share(NamedTuple):
-    """Work of one of several callers: pieces of `size` of the alpha pixels first .. last, drawn from a common
-    counter, with scratch of its own."""
+    """Work of one of several callers.
+
+    Attributes:
+        first: first alpha pixel of all callers.
+        last: end of the alpha pixels.
+        size: number of pixels of a piece, drawn from the counter.
+        counter: common counter of the callers.
+        block: the caller's own scratch.
+    """
 
     first: int
     last: int
@@ -102,7 +140,14 @@ class Share(NamedTuple):
 
 
 class Outputs(NamedTuple):
-    """Values, statistics (pixel, 4; if `measured`), and logarithms of the sums of exponentials."""
+    """Outputs of forward.
+
+    Attributes:
+        value: weighted values.
+        statistics: four per pixel, if `measured`.
+        logsum: logarithms of the sums of exponentials.
+        measured: True if statistics are wanted.
+    """
 
     value: Any
     statistics: Any
@@ -111,7 +156,15 @@ class Outputs(NamedTuple):
 
 
 class Saved(NamedTuple):
-    """What forward found, and the gradients by its outputs. Statistics of pixel p start at `step` p."""
+    """Results of forward, and gradients by its outputs.
+
+    Attributes:
+        statistics: statistics of forward; those of pixel p start at `step` p.
+        logsum: logarithms of the sums of exponentials.
+        value_upstream: gradients by the values.
+        statistics_upstream: gradients by the statistics.
+        step: distance between two pixels' statistics.
+    """
 
     statistics: Any
     logsum: Any
@@ -121,7 +174,16 @@ class Saved(NamedTuple):
 
 
 class Gradients(NamedTuple):
-    """Those that belong to alpha's pixels, and which of them are wanted. points and bias come zeroed."""
+    """Gradients of alpha's pixels, with flags for the wanted ones. `points` and `bias` must be zero before.
+
+    Attributes:
+        query: gradients by the query.
+        points: gradients by the points.
+        bias: gradients by the bias.
+        wants_query: True if `query` is wanted.
+        wants_points: True if `points` is wanted.
+        wants_bias: True if `bias` is wanted.
+    """
 
     query: Any
     points: Any
@@ -132,8 +194,15 @@ class Gradients(NamedTuple):
 
 
 class TapList(NamedTuple):
-    """What backward leaves for `scatter`, for each of the alpha pixels from `first` on: the number of its
-    taps, their rows, and their weights in the gradients of key and value."""
+    """Input of `scatter`, for each alpha pixel from `first` on.
+
+    Attributes:
+        first: first alpha pixel.
+        tap_count: number of its taps.
+        rows: beta's pixels of the taps.
+        key_weight: weights of the taps in the gradient of key.
+        value_weight: weights of the taps in the gradient of value.
+    """
 
     first: int
     tap_count: Any
@@ -143,14 +212,24 @@ class TapList(NamedTuple):
 
 
 class Taps(NamedTuple):
-    """The fields of a block that backward keeps in a `TapList`."""
+    """Fields of a block that backward stores in a `TapList`.
+
+    Attributes:
+        tap_count: number of a pixel's taps.
+        rows: beta's pixels of the taps.
+    """
 
     tap_count: Any
     rows: Any
 
 
 class Column(NamedTuple):
-    """A list for each pixel: where the first one's begins, and how far it is to the next."""
+    """One list for each pixel.
+
+    Attributes:
+        first: pointer to the first list.
+        step: distance to the next list.
+    """
 
     first: Any
     step: Any
@@ -160,7 +239,7 @@ class Column(NamedTuple):
 
 
 def _pointed(kind):
-    """The type of what `pointers` makes of a type."""
+    """Type of the result of `pointers` for a type."""
     if isinstance(kind, types.Array):
         first = types.CPointer(kind.dtype)
         return first if kind.ndim == 1 else types.NamedTuple([first, types.intp], Column)
@@ -188,7 +267,8 @@ def _tuple(code, kind, parts):
 
 @instruction(_pointed)
 def pointers(code, arrays):
-    """A tuple, pointers for flat arrays and a `Column` for arrays of two axes, in tuples within it, too."""
+    """Convert a tuple of arrays, nested ones too, to pointers for flat arrays and a `Column` for arrays of
+    two axes."""
     return _point(code, code.kinds[0], arrays)
 
 
@@ -198,14 +278,14 @@ def _first_of_each(block, *_):
 
 @instruction(_first_of_each)
 def pixel_of(code, block, slot: index):
-    """The pointers of one pixel of a block: those of its columns."""
+    """Return the pointers of one pixel of a block."""
     columns = [code.parts(column) for column in code.parts(block)]
     return code.pack([code.gep(first, [code.mul(slot, step)]) for first, step in columns])
 
 
 @instruction(lambda block, other: block)
 def replaced(code, block, other):
-    """A block with the columns that another tuple has by the same name."""
+    """Replace the columns of a block that another tuple has by the same name."""
     names, others = (kind.instance_class._fields for kind in code.kinds)
     changed = dict(zip(others, code.parts(other)))
     return code.pack([changed.get(name, column) for name, column in zip(names, code.parts(block))])
@@ -213,11 +293,11 @@ def replaced(code, block, other):
 
 @compiled
 def of(column, slot):
-    """The list of one pixel."""
+    """Return the list of one pixel."""
     return from_index(column.first, slot * column.step)
 
 
 @compiled
 def from_pixel(column, slot):
-    """The column from one pixel on."""
+    """Return the column from one pixel on."""
     return Column(of(column, slot), column.step)

@@ -1,4 +1,4 @@
-"""Attention of each pixel to a window around it, for images that lie channels first.
+"""Attention of each pixel to a window around it, for images with channels first.
 
 A sample is the same step away from every pixel, so that work on one is work on a whole row of pixels side by
 side: inner products with it, and its share of the mean.
@@ -18,15 +18,18 @@ from .vectors import add, load, maximum, splat, store, sub
 ROWS = 16
 """Rows of pixels that a thread takes at a time."""
 LOWEST = np.finfo(np.float32).min
-"""What scores are compared with at least: of -inf alone all weights are 0."""
+"""Lower bound of the largest score: pixels whose scores are all -inf get weights of 0."""
 
 
 @compiled(nogil=True, cache=True, fastmath={"contract"})
 def attend_rows(query, key, value, out, logsum, bias, which, size, spacing, top):
-    """`ROWS` rows of `out`, from `top` on, of one image (channels, h, w): the mean of the values at some
-    (`which`) of `size` x `size` pixels, `spacing` apart, by the softmax of inner products and the samples'
-    bias. What is outside the image does not count. And the logarithm of the sum of exponentials (h, w), inf
-    where nothing counts."""
+    """Compute `ROWS` rows, from `top` on, of one image (channels, h, w): the softmax-weighted mean of window
+    samples.
+
+    Written in place: `out`, the mean of the values at the samples `which` of `size` x `size` pixels,
+    `spacing` apart, with a bias for each sample; samples outside the image do not count. And `logsum` (h, w),
+    the log of the sum of exponentials, inf where no sample counts.
+    """
     channels, height, width = query.shape
     scores = np.empty((len(which), -(-width // LANES) * LANES), np.float32)
     total, top_score = np.empty(scores.shape[1], np.float32), np.empty(scores.shape[1], np.float32)
@@ -58,8 +61,8 @@ def attend_rows(query, key, value, out, logsum, bias, which, size, spacing, top)
 
 @compiled
 def _sampled(t, y, size, spacing, height, width):
-    """The row of sample t of the pixels in row y, the first of these for which it is in the image, the end of
-    these, and how far it is to the right."""
+    """Row of sample t for the pixels of row y, the first pixel for which it is in the image, the end of
+    these, and the sample's distance to the right."""
     row, step = y + (t // size - size // 2) * spacing, (t % size - size // 2) * spacing
     first, last = max(0, -step), min(width, width - step)
     if row < 0 or row >= height or first >= last:
@@ -69,7 +72,8 @@ def _sampled(t, y, size, spacing, height, width):
 
 @compiled
 def _exponentiate(rows, shape):
-    """From scores (samples, pixels) to exp(score - the pixel's largest), in place; their sums, and these."""
+    """Replace scores (samples, pixels) by exp(score - the pixel's largest), in place; writes their sums and
+    the largest."""
     scores, total, top_score = rows
     for x in range(0, shape[1], LANES):
         top, mass = splat(LOWEST), splat(np.float32(0))
@@ -85,11 +89,12 @@ def _exponentiate(rows, shape):
 
 @compiled(nogil=True, cache=True, fastmath={"contract"})
 def differentiate_rows(query, key, value, upstream, sums, gradients, wanted, bias, which, size, spacing, top):
-    """`ROWS` rows of the gradients by query, key and value, from `top` on, as far as `wanted`.
+    """Compute `ROWS` rows of the gradients by query, key and value, from `top` on, as far as `wanted`;
+    written in place.
 
-    `sums` (2, h, w) are the logarithm of the sum of exponentials, and the inner product of `upstream`, the
-    gradient by the output, with the output. A pixel is looked at from as many as it looks at: with the roles
-    of the two exchanged, what belongs to keys and values is gathered, too.
+    `sums` (2, h, w) are the log of the sum of exponentials, and the inner product of `upstream`, the gradient
+    by the output, with the output. A pixel is a sample of as many pixels as it has samples: with the roles of
+    the two exchanged, gradients of keys and values are gathered, too.
     """
     (channels, height, width), (by_query, by_key, by_value) = query.shape, gradients
     weight, slope = np.zeros((2, -(-width // LANES) * LANES), np.float32)
@@ -115,7 +120,7 @@ def differentiate_rows(query, key, value, upstream, sums, gradients, wanted, bia
 
 @compiled
 def _weigh(query, key, value, upstream, sums, bias, here, there, weight, slope):
-    """Weights of the pixels `there` (row, first, last) for those `here`, and the gradients by scores."""
+    """Weights of the pixels `there` (row, first, last) for the pixels `here`, and the gradients by scores."""
     (y, first, last), (row, start, stop) = here, there
     count = last - first
     logsum, mean_slope = sums[0, y, first:last], sums[1, y, first:last]
@@ -135,6 +140,6 @@ def _weigh(query, key, value, upstream, sums, bias, here, there, weight, slope):
 
 @compiled
 def _accumulate(total, factor, row):
-    """Add products of two rows."""
+    """Add the products of two rows."""
     for x in range(len(total)):
         total[x] += factor[x] * row[x]

@@ -1,4 +1,4 @@
-"""Which samples an alpha pixel has, which pixels of beta they touch (*taps*), and from one to the other."""
+"""Samples of an alpha pixel, the pixels of beta that they touch (*taps*), and conversion between both."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ from .vectors import (
 )
 
 ONE, HALF = np.float32(1), np.float32(0.5)
-"""In float32, so that they make a float64 of nothing that is not."""
+"""Constants in float32, so that no float32 result becomes float64."""
 
 
 @compiled
 def find_samples(p, geometry, here):
-    """The samples and taps of pixel p."""
+    """Find the samples and taps of pixel p; written in place."""
     here.sample_count[0] = n = _collect(p, geometry, here)
     first = p // geometry.alpha_pixels * (geometry.height * geometry.width)
     here.tap_count[0] = _find_taps(n, first, geometry, here) if n > 0 else 0
@@ -56,7 +56,7 @@ def _on_image(x, y, geometry, slack):
 
 @compiled
 def _collect(p, geometry, here):
-    """Positions of the samples of pixel p that count, padded with 0; how many."""
+    """Positions of the samples of pixel p that count, padded with 0. Returns their number."""
     pixel = p % geometry.alpha_pixels if geometry.shared else p
     if geometry.straight:
         n = _collect_segment(pixel, geometry, here) if geometry.mask[pixel] else 0
@@ -100,7 +100,7 @@ def _collect_segment(pixel, geometry, here):
 
 @compiled
 def _divide(start, along, geometry, out):
-    """start + fraction along, rounded as torch rounds it (no fused multiply-add)."""
+    """start + fraction · along, rounded as torch rounds it (no fused multiply-add)."""
     for i in range(0, geometry.samples, LANES):
         store(out, i, add(splat(start), mul(load(geometry.fractions, i), splat(along))))
 
@@ -110,7 +110,8 @@ def _divide(start, along, geometry, out):
 
 @compiled
 def _find_taps(n, first, geometry, here):
-    """Finds the taps of n samples; how many. `first` is the index of the first pixel of this beta."""
+    """Find the taps of n samples. Returns their number. `first` is the index of the first pixel
+    of this beta."""
     if geometry.nearest:
         m = _find_pixels(n, np.int32(first), geometry, here)
     else:
@@ -122,7 +123,7 @@ def _find_taps(n, first, geometry, here):
 
 @compiled
 def _find_pixels(n, first, geometry, here):
-    """The pixels that samples lie on, those of neighbours once. As many as samples: each has its own."""
+    """Pixels that samples lie on, equal neighbours once. If as many as samples, each has its own."""
     half, width, first = splat(HALF + zero(here.x)), splat(np.int32(geometry.width)), splat(first)
     last_x, last_y = splat(np.int32(geometry.width - 1)), splat(np.int32(geometry.height - 1))
     for j in range(0, n, LANES):
@@ -143,7 +144,12 @@ def _find_pixels(n, first, geometry, here):
 
 
 class Course(NamedTuple):
-    """Which way the samples of a pixel run on the whole: along y or x, backward or forward."""
+    """Main direction of a pixel's samples.
+
+    Attributes:
+        steep: True along y, False along x.
+        backward: True if the coordinate falls.
+    """
 
     steep: Any
     backward: Any
@@ -151,7 +157,7 @@ class Course(NamedTuple):
 
 @compiled
 def course_of(n, here):
-    """The course of n samples."""
+    """Return the course of n samples."""
     along_x, along_y = here.x[n - 1] - here.x[0], here.y[n - 1] - here.y[0]
     steep = abs(along_y) > abs(along_x)
     return Course(steep, along_y < 0 if steep else along_x < 0)
@@ -159,8 +165,8 @@ def course_of(n, here):
 
 @compiled
 def _find_corners(n, first, geometry, here):
-    """A cell's taps are four in a row: two behind, then the two ahead, as the samples run. A sample one cell
-    further has for its first two the last two of the sample before."""
+    """Find a cell's four taps in a row: two behind, then two ahead, as the samples run. A sample one cell
+    further shares its first two with the last two of the sample before."""
     course = course_of(n, here)
     width = np.int32(geometry.width)
     right, down = np.int32(min(1, geometry.width - 1)), np.int32(min(1, geometry.height - 1)) * width
@@ -184,7 +190,7 @@ def _find_corners(n, first, geometry, here):
 
 @compiled
 def _find_cells(n, first, geometry, here, course):
-    """The cell of each sample, as the index of its upper left pixel, and how far ahead and aside in it."""
+    """Cell of each sample, as the index of its upper left pixel, and the position ahead and aside in it."""
     nothing, one = splat(zero(here.x)), splat(ONE + zero(here.x))
     last_x, last_y = splat(geometry.last_x), splat(geometry.last_y)
     cell_x, cell_y = splat(np.int32(max(geometry.width - 2, 0))), splat(np.int32(max(geometry.height - 2, 0)))
@@ -207,7 +213,7 @@ def _find_cells(n, first, geometry, here, course):
 
 @compiled
 def interpolate(by_tap, geometry, here, out):
-    """From numbers on taps to numbers on samples."""
+    """Convert numbers on taps to numbers on samples."""
     n, m = here.sample_count[0], here.tap_count[0]
     if geometry.nearest:
         if m == n:
@@ -226,7 +232,7 @@ def interpolate(by_tap, geometry, here, out):
 
 @compiled
 def distribute(numbers, geometry, here, by_tap):
-    """From numbers on samples, padded with 0, to numbers on taps: the transpose of `interpolate`."""
+    """Convert numbers on samples, padded with 0, to numbers on taps: the transpose of `interpolate`."""
     n, m = here.sample_count[0], here.tap_count[0]
     if geometry.nearest and m == n:
         for j in range(0, n, LANES):
@@ -249,7 +255,7 @@ def distribute(numbers, geometry, here, by_tap):
 
 @compiled
 def interpolation_slopes(j, course, here, by_tap):
-    """How the interpolated number changes with x and with y, at sample j."""
+    """Return the derivatives of the interpolated number by x and y, at sample j."""
     u, v, t = here.ahead[j], here.aside[j], here.tap[j]
     a, b, c, d = by_tap[t], by_tap[t + 1], by_tap[t + 2], by_tap[t + 3]
     ahead, aside = (ONE - v) * (c - a) + v * (d - b), (ONE - u) * (b - a) + u * (d - c)

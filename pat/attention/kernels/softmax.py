@@ -1,4 +1,4 @@
-"""Weights of scores."""
+"""Softmax weights of scores."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from .vectors import (
 
 
 def exponentials(x):
-    """exp of a vector of numbers at most 0; 0 below exp(-87), a hair above the least of float32."""
+    """exp of a vector of numbers of at most 0; 0 below exp(-87), slightly above the least of float32."""
 
 
 @overload(exponentials)
@@ -61,7 +61,7 @@ def _exponentials32(x):
 
 @compiled
 def find_scores(p, call, here):
-    """The scores of pixel p's samples."""
+    """Compute the scores of pixel p's samples, padded with -inf; written in place."""
     n = here.sample_count[0]
     interpolate(here.by_key, call.geometry, here, here.score)
     if call.biased:
@@ -72,7 +72,8 @@ def find_scores(p, call, here):
 
 @compiled
 def softmax(n, score, weight):
-    """Weights of n scores, and the logarithm of the sum of exponentials (-inf if there is none)."""
+    """Compute the weights of n scores, written in place. Returns the log of the sum of exponentials (-inf for
+    no samples)."""
     best = load(score, 0)
     for j in range(LANES, n, LANES):
         best = maximum(load(score, j), best)
@@ -96,7 +97,7 @@ def _plain_sum(numbers, n):
 
 @compiled
 def exponentiate(n, score, weight, top):
-    """weight = exp(score - top), and the sum; scores are padded with -inf."""
+    """Compute weight = exp(score - top) in place; scores are padded with -inf. Returns the sum."""
     minus_top = splat(-top)
     mass = splat(zero(score))
     for j in range(0, n, LANES):

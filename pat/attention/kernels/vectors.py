@@ -26,31 +26,31 @@ def _first(kind, *_):
 
 @instruction(lambda counter: counter.dtype)
 def take(code, counter):
-    """Increments the number at a pointer atomically; gives what it was."""
+    """Increment the number at a pointer atomically; returns its former value."""
     return code.atomic_rmw("add", counter, ir.Constant(counter.type.pointee, 1), "monotonic")
 
 
 @instruction(_first)
 def from_index(code, array, i: index):
-    """The pointer to an index."""
+    """Return the pointer to an index."""
     return code.gep(array, [i])
 
 
 @instruction(lambda array: array.dtype)
 def zero(code, array):
-    """0 in the type of the numbers at a pointer."""
+    """Return 0 in the type of the numbers at a pointer."""
     return code.context.get_constant(code.result, 0)
 
 
 @instruction(lambda array, i: Vector(array.dtype))
 def load(code, array, i: index):
-    """The vector at an index."""
+    """Load the vector at an index."""
     return code.get(code.kinds[0], array, i)
 
 
 @instruction(_nothing)
 def store(code, array, i: index, vector):
-    """Stores a vector at an index."""
+    """Store a vector at an index."""
     code.put(code.kinds[0], array, i, vector)
 
 
@@ -59,13 +59,13 @@ def store(code, array, i: index, vector):
 
 @instruction(lambda array, i, n, lanes: row_of(Vector(array.dtype, lanes.literal_value), n))
 def load_row(code, array, i: index, n: literal, lanes: literal):
-    """n vectors of so many lanes from an index on."""
+    """Load n vectors of `lanes` lanes from an index on."""
     return code.pack([code.get(code.kinds[0], array, code.offset(i, k * lanes), lanes) for k in range(n)])
 
 
 @instruction(lambda array, starts, i: row_of(Vector(array.dtype, NARROW), starts.count))
 def gather_row(code, array, starts, i: index):
-    """The narrow vector at an index from each of some starts on."""
+    """Load the narrow vector at an index relative to each of some starts."""
     return code.pack(
         [code.get(code.kinds[0], array, code.add(start, i), NARROW) for start in code.parts(starts)]
     )
@@ -73,27 +73,27 @@ def gather_row(code, array, starts, i: index):
 
 @instruction(_nothing)
 def store_row(code, array, i: index, row):
-    """Stores a row from an index on."""
+    """Store a row from an index on."""
     for k, vector in enumerate(code.parts(row)):
         code.put(code.kinds[0], array, code.offset(i, k * vector.type.count), vector)
 
 
 @instruction(lambda row, n: row_of(row.dtype, n))
 def extend_row(code, row, n: literal):
-    """A row with zeros added: n vectors."""
+    """Extend a row by zeros to n vectors."""
     vectors = code.parts(row)
     return code.pack(vectors + [ir.Constant(vectors[0].type, None)] * (n - len(vectors)))
 
 
 @instruction(lambda array: Vector(array.dtype, NARROW))
 def nothing_narrow(code, array):
-    """A narrow vector of 0."""
+    """Return a narrow vector of 0."""
     return ir.Constant(code.context.get_value_type(code.result), None)
 
 
 @instruction(lambda vector, row, totals: totals)
 def fma_row(code, vector, row, totals):
-    """totals + vector row, each rounded once; instead of a vector a number does."""
+    """Compute totals + vector row, each rounded once; a number may replace the vector."""
     rows = list(zip(code.parts(row), code.parts(totals)))
     if not isinstance(vector.type, ir.VectorType):
         vector = code.repeat(vector, rows[0][0].type.count)
@@ -102,7 +102,7 @@ def fma_row(code, vector, row, totals):
 
 @instruction(lambda row, array, i: row.dtype)
 def dot_row(code, row, array, i: index):
-    """The products of a row with the one at an index, summed lane by lane."""
+    """Multiply a row with the one at an index, and sum the products lane by lane."""
     total = None
     for k, a in enumerate(code.parts(row)):
         b = code.get(code.kinds[1], array, code.offset(i, k * a.type.count), a.type.count)
@@ -112,7 +112,7 @@ def dot_row(code, row, array, i: index):
 
 @instruction(lambda weights, rows, t, image, channels, c, totals, n: totals)
 def fma_taps(code, weights, rows, t: index, image, channels: index, c: index, totals, n: literal):
-    """Adds, for each group k of n vectors of `totals`, weights[t + k] times the row image[rows[t + k], c]."""
+    """Add weights[t + k] times the row image[rows[t + k], c] to each group k of n vectors of `totals`."""
     vectors = code.parts(totals)
     lanes = vectors[0].type.count
     for k in range(0, len(vectors), n):
@@ -127,7 +127,7 @@ def fma_taps(code, weights, rows, t: index, image, channels: index, c: index, to
 
 @instruction(lambda row, n: row_of(row.dtype, n))
 def fold_row(code, row, n: literal):
-    """The sum, pair by pair, of the groups of n vectors of a row."""
+    """Sum the groups of n vectors of a row, pair by pair."""
     vectors = code.parts(row)
     groups = [vectors[k : k + n] for k in range(0, len(vectors), n)]
     while len(groups) > 1:
@@ -139,7 +139,7 @@ def fold_row(code, row, n: literal):
 
 
 def _elementwise(emit):
-    """The intrinsic of vectors of one kind that gives another one of it."""
+    """Make an intrinsic from vectors of one kind to another of the same kind."""
     return instruction(_first)(emit)
 
 
@@ -151,7 +151,7 @@ mul_int = _elementwise(lambda code, a, b: code.mul(a, b))
 minimum_int = _elementwise(lambda code, a, b: code.select(code.icmp_signed("<", a, b), a, b))
 minimum = _elementwise(lambda code, a, b: code.select(code.fcmp_ordered("<", a, b), a, b))
 maximum = _elementwise(lambda code, a, b: code.select(code.fcmp_ordered(">", a, b), a, b))
-"""Where either number is NaN, minimum and maximum are that of b."""
+"""Of minimum and maximum alike, b is the result where either number is NaN."""
 fma = _elementwise(lambda code, a, b, c: code.fused(a, b, c))
 """a b + c, rounded once."""
 exponentials64 = _elementwise(lambda code, a: code.intrinsic("llvm.exp.%", a.type, [a]))
@@ -159,13 +159,13 @@ exponentials64 = _elementwise(lambda code, a: code.intrinsic("llvm.exp.%", a.typ
 
 @_elementwise
 def keep_above(code, a, limit, b):
-    """The numbers of b; 0 where those of a are below the limit."""
+    """Keep the numbers of b where those of a are at least the limit; 0 elsewhere."""
     return code.select(code.fcmp_ordered("<", a, limit), ir.Constant(b.type, None), b)
 
 
 @_elementwise
 def two_to(code, a):
-    """2 to the power of whole numbers in float32."""
+    """Compute 2 to the power of whole numbers in float32."""
     whole = ir.VectorType(ir.IntType(32), LANES)
     exponent = code.add(code.fptosi(a, whole), ir.Constant(whole, [127] * LANES))
     return code.bitcast(code.shl(exponent, ir.Constant(whole, [23] * LANES)), a.type)
@@ -173,38 +173,38 @@ def two_to(code, a):
 
 @instruction(Vector)
 def splat(code, number):
-    """A vector of one number repeated."""
+    """Make a vector of one repeated number."""
     return code.repeat(number)
 
 
 @instruction(lambda a: Vector(types.int32))
 def truncated(code, a):
-    """A vector's numbers towards 0, as int32."""
+    """Truncate a vector's numbers towards 0, to int32."""
     return code.fptosi(a, ir.VectorType(ir.IntType(32), LANES))
 
 
 @instruction(lambda whole, like: like)
 def converted(code, whole, like):
-    """A vector of int32 in the type of another."""
+    """Convert a vector of int32 to the type of another."""
     return code.sitofp(whole, like.type)
 
 
 @instruction(lambda a: a.scalar)
 def total(code, a):
-    """The sum of a vector's numbers."""
+    """Sum a vector's numbers."""
     nothing = ir.Constant(a.type.element, 0.0)
     return code.intrinsic("llvm.vector.reduce.fadd.%", a.type.element, [nothing, a], fastmath=["reassoc"])
 
 
 @instruction(lambda a: a.scalar)
 def largest(code, a):
-    """The largest of a vector's numbers."""
+    """Return the largest of a vector's numbers."""
     return code.intrinsic("llvm.vector.reduce.fmax.%", a.type.element, [a], fastmath=["reassoc"])
 
 
 @instruction(_nothing)
 def add_totals(code, array, i: index, a, b, c, d):
-    """Adds the sums of four vectors to four numbers side by side."""
+    """Add the sums of four vectors to four adjacent numbers."""
     if a.type.count > NARROW:
         sums = _wide_totals(code, a, b, c, d)
     else:
@@ -214,14 +214,14 @@ def add_totals(code, array, i: index, a, b, c, d):
 
 
 def _neighbours(code, p, q):
-    """The sums of neighbours in two vectors; in each four of p's and q's, two of p first."""
+    """Sums of neighbours in two vectors; each four hold two of p's, then two of q's."""
     n = p.type.count
     even = [lane for k in range(0, n, 4) for lane in (k, k + 2, n + k, n + k + 2)]
     return code.fadd(code.shuffle(p, q, even), code.shuffle(p, q, [lane + 1 for lane in even]))
 
 
 def _wide_totals(code, a, b, c, d):
-    """Halves are added first, then neighbours twice."""
+    """Totals of wide vectors: halves are added first, then neighbours twice."""
 
     def folded(p, q):
         low = [*range(8), *range(16, 24)]
@@ -250,7 +250,7 @@ def _transpose(code, a, b, c, d):
 
 @instruction(lambda array, starts, i: row_of(Vector(array.dtype), 4))
 def load_fours(code, array, starts, i: index):
-    """Four vectors, the k-th of array[start + k] for the `LANES` starts at an index."""
+    """Load four vectors, the k-th of array[start + k] for the `LANES` starts at an index."""
 
     def four(k):
         return code.get(code.kinds[0], array, code.at(starts, code.offset(i, k)), 4)
@@ -260,7 +260,7 @@ def load_fours(code, array, starts, i: index):
 
 
 def _side_by_side(code, parts):
-    """One vector of all the numbers."""
+    """Join vectors into one."""
     while len(parts) > 1:
         parts = [code.shuffle(a, b, [*range(2 * a.type.count)]) for a, b in zip(parts[::2], parts[1::2])]
     return parts[0]
@@ -268,8 +268,8 @@ def _side_by_side(code, parts):
 
 @instruction(_nothing)
 def add_fours(code, array, starts, i: index, a, b, c, d):
-    """Adds the numbers of four vectors to array[start + k], k from 0 to 3, for the `LANES` starts at an
-    index, in their order. By twos: what the next start touches is the second two of this one."""
+    """Add the numbers of four vectors to array[start + k], k from 0 to 3, for the `LANES` starts at an index,
+    in their order. Twos at a time: the next start touches the second two of this one."""
     fours = _transpose(code, a, b, c, d)
     for k in range(LANES):
         start = code.at(starts, code.offset(i, k))
@@ -282,7 +282,7 @@ def add_fours(code, array, starts, i: index, a, b, c, d):
 
 @instruction(_nothing)
 def store_four(code, array, i: index, number, offsets):
-    """array[i + k] = number + offsets[k], k from 0 to 3."""
+    """Store array[i + k] = number + offsets[k], k from 0 to 3."""
     numbers = shifts = ir.Constant(ir.VectorType(number.type, 4), ir.Undefined)
     for k, shift in enumerate(code.parts(offsets)):
         shift = code.context.cast(code.builder, shift, code.kinds[3].dtype, code.kinds[0].dtype)

@@ -1,4 +1,4 @@
-"""Pairs and arrays on disk."""
+"""Stereo pairs and rendered scenes on disk."""
 
 from pat.lab.data.pairs import PAPER_DISPARITY, Disparity, StereoPair, folder_pairs, middlebury_pairs
 from pat.lab.data.windows import scene_folders

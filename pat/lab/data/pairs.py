@@ -1,8 +1,7 @@
-"""Stereo pairs on disk, one at a time.
+"""Stereo pairs on disk, read one at a time.
 
-The readers are generators that hold one pair in memory at a time. A folder without any pair is an error. Left
-is meant to be alpha, right beta: in a rectified pair the point at (x, y) in left is at (x - disparity, y) in
-right.
+Readers are generators that hold one pair in memory. A folder without a pair is an error. Left is meant to be
+alpha, right beta: in a rectified pair the point at (x, y) in left is at (x - disparity, y) in right.
 """
 
 from __future__ import annotations
@@ -24,14 +23,25 @@ T = TypeVar("T")
 
 
 class Disparity(NamedTuple):
-    """Disparity of left in pixels, >= 0, and where it is known."""
+    """True disparity of the left image.
+
+    Attributes:
+        value: disparity in pixels, 0 or more; meaningless where not `valid`.
+        valid: True where the disparity is known.
+    """
 
     value: Float[Tensor, "h w"]
     valid: Bool[Tensor, "h w"]
 
     def regions(self) -> DisparityRegions:
-        """Where left's pixels of known disparity are in right: another is in front if it is on the same pixel
-        of right and its disparity is greater by more than 1."""
+        """Classify the left image's pixels by whether right sees their point.
+
+        A pixel is occluded if another one falls on the same pixel of right with a disparity greater by more
+        than 1.
+
+        Returns:
+            Three masks (h, w): seen, occluded, beyond right's edge; all False where the disparity is unknown.
+        """
         column = (torch.arange(self.value.shape[1]).to(self.value) - self.value).round()
         on_right = self.valid & (column >= 0)
         index = torch.where(on_right, column, 0).long()
@@ -42,7 +52,13 @@ class Disparity(NamedTuple):
 
 
 class DisparityRegions(NamedTuple):
-    """Of left's pixels: those seen in right, behind others there, and beyond right's left edge."""
+    """Masks of the left image's pixels of known disparity; they exclude each other.
+
+    Attributes:
+        seen: visible in right.
+        occluded: behind another surface in right.
+        beyond: left of right's left edge.
+    """
 
     seen: Bool[Tensor, "h w"]
     occluded: Bool[Tensor, "h w"]
@@ -51,9 +67,14 @@ class DisparityRegions(NamedTuple):
 
 @dataclass(frozen=True)
 class StereoPair:
-    """Two images, 0..1, grey or RGB, and what is known about them.
+    """Two images and their known disparities.
 
-    `max_disparity` is in pixels of left, None where it is not known.
+    Attributes:
+        name: name in tables, usually the path.
+        left: image 0..1, grey or RGB.
+        right: image 0..1, grey or RGB.
+        max_disparity: largest disparity in pixels of left; None if unknown.
+        disparity: true disparity of left; None if unknown.
     """
 
     name: str
@@ -64,7 +85,13 @@ class StereoPair:
 
 
 class PairFiles(NamedTuple):
-    """The files of a rectified pair, and its largest disparity in pixels of left."""
+    """Files of a rectified pair.
+
+    Attributes:
+        left: left image.
+        right: right image.
+        max_disparity: largest disparity, pixels of left.
+    """
 
     left: Path
     right: Path
@@ -72,7 +99,7 @@ class PairFiles(NamedTuple):
 
 
 class _Middlebury(NamedTuple):
-    """How one Middlebury collection names its files, and the disparity value of one pixel."""
+    """File names of one Middlebury collection, and its disparity value for one pixel."""
 
     left: str
     right: str
@@ -98,20 +125,27 @@ LEFT_AND_RIGHT = (
     ("im2.", "im6."),
     ("im0.", "im1."),
 )
-"""The mark of a left image's path, and its counterpart in the right one's."""
+"""Marks of left and right images in their paths."""
 
 PAPER_DISPARITY = 120.0
-"""The paper's largest disparity in a rectified pair, in pixels of left; used where a data set states none."""
+"""Largest disparity in the paper, pixels of left; used where a data set states none."""
 
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".ppm", ".pgm"}
 
 
 def middlebury_pairs(root: str | Path) -> Iterator[StereoPair]:
-    """The 2001 to 2006 scenes under `root`/collection/scene with the true disparity of left.
+    """Read the 2001 to 2006 scenes under `root`/collection/scene, with left's true disparity.
 
-    Collections are distinguished by folder name: 2001..., 2003_quarter, ..._half, ..._third. The largest
-    disparity is the one that the files can hold (255 / scale), not the scene's own. Tsukuba is its cameras 3
-    and 4.
+    Collections are recognised by folder name: 2001..., 2003_quarter, ..._half, ..._third. Tsukuba is its
+    cameras 3 and 4.
+
+    Returns:
+        Pairs, read one at a time; their `max_disparity` is what the files can hold (255 / scale), not the
+        scene's own.
+
+    Raises:
+        FileNotFoundError: for a missing folder.
+        ValueError: for a folder without a pair.
     """
     root = _folder(root)
     scenes = _some(_middlebury_scenes(root), root)
@@ -119,7 +153,16 @@ def middlebury_pairs(root: str | Path) -> Iterator[StereoPair]:
 
 
 def folder_pairs(root: str | Path) -> Iterator[StereoPair]:
-    """Every (near-)rectified pair under `root`, names following one of `LEFT_AND_RIGHT`, such as KITTI's."""
+    """Read every pair under `root` whose names follow one of `LEFT_AND_RIGHT`, such as KITTI's. Rectification
+    is assumed.
+
+    Returns:
+        Pairs, read one at a time, with `max_disparity` `PAPER_DISPARITY` and no true disparity.
+
+    Raises:
+        FileNotFoundError: for a missing folder.
+        ValueError: for a folder without a pair.
+    """
     root = _folder(root)
     files = _some(_named(root), root)
     return (
@@ -129,9 +172,14 @@ def folder_pairs(root: str | Path) -> Iterator[StereoPair]:
 
 
 def pair_files(root: str | Path) -> list[PairFiles]:
-    """The files of every pair `middlebury_pairs` and `folder_pairs` read, in order, without reading them.
+    """List the files of every pair that `middlebury_pairs` and `folder_pairs` would read.
 
-    Raises FileNotFoundError for no such folder, ValueError where there is no pair.
+    Returns:
+        The files, sorted by the left image's path.
+
+    Raises:
+        FileNotFoundError: for a missing folder.
+        ValueError: for a folder without a pair.
     """
     root = _folder(root)
     files = {left: PairFiles(left, right, PAPER_DISPARITY) for left, right in _named(root)}
@@ -175,7 +223,7 @@ def _middlebury_pair(root: Path, left: Path, layout: _Middlebury) -> StereoPair:
 
 
 def _named(root: Path) -> list[tuple[Path, Path]]:
-    """Left and right by their names: the first of `LEFT_AND_RIGHT` whose right image is there."""
+    """Left and right files by their names: the first of `LEFT_AND_RIGHT` whose right image exists."""
     before = root.as_posix()
     files: list[tuple[Path, Path]] = []
     for left in (file for file in files_below(root) if file.suffix.lower() in IMAGE_SUFFIXES):
@@ -187,6 +235,6 @@ def _named(root: Path) -> list[tuple[Path, Path]]:
 
 
 def _pair_name(root: Path, left: Path) -> str:
-    """The path of `left` without the mark of left: `0001_L.png` is pair `0001`."""
+    """Path of `left` without its mark: `0001_L.png` is pair `0001`."""
     name = left.relative_to(root).with_suffix("").as_posix()
     return re.sub(r"(^|[/_])(L|left|image_2|colored_0|view1|im2|im0)($|/)", r"\3", name).strip("/") or name

@@ -1,4 +1,4 @@
-"""Rendered scenes on disk, their views, and windows cut from them."""
+"""Rendered scenes on disk: their views, and windows cut from them."""
 
 from __future__ import annotations
 
@@ -24,9 +24,17 @@ AGAIN = "remove it and run 'pat lab render' again"
 
 
 def scene_folders(root: str | Path) -> list[Path]:
-    """The complete scenes in a folder of a job, of scenes, or a scene itself, in order of their names.
+    """List the complete rendered scenes of a folder.
 
-    Raises FileNotFoundError for no such folder, ValueError where there is no scene, or an incomplete one.
+    Args:
+        root: folder of a job (with `scenes` in it), folder of scenes, or one scene.
+
+    Returns:
+        Folders in order of their names.
+
+    Raises:
+        FileNotFoundError: for a missing folder.
+        ValueError: for a folder without a scene, or with an incomplete one.
     """
     root = Path(root)
     if not root.is_dir():
@@ -45,7 +53,12 @@ def scene_folders(root: str | Path) -> list[Path]:
 
 @contextmanager
 def reading(folder: Path) -> Iterator[None]:
-    """Errors of what is read name the folder and what to do."""
+    """Context manager that turns errors while reading a scene into ValueError, naming the folder and a
+    remedy.
+
+    Raises:
+        ValueError: for any error of a damaged or missing file in the block.
+    """
     try:
         yield
     except (OSError, ValueError, KeyError, EOFError, BadZipFile, TypeError) as error:
@@ -54,13 +67,27 @@ def reading(folder: Path) -> Iterator[None]:
 
 
 def scene_rig(folder: Path) -> Rig:
-    """The cameras of a scene. Raises ValueError if they cannot be read, or are not calibrated."""
+    """Read the rig of a rendered scene.
+
+    Returns:
+        The rig as rendered; whether its cameras are calibrated is not checked.
+
+    Raises:
+        ValueError: naming the folder, if it cannot be read.
+    """
     with reading(folder):
         return Rendered(folder).rig
 
 
 class RenderedView(NamedTuple):
-    """An image in linear light, its pixels' depth (metres; NaN where the camera sees nothing), its camera."""
+    """One camera's view of a rendered scene.
+
+    Attributes:
+        rgb: image in linear light, 1 is white, may exceed it.
+        depth: z in metres at the pixels' centres; infinite where nothing is hit, NaN where the lens sees
+            nothing.
+        camera: the camera, float64.
+    """
 
     rgb: Float[Tensor, "3 h w"]
     depth: Float[Tensor, "h w"]
@@ -68,7 +95,15 @@ class RenderedView(NamedTuple):
 
 
 def read_view(folder: Path, name: str) -> RenderedView:
-    """A camera's first frame, as rendered. Raises ValueError, naming the folder, for one of no use."""
+    """Read a camera's first frame as rendered.
+
+    Returns:
+        The view.
+
+    Raises:
+        ValueError: naming the folder, if it cannot be read, the camera is not calibrated, or sizes disagree
+            with the rig.
+    """
     with reading(folder):
         frame, camera = Rendered(folder).frame(name), Rendered(folder).rig[name]
     if not isinstance(camera, Camera):
@@ -81,12 +116,16 @@ def read_view(folder: Path, name: str) -> RenderedView:
 
 
 def pinhole_of(camera: Camera) -> Camera:
-    """The camera itself, or its pinhole view if it has a lens model."""
+    """Return the camera's pinhole view, or the camera itself if it has no lens model."""
     return camera if camera.distortion is None else pinhole_view(camera)
 
 
 def undistorted(view: RenderedView) -> RenderedView:
-    """The view resampled to its pinhole camera, if it has a lens model."""
+    """Resample a view to its pinhole camera.
+
+    Returns:
+        The undistorted view, bicubic in colour and nearest in depth; the view itself without a lens model.
+    """
     if view.camera.distortion is None:
         return view
     pinhole = pinhole_of(view.camera)
@@ -96,7 +135,17 @@ def undistorted(view: RenderedView) -> RenderedView:
 
 
 def window(view: RenderedView, top: int, left: int, size: HW, hw: HW) -> RenderedView:
-    """A window of a view, reduced (or enlarged) to `hw`. Beyond the image its edge repeats, without depth."""
+    """Cut a window from a view and resize it to `hw`.
+
+    Args:
+        top: first row, may lie outside.
+        left: first column, may lie outside.
+        size: (height, width) of the window in the view.
+        hw: (height, width) of the result.
+
+    Returns:
+        The view of the window, with its camera. Outside the image colours repeat the edge and depth is NaN.
+    """
     rows, columns = (torch.arange(n) + start for n, start in zip(size, (top, left)))
     h, w = view.camera.hw
     inside = ((rows >= 0) & (rows < h))[:, None] & (columns >= 0) & (columns < w)
@@ -107,14 +156,23 @@ def window(view: RenderedView, top: int, left: int, size: HW, hw: HW) -> Rendere
 
 
 def reduced(rgb: Float[Tensor, "n c h w"], hw: HW) -> Float[Tensor, "n c h2 w2"]:
-    """Cubic (a = -0.5, antialiased) reduction of linear light, which stays above zero."""
+    """Reduce linear light cubically (a = -0.5, antialiased) to a size, clipped at zero.
+
+    Returns:
+        Images (n, c, h2, w2); the same tensor if the size is unchanged.
+    """
     if rgb.shape[-2:] == hw:
         return rgb
     return interpolate(rgb, hw, mode="bicubic", align_corners=False, antialias=True).clamp(min=0)
 
 
 def reduced_depth(depth: Float[Tensor, "n h w"], hw: HW) -> Float[Tensor, "n h2 w2"]:
-    """Depth at the new pixels' centres: inverse depth interpolated on even surfaces, the nearest at edges."""
+    """Resample depth to the centres of coarser pixels.
+
+    Returns:
+        Depth (n, h2, w2): inverse depth interpolated where it differs by under 1 % from the nearest pixel's,
+        else the nearest pixel's.
+    """
     old = (depth.shape[-2], depth.shape[-1])
     if old == hw:
         return depth

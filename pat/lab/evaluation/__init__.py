@@ -1,1 +1,1 @@
-"""Scores, baselines and ablations of fusions: the paper's protocols, tables and figures."""
+"""Evaluation of fusions: the paper's protocols, baselines, ablations, tables and figures."""

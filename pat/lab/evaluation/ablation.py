@@ -1,8 +1,7 @@
-"""What calibration is worth: one checkpoint, every family of receptive fields, on the same scenes.
+"""Ablation of calibration: one checkpoint with every family of receptive fields on the same scenes.
 
-The paper's figure of calibrated against rectified as a tool. Scenes are layered photographs seen by
-unrectified rigs, alpha with a focal length 1 to 3 times beta's, rendered here; or rendered folders of one's
-own.
+Reproduces the paper's comparison of calibrated and rectified fields. Scenes are layered photographs seen by
+unrectified rigs, alpha with a focal length 1 to 3 times beta's, or rendered folders.
 """
 
 from __future__ import annotations
@@ -78,19 +77,28 @@ RIGS = RigDistribution(
     rotation=3.0,
     decentring=0.05,
 )
-"""Rigs of the layered scenes: beta's focal length is 1/3 to 1 of alpha's, in images of equal sizes."""
+"""Rig distribution of the layered scenes: beta's focal length is 1/3 to 1 of alpha's, at equal
+image sizes."""
 DENSE_LIMIT = 2**31
-"""Bytes that explicit positions may take; the dense field of larger images is omitted."""
+"""Bytes of explicit positions above which the dense field is omitted."""
 RATIOS = (1.0, 1.5, 2.0)
-"""Where groups of focal ratios begin in the table; those below are one more."""
+"""Lower bounds of the table's groups of focal ratios; lower ratios form one more group."""
 CROP = 96
-"""Side of the crops in the figure, pixels."""
+"""Side in pixels of the figure's crops."""
 SHOWN = 4
-"""Cases in the figure."""
+"""Number of cases in the figure."""
 
 
 class AblationCase(NamedTuple):
-    """One scene: the rig, the recorded images, alpha's view in true colour, and its depth in metres."""
+    """One scene of the ablation.
+
+    Attributes:
+        name: name in tables.
+        rig: rig with cameras alpha and beta, and a depth range.
+        images: recorded images by camera; alpha is grey.
+        ground_truth: alpha's view in colour, (3, h, w), 0..1.
+        depth: true depth of alpha's pixels in metres, (h, w).
+    """
 
     name: str
     rig: Rig
@@ -100,16 +108,19 @@ class AblationCase(NamedTuple):
 
     @property
     def ratio(self) -> float:
-        """Alpha's focal length over beta's."""
+        """Alpha's focal length divided by beta's."""
         alpha, beta = self.rig.pair(ALPHA, BETA).cameras
         return float(alpha.K[0, 0] / beta.K[0, 0])
 
 
 @dataclass(frozen=True)
 class FieldFamily:
-    """A receptive field, given the largest displacement from H x, and the rig that it is computed from.
+    """Family of receptive fields, and the rig that the field is computed from.
 
-    If `warped`, both images are rectified by that rig before, and the result is warped back.
+    Attributes:
+        field: receptive field for the largest displacement from H x in pixels; None for the default field.
+        assumed: returns the (possibly wrong) rig to fuse with, given the true one and a generator.
+        warped: True to rectify both images by that rig first and to warp the result back.
     """
 
     field: Callable[[float], ReceptiveField | None]
@@ -117,7 +128,18 @@ class FieldFamily:
     warped: bool = False
 
     def fuse(self, network: FusionNetwork, rig: Rig, case: AblationCase, far: float) -> tuple[Tensor, Tensor]:
-        """Alpha's view fused (3, H, W), its depth. Raises ValueError for a rig that cannot be rectified."""
+        """Fuse a case with this family.
+
+        Args:
+            rig: rig to fuse with.
+            far: largest displacement from H x, pixels of beta.
+
+        Returns:
+            Alpha's fused view (3, h, w), and its depth in metres (h, w).
+
+        Raises:
+            ValueError: for a rig that cannot be rectified, or a field that the network does not support.
+        """
         settings = FuseSettings(field=self.field(far))
         if not self.warped:
             frame = fuse_frame(case.images, rig, alpha=ALPHA, network=network, settings=settings)
@@ -128,10 +150,17 @@ class FieldFamily:
 
 
 class AblationRow(NamedTuple):
-    """One family on one scene: scores of the image, error in beta of points at the depth found (pixels).
+    """Result of one family on one scene.
 
-    `within_one` is the share of pixels whose point is within one pixel of its true position in beta. `note`
-    says why there are no figures, where there are none.
+    Attributes:
+        scene: name of the case.
+        ratio: alpha's focal length over beta's.
+        family: name of the family, or of a baseline.
+        psnr: PSNR in dB; NaN if there is no result.
+        ssim: SSIM; NaN if there is no result.
+        end_point_error: mean error in pixels of beta of the points at the estimated depth; NaN without depth.
+        within_one: share of pixels whose point is within a pixel of its true position in beta.
+        note: reason for a missing result; else empty.
     """
 
     scene: str
@@ -146,15 +175,21 @@ class AblationRow(NamedTuple):
 
 @dataclass(frozen=True)
 class HorizontalDisplacement:
-    """The rectified assumption at its best: H known, so position and scale; only lines are taken as rows.
+    """Field along rows around the true H x: rectified geometry with correct position and scale.
 
-    The segment is +-`disparity` pixels along x around H x.
+    Attributes:
+        disparity: half length of the segment, pixels.
     """
 
     disparity: float
 
     def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> Segments:
-        """Horizontal segments of beta around H x."""
+        """Compute horizontal segments in beta around H x, clipped to its image.
+
+        Returns:
+            Segments for pixels x (n, 2) of alpha; invalid where H x is infinite or the segment misses the
+            image.
+        """
         centre, finite = apply_homography(pair.homography, x)
         step = centre.new_tensor([self.disparity, 0.0])
         segments = clip_to_image(centre + step, centre - step, pair.beta.hw)
@@ -162,7 +197,8 @@ class HorizontalDisplacement:
 
 
 def families() -> dict[str, FieldFamily]:
-    """Every family by name, `calibrated` first."""
+    """Return every family by name, `calibrated` first; then wrong calibrations (rotation,
+    principal point)."""
     exact = {
         "calibrated": FieldFamily(lambda disparity: None),  # the default
         "rectified, warped": FieldFamily(lambda disparity: Epipolar(), warped=True),
@@ -179,7 +215,11 @@ def families() -> dict[str, FieldFamily]:
 
 
 def disparity(network: FusionNetwork, pair: Pair) -> float:
-    """The largest displacement of a point from H x, pixels of beta as the network gets it."""
+    """Bound the displacement of a point from H x over the depth range.
+
+    Returns:
+        Pixels of beta as the network receives it (resized if it needs equal resolutions); 1 or more.
+    """
     if pair.has_lens:
         segments = Curved(bounds=natural_bounds(pair))(
             pair, coarse_grid(pair.alpha.hw).reshape(-1, 2).double()
@@ -198,7 +238,19 @@ def layered_cases(
     hw: HW = (240, 320),
     seed: int = 0,
 ) -> Iterator[AblationCase]:
-    """Scenes of layered photographs (scikit-image's, if none are given), recorded with some noise."""
+    """Render cases from layered photographs, with some noise.
+
+    Args:
+        count: number of cases.
+        photos: folders of photographs; empty for those in scikit-image.
+        hw: (height, width) of both images.
+
+    Yields:
+        One case at a time.
+
+    Raises:
+        ValueError: for folders without images.
+    """
     bank = PhotoBank.load(*photos) if photos else sample_photographs()
     scenes, g = LayeredScenes(bank, RIGS, hw=hw, seed=seed), Generator().manual_seed(seed)
     for number in range(count):
@@ -209,7 +261,15 @@ def layered_cases(
 
 
 def rendered_cases(folder: Path, *, seed: int = 0) -> Iterator[AblationCase]:
-    """Rendered scenes of a folder (`scene_folders`): their first camera is alpha, their second beta."""
+    """Read cases from rendered scenes (`scene_folders`): their first camera is alpha, their second beta.
+
+    Returns:
+        Iterator over the cases, with noise drawn from `seed`.
+
+    Raises:
+        FileNotFoundError: for a missing folder.
+        ValueError: for a folder without scenes.
+    """
 
     def case(path: Path) -> AblationCase:
         scene, g = Rendered(path), Generator().manual_seed(seed)
@@ -225,7 +285,7 @@ def rendered_cases(folder: Path, *, seed: int = 0) -> Iterator[AblationCase]:
 def _recorded(
     name: str, rig: Rig, ground_truth: Tensor, beta_image: Tensor, depth: Tensor, g: Generator
 ) -> AblationCase:
-    """The case of two ideal images: some noise, a depth range a little wider than the scene's."""
+    """Case of two ideal images, with noise and a depth range 10 % wider than the scene's."""
     finite = depth[depth.isfinite()]
     images = recorded({ALPHA: luminance(ground_truth), BETA: beta_image}, g)
     rig = rig.replace(depth=(float(finite.min()) / 1.1, float(finite.max()) * 1.1))
@@ -233,15 +293,22 @@ def _recorded(
 
 
 def recorded(ideal: Mapping[str, Tensor], g: Generator) -> dict[str, Tensor]:
-    """Ideal images (C, H, W) as good cameras record them: some noise, 8 bits."""
+    """Simulate recording by a good camera: little noise, 8 bits.
+
+    Returns:
+        Images (c, h, w) in 0..1 by name.
+    """
     steps = [Noise(8000, 3), Clip(), Quantise(8)]
     return {name: record(image[None], steps, g)[0] for name, image in ideal.items()}
 
 
 def sample_photographs(*, count: int = 12, seed: int = 0) -> PhotoBank:
-    """The photographs that scikit-image ships, and `count` patterns drawn by the seed.
+    """Load the photographs in scikit-image, and `count` patterns drawn from `seed`.
 
     They are free to use (astronaut: NASA; chelsea, coffee and rocket: CC0).
+
+    Returns:
+        Bank of textures.
     """
     from skimage import io
     from skimage.data import data_dir
@@ -256,7 +323,11 @@ def sample_photographs(*, count: int = 12, seed: int = 0) -> PhotoBank:
 def ablate(
     network: FusionNetwork, cases: Iterable[AblationCase], chosen: Mapping[str, FieldFamily], *, out: Path
 ) -> list[AblationRow]:
-    """Every chosen family on every case; ablation.md, .csv and .png (crops of some cases) go to `out`."""
+    """Run every chosen family on every case; write ablation.md, .csv and .png (crops of some cases) to `out`.
+
+    Returns:
+        One row for each family and case, baselines included.
+    """
     rows: list[AblationRow] = []
     panels: dict[str, Tensor] = {}
     for i, case in enumerate(track(cases, "ablating", disable=not sys.stderr.isatty())):
@@ -299,9 +370,11 @@ def _case(
 
 
 def point_errors(case: AblationCase, depth: Float[Tensor, "h w"]) -> tuple[float, float]:
-    """Mean error in beta (pixels) of points at `depth` where known; the share of all within a pixel.
+    """Compare estimated with true depth by the projection into beta, also for points that beta does not see.
 
-    Whether beta sees the point or not: the reference is the projection at the true depth.
+    Returns:
+        Mean error in pixels of beta where both are known, and share of pixels of known true depth with an
+        error of at most 1; (nan, nan) if none can be compared.
     """
     alpha, beta = case.rig.pair(ALPHA, BETA).cameras
     x = pixel_grid(alpha.hw, dtype=torch.float64).reshape(-1, 2)
@@ -316,7 +389,12 @@ def point_errors(case: AblationCase, depth: Float[Tensor, "h w"]) -> tuple[float
 
 
 def markdown(rows: Sequence[AblationRow]) -> str:
-    """One line a family: mean PSNR, its 95% bootstrap interval, SSIM, dB to calibrated, by focal ratio."""
+    """Format rows as a Markdown table with an introduction, one line for each family.
+
+    Returns:
+        The text: mean PSNR with 95 % bootstrap interval, SSIM, difference to calibrated in dB, PSNR by focal
+        ratio, errors in beta.
+    """
     between = [f"ratio {low:g} to {high:g}" for low, high in pairwise(RATIOS)]
     bins = [f"ratio below {RATIOS[0]:g}", *between, f"ratio from {RATIOS[-1]:g}"]
     columns = ["family", "PSNR", "SSIM", "against calibrated", *bins, "off, px", "within 1 px", ""]
@@ -334,7 +412,7 @@ def markdown(rows: Sequence[AblationRow]) -> str:
 
 
 def _cells(rows: Sequence[AblationRow], every: Sequence[AblationRow]) -> list[str]:
-    """One family's line of the table: its own rows, and all rows for the reference."""
+    """Cells of one family's line, with all rows as reference."""
     served = [row for row in rows if not math.isnan(row.psnr)]
     if not served:
         return [""] * (len(RATIOS) + 6) + [rows[0].note]
@@ -358,13 +436,17 @@ def _scenes(count: int) -> str:
 
 
 def _mean(values: Sequence[float]) -> float:
-    """Of those that are known; NaN if none is."""
+    """Mean of the values that are not NaN; NaN if there is none."""
     numbers = [value for value in values if not math.isnan(value)]
     return float(np.mean(numbers)) if numbers else math.nan
 
 
 def crops(case: AblationCase, images: Mapping[str, Tensor], rows: Sequence[AblationRow]) -> dict[str, Tensor]:
-    """Crops by title of what was fused, where calibrated and rectified differ most; PSNR is the whole's."""
+    """Cut crops of a case where calibrated and rectified fields differ most.
+
+    Returns:
+        Crops (3, h, w) by title; a title has the PSNR of the whole image.
+    """
     window = (slice(None), *_most_different(images, case.ground_truth))
     panels = {f"{case.name}: ground truth\nfocal ratio {case.ratio:.1f}": case.ground_truth[window]}
     for row in rows:
@@ -374,7 +456,7 @@ def crops(case: AblationCase, images: Mapping[str, Tensor], rows: Sequence[Ablat
 
 
 def _most_different(images: Mapping[str, Tensor], ground_truth: Tensor) -> tuple[slice, slice]:
-    """The square in which the rectified assumption is worse than calibrated by most."""
+    """Square in which the rectified assumption is worst compared with calibrated."""
     h, w = ground_truth.shape[1:]
     side = min(CROP, h, w)
     names = [n for n in ("rectified assumption", "calibrated") if n in images]
@@ -392,7 +474,7 @@ def _rotated(degrees: float, rig: Rig, g: Generator) -> Rig:
 
 
 def turned(rig: Rig, rotation: Float[Tensor, "3"]) -> Rig:
-    """Beta turned about its centre, by a rotation vector in its own axes."""
+    """Return the rig with beta rotated about its centre by a rotation vector (radians) in beta's axes."""
     beta = rig.pair(ALPHA, BETA).cameras[1]
     turn = Pose(rotation_from_vector(rotation), torch.zeros(3).double())
     return rig.with_camera(BETA, beta.replace(cam_from_world=turn @ beta.cam_from_world))

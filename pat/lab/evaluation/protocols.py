@@ -1,6 +1,6 @@
-"""The paper's mono + colour on stereo pairs: what a method is given, and the methods that are compared.
+"""The paper's mono + colour protocol on stereo pairs, and the methods under comparison.
 
-Left made grey is alpha, right, reduced, is beta.
+Left made grey is alpha; right, reduced, is beta.
 """
 
 from __future__ import annotations
@@ -26,10 +26,14 @@ from ..data.pairs import Disparity, StereoPair
 
 
 class MonoColourTask(NamedTuple):
-    """What a fusion gets (`alpha`, `beta`) and what it should return (`ground_truth`).
+    """One fusion task of the protocol.
 
-    alpha is grey and sharp. beta is in colour and `rate` times smaller: the pixel at x in the whole right
-    image is at (x + 0.5) / rate - 0.5 in it. `disparity` is of the ground truth's pixels, where it is known.
+    Attributes:
+        alpha: grey image, sharp.
+        beta: image in colour, `rate` times smaller: the pixel at x in right is at (x + 0.5) / rate - 0.5 in
+            it.
+        ground_truth: left in colour.
+        disparity: true disparity of the ground truth's pixels; None if unknown.
     """
 
     alpha: Float[Tensor, "1 h w"]
@@ -39,11 +43,17 @@ class MonoColourTask(NamedTuple):
 
 
 def mono_colour_task(pair: StereoPair, rate: int) -> MonoColourTask:
-    """Left as grey alpha (Rec. 601) and as ground truth in colour; right, reduced `rate` times, as beta.
+    """Make the task of a stereo pair: left as grey alpha (Rec. 601) and as ground truth, right reduced as
+    beta.
 
-    A pixel of beta is the mean of `rate` x `rate` pixels of right, as a sensor with larger pixels sees it.
-    Rows and columns beyond the last multiple of `rate` are cut from the bottom and the right. Raises
-    ValueError for a grey pair, and for images of unequal sizes.
+    A pixel of beta is the mean of `rate` x `rate` pixels, as a sensor with larger pixels sees it. Rows and
+    columns beyond the last multiple of `rate` are cut.
+
+    Returns:
+        The task.
+
+    Raises:
+        ValueError: for a grey pair, and images of unequal sizes.
     """
     if pair.left.shape[0] != 3 or pair.right.shape[0] != 3:
         raise ValueError(f"{pair.name}: the mono + colour protocol needs colour images, and these are grey")
@@ -58,29 +68,39 @@ def mono_colour_task(pair: StereoPair, rate: int) -> MonoColourTask:
 
 
 def cut_to_multiple(image: Shaped[Tensor, "*c h w"], rate: int) -> Shaped[Tensor, "*c hc wc"]:
-    """The image without the rows and columns beyond the last multiple of `rate`."""
+    """Cut the rows and columns beyond the last multiple of `rate`, at the bottom and the right.
+
+    Returns:
+        A view of the image.
+    """
     height, width = (side - side % rate for side in image.shape[-2:])
     return image[..., :height, :width]
 
 
 def hw_of(image: Float[Tensor, "*c h w"]) -> HW:
-    """Height and width."""
+    """Return an image's (height, width)."""
     return image.shape[-2], image.shape[-1]
 
 
 class StereoResult(NamedTuple):
-    """An image (3, H, W), 0..1 or more, and the disparity (H, W) of its match in alpha's pixels, or NaN."""
+    """Result of a fusion method.
+
+    Attributes:
+        image: fused image (3, h, w), may exceed 0..1.
+        disparity: disparity (h, w) in alpha's pixels, NaN where unknown; None for a method without matching.
+    """
 
     image: Tensor
     disparity: Tensor | None = None
 
 
 StereoMethod = Callable[[Tensor, Tensor, float], StereoResult]
-"""Of alpha (1, H, W), beta (3, Hb, Wb), and the largest disparity in alpha's pixels."""
+"""Fusion method: called with alpha (1, h, w), beta (3, hb, wb) and the largest disparity in
+alpha's pixels."""
 
 
 def enlarged(beta: Float[Tensor, "c hb wb"], hw: HW) -> Float[Tensor, "c h w"]:
-    """Beta as large as alpha (bicubic, 0..1), and not warped."""
+    """Enlarge beta to alpha's size (bicubic, clipped to 0..1), without warping."""
     return interpolate(beta[None], hw, mode="bicubic", align_corners=False)[0].clamp(0, 1)
 
 
@@ -89,7 +109,7 @@ BASELINES: dict[str, StereoMethod] = {
     "beta": lambda alpha, beta, most: StereoResult(enlarged(beta, hw_of(alpha))),
     "classical": lambda alpha, beta, most: StereoResult(classical_fusion(alpha, beta, most)),
 }
-"""Methods without learning, by name: without any colour, without any matching."""
+"""Methods without learning: alpha alone, beta alone, and the classical fusion."""
 
 
 def rectified_fusion(
@@ -99,9 +119,16 @@ def rectified_fusion(
     settings: FuseSettings = FuseSettings(),
     matcher: Matcher = match,
 ) -> StereoMethod:
-    """`fuse` with a network as a method, alpha on the left: segments are rows, `max_disparity` pixels long.
+    """Make a method from `fuse` with a network, alpha on the left: segments are rows, `max_disparity` pixels
+    long.
 
-    With `bands` each channel of beta is a camera. A field in the settings replaces rows of that length.
+    Args:
+        bands: True to treat each channel of beta as a camera of its own.
+        settings: settings of fusion; a field in them replaces the rows.
+        matcher: matcher to use instead of `match`.
+
+    Returns:
+        The method.
     """
 
     def fused(alpha: Tensor, beta: Tensor, max_disparity: float) -> StereoResult:
@@ -116,9 +143,16 @@ def rectified_fusion(
 
 
 def rectified_rig(hw: HW, betas: Mapping[str, HW], max_disparity: float) -> Rig:
-    """A rectified rig in which disparity is alpha's width over depth, in pixels of alpha.
+    """Make a rectified rig in which disparity is alpha's width over depth, in pixels of alpha.
 
-    All cameras have the same field of view; the betas are co-located, one metre to the right of alpha.
+    All cameras have the same field of view; the betas are together, one metre to the right of alpha.
+
+    Args:
+        betas: (height, width) of each beta.
+        max_disparity: pixels of alpha, which sets the near bound; the far bound is infinity.
+
+    Returns:
+        The rig.
     """
     alpha = Camera(K=intrinsics(float(hw[1]), hw), cam_from_world=Pose.identity(), hw=hw)
     right = alpha.replace(cam_from_world=Pose(alpha.R, alpha.t.new_tensor([-1.0, 0.0, 0.0])))

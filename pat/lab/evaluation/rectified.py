@@ -1,4 +1,4 @@
-"""The fair contender of calibrated segments: images warped to rows, fused there, the result warped back."""
+"""Comparison method for calibrated segments: warp images to rows, fuse there, warp the result back."""
 
 from __future__ import annotations
 
@@ -14,11 +14,18 @@ from arraygeom.pixels import HW, product
 from arraygeom.sampling import Interpolation
 
 LARGEST = 6.0
-"""A canvas of more times alpha's pixels is refused: a camera nearly ahead stretches it without bound."""
+"""Largest canvas, in multiples of alpha's pixels: a camera nearly ahead stretches it without bound."""
 
 
 class Warped(NamedTuple):
-    """A rectified pair: its two cameras as a rig, their images by name, and the way back."""
+    """Rectified pair of images.
+
+    Attributes:
+        rig: the two rectified cameras, with the depth range.
+        images: rectified images (c, h, w) by name.
+        rectification: homographies and cameras of the rectification.
+        original: the pair before it.
+    """
 
     rig: Rig
     images: dict[str, Tensor]
@@ -28,11 +35,15 @@ class Warped(NamedTuple):
     def back(
         self, image: Float[Tensor, "c h w"], *, interpolation: Interpolation = "bicubic"
     ) -> Float[Tensor, "c ha wa"]:
-        """An image of the canvas at alpha's pixels."""
+        """Warp an image of the canvas to alpha's pixels.
+
+        Returns:
+            Image (c, ha, wa); beyond the canvas its border repeats.
+        """
         return warped(image, self.rectification.H_alpha, self.original.alpha.hw, interpolation=interpolation)
 
     def depth_back(self, depth: Float[Tensor, "h w"]) -> Float[Tensor, "ha wa"]:
-        """Depth of the canvas as alpha's at its pixels, by the nearest pixel."""
+        """Warp a depth map of the canvas to alpha: depth along alpha's axis, from the nearest pixel."""
         level, (alpha, _) = self.rectification.pair.cameras[0], self.original.cameras
         x = apply_homography(self.rectification.H_alpha, pixel_grid(alpha.hw, dtype=torch.float64)).x
         warped = self.back(depth[None], interpolation="nearest")[0].double()
@@ -40,10 +51,16 @@ class Warped(NamedTuple):
 
 
 def rectified(rig: Rig, images: Mapping[str, Tensor]) -> Warped:
-    """The first two cameras of a rig and their images (C, H, W), with epipolar lines as rows.
+    """Rectify the first two cameras of a rig and their images, so that epipolar lines are rows.
 
-    The canvas holds all of alpha, with alpha's focal length: nothing of alpha is lost but what resampling
-    costs. Raises ValueError where the pair cannot be rectified, or not onto a canvas of sensible size.
+    The canvas holds all of alpha at alpha's focal length: alpha loses only what resampling costs.
+
+    Returns:
+        The rectified pair; images clipped to 0..1.
+
+    Raises:
+        ValueError: for a pair that cannot be rectified, or not onto a canvas of up to `LARGEST` times alpha's
+            pixels.
     """
     first, second = rig.names[:2]
     pair = rig.pair(first, second)
@@ -57,7 +74,14 @@ def rectified(rig: Rig, images: Mapping[str, Tensor]) -> Warped:
 
 
 def whole_alpha(pair: Pair) -> Rectification:
-    """`rectify` at alpha's focal length, onto the canvas that alpha's image fills."""
+    """Rectify a pair at alpha's focal length, onto the canvas that alpha's image fills.
+
+    Returns:
+        The rectification.
+
+    Raises:
+        ValueError: if the baseline is too close to an optical axis.
+    """
     alpha, _ = pair.cameras
     rough = rectify(pair)
     h, w = alpha.hw
@@ -79,6 +103,10 @@ def whole_alpha(pair: Pair) -> Rectification:
 
 
 def warped(image: Tensor, H: Tensor, hw: HW, *, interpolation: Interpolation = "bicubic") -> Tensor:
-    """An image (C, h, w) at H x for the pixels x of an image of size hw; its border is repeated beyond."""
+    """Sample an image at H x for all pixels x of an image of size `hw`; its border repeats beyond.
+
+    Returns:
+        Image (c, *hw).
+    """
     x = apply_homography(H, pixel_grid(hw, dtype=torch.float64)).x
     return sample(image[None], x[None].float(), interpolation=interpolation, extended=True).values[0]

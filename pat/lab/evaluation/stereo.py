@@ -1,4 +1,4 @@
-"""Methods compared on stereo pairs by the paper's protocols: scores, tables, images."""
+"""Comparison of methods on stereo pairs by the paper's protocols: scores, tables, images."""
 
 from __future__ import annotations
 
@@ -26,14 +26,21 @@ DATA_SETS: dict[str, Callable[[Path], Iterable[StereoPair]]] = {
     "flickr1024": folder_pairs,
     "folder": folder_pairs,
 }
-"""Readers of the folders, by data set."""
+"""Readers of folders by data set."""
 
 
 class StereoRow(NamedTuple):
-    """Scores of one method on one pair with beta reduced `rate` times.
+    """Scores of one method on one pair.
 
-    `end_point_error` (pixels) and `within_one` (share of the pixels with a true disparity) are None where the
-    true disparity is not known or the method gives none.
+    Attributes:
+        pair: name of the pair.
+        rate: factor by which beta is reduced.
+        method: name of the method.
+        psnr: PSNR in dB.
+        ssim: SSIM.
+        end_point_error: mean error of disparity in pixels; None without true disparity or without an
+            estimate.
+        within_one: share of pixels of known true disparity with an error of at most one pixel; None likewise.
     """
 
     pair: str
@@ -52,7 +59,11 @@ def evaluate_sets(
     *,
     out: Path,
 ) -> dict[str, list[StereoRow]]:
-    """`evaluate_pairs` on data sets by name: rows by set, a strip of images a pair in out/set."""
+    """Evaluate methods on several data sets by `evaluate_pairs`; strips of images go to `out`/set.
+
+    Returns:
+        Rows by data set.
+    """
     return {name: evaluate_pairs(pairs, methods, rates, images=out / name) for name, pairs in sets.items()}
 
 
@@ -64,11 +75,18 @@ def evaluate_pairs(
     max_disparity: float = PAPER_DISPARITY,
     images: Path | None = None,
 ) -> list[StereoRow]:
-    """Each method's scores on each pair at each rate: whole frames, values clipped to 0..1 and not rounded.
+    """Score each method on each pair at each rate: whole frames, values clipped to 0..1, not rounded.
 
-    `max_disparity`, in alpha's pixels, is the same for all (the paper's: 120 / rate pixels of beta). With
-    `images`, a folder, a strip for each pair and rate goes there: beta enlarged, each method, the ground
-    truth.
+    Args:
+        max_disparity: pixels of alpha, the same for all pairs (the paper's: 120 / rate pixels of beta).
+        images: folder for one strip of each pair and rate: beta enlarged, each method, the ground truth; None
+            writes none.
+
+    Returns:
+        One row for each pair, rate and method.
+
+    Raises:
+        ValueError: for grey pairs, and images of unequal sizes.
     """
     rows = []
     for pair in track(pairs, "evaluating", disable=not sys.stderr.isatty()):
@@ -87,13 +105,21 @@ def evaluate_pairs(
 
 
 PrintedScores = Mapping[int, tuple[float, float]]
-"""Published PSNR and SSIM, by rate."""
+"""Published (PSNR, SSIM) by rate."""
 
 
 def sets_markdown(
     rows: Mapping[str, Sequence[StereoRow]], *, printed: Mapping[str, PrintedScores] = {}, depth: bool = True
 ) -> str:
-    """`markdown` of each data set under its name, then `structure_kept` and, with `depth`, its errors."""
+    """Format rows of several data sets: a table of each, the sentence of `structure_kept`, and errors of
+    depth if wanted.
+
+    Args:
+        printed: published scores by data set, shown in a column of their own.
+
+    Returns:
+        Markdown text.
+    """
     parts = []
     for name, of_set in rows.items():
         scores = markdown(of_set, printed=printed.get(name, {}))
@@ -103,15 +129,20 @@ def sets_markdown(
 
 
 def markdown(rows: Sequence[StereoRow], *, printed: PrintedScores = {}) -> str:  # noqa: B006
-    """A table for each rate: pairs and mean as lines, methods as columns, PSNR / SSIM in the cells.
+    """Format rows as one table for each rate: pairs and mean in lines, methods in columns, PSNR / SSIM in
+    cells.
 
-    `printed` figures of the paper get a column with a mean only.
+    Args:
+        printed: published scores by rate, shown as a column with a mean only.
+
+    Returns:
+        Markdown text.
     """
     return "\n".join(_table(own, printed.get(rate)) for rate, own in grouped(rows, "rate").items())
 
 
 def _table(rows: Sequence[StereoRow], printed: tuple[float, float] | None = None) -> str:
-    """The table of one rate."""
+    """Table of one rate."""
     methods = grouped(rows, "method")
     scores = {(row.pair, row.method): f"{row.psnr:.2f} / {row.ssim:.4f}" for row in rows}
     columns = [f"beta reduced {rows[0].rate}x" if rows[0].rate > 1 else "beta as it is", *methods]
@@ -132,7 +163,11 @@ def _mean_cell(rows: Sequence[StereoRow]) -> str:
 
 
 def depth_markdown(rows: Sequence[StereoRow]) -> str:
-    """Errors of known depth: end-point error in pixels / share within one pixel. Empty if none is known."""
+    """Format disparity errors where truth is known: end-point error in pixels / share within one pixel.
+
+    Returns:
+        Markdown table; empty text if no row has errors.
+    """
     with_disparity = [row for row in rows if row.end_point_error is not None]
     if not with_disparity:
         return ""
@@ -152,7 +187,11 @@ def _depth_cell(rows: Sequence[StereoRow]) -> str:
 
 
 def structure_kept(rows: Sequence[StereoRow]) -> str:
-    """One line: on which pairs, if any, the SSIM of the fusion is below that of alpha alone."""
+    """Say in one line for which pairs, if any, the fusion's SSIM is below that of alpha alone.
+
+    Returns:
+        A sentence. Rows need the methods "fusion" and "alpha".
+    """
     ssim = {(row.pair, row.rate, row.method): row.ssim for row in rows}
     cases = [(pair, rate) for pair, rate, name in ssim if name == "fusion"]
     lost = [f"{p} {r}x" for p, r in cases if ssim[p, r, "fusion"] < ssim[p, r, "alpha"]]
@@ -170,7 +209,12 @@ def _row(pair: str, rate: int, method: str, result: StereoResult, task: MonoColo
 def disparity_errors(
     disparity: Float[Tensor, "h w"], ground_truth: Disparity
 ) -> tuple[float | None, float | None]:
-    """Mean error where both are known, and the share of the known ground truth within a pixel of it."""
+    """Compare estimated with true disparity.
+
+    Returns:
+        Mean absolute error in pixels where both are known, and share of all known true disparities with an
+        error of at most 1; (None, None) if none can be compared.
+    """
     value, valid = ground_truth
     compared = valid & disparity.isfinite()
     if not compared.any():

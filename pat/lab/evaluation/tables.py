@@ -1,4 +1,4 @@
-"""Tables in Markdown and CSV: the one writer of both."""
+"""Tables in Markdown and CSV."""
 
 from __future__ import annotations
 
@@ -15,7 +15,11 @@ T = TypeVar("T")
 
 
 def grouped(rows: Iterable[T], *names: str) -> dict[Any, list[T]]:
-    """Rows by what they have in these attributes (a tuple if several), in order of first appearance."""
+    """Group rows by one attribute, or by a tuple of several, in order of first appearance.
+
+    Returns:
+        Lists of rows by value.
+    """
     groups: dict[Any, list[T]] = {}
     for row in rows:
         groups.setdefault(attrgetter(*names)(row), []).append(row)
@@ -23,27 +27,35 @@ def grouped(rows: Iterable[T], *names: str) -> dict[Any, list[T]]:
 
 
 def markdown_table(columns: Sequence[str], rows: Iterable[Sequence[object]], *, align: str = "lr") -> str:
-    """Header, rule and rows, a newline after each.
+    """Format a Markdown table: header, rule and rows, each with a newline.
 
-    `align` has one letter, l or r, for each column; the last stands for all that follow.
+    Args:
+        align: one letter, l or r, for each column; the last one repeats.
+
+    Returns:
+        The text.
     """
     return "".join(f"{line}\n" for line in (markdown_header(columns, align=align), *map(markdown_row, rows)))
 
 
 def markdown_header(columns: Sequence[str], *, align: str = "lr") -> str:
-    """Header and rule, for tables that are printed row by row; see `markdown_table`."""
+    """Format header and rule of a Markdown table, for tables printed row by row; see `markdown_table`.
+
+    Returns:
+        Two lines, without a newline at the end.
+    """
     letters = align.ljust(len(columns), align[-1])
     rule = markdown_row("---:" if letters[i] == "r" else "---" for i in range(len(columns)))
     return markdown_row(columns).replace("|  |", "| |") + "\n" + rule
 
 
 def markdown_row(cells: Iterable[object]) -> str:
-    """One row, without a newline."""
+    """Format one row of a Markdown table, without a newline. Cells with "|" are not escaped."""
     return f"| {' | '.join(map(str, cells))} |"
 
 
 def write_csv(path: str | Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """A header and one line for each row, all digits; the file is written atomically."""
+    """Write a header and one line for each row to a CSV file, atomically, with all digits."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)

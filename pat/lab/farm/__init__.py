@@ -1,1 +1,1 @@
-"""Many scenes rendered: what is to be rendered, the renderers, and the job that makes what is missing."""
+"""Rendering of many scenes: configuration, renderers, and the job that renders missing scenes."""

@@ -1,4 +1,4 @@
-"""Renderers of one scene from one seed: layered photographs, or Blender."""
+"""Renderers of one scene from a seed: layered photographs, or Blender."""
 
 from __future__ import annotations
 
@@ -33,19 +33,26 @@ from pat.media.colour import linear_from_srgb
 from pat.support.schema import from_document
 
 FARTHEST = 50.0
-"""Layered scenes of rigs that see to infinity end at this many times the near bound."""
+"""Multiple of the near bound at which layered scenes end for rigs that see to infinity."""
 
 
 Renderer = Callable[[int, Path], None]
-"""Renders and checks the scene of a seed into a folder, made here. Raises ValueError."""
+"""Function of a seed and a folder that renders and checks a scene into that folder, which it makes. Raises
+ValueError."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LayeredSettings:
-    """Layered scenes: the first camera of the rig is alpha.
+    """Settings of layered scenes; the rig's first camera is alpha.
 
-    `photos` are folders of images (none: patterns alone), reduced to `edge` pixels; `layers` bounds the
-    number of planes; `oversampling` samples a pixel along each axis.
+    Attributes:
+        photos: folders of images for textures; empty for patterns alone.
+        edge: longest side, in pixels, that images are reduced to; 32 or more.
+        layers: least and greatest number of planes.
+        oversampling: samples in a pixel along each axis.
+
+    Raises:
+        ValueError: for values below these bounds.
     """
 
     photos: tuple[Path, ...] = ()
@@ -61,11 +68,22 @@ class LayeredSettings:
             raise ValueError(f"layers must be two numbers, at least 1 and in order, got {self.layers}")
 
     def images(self, rig: Rig) -> list[HW]:
-        """The sizes of the images of a scene. Raises ValueError for a rig that cannot be rendered."""
+        """List the sizes (height, width) of a scene's images.
+
+        Raises:
+            ValueError: for a rig that cannot be rendered.
+        """
         return [camera.hw for camera in rig_from_alpha(rig).cameras]
 
     def renderer(self, rig: Rig, limits: CheckLimits) -> Renderer:
-        """A renderer that is ready."""
+        """Prepare a renderer for a rig, with the photographs loaded.
+
+        Returns:
+            The renderer.
+
+        Raises:
+            ValueError: for a rig that cannot be rendered, and folders without images.
+        """
         rig_batch = rig_from_alpha(rig)
         if self.photos:
             bank = PhotoBank.load(*self.photos, max_edge=self.edge)
@@ -100,9 +118,17 @@ class LayeredSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class BlenderSettings:
-    """Blender's scenes: a generator, a preset, and settings that differ from the preset's.
+    """Settings of Blender's scenes.
 
-    The generator is "abstract", "photographs" (with `photos`, a folder of images), or "module:function".
+    Attributes:
+        generator: "abstract", "photographs", or your own "module:function".
+        photos: folder of images, for "photographs" only.
+        preset: name of a preset of render settings.
+        settings: entries of `RenderSettings` that differ from the preset.
+
+    Raises:
+        ValueError: for a generator without its `photos` or with photos it does not take, an unknown
+            generator, and invalid settings.
     """
 
     generator: str = "abstract"
@@ -118,14 +144,22 @@ class BlenderSettings:
         self.render_settings()
 
     def render_settings(self) -> RenderSettings:
-        """All settings; one thread by default, because a farm has a worker a core."""
+        """Combine preset and own entries, with one thread by default, as a farm has one worker for each core.
+
+        Returns:
+            The settings.
+
+        Raises:
+            ValueError: naming the entry, for an invalid one.
+        """
         settings = {**PRESETS[self.preset], "threads": 1, **self.settings}
         return from_document(RenderSettings, settings, "settings")
 
     def images(self, rig: Rig) -> list[HW]:
-        """The sizes of the images of a scene, one for each exposure.
+        """List the sizes (height, width) of a scene's images, one for each exposure.
 
-        Raises ValueError for a rig that cannot be rendered, and a generator that cannot be imported.
+        Raises:
+            ValueError: for a rig that cannot be rendered, and a generator that cannot be imported.
         """
         generator_named(self.generator)
         for name, camera in rig.cameras.items():
@@ -135,7 +169,14 @@ class BlenderSettings:
         return [rig[shot.camera].hw for shot in shots(rig, settings)]
 
     def renderer(self, rig: Rig, limits: CheckLimits) -> Renderer:
-        """A renderer that is ready; this process imports bpy. Raises ValueError without Blender."""
+        """Prepare a renderer for a rig; imports bpy into this process.
+
+        Returns:
+            The renderer.
+
+        Raises:
+            ValueError: if Blender is not installed, or the generator cannot be imported.
+        """
         compat.load()
         generator, settings = generator_named(self.generator), replace(self.render_settings(), limits=limits)
         further = {} if self.photos is None else {"folder": self.photos}
@@ -148,9 +189,14 @@ class BlenderSettings:
 
 
 def rig_from_alpha(rig: Rig) -> RigBatch:
-    """The rig as a batch of one, the first camera being the world's frame.
+    """Convert a rig to a batch of one, with the first camera's frame as the world.
 
-    Raises ValueError for cameras that are not calibrated or have a lens, and for a rig without a depth range.
+    Returns:
+        The rig; a far bound beyond `FARTHEST` times near is cut.
+
+    Raises:
+        ValueError: for cameras that are not calibrated or have a lens model, and for a rig without a depth
+            range.
     """
     for name, camera in rig.cameras.items():
         if not isinstance(camera, Camera):

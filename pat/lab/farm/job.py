@@ -1,7 +1,7 @@
-"""Many scenes rendered: a file that says what, and the job that makes those that are missing.
+"""Rendering of many scenes: the configuration file, and the job that renders missing scenes.
 
-The folder of a job holds `manifest.yaml` (what is rendered, by which versions) and `scenes/000012/` (scene
-12; that the folder exists means that it is complete). `.work` holds unfinished scenes.
+A job's folder holds `manifest.yaml` (what is rendered, by which versions) and `scenes/000012/` (scene 12; the
+folder exists only if it is complete). `.work` holds unfinished scenes.
 """
 
 from __future__ import annotations
@@ -40,14 +40,22 @@ from .backends import BlenderSettings, LayeredSettings, Renderer
 MANIFEST = "manifest.yaml"
 FORMAT = "pat-render 1"
 FACTS = "farm.json"
-"""In every scene's folder: its number, attempt, seed, figures of the self-check, and its cost."""
+"""File in every scene's folder: its number, attempt, seed, figures of the self-check, and cost."""
 RESERVE = 64 << 20
 """Bytes of disk that stay free."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RetryLimits:
-    """A scene may take `timeout` seconds; if its check refuses, the next seed is taken, `refusals` times."""
+    """Limits on the attempts at a scene.
+
+    Attributes:
+        timeout: seconds a scene may take, more than 0.
+        refusals: seeds tried while the self-check refuses them, more than 0.
+
+    Raises:
+        ValueError: for values of 0 or less.
+    """
 
     timeout: float = 900.0
     refusals: int = 20
@@ -73,16 +81,32 @@ class RenderConfig:
     """
 
     rig: Path
+    """File of the rig."""
     seed: int = 0
+    """Seed of all scenes."""
     backend: Literal["layered", "blender"] = "layered"
+    """Renderer of the scenes."""
     layered: LayeredSettings = field(default_factory=LayeredSettings)
+    """Settings of the layered renderer."""
     blender: BlenderSettings = field(default_factory=BlenderSettings)
+    """Settings of the Blender renderer."""
     check: CheckLimits = field(default_factory=CheckLimits)
+    """Requirements of the self-check."""
     limits: RetryLimits = field(default_factory=RetryLimits)
+    """Limits of time and tries."""
 
     @classmethod
     def load(cls, path: str | Path) -> RenderConfig:
-        """Read a file; paths in it are relative to it. Raises ValueError naming the file and the entry."""
+        """Read a configuration file; paths in it are relative to it.
+
+        Returns:
+            The configuration, with absolute paths.
+
+        Raises:
+            FileNotFoundError: for a missing file.
+            ValueError: naming the file and the entry, for an invalid one, and for missing files that it
+                names.
+        """
         path = Path(path)
         try:
             return from_document(cls, read_yaml(path)).beside(path.absolute().parent)
@@ -91,7 +115,11 @@ class RenderConfig:
             raise ValueError(f"{prefix}{error}") from None
 
     def beside(self, folder: Path) -> RenderConfig:
-        """The same with paths made absolute, as seen from a folder. Raises ValueError for missing ones."""
+        """Return the configuration with its paths made absolute, relative to `folder`.
+
+        Raises:
+            ValueError: for a file or folder that is missing.
+        """
         photos = tuple(folder / p for p in self.layered.photos)
         blender = self.blender
         if blender.photos is not None:
@@ -107,24 +135,33 @@ class RenderConfig:
 
     @property
     def settings(self) -> LayeredSettings | BlenderSettings:
-        """Those of the backend that is used."""
+        """Settings of the chosen backend."""
         return self.layered if self.backend == "layered" else self.blender
 
     def renderer(self) -> Renderer:
-        """A ready renderer. Raises ValueError for a rig it cannot render, or if a library is missing."""
+        """Prepare the renderer of the chosen backend.
+
+        Returns:
+            The renderer.
+
+        Raises:
+            ValueError: for a rig that cannot be rendered, or a missing library.
+        """
         rig = Rig.load(self.rig)
         self.settings.images(rig)  # refuses rigs
         return self.settings.renderer(rig, self.check)
 
     def scene_bytes(self) -> float:
-        """Approximate bytes of a scene on disk: 2 a colour and 4 for depth, before compression.
+        """Estimate the bytes of a scene on disk: 2 for each colour and 4 for depth of a pixel, before
+        compression.
 
-        Raises ValueError for a rig that cannot be rendered.
+        Raises:
+            ValueError: for a rig that cannot be rendered.
         """
         return sum(10.0 * h * w for h, w in self.settings.images(Rig.load(self.rig))) + 20_000
 
     def identity(self) -> dict[str, Any]:
-        """All that the scenes depend on."""
+        """Return everything that the scenes depend on, as a plain document."""
         return {
             "backend": self.backend,
             "seed": self.seed,
@@ -136,17 +173,28 @@ class RenderConfig:
 
 @dataclass(frozen=True)
 class Shard:
-    """Part `number` (from 1) of `count`: scenes number - 1, number - 1 + count, and so on."""
+    """Part of a job: scenes number - 1, number - 1 + count, and so on.
+
+    Attributes:
+        number: number of the part, from 1.
+        count: number of parts.
+    """
 
     number: int = 1
     count: int = 1
 
     @classmethod
     def parse(cls, text: str) -> Shard:
-        """From "2/4". Raises ValueError.
+        """Parse text such as "2/4".
 
         >>> Shard.parse("2/4").of(10)
         [1, 5, 9]
+
+        Returns:
+            The part.
+
+        Raises:
+            ValueError: for other text, and a number outside 1 to the count.
         """
         number, _, count = text.partition("/")
         if not (number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
@@ -154,7 +202,7 @@ class Shard:
         return cls(int(number), int(count))
 
     def of(self, scenes: int) -> list[int]:
-        """The scenes of this part."""
+        """List the scene numbers of this part among `scenes` scenes."""
         return list(range(self.number - 1, scenes, self.count))
 
 
@@ -168,10 +216,20 @@ def render(
     scheduler: str | None = None,
     console: Console | None = None,
 ) -> JobReport:
-    """Render what is missing of `scenes` scenes into folder `out`, by `workers` processes or Dask's.
+    """Render the missing ones of `scenes` scenes into folder `out`.
 
-    Raises ValueError for what cannot be rendered, more scenes than the disk holds, or a folder in use or of
-    another configuration; JobError if the job cannot go on.
+    Args:
+        workers: processes on this machine.
+        shard: part of the scenes to render.
+        scheduler: address of a Dask scheduler whose workers render instead; None for this machine.
+
+    Returns:
+        Report of the scenes made, kept and failed; a failed scene is skipped.
+
+    Raises:
+        ValueError: for what cannot be rendered, scenes or workers below 1, more scenes than the disk holds,
+            or a folder in use or of another configuration.
+        JobError: if the job cannot go on, such as on a full disk.
     """
     if scenes < 1 or workers < 1:
         raise ValueError(f"give at least one scene and one worker, got --scenes {scenes} --workers {workers}")
@@ -202,9 +260,10 @@ def render(
 
 
 def write_manifest(config: RenderConfig, root: Path) -> None:
-    """Write the manifest, or check that the existing one is the same.
+    """Write the job's manifest, or check that the existing one is the same.
 
-    Raises ValueError if the folder holds scenes of another configuration, or of none that is stated.
+    Raises:
+        ValueError: if the folder holds scenes of another configuration, or of an unknown one.
     """
     path, identity = root / MANIFEST, json.loads(json.dumps(config.identity()))
     if path.is_file():
@@ -223,7 +282,7 @@ def write_manifest(config: RenderConfig, root: Path) -> None:
 
 
 def versions() -> dict[str, str]:
-    """Versions of the packages that rendering uses."""
+    """Return the versions of the installed packages that rendering uses, by name."""
     versions = {"python": platform.python_version()}
     for package in ("arraygeom-pat", "torch", "numpy", "bpy", "OpenEXR"):
         try:
@@ -234,7 +293,11 @@ def versions() -> dict[str, str]:
 
 
 def check_space(root: Path, scenes: int, scene_bytes: float) -> None:
-    """Raises ValueError if so many more scenes do not fit on the disk."""
+    """Check that the disk holds `scenes` more scenes of `scene_bytes` bytes.
+
+    Raises:
+        ValueError: with how many would fit, if it does not.
+    """
     need, free = scenes * scene_bytes + RESERVE, shutil.disk_usage(root).free
     if scenes and need > free:
         fits = max(int((free - RESERVE) / scene_bytes), 0)
@@ -246,9 +309,11 @@ def check_space(root: Path, scenes: int, scene_bytes: float) -> None:
 
 
 def make_scene(config_text: str, work: Path, scene: Path, index: int) -> None:
-    """The task of a scene: rendered from the first seed the self-check accepts, published as a whole.
+    """Render one scene from the first seed that the self-check accepts, and publish its folder.
 
-    Raises ValueError for one that is refused again and again, JobError if no scene can be made.
+    Raises:
+        ValueError: if `refusals` seeds are refused.
+        JobError: if no scene can be made, such as on a full disk.
     """
     config, render_scene = _ready(config_text)
     reason = ""
@@ -285,7 +350,7 @@ def make_scene(config_text: str, work: Path, scene: Path, index: int) -> None:
 
 
 def scene_seed(config: RenderConfig, index: int, attempt: int) -> int:
-    """The seed of a scene; another one for every attempt that the self-check refused."""
+    """Return the seed of one attempt at a scene."""
     return seed_for(config.seed, "scene", index, attempt)
 
 
@@ -299,7 +364,11 @@ def _ready(config_text: str) -> tuple[RenderConfig, Renderer]:
 
 
 def publish(partial: Path, final: Path) -> None:
-    """Publish a complete folder under its name, after all of it is on disk; one that is there stays."""
+    """Rename a complete folder to its final name after all of it is on disk; an existing folder stays.
+
+    Raises:
+        OSError: if it cannot be renamed.
+    """
     for path in [*partial.iterdir(), partial]:
         flush(path)
     final.parent.mkdir(parents=True, exist_ok=True)
@@ -312,7 +381,15 @@ def publish(partial: Path, final: Path) -> None:
 
 
 def summarise(root: Path) -> str:
-    """Scenes, images, disk, time and memory, and refusals. Raises ValueError if there is none."""
+    """Summarise rendered scenes: number, image sizes, disk, time, memory and refused seeds.
+
+    Returns:
+        One or two lines of text.
+
+    Raises:
+        FileNotFoundError: for a missing folder.
+        ValueError: for a folder without scenes.
+    """
     from statistics import median
 
     from pat.lab.data.windows import scene_folders, scene_rig

@@ -1,1 +1,1 @@
-"""Scenes to images of arrays, with ground truth."""
+"""Synthesis: scenes rendered as images of camera arrays, with ground truth."""

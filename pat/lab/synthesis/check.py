@@ -1,4 +1,4 @@
-"""Checks of a rendered array: depth and cameras of one view must predict what the others see."""
+"""Self-check of a rendered array: depth and cameras of one view must predict the other views."""
 
 from __future__ import annotations
 
@@ -22,14 +22,17 @@ from .rendered import RenderedFrame, depth_between
 
 @dataclass(frozen=True, kw_only=True)
 class CheckLimits:
-    """What a rendered scene must keep to.
+    """Limits that a rendered scene must keep.
 
-    `error` bounds the 95th percentile, in pixels, of how far a point that both of two views see misses its
-    pixel on the way there and back by both depths; `shift` bounds the displacement, in pixels, of the
-    predicted colours; `contradicted` the share of points where a view looks through a surface
-    that another one sees. `dark` and `bright` bound the share of pixels below 0.004 and above 1 in all
-    colours. `texture` is the least share of 8x8 patches with contrast above 2 %, `overlap` the least share of
-    a view's pixels that some other view sees.
+    Attributes:
+        error: largest 95th percentile, in pixels, of the error of points that two views see, projected forth
+            and back by both depths.
+        shift: largest displacement of predicted colours, pixels.
+        contradicted: largest share of points where a view looks through a surface that another one sees.
+        dark: largest share of pixels below 0.004 in all colours.
+        bright: largest share of pixels above 1 in all colours.
+        texture: least share of 8x8 patches with contrast above 2 %.
+        overlap: least share of a view's pixels that some other view sees.
     """
 
     error: float = 0.02
@@ -44,10 +47,11 @@ class CheckLimits:
 def check_views(
     rig: Rig, frames: Mapping[str, RenderedFrame], limits: CheckLimits = CheckLimits()
 ) -> dict[str, Any]:
-    """Check one frame of every camera against each other and against the limits, for a file.
+    """Check one frame of every camera against the other cameras and the limits.
 
-    `views` and `pairs` are figures by view and by "alpha > beta", pairs of frames of different times left
-    out; `reasons` are those for refusal, and without any the scene is `accepted`.
+    Returns:
+        A document for JSON: `views` and `pairs`, figures by view and by "alpha > beta" (pairs of frames of
+        different times are left out), `reasons` for refusal, and `accepted`, True without any.
     """
     views = {name: view_figures(frame) for name, frame in frames.items()}
     together = [(a, b) for a, b in permutations(frames, 2) if frames[a].time == frames[b].time]
@@ -64,7 +68,11 @@ def check_views(
 
 
 def view_figures(frame: RenderedFrame) -> dict[str, float]:
-    """Brightness, texture and depths of one image."""
+    """Measure brightness, texture and depths of one image.
+
+    Returns:
+        Figures by name; "near" and "far" are in metres, infinite if nothing is hit.
+    """
     finite = frame.depth.isfinite()
     depths = frame.depth[finite] if finite.any() else frame.depth.new_tensor([torch.inf])
     return _rounded(
@@ -81,7 +89,11 @@ def view_figures(frame: RenderedFrame) -> dict[str, float]:
 
 
 def texture(rgb: Float[Tensor, "3 h w"], patch: int = 8) -> Float[Tensor, ""]:
-    """The share of patches whose brightness deviates by more than 2 % of its mean."""
+    """Compute the share of patches whose brightness deviates by more than 2 % of its mean.
+
+    Returns:
+        A scalar tensor, 0..1.
+    """
     grey = rgb.mean(0)[None, None].clamp(0, 1)
     mean = avg_pool2d(grey, min(patch, *rgb.shape[1:]))
     square = avg_pool2d(grey**2, min(patch, *rgb.shape[1:]))
@@ -90,13 +102,14 @@ def texture(rgb: Float[Tensor, "3 h w"], patch: int = 8) -> Float[Tensor, ""]:
 
 
 def pair_figures(pair: Pair, here: RenderedFrame, there: RenderedFrame) -> dict[str, float]:
-    """How well alpha's depth predicts beta's view, at up to 200,000 pixels.
+    """Measure how well alpha's depth predicts beta's view, at up to 200,000 pixels.
 
-    `inside` is the share of alpha's pixels whose points are on beta's image; of all, `visible` are seen
-    there, `hidden` lie behind something nearer, `contradicted` in front of what beta records. Points beside
-    an edge in beta are none of these. `median`, `p95` and `p99` of the error on visible points are in alpha's
-    pixels. `colour` is the median difference of their colours, relative to their brightness, `shift` how many
-    pixels one image is displaced against the other by all of these differences together.
+    Returns:
+        Figures by name. Shares of alpha's pixels of known depth: `inside` beta's image, `visible` there,
+        `hidden` behind something nearer, `contradicted` in front of beta's surface; points beside an edge in
+        beta count for none of these. Of visible points: `median`, `p95` and `p99` of the error in alpha's
+        pixels, `colour`, the median difference relative to brightness, and `shift`, the displacement in
+        pixels that explains most of it. Without visible points only the shares.
     """
     alpha, beta = (camera.to(dtype=torch.float64) for camera in pair.cameras)
     x, depth, index = _chosen(here, 200_000)
@@ -127,7 +140,7 @@ def pair_figures(pair: Pair, here: RenderedFrame, there: RenderedFrame) -> dict[
 
 
 def _chosen(frame: RenderedFrame, most: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Pixels with finite depth, evenly subsampled: x (n, 2), depth and index."""
+    """Pixels of finite depth, evenly subsampled: x (n, 2), depth and index."""
     grid = pixel_grid((frame.depth.shape[0], frame.depth.shape[1]), dtype=torch.float64)
     finite = frame.depth.isfinite()
     step = max(1, -(-int(finite.sum()) // most))

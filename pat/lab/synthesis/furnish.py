@@ -1,4 +1,4 @@
-"""Rooms with shapes, lights and walls around the cameras of a rig, from a seed."""
+"""Random rooms with shapes, lights and walls around the cameras of a rig."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from .scene import (
 )
 
 DEPTHS = (2.0, 20.0)
-"""Near and far, metres, of scenes for rigs without a depth range."""
+"""Near and far bounds in metres for rigs without a depth range."""
 
 _SHAPES: tuple[Shape, ...] = ("plane", "cube", "sphere", "cylinder", "cone", "torus")
 _PATTERNS: tuple[TextureKind, ...] = ("voronoi", "magic", "brick", "checker", "noise", "wave")
@@ -41,12 +41,12 @@ _WALLS: tuple[TextureKind, ...] = ("voronoi", "brick", "noise", "wave", "magic")
 _IRRADIANCE = 5.0
 
 Surface = Callable[["Setting", float, tuple[TextureKind, ...]], Texture]
-"""Makes the texture, of one of these kinds, of a surface at this depth (metres)."""
+"""Function of setting, depth (metres) and kinds of texture that makes the texture of a surface."""
 
 
 @dataclass(frozen=True)
 class _Room:
-    """A box in the world that everything is in."""
+    """Box in the world that contains everything."""
 
     R: Float[NDArray, "3 3"]
     centre: Float[NDArray, "3"]
@@ -56,12 +56,16 @@ class _Room:
         return bool((np.abs(self.R.T @ (X - self.centre)) < self.extent / 2 - margin).all())
 
     def at(self, fraction: NDArray) -> NDArray:
-        """The point at fractions (-1..1) of the way from the middle to the walls."""
+        """Point at fractions (-1..1) of the way from the middle to the walls."""
         return np.asarray(self.centre + self.R @ (fraction * self.extent / 2))
 
 
 class Setting:
-    """The rig, and the random generator of one scene."""
+    """Rig and random generator of one scene.
+
+    Raises:
+        ValueError: for a rig without a calibrated camera.
+    """
 
     def __init__(self, rig: Rig, rng: Generator):
         self.rng = rng
@@ -73,28 +77,42 @@ class Setting:
         self.centres = np.stack([c.centre.double().numpy() for c in self.cameras])
 
     def metres(self, depth: float, pixels: float) -> float:
-        """Width of so many pixels at a depth, in the camera with the finest resolution."""
+        """Return the width in metres of `pixels` pixels at a depth, in the camera of finest resolution."""
         return float(pixels * depth / max(float(c.K[:2, :2].abs().max()) for c in self.cameras))
 
     def camera(self) -> Camera:
-        """One of the cameras, drawn."""
+        """Draw one of the cameras."""
         return self.cameras[int(self.rng.integers(len(self.cameras)))]
 
     def nearest(self, X: NDArray) -> float:
-        """The least depth at which a camera can see a point; to cameras it is not before, the distance."""
+        """Return the least depth of a point over all cameras; its distance for cameras that it is not in
+        front of."""
         distances = np.linalg.norm(self.centres - X, axis=1)
         depths = [float(c.cam_from_world.apply(c.K.new_tensor(X)[None])[0, 2]) for c in self.cameras]
         return float(min(z if z > 0.3 * d else d for z, d in zip(depths, distances)))
 
     def ahead(self, camera: Camera, fraction: NDArray, depth: float) -> NDArray:
-        """The point at a depth in the middle `fraction` (-1..1, across and down) of a camera's image."""
+        """Return the world point at a depth and at `fraction` (-1..1, across and down) of a
+        camera's image."""
         h, w = camera.hw
         x = camera.K.new_tensor([(w - 1) / 2 * (1 + fraction[0]), (h - 1) / 2 * (1 + fraction[1])])
         return camera.unproject(x, x.new_tensor(depth)).double().numpy()
 
 
 def furnished(name: str, seed: int, rig: Rig, surface: Surface, moving: float) -> Scene:
-    """10 to 20 shapes with surfaces of a kind, in a room, within the depths of the rig."""
+    """Make a scene of 10 to 20 shapes in a room, within the rig's depth range.
+
+    Args:
+        name: name of the generator, part of the seed.
+        surface: function that makes the textures.
+        moving: seconds of motion; 0 for none.
+
+    Returns:
+        The scene; fewer shapes if they do not fit.
+
+    Raises:
+        ValueError: for a rig without a calibrated camera.
+    """
     setting = Setting(rig, seeded(name, seed))
     room = _room(setting)
     count = int(setting.rng.integers(10, 21))
@@ -120,7 +138,7 @@ def furnished(name: str, seed: int, rig: Rig, surface: Surface, moving: float) -
 
 
 def _room(setting: Setting) -> _Room:
-    """A room around the cameras, its walls between near and far along every camera's axis."""
+    """Room around the cameras, its walls between near and far along every camera's axis."""
     rng, camera = setting.rng, setting.cameras[0]
     rotation = Rotation.from_rotvec(np.radians(rng.uniform(-8, 8, 3)))
     R = (rotation * Rotation.from_matrix(camera.R.double().numpy())).as_matrix().T
@@ -143,19 +161,19 @@ def _room(setting: Setting) -> _Room:
 
 
 def _rays(camera: Camera) -> NDArray:
-    """Directions in the world, per metre of depth, of pixels all over the image."""
+    """World directions, for a metre of depth, of pixels all over the image."""
     grid = coarse_grid(camera.hw, max(camera.hw) // 24 or 1).reshape(-1, 2)
     directions = (camera.unproject(grid, grid.new_ones(len(grid))) - camera.centre).double().numpy()
     return np.asarray(directions[np.isfinite(directions).all(1)])
 
 
 def _half_view(camera: Camera) -> list[float]:
-    """Tangents of half the view across and down."""
+    """Tangents of half the angle of view across and down."""
     return [n / 2 / float(f) for n, f in zip(camera.hw[::-1], camera.K[:2, :2].abs().amax(1))]
 
 
 def _wall_depths(room: _Room, cameras: Sequence[Camera], rays: Sequence[NDArray]) -> tuple[float, float]:
-    """The least and the greatest depth at which cameras see the walls."""
+    """Least and greatest depth at which cameras see the walls."""
     depths = []
     for camera, directions in zip(cameras, rays):
         origin = (camera.centre.double().numpy() - room.centre) @ room.R
@@ -167,7 +185,8 @@ def _wall_depths(room: _Room, cameras: Sequence[Camera], rays: Sequence[NDArray]
 
 
 def _lights(setting: Setting, room: _Room) -> tuple[Light, ...]:
-    """Two to four lamps beside and above the cameras, perhaps a sun; together about as bright everywhere."""
+    """Two to four lamps beside and above the cameras, perhaps a sun; of similar brightness together in all
+    scenes."""
     rng = setting.rng
     count = int(rng.integers(2, 5))
     shares = rng.dirichlet(np.full(count, 3.0)) * _IRRADIANCE * rng.uniform(0.8, 1.2)
@@ -194,7 +213,7 @@ def _lamp(setting: Setting, room: _Room, target: NDArray, irradiance: float) -> 
 
 
 def _tinted(rng: Generator, light: Light) -> Light:
-    """From warm to cold; warm light has more near infrared."""
+    """Tint a light from warm to cold; warm light has more near infrared."""
     warmth = float(rng.uniform(-0.12, 0.2))
     return replace(light, rgb=(1 + warmth, 1.0, 1 - warmth), nir=1 + 2 * max(warmth, 0.0))
 
@@ -205,7 +224,7 @@ def _tinted(rng: Generator, light: Light) -> Light:
 def _object(
     setting: Setting, room: _Room, others: list[Object], surface: Surface, moving: float
 ) -> Object | None:
-    """A shape at a random place in view, or None if the drawn position is unsuitable."""
+    """Shape at a random place in view; None if the drawn position is unsuitable."""
     rng, camera = setting.rng, setting.camera()
     depth = float(1 / rng.uniform(1 / (0.75 * setting.far), 1 / (1.25 * setting.near)))
     centre = setting.ahead(camera, rng.uniform(-0.95, 0.95, 2), depth)
@@ -225,7 +244,7 @@ def _object(
 
 
 def _crowded(centre: NDArray, radius: float, others: list[Object]) -> bool:
-    """Whether much of the object would be inside another one."""
+    """True if much of the object would be inside another one."""
     for key in (other.motion.keys[0] for other in others):
         if np.linalg.norm(centre - key.position) < 0.5 * (radius + np.linalg.norm(key.extent) / 2):
             return True
@@ -233,7 +252,7 @@ def _crowded(centre: NDArray, radius: float, others: list[Object]) -> bool:
 
 
 def _extent(rng: Generator, shape: Shape, radius: float) -> NDArray:
-    """Lengths of the box around a shape that is inside a sphere."""
+    """Side lengths of the box around a shape inside a sphere."""
     extent = rng.uniform(0.55, 1.0, 3)
     if shape == "torus":
         extent[1] = 0.3 * extent[0]
@@ -250,7 +269,8 @@ def _relief(rng: Generator, extent: NDArray) -> Relief:
 
 
 def _path(setting: Setting, start: Key, radius: float, duration: float) -> tuple[Key, ...]:
-    """Four keys, evenly spaced: steps up to its size, rotations to 60 degrees, a fifth longer or shorter."""
+    """Four evenly spaced keys: steps up to the object's size, rotations to 60 degrees, extents changed by up
+    to a fifth."""
     rng, keys = setting.rng, [start]
     for k in range(1, 4):
         position = np.asarray(keys[-1].position) + rng.normal(size=3) * 0.4 * radius
@@ -264,7 +284,8 @@ def _path(setting: Setting, start: Key, radius: float, duration: float) -> tuple
 
 
 def _material(rng: Generator, texture: Texture, pixel: float) -> Material:
-    """Mostly dull; metallic one time in ten, transparent one in twenty, with fine bumps one in three."""
+    """Random material: mostly dull; metallic one time in ten, transparent one in twenty, with fine bumps one
+    in three."""
     metallic = float(rng.uniform(0.6, 1)) if rng.uniform() < 0.1 else 0.0
     transmission = float(rng.uniform(0.5, 0.9)) if not metallic and rng.uniform() < 0.05 else 0.0
     return Material(
@@ -278,11 +299,11 @@ def _material(rng: Generator, texture: Texture, pixel: float) -> Material:
 
 
 def seeded(name: str, seed: int) -> Generator:
-    """An independent random generator for every scene generator and seed."""
+    """Make an independent random generator for a scene generator's name and a seed."""
     return np.random.default_rng([zlib.crc32(name.encode()), seed])
 
 
 def vec(values: NDArray) -> Vec3:
-    """Three numbers as a tuple, for a scene."""
+    """Convert three numbers to a tuple, as scenes hold them."""
     x, y, z = (float(v) for v in values)
     return x, y, z

@@ -1,4 +1,4 @@
-"""Scenes from seeds: the paper's abstract ones, and photograph-textured ones."""
+"""Scene generators: the paper's abstract scenes, and scenes textured with photographs."""
 
 from __future__ import annotations
 
@@ -25,19 +25,30 @@ from .scene import Paint, Scene, Texture, TextureKind, Vec3
 
 
 def abstract(seed: int, rig: Rig, *, moving: float = 0.0) -> Scene:
-    """The paper's scenes: 10 to 20 shapes with patterns in a room, within the depths of the rig.
+    """Generate one of the paper's scenes: 10 to 20 patterned shapes in a room, within the rig's depth range.
 
-    With `moving` seconds, objects move, rotate and stretch along random paths for so long. The same seed and
-    rig give the same scene. Raises ValueError if the rig has no calibrated camera.
+    Args:
+        moving: seconds for which objects move, rotate and stretch along random paths; 0 for none.
+
+    Returns:
+        The scene, the same for the same seed and rig.
+
+    Raises:
+        ValueError: for a rig without a calibrated camera.
     """
     return furnished("abstract", seed, rig, _pattern, moving)
 
 
 def photographs(seed: int, rig: Rig, folder: str | Path, *, moving: float = 0.0) -> Scene:
-    """Scenes like those of `abstract`, with the images under a folder on all surfaces.
+    """Generate a scene like `abstract`, with the images under a folder on all surfaces.
 
-    Images that are black in large parts are used only if there are no others. Raises ValueError if the folder
-    holds no images.
+    Images that are black in large parts are avoided.
+
+    Returns:
+        The scene, the same for the same seed, rig and images.
+
+    Raises:
+        ValueError: for a folder without images, and a rig without a calibrated camera.
     """
     files = _images(Path(folder))
 
@@ -53,9 +64,13 @@ def photographs(seed: int, rig: Rig, folder: str | Path, *, moving: float = 0.0)
 
 
 def generator_named(name: str) -> Callable[..., Scene]:
-    """ "abstract", "photographs", or one's own "module:function", called with seed, rig, `moving` seconds.
+    """Look up a scene generator: "abstract", "photographs", or your own "module:function".
 
-    Raises ValueError for a name that is neither.
+    Returns:
+        The function, called with seed, rig and `moving` seconds.
+
+    Raises:
+        ValueError: for a name that is neither, or cannot be imported.
     """
     ours: dict[str, Callable[..., Scene]] = {"abstract": abstract, "photographs": photographs}
     if name not in ours and ":" not in name:
@@ -80,7 +95,7 @@ def _pattern(setting: Setting, depth: float, kinds: tuple[TextureKind, ...]) -> 
 
 
 def paints(rng: Generator) -> tuple[Paint, ...]:
-    """Two to four paints, alternately lighter and darker, of similar hues or not."""
+    """Draw two to four paints, alternately lighter and darker, of similar hues or not."""
     hue, width, dark_first = rng.uniform(), rng.choice([0.08, 0.5]), int(rng.integers(2))
     paints = []
     for i in range(int(rng.integers(2, 5))):
@@ -92,7 +107,8 @@ def paints(rng: Generator) -> tuple[Paint, ...]:
 
 
 def _near_infrared(rng: Generator, rgb: Vec3) -> float:
-    """Dyes hardly absorb there, pigments much as they do in red, green is often a leaf, soot stays black."""
+    """Near-infrared reflectance: dyes hardly absorb there, pigments as in red, green is often a leaf, soot
+    stays black."""
     r, g, b = rgb
     if g > 1.2 * max(r, b):
         return float(rng.uniform(0.4, 0.6))
@@ -113,13 +129,13 @@ def _images(folder: Path) -> tuple[str, ...]:
 
 
 def _bright_one(rng: Generator, files: tuple[str, ...]) -> str:
-    """One of the images, preferably none that is black in large parts."""
+    """Draw an image, preferably not one that is black in large parts."""
     drawn = [str(rng.choice(files)) for _ in range(8)]
     return next((file for file in drawn if _blackness(file) < 0.3), drawn[0])
 
 
 @lru_cache(maxsize=4096)
 def _blackness(file: str) -> float:
-    """The share of pixels that are nearly black; 1 for what is no image, or one too large."""
+    """Share of nearly black pixels; 1 for a file that is no image, or too large."""
     small = decoded_photograph(Path(file), cv2.IMREAD_REDUCED_GRAYSCALE_8)
     return 1.0 if small is None else float((small < 24).mean())

@@ -1,9 +1,9 @@
-"""Scenes of layers: textured planes at random depths and slants with random outlines, seen by any cameras.
+"""Layered scenes: textured planes at random depths and slants with random outlines, seen by any cameras.
 
-A layer is a plane in the world with a painter: a camera with K = I that faces it from distance 1, so
-that the painter's image is the plane itself in metres. The plane's homography from each view to the painter
-gives, at any pixel, the position on the plane and (as its third entry) the inverse depth: images, depth and
-occlusion are exact, and no geometry is approximated. All surfaces are opaque and diffuse.
+A layer is a plane in the world with a painter: a camera with K = I that faces it from distance 1, so that the
+painter's image is the plane itself in metres. The plane's homography from each view to the painter gives, at
+any pixel, the position on the plane and (as its third entry) the inverse depth: images, depth and occlusion
+are exact, and no geometry is approximated. All surfaces are opaque and diffuse.
 """
 
 from __future__ import annotations
@@ -36,11 +36,14 @@ _CHUNK = 1 << 16
 
 @dataclass(frozen=True)
 class ArrayBatch:
-    """Images and ground truth, one entry a camera, alpha first.
+    """Batch of array images with ground truth; lists have one entry for each camera, alpha first.
 
-    `images` 0..1 (sRGB, as the photographs); `depth` in metres along each camera's own axis at the
-    pixels' centres; `cameras` are batched (B); `depth_range` holds bounds (near, far) of alpha's depths;
-    `index` is the number of the visible layer, from 1.
+    Attributes:
+        images: images 0..1, sRGB.
+        depth: metres along each camera's own axis at the pixels' centres; NaN where unknown.
+        cameras: cameras, batched (b).
+        depth_range: nearest and farthest of alpha's depths, metres.
+        index: number of the visible layer, from 1; empty where there are no layers.
     """
 
     images: list[Float[Tensor, "b 3 _ _"]]
@@ -51,10 +54,16 @@ class ArrayBatch:
 
 
 class LayeredScenes:
-    """A source of training samples.
+    """Source of random layered scenes for training.
 
-    `layers` bounds the number of planes in a scene, both ends included. All randomness comes from the
-    generator given to `sample` (on the CPU, whatever the device) and from `seed`, which makes the outlines.
+    All randomness comes from the generator given to `sample` (on the CPU for any device) and from `seed`,
+    which makes the outlines.
+
+    Args:
+        photos: textures.
+        rigs: distribution of the random rigs.
+        hw: (height, width) of alpha's images.
+        layers: least and greatest number of planes.
     """
 
     def __init__(
@@ -75,15 +84,25 @@ class LayeredScenes:
         self.outlines = outlines(256, seed).to(device)
 
     def sample(self, batch: int, generator: Generator) -> ArrayBatch:
-        """Random scenes seen by random rigs."""
+        """Render random scenes seen by random rigs.
+
+        Returns:
+            A batch of `batch` scenes.
+        """
         return self.render(random_rigs(self.rigs, batch, self.hw, generator), generator)
 
     @torch.no_grad()
     def render(self, rigs: RigBatch, generator: Generator, *, oversampling: int = 1) -> ArrayBatch:
-        """Random scenes seen by given rigs, whose first view is alpha and the world frame.
+        """Render random scenes seen by given rigs, whose first camera is alpha and the world frame.
 
-        A view with fewer pixels a radian than alpha is rendered at about alpha's and averaged down by area,
-        as a coarser sensor would; `oversampling` asks for more than that.
+        A view with fewer pixels a radian than alpha is rendered at about alpha's resolution (up to 4 times)
+        and averaged by area, as a coarser sensor would.
+
+        Args:
+            oversampling: further samples in a pixel along each axis.
+
+        Returns:
+            A batch, one scene for each rig, without gradient.
         """
         layers = draw_layers(rigs, self.layers, self.photos, len(self.outlines), generator)
         factors = [oversampling * _oversampling(rigs.cameras[0], v) for v in rigs.cameras]
@@ -93,7 +112,7 @@ class LayeredScenes:
         return ArrayBatch(list(images), list(depth), cameras, bounds, list(index))
 
     def _seen(self, layers: Layers, camera: Camera, factor: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Image, and depth at the pixels' centres and index of the surface that covers most of each pixel."""
+        """Image; depth at the pixels' centres; index of the surface that covers most of each pixel."""
         front = self._front(layers, camera)
         depth, index = ((v.view(-1, *camera.hw)) for v in (1 / front.inverse_depth, front.main + 1))
         if factor == 1:
@@ -129,7 +148,7 @@ class LayeredScenes:
         return q, opacity * in_front
 
     def _shade(self, layers: Layers, camera: Camera, front: _Front) -> Tensor:
-        """The image (B, 3, h, w): each pixel's two foremost layers, mixed by the opacity of the first."""
+        """Image (B, 3, h, w): each pixel's two foremost layers, mixed by the opacity of the first."""
         H = (layers.texel_from_plane @ plane_from_camera(layers, camera)).float().to(self.device)
         everywhere = torch.ones_like(front.opacity, dtype=torch.bool)
         colour = self._colours(layers, H, camera.hw, front.first, everywhere)
@@ -139,7 +158,7 @@ class LayeredScenes:
         return colour.view(3, -1, *camera.hw).movedim(0, 1).contiguous()
 
     def _colours(self, layers: Layers, H: Tensor, hw: HW, layer: Tensor, where: Tensor) -> Tensor:
-        """Colours (3, B, N), or (3, n) at those pixels `where` is True if not everywhere."""
+        """Colours (3, B, N), or (3, n) for the n pixels where `where` is True if these are not all."""
         B, L = layers.present.shape
         flat = layer + L * torch.arange(B, device=self.device)[:, None]
         pixel = torch.arange(hw[0] * hw[1], device=self.device).expand_as(flat)
@@ -167,7 +186,8 @@ class LayeredScenes:
 
 @dataclass(frozen=True)
 class _Front:
-    """At each pixel the two foremost layers, the first's opacity, and the main one with its inverse depth."""
+    """The two foremost layers at each pixel, the first one's opacity, and the main one with its inverse
+    depth."""
 
     first: Tensor
     second: Tensor
@@ -177,7 +197,11 @@ class _Front:
 
 
 def plane_from_camera(layers: Layers, camera: Camera) -> Float[Tensor, "b l 3 3"]:
-    """The homography H with H (x, 1) = (u, v, 1) / z: pixels to metres on the planes, and inverse depth."""
+    """Compute the homographies from pixels to the layers' planes: H (x, 1) = (u, v, 1) / z.
+
+    Returns:
+        H (b, l, 3, 3), float64: u, v in metres on the plane, z the depth in the camera.
+    """
     planes = layers.plane_from_world
     camera_from_world = Pose(camera.R[:, None].expand_as(planes.R), camera.t[:, None].expand_as(planes.t))
     pose = camera_from_world @ planes.inverse()
@@ -187,7 +211,7 @@ def plane_from_camera(layers: Layers, camera: Camera) -> Float[Tensor, "b l 3 3"
 
 
 def _steps(distance: Tensor) -> Tensor:
-    """How much a distance changes from pixel to pixel, so that edges get one pixel wide from any angle."""
+    """Change of a distance from pixel to pixel, so that edges are one pixel wide from any angle."""
     x = torch.nn.functional.pad(distance.diff(dim=-1).abs(), (1, 1))
     y = torch.nn.functional.pad(distance.diff(dim=-2).abs(), (0, 0, 1, 1))
     x, y = torch.maximum(x[..., 1:], x[..., :-1]), torch.maximum(y[..., 1:, :], y[..., :-1, :])

@@ -1,4 +1,4 @@
-"""The content of a layered scene: random planes with their outlines, textures and colours."""
+"""Content of a layered scene: random planes with outlines, textures and colours."""
 
 from __future__ import annotations
 
@@ -20,16 +20,24 @@ from .photos import PhotoBank
 from .rigs import RigBatch, log_uniform, uniform
 
 _GRAZING = 0.04
-"""Planes seen at a smaller angle than this (as a sine) are left out."""
+"""Sine of the angle to the view below which planes are left out."""
 
 
 @dataclass(frozen=True)
 class Layers:
-    """The layers (B, L) of a batch of scenes, in float64 on the CPU.
+    """Layers (b, l) of a batch of scenes, float64 on the CPU.
 
-    A layer is the plane Z = 1 of its own frame, `plane_from_world`, where (X, Y) in metres are positions on
-    it. It covers all of that plane if `solid`, else the inside of an outline, which lives on [-1, 1]^2.
-    Textures are sampled at texels and their colours (r, g, b, 1) multiplied by `colour`.
+    A layer is the plane Z = 1 of its own frame, on which (X, Y) are positions in metres.
+
+    Attributes:
+        plane_from_world: pose of the layer's frame.
+        present: True for layers in the scene.
+        solid: True for a layer that covers its whole plane; otherwise it covers the inside of an outline.
+        outline: number of the outline.
+        outline_from_plane: map from metres to the outline's square [-1, 1]^2.
+        texture: number of the texture.
+        texel_from_plane: map from metres to texels.
+        colour: matrix by which texture colours (r, g, b, 1) are multiplied.
     """
 
     plane_from_world: Pose
@@ -45,10 +53,17 @@ class Layers:
 def draw_layers(
     rigs: RigBatch, count: tuple[int, int], photos: PhotoBank, shapes: int, generator: Generator
 ) -> Layers:
-    """Random layers in front of the first view of the rigs, between the rigs' near and far depths.
+    """Draw random layers in front of the rigs' first camera, between near and far.
 
-    Layer 0 is the background. In half of the scenes layer 1 is a ground (or a ceiling), in a quarter layer 2
-    is a wall; the others are things with outlines. In one scene in eight all lie within 5 % of one depth.
+    Layer 0 is the background. In half of the scenes layer 1 is a ground or a ceiling, in a quarter layer 2 is
+    a wall; the others have outlines. In one scene in eight all lie within 5 % of one depth.
+
+    Args:
+        count: least and greatest number of layers.
+        shapes: number of outlines to choose from.
+
+    Returns:
+        The layers.
     """
     g = generator
     shape = len(rigs.near), count[1]
@@ -71,7 +86,8 @@ def draw_layers(
 
 
 class _Planes(NamedTuple):
-    """Of each layer (B, L): the ray to its anchor, its normal, its radius in alpha's pixels, and so on."""
+    """Geometry of each layer (B, L): ray to its anchor, normal, sine of its angle, inverse depth, radius in
+    alpha's pixels."""
 
     ray: Tensor
     normal: Tensor
@@ -82,7 +98,7 @@ class _Planes(NamedTuple):
 
 
 def _planes(rigs: RigBatch, shape: tuple[int, int], g: Generator) -> _Planes:
-    """Planes before alpha, drawn; in some scenes one is a ground, and one a wall."""
+    """Draw planes in front of alpha; in some scenes one is a ground, one a wall."""
     alpha = rigs.cameras[0]
     wh = torch.tensor(alpha.hw[::-1], dtype=torch.float64)
     ray = _rays(alpha, uniform((-0.15, 1.15), (*shape, 2), g) * wh)  # up to 15 % of the image outside it
@@ -111,12 +127,12 @@ def _tilted(normal: tuple[float, float, float], by: float, count: int, g: Genera
 
 
 def _rays(camera: Camera, pixel: Tensor) -> Tensor:
-    """(x, y, 1) in the camera's frame of pixels (B, L, 2)."""
+    """Directions (x, y, 1) in the camera's frame of pixels (B, L, 2)."""
     return to_homogeneous(pixel) @ torch.linalg.inv(camera.K).mT
 
 
 def _ground_anchor(alpha: Camera) -> Tensor:
-    """The ray through the middle of the bottom or the top row, whichever is farther from the horizon."""
+    """Ray through the middle of the bottom or the top row, whichever is farther from the horizon."""
     h, w = alpha.hw
     rows = torch.tensor([0.0, h - 1.0], dtype=torch.float64)
     row = rows[(rows - alpha.K[:, 1, 2, None]).abs().argmax(1)]
@@ -124,7 +140,7 @@ def _ground_anchor(alpha: Camera) -> Tensor:
 
 
 def _normals(shape: tuple[int, int], g: Generator) -> Tensor:
-    """Unit normals: half of the things nearly face the camera, the others slant by up to 60 degrees."""
+    """Unit normals: half of the layers nearly face the camera, the others slant by up to 60 degrees."""
     facing = torch.rand(shape, generator=g) < 0.5
     slant = torch.where(facing, uniform((0.001, 0.15), shape, g), uniform((0.1, 1.0), shape, g))
     slant[:, 0] *= 0.4
@@ -133,7 +149,8 @@ def _normals(shape: tuple[int, int], g: Generator) -> Tensor:
 
 
 def _inverse_depths(rigs: RigBatch, shape: tuple[int, int], g: Generator) -> Tensor:
-    """At the anchors: even in disparity or log depth, background farthest, one scene in eight flat."""
+    """Inverse depths at the anchors: even in disparity or log depth, background farthest, one scene in eight
+    flat."""
     B = shape[0]
     low, high = 1 / rigs.far[:, None], 1 / rigs.near[:, None]
     where = uniform((0, 1), shape, g)
@@ -165,12 +182,12 @@ def _painters(normal: Tensor) -> Tensor:
 
 
 def _upright(R: Tensor) -> Tensor:
-    """The angle of e1 in the image."""
+    """Angle of e1 in the image."""
     return torch.atan2(R[..., 0, 1], R[..., 0, 0])
 
 
 def _affine(angle: Tensor, sx: Tensor, sy: Tensor) -> Tensor:
-    """Scale, then rotate: a 3x3 matrix without shift."""
+    """Matrix (3 x 3) that scales, then rotates, without shift."""
     A = torch.eye(3, dtype=torch.float64).repeat(*angle.shape, 1, 1)
     c, s = angle.cos(), angle.sin()
     A[..., :2, :2] = torch.stack([c * sx, -s * sy, s * sx, c * sy], -1).unflatten(-1, (2, 2))
@@ -178,7 +195,7 @@ def _affine(angle: Tensor, sx: Tensor, sy: Tensor) -> Tensor:
 
 
 def _outline_from_plane(R: Tensor, radius: Tensor, g: Generator) -> Tensor:
-    """Outlines of about this radius in metres, upright but for some."""
+    """Maps to outlines of about this radius in metres, mostly upright."""
     aspect = log_uniform((0.7, 1.4), radius.shape, g)
     return _affine(_upright(R) + 0.3 * _randn(radius.shape, g), aspect / radius, 1 / (aspect * radius))
 
@@ -186,7 +203,7 @@ def _outline_from_plane(R: Tensor, radius: Tensor, g: Generator) -> Tensor:
 def _texture(
     R: Tensor, metres_per_pixel: Tensor, facing: Tensor, photos: PhotoBank, g: Generator
 ) -> tuple[Tensor, Tensor]:
-    """Which texture, and texels from metres: 0.5 to 3 texels a pixel of alpha at the anchor.
+    """Texture numbers, and maps from metres to texels: 0.5 to 3 texels for each pixel of alpha at the anchor.
 
     Along the slant textures are stretched as much as the view compresses them, so that they stay sharp.
     """

@@ -1,4 +1,5 @@
-"""Random outlines of layers, as signed distances: blobs, polygons, thin things, fences, things with holes."""
+"""Random outlines of layers as signed distances: blobs, polygons, rods, fences, branches, shapes
+with holes."""
 
 from __future__ import annotations
 
@@ -17,10 +18,12 @@ _BORDER = 2 * _FINE // SIDE
 
 @functools.cache
 def outlines(count: int, seed: int) -> Float[Tensor, "count 1 side side"]:
-    """Signed distance to the outline, positive inside, on the square [-1, 1]^2 (whose side has length 2).
+    """Draw random outlines as signed distance maps, positive inside, on the square [-1, 1]^2 (side length 2).
 
-    The outer border is always outside, so that clamping positions to the square is safe. Made once a process:
-    not to be written to.
+    The border is always outside, so that positions may be clamped to the square.
+
+    Returns:
+        Maps (count, 1, 96, 96), float32, cached for the process: not to be modified.
     """
     rng = np.random.default_rng(seed)
     makers = (_blob, _polygon, _cloud, _rods, _fence, _branches, _box)

@@ -12,15 +12,22 @@ _LUMINANCE = np.array(REC601, np.float32)
 
 
 def patterns(rng: np.random.Generator, count: int) -> list[np.ndarray]:
-    """`count` textures (256, 256, 3) uint8, alternating gradients, stripes, tiles, dots and noise."""
+    """Draw `count` textures in turn: gradients, stripes, tiles, dots, noise.
+
+    Returns:
+        Arrays (256, 256, 3), uint8, RGB.
+    """
     makers = (_gradient, _stripes, _tiles, _dots, _cloud)
     return [to_bytes(makers[i % len(makers)](rng)) for i in range(count)]
 
 
 def recoloured(images: list[np.ndarray], rng: np.random.Generator, count: int) -> list[np.ndarray]:
-    """Textures with the luminance of one image and the chroma of another, or smooth, or without one of them.
+    """Make textures with the luminance of one image and the chroma of another, some smoothed.
 
-    The correlation of colour and luminance of photographs does not hold here.
+    They break the correlation of colour and luminance in photographs.
+
+    Returns:
+        `count` arrays (256, 256, 3), uint8, RGB.
     """
     return [to_bytes(_mixed(images, rng)) for _ in range(count)]
 
@@ -71,7 +78,7 @@ def _stripes(rng: np.random.Generator) -> np.ndarray:
 
 
 def _tiles(rng: np.random.Generator) -> np.ndarray:
-    """Brick or checker: each tile of its own shade, with joints."""
+    """Bricks or checkers: each tile of its own shade, with joints."""
     rows, columns = rng.integers(3, 12, size=2)
     x, y = _grid()
     row = np.floor(y * rows)
@@ -89,7 +96,7 @@ def _dots(rng: np.random.Generator) -> np.ndarray:
 
 
 def _cloud(rng: np.random.Generator) -> np.ndarray:
-    """Noise of several octaves, its colours independent of one another."""
+    """Noise of several octaves with independent colour channels."""
     octaves: list[np.ndarray] = []
     for k in range(1, 8):
         noise = rng.normal(0, 1, (2**k, 2**k, 3)).astype(np.float32)

@@ -1,7 +1,7 @@
-"""A bank of photographs in memory, sampled per pixel at the right level of detail.
+"""Textures in memory, sampled at any position and level of detail.
 
-Textures repeat by mirroring, so that planes may be of any size. Each is stored with its pyramid of
-2x area averages as packed bytes (R + 256 G + 65536 B in one int32): one gather fetches one texel.
+Textures repeat by mirroring, so that planes may be of any size. Each is stored with its pyramid of 2x area
+averages as packed bytes (R + 256 G + 65536 B in one int32): one gather fetches one texel.
 """
 
 from __future__ import annotations
@@ -30,9 +30,15 @@ _MULTIPLE = 2 ** (LEVELS - 1)
 class PhotoBank:
     """Textures of any sizes with their pyramids, on one device.
 
-    Each side is cropped to a multiple of 32, so that every level is an exact 2x area average of the one
-    below. `len(bank)` textures; `photos` of them, the first, are photographs and the others patterns made
-    from a seed.
+    Sides are cropped to multiples of 32, so that every level is an exact 2x average of the one below.
+    `len(bank)` is the number of textures.
+
+    Args:
+        images: arrays (h, w, 3), uint8, RGB.
+        photos: number of photographs, which come first; None counts all as photographs.
+
+    Raises:
+        ValueError: for no images.
     """
 
     def __init__(self, images: Iterable[np.ndarray], *, photos: int | None = None):
@@ -56,11 +62,19 @@ class PhotoBank:
         seed: int = 0,
         choose: Callable[[int], bool] = lambda i: True,
     ) -> PhotoBank:
-        """All images under the folders, colour or grey, reduced to `max_edge` pixels, and patterns beside.
+        """Load all images under the folders, grey or in colour, and add 96 patterns made from `seed`.
 
-        `cache` names an .npz file that is written on the first call and read
-        on later ones; it is not checked against the folders. `choose` selects images by number, to hold
-        some out. Raises ValueError where no image is found or chosen, and for a file that is no cache.
+        Args:
+            max_edge: longest side in pixels that images are reduced to.
+            cache: .npz file, written on the first call and read on later ones; it is not checked against the
+                folders.
+            choose: selects images by number, to hold some out.
+
+        Returns:
+            The bank.
+
+        Raises:
+            ValueError: if no image is found or chosen, and for a file that is no cache.
         """
         if cache and Path(cache).exists():
             images = _cached(Path(cache))
@@ -82,7 +96,7 @@ class PhotoBank:
         return len(self.wh)
 
     def to(self, device: torch.device | str) -> PhotoBank:
-        """The same bank on a device."""
+        """Return the same bank on a device."""
         moved = object.__new__(PhotoBank)
         moved.photos = self.photos
         moved.texels, moved.starts, moved.wh = (x.to(device) for x in (self.texels, self.starts, self.wh))
@@ -91,10 +105,16 @@ class PhotoBank:
     def lookup(
         self, texture: Int[Tensor, " n"], xy: Float[Tensor, "n 2"], level: Float[Tensor, " n"]
     ) -> Float[Tensor, "3 n"]:
-        """Colours 0..1 at the textures' pixels (x, y) (first centre (0, 0)), trilinear in position and level.
+        """Sample colours trilinearly in position and level.
 
-        `level` is log2 of the distance between samples in pixels of the full texture: at 0 the full image is
-        read, at 1 its 2x reduction, whose pixel (0, 0) lies at (0.5, 0.5) of the full one.
+        Args:
+            texture: numbers of textures.
+            xy: pixels of the full texture, first centre (0, 0), mirrored beyond the sides.
+            level: log2 of the distance between samples in pixels of the full texture: 0 reads the full image,
+                1 its 2x reduction, whose pixel (0, 0) lies at (0.5, 0.5) of the full one.
+
+        Returns:
+            Colours (3, n), 0..1, without gradient with respect to the texels.
         """
         level = level.clamp(0, LEVELS - 1)
         fine = level.floor().clamp(max=LEVELS - 2)
@@ -109,7 +129,14 @@ class PhotoBank:
     def window(
         self, texture: int, level: int, xy: tuple[int, int], side: int
     ) -> Float[Tensor, "3 side side"]:
-        """A square of a texture at one level, its first pixel at (x, y), repeated by mirroring."""
+        """Cut a square from one level of a texture, mirrored beyond its sides.
+
+        Args:
+            xy: its first pixel.
+
+        Returns:
+            Colours (3, side, side), 0..1.
+        """
         w, h = self.wh[texture, level].tolist()
         x, y = (_mirrored(start + torch.arange(side), torch.tensor(n)) for start, n in zip(xy, (w, h)))
         return self._fetch(int(self.starts[texture, level]) + w * y[:, None] + x)
@@ -133,7 +160,7 @@ class PhotoBank:
 
 
 def _mirrored(i: Tensor, n: Tensor) -> Tensor:
-    """Indices folded into 0 .. n - 1 by reflecting at the edges: ... 1 0 | 0 1 ... n-1 | n-1 ..."""
+    """Fold indices into 0 .. n - 1 by reflection at the edges: ... 1 0 | 0 1 ... n-1 | n-1 ..."""
     period = 2 * n
     i = i - period * torch.div(i.float(), period.float()).floor().int()
     i = torch.where(i < n, i, period - 1 - i)
@@ -141,7 +168,7 @@ def _mirrored(i: Tensor, n: Tensor) -> Tensor:
 
 
 def _cached(file: Path) -> list[np.ndarray]:
-    """The images of a cache. Raises ValueError, which names the file, for a damaged or another one."""
+    """Read the images of a cache. Raises ValueError, naming the file, for a damaged or another file."""
     try:
         with np.load(file) as archive:
             return list(archive.values())
@@ -152,7 +179,14 @@ def _cached(file: Path) -> list[np.ndarray]:
 
 
 def read_photographs(folders: tuple[str | Path, ...], max_edge: int) -> list[np.ndarray]:
-    """RGB bytes of all images under the folders, reduced to `max_edge` pixels. Raises ValueError for none."""
+    """Read all images under the folders, reduced to `max_edge` pixels.
+
+    Returns:
+        Arrays (h, w, 3), uint8, RGB; files that are no images, or have a side under 32 pixels, are skipped.
+
+    Raises:
+        ValueError: if none is found.
+    """
     paths = sorted(p for folder in folders for p in files_below(folder) if p.suffix.lower() in PHOTO_SUFFIXES)
     images = [_reduced(p, max_edge) for p in map(_decoded, paths) if p is not None]
     if not images:
@@ -161,7 +195,7 @@ def read_photographs(folders: tuple[str | Path, ...], max_edge: int) -> list[np.
 
 
 def _decoded(path: Path) -> np.ndarray | None:
-    """RGB bytes, or None for a file that is no image, or one too small or too large to be a texture."""
+    """RGB bytes; None for a file that is no image, or too small or large for a texture."""
     image = decoded_photograph(path, cv2.IMREAD_COLOR, least=_MULTIPLE)
     if image is None or min(image.shape[:2]) < _MULTIPLE:
         return None

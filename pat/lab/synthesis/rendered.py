@@ -1,7 +1,8 @@
-"""A rendered scene on disk: images and ground truth of every camera, its rig, its description, its check.
+"""Rendered scenes on disk: images and ground truth of every camera, rig, description, self-check.
 
 A folder holds `rig.yaml` (the rig as rendered), `scene.yaml`, `render.json` (settings, versions, frames,
-check) and one `<camera>-<frame>.npz` for every frame of every camera, with the arrays of `Frame` by name.
+check) and one `<camera>-<frame>.npz` for every frame of every camera, with the arrays of `RenderedFrame` by
+name.
 """
 
 from __future__ import annotations
@@ -24,17 +25,19 @@ from arraygeom.runtime.atomic import flush
 from arraygeom.sampling import sample
 
 RENDER_FILE = "render.json"
-"""The last file written: a folder that has it is complete."""
+"""Last file written: a folder that has it is complete."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RenderedFrame:
-    """One image and its ground truth, at the pixels' centres.
+    """One image with its ground truth, at the pixels' centres.
 
-    `rgb` is linear radiance (stored as float16, 1 is white by intent, brighter is possible), `nir` that of
-    the near infrared. `depth` is z in metres (float32), infinite where nothing is. `index` is 0 where nothing
-    is, else the object's number in the scene plus one. Pixels that a lens does not see have `depth` NaN and
-    index 0.
+    Attributes:
+        time: seconds.
+        rgb: linear radiance, 1 is white, brighter is possible; stored as float16.
+        depth: z in metres; infinite where nothing is hit, NaN where the lens sees nothing.
+        index: number of the object in the scene plus one; 0 where nothing is hit or seen.
+        nir: linear radiance in near infrared; None if not rendered.
     """
 
     time: float
@@ -46,26 +49,41 @@ class RenderedFrame:
 
 @dataclass(frozen=True)
 class Rendered:
-    """A rendered folder. Images are read lazily."""
+    """Rendered folder, read on demand.
+
+    Attributes:
+        folder: the folder.
+    """
 
     folder: Path
 
     @cached_property
     def about(self) -> dict[str, Any]:
-        """The content of `render.json`: `settings`, `versions`, `seconds`, `frames` and `check`."""
+        """Content of `render.json`: `settings`, `versions`, `seconds`, `frames` and `check`.
+
+        Raises:
+            OSError: if it cannot be read.
+        """
         return dict(json.loads((self.folder / RENDER_FILE).read_text(encoding="utf-8")))
 
     @cached_property
     def rig(self) -> Rig:
-        """The cameras as rendered: sizes included, calibrated, with their lenses."""
+        """Rig as rendered, calibrated, with sizes and lenses."""
         return Rig.load(self.folder / "rig.yaml")
 
     def frames(self, camera: str) -> int:
-        """How many frames of a camera there are."""
+        """Return the number of frames of a camera."""
         return len(self.about["frames"][self.rig.require(camera)])
 
     def frame(self, camera: str, number: int = 0) -> RenderedFrame:
-        """One frame of a camera, as float32 (index: int64)."""
+        """Read one frame of a camera.
+
+        Returns:
+            The frame, float32 (index int64).
+
+        Raises:
+            IndexError: for a `number` beyond its frames.
+        """
         entry = self.about["frames"][self.rig.require(camera)][number]
         with np.load(self.folder / entry["file"]) as arrays:
             kinds = {k: np.int64 if k == "index" else np.float32 for k in arrays}
@@ -78,7 +96,7 @@ _MOST = 6e4
 
 
 def save_frame(path: Path, frame: RenderedFrame) -> None:
-    """Write the arrays of a frame, synced to disk."""
+    """Write the arrays of a frame to an .npz file, synced to disk; not atomically."""
     arrays: dict[str, NDArray] = {}
     for name, value in vars(frame).items():
         if isinstance(value, Tensor):
@@ -91,19 +109,20 @@ def save_frame(path: Path, frame: RenderedFrame) -> None:
 
 
 def frame_file(rig: Rig, camera: str, number: int = 0) -> str:
-    """The name of a frame's file; the camera's number is in front where its name has odd characters."""
+    """Return the name of a frame's file; odd characters of the camera become _, with its number in front."""
     plain = re.sub(r"[^A-Za-z0-9_.+]", "_", camera)
     same = plain == camera and not camera.startswith(".")
     return f"{plain if same else f'{rig.names.index(camera):02d}_{plain}'}-{number:04d}.npz"
 
 
 def is_rendered(folder: str | Path) -> bool:
-    """Whether a folder holds a complete rendered scene."""
+    """Return True if a folder holds a complete rendered scene."""
     return (Path(folder) / RENDER_FILE).is_file()
 
 
 UNEVEN = 0.001
-"""Where allowed, interpolation is off by an eighth of this: a hundredth of a pixel at a disparity of 80."""
+"""Relative deviation of inverse depth from its neighbours' mean that counts as a crease: interpolation errs
+by up to an eighth of it, a hundredth of a pixel at a disparity of 80."""
 
 
 def depth_between(
@@ -113,10 +132,15 @@ def depth_between(
     *,
     uneven: float = UNEVEN,
 ) -> tuple[Float[Tensor, "*n"], Bool[Tensor, "*n"]]:
-    """Depth at positions (x, y), whether the four pixels around are of one object, no step or crease.
+    """Interpolate depth at positions (x, y), linearly in inverse depth, which is exact on planes.
 
-    Inverse depth is interpolated, which is exact on planes. Infinite depths stay infinite. More than `uneven`
-    counts as a step or crease: how far, relatively, an inverse depth is from the middle of its neighbours'.
+    Args:
+        index: object index of each pixel.
+        uneven: relative deviation of inverse depth from its neighbours' mean that counts as a step or crease.
+
+    Returns:
+        Depth (n), infinite depths stay infinite; and True where the four pixels around are one object without
+        step or crease.
     """
     inverse = torch.where(depth.isfinite(), 1 / depth, 0.0).to(x)
     layers = torch.stack([inverse, index.to(x), *(b.to(x) for b in _creases(inverse, uneven))])[None]
@@ -129,7 +153,8 @@ def depth_between(
 
 
 def _creases(inverse: Float[Tensor, "h w"], uneven: float) -> tuple[Bool[Tensor, "h w"], Bool[Tensor, "h w"]]:
-    """Creases and steps of inverse depth, along rows and columns. Between two such pixels is an edge."""
+    """Pixels at creases and steps of inverse depth, along rows and columns. Between two such pixels is an
+    edge."""
     across, down = torch.zeros_like(inverse, dtype=torch.bool), torch.zeros_like(inverse, dtype=torch.bool)
     across[:, 1:-1] = inverse.diff(n=2, dim=1).abs() > uneven * inverse[:, 1:-1]
     down[1:-1] = inverse.diff(n=2, dim=0).abs() > uneven * inverse[1:-1]

@@ -1,4 +1,4 @@
-"""What random rigs are drawn from. Torch is not imported: the command line reads it for its options."""
+"""Distribution of random rigs. Imports no torch: the command line reads it for its options."""
 
 from __future__ import annotations
 
@@ -11,20 +11,27 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True)
 class RigDistribution:
-    """A distribution of random rigs. Pairs are ranges; lengths are drawn evenly in their logarithm.
+    """Distribution of random rigs. Pairs are (low, high) bounds; lengths are drawn evenly in their logarithm.
 
-    - `mode`: "rectified" (betas displaced along x alone, their images resized copies of alpha's geometry, so
-      that x_beta = s (x_alpha - disparity) up to the half pixel) or "general".
-    - `parallax`: displacement of the nearest depth against infinity, in alpha's pixels; sets the baseline.
-    - `near` in metres and `depth_ratio` = far / near.
-    - `frame`: width of the whole image as a multiple of alpha's, which is a patch of it; `focal`: focal
-      length as a multiple of that width.
-    - `resolutions`: beta's pixels a radian over alpha's and its size over alpha's; one is drawn for each
-      camera of a batch.
-    - `alpha`, rectified only: whether alpha is the left camera, the right, or either (one draw a rig).
-    - general only: `focal_ratio` (on top of the resolution), `rotation` in degrees about a random axis,
-      `toe_in` (how far betas rotate towards a point of the scene: 0 parallel, 1 wholly), `decentring` (how
-      far beta's patch misses alpha's, as a fraction of its size).
+    Attributes:
+        mode: "rectified" (betas displaced along x alone, images resized copies of alpha's geometry, so that
+            x_beta = s (x_alpha - disparity) up to the half pixel) or "general".
+        betas: number of betas.
+        parallax: displacement of the nearest depth against infinity, alpha's pixels; sets the baseline.
+        near: near bound, metres.
+        depth_ratio: far / near.
+        frame: width of the whole image as a multiple of alpha's, which is a patch of it.
+        focal: focal length as a multiple of that width.
+        resolutions: beta's pixels a radian over alpha's, and its size over alpha's; one is drawn for each
+            camera of a batch.
+        alpha: side of alpha in rectified rigs; "either" draws one for each rig.
+        focal_ratio: further factor of beta's focal length (general).
+        rotation: degrees about a random axis (general).
+        toe_in: rotation of betas towards a point of the scene, 0 parallel, 1 fully (general).
+        decentring: offset of beta's patch from alpha's view, as a fraction of its size (general).
+
+    Raises:
+        ValueError: for bounds that are not positive and in order, no betas, or no positive resolutions.
     """
 
     mode: Literal["rectified", "general"] = "rectified"

@@ -1,4 +1,4 @@
-"""Random rigs for training: distributions of baselines, focal lengths, rotations and resolutions."""
+"""Random rigs for training: baselines, focal lengths, rotations and resolutions."""
 
 from __future__ import annotations
 
@@ -22,7 +22,13 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class RigBatch:
-    """Cameras, alpha first, each batched (B), and the depths (metres, from alpha) where scenes should be."""
+    """Batch of rigs.
+
+    Attributes:
+        cameras: cameras, alpha first, each batched (b).
+        near: near bound of scenes from alpha, metres.
+        far: far bound of scenes from alpha, metres.
+    """
 
     cameras: list[Camera]
     near: Float[Tensor, " b"]
@@ -30,12 +36,19 @@ class RigBatch:
 
 
 def in_frame_of(alpha: Camera, camera: Camera) -> Camera:
-    """The camera with alpha's frame as the world."""
+    """Return the camera with alpha's frame as the world."""
     return camera.replace(cam_from_world=camera.cam_from_world @ alpha.cam_from_world.inverse())
 
 
 def random_rigs(rigs: RigDistribution, batch: int, hw: HW, generator: Generator) -> RigBatch:
-    """`batch` rigs, alpha's images being of height and width `hw`, alpha's frame being the world."""
+    """Draw a batch of rigs; alpha's frame is the world.
+
+    Args:
+        hw: (height, width) of alpha's images.
+
+    Returns:
+        The rigs, float64 on the CPU.
+    """
     near = log_uniform(rigs.near, (batch,), generator)
     far = near * log_uniform(rigs.depth_ratio, (batch,), generator)
     alpha = _alpha(rigs, batch, hw, generator)
@@ -69,7 +82,7 @@ def _rectified_beta(rigs: RigDistribution, alpha: Camera, near: Tensor, far: Ten
 
 
 def _general_beta(rigs: RigDistribution, alpha: Camera, near: Tensor, far: Tensor, g: Generator) -> Camera:
-    """Placed anywhere around alpha; the principal point puts what alpha sees in the middle of the image."""
+    """Beta placed anywhere around alpha; its principal point centres what alpha sees."""
     batch, resolution = len(near), one_of(rigs.resolutions, g)
     hw = scaled(alpha.hw, resolution)
     centre = _baseline(rigs, alpha, near, g)[:, None] * _direction(batch, g)
@@ -90,28 +103,28 @@ def _general_beta(rigs: RigDistribution, alpha: Camera, near: Tensor, far: Tenso
 
 
 def scaled(hw: HW, s: float) -> HW:
-    """The size s times as large, rounded."""
+    """Return a (height, width) multiplied by `s`, rounded."""
     return round(hw[0] * s), round(hw[1] * s)
 
 
 def one_of(items: Sequence[T], generator: Generator) -> T:
-    """One of several, all equally likely."""
+    """Draw one of several items, all equally likely."""
     return items[below(len(items), generator)]
 
 
 def below(count: int, generator: Generator) -> int:
-    """A whole number from 0 to `count` - 1."""
+    """Draw a whole number from 0 to `count` - 1."""
     return int(torch.randint(count, (), generator=generator))
 
 
 def uniform(bounds: Range, shape: tuple[int, ...], generator: Generator) -> Tensor:
-    """Float64 values even between the bounds."""
+    """Draw float64 values evenly between bounds."""
     low, high = bounds
     return low + (high - low) * torch.rand(shape, generator=generator, dtype=torch.float64)
 
 
 def log_uniform(bounds: Range, shape: tuple[int, ...], generator: Generator) -> Tensor:
-    """Float64 values whose logarithm is even between the bounds'."""
+    """Draw float64 values evenly in their logarithm between bounds."""
     return uniform((math.log(bounds[0]), math.log(bounds[1])), shape, generator).exp()
 
 
@@ -128,7 +141,7 @@ def _middle_ray(camera: Camera) -> Tensor:
 
 
 def _rotation_towards(direction: Tensor, old: Tensor) -> Tensor:
-    """Rotation vector from `direction` to `old`, so that beta sees it as alpha does."""
+    """Rotation vector from `direction` to `old`, so that beta sees the point as alpha does."""
     a, b = (v / v.norm(dim=-1, keepdim=True) for v in (direction, old))
     axis = torch.linalg.cross(a, b)
     sine = axis.norm(dim=-1, keepdim=True)

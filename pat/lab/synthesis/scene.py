@@ -1,8 +1,8 @@
-"""A scene apart from any renderer: objects, materials, lights and motions, as frozen values that serialise.
+"""Description of a scene for any renderer: objects, materials, lights and motions, as frozen values.
 
-The world is the rig's: metres, and whatever directions the rig's `cam_from_world` give it. Radians, seconds.
-Colours are linear reflectances and radiances of red, green and blue (Rec. 709 primaries), with one of the
-near infrared beside them.
+The world is the rig's: metres, in the directions of the rig's `cam_from_world`; radians, seconds. Colours are
+linear reflectances and radiances of red, green and blue (Rec. 709 primaries), with one of near infrared
+beside them.
 """
 
 from __future__ import annotations
@@ -30,7 +30,12 @@ FORMAT = "pat-scene 1"
 
 @dataclass(frozen=True)
 class Paint:
-    """What a surface reflects, 0..1: linear red, green and blue, and near infrared."""
+    """Reflectance of a surface, 0..1.
+
+    Attributes:
+        rgb: linear red, green and blue.
+        nir: near infrared.
+    """
 
     rgb: Vec3
     nir: float
@@ -38,13 +43,18 @@ class Paint:
 
 @dataclass(frozen=True, kw_only=True)
 class Texture:
-    """How paints are laid on a surface.
+    """Layout of paints on a surface.
 
-    Patterns live in the object's own coordinates in metres and have about `scale` features a metre; `offset`
-    shifts them, `distortion` (0 to some) makes them irregular, `grain` (0..1) lays fine noise over them. They
-    run through the `paints` in order. An "image" is a file (sRGB) whose width covers 1 / `scale` metres of
-    the surface and which repeats beyond; it is multiplied by the first paint's colour. Its near infrared is
-    its red plus 1.5 times by how much green exceeds red and blue (leaves), times the paint's.
+    Attributes:
+        kind: pattern, in the object's own coordinates, that runs through the paints in order; or "image".
+        paints: paints of a pattern; an image is multiplied by the first.
+        scale: features of a pattern for each metre; an image's width covers 1 / scale metres and repeats
+            beyond.
+        offset: shift of the coordinates.
+        distortion: irregularity of the pattern, 0 for none.
+        grain: strength of fine noise, 0..1.
+        image: sRGB file; its near infrared is red plus 1.5 times the excess of green over red and blue
+            (leaves), times the paint's.
     """
 
     kind: TextureKind = "plain"
@@ -58,10 +68,16 @@ class Texture:
 
 @dataclass(frozen=True, kw_only=True)
 class Material:
-    """A surface: its texture and how it shines.
+    """Texture of a surface and its reflection; 0..1 as in Disney's principled model.
 
-    `roughness`, `specular`, `metallic` and `transmission` are 0..1 as in Disney's principled model; `bump`
-    metres of relief follow the texture in shading only; `emission` makes the surface shine its paint, unlit.
+    Attributes:
+        texture: colours.
+        roughness: roughness.
+        specular: specular level.
+        metallic: share of metal.
+        transmission: share of light passed through.
+        bump: metres of relief that follow the texture, in shading only.
+        emission: strength of light in the paint's colour.
     """
 
     texture: Texture = field(default_factory=Texture)
@@ -74,7 +90,13 @@ class Material:
 
 
 class ObjectPose(NamedTuple):
-    """X_world = R diag(extent) X_object + position, for a shape that fills [-0.5, 0.5]^3."""
+    """Pose of a shape that fills [-0.5, 0.5]^3: X_world = R diag(extent) X_object + position.
+
+    Attributes:
+        R: rotation.
+        position: position of the middle, metres.
+        extent: lengths along its axes, metres.
+    """
 
     R: Float[NDArray, "3 3"]
     position: Float[NDArray, "3"]
@@ -83,7 +105,14 @@ class ObjectPose(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Key:
-    """Where an object is at a time: middle's position, rotation vector (radians), extent along its axes."""
+    """Placement of an object at a time.
+
+    Attributes:
+        position: position of the middle, metres.
+        rotation: rotation vector, radians.
+        extent: lengths along its axes, metres.
+        time: seconds.
+    """
 
     position: Vec3
     rotation: Vec3 = (0.0, 0.0, 0.0)
@@ -93,8 +122,16 @@ class Key:
 
 @dataclass(frozen=True)
 class Motion:
-    """Keys in order of time. Between them positions and extents change evenly and rotations evenly about an
-    axis; before the first and after the last nothing moves."""
+    """Keys of a motion; positions and extents change evenly between them, rotations evenly about an axis.
+
+    Nothing moves before the first and after the last.
+
+    Attributes:
+        keys: keys in order of time.
+
+    Raises:
+        ValueError: for no keys, or times that do not rise.
+    """
 
     keys: tuple[Key, ...]
 
@@ -104,7 +141,11 @@ class Motion:
             raise ValueError(f"a motion needs keys whose times rise, got times {times}")
 
     def at(self, time: float) -> ObjectPose:
-        """Where the object is at a time in seconds."""
+        """Interpolate the object's pose at a time in seconds.
+
+        Returns:
+            The pose, float64.
+        """
         from scipy.spatial.transform import Rotation, Slerp  # here, as it takes .2 s to import
 
         times, rotations, positions, extents = (
@@ -122,7 +163,13 @@ class Motion:
 
 @dataclass(frozen=True, kw_only=True)
 class Relief:
-    """Bumps and dents in the surface itself, `height` metres to both sides and about `size` metres across."""
+    """Bumps and dents of a surface.
+
+    Attributes:
+        height: amplitude to both sides, metres.
+        size: typical width, metres.
+        seed: random seed.
+    """
 
     height: float
     size: float
@@ -131,11 +178,18 @@ class Relief:
 
 @dataclass(frozen=True, kw_only=True)
 class Object:
-    """A shape with a material, and perhaps a relief.
+    """Shape with a material. Object `i` of a scene has the index i + 1 in rendered index images.
 
-    A "room" is a cube seen from inside; it casts no shadow. A "lathe" is the surface that `profile` sweeps
-    around the y axis: from its top, pairs of a radius (0..0.5) and a y (-0.5..0.5). Object `i` of a scene has
-    the index i + 1 in rendered index images.
+    Attributes:
+        name: name in messages.
+        shape: kind of shape; a "room" is a cube seen from inside and casts no shadow.
+        motion: placement over time.
+        material: its surface.
+        relief: bumps of the surface; None for a smooth one.
+        profile: points (radius 0..0.5, y -0.5..0.5), from the top, that a "lathe" sweeps around the y axis.
+
+    Raises:
+        ValueError: for a lathe without a profile of 2 points or more, and a profile of another shape.
     """
 
     name: str
@@ -152,10 +206,16 @@ class Object:
 
 @dataclass(frozen=True, kw_only=True)
 class Light:
-    """A light. `power` is in watts ("sun": watts a square metre), for each of the colours times that colour.
+    """Light source.
 
-    `direction` is where an area light or a sun shines to. `size` is the side of an area light or the radius
-    of a point light in metres, and the angle of a sun in radians.
+    Attributes:
+        kind: "area", "sun" or "point".
+        power: watts (sun: watts for each square metre) in each colour, times `rgb` or `nir`.
+        position: metres.
+        direction: direction that an area light or a sun shines to.
+        rgb: relative power in red, green and blue.
+        nir: relative power in near infrared.
+        size: side of an area light or radius of a point light, metres; angle of a sun, radians.
     """
 
     kind: Literal["area", "sun", "point"]
@@ -169,7 +229,12 @@ class Light:
 
 @dataclass(frozen=True)
 class World:
-    """Light from all directions that no object blocks: radiance of red, green, blue and near infrared."""
+    """Light from all directions that no object blocks.
+
+    Attributes:
+        rgb: radiance of red, green and blue.
+        nir: radiance of near infrared.
+    """
 
     rgb: Vec3 = (0.0, 0.0, 0.0)
     nir: float = 0.0
@@ -177,7 +242,16 @@ class World:
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """The content of a scene. `depth` is (near, far) in metres, `generator` and `seed` are its origin."""
+    """Content of a scene.
+
+    Attributes:
+        objects: objects.
+        lights: light sources.
+        world: light from all around.
+        depth: (near, far) in metres.
+        generator: name of the generator that made it; empty if none.
+        seed: seed that it was made from.
+    """
 
     objects: tuple[Object, ...]
     lights: tuple[Light, ...] = ()
@@ -187,6 +261,6 @@ class Scene:
     seed: int = 0
 
     def save(self, path: str | Path) -> None:
-        """Write the scene to a YAML file, atomically, for the record."""
+        """Write the scene to a YAML file, atomically, for the record; nothing reads it back."""
         document = {"format": FORMAT, **to_document(self)}
         write_text(path, dump_yaml(document, width=120, default_flow_style=None))

@@ -1,4 +1,4 @@
-"""The shapes of scenes as meshes in metres, the same for every renderer."""
+"""Shapes of scenes as meshes in metres, the same for every renderer."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 from .scene import Object, Relief, Shape, Vec3
 
 Patch = Callable[[NDArray, NDArray], tuple[NDArray, NDArray, NDArray]]
-"""(s, t) in 0..1 to (x, y, z) on the shape in [-0.5, 0.5]^3. From outside, s is right where t is down."""
+"""Function from (s, t) in 0..1 to (x, y, z) on the shape in [-0.5, 0.5]^3. From outside, s is right where t
+is down."""
 
 TORUS = 0.3
-"""Radius of a torus's tube over that of its outline."""
+"""Radius of a torus's tube divided by that of its outline."""
 
 _FLAT = 1
 _ROUND = 64
@@ -25,11 +26,12 @@ _MOST_CELLS = 96
 
 
 class Mesh(NamedTuple):
-    """Corners of quadrilaterals, and where each corner is on an image laid on the surface.
+    """Quadrilateral mesh with texture coordinates.
 
-    `vertices` are metres in the object's frame, at the extent of its first key. `faces` go counter-clockwise
-    seen from outside; one of three corners has its last index twice. `uv` (metres, x right, y down) is by
-    face and corner.
+    Attributes:
+        vertices: metres in the object's frame, at the extent of its first key.
+        faces: vertex numbers, counter-clockwise from outside; a triangle has its last one twice.
+        uv: texture position of each face's corners, metres, x right, y down.
     """
 
     vertices: Float[NDArray, "v 3"]
@@ -38,7 +40,7 @@ class Mesh(NamedTuple):
 
 
 class _Surface(NamedTuple):
-    """A patch, its cells along s and t, and whether corners that coincide are merged.
+    """Patch, its cells along s and t, and whether coinciding corners are merged.
 
     They are not at the tip of a cone, where each has the normal of its own part of the side.
     """
@@ -49,9 +51,13 @@ class _Surface(NamedTuple):
 
 
 def mesh(item: Object) -> Mesh:
-    """The object's surface, relief included.
+    """Build the mesh of an object, relief included.
 
-    Patches of a plain shape do not share corners, so that edges between them are sharp; those of a relief do.
+    Patches of a plain shape do not share corners, so that edges between them are sharp; patches with relief
+    do.
+
+    Returns:
+        The mesh.
     """
     extent = np.asarray(item.motion.keys[0].extent)
     surfaces = (_lathe(item.profile),) if item.shape == "lathe" else SURFACES[item.shape]
@@ -64,7 +70,11 @@ def mesh(item: Object) -> Mesh:
 
 
 def inside(item: Object, point: Float[NDArray, "3"], time: float) -> bool:
-    """Whether a point of the world is within a solid object, or about as near to it as its relief is high."""
+    """Return True for a world point inside a solid object at a time, or within about its relief's height of
+    it.
+
+    Planes, rooms and lathes have no inside: always False.
+    """
     placement = item.motion.at(time)
     margin = item.relief.height if item.relief else 0.0
     local = placement.R.T @ (point - placement.position) / (placement.extent + 2 * margin)
@@ -99,14 +109,14 @@ def _cells(surface: _Surface, extent: NDArray, relief: Relief | None) -> tuple[i
 
 
 def _lengths(points: NDArray) -> tuple[float, float]:
-    """The longest line along each of the two directions of a grid of points."""
+    """Longest line along each of the two directions of a grid of points."""
     along_s = np.linalg.norm(np.diff(points, axis=0), axis=-1).sum(0).max()
     along_t = np.linalg.norm(np.diff(points, axis=1), axis=-1).sum(1).max()
     return float(along_s), float(along_t)
 
 
 def _welded(loose: Mesh, extent: NDArray) -> Mesh:
-    """Corners that coincide made one, and faces without area gone."""
+    """Merge coinciding corners, and drop faces without area."""
     corners = np.round(loose.vertices / extent, 6)
     _, first, new = np.unique(corners, axis=0, return_index=True, return_inverse=True)
     faces, uv = _triangles_last(new.reshape(-1)[loose.faces], loose.uv)
@@ -115,7 +125,7 @@ def _welded(loose: Mesh, extent: NDArray) -> Mesh:
 
 
 def _triangles_last(faces: NDArray, uv: NDArray) -> tuple[NDArray, NDArray]:
-    """Faces with two equal adjacent corners rotated so that these come last."""
+    """Rotate faces with two equal adjacent corners so that these come last."""
     faces, uv = faces.copy(), uv.copy()
     for i in range(3):
         rows = np.flatnonzero(faces[:, i] == faces[:, i + 1])
@@ -149,7 +159,7 @@ def _quad(origin: Vec3, along_s: Vec3, along_t: Vec3) -> Patch:
 
 
 def _revolved(radius: Callable[[NDArray], NDArray], y: Callable[[NDArray], NDArray], sign: int = 1) -> Patch:
-    """What a profile, by its radius and y along t, sweeps around the y axis; with `sign` -1 backwards."""
+    """Surface that a profile, by radius and y along t, sweeps around the y axis; backwards for `sign` -1."""
 
     def patch(s: NDArray, t: NDArray) -> tuple[NDArray, NDArray, NDArray]:
         azimuth = 2 * np.pi * s * sign
@@ -159,7 +169,7 @@ def _revolved(radius: Callable[[NDArray], NDArray], y: Callable[[NDArray], NDArr
 
 
 def _lathe(profile: tuple[tuple[float, float], ...]) -> _Surface:
-    """The surface that a profile sweeps around the y axis; corners of the profile are points of it."""
+    """Surface that a profile sweeps around the y axis; its corners are points of the surface."""
     index = np.arange(len(profile))
     radius, y = (lambda t, v=v: np.interp(t * (len(profile) - 1), index, v) for v in np.array(profile).T)
     return _Surface(_revolved(radius, y), (_ROUND, len(profile) - 1))

@@ -1,1 +1,1 @@
-"""Training: recipes, samples, losses, the loop, checkpoints."""
+"""Training of fusion networks: recipes, samples, losses, the loop, checkpoints."""

@@ -1,9 +1,8 @@
-"""Attention supervised by geometry: if the true position is known, weights along the segment classify.
+"""Attention loss supervised by geometry: weights along the segment classify the true position.
 
-For an alpha pixel whose point beta sees at a true position between the samples l and l + 1 of its segment, a
-share u of the way, the loss is the cross-entropy of the weights against (1 - u) at l and u at l + 1. For a
-pixel whose point beta does not see, it is that against equal weights: a search that finds nothing says so by
-a small peak.
+For an alpha pixel whose point beta sees between the samples l and l + 1 of its segment, a share u of the way,
+the loss is the cross-entropy of the weights against (1 - u) at l and u at l + 1. For a pixel whose point beta
+does not see, it is the cross-entropy against equal weights, so that a failed search has a small peak.
 """
 
 from __future__ import annotations
@@ -19,13 +18,20 @@ from arraygeom import Segments, sample
 from pat.attention.scores import Compared, log_sum, mean_score
 
 UNSEEN = 0.1
-"""Weight of pixels that beta does not see, against 1 of those it sees. Tuned on nothing."""
+"""Weight of pixels that beta does not see, against 1 for visible ones. Not tuned."""
 OFF = 1.5
-"""A true position farther than this from its segment, in samples along or pixels across it, is no target."""
+"""Distance from the segment, in samples along or pixels across it, above which a true position is ignored."""
 
 
 class Target(NamedTuple):
-    """Two samples (x, y) around a true position, the share of the second, whether it is on the segment."""
+    """Samples around a true position.
+
+    Attributes:
+        first: position (x, y) of the sample before it, pixels of beta.
+        second: position of the sample after it.
+        share: weight of the second, 0..1.
+        on_segment: True if the position is within `OFF` of the segment.
+    """
 
     first: Float[Tensor, "b h w 2"]
     second: Float[Tensor, "b h w 2"]
@@ -40,10 +46,16 @@ def attention_loss(
     *,
     stride: int = 2,
 ) -> Tensor:
-    """Mean cross-entropy over betas, of every `stride`-th row and column of alpha; nothing is gathered.
+    """Compute the mean cross-entropy over betas, on every `stride`-th row and column of alpha; nothing is
+    gathered.
 
-    `position` (x, y in beta's pixels) is (0, 0) where it is not known, `visible` whether beta sees the point
-    there.
+    Args:
+        compared: features and segments of each beta.
+        position: true positions (x, y) in pixels of each beta; (0, 0) where unknown.
+        visible: True where that beta sees the point.
+
+    Returns:
+        A scalar.
     """
     sparse = (slice(None), slice(None, None, stride), slice(None, None, stride))
     losses = [
@@ -63,7 +75,11 @@ def _of_beta(compared: Compared, position: Tensor, visible: Tensor) -> Tensor:
 
 
 def target_of(segments: Segments, samples: int, position: Float[Tensor, "b h w 2"]) -> Target:
-    """The samples around true positions (x, y) on segments (B or 1, h, w) of `samples` positions each."""
+    """Find the samples around true positions (x, y) on segments of `samples` positions each.
+
+    Returns:
+        The targets, clamped to the segment.
+    """
     along = segments.end - segments.start
     squared = along.square().sum(-1).clamp(min=1e-12)
     share = ((position - segments.start) * along).sum(-1) / squared
@@ -80,7 +96,7 @@ def target_of(segments: Segments, samples: int, position: Float[Tensor, "b h w 2
 
 
 def _true_scores(compared: Compared, target: Target) -> tuple[Tensor, Tensor]:
-    """The score at the true position, (b, h, w), and whether both samples around it lie on beta."""
+    """Score at the true position (b, h, w), and True if both samples around it lie on beta."""
     query, key, how = compared.query, compared.key, compared.interpolation
     first, second = (sample(key, xy.to(key), interpolation=how) for xy in (target.first, target.second))
     share = target.share[:, None].to(key)
@@ -89,5 +105,5 @@ def _true_scores(compared: Compared, target: Target) -> tuple[Tensor, Tensor]:
 
 
 def _mean(values: Tensor, where: Tensor) -> Tensor:
-    """Over some pixels; 0 of none."""
+    """Mean over the pixels in a mask; 0 for none."""
     return torch.where(where, values, 0).sum() / where.sum().clamp(min=1)

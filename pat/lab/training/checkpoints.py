@@ -1,4 +1,4 @@
-"""Checkpoints: the whole state of a run. Tensors and JSON, nothing pickled."""
+"""Checkpoints with the whole state of a run: tensors and JSON, nothing pickled."""
 
 from __future__ import annotations
 
@@ -26,13 +26,18 @@ FACTS: Mapping[str, tuple[type, ...]] = {
     "done": (bool,),
     "recipe": (str,),
 }
-"""What a checkpoint says beside its tensors, and the types of it."""
+"""Facts that a checkpoint states beside its tensors, with their types."""
 LONGEST = 1e7
-"""Minutes that a run takes at most: 19 years."""
+"""Minutes above which a checkpoint's time counts as damaged: 19 years."""
 
 
 class Checkpoint(NamedTuple):
-    """Tensors by name, and facts: the step, the best score so far, minutes spent, the recipe."""
+    """State of a run.
+
+    Attributes:
+        tensors: tensors by name.
+        facts: step, best score so far, minutes spent, whether the run is done, and the recipe as text.
+    """
 
     tensors: dict[str, Tensor]
     facts: dict[str, Any]
@@ -41,7 +46,11 @@ class Checkpoint(NamedTuple):
 def collect(
     network: nn.Module, optimiser: Optimizer, average: AveragedModel, facts: Mapping[str, Any]
 ) -> Checkpoint:
-    """The state of a run."""
+    """Collect the state of a run: weights, their average, and the optimiser's state.
+
+    Returns:
+        The checkpoint; tensors are not copied.
+    """
     tensors = {f"network/{k}": v for k, v in network.state_dict().items()}
     tensors |= {f"average/{k}": v for k, v in average.state_dict().items()}
     for i, state in optimiser.state_dict()["state"].items():
@@ -50,7 +59,11 @@ def collect(
 
 
 def restore(checkpoint: Checkpoint, network: nn.Module, optimiser: Optimizer, average: AveragedModel) -> None:
-    """Put the state of a run back. Raises ValueError if it is another network's."""
+    """Restore the state of a run into network, optimiser and average, in place.
+
+    Raises:
+        ValueError: if the checkpoint is of another network or optimiser.
+    """
     parts: dict[str, dict[str, Tensor]] = {"network": {}, "average": {}, "optimiser": {}}
     for name, tensor in checkpoint.tensors.items():
         section, _, rest = name.partition("/")
@@ -66,7 +79,7 @@ def restore(checkpoint: Checkpoint, network: nn.Module, optimiser: Optimizer, av
 
 
 def _state(tensors: Mapping[str, Tensor], optimiser: Optimizer) -> dict[int, dict[str, Tensor]]:
-    """An optimiser's state by its parameters' numbers. Raises ValueError if it is not of such parameters."""
+    """Optimiser state by number of the parameter. Raises ValueError if shapes are other parameters'."""
     shapes = [tuple(p.shape) for group in optimiser.param_groups for p in group["params"]]
     state: dict[int, dict[str, Tensor]] = {}
     for name, tensor in tensors.items():
@@ -83,7 +96,11 @@ def _state(tensors: Mapping[str, Tensor], optimiser: Optimizer) -> dict[int, dic
 def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> Path:
     """Write a checkpoint atomically, and remove all but it and the previous one.
 
-    Raises OSError, the older ones intact, if the disk is full.
+    Returns:
+        Its file.
+
+    Raises:
+        OSError: if it cannot be written, on a full disk for instance; older ones stay.
     """
     step = checkpoint.facts["step"]
     path = folder / f"step-{step:08d}.safetensors"
@@ -97,9 +114,14 @@ def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> Path:
 
 
 def newest_checkpoint(folder: Path) -> Checkpoint | None:
-    """The newest complete checkpoint; None if the folder has none.
+    """Read the newest readable checkpoint of a folder.
 
-    Raises ValueError if it has some and none of them can be read: a run is not to begin again unasked.
+    Returns:
+        The checkpoint; None if the folder has none.
+
+    Raises:
+        ValueError: if the folder has checkpoints and none can be read, so that no run starts again by
+            accident.
     """
     files = _files(folder)
     newest = next((checkpoint for path in files if (checkpoint := read_checkpoint(path))), None)
@@ -114,7 +136,11 @@ def newest_checkpoint(folder: Path) -> Checkpoint | None:
 
 
 def read_checkpoint(path: Path) -> Checkpoint | None:
-    """A checkpoint, or None for a file that is damaged or is none."""
+    """Read a checkpoint file.
+
+    Returns:
+        The checkpoint; None for a damaged file and for one that is no checkpoint.
+    """
     try:
         tensors, metadata = read_tensors(path)
         facts = json.loads(metadata.get("facts", "null"))
@@ -133,7 +159,7 @@ def _are_facts(facts: object) -> bool:
 
 
 def _files(folder: Path) -> list[Path]:
-    """Checkpoints, newest first."""
+    """Checkpoint files, newest first."""
     return sorted(
         (p for p in folder.glob("step-*.safetensors") if re.fullmatch(r"step-\d+", p.stem)), reverse=True
     )

@@ -1,4 +1,4 @@
-"""Training recipes: one typed dataclass, read from YAML, with command-line overrides."""
+"""Training recipes: one typed dataclass, read from YAML, with overrides from the command line."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ RECIPES = Path(__file__).parent / "recipes"
 RECTIFIED = RigDistribution(mode="rectified", parallax=(6.0, 110.0))
 GENERAL = RigDistribution(mode="general", parallax=(6.0, 90.0), focal_ratio=(0.8, 1.25))
 UNSEEN = ("out", "device", "save", "tensorboard", "cache")
-"""Entries that may differ between a run and its continuation: samples and steps do not depend on them."""
+"""Entries that may differ between a run and its continuation, as samples and steps do not depend on them."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,9 @@ class TrainConfig:
     rectified: float = 0.5
     """Share of the batches with rigs of `rectified_rigs`, the others being of `general_rigs`."""
     rectified_rigs: RigDistribution = RECTIFIED
+    """Distribution of rectified rigs."""
     general_rigs: RigDistribution = GENERAL
+    """Distribution of rigs in any pose."""
     rendered: float = 0.0
     """Share of the batches made of rendered scenes instead of layered ones."""
     rendered_from: tuple[Path, ...] = ()
@@ -108,6 +110,7 @@ class TrainConfig:
     measured_from: tuple[Path, ...] = ()
     """Folders of Middlebury's stereo pairs, with the true disparity of both images."""
     recording: RecordingConfig = RecordingConfig()
+    """Recording of the scenes by the cameras."""
     field: str = "epipolar"
     """The receptive field, by name, or MODULE:OBJECT for your own."""
     held_out: int = 12
@@ -158,14 +161,19 @@ class TrainConfig:
 
 
 def recipes() -> tuple[str, ...]:
-    """Names of the recipes in the package."""
+    """Return the names of the recipes in the package, sorted."""
     return tuple(sorted(p.stem for p in RECIPES.glob("*.yaml")))
 
 
 def load_config(name: str | Path) -> TrainConfig:
-    """A recipe of the package by name, or a YAML file.
+    """Load a recipe of the package by name, or a YAML file.
 
-    Raises FileNotFoundError for neither, ValueError naming the entry for what a recipe cannot be.
+    Returns:
+        The recipe.
+
+    Raises:
+        FileNotFoundError: if it is neither.
+        ValueError: naming the entry, for an invalid recipe.
     """
     path = next((p for p in (RECIPES / f"{name}.yaml", Path(name)) if p.is_file()), None)
     if path is None:
@@ -176,7 +184,14 @@ def load_config(name: str | Path) -> TrainConfig:
 
 
 def parse_config(text: str, name: str = "config") -> TrainConfig:
-    """A recipe from YAML text. Raises ValueError naming the entry."""
+    """Parse a recipe from YAML text; `name` is used in messages.
+
+    Returns:
+        The recipe.
+
+    Raises:
+        ValueError: naming the entry, for an invalid or empty recipe.
+    """
     values = parse_yaml(text, name)
     try:
         if not values:
@@ -191,14 +206,18 @@ def parse_config(text: str, name: str = "config") -> TrainConfig:
 
 
 def config_text(config: TrainConfig) -> str:
-    """The recipe as YAML, every value written out; `parse_config` reads it back."""
+    """Format a recipe as YAML with every value written out; `parse_config` reads it back.
+
+    Returns:
+        The text.
+    """
     from arraygeom.runtime.safe_yaml import dump_yaml
 
     return dump_yaml(to_document(config, defaults=True), default_flow_style=None, width=118)
 
 
 def save_config(config: TrainConfig, path: Path) -> None:
-    """Write `config_text` atomically."""
+    """Write a recipe to a YAML file, atomically."""
     from arraygeom.runtime.atomic import write_text
 
     text = config_text(config)
@@ -206,7 +225,17 @@ def save_config(config: TrainConfig, path: Path) -> None:
 
 
 def command_line(arguments: list[str], prog: str = "pat lab train") -> TrainConfig:
-    """`[RECIPE] [--name value ...]`: a recipe by name or file, and overrides of its values."""
+    """Parse `[RECIPE] [--name value ...]`: a recipe by name or file, and overrides of its values.
+
+    Returns:
+        The recipe.
+
+    Raises:
+        ValueError: for an invalid recipe, and for one that names code as its field where the arguments do
+            not.
+        FileNotFoundError: for a missing recipe.
+        UsageError: for unknown options and invalid values.
+    """
     base = TrainConfig()
     if arguments and not arguments[0].startswith("-"):
         base, arguments = load_config(arguments[0]), arguments[1:]
@@ -225,7 +254,11 @@ def command_line(arguments: list[str], prog: str = "pat lab train") -> TrainConf
 
 
 def difference(config: TrainConfig, other: TrainConfig) -> str | None:
-    """The first entry, as "name: a, b", that makes two recipes different runs; None if none does."""
+    """Compare two recipes, except for entries that results do not depend on.
+
+    Returns:
+        The first difference, as "name: a, b"; None if both are the same run.
+    """
     for entry in dataclasses.fields(TrainConfig):
         ours, theirs = getattr(config, entry.name), getattr(other, entry.name)
         if entry.name not in UNSEEN and ours != theirs:

@@ -1,4 +1,4 @@
-"""Images recorded through distorting lenses, and undistorted as `pat fuse` does it."""
+"""Images recorded through distorting lenses, and undistorted as `pat fuse` does."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from arraygeom.sampling import Sampled
 from arraygeom.undistortion import resampled
 
 STRONGEST = 0.3
-"""|k1| of the strongest lens."""
+"""Largest |k1| of a random lens."""
 STRETCHED = 0.4
 """Largest relative change of radial scale, in the corner farthest from the axis."""
 LOST = 0.1
@@ -30,10 +30,16 @@ def through_lenses(
     *,
     lost: float = 0.0,
 ) -> Sampled:
-    """Images distorted by a random lens, one a pinhole, passed to `recorded`, undistorted to the pinholes.
+    """Distort images by random lenses, pass them to `recorded`, and undistort the result.
 
-    Where the lens saw nothing, up to the share `lost` on each side, an image repeats its edge and is not
-    valid.
+    Args:
+        cameras: pinhole cameras, one for each image.
+        recorded: simulates the recording of a batch of images.
+        lost: largest share of height or width that the lens loses on each side.
+
+    Returns:
+        Images (b, c, h, w) at the pinholes, without gradient; where the lens saw nothing, the edge repeats
+        and `valid` is False.
     """
     pinholes = [cameras[i].to("cpu", torch.float64) for i in range(len(images))]
     lenses = [lens_over(pinhole, g, lost) for pinhole in pinholes]
@@ -50,7 +56,14 @@ def through_lenses(
 
 
 def lens_over(pinhole: Camera, g: Generator, lost: float = 0.0) -> Camera:
-    """A camera with a random lens, as many pixels, that covers the pinhole's view but for lost borders."""
+    """Draw a random lens with as many pixels that covers a pinhole's view, except for lost borders.
+
+    Args:
+        lost: largest share of height or width to lose on each side.
+
+    Returns:
+        The camera with its lens.
+    """
     x = border(pinhole)
     rays, _ = pinhole.rays(x)
     widest = float(rays[..., :2].square().sum(-1).max())
@@ -64,13 +77,17 @@ def lens_over(pinhole: Camera, g: Generator, lost: float = 0.0) -> Camera:
 
 
 def border(camera: Camera) -> Float[Tensor, "n 2"]:
-    """The pixels on the border of an image."""
+    """Return the pixels (x, y) on the border of a camera's image; corners appear twice."""
     x = pixel_grid(camera.hw, dtype=torch.float64)
     return torch.cat([x[0], x[-1], x[:, 0], x[:, -1]])
 
 
 def filling(low: Float[Tensor, "2"], high: Float[Tensor, "2"], hw: tuple[int, int]) -> Float[Tensor, "3 3"]:
-    """The map of pixels that takes the area between two corners to an image of a size."""
+    """Make the pixel map from the area between two corners to a whole image of size `hw`.
+
+    Returns:
+        Matrix (3, 3), float64.
+    """
     scale = torch.tensor([hw[1], hw[0]], dtype=torch.float64) / (high - low)
     A = torch.eye(3, dtype=torch.float64)
     A[0, 0], A[1, 1] = scale

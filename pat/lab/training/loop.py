@@ -1,4 +1,4 @@
-"""The loop: steps, validations and checkpoints, on one process or several."""
+"""Training loop: steps, validations and checkpoints, on one process or several."""
 
 from __future__ import annotations
 
@@ -32,20 +32,24 @@ from .watch import Watch
 
 BEST, CHECKPOINTS = "best.safetensors", "checkpoints"
 EARLY = 16
-"""From this step on, at each doubling until the first validation, images are written."""
+"""First step at which images are written; then at each doubling, until the first validation."""
 
 
 def train(config: TrainConfig) -> Path:
-    """Train with the receptive field that the configuration names; returns the file of the best weights.
+    """Train a network by a recipe, or continue the interrupted run in `config.out`.
 
-    In `config.out`: best.safetensors, config.yaml, log.jsonl (a line for each validation), steps.csv (a line
-    for each step), images/ and checkpoints/. If that folder holds the same run, interrupted, it continues:
-    with `steps` the result is that of an uninterrupted run, bit for bit; with `minutes` the time spent
-    counts.
+    Writes best.safetensors, config.yaml, log.jsonl (a line for each validation), steps.csv (a line for each
+    step), images/ and checkpoints/. With `steps` a continued run gives bit-identical weights; with `minutes`
+    the time spent before counts.
 
-    Raises FloatingPointError if a loss or a gradient is not finite, naming the sample, the batch saved beside
-    the weights; OSError if a checkpoint cannot be written; ValueError for a folder with another run, or one
-    that another command is writing to.
+    Returns:
+        File of the best weights.
+
+    Raises:
+        FloatingPointError: for a loss or gradient that is not finite, naming the samples; their batch is
+            saved.
+        OSError: if a checkpoint cannot be written.
+        ValueError: for a folder with another run, a folder in use, or data that do not suit the recipe.
     """
     former = former_run(config)
     if former and former.facts["done"]:
@@ -62,7 +66,14 @@ def train(config: TrainConfig) -> Path:
 
 
 def former_run(config: TrainConfig) -> Checkpoint | None:
-    """The same run's last checkpoint, if there is one. Raises ValueError if the folder holds another run."""
+    """Read the last checkpoint of the same run.
+
+    Returns:
+        The checkpoint; None if there is none.
+
+    Raises:
+        ValueError: if the folder holds another recipe's run, or no readable checkpoint.
+    """
     checkpoint = newest_checkpoint(config.out / CHECKPOINTS)
     if checkpoint is None:
         return None
@@ -73,10 +84,16 @@ def former_run(config: TrainConfig) -> Checkpoint | None:
 
 
 def rate_at(config: TrainConfig, step: int, share: float) -> float:
-    """The learning rate of a step; `share` is how much of the run is, 1 at the end.
+    """Compute the learning rate of a step.
 
     >>> rate_at(TrainConfig(rate=1e-3, schedule="halving", warmup=0), 1, 0.5)
     0.0005
+
+    Args:
+        share: share of the run that is done, 1 at the end.
+
+    Returns:
+        The rate.
     """
     if config.schedule == "halving":
         fall = 0.5 ** int(min(share, 1) * 80 / 30)
@@ -86,10 +103,13 @@ def rate_at(config: TrainConfig, step: int, share: float) -> float:
 
 
 class Run:
-    """A run under way: the network and its objective, the average of its weights, and what it learns from.
+    """State of a run: network, objective, averaged weights, and sources of samples.
 
-    `together` is the objective whose gradients all processes share, `groups` of each step are this process's.
-    Of the first process only: `examined`, which is validated on, and `watch`.
+    Attributes:
+        together: objective whose gradients all processes share.
+        groups: this process's groups of each step.
+        examined: validation samples; empty except in the first process.
+        watch: progress reports; None except in the first process.
     """
 
     def __init__(self, config: TrainConfig, here: Process, former: Checkpoint | None) -> None:
@@ -117,16 +137,21 @@ class Run:
 
     @property
     def averaged(self) -> PAT:
-        """The network with averaged weights."""
+        """Network with averaged weights."""
         return cast(PAT, self.average.module)
 
     @property
     def minutes(self) -> float:
-        """The time spent."""
+        """Minutes spent, those before a continuation included."""
         return (time.monotonic() - self.began) / 60
 
     def work(self) -> None:
-        """Step until done."""
+        """Run steps, validations and checkpoints until the run is done.
+
+        Raises:
+            FloatingPointError: for a loss or gradient that is not finite.
+            OSError: if a checkpoint cannot be written.
+        """
         given = self.samples.steps(self.groups, start=self.step)
         recipe = self.config
         for samples in made_ahead(given):
@@ -143,7 +168,7 @@ class Run:
                 return
 
     def _advance(self, samples: list[Sample], share: float) -> None:
-        """One step of the optimiser. Raises FloatingPointError if loss or gradients are not finite."""
+        """Do one step of the optimiser. Raises FloatingPointError if loss or gradients are not finite."""
         self.adam.zero_grad()
         losses = [self._backward(sample, len(samples), last=sample is samples[-1]) for sample in samples]
         norm = clip_grad_norm_(self.network.parameters(), self.config.clip)
@@ -160,7 +185,7 @@ class Run:
             self.watch.step(self.step, self.loss, float(norm), rate, done=share)
 
     def _backward(self, given: Sample, groups: int, *, last: bool) -> Tensor:
-        """Add the gradients of one group to the others'; processes exchange them with the last."""
+        """Add the gradients of one group; processes exchange them with the last group."""
         wait = isinstance(self.together, DistributedDataParallel) and not last
         with self.together.no_sync() if wait else nullcontext():  # type: ignore[operator]
             loss = self.together(given)
@@ -168,7 +193,7 @@ class Run:
         return loss.detach()
 
     def _validate(self) -> None:
-        """Measure, show, and keep the weights if they are the best so far."""
+        """Measure, show, and save the weights if they are the best so far."""
         if self.watch is None:
             return
         facts = validation(self.averaged, self.examined)
@@ -194,7 +219,7 @@ class Run:
             write_checkpoint(self.config.out / CHECKPOINTS, state)
 
     def _offence(self, samples: list[Sample]) -> str:
-        """Save the groups of a failed step; the error message names the samples."""
+        """Save the groups of a failed step. Returns the error message, which names the samples."""
         offences = []
         for group, sample in zip(self.groups, samples):
             bad = [i for i in range(len(sample.alpha)) if not self._is_finite(alone(sample, i))]
@@ -210,7 +235,7 @@ class Run:
         )
 
     def _is_finite(self, given: Sample) -> bool:
-        """Whether the loss of a sample and its gradients are finite."""
+        """True if the loss of a sample and its gradients are finite."""
         self.objective.zero_grad()
         loss = self.objective(given)
         loss.backward()
@@ -219,7 +244,12 @@ class Run:
 
 
 def save_sample(sample: Sample, path: Path, *, facts: dict[str, str]) -> None:
-    """A group's sample tensors: alpha, ground truth, and beta, position, visible of each beta by number."""
+    """Write the tensors of a group: alpha, ground truth, and beta, position and visibility by number of the
+    beta.
+
+    Raises:
+        OSError: if writing fails.
+    """
     tensors = {"alpha": sample.alpha, "ground_truth": sample.ground_truth}
     for name in ("betas", "position", "visible"):
         tensors |= {f"{name}/{i}": t for i, t in enumerate(getattr(sample, name))}

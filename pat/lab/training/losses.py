@@ -1,4 +1,4 @@
-"""Training losses, and validation figures."""
+"""Training losses and validation metrics."""
 
 from __future__ import annotations
 
@@ -18,9 +18,11 @@ from .samples import Sample
 
 
 def image_loss(image: Tensor, ground_truth: Tensor) -> Tensor:
-    """Minus the mean PSNR over 10 of images (b, c, h, w) in 0..1, with a floor on the error.
+    """Compute minus a tenth of the mean PSNR of images (b, c, h, w) in 0..1, with a floor of 1e-5 on the
+    error.
 
-    Every sample has the same weight.
+    Returns:
+        A scalar; every image has the same weight.
     """
     return ((image - ground_truth).square().flatten(1).mean(1) + 1e-5).log10().mean()
 
@@ -29,7 +31,12 @@ IMAGE_LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {"psnr": image_los
 
 
 class Objective(nn.Module):
-    """A network and its loss in one module, so that DistributedDataParallel sees one forward."""
+    """Network and its loss in one module, so that DistributedDataParallel sees one forward.
+
+    Args:
+        loss: name of the image loss, "psnr" or "mse".
+        attention: weight of the attention loss; 0 leaves it out.
+    """
 
     def __init__(self, network: PAT, loss: str, *, attention: float = 0.0) -> None:
         super().__init__()
@@ -38,7 +45,11 @@ class Objective(nn.Module):
         self.attention = attention
 
     def forward(self, sample: Sample) -> Tensor:
-        """The loss of a group of samples."""
+        """Compute the loss of a group of samples.
+
+        Returns:
+            A scalar.
+        """
         if not self.attention:
             return self.image_loss(self.network(sample.inputs).image, sample.ground_truth)
         fused, compared = self.network.compare(sample.inputs)
@@ -48,10 +59,12 @@ class Objective(nn.Module):
 
 @torch.no_grad()
 def validation(network: FusionNetwork, samples: list[Sample]) -> dict[str, float]:
-    """Mean PSNR, and the share of visible pixels matched within 1.5 pixels (NaN without ground truth).
+    """Measure a network on validation samples, by the first beta of each.
 
-    Of networks that are `Comparing` also `peaks`, the share of them where the largest weight is within a
-    pixel of the true position.
+    Returns:
+        By name: `psnr` in dB, the mean over samples, clipped to 0..1; `matched`, the share of visible pixels
+        whose match is within 1.5 pixels (NaN without truth); and for networks that are `Comparing` `peaks`,
+        the share whose largest weight is within one pixel.
     """
     psnr, near, peaks = [], [], []
     for sample in samples:

@@ -1,4 +1,4 @@
-"""One process of training, or one of several that torchrun started."""
+"""Processes of training: a single one, or several started by torchrun."""
 
 from __future__ import annotations
 
@@ -16,7 +16,13 @@ CPU = torch.device("cpu")
 
 @dataclass(frozen=True)
 class Process:
-    """Rank of this process, their number, and its device."""
+    """This process among those of the run.
+
+    Attributes:
+        rank: number of this process, from 0.
+        count: number of processes.
+        device: device that it computes on.
+    """
 
     rank: int = 0
     count: int = 1
@@ -24,11 +30,15 @@ class Process:
 
     @property
     def first(self) -> bool:
-        """Whether this process writes and validates."""
+        """True for the process that writes and validates."""
         return self.rank == 0
 
     def share(self, groups: int) -> list[int]:
-        """This process's groups of a step. Raises ValueError where they cannot be distributed evenly."""
+        """List this process's groups of a step.
+
+        Raises:
+            ValueError: if the groups cannot be distributed evenly.
+        """
         if groups % self.count:
             raise ValueError(
                 f"{groups} groups cannot be shared by {self.count} processes: give --groups a multiple"
@@ -36,17 +46,22 @@ class Process:
         return list(range(self.rank, groups, self.count))
 
     def together(self, objective: nn.Module) -> nn.Module:
-        """The module, with its gradients averaged over all processes."""
+        """Return the module with gradients averaged over all processes; the module itself in a single
+        process."""
         return objective if self.count == 1 else DistributedDataParallel(objective)
 
     def mean(self, number: Tensor) -> Tensor:
-        """The mean over all processes."""
+        """Average a number over all processes.
+
+        Returns:
+            The mean; with several processes `number` is overwritten by their sum.
+        """
         if self.count > 1:
             distributed.all_reduce(number)
         return number / self.count
 
     def agreed(self, number: float) -> float:
-        """The first process's number, in all of them."""
+        """Return the first process's number in all processes."""
         if self.count == 1:
             return number
         shared = torch.tensor([number], dtype=torch.float64, device=self.device)
@@ -54,13 +69,14 @@ class Process:
         return float(shared)
 
     def wait(self) -> None:
-        """Barrier: wait for all processes."""
+        """Wait until all processes arrive here."""
         if self.count > 1:
             distributed.barrier()
 
     @contextmanager
     def before_others(self) -> Iterator[None]:
-        """A block that the first process goes through before the others, for which it may leave a file."""
+        """Context manager: the first process runs the block before the others, and may leave a
+        file for them."""
         if not self.first:
             self.wait()
         yield
@@ -70,9 +86,16 @@ class Process:
 
 @contextmanager
 def process(device: str = "auto") -> Iterator[Process]:
-    """This process, connected with the others if torchrun started several (gloo on CPUs, NCCL on GPUs).
+    """Context manager that connects this process with the others of torchrun (gloo on CPUs, NCCL on GPUs).
 
-    Raises ValueError for a device that does not exist.
+    Args:
+        device: torch device; "auto" takes a GPU if there is one.
+
+    Yields:
+        This process.
+
+    Raises:
+        ValueError: for a device that does not exist.
     """
     count = int(os.environ.get("WORLD_SIZE", "1"))
     chosen = _device(device)

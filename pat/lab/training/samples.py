@@ -1,6 +1,6 @@
-"""Samples made in training: layered scenes from photographs, seen by random rigs, recorded by random cameras.
+"""Training samples: layered scenes from photographs, seen by random rigs, recorded by random cameras.
 
-A share of them may come from rendered scenes, and from stereo pairs with true disparity.
+A share may come from rendered scenes, and from stereo pairs with true disparity.
 
 The samples of a step are a pure function of the seed and the number of the step, so that a run continues
 where it stopped, and processes share a step without communication.
@@ -40,15 +40,24 @@ from .scenes import Crops, RenderedCrops
 from .stereo import MeasuredPairs
 
 CACHED = 48
-"""Groups of scenes cached to be recorded again."""
+"""Number of groups of scenes that are cached to be recorded again."""
 FEW = 8
-"""With fewer cached than this, a new one is always made."""
+"""Number of cached groups below which a new one is always made."""
 SCENE, RECORDING = 0, 1
-"""Purpose of a random generator, beside the seed and a number."""
+"""Purposes of random generators, combined with the seed and a number."""
 
 
 class Sample(NamedTuple):
-    """A network's input, the ground truth, and the true position of each pixel in each beta."""
+    """Group of training samples of one batch.
+
+    Attributes:
+        alpha: recorded alpha (b, 1, h, w).
+        betas: recorded betas (b, c, h, w), at alpha's size.
+        fields: receptive field of each beta.
+        ground_truth: image (b, 3, h, w) to be learnt.
+        position: true positions (b, h, w, 2) of alpha's pixels, pixels of each beta; (0, 0) where unknown.
+        visible: masks (b, h, w), True where that beta sees the point.
+    """
 
     alpha: Tensor
     betas: list[Tensor]
@@ -59,21 +68,30 @@ class Sample(NamedTuple):
 
     @property
     def inputs(self) -> Inputs:
-        """What a network is given."""
+        """Inputs of a network."""
         return Inputs.of(self.alpha, self.betas, self.fields)
 
 
 class Planned(NamedTuple):
-    """The scenes that a step records: their number, and the kind of their rigs."""
+    """Scenes that a step records.
+
+    Attributes:
+        scenes: number of the group of scenes.
+        kind: kind of their rigs or source.
+        dropped: number of the group to drop from the cache; None for none.
+    """
 
     scenes: int
     kind: str
     dropped: int | None
-    """The number of the scenes to drop from the cache."""
 
 
 def plan(config: TrainConfig, seed: int) -> Iterator[Planned]:
-    """What each step of a recipe records, from step 0: new scenes, or some of the last `CACHED` again."""
+    """Plan the scenes of each step: new ones, or one of the last `CACHED` groups again.
+
+    Yields:
+        The plan of each step, from step 0, without end.
+    """
     draw = random.Random(seed)
     shares = {name: getattr(config, name) for name in ("rendered", "measured")}
     layered = max(1 - sum(shares.values()), 0.0)
@@ -95,9 +113,15 @@ def plan(config: TrainConfig, seed: int) -> Iterator[Planned]:
 
 @dataclass
 class SampleSource:
-    """Samples by the number of the step: called with a count it gives the first group of that many steps.
+    """Samples by number of the step; calling it with a count yields the first group of that many steps.
 
-    Scenes are of `layered`, by the kind of their rigs, or of `folders`, by their kind.
+    Attributes:
+        config: recipe.
+        layered: layered scenes by kind of their rigs.
+        folders: windows of rendered scenes and measured pairs, by kind.
+        seed: random seed.
+        field: receptive field.
+        cache: groups of scenes, by (number, group).
     """
 
     config: TrainConfig
@@ -108,11 +132,11 @@ class SampleSource:
     cache: dict[tuple[int, int], ArrayBatch] = dataclasses.field(default_factory=dict)
 
     def __call__(self, count: int) -> Iterator[Sample]:
-        """The first group of the first `count` steps."""
+        """Yield the first group of the first `count` steps."""
         return (group[0] for group in islice(self.steps([0]), count))
 
     def steps(self, groups: list[int], *, start: int = 0) -> Iterator[list[Sample]]:
-        """The samples of these groups, step by step, from step `start` on."""
+        """Yield the samples of the given groups, step by step, from step `start` on, without end."""
         for step, planned in enumerate(plan(self.config, self.seed)):
             for key in [key for key in self.cache if key[0] == planned.dropped]:
                 del self.cache[key]
@@ -120,7 +144,11 @@ class SampleSource:
                 yield [self.sample(planned, step, group) for group in groups]
 
     def sample(self, planned: Planned, step: int, group: int) -> Sample:
-        """One group of one step."""
+        """Make one group of one step.
+
+        Returns:
+            The samples; the scenes stay in the cache.
+        """
         if (planned.scenes, group) not in self.cache:
             g = _generator(self.seed, SCENE, planned.scenes, group)
             self.cache[planned.scenes, group] = self._made(planned, g)
@@ -137,7 +165,7 @@ class SampleSource:
 
 
 def made_ahead(samples: Iterator[list[Sample]]) -> Iterator[list[Sample]]:
-    """The same samples: those of the next step are made while a step is computed."""
+    """Yield the same samples, those of the next step being made in a thread meanwhile."""
     with ThreadPoolExecutor(1) as beside:
         coming = beside.submit(next, samples)
         while True:
@@ -147,7 +175,14 @@ def made_ahead(samples: Iterator[list[Sample]]) -> Iterator[list[Sample]]:
 
 
 def scenes(config: TrainConfig, *, device: str = "cpu") -> tuple[SampleSource, SampleSource]:
-    """Sources of samples to learn from and to validate on, from different photographs, scenes and pairs."""
+    """Open a recipe's data, split into training and validation by photographs, scenes and pairs.
+
+    Returns:
+        Sources of training and of validation samples.
+
+    Raises:
+        ValueError: for no photographs, or too few to hold some out, and other data that cannot be used.
+    """
     field, n = named_field(config.field), config.held_out
     layered = config.rendered + config.measured < 1
     bank, unseen = photographs(config) if layered else (None, None)
@@ -167,7 +202,15 @@ def source_of(
     device: str = "cpu",
     folders: Mapping[str, Crops] = {},
 ) -> SampleSource:
-    """A recipe's samples. `photos` may be None where all batches come from `folders`, by kind of scenes."""
+    """Make a source of a recipe's samples.
+
+    Args:
+        photos: textures; None if all batches come from `folders`.
+        folders: windows of rendered scenes and measured pairs, by kind.
+
+    Returns:
+        The source.
+    """
     kinds = {"rectified": config.rectified_rigs, "general": config.general_rigs}
     betas = config.network.betas
     layered = {
@@ -179,7 +222,17 @@ def source_of(
 
 
 def crops(config: TrainConfig, seed: int, device: str, choose: Callable[[int], bool]) -> dict[str, Crops]:
-    """Windows of rendered scenes and of pairs, by kind; of each the items chosen by their number."""
+    """Open the recipe's rendered scenes and measured pairs.
+
+    Args:
+        choose: selects items by their number.
+
+    Returns:
+        Windows by kind ("rendered", "measured"); kinds without a folder are absent.
+
+    Raises:
+        ValueError: for folders that cannot be used.
+    """
     general, rectified = config.general_rigs.resolutions, config.rectified_rigs.resolutions
     sources: dict[str, tuple[type[Crops], tuple[Path, ...], tuple[float, ...]]] = {
         "rendered": (RenderedCrops, config.rendered_from, general),
@@ -193,9 +246,13 @@ def crops(config: TrainConfig, seed: int, device: str, choose: Callable[[int], b
 
 
 def photographs(config: TrainConfig) -> tuple[PhotoBank, PhotoBank]:
-    """Photographs to learn from, and every `held_out`-th for validation.
+    """Load the recipe's photographs, every `held_out`-th for validation.
 
-    Raises ValueError where there are none, or too few to hold some out.
+    Returns:
+        Textures for training and for validation.
+
+    Raises:
+        ValueError: if there are none, or too few to hold some out.
     """
     if not config.photos and not (config.cache and config.cache.exists()):
         raise ValueError("no photographs: give `photos` one or more folders with images")
@@ -214,7 +271,15 @@ def degraded(
     field: ReceptiveField = Epipolar(),  # noqa: B008
     recording: RecordingConfig = RecordingConfig(),  # noqa: B008
 ) -> Sample:
-    """Recorded images of a scene: alpha grey, betas in colour (or one band), at alpha's resolution."""
+    """Record a scene by random cameras: alpha grey, betas in colour (one band each if there are several).
+
+    Args:
+        field: receptive field of all betas.
+        recording: probabilities of degradations.
+
+    Returns:
+        The samples, betas at alpha's size.
+    """
     images, two_views = scene.images, len(scene.images) == 2
     ideal, grey, cameras = images[0], luminance(scene.images[0]), scene.cameras
     alpha = recorded(grey, cameras[0], g, recording).values
@@ -237,7 +302,14 @@ def degraded(
 def recorded(
     image: Tensor, camera: Camera, g: Generator, recording: RecordingConfig, *, lost: float = 0.0
 ) -> Sampled:
-    """The recorded image, perhaps distorted by a lens and undistorted; up to `lost` missing on each side."""
+    """Record images by one random camera, possibly through a lens and undistorted.
+
+    Args:
+        lost: largest share that an undistorted image lacks on each side.
+
+    Returns:
+        The images; `valid` is False where the lens saw nothing.
+    """
 
     def record_here(image: Tensor) -> Tensor:
         return record(image, steps(g, recording), g)
@@ -249,7 +321,11 @@ def recorded(
 
 
 def steps(g: Generator, recording: RecordingConfig) -> list[Step]:
-    """Gain, blur and noise of one camera; each with its own probability."""
+    """Draw the degradations of one camera: gain, blur and noise, each with its own probability, then 8 bits.
+
+    Returns:
+        The steps.
+    """
     steps: list[Step] = []
     if _chance(recording.gain, g):
         steps.append(Jitter(0.04, 0.04, 0.01))
@@ -261,7 +337,14 @@ def steps(g: Generator, recording: RecordingConfig) -> list[Step]:
 
 
 def pair_of(scene: ArrayBatch, beta: int, g: Generator) -> Pair:
-    """The batch of pairs (alpha, beta), beta at alpha's resolution, bounds looser than the scenes' own."""
+    """Make the batched pair of alpha and a beta at alpha's size, with depth bounds looser than the scenes'.
+
+    Args:
+        beta: number of the beta, from 1.
+
+    Returns:
+        The pair, float64; the far bound is infinite in half of the cases.
+    """
     near, far = scene.depth_range.double().unbind(-1)
     loose = torch.rand(2, len(near), generator=g, dtype=torch.float64).to(near.device)
     depth = near / (1 + 0.6 * loose[0]), torch.where(loose[1] < 0.5, torch.inf, far * (1 + 2 * loose[1]))
@@ -270,7 +353,11 @@ def pair_of(scene: ArrayBatch, beta: int, g: Generator) -> Pair:
 
 
 def perturbed(pair: Pair, pixels: float, g: Generator) -> Pair:
-    """The pairs, betas rotated at random, points moving by about `pixels`, root mean square, on each axis."""
+    """Rotate betas at random, so that points move by about `pixels` (root mean square on each axis).
+
+    Returns:
+        The pair; the same one for 0 pixels.
+    """
     if pixels == 0:
         return pair
     alpha, beta = pair.cameras
@@ -283,9 +370,15 @@ def perturbed(pair: Pair, pixels: float, g: Generator) -> Pair:
 
 
 def transfer(pair: Pair, depth: Tensor, beta_depth: Tensor) -> tuple[Tensor, Tensor]:
-    """Positions of alpha's pixels in beta (B, h, w, 2); whether beta sees the same surface there (B, h, w).
+    """Project alpha's pixels at their true depth into beta, and test visibility by beta's depth (within 2 %).
 
-    Pixels without depth (NaN) are not visible, and at (0, 0).
+    Args:
+        depth: depth (b, h, w) of alpha, metres; NaN where unknown.
+        beta_depth: depth (b, hb, wb) of beta, of any size; NaN where unknown.
+
+    Returns:
+        Positions (b, h, w, 2) in beta's pixels, (0, 0) where unknown, and masks (b, h, w), True where
+        visible.
     """
     hw = pair.alpha.hw
     track = pinhole_track(pair, pixel_grid(hw, device=depth.device).reshape(1, -1, 2))
@@ -300,7 +393,7 @@ def transfer(pair: Pair, depth: Tensor, beta_depth: Tensor) -> tuple[Tensor, Ten
 
 
 def alone(sample: Sample, i: int) -> Sample:
-    """The i-th of a group of samples."""
+    """Return sample `i` of a group, as a batch of one."""
 
     def one(parts: Sequence[Tensor]) -> list[Tensor]:
         return [tensor if len(tensor) == 1 else tensor[i : i + 1] for tensor in parts]
@@ -311,7 +404,11 @@ def alone(sample: Sample, i: int) -> Sample:
 
 
 def enlarged(image: Float[Tensor, "b c hb wb"], hw: HW) -> Float[Tensor, "b c h w"]:
-    """An image enlarged to another one's size (bicubic)."""
+    """Enlarge images to a size (bicubic, clipped to 0..1).
+
+    Returns:
+        Images (b, c, *hw); the same tensor if the size is unchanged.
+    """
     if image.shape[-2:] == hw:
         return image
     return interpolate(image, size=hw, mode="bicubic", align_corners=False).clamp(0, 1)
@@ -322,5 +419,5 @@ def _chance(p: float, g: Generator) -> bool:
 
 
 def _generator(*numbers: int) -> Generator:
-    """A generator of its own for each sequence of numbers."""
+    """Random generator seeded by a sequence of numbers."""
     return Generator().manual_seed(int(np.random.SeedSequence(numbers).generate_state(1)[0]))

@@ -1,7 +1,7 @@
-"""Rendered scenes as training samples: a random window of any camera as alpha, of any others as betas.
+"""Rendered scenes as training samples: a random window of any camera is alpha, of any others betas.
 
-Folders hold the output of `pat lab render`. Scenes may differ in their rigs and image sizes; images of
-cameras with a lens model are undistorted as `pat fuse` does it.
+Folders hold the output of `pat lab render`. Scenes may differ in rigs and image sizes; images of cameras with
+a lens model are undistorted as `pat fuse` does.
 """
 
 from __future__ import annotations
@@ -35,21 +35,25 @@ from pat.sensors import generator_for
 
 T = TypeVar("T")
 ACTIVE = 8
-"""Scenes, or pairs, that samples are drawn from at a time; their images stay in memory."""
+"""Number of scenes or pairs that samples are drawn from at a time; their images stay in memory."""
 GROUPS_PER_EXCHANGE = 8
-"""After so many groups of samples one of the active items is exchanged."""
+"""Number of groups of samples after which one of the active items is exchanged."""
 REDUCED = 4
-"""The largest reduction of a window."""
+"""Largest reduction of a window."""
 SKY = 1e6
-"""Distance from the camera, in metres, assigned to what is infinitely far: its parallax is negligible."""
+"""Distance in metres assigned to infinitely far points: their parallax is negligible."""
 DECENTRED = 0.1
 """Largest random shift of a beta's window, as a fraction of its size."""
 
 
 class Crops:
-    """Random windows of what is in folders; `hw` is alpha's size in the samples.
+    """Base class of random windows of the items in folders.
 
-    `resolutions` are those of betas, as in `RigDistribution`; `choose` selects items by their number.
+    Args:
+        roots: folders.
+        hw: (height, width) of alpha in the samples.
+        resolutions: resolutions of betas, as in `RigDistribution`.
+        choose: selects items by their number.
     """
 
     def __init__(
@@ -66,23 +70,32 @@ class Crops:
         self._find(roots, choose)
 
     def _find(self, roots: Sequence[Path], choose: Callable[[int], bool]) -> None:
-        """List the items, and refuse what cannot be used."""
+        """List the items, and refuse unusable ones."""
         raise NotImplementedError
 
     def sample(self, batch: int, generator: Generator, *, number: int, betas: int = 1) -> ArrayBatch:
-        """Windows of group `number`, of the items active then."""
+        """Draw windows from the items that are active for group `number`.
+
+        Returns:
+            A batch of `batch` samples with `betas` betas.
+
+        Raises:
+            NotImplementedError: in this base class.
+        """
         raise NotImplementedError
 
     def beta_sizes(self, betas: int, generator: Generator) -> list[HW]:
-        """Sizes of betas, drawn."""
+        """Draw the sizes (height, width) of betas."""
         return [scaled(self.hw, one_of(self.resolutions, generator)) for _ in range(betas)]
 
 
 class RenderedCrops(Crops):
-    """Random windows of the rendered scenes in folders.
+    """Random windows of rendered scenes.
 
-    Raises ValueError for a folder without scenes or with an incomplete one, for a scene of one camera, and
-    for one of which no image is as large as `hw`; when it is read, for one whose images cannot be read.
+    Raises:
+        FileNotFoundError: for a missing folder.
+        ValueError: for a folder without scenes or with an incomplete one, a scene with fewer than two
+            calibrated cameras, or without an image as large as `hw`.
     """
 
     def _find(self, roots: Sequence[Path], choose: Callable[[int], bool]) -> None:
@@ -96,9 +109,15 @@ class RenderedCrops(Crops):
         )
 
     def sample(self, batch: int, generator: Generator, *, number: int, betas: int = 1) -> ArrayBatch:
-        """Windows of group `number`, of the scenes active then.
+        """Draw windows from the scenes that are active for group `number`.
 
         If a scene has fewer other cameras than betas are wanted, several betas are of the same camera.
+
+        Returns:
+            A batch of `batch` samples with `betas` betas.
+
+        Raises:
+            ValueError: naming the scene, if its images cannot be read.
         """
         scenes = active_items(number, len(self.folders), self.seed)
         sizes = self.beta_sizes(betas, generator)
@@ -121,10 +140,14 @@ class RenderedCrops(Crops):
 
 
 def active_items(number: int, count: int, seed: int) -> list[int]:
-    """Which of `count` items group `number` of samples is drawn from: a function of these numbers alone.
+    """Choose the items (of `count`) that group `number` of samples is drawn from: a function of these numbers
+    alone.
 
     >>> active_items(0, 3, seed=0) == active_items(100, 3, seed=0) == [0, 1, 2]
     True
+
+    Returns:
+        Numbers of at most `ACTIVE` items.
     """
     if count <= ACTIVE:
         return list(range(count))
@@ -138,7 +161,14 @@ def _order(count: int, seed: int, epoch: int) -> list[int]:
 
 
 def chosen(every: list[T], choose: Callable[[int], bool], what: str) -> list[T]:
-    """Those chosen by their number. Raises ValueError if none is."""
+    """Select items by their number; `what` names them in messages.
+
+    Returns:
+        The selected items.
+
+    Raises:
+        ValueError: if there are none.
+    """
     items = [item for i, item in enumerate(every) if choose(i)]
     if not items:
         raise ValueError(
@@ -148,7 +178,14 @@ def chosen(every: list[T], choose: Callable[[int], bool], what: str) -> list[T]:
 
 
 def large_enough(folder: Path, rig: Rig, hw: HW) -> list[str]:
-    """The cameras of a scene that can be alpha. Raises ValueError if none can, or there is no other."""
+    """List the cameras of a scene that can be alpha, at least as large as `hw` after undistortion.
+
+    Returns:
+        Their names.
+
+    Raises:
+        ValueError: if none is large enough, a camera is not calibrated, or there is only one.
+    """
     sizes = {name: pinhole_of(c).hw for name, c in rig.cameras.items() if isinstance(c, Camera)}
     count = len(rig.names)
     if len(sizes) < max(count, 2):
@@ -165,7 +202,16 @@ def large_enough(folder: Path, rig: Rig, hw: HW) -> list[str]:
 
 
 def beside(alpha: RenderedView, beta: RenderedView, size: HW, hw: HW, g: Generator) -> RenderedView:
-    """A window of beta with alpha's angle of view, about where alpha's centre projects at a random depth."""
+    """Cut beta's window with alpha's angle of view, around the projection of alpha's centre at a random
+    depth.
+
+    Args:
+        size: (height, width) of the result.
+        hw: (height, width) of alpha's window.
+
+    Returns:
+        The view.
+    """
     ratio = pixels_per_radian(beta.camera) / pixels_per_radian(alpha.camera)
     wanted = (max(round(hw[0] * ratio), 1), max(round(hw[1] * ratio), 1))
     middle = torch.tensor([(hw[1] - 1) / 2, (hw[0] - 1) / 2], dtype=torch.float64)
@@ -185,18 +231,22 @@ def beside(alpha: RenderedView, beta: RenderedView, size: HW, hw: HW, g: Generat
 
 
 def _inside(start: float, length: int, whole: int) -> int:
-    """Where a window starts, shifted into the image, or centred on it where it is larger."""
+    """Start of a window, shifted into the image, or centred on it if the window is larger."""
     low, high = sorted((0, whole - length))
     return round(min(max(start, low), high))
 
 
 def pixels_per_radian(camera: Camera) -> float:
-    """The angular resolution in the middle of the image."""
+    """Return the angular resolution in the middle of a camera's image."""
     return float(camera.K[:2, :2].det().abs().sqrt())
 
 
 def finite_window(view: RenderedView, top: int, left: int, size: HW, hw: HW) -> RenderedView:
-    """A `window` whose infinite depths are replaced by those of a distance `SKY`."""
+    """Cut a `window` and replace infinite depths by those at a distance of `SKY`.
+
+    Returns:
+        The view.
+    """
     cut = window(view, top, left, size, hw)
     rays, _ = cut.camera.rays(pixel_grid(hw, dtype=torch.float64))
     return cut._replace(
@@ -205,14 +255,22 @@ def finite_window(view: RenderedView, top: int, left: int, size: HW, hw: HW) -> 
 
 
 def bounds(depth: Float[Tensor, "b h w"]) -> Float[Tensor, "b 2"]:
-    """The nearest and the farthest depth; `SKY` where nothing is seen."""
+    """Compute the nearest and farthest depth of each map, NaN ignored.
+
+    Returns:
+        Bounds (b, 2); both `SKY` for a map without depth.
+    """
     unseen = depth.isnan()
     near = torch.where(unseen, SKY, depth).flatten(1).amin(1)
     return torch.stack([near, torch.maximum(near, torch.where(unseen, 0.0, depth).flatten(1).amax(1))], -1)
 
 
 def batched(drawn: Sequence[Sequence[RenderedView]], device: str) -> ArrayBatch:
-    """Samples of views of the same sizes, each with alpha first, as one batch."""
+    """Stack samples of views of the same sizes, each with alpha first.
+
+    Returns:
+        A batch on the device, images sRGB-encoded, alpha's frame as the world.
+    """
     views = list(zip(*drawn))
     images = [srgb_image(torch.stack([v.rgb for v in same])).to(device) for same in views]
     depth = [torch.stack([v.depth for v in same]).to(device) for same in views]

@@ -1,6 +1,6 @@
-"""Stereo pairs as training samples: a random window of an image as alpha and truth, of the other as beta.
+"""Stereo pairs as training samples: a random window of one image is alpha and truth, of the other beta.
 
-Their true disparity is known. Their cameras are assumed: rectified, a metre apart, with the pair's range of
+True disparities are known. Cameras are assumed: rectified, a metre apart, with the pair's range of
 disparities.
 """
 
@@ -29,13 +29,20 @@ from pat.media.images import read_image
 from .scenes import ACTIVE, Crops, active_items, chosen
 
 DISPARITIES = ("disp2.png", "disp6.png"), ("disp1.png", "disp5.png")
-"""Files of the disparity of the left and of the right image."""
+"""File names of the disparities of the left and the right image."""
 REDUCED = 2
-"""The largest reduction of a window: images found online are often less sharp than their pixels."""
+"""Largest reduction of a window: images found online are often less sharp than their pixels."""
 
 
 class Pictures(NamedTuple):
-    """Two images (3, H, W), their disparities (H, W), 0 where not known, and the largest; pixels."""
+    """Images and disparities of a pair, in pixels.
+
+    Attributes:
+        left: left image (3, h, w).
+        right: right image (3, h, w).
+        disparities: disparities (h, w) of both; 0 where unknown.
+        largest: largest disparity.
+    """
 
     left: Tensor
     right: Tensor
@@ -44,11 +51,12 @@ class Pictures(NamedTuple):
 
 
 class MeasuredPairs(Crops):
-    """Random windows of Middlebury's pairs in folders, of the collections of 2003, 2005 and 2006.
+    """Random windows of Middlebury's pairs, from the collections of 2003, 2005 and 2006.
 
-    Raises ValueError for a folder without pairs, for a pair whose images differ in size, are not in colour or
-    are smaller than `hw`, or without the disparity of both images; when it is read, for an image that cannot
-    be read.
+    Raises:
+        FileNotFoundError: for a missing folder.
+        ValueError: for a folder without pairs, images that differ in size, are grey or smaller than `hw`, or
+            a pair without the disparity of both images.
     """
 
     def _find(self, roots: Sequence[Path], choose: Callable[[int], bool]) -> None:
@@ -59,7 +67,11 @@ class MeasuredPairs(Crops):
         self._pictures = lru_cache(ACTIVE)(lambda i: self.read(self.pairs[i]))
 
     def check(self, pair: PairFiles) -> None:
-        """Raise ValueError unless both images are in colour, of one size, at least `hw`, and measured."""
+        """Check that both images are in colour, of one size, at least `hw`, and have disparities.
+
+        Raises:
+            ValueError: naming the file, if not.
+        """
         left, right = _header(pair.left), _header(pair.right)
         if left != right:
             raise ValueError(
@@ -76,14 +88,23 @@ class MeasuredPairs(Crops):
         disparity_files(pair)
 
     def read(self, pair: PairFiles) -> Pictures:
-        """The images and disparities of a pair."""
+        """Read the images and disparities of a pair.
+
+        Raises:
+            ValueError: for a file that cannot be read.
+        """
         left, right = (read_image(path)[0] * pair.max_disparity for path in disparity_files(pair))
         return Pictures(read_image(pair.left), read_image(pair.right), (left, right), pair.max_disparity)
 
     def sample(self, batch: int, generator: Generator, *, number: int, betas: int = 1) -> ArrayBatch:
-        """Windows of group `number`, of the pairs active then. Several betas are of the same camera.
+        """Draw windows from the pairs that are active for group `number`. Several betas are of the same
+        camera.
 
-        `depth` is NaN where it is not known.
+        Returns:
+            A batch of `batch` samples; depth is NaN where unknown.
+
+        Raises:
+            ValueError: for an image that cannot be read.
         """
         active = active_items(number, len(self.pairs), self.seed)
         sizes = self.beta_sizes(betas, generator)
@@ -98,7 +119,8 @@ class MeasuredPairs(Crops):
         return replace(cameras, depth=[d.to(self.device) for d in depth])
 
     def _window(self, i: int, g: Generator) -> tuple[list[Tensor], list[Tensor], float, float]:
-        """Alpha and beta, their disparities, 1 where alpha is left, -1 where right, the largest disparity."""
+        """Alpha and beta, their disparities, 1 if alpha is left and -1 if right, and the largest
+        disparity."""
         pictures, (h, w) = self._pictures(i), self.hw
         whole = pictures.left.shape[1:]
         times = 1 + below(min(REDUCED, whole[0] // h, whole[1] // w), g)
@@ -113,7 +135,14 @@ class MeasuredPairs(Crops):
 
 
 def disparity_files(pair: PairFiles) -> tuple[Path, Path]:
-    """Of the left and of the right image. Raises ValueError where one is missing."""
+    """Find the disparity files of the left and the right image.
+
+    Returns:
+        Both paths.
+
+    Raises:
+        ValueError: if one is missing.
+    """
     for names in DISPARITIES:
         left, right = (pair.left.with_name(name) for name in names)
         if left.is_file() and right.is_file():
@@ -124,12 +153,17 @@ def disparity_files(pair: PairFiles) -> tuple[Path, Path]:
 
 
 def depth_of(disparity: Float[Tensor, "b h w"], width: int) -> Float[Tensor, "b h w"]:
-    """Of the cameras of `assumed_cameras`, in metres; NaN where the disparity is 0."""
+    """Convert disparity to depth in metres for the cameras of `assumed_cameras`; NaN where the disparity is
+    0."""
     return torch.where(disparity > 0, width / disparity, torch.nan)
 
 
 def coarser(depth: Float[Tensor, "b h w"], hw: HW) -> Float[Tensor, "b hs ws"]:
-    """The depth at about the centres of larger pixels, never a mean across an edge."""
+    """Pick depth at about the centres of coarser pixels, never a mean across an edge.
+
+    Returns:
+        Depth (b, *hw).
+    """
     h, w = depth.shape[-2:]
     rows, columns = (((torch.arange(n) + 0.5) * whole / n).long() for n, whole in zip(hw, (h, w)))
     return depth[:, rows][:, :, columns]
@@ -138,7 +172,16 @@ def coarser(depth: Float[Tensor, "b h w"], hw: HW) -> Float[Tensor, "b hs ws"]:
 def assumed_cameras(
     images: list[Tensor], side: Float[Tensor, " b"], disparity: Float[Tensor, " b"], device: str
 ) -> ArrayBatch:
-    """The images, alpha first, cameras a metre apart that put the nearest points `disparity` pixels apart."""
+    """Make a batch of images with cameras a metre apart, alpha first.
+
+    Args:
+        side: 1 where alpha is left, -1 where right.
+        disparity: disparity of the nearest points in pixels, which sets the near bound; the far bound is
+            infinity.
+
+    Returns:
+        The batch, without depth.
+    """
     batch, _, h, w = images[0].shape
     K = intrinsics(float(w), (h, w)).expand(batch, 3, 3)
     t = torch.zeros(batch, 3, dtype=torch.float64)
@@ -154,7 +197,7 @@ def assumed_cameras(
 
 
 def _header(file: Path) -> tuple[int, int, int]:
-    """Height, width and channels (1 or 3) of an image, without reading it whole."""
+    """Height, width and channels (1 or 3) of an image, without decoding it."""
     try:
         with Image.open(file) as image:
             return image.height, image.width, 1 if image.mode[0] in "1LIF" else 3

@@ -23,21 +23,28 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from arraygeom.runtime.atomic import write_text
+from arraygeom.runtime.extras import install_line
 from pat.media.images import write_image
 from pat.networks.protocol import FusionNetwork, fused_at_once
 
 from .samples import Sample
 
 SHOWN = 3
-"""Groups of the validation of which the first scene is shown."""
+"""Number of validation groups whose first scene is shown."""
 HEADER = "step,loss,gradient,rate\n"
 
 
 class Watch:
-    """Progress reports, of the first process alone.
+    """Progress reports of the first process: `steps.csv`, `log.jsonl`, images, a bar on a terminal.
 
-    `steps.csv` has a line for each step and `log.jsonl` one for each validation. Lines of steps after
-    `step`, where the run continues, are removed. A step sees so many `scenes`.
+    Args:
+        out: folder of the run.
+        step: step at which the run continues; lines of later steps are removed.
+        scenes: scenes in a step, for the speed.
+        tensorboard: True to log for TensorBoard too.
+
+    Raises:
+        ValueError: if TensorBoard is wanted and not installed.
     """
 
     def __init__(self, out: Path, step: int, scenes: int, *, tensorboard: bool) -> None:
@@ -60,7 +67,7 @@ class Watch:
         self.bar.start()
 
     def step(self, step: int, loss: float, norm: float, rate: float, *, done: float) -> None:
-        """Report one step; `done` is the completed fraction of the run."""
+        """Report one step; `done` is the completed share of the run."""
         now = time.monotonic()
         speed, self.ticked = self.scenes / (now - self.ticked), now
         self.steps.write(f"{step},{loss!r},{norm!r},{rate!r}\n")
@@ -71,7 +78,7 @@ class Watch:
                 self.board.add_scalar(name, value, step)
 
     def validated(self, facts: Mapping[str, float]) -> None:
-        """Report a validation."""
+        """Report the figures of a validation: print, write to log.jsonl, and to TensorBoard."""
         line = json.dumps({k: round(v, 4) for k, v in facts.items()})
         self.bar.console.print(line, highlight=False) if not self.bar.disable else print(line, flush=True)
         self.steps.flush()
@@ -82,14 +89,15 @@ class Watch:
                 self.board.add_scalar(f"validation/{name}", facts[name], int(facts["step"]))
 
     def show(self, network: FusionNetwork, samples: list[Sample], step: int) -> None:
-        """Images of the validation: beta, alpha, fused, ground truth, confidence, side by side."""
+        """Write an image of validation samples: beta, alpha, fused image, ground truth, confidence side by
+        side."""
         sheet = contact_sheet(network, samples[:SHOWN])
         write_image(self.out / "images" / f"step-{step:06d}.png", sheet)
         if self.board:
             self.board.add_image("validation", sheet, step)
 
     def close(self) -> None:
-        """Close bar and files."""
+        """Close the bar and the files."""
         self.bar.stop()
         self.steps.close()
         if self.board:
@@ -98,7 +106,12 @@ class Watch:
 
 @torch.no_grad()
 def contact_sheet(network: FusionNetwork, samples: list[Sample]) -> Float[Tensor, "3 _ _"]:
-    """A row for the first scene of each group: beta (three bands or one), alpha, fused, truth, confidence."""
+    """Compose one row for the first scene of each group: beta (three bands or one), alpha, fused, truth,
+    confidence.
+
+    Returns:
+        RGB image 0..1, on the CPU.
+    """
     return torch.cat([_row(network, sample) for sample in samples], -2).cpu()
 
 
@@ -114,7 +127,7 @@ def _row(network: FusionNetwork, sample: Sample) -> Tensor:
 
 
 def _keep_lines(path: Path, step: int, step_of: Any, *, header: str = "") -> None:
-    """Remove the lines of steps after `step`, and a last line cut short."""
+    """Remove the lines of steps after `step`, and an incomplete last line."""
     lines = (
         path.read_text(encoding="utf-8").splitlines(keepends=True)[bool(header) :] if path.is_file() else []
     )
@@ -126,5 +139,6 @@ def _board(folder: Path) -> Any:
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError:
-        raise ValueError("tensorboard is not installed: pip install 'arraygeom-pat[tensorboard]'") from None
+        install = install_line("tensorboard", "tensorboard")
+        raise ValueError(f"tensorboard is not installed: {install}") from None
     return SummaryWriter(folder)

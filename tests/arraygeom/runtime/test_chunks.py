@@ -104,7 +104,7 @@ def test_each_part_is_asked_for_once():
 
 
 def test_parts_are_forgotten():
-    """What is held at a time is the whole and one part."""
+    """At any time only the whole and one part are held."""
     memory = []
 
     def make(box):

@@ -1,4 +1,4 @@
-"""YAML files that are meant to harm, or were edited twice: refused at once, with the line."""
+"""Malicious YAML files, and files with repeated keys, are refused at once, with the line."""
 
 import re
 import time

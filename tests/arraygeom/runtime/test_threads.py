@@ -17,7 +17,7 @@ from arraygeom.runtime.threads import (
 
 
 class Noted(list):
-    """Tasks, and whether all were taken."""
+    """Tasks, and True if all were taken."""
 
     def __init__(self, tasks):
         super().__init__(tasks)
@@ -36,7 +36,7 @@ class Noted(list):
 
 
 def test_an_error_is_raised_once_no_task_runs_any_more(monkeypatch):
-    """Else what a task writes would still appear after it was cleaned up."""
+    """No output of a task appears after the clean-up."""
     monkeypatch.setattr(threads_module, "threads", lambda: 2)
     begun, both, done = [], threading.Barrier(2, timeout=300), []
 
@@ -100,7 +100,7 @@ def test_every_task_has_torch_in_its_own_thread_alone(two_threads, alone):
 
 
 def test_parts_are_computed_on_all_threads_and_come_in_order(two_threads):
-    """Each with torch alone, and with gradients or not as where they were asked for."""
+    """Each with torch alone, and with the gradient mode of the caller."""
     both, weight = threading.Barrier(2, timeout=300), torch.ones(3, requires_grad=True)
 
     def part(i):

@@ -35,8 +35,8 @@ def seen(folder) -> dict[str, str]:
 
 
 def interrupted(act, number: int, error: OSError | None) -> bool:
-    """Whether a forked process that is stopped before its so-manieth file operation, or whose operation
-    raises, was stopped at all."""
+    """Fork a process that is stopped before its n-th file operation, or whose operation raises; True if it
+    was."""
     child = os.fork()
     if child:
         return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 1

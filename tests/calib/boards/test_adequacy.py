@@ -29,7 +29,7 @@ def found():
 
 
 def test_a_calibration_is_shown_in_a_few_lines(found):
-    """In a notebook it was four thousand lines of residuals."""
+    """A notebook shows no residuals."""
     assert "Rig" in repr(found)
     assert len(repr(found)) < 1000
 
@@ -42,7 +42,7 @@ def test_lenses_that_there_are_not():
 
 
 def test_an_adjustment_that_goes_on_is_said(found):
-    """It was known, and read by nobody."""
+    """A fit that has not converged is reported."""
     going = "the adjustment has not come to rest"
     for converged in (True, False):
         assert (going in " ".join(misfit_notes(replace(found.fit, converged=converged)))) != converged
@@ -95,7 +95,7 @@ def test_halves_are_compared_only_where_both_saw_boards():
 
 
 def test_a_camera_of_half_the_rate_is_in_one_half_alone():
-    """Its boards are all in even frames: the report of the calibration, which was good, was not made."""
+    """Its boards are all in even frames; the report is made all the same."""
     rig = Rig({"fast": TRUE, "slow": camera(700.0, (480, 640), (0.1, 0.0, 0.0))})
     views = see(rig, board_poses(12, spread=0.2), noise=0.2)
     views["slow"] = views["slow"].only(range(0, 12, 2))
@@ -219,7 +219,8 @@ def test_rational_lenses_are_fitted():
 
 
 def test_no_board_is_mistaken_for_its_mirror_image_by_a_poor_start():
-    """With one radial term a board near the corner was seen from the other side for good: 5.7 px."""
+    """With one radial term a board near the corner can start from the other side; it ends on the
+    right one."""
     true = camera(420.0, (480, 640), lens=RATIONAL)
     views = see(Rig({"c": true}), board_poses(12, seed=5, spread=0.7, depth=(0.6, 1.6)), noise=0.05)
     assert calibrate(views, BOARD).rms < 0.15
@@ -305,7 +306,7 @@ def test_what_a_fit_does_not_determine_gives_no_advice(found):
 
 
 def test_images_that_show_no_view_of_the_board_have_none_proposed():
-    """A strip shows less than the board's height: its report ended in "min() arg is an empty sequence"."""
+    """A strip shows less than the board's height: the report proposes no view."""
     views = see(Rig({"cam": camera(1150.0, (160, 1600))}), board_poses(12, spread=0.1, depth=(6, 14)))
     strip = calibrate(views, BOARD)
     said = " ".join(coverage_advice(strip))
@@ -315,7 +316,7 @@ def test_images_that_show_no_view_of_the_board_have_none_proposed():
 
 
 def test_maps_of_uncertainty_show_the_images_area(found):
-    """They began half a pixel inside it, and ended half a pixel outside."""
+    """They extend from -0.5 to W - 0.5."""
     for axes in draw_adequacy(found, (0.9, 2.4)).axes[:3]:
         assert axes.get_xlim() == (-0.5, 639.5)
         assert axes.get_ylim() == (479.5, -0.5)

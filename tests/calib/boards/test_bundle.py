@@ -86,7 +86,7 @@ def test_derivatives_are_those_of_finite_differences(lens, model):
 
 
 def test_derivatives_of_boards(small):
-    """Of the pixels, by the poses of the boards."""
+    """Derivatives of the pixels by the poses of the boards."""
     _, _, problem = small
     problem = replace(problem, sigma={"mono": 1.0, "colour": 1.0})
     found, still = linearised(problem)["colour"].by_board, np.zeros(len(problem.names))
@@ -113,7 +113,7 @@ def test_a_problems_points_are_projected_once(small, monkeypatch):
 
 
 def test_views_of_the_same_points_are_solved_once(small, monkeypatch):
-    """Before the adjustment; once more where there were fewer at first."""
+    """Once before the adjustment, and once more where there were fewer points at first."""
     solved, counts = intrinsics._solved, []
 
     def counted(*given):

@@ -21,7 +21,7 @@ SEEDED = RANDOM.bit_generator.state
 
 @pytest.fixture(autouse=True)
 def the_same_draws_in_any_order():
-    """Each test draws as if it were the first: by itself, or after others."""
+    """Each test draws as if it were the first: alone, or after others."""
     RANDOM.bit_generator.state = SEEDED
 
 

@@ -102,7 +102,7 @@ def crossing(square):
 
 @pytest.mark.parametrize("dictionary", ["5x5_50", "apriltag_36h11"])
 def test_centres_are_found_to_a_fraction_of_a_pixel(dictionary, tmp_path):
-    """OpenCV counts AprilTags' pixels from the first one's corner: they were half a pixel off."""
+    """OpenCV counts AprilTags' pixels from the first one's corner, which is corrected by half a pixel."""
     image, squares = six_markers(dictionary)
     found = detect(image, parse_board(f"{written(tmp_path, in_a_room(6))}:{dictionary}"))
     off = found.x - [crossing(squares[number]) for number in found.ids]
@@ -110,7 +110,7 @@ def test_centres_are_found_to_a_fraction_of_a_pixel(dictionary, tmp_path):
 
 
 def test_an_image_with_markers_on_a_line_alone_is_not_used(tmp_path):
-    """About which the camera could turn: the calibration ended in a singular matrix."""
+    """A camera could turn about that line."""
     places = np.concatenate([np.arange(6)[:, None] * np.array([1.0, 2.0, 3.0]), in_a_room(2)])
     image, board = six_markers()[0], parse_board(str(written(tmp_path, places)))
     assert detect(image, board) is None
@@ -158,7 +158,7 @@ def test_wrong_files_are_explained(text, message, tmp_path):
 
 
 def test_spreadsheets_mark_the_beginning_of_their_files(tmp_path):
-    """The mark of UTF-8 was part of the first column's name, unseen in the message that refused it."""
+    """The byte order mark of UTF-8 is no part of the first column's name."""
     path = written(tmp_path, in_a_room(8))
     plain = parse_board(str(path)).positions
     path.write_text(path.read_text(), encoding="utf-8-sig")

@@ -56,7 +56,7 @@ def test_a_folder_for_each_camera(tmp_path):
 
 
 def test_images_beside_folders_of_images_are_refused(tmp_path):
-    """Thumbnails were taken for the only camera, without a word."""
+    """Thumbnails beside folders are not taken for the only camera."""
     for name in ("left1", "right1", "thumbnails/left1", "thumbnails/right1"):
         write(tmp_path / f"{name}.png")
     with pytest.raises(ValueError, match=r"such as left1.png, and folders of images \(thumbnails\): move"):
@@ -164,7 +164,7 @@ def test_a_photograph_that_states_too_many_pixels_is_not_decoded(tmp_path):
 @pytest.mark.parametrize("kind", [np.uint16, np.int16, np.int32, np.float32, np.float64])
 @pytest.mark.parametrize("bands", [1, 3])
 def test_values_of_any_kind_are_stretched_to_grey(kind, bands, tmp_path):
-    """Temperatures in one band, as thermal cameras save them, were not read; others gave OpenCV's errors."""
+    """Temperatures in one band, as thermal cameras save them, are read."""
     values = np.add.outer(20 * np.arange(48), np.zeros((64, bands))).astype(kind)
     if kind in (np.float32, np.float64):
         values = 20 + values / 4000

@@ -225,7 +225,7 @@ def test_a_poorly_constrained_camera_stays_plausible():
 
 @pytest.mark.parametrize("seed", [0, 1, 3])
 def test_a_narrow_view_by_a_fisheyes_model(seed):
-    """OpenCV was started from half a sphere: good images were left out, or did not suffice."""
+    """OpenCV's start from half a sphere would leave out good images."""
     views = see(
         Rig({"a": camera(300.0, (240, 320))}), board_poses(4, seed=seed, depth=(0.5, 1.5)), noise=0.02
     )
@@ -284,14 +284,14 @@ def test_a_board_that_bends_raises_the_deviations():
 
 @pytest.mark.parametrize(("frames", "raised"), [(4, 3.0), (7, 1.0)])
 def test_deviations_that_few_frames_cannot_check_are_raised(frames, raised):
-    """Of a real pair, baselines of three frames were up to 6.8 stated deviations off; nothing said so."""
+    """Baselines of three frames of a real pair are up to 6.8 deviations off unless these are raised."""
     found = calibrate(see(pair_rig(), board_poses(frames, spread=0.2), noise=0.05), BOARD)
     assert found.fit.raised == raised
     assert any("too few to check standard deviations" in note for note in found.notes) == (raised > 1)
 
 
 def test_frames_that_disagree_about_the_focal_lengths_raise_those_alone(found, monkeypatch):
-    """By the jackknife their deviations are five times as large, the others' the same."""
+    """The jackknife makes their deviations five times as large, and leaves the others."""
     factor = np.array([5.0 if "focal" in name else 1.0 for name in found.fit.names])
     disagreeing = found.fit.covariance * factor[:, None] * factor
     given = jackknife(found.fit.problem)._replace(covariance=disagreeing, left_out=disagreeing)
@@ -305,10 +305,8 @@ def test_frames_that_disagree_about_the_focal_lengths_raise_those_alone(found, m
 
 @pytest.mark.parametrize("part", [0, 2])
 def test_small_boards_around_the_centre_do_not_lead_the_start_astray(shared_data, part):
-    """Four fifths of a recording: without part 0 aspect and k2 ran off (4,227 by 937 px): "all parallel".
-
-    So did one of 96 random subsets of its cameras' boards.
-    """
+    """Four fifths of a recording, and random subsets of a camera's boards, on which aspect and k2 can run
+    off."""
     views = caliscope_views(shared_data)
     frames = dict.fromkeys(key for v in views.values() for key in v.seen)
     left_out = [key for key in frames if sum(key in v.seen for v in views.values()) > 1][part::FOLDS]

@@ -1,4 +1,5 @@
-"""`pat rig diff`: simulated recalibrations of a rig that moved and one that did not; what is refused."""
+"""Differences of rigs by `pat rig diff`: simulated recalibrations of a rig that moved and one that did not;
+refusals."""
 
 import math
 import re
@@ -47,7 +48,8 @@ def compared(one, other):
 
 
 def shares(rig, count):
-    """Of so many recalibrations of a rig that did not move and one that did, what share is said to be so."""
+    """Return the share of recalibrations of one rig that are called the same, and of a moved one called
+    moved."""
     fits = [recalibrated(rig, seed) for seed in range(count + 1)]
     same = [not compared(*pair).significance.moved for pair in pairwise(fits)]
     moved = [compared(fits[i], recalibrated(turned(rig, i), 10_000 + i)).significance for i in range(count)]
@@ -111,7 +113,7 @@ def test_differences_are_those_of_the_motion(rig, name):
 
 @pytest.mark.parametrize("unit", [1e-3, 1e3])
 def test_pixels_differ_alike_in_any_unit_of_length(rig, unit):
-    """Of large units the motion was sought until it changed no more, of small ones until to a millionth."""
+    """The end of the iteration is relative to the unit."""
     pose = rig["nir"].cam_from_world.perturbed(
         torch.zeros(3).double(), torch.tensor([0.1, 0.1, 0.1]).double()
     )
@@ -178,7 +180,7 @@ def test_depths_of_rigs_of_unknown_scale_are_not_in_metres(files, tmp_path, caps
 
 
 def test_a_covariance_is_of_the_rig_it_was_found_with(files, tmp_path, capsys):
-    """Of a rig that was repaired in its place, lengths in another unit, it stood for the repaired one's."""
+    """A covariance file is refused for a rig whose lengths were changed; another depth range is no change."""
     for path in files.glob("a.*"):
         shutil.copy(path, tmp_path)
     rig = Rig.load(tmp_path / "a.yaml")
@@ -226,7 +228,7 @@ def test_mistakes_are_named(files, capsys, one, other, message):
 
 
 def test_derivatives_are_those_of_the_difference(rig):
-    """Of the second rig's parameters in its own world, which is turned and shifted, by differences."""
+    """Derivatives by the second rig's parameters in its own world, which is turned and shifted."""
     other, pixels = set_up_in(WORLD, rig), torch.tensor([[100.0, 80], [500, 400]]).double()
     X = rig["nir"].unproject(pixels, torch.tensor([1.5, 3.0]).double()).numpy()
     part = _projections(rig, other, WORLD, "nir", X)

@@ -39,7 +39,7 @@ FLAT = (0.0, 0.0, 0.0, 0.0)
 
 @cache
 def calibrated(values, **options):
-    """What is found of boards of a shape, `seen_of` them."""
+    """Calibrate with boards of a shape, `seen_of` them."""
     return calibrate(seen_of(values, **options), BOARD)
 
 

@@ -52,7 +52,7 @@ def test_boards_are_tilted_and_at_several_depths(rig):
 
 
 def test_images_that_are_turned_show_boards_as_large(rig):
-    """The board was sought at no distance at all: by a focal length that is beside K's diagonal."""
+    """The focal length of a turned image is beside K's diagonal; the board's distance follows from it."""
     turned = Rig({name: c.rot90(1) for name, c in rig.cameras.items()})
     depths = [board_poses(each, BOARD, 8).t[:, 2].mean() for each in (rig, turned)]
     assert 0.5 < depths[1] / depths[0] < 2

@@ -50,7 +50,7 @@ def one_board(seed: int) -> Pose:
 
 
 def calibrated(rig, *, seed=0, start=None):
-    """What one image of each camera says of a rig that is near a start."""
+    """Calibrate a rig that is near a start with one image of each camera."""
     views = see(rig, one_board(seed), noise=0.1, seed=seed)
     return calibrate(views, BOARD, lens="none", start=start or four(), deviations=STATED)
 
@@ -69,7 +69,7 @@ def test_the_stated_deviations_hold():
 
 
 def test_images_that_are_turned_have_their_start():
-    """Their focal lengths are beside K's diagonal, where 0 was taken for one."""
+    """The focal length of a turned image is beside K's diagonal."""
     turned = {}
     for kind, rig in (("true", drawn(four(), 0)), ("start", four())):
         turned[kind] = Rig({name: c.rot90(1) for name, c in rig.cameras.items()})
@@ -90,7 +90,7 @@ def test_images_that_are_turned_have_their_start():
     ],
 )
 def test_the_lens_that_is_wanted_of_a_start_with_another(own, wanted, terms, kept):
-    """It was left out without a word: a rational lens had the four terms of the start."""
+    """A rational lens begins with the terms of the start and has all of its own."""
     lens = Distortion(own[0], tensor(*own[1]))
     rig = Rig({name: c.replace(distortion=lens) for name, c in four().cameras.items()})
     found = calibrate(see(rig, one_board(0), noise=0.1), BOARD, lens=wanted, start=rig, deviations=STATED)
@@ -99,7 +99,7 @@ def test_the_lens_that_is_wanted_of_a_start_with_another(own, wanted, terms, kep
 
 
 def test_what_one_board_leaves_open_is_said():
-    """One board does not show where a camera is: the deviation of its position stays as it was stated."""
+    """One board does not show where a camera is: the deviation of its position stays as stated."""
     found = calibrated(drawn(four(), 0))
     focal, centre, position = (
         tuple(map(float, re.search(rf"{kind} ±([\d.]+) > ±([\d.]+)", found.notes[0]).groups()))
@@ -118,7 +118,7 @@ def test_a_wrong_start_is_named():
 
 
 def test_a_start_in_millimetres_is_refused():
-    """No image of a camera was left, which ended in a TypeError."""
+    """The message names a camera whose boards are nowhere near the start's, and asks for metres."""
     with pytest.raises(ValueError, match=r"c1: its boards are nowhere near .* in metres"):
         calibrated(four(), start=four().scaled(1000.0))
 
@@ -206,7 +206,7 @@ def test_the_nine_band_array(shared_data):
 
 
 def test_cameras_far_apart_are_rotated_by_way_of_those_between():
-    """Each sees boards with the next alone: the last, off by 8 degrees against the second, was refused."""
+    """Each sees boards with the next alone; the last, 8 degrees off against the second, is accepted."""
     row = Rig({f"c{i}": camera(600.0, (480, 640), (0.5 * i, 0.0, 0.0)) for i in range(4)})
     views, middle = {name: {} for name in row.names}, torch.from_numpy(BOARD.middle)
     for frame, x in enumerate((0.25, 0.75, 1.25, 0.2, 0.8, 1.3)):

@@ -313,7 +313,7 @@ def test_points_whose_equations_are_singular_are_invalid():
 
 
 def test_only_a_distortion_may_have_the_wrong_sign():
-    """The numbers of a camera model were negated too, as if they were called coefficients: a TypeError."""
+    """The numbers of a camera model are not negated."""
     cameras = dict(simulated_rig("wide", 2, np.random.default_rng(0)).cameras)
     lenses = (PolynomialFisheye(vector(0.01, -0.02)), Distortion("kannala-brandt", vector(0.1, 0, 0, 0)))
     for name, lens in zip(cameras, lenses):
@@ -329,7 +329,7 @@ def test_only_a_distortion_may_have_the_wrong_sign():
 
 
 def test_a_rig_without_a_depth_range_is_told_one():
-    """That fusion then searches: it holds all points."""
+    """The range is the one that fusion then searches: it holds all points."""
     rig = unlike_pair()
     points = seen_points(rig)
     assert "states no depth" not in diagnose_matches(rig, sizes(rig), points).as_text()
@@ -365,7 +365,7 @@ def test_mistakes_in_a_part_of_the_numbers_are_named(part):
     ("change", "kind"), [({"focal": 0.5, "centre": 0.5}, "resized"), ({"focal": 0.01}, "focal length")]
 )
 def test_what_lines_cannot_see_the_size_of_the_image_can(change, kind):
-    """Rectified pairs: they were healthy."""
+    """Rectified pairs of which one image is resized."""
     rig = rectified_pair()
     found = diagnose_matches(each(lambda c: with_numbers(c, **change))(rig), sizes(rig), seen_points(rig))
     assert found.named.kind == kind
@@ -373,7 +373,7 @@ def test_what_lines_cannot_see_the_size_of_the_image_can(change, kind):
 
 
 def test_a_factory_calibration_is_healthy():
-    """One of 1.3 px by OpenCV had drifted; so small a share of an image is what factories reach."""
+    """1.3 px are as small a share of an image as factories reach."""
     rig = unlike_pair()
     some = rig.perturbed({"second.rotation": vector(0.0008, -0.0005, 0.0008)})
     found = diagnose_matches(some, sizes(rig), seen_points(rig))

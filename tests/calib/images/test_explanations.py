@@ -84,7 +84,7 @@ def test_a_few_things_before_a_wall_make_lines():
 
 
 def test_lenses_are_no_parallax():
-    """Two lenses at one place had a depth, by how they differ."""
+    """Two different lenses at one place have no depth."""
     one = rectified_pair()["left"]
     turned = Pose(rotation_from_vector(vector(0.01, -0.02, 0.03)), torch.zeros(3).double())
     lens = Distortion("brown-conrady", vector(-0.05, 0.01, 0.0, 0.0))
@@ -96,7 +96,7 @@ def test_lenses_are_no_parallax():
 
 
 def test_a_rig_of_one_homography_has_it_as_its_map():
-    """The case planar_matches: any F was written, its lines 34 to 80 degrees wrong."""
+    """The case planar_matches: F is arbitrary, its lines may be 34 to 80 degrees wrong, the map is not."""
     images = {name: torch.zeros(1, *VGA) for name in "ab"}
     matches = points_of(wall)
     found = rig_from_images(images, matches={("a", "b"): matches})
@@ -122,7 +122,7 @@ def test_the_command_says_that_the_file_is_for_these_images(tmp_path, capsys):
 
 
 def test_depth_has_no_bounds_where_focal_lengths_are_assumed(tmp_path):
-    """They were stated as if the focal lengths were known: 123 to 156 baselines of a skyline."""
+    """Bounds of depth are not stated as if the focal lengths were known."""
     rig = rectified_pair()
     depth = torch.full((16, 16), 3.0)
     frame = Frame(torch.rand(3, 16, 16), depth, depth / 3, 0.01 * depth)

@@ -15,7 +15,8 @@ ASSUMED = 1.2 * max(HW)
 
 
 def views_and_points(rig: Rig, *, seed: int = 0, count: int = 500):
-    """A rig's views, F of its points, and the points: before it, good to .15 pixels, some of them wrong."""
+    """Return a rig's views, F of its points, and the points in front, good to 0.15 pixels, some of them
+    wrong."""
     g = np.random.default_rng(seed)
     alpha, beta = rig.cameras.values()
     x = torch.from_numpy(g.uniform(0, 1, (8 * count, 2)) * np.array(HW[::-1]))
@@ -83,7 +84,7 @@ def test_held_out_points_decide(monkeypatch):
 
 
 def test_mirrored_points_and_unlike_sizes_have_none():
-    """Of a mirrored image's points a focal length of half the true one was found, to 8 %."""
+    """A mirrored image's points would give half the true focal length, to 8 %."""
     views, link, matches = views_and_points(hand_held(190.0))
     mirrored = PointMatches(matches.alpha, matches.beta * vector(-1, 1) + vector(HW[1] - 1, 0))
     assert fit_focal_length(views, Link(fit_fundamental(mirrored)), mirrored) is None

@@ -56,7 +56,7 @@ def test_command_line(tmp_path, capsys):
 
 
 def test_points_in_one_spot_are_held_out_too():
-    """Where none was in a square that is held out, this ended in an error of tuples or of torch."""
+    """Points of which none is in a square to hold out are split all the same."""
     torch.manual_seed(0)
     images = {name: torch.zeros(1, 240, 320) for name in "ab"}
 

@@ -41,10 +41,8 @@ def test_poses_before_a_flat_scene_are_fitted_until_lines_are():
 @pytest.mark.parametrize("noise", [None, 8.0])
 @pytest.mark.parametrize("lost", ["b", "c"])
 def test_lengths_are_those_stated_of_cameras_that_match(lost, noise, monkeypatch):
-    """With the first beta left out, the next one's baseline became as long as that of the one left out.
-
-    And one that matches at first, but hardly once lines are fitted, ended in an error of torch.
-    """
+    """With the first beta left out, the next one keeps its own baseline. A camera that matches at first, but
+    hardly after lines are fitted, is left out."""
     torch.manual_seed(0)
     K, hw = intrinsics(700.0, (480, 640)), (480, 640)
     centres = {"a": (0.0, 0.0, 0.0), "b": (0.3, 0.0, 0.0), "c": (0.0, 0.1, 0.0), "d": (0.1, 0.1, 0.0)}

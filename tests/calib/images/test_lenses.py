@@ -138,7 +138,7 @@ def test_the_fusions_error_sees_through_lenses():
     views = with_lenses(
         Rig({n: View(hw=rig[n].hw) for n in rig.names}, links={("left", "right"): Link(F, H)})
     )
-    ready = {name: PhotometricImage.of(image) for name, image in images.items()}
+    ready = {name: PhotometricImage.from_image(image) for name, image in images.items()}
 
     def error(change):
         changed = views.perturbed({"right.distortion": change})

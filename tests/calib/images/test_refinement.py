@@ -60,7 +60,8 @@ def small_drift() -> tuple[Rig, Rig]:
 
 
 def test_depth_that_points_do_not_determine_stays():
-    """Rotation about the vertical hardly moves a line: what is determined returns, depth stays as it was."""
+    """Rotation about the vertical hardly moves a line: determined parameters return, depth keeps
+    its value."""
     rig, bad = small_drift()
     points = simulated_matches(rig, "narrow", np.random.default_rng(6))
     found = refine_matches(bad, [points])
@@ -76,7 +77,7 @@ def test_depth_that_points_do_not_determine_stays():
 def test_what_is_kept_is_named_alike_by_any_basis():
     """A name for each combination, whichever of them span what is kept."""
     _, bad = small_drift()
-    problem = RefinementProblem.of(bad, ["rotation", "centre", "focal"], frames=[seen_points(bad)])
+    problem = RefinementProblem.from_frames(bad, ["rotation", "centre", "focal"], frames=[seen_points(bad)])
     solution, g = problem.solve_freely(), torch.Generator().manual_seed(0)
     root = torch.linalg.cholesky(solution.covariance[solution.active][:, solution.active])
     basis = torch.linalg.qr(torch.randn(root.shape, generator=g, dtype=torch.float64)).Q[:, 4:]
@@ -153,7 +154,11 @@ def test_several_frames_hold_a_whole_one_out():
     found = refine_matches(drawn(rig), frames, force=True)
     assert found.held_out[0].points == 100
     assert (
-        sum(len(m.alpha) for m in RefinementProblem.of(rig, ["rotation"], frames=frames).used.values()) == 200
+        sum(
+            len(m.alpha)
+            for m in RefinementProblem.from_frames(rig, ["rotation"], frames=frames).used.values()
+        )
+        == 200
     )
     assert found.accepted
 
@@ -170,7 +175,7 @@ def test_what_images_do_not_determine_is_unobservable_and_named():
 
 
 def test_translations_are_freed_where_points_demand_it():
-    """What no turn or shift of principal points explains; where they do, the baseline stays as it is."""
+    """Only points that no turn or shift of principal points explains change the baseline."""
     rig = unlike_pair()
     exact = seen_points(rig, noise=0.0, seed=1)
     moved = rig.perturbed({"second.translation": vector(0, 0.006, 0.012)})
@@ -184,11 +189,11 @@ def test_translations_are_freed_where_points_demand_it():
 
 
 def test_a_refusal_says_what_else_to_free():
-    """A rotation that stands for no shift of the principal point was refused without a word of the latter."""
+    """A rotation that stands in for a shift of the principal point is refused with that hint."""
     rig = unlike_pair()
     bad, points = rig.perturbed({"second.centre": vector(0, 8, 0)[:2]}), seen_points(rig, count=200)
     for free, advice in ((["rotation"], "leave out --free, or free "), (["rotation", "centre"], "")):
-        problem = RefinementProblem.of(bad, free, frames=[points])
+        problem = RefinementProblem.from_frames(bad, free, frames=[points])
         solution = problem.solve()
         refused = problem.report(solution._replace(z=torch.zeros_like(solution.z))).objections[0]
         assert advice in refused
@@ -205,7 +210,7 @@ def test_a_rig_of_unknown_scale_is_not_refined_in_millimetres():
 
 
 def test_units_of_length_do_not_matter():
-    """Depths and baselines were compared with a millionth of a metre."""
+    """No threshold is in metres."""
     rig, bad = small_drift()
     points = simulated_matches(rig, "narrow", np.random.default_rng(6))
     found = [refine_matches(bad.scaled(factor), [points]) for factor in (1.0, 1e-8, 1e8)]
@@ -238,7 +243,8 @@ def test_held_out_points_reject_a_fit_to_wrong_points():
 
 
 def test_deviations_are_those_of_repeated_draws():
-    """Of rigs that drifted in every parameter, by the prior: the error over the draws is the stated one."""
+    """Rigs that drifted in every parameter, by the prior: the error over the draws is the stated
+    deviation."""
     rig, errors = rectified_pair(), []
     parameters = free_parameters(
         rig, rig.names, free=["right.rotation", "right.translation", "*.focal", "*.centre"]
@@ -247,7 +253,9 @@ def test_deviations_are_those_of_repeated_draws():
         g = torch.Generator().manual_seed(seed)
         z = 0.7 * torch.randn(sum(len(u.sigma) for u in parameters), generator=g, dtype=torch.float64)
         bad = apply_change(rig, parameters, -z)
-        fit = RefinementProblem.of(bad, ["right.rotation"], frames=[seen_points(rig, noise=0.2, seed=seed)])
+        fit = RefinementProblem.from_frames(
+            bad, ["right.rotation"], frames=[seen_points(rig, noise=0.2, seed=seed)]
+        )
         found = fit.solve()
         errors.append((found.full[:3] - z[:3]) / found.covariance.diagonal()[:3].sqrt())
     rms = torch.stack(errors).square().mean(0).sqrt()
@@ -302,7 +310,7 @@ def test_a_fundamental_matrix_is_refined():
 def test_photometric_error_is_least_for_the_true_rig():
     rig, images = rectified_pair(), rectified_images()
     rig = rig.replace(depth=(2.5, 6.5))
-    views = {name: PhotometricImage.of(image) for name, image in images.items()}
+    views = {name: PhotometricImage.from_image(image) for name, image in images.items()}
 
     def error(pixels):
         moved = rig.perturbed({"right.centre": vector(0, pixels)})
@@ -348,7 +356,7 @@ def test_photometric_error_alone_refines_a_rig():
     """No point is used: the gradient through attention's segments moves the rig."""
     rig, images = rectified_pair().replace(depth=(2.5, 6.5)), rectified_images()
     bad = rig.perturbed({"right.rotation": vector(0.004, 0, 0.002)})
-    fit = RefinementProblem.of(bad, ["right.rotation"], frames=[match_cameras(images)])
+    fit = RefinementProblem.from_frames(bad, ["right.rotation"], frames=[match_cameras(images)])
     ground_truth = seen_points(rig, near=3.0, far=5.5, noise=0.0)
     before = median_off(fit.rig, ground_truth)
     found, errors = polish(fit, uninformed(fit), [images], attend_with_statistics)
@@ -431,7 +439,7 @@ def test_depth_that_is_lost_counts_as_changed():
 
 
 def test_poses_do_not_stand_in_for_lenses():
-    """Wrong lenses were explained by other poses, which changed depth; no lens explains a rotation."""
+    """Wrong lenses are not explained by other poses, which would change depth."""
     g = np.random.default_rng([0, 2, 4])
     rig = simulated_rig("wide", 2, g)
     matches = simulated_matches(rig, "wide", g)
@@ -455,7 +463,7 @@ def test_poses_do_not_stand_in_for_lenses():
     ],
 )
 def test_depth_does_not_change_for_nothing(shared_data, name, kind, seed):
-    """Real pairs' depth changed by 2.3 % or more, 4 to 76 times its deviation's fall, and was worse."""
+    """Changes of depth by many times its deviation's fall are refused."""
     (pair,) = syntim(shared_data, (name,))
     matches = match_cameras(pair.images)
     rig = Rig({name: pair.rig[name] for name in pair.images})

@@ -48,7 +48,7 @@ def test_points_behind_the_cameras_and_wrong_units_are_named():
 
 
 def test_cameras_at_one_position_are_named():
-    """All lines are points, and any point lies on them: the rig was "0.00 px off", and had drifted."""
+    """All lines are points, and any point lies on them: 0 px say nothing."""
     rig = rectified_pair()
     wrong = rig.with_camera("right", rig["right"].replace(cam_from_world=rig["left"].cam_from_world))
     found = find_misfit(wrong, rectified_images())

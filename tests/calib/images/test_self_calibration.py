@@ -55,7 +55,7 @@ def test_pose_and_bounds_are_found_with_the_focal_lengths():
 
 @pytest.mark.parametrize("side", [1, -1], ids=["below", "above"])
 def test_most_points_are_in_front_where_some_are_behind(side):
-    """As in views shifted towards each other, whose far points have negative disparities: same lines."""
+    """Views shifted towards each other, whose far points have negative disparities, have the same lines."""
     rig = rectified_pair()
     a, b = rig.names
     apart = Pose(torch.eye(3, dtype=torch.float64), torch.tensor([0, -0.2 * side, 0], dtype=torch.float64))
@@ -94,7 +94,7 @@ def test_focal_lengths_that_the_points_contradict_give_rough_depths_alone():
 
 
 def test_cameras_have_the_lenses_of_their_views():
-    """Views with lenses were taken for pinholes, whose lines do not fit: there was no depth."""
+    """Views with lenses have depth: pinholes' lines would not fit."""
     rig = rectified_pair()
     (matches,) = seen_points(rig, noise=0.1, near=2.0, far=6.0).values()
     lens = Distortion("brown-conrady", torch.tensor([-0.08, 0.01, 0.002, -0.001], dtype=torch.float64))

@@ -70,14 +70,15 @@ def test_images_are_found_in_the_order_of_their_numbers(material, tmp_path):
 
 
 def test_digits_that_are_no_numbers_are_letters_in_names(tmp_path):
-    """A superscript between numbers ended in an error of int's."""
+    """A superscript between numbers is a letter."""
     for name in ("1²10.png", "1²9.png"):
         (tmp_path / name).touch()
     assert [path.name for path in find_images(tmp_path)] == ["1²9.png", "1²10.png"]
 
 
 def test_files_of_the_system_are_no_frames_and_two_of_one_are_refused(tmp_path):
-    """A pattern took hidden files; of a raw file and its JPEG one was taken, in a sequence both."""
+    """Neither a folder nor a pattern takes hidden files; a folder with a raw file and its PNG is
+    ambiguous."""
     for name in ("1.png", "._1.png", "2.png"):
         (tmp_path / name).touch()
     for given in (tmp_path, tmp_path / "*.png"):
@@ -107,7 +108,7 @@ def test_folders_are_no_frames_and_those_that_hold_images_are_named(tmp_path):
 
 @pytest.mark.parametrize("alone", [False, True])
 def test_bands_of_a_sequence_are_called_as_their_cameras(material, tmp_path, alone):
-    """Propagated ones were fused_1 and fused_2, and three of them in no files of their own."""
+    """Propagated bands have files named by camera, three of them too."""
     rig, files = Rig.load(material / "rig.yaml"), {"fast": find_images(material / "fast")[:2]}
     slow = read_image(find_images(material / "slow")[0])
     for i, name in enumerate(("nir", "green", "blue")):
@@ -154,7 +155,7 @@ def test_other_settings_are_not_mixed_in(material, tmp_path):
 
 
 def test_frames_that_came_later_are_made_and_what_differs_is_named(material, tmp_path):
-    """A folder that had grown counted as other settings."""
+    """A folder that has grown has the same settings."""
     whole = batch(material, tmp_path / "out")
     part = replace(whole, files={name: files[:2] for name, files in whole.files.items()})
     assert len(part.run().made) == 2
@@ -191,7 +192,7 @@ def test_a_corrupt_image_costs_its_frame_or_stops_the_job(material, tmp_path):
 
 
 def test_a_file_of_a_sequence_that_cannot_be_read_is_named_once(material, tmp_path):
-    """Alpha's was named twice: as what the task is about, and by the error."""
+    """The message has the file's name once."""
     files = spoiled(material, tmp_path, 0) | {"slow": find_images(material / "slow")}
     with pytest.raises(JobError, match=r"^key frame fast_8: fast: .*fast_8\.png: ") as stopped:
         batch(material, tmp_path / "out", sequence=True, files=files).run()

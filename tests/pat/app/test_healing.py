@@ -64,7 +64,7 @@ def test_a_rig_where_the_healed_one_would_go_is_refused_and_kept(material, capsy
 
 
 def test_a_healed_rig_is_of_the_files_as_they_were_recorded(material):
-    """It was of the developed images: of many frames and by the next command, raw ones were not developed."""
+    """Raw files are developed by it in many frames and by the next command."""
     folder, _ = material
     rig = Rig.load(folder / "rough.yaml")
     rig = rig.with_camera("colour", rig["colour"].replace(sensor=Sensor("rgb", bits=8, black_level=2.0)))

@@ -56,7 +56,7 @@ def test_without_depth_poses_and_warnings_there_is_nothing_of_them(page):
 
 
 def test_labels_of_cameras_above_one_another_are_apart():
-    """As of three rows of cameras, of which those of a column are at one point seen from above."""
+    """Cameras of one column of three rows are at one point seen from above."""
     camera = load_sample().rig["mono"]
     places = [torch.tensor([0.04 * (i % 3), 0.04 * (i // 3), 0]).double() for i in range(9)]
     poses = {f"Cam-{i}": Pose(torch.eye(3).double(), t) for i, t in enumerate(places)}

@@ -75,7 +75,8 @@ def relative(a: Tensor, b: Tensor) -> float:
 
 
 def differences(tensors: dict, options: dict, backend: str, *, seed: int) -> dict[str, float]:
-    """How far a backend's outputs are from the reference's, and the gradients by all tensors."""
+    """Return the differences of a backend's outputs, and of the gradients by all tensors, from the
+    reference's."""
     found, expected = (
         call(attend_with_statistics, tensors, options, backend=b) for b in (backend, "reference")
     )
@@ -85,8 +86,10 @@ def differences(tensors: dict, options: dict, backend: str, *, seed: int) -> dic
 
 
 def of_16_bits(tensors: dict, options: dict, dtype: torch.dtype, backend: str) -> dict[str, float]:
-    """How far outputs of features in 16 bits are from the reference's of the same numbers; types and
-    gradients are as they should be."""
+    """Return the differences of outputs for features in 16 bits from the reference's of the same numbers.
+
+    Types and gradients are checked too.
+    """
     images = ("query", "key", "value")
     stored = {n: t.detach().to(dtype).requires_grad_() if n in images else t for n, t in tensors.items()}
     exact = {n: t.detach().float().requires_grad_() for n, t in stored.items()}

@@ -13,7 +13,7 @@ HW = (16, 16)
 
 
 def segments(seeds: tuple[int, ...] = (1,)) -> Segments:
-    """Of alpha's every fourth pixel, in beta made 16 x 16."""
+    """Return the segments of alpha's every fourth pixel, in beta made 16 x 16."""
     rigs = [random_rig(seed).resize("alpha", (12, 16)).resize("beta", HW) for seed in seeds]
     found = [sampling_locations(Epipolar(), rig.pair("alpha", "beta")) for rig in rigs]
     return found[0] if len(seeds) == 1 else stack(found)

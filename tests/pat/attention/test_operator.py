@@ -1,4 +1,4 @@
-"""What the public functions accept and refuse."""
+"""Inputs that the public functions accept and refuse."""
 
 import importlib
 import inspect

@@ -68,7 +68,7 @@ def jacobian(values: Tensor, by: Tensor) -> Tensor:
 def recovered(
     network: FusionNetwork, rig: Rig, images: dict[str, Tensor], which: Sequence[str], *, steps: int
 ) -> list[Tensor]:
-    """What is left of a move by 1 in each of these ways, before and after each step."""
+    """Return the remainder of a move by 1 in each of these ways, before and after each step."""
     left = [torch.ones(len(which), dtype=torch.float64)]
     for _ in range(steps):
         by = left[-1].clone().requires_grad_()

@@ -77,7 +77,7 @@ def found():
 
 @pytest.mark.parametrize("count", [1, 3])
 def test_fine_texture_and_short_segments_are_no_reason_for_doubt(count):
-    """Matches are more distinct then than those that certainty was fitted to, and are right; it was 0.06."""
+    """Matches are more distinct than those to which certainty was fitted, and are right."""
     alpha = Camera(K=intrinsics(150.0, HW), cam_from_world=Pose.identity(), hw=HW)
     offsets = torch.tensor([[-0.15, 0, 0], [0.15, 0, 0], [0, -0.15, 0]], dtype=torch.float64)[:count]
     betas = [alpha.replace(cam_from_world=Pose(alpha.R, t)) for t in offsets]
@@ -97,7 +97,7 @@ def in_order(pair, x):
     [(None, 0, None), (LENS, 0, None), (None, 1, None), (LENS, 0, in_order), (LENS, 1, Curved())],
 )
 def test_positions_are_of_the_recorded_image(lens, turns, field):
-    """Also of images that are not undistorted: betas' were distorted twice, and alpha's lens was an error."""
+    """Also in images that are not undistorted: betas are distorted once."""
     rig, images = array(lens, turns)
     found = align(images, rig, alpha="mono", settings=FuseSettings(align=False, field=field))
     view = found["nir"]
@@ -115,7 +115,7 @@ def test_positions_are_of_the_recorded_image(lens, turns, field):
 
 @pytest.mark.parametrize("lens", [None, LENS])
 def test_points_that_move_may_do_so_within_a_band(lens):
-    """Depth was of where they are when alpha records, and lenses were an error."""
+    """Depth is that at the positions when beta records, through lenses too."""
     rig, images = array(lens)
     step = torch.stack([torch.full(HW, 4.0), torch.full(HW, 1.0)])
     within, around = Widened(Moved(Epipolar(), step), along=2.0), Moved(Widened(Epipolar(), along=2.0), step)
@@ -286,7 +286,7 @@ def test_a_camera_called_depth_has_no_file_of_its_own(found, tmp_path):
 
 
 def test_cameras_of_any_name_write_into_the_folder_and_never_share_a_file(found, tmp_path):
-    """They wrote where their names led: beside the folder, and over what was there."""
+    """Names cannot lead outside the folder, nor to another camera's file."""
     rig, images = array()
     evil, other, out = "../../evil", str(tmp_path / "evil"), tmp_path / "a" / "b" / "out"
     rig = Rig({evil: rig["mono"], other: rig["nir"]}, depth=rig.depth)
@@ -342,7 +342,7 @@ def test_mistakes_are_named(found):
 
 
 def test_weights_without_matches_are_refused():
-    """Of odd sizes the process crashed: those weights do not ask for padding."""
+    """Such weights ask for no padding, and odd sides would crash the process."""
     rig, images = array()
     for name in rig.names:
         rig, images[name] = rig.crop(name, 0, 0, (95, 159)), images[name][:, :95, :159]
@@ -372,7 +372,7 @@ def test_one_band_and_packed_values(tmp_path):
 
 
 def test_ndvi_is_of_light_where_the_sensors_are_stated():
-    """Counts above the black level, by exposure and gain: as if both bands had been exposed alike."""
+    """Counts above the black level, by exposure and gain."""
     rig, images = array()
     facts = {"mono": (Band(660.0, 40.0), 100.0, 0.01, 2.0), "nir": (Band(840.0, 40.0), 300.0, 0.04, 1.0)}
     cameras, counts = {}, {}

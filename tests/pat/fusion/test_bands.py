@@ -48,7 +48,7 @@ def sample_of_bands(scales: dict[str, float]) -> tuple[Rig, dict[str, torch.Tens
     ],
 )
 def test_three_bands_are_colours_only_if_their_names_say_so(names, colour):
-    """A red edge, red and green were shown as red, green and blue, and any three in the order given."""
+    """Red edge, red and green are not shown as red, green and blue."""
     assert show_colour(names, [1] * len(names)) == colour
     assert not show_colour(names, [3] * len(names))
 
@@ -61,7 +61,7 @@ def test_a_red_edge_is_ordered_before_red():
 
 
 def test_bands_keep_their_own_values_where_levels_are_matched():
-    """They were scaled to alpha's mean and contrast."""
+    """They are not scaled to alpha's mean and contrast."""
     rig, images = sample_of_bands({"a": 1.0, "b": 0.25})
     frame = fuse(
         images,
@@ -101,7 +101,7 @@ def confidence_warning(by_band: list[float] | None) -> list[warnings.WarningMess
 
 
 def test_one_band_that_matches_badly_is_no_wrong_rig():
-    """Nine bands right to the eye ended with status 3: the least of their confidences was .04."""
+    """The median of the bands' confidences decides, not the least."""
     assert confidence_warning([0.04, 0.1, *[0.6] * 7]) == []
     (none,), (most,) = confidence_warning(None), confidence_warning([0.04] * 7 + [0.6] * 2)
     assert none.category is LowConfidenceWarning
@@ -118,7 +118,7 @@ def test_plain_noise_names_the_option_that_it_needs():
 
 
 def test_sixteen_bits_are_written_for_sixteen(tmp_path):
-    """They were written as 8 bits unless asked otherwise."""
+    """Unless another depth is requested."""
     rig, images = sample_of_bands({"a": 1.0, "b": 0.25})
     rig.save(tmp_path / "rig.yaml")
     for name, image in images.items():

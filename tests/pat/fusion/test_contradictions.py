@@ -72,7 +72,7 @@ def test_fourteen_bits_in_sixteen_are_named(tmp_path):
 
 
 def test_a_dense_field_that_does_not_fit_is_refused_before_the_work():
-    """640x400 was killed at 22 GB, whatever the limit."""
+    """Also without a limit: 640x400 would take 22 GB."""
     wide = Rig({name: View(hw=(400, 640)) for name in ("mono", "colour")})
     images = {"mono": torch.rand(1, 400, 640), "colour": torch.rand(3, 400, 640)}
     for settings in (FuseSettings(field=Dense()), FuseSettings(field=Dense(), max_memory="4GiB")):

@@ -1,4 +1,4 @@
-"""What fuse finds and puts right by itself: another response, a beta off its search segments."""
+"""Corrections that fuse estimates and makes by itself: another response, a beta off its search segments."""
 
 import math
 from dataclasses import replace
@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from pat import FuseSettings, fuse
+from pat.fusion import corrections
 from pat.fusion.corrections import Corrections, find_corrections
 from pat.fusion.fuse import corrections_of
 from pat.fusion.inputs import prepared
@@ -143,7 +144,7 @@ def test_corrections_of_other_betas_are_refused(sample, network, images):
 
 
 def test_betas_without_names_are_corrected_too(middle, network):
-    """What was found was forgotten, and what was given ended in an IndexError."""
+    """Corrections are kept by number, and can be given."""
     sample, images, _ = middle
     frame, _ = prepared(network, Views.of(with_beta_rotated(sample.rig, 0.3), images, alpha=ALPHA), [])
     named = find_corrections(network, frame, "fit", align=True)
@@ -162,6 +163,20 @@ def test_whether_alpha_sees_luma_is_found_whatever_response_is_stated(middle, ne
         views = Views.of(sample.rig, images | {ALPHA: alpha}, alpha=ALPHA)
         frame, _ = prepared(network, views, [])
         assert find_corrections(network, frame, response, align=True).response.explains == alike
+
+
+def test_few_matches_judge_neither_the_spectrum_nor_vignetting(middle, network, monkeypatch):
+    """As with few textures: what little matches explains of alpha need not be much."""
+    sample, images, _ = middle
+    w = images[BETA].shape[-1]
+    shade = 1 - 0.4 * torch.linspace(-1, 1, w).square()
+    views = Views.of(sample.rig, images | {BETA: images[BETA] * shade}, alpha=ALPHA)
+    frame, _ = prepared(network, views, [])
+    assert find_corrections(network, frame, "fit", align=False).response.shading
+    monkeypatch.setattr(corrections, "SETTINGS", replace(corrections.SETTINGS, matched=10.0))
+    found = find_corrections(network, frame, "fit", align=False).response
+    assert found.explained == 1
+    assert not found.shading
 
 
 def test_a_sequence_finds_corrections_once(middle, network, monkeypatch):

@@ -39,7 +39,7 @@ def smooth(channels, seed):
 
 @pytest.fixture
 def reads(monkeypatch):
-    """How often each file was read, and how often anything was developed."""
+    """Count the reads of each file, and all developments."""
     count = Counter()
 
     def counted(name):
@@ -149,7 +149,7 @@ def test_each_field_is_evaluated_once_a_pixel(tiled, monkeypatch):
     ],
 )
 def test_images_without_a_rig_are_checked_alike(change, message):
-    """Counts ended in an error of torch's, others in advice on focus."""
+    """Images of wrong kinds are refused by name before any rig is estimated."""
     with pytest.raises((TypeError, ValueError), match=f"the image of 'b' .*{message}"):
         fuse({"a": smooth(1, 0), "b": change(smooth(3, 1))})
 

@@ -56,7 +56,7 @@ LENSES = {
 @pytest.mark.parametrize("true", [0.2, 1.0, 60.0, -60.0])
 @pytest.mark.parametrize("lens", LENSES)
 def test_bounds_are_those_of_the_field_where_it_has_some(lens, true, depth):
-    """Depth through lenses was any, distances of a wide fisheye were within the rig's range or an error."""
+    """Through lenses too, and distances of a wide fisheye."""
     wide = lens == "fisheye"
     hw, near, far = (24, 64), 0.5, 30.0
     places = {"a": (), "b": (0.02, -0.01, -0.005)}
@@ -80,7 +80,7 @@ BOUNDS = {False: "depth", True: "distance"}
 
 
 def test_a_field_with_bounds_needs_none_of_the_rig_in_cameras_of_any_model():
-    """Whether beta was upright was asked of the middle of the rig's depth range."""
+    """No step asks for the rig's depth range."""
     rig = parallel_rig(10.0, HW, {"a": (), "b": ()}, distortion=Equirectangular())
     images = {"a": torch.zeros(1, *HW), "b": torch.zeros(3, *HW)}
     views = Views.of(rig, images, alpha="a", field=Curved(near=1.0, far=3.0))
@@ -137,7 +137,7 @@ def test_depth_of_low_confidence_is_that_of_the_background_beside_it(step):
 
 
 def test_planes_end_at_the_bounds_that_were_searched():
-    """Planes of a floor that runs into the distance were continued beyond the far bound."""
+    """Planes of a floor that runs into the distance end at the far bound."""
     inverse = torch.linspace(1 / 2, 1 / 18, 100).repeat(40, 1)
     depth = torch.cat([1 / inverse, torch.full((40, 30), 10.0)], 1)  # the last ones wrong, and not confident
     confidence = torch.where(torch.arange(130) < 100, 1.0, 0.1).repeat(40, 1)

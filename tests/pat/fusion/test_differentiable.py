@@ -20,7 +20,7 @@ def cropped():
 
 
 def error_of(cropped, angle: torch.Tensor) -> torch.Tensor:
-    """Of the image fused with the colour camera rotated, against the ground truth."""
+    """Return the error of the image fused with the colour camera rotated, against the ground truth."""
     rig, images, ground_truth = cropped
     network, turned = load_weights("mono-colour"), rotated(rig, angle)
     frame = fuse(
@@ -44,7 +44,7 @@ def test_a_rotation_is_recovered_through_the_fused_image(cropped):
 
 @pytest.mark.parametrize(("which", "steps"), [(("rz", "ty", "focal"), 3), (("ry",), 2)])
 def test_a_rig_is_recovered_from_images_alone(cropped, which, steps):
-    """What alpha sees is in the colour image where the depth found says, in the rig as it should be."""
+    """The point that alpha sees is in the colour image at the position of its depth, in the true rig."""
     rig, images, _ = cropped
     left = recovered(load_weights("mono-colour"), rig, images, which, steps=steps)[-1]
     assert left.abs().max() < 0.1

@@ -36,7 +36,7 @@ def test_frames_that_are_all_there_are_matched_without_a_word(a, b):
 
 @pytest.mark.parametrize(("prefix_a", "prefix_b"), [("", ""), ("m_", "c_"), ("cam0_", "cam1_")])
 def test_a_frame_that_a_camera_lacks_shifts_none(prefix_a, prefix_b):
-    """Of as many files each, they were fused one by one: 2 with 1, 3 with 2."""
+    """As many files of each camera are not fused one by one: 2 with 1, 3 with 2."""
     a = [f"{prefix_a}{i}" for i in (0, 2, 3, 4)]
     b = [f"{prefix_b}{i}" for i in (0, 1, 2, 4)]
     said = rf"'a' has none of {prefix_b}1; 'b' has none of {prefix_a}3: 3 of 5"
@@ -73,7 +73,7 @@ def test_a_gap_in_a_sequence_is_said():
 
 
 def test_one_frame_of_a_camera_has_no_gap():
-    """A sequence of many fast frames and one slow one ended with an IndexError."""
+    """A sequence of many fast frames and one slow one."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warn_of_gaps(files(fast=["fast_0", "fast_1", "fast_2"], slow=["slow_0"]))

@@ -81,7 +81,7 @@ def scene(hw=(64, 96), beta_hw=(64, 96), **focal) -> tuple[Rig, dict[str, torch.
 
 
 def in_tiles(patched, hw, side, halo):
-    """What is fused from here on is fused in these tiles."""
+    """Fuse in these tiles from here on."""
     tiles = list(tiles_of(hw, side, halo))
     patched.setattr(pat.fusion.tiles, "tiles_within", lambda *_: tiles)
     return tiles
@@ -231,7 +231,7 @@ def test_what_is_no_field_or_no_list_is_refused_in_a_line():
 
 
 def test_an_image_of_one_colour_is_named():
-    """As with images alone: a black frame was a rig that does not fit."""
+    """A black frame is not reported as a rig that does not fit."""
     rig, images = scene()
     images["colour"] = torch.ones(3, 64, 96)
     with pytest.warns(UserWarning, match="'colour' is of one colour, with nothing to match: give another"):
@@ -353,7 +353,7 @@ def test_a_stopped_frame_goes_on_with_its_tiles(tmp_path, monkeypatch):
 
 
 def test_tiles_of_another_depth_map_are_not_taken(tmp_path, monkeypatch):
-    """Every 64th pixel was compared."""
+    """A stored tile belongs to one depth map, compared at all pixels."""
     hw, network = (34, 130), network_of("GuidedPAT")
     rig, images = scene(hw, (30, 110))
     in_tiles(monkeypatch, hw, 64, 16)
@@ -374,7 +374,7 @@ def test_tiles_of_another_depth_map_are_not_taken(tmp_path, monkeypatch):
 
 
 def test_fields_of_cameras_that_are_not_there_and_other_bands_of_alpha_are_refused():
-    """A misspelt name was ignored; two or four bands ended in an error of torch's."""
+    """A misspelt name, and an alpha of two or four bands."""
     (rig, images), network = scene(), network_of("GuidedPAT")
     with pytest.raises(ValueError, match="'color'"):
         fuse(images, rig, alpha="mono", network=network, settings=FuseSettings(field={"color": Epipolar()}))

@@ -214,7 +214,7 @@ def test_a_distorted_alpha_is_denoised_too(network):
 
 
 def test_noisy_bands_at_one_position_are_joined():
-    """As one beta of three bands; in the rig's order, and nearer the ground truth than fused as recorded."""
+    """To one beta of three bands, in the rig's order, nearer the ground truth than fused as recorded."""
     sample, images, noise = in_low_light(200, load_sample)
     cameras = {ALPHA: sample.rig[ALPHA], **dict.fromkeys(("r", "g", "b"), sample.rig[BETA])}
     rig = Rig(cameras, depth=sample.rig.depth).crop(ALPHA, 100, 200, (160, 200))

@@ -29,7 +29,7 @@ def test_chroma_is_alphas_own_as_the_betas_show_it_and_luminance_stays():
 
 @pytest.mark.parametrize("in_colour", [True, False])
 def test_what_no_beta_sees_has_alphas_colours(in_colour):
-    """The beta shows the left part alone; the right was coloured by extrapolation."""
+    """The beta shows the left part alone; the right is not coloured by extrapolation."""
     sample = load_sample()
     half = tuple(n // 2 for n in sample.rig["mono"].hw)
     rig = sample.rig.resize("mono", half).resize("colour", (180, 280))

@@ -66,7 +66,7 @@ def test_fused_images_say_that_they_are_srgb(tmp_path):
 
 
 def test_depth_and_image_of_a_former_frame_do_not_stay_beside_one_without(tmp_path):
-    """An image in another format stayed, and looked like that of the new depth and confidence."""
+    """An image in another format would look like that of the new depth and confidence."""
     save_frame(Frame(torch.rand(3, 6, 8), torch.ones(6, 8), *torch.rand(2, 6, 8)), tmp_path, kind="tif")
     save_frame(frame_of(3), tmp_path)
     assert sorted(p.name for p in tmp_path.iterdir() if p.is_file()) == ["confidence.png", "fused.png"]
@@ -104,7 +104,7 @@ def test_unknown_depth_is_nan_in_the_file_as_in_memory(tmp_path):
 
 
 def test_a_frame_that_wants_gradients_is_shown_and_saved(tmp_path):
-    """That of `fuse(..., differentiable=True)`: a notebook that showed it failed."""
+    """The frame of `fuse(..., differentiable=True)`, in a notebook too."""
     hw = (4, 5)
     parts = torch.rand(3, *hw), torch.full(hw, 2.0), torch.rand(hw), torch.full(hw, 0.1)
     frame, wanting = Frame(*parts), Frame(*(part.clone().requires_grad_() for part in parts))

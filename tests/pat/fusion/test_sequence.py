@@ -54,7 +54,7 @@ def test_clocks_that_do_not_fit_are_named(line, message):
 
 
 def test_a_beta_that_recorded_at_another_time_is_named():
-    """Its first or last frame was used for all of the sequence, if another beta's times fitted."""
+    """Its first or last frame is not used for all of the sequence, even if another beta's times fit."""
     line = clocks(30.0, 30.0, 0.0, 9, 9)
     for offset, count in ((0.0, 1), (0.12, 3), (5.0, 3), (-5.0, 3)):
         sensor = Sensor(frame_rate=10.0, time_offset=offset)
@@ -68,7 +68,7 @@ def test_a_beta_that_recorded_at_another_time_is_named():
 
 
 def test_a_beta_that_recorded_a_part_of_the_time_is_said():
-    """Its first or last frame was used for the rest of the sequence without a word."""
+    """Its first or last frame is used for the rest of the sequence, with a warning."""
     with pytest.warns(
         UserWarning, match=r"'b' recorded from 0\.2 to 0\.4 s and 'a' from 0 to 0\.9 s: 5 of 10"
     ):
@@ -171,7 +171,7 @@ def test_an_image_that_cannot_be_read_costs_its_own_key_frame_alone():
 
 
 def test_bands_keep_their_own_level_where_levels_are_matched():
-    """As those of single frames do; in a sequence they had alpha's."""
+    """Bands of a sequence have the levels of single frames."""
     frames, _ = moving.recording(2)
     band = [0.3 * image[1:2] + 0.05 for image in frames["slow"]]
     settings = FuseSettings(align=False, match_levels=True)
@@ -204,7 +204,7 @@ def test_cameras_behind_filters_at_one_place_are_fused_between_key_frames_too(al
 
 
 def test_a_response_that_is_none_is_refused_before_a_sequence_is_fused():
-    """It was taken for an image that cannot be read, and left out."""
+    """It is not taken for an image that cannot be read."""
     with pytest.raises(ValueError, match="three weights"):
         FuseSettings(response=(-1.0, 0.0, 0.0))
 
@@ -328,7 +328,7 @@ def test_a_noisy_sequence_is_denoised(fused):
 
 
 def test_of_several_betas_the_lowest_weight_of_motion_counts(fused, monkeypatch):
-    """Of several betas each has its own time: the least certain motion counts."""
+    """Each beta has its own time: the least certain motion counts."""
     frames, _, _, _ = fused
     rig = moving.rig()
     rig = rig.with_camera("other", rig["slow"])
@@ -347,7 +347,7 @@ def test_of_several_betas_the_lowest_weight_of_motion_counts(fused, monkeypatch)
 
 @pytest.mark.parametrize("step", [0.3, 0.7])
 def test_depth_beside_what_is_unknown_is_not_mixed_with_it(monkeypatch, step):
-    """It was blended with an inverse depth of 0: up to twice as far away."""
+    """An unknown neighbour is no inverse depth of 0."""
     frames, _ = moving.recording(3)
     job = SequenceFusion(load_weights("mono-colour"), moving.rig(), frames, "fast")
     flow = Flow(torch.tensor([step, 0.0])[:, None, None].expand(2, *moving.HW), torch.ones(moving.HW))

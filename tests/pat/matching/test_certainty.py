@@ -54,7 +54,7 @@ def test_other_threads_find_the_networks_as_they_were():
 
 
 def test_what_is_surely_hidden_keeps_a_little_certainty():
-    """Else the disparity that was chosen for it gave no depth."""
+    """Its chosen disparity gives depth all the same."""
     found = a_match([1.0, 0.0, 1.0])
     found = replace(found, stated=torch.tensor([-60.0, 4.0])[None, :, None, None].expand(1, 2, 4, 4))
     (beta,) = with_certainty(Matches((found,))).betas
@@ -130,7 +130,7 @@ def test_true_depths_are_in_the_interval(motorcycle):
 
 
 def test_confidence_is_the_share_of_depths_that_are_right(motorcycle):
-    """Right is within a pixel of disparity; points hidden may be so by what was filled in: a few more."""
+    """Right means within a pixel of disparity; hidden points may be right by filling: a few more."""
     frame, depth = motorcycle
     known = depth.isfinite() & frame.depth.isfinite()
     pixel = 1 / (994.978 * 0.193001)

@@ -96,7 +96,8 @@ def motorcycle():
 
 
 def test_what_is_chosen_is_nearer_the_truth(motorcycle):
-    """A pair that it was not trained on: fewer are wrong by more than a pixel, and by more than three."""
+    """On a pair outside the training set fewer pixels are wrong by more than a pixel, and by more
+    than three."""
     inputs, before = motorcycle
     (after,) = chosen(inputs, before).betas
     truth = torch.from_numpy(stereo_motorcycle()[2][:, :740].copy())
@@ -163,7 +164,7 @@ def test_quarter_turns_bring_near_ends_to_the_left():
 
 @pytest.mark.parametrize("k", [1, 2, 3])
 def test_beta_may_be_on_any_side(motorcycle, k):
-    """It was trained with beta on the right: of turned views all is chosen and stated as of upright ones."""
+    """The network knows beta on the right: turned views have the choices and statements of upright ones."""
     inputs, (found,) = motorcycle[0], motorcycle[1].betas
     (upright,) = chosen(turned(inputs, 0), Matches((found,))).betas
     planes = {n: getattr(found, n).rot90(k, (-2, -1)) for n in ("disparity", "facts")}

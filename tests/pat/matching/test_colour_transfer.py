@@ -31,7 +31,7 @@ def in_place(hw: tuple[int, int]) -> list[Segments]:
 def chroma_errors(
     alpha: torch.Tensor, beta: torch.Tensor, ground_truth: torch.Tensor, segments: list[Segments]
 ) -> list[torch.Tensor]:
-    """How far colour differences are from the true ones: those at the matches, and beta's where it is."""
+    """Return the errors of colour differences: at the matches, and of beta's where it is."""
     matched = semi_global_matching(alpha, beta, *segments).carried.bands
     found, given, true = (image - luminance(image) for image in (matched, beta, ground_truth))
     return [found - true, given - true]
@@ -147,7 +147,7 @@ def with_other_patch() -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def test_of_a_band_that_does_not_explain_alpha_likeness_says_nothing():
-    """As near infrared beside a mono camera: certain matches of such a band gave way to fills."""
+    """Near infrared beside a mono camera: certain matches of such a band do not give way to fills."""
     alpha, band = (faint(seed, contrast=0.1, blur=3.0)[..., :128] for seed in (1, 9))
     assert certain(alpha, alpha, 0.9).likeness.min() > 0.9
     assert certain(alpha, band, 0.9).likeness.min() > 0.9
@@ -190,7 +190,7 @@ def test_weight_is_a_share_whatever_the_certainty_and_none_off_beta(certainty):
 
 
 def test_statistics_of_pieces_are_those_of_the_whole():
-    """Each part was brought to alpha's mean and contrast by itself, and likeness was wrong."""
+    """No part is brought to alpha's mean and contrast alone."""
     g = torch.Generator().manual_seed(0)
     alpha = torch.rand(1, 1, 40, 60, generator=g) * torch.linspace(0.2, 1, 60)
     beta = 0.5 * alpha + 0.1
@@ -243,7 +243,7 @@ def test_colour_is_as_strong_as_beta_shows_it_if_alpha_sees_something_else(sees_
 
 
 def test_detail_counts_as_far_as_brightness_explains_alpha():
-    """Of an alpha that sees something else none is taken, of its like nearly all, of a negative none."""
+    """None for an alpha of another spectrum, nearly all for a similar one, none for a negative."""
     g = torch.Generator().manual_seed(4)
     alpha, other, noise = (torch.rand(1, 1, 40, 60, generator=g) for _ in range(3))
     ones = torch.ones_like(alpha)

@@ -96,7 +96,7 @@ def test_matches_are_located_first_and_coloured_then(inputs):
 
 
 def test_which_beta_is_matched_is_said(inputs, caplog):
-    """Of the nine-band array it was the same line eight times, for minutes."""
+    """The nine-band array shows progress by beta."""
     with caplog.at_level(logging.INFO, "pat.matching.match"):
         located(replace(inputs, betas=inputs.betas[:1] * 2))
     said = [record.getMessage() for record in caplog.records if record.name == "pat.matching.match"]
@@ -199,7 +199,7 @@ def holed(plane):
     ],
 )
 def test_matches_of_ones_own_are_checked(network, flat, plane, change, problem):
-    """A few NaN made the image, the depth or the confidence NaN, without a word; the rest were tracebacks."""
+    """NaN and other shapes are refused with a sentence."""
     rig, images = flat
 
     def matcher(inputs):

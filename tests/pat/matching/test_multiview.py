@@ -108,7 +108,7 @@ def test_of_betas_a_pixel_that_one_does_not_see_is_the_others():
 
 
 def test_colours_are_where_a_beta_is_most_like_alpha(network, scene):
-    """Of its own match and of that on which betas agree; of betas with some of the bands where all agree."""
+    """At its own match or the agreed one; for betas with some of the bands where all agree."""
     rig, images, _ = scene
     inputs = replace(frame_inputs(network, Views.of(rig, images, alpha="mono")).inputs, bands=3)
     found = located(replace(inputs, betas=inputs.betas[:1]))
@@ -264,7 +264,7 @@ def test_a_band_unlike_alpha_is_matched_through_one_that_is_like_it():
 
 
 def test_betas_whose_lengths_do_not_fit_agree_all_the_same(network, scene):
-    """As cameras found by pairs: the right one is thought to be farther, so its depths are too large."""
+    """Cameras calibrated by pairs: the right one is too far away in the rig, so its depths are too large."""
     _, images, ground_truth = scene
     cameras = {"mono": camera(0.0), "left": camera(-0.25), "right": camera(0.25)}
     wrong = cameras | {"right": camera(0.4)}
@@ -288,7 +288,7 @@ def located_alone(inputs):
 
 
 def test_a_plane_is_no_ambiguity():
-    """What most wrong matches agree with, and what a flat scene does: no reason to bring depths together."""
+    """Most wrong matches agree with a plane, and so does a flat scene: no reason to bring depths together."""
     y, x = torch.meshgrid(torch.arange(64.0).double(), torch.arange(80.0).double(), indexing="ij")
     g = torch.Generator().manual_seed(3)
     depths = 0.1 + 0.3 * torch.rand(64, 80, generator=g, dtype=torch.float64)

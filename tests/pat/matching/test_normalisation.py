@@ -58,7 +58,7 @@ def test_box_means_with_gradients_are_those_without():
 
 
 def test_images_of_few_rows_are_as_sharp_as_their_columns_are():
-    """Of less than three pairs of rows there is no second difference."""
+    """Less than three pairs of rows have no second difference."""
     one = torch.rand(1, 1, 4, 40, generator=torch.Generator().manual_seed(0))
     assert equalising_blurs(one, one) == ([0.0], [0.0])
     (own,), (other,) = equalising_blurs(one, 0.3 * one)

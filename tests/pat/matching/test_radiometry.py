@@ -162,7 +162,7 @@ def test_leaves_lit_more_brightly_are_not_taken_for_a_sensor_of_green_alone(monk
 
 
 def test_a_band_that_no_combination_explains_leaves_rec601(monkeypatch):
-    """As near infrared: materials reflect it as they like, and shadows alone are common to all bands."""
+    """Near infrared: reflectance is unrelated to the colours, and only shadows are common to all bands."""
     g = torch.Generator().manual_seed(0)
     material = torch.randint(12, (4000,), generator=g)
     shadow = 0.4 + 0.6 * torch.rand(4000, generator=g)

@@ -100,7 +100,7 @@ def test_costs_are_those_of_their_slow_twin(views, runs, count, spread):
 @pytest.mark.parametrize("spread", [0, 1, 3, 9, 40])
 @pytest.mark.parametrize(("runs", "count"), [(1, 6), (1, 16), (1, 21), (2, 5), (2, 3)])
 def test_aggregation_is_that_of_its_slow_twin(runs, count, spread):
-    """Whether the labels of neighbours are the same, or some, or none."""
+    """For equal, overlapping and disjoint labels of neighbours."""
     rng = np.random.default_rng(spread)
     first = windows(rng, runs, count, spread)
     costs = np.full((*HW, runs, lanes_of(runs, count)), kernels.NO_LABEL)

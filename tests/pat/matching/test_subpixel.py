@@ -1,4 +1,4 @@
-"""Matching at full size, around what was found at half the size."""
+"""Matching at full size, around the matches at half the size."""
 
 import numpy as np
 import pytest

@@ -46,7 +46,7 @@ def test_planes_are_the_weighted_least_squares_around_each_pixel():
 
 
 def test_all_pixels_of_odd_sides_lie_on_the_plane():
-    """As exact as to the next pixel's step, which is a fifth."""
+    """To the accuracy of the next pixel's step, which is a fifth."""
     whole, _ = whole_and_every_second(0.2, -0.2)
     whole = whole[:119, :159]
     values = whole[::2, ::2]

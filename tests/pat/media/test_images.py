@@ -48,7 +48,7 @@ def test_what_is_written_is_read_back(tmp_path, channels, suffix, bits):
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16, torch.float64])
 @pytest.mark.parametrize(("suffix", "bits"), [("png", 8), ("tif", 32)])
 def test_floats_of_any_precision_are_written(tmp_path, dtype, suffix, bits):
-    """bfloat16 ended in a TypeError of NumPy's, which has none."""
+    """NumPy has no bfloat16."""
     image = make_image(channels=3).to(dtype)
     write_image(tmp_path / f"a.{suffix}", image, bits=bits)
     again = read_image(tmp_path / f"a.{suffix}")
@@ -86,7 +86,7 @@ def test_few_bits_in_sixteen_are_said_unless_they_are_stated(tmp_path, largest, 
 @pytest.mark.parametrize("white", [1, 31, 100, 255, 1000, 1023, 4095, 40000, 65535])
 @pytest.mark.parametrize("kind", [b"P2", b"P3", b"P5", b"P6"])
 def test_a_pnm_file_states_its_white(tmp_path, white, kind):
-    """White of 100 or 40000 was taken for grey, without a word, and what follows a comment for 8 bits."""
+    """White of 100 or 40000 is white, and comments are skipped."""
     values = np.array([[0, white // 5, white // 2, white]], np.uint16)
     stored = values.repeat(3) if kind in (b"P3", b"P6") else values
     text = " ".join(map(str, stored.ravel().tolist())).encode()  # OpenCV wants a line break at its end
@@ -127,7 +127,7 @@ def test_an_opaque_alpha_channel_is_dropped_and_any_other_refused(tmp_path, kind
 
 @pytest.mark.parametrize("mode", ["LA", "L"])
 def test_a_grey_png_file_with_alpha_or_a_transparent_level_is_grey(tmp_path, mode):
-    """One of grey and alpha was three equal bands: a camera in colour, which is not taken for alpha."""
+    """It is one band, not three equal ones."""
     grey = np.arange(20, dtype=np.uint8).reshape(4, 5)
     image = Image.fromarray(grey)
     image.convert(mode).save(tmp_path / "a.png", **({"transparency": 255} if mode == "L" else {}))
@@ -184,7 +184,7 @@ def test_half_a_planar_tiff_is_refused(tmp_path, options):
 
 
 def test_the_first_of_several_images_in_a_tiff_is_said_to_be_taken(tmp_path):
-    """A recording in one file was fused as its first frame without a word."""
+    """A recording in one file gives a warning."""
     image = np.full((30, 40), 200, np.uint8)
     tifffile.imwrite(tmp_path / "stack.tif", np.stack([image, image, image]), photometric="minisblack")
     with pytest.warns(UserWarning, match=r"stack\.tif: "):
@@ -242,7 +242,7 @@ def test_three_bands_of_a_tiff_are_read_however_they_are_stored(tmp_path, kind, 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16])
 def test_white_is_white_in_a_tiff_where_0_is(tmp_path, kind):
-    """Images of 16 bits were read as their negatives."""
+    """Images of 16 bits are not read as their negatives."""
     values = np.arange(12, dtype=kind).reshape(3, 4)
     tifffile.imwrite(tmp_path / "a.tif", values, photometric="miniswhite")
     assert np.array_equal(read_recorded(tmp_path / "a.tif")[0], np.iinfo(kind).max - values)
@@ -259,7 +259,7 @@ def test_white_is_white_in_a_tiff_where_0_is(tmp_path, kind):
     ],
 )
 def test_what_opencv_does_not_read_of_a_tiff_is_named(tmp_path, shape, kind, complaint):
-    """Such files were no images at all; of two channels the second was left out without a word."""
+    """Channels are not left out without a word."""
     values = np.ones(shape, kind)
     tifffile.imwrite(tmp_path / "a.tif", values, photometric="minisblack", planarconfig="contig")
     with pytest.raises(ValueError, match=f"a.tif: has {complaint}"):
@@ -334,7 +334,7 @@ def test_a_file_system_that_is_read_only_is_said_of_the_file_itself(tmp_path, mo
 
 
 def test_no_room_is_said_of_the_file_whoever_writes(tmp_path):
-    """NumPy's own error was "176128 requested and 101744 written"."""
+    """Also for files that NumPy writes."""
     said = r"a\.npy: not written whole \(.* written\): is there room\?"
     with (
         room_for(1000),
@@ -420,7 +420,7 @@ def test_the_size_is_compared_before_anything_is_decoded(tmp_path, monkeypatch):
 
 
 def test_the_size_of_a_heic_file_is_compared_before_it_is_decoded(tmp_path, monkeypatch):
-    """By a stand-in for pillow-heif, which opens a file without decoding it."""
+    """With a stand-in for pillow-heif, which opens a file without decoding it."""
 
     class Stored:
         size = 30_000, 20_000
@@ -448,7 +448,7 @@ def test_headers_state_the_size_of_every_format(tmp_path, suffix, shape):
 
 
 def test_a_tiff_of_two_widths_has_no_header(tmp_path):
-    """What fuzzing found: the width's tag with as many values as the file states, not one."""
+    """The width's tag with as many values as the file states, not one."""
     tifffile.imwrite(tmp_path / "a.tif", np.zeros((3, 4), np.uint8))
     content = bytearray((tmp_path / "a.tif").read_bytes())
     with tifffile.TiffFile(tmp_path / "a.tif") as file:
@@ -468,7 +468,7 @@ def test_comments_bigtiff_and_damaged_orientation(tmp_path):
 
 @pytest.mark.parametrize("bits", [8, 16, 32])
 def test_tiffs_are_read_without_further_codecs(bits, tmp_path):
-    """By tifffile alone, which scikit-image and imageio read them by: LZW it does not."""
+    """With tifffile alone, by which scikit-image and imageio read them: it does not read LZW."""
     tifffile = pytest.importorskip("tifffile")
     image = torch.rand(3, 12, 17)
     write_image(tmp_path / "a.tif", image, bits=bits)

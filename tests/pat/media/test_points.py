@@ -24,7 +24,7 @@ def test_points_are_the_pixels_of_known_depth_in_the_camera_frame(tmp_path):
 
 
 def test_points_at_distances_are_on_their_rays_also_behind(tmp_path):
-    """A depth of a whole sphere is a distance: taken for z, points beside were far, those behind in front."""
+    """A depth of a whole sphere is a distance, not z."""
     pose = Pose(torch.eye(3).double(), torch.tensor([1.0, 2.0, 3.0]).double())
     K = intrinsics(4 / torch.pi, (4, 8), (4.0, 2.0))
     camera = Camera(K=K, cam_from_world=pose, hw=(4, 8), distortion=Equirectangular())

@@ -19,7 +19,8 @@ COLOURS = np.random.default_rng(0).integers(20, 236, (8, 9, 3), np.uint8)
 
 
 def profile_of(primaries: tuple[float, ...], called: str = "wide built-in") -> bytes:
-    """That of sRGB with the columns of another matrix of colorants, and a name of as many letters."""
+    """Return the profile of sRGB with the columns of another matrix of colorants, and a name of as many
+    letters."""
     content = bytearray(srgb_profile())
     for i, name in enumerate((b"rXYZ", b"gXYZ", b"bXYZ")):
         at = int.from_bytes(content[content.index(name) + 4 :][:4], "big")
@@ -49,7 +50,7 @@ def test_another_profile_is_converted_and_said(suffix, tmp_path):
 
 
 def test_linear_srgb_is_another_profile(tmp_path):
-    """Such images, as of GIMP, were taken for sRGB ones by its name, and are far darker."""
+    """Such images, as of GIMP, are not sRGB, whatever the name."""
     profile = profile_of(DISPLAY_P3, "Linear sRGB 1")
     Image.fromarray(COLOURS).save(tmp_path / "a.png", icc_profile=profile)
     with pytest.warns(UserWarning, match="'Linear sRGB"):
@@ -96,7 +97,7 @@ def test_a_written_profile_is_read_by_others(suffix, tmp_path):
 def test_raw_files_name_the_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rawpy", None)
     (tmp_path / "a.dng").write_bytes(b"II*\0")
-    with pytest.raises(ValueError, match=r"pip install 'arraygeom-pat\[raw\]'"):
+    with pytest.raises(ValueError, match=r"pip install rawpy, .*'\.\[raw\]'"):
         read_image(tmp_path / "a.dng")
 
 

@@ -1,4 +1,4 @@
-"""Counts to images: black level, bits, filter mosaic, coding and exposure undo what the camera did."""
+"""Counts to images: black level, bits, filter mosaic, coding and exposure undo the camera's processing."""
 
 import cv2
 import numpy as np
@@ -53,7 +53,7 @@ def test_counts_of_any_depth_become_the_light_they_stood_for(tmp_path, bits, suf
 
 @pytest.mark.parametrize(("response", "bands"), [("mono", 1), (Band(850, 40), 1), ("rgb", 3), (None, 3)])
 def test_three_equal_bands_of_a_camera_in_grey_are_one(tmp_path, response, bands):
-    """Of many frames and with a rig they were fused as three bands: of three such cameras nine, in grey."""
+    """In many frames and with a rig too: three such cameras make three bands, not nine."""
     write_image(tmp_path / "a.png", light(channels=1).expand(3, -1, -1))
     cameras, files = rig(a=Sensor(response)), {"a": tmp_path / "a.png"}
     for images in (ViewFiles(cameras, files, alpha="a"), RecordedFiles(cameras, files)):
@@ -62,7 +62,7 @@ def test_three_equal_bands_of_a_camera_in_grey_are_one(tmp_path, response, bands
 
 @pytest.mark.parametrize("bits", [12, 32])
 def test_recorded_values_behind_a_mosaic_are_colours_in_their_own_counts(tmp_path, bits):
-    """Those of floats were left as the mosaic, one band."""
+    """Floats are demosaiced too."""
     raw = mosaic(light(), "RGGB")
     values = counts(raw, bits=12, black=0) if bits == 12 else raw.numpy()
     save(tmp_path / "a.tif", values)
@@ -99,7 +99,7 @@ def test_colours_come_back_from_behind_each_filter_pattern(tmp_path, pattern):
 
 @pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG"])
 def test_developing_a_mosaic_moves_nothing(pattern):
-    """A ramp has no curvature: inside the border it comes back exactly where it was."""
+    """A ramp has no curvature: inside the border it is reproduced exactly."""
     y, x = torch.meshgrid(torch.linspace(0.1, 0.4, 40), torch.linspace(0.1, 0.5, 60), indexing="ij")
     ramp = torch.stack([x, y, x + y])
     back = demosaiced(mosaic(ramp, pattern), pattern)

@@ -39,7 +39,7 @@ def written_by_opencv(path, images, codec):
 
 @pytest.mark.parametrize("codec", ["mp4v", "MJPG"])
 def test_a_grey_video_is_not_in_colour(tmp_path, codec):
-    """MPEG-4 rounds the colour of grey to 3 counts, by which it was taken for one in colour."""
+    """MPEG-4 rounds the colour of grey to 3 counts."""
     ramp = np.repeat(np.arange(0, 255, 5, dtype=np.uint8)[None, :, None], 48, 0)
     written_by_opencv(tmp_path / "grey.avi", [ramp.repeat(3, 2)] * 2, codec)
     assert {frame.shape[0] for frame in read_video(tmp_path / "grey.avi").frames} == {1}
@@ -70,6 +70,6 @@ def test_what_goes_wrong_leaves_no_file(tmp_path):
 
 
 def test_a_video_that_begins_black_keeps_its_colours(tmp_path):
-    """Its first frame was taken for one of a grey video, and green for all of the others."""
+    """Its first frame does not decide."""
     write_video(tmp_path / "a.mp4", [torch.zeros(3, 48, 64), *frames(2, (48, 64))])
     assert {frame.shape[0] for frame in read_video(tmp_path / "a.mp4").frames} == {3}

@@ -8,7 +8,7 @@ from pat.support.blocks import plain, stacked
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_stacked_channels_are_those_of_the_parts(dtype):
-    """By compiled loops in float32, by torch otherwise."""
+    """For compiled loops (float32) and for torch."""
     small = torch.rand(2, 3, 34, 40, dtype=dtype)
     large = torch.rand(2, 5, 68, 80, dtype=dtype)[:, 1:3]
     assert plain(large) == (dtype == torch.float32)

@@ -177,7 +177,7 @@ def test_images_of_any_size(hw):
 
 
 def observed(image, *, deviation=0.0, confidence=1.0, seed=11):
-    """As another camera with white noise records an image."""
+    """Return an image as another camera with white noise records it."""
     grain = noise_of(image.shape, seed)
     planes = (deviation * torch.ones_like(image), noise_of(image.shape, seed + 1))
     return Observation(image + deviation * grain, *planes, confidence * torch.ones_like(image))

@@ -123,7 +123,7 @@ def test_what_no_beta_sees_is_half_by_attention_and_half_by_nearest_examples(mon
 
 
 def test_what_is_doubtful_lies_between_matched_and_filled():
-    """The more certain the nearer to what was matched."""
+    """The more certain, the nearer to the match."""
     torch.manual_seed(0)
     network = GuidedPAT(GuidedPATConfig(keep_luminance=False))
     inputs = Inputs.of(torch.full((1, 1, *HW), 0.5), [torch.rand(1, 3, *HW)], [rectified()])

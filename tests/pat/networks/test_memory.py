@@ -50,7 +50,8 @@ def found_in(inputs):
 
 
 def growth(work):
-    """Bytes by which the peak exceeds what the process had; the least of several runs after the first."""
+    """Return the bytes by which the peak exceeds the process's memory; the least of several runs after the
+    first."""
     least = float("inf")
     for i in range(REPEATS + 1):
         give_back()
@@ -96,8 +97,7 @@ def measured():
 
 
 def test_agreement_takes_little_more_than_its_result(measured):
-    """Disparity and facts, 7 bytes for each beta, and what is computed on the way. In float64 for the whole
-    image it was 460 bytes a pixel."""
+    """Disparity and facts, 7 bytes for each beta, and intermediate results in strips."""
     assert measured["agree"] < 220
 
 

@@ -52,7 +52,7 @@ def test_a_job_that_failed_leaves_torch_its_threads(tmp_path):
 
 
 def test_a_message_names_what_a_task_is_about(tmp_path):
-    """Of a sequence it named the file of a key frame's colour, 00000000.safetensors."""
+    """In a sequence the frame, not the file of its colour."""
     bad = tasks(tmp_path, "bad")[0]._replace(about="mono/0001.png")
     with pytest.raises(JobError, match=r"^mono/0001.png: "):
         run_tasks([bad])
@@ -83,7 +83,7 @@ def test_what_crashes_or_hangs_is_tried_again_and_fails_alone(tmp_path, monkeypa
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_what_would_befall_every_task_stops_the_job(tmp_path, monkeypatch, count):
-    """However late the job's own thread hears of it: on a busy machine all the others were tried before."""
+    """However late the job's own thread hears of it on a busy machine."""
     monkeypatch.setattr("pat.support.jobs.as_completed", lambda futures: as_completed(wait(futures).done))
     todo = [Task(tmp_path / f"{i}.txt", befallen, (tmp_path / f"{i}.txt", "full")) for i in range(20)]
     with pytest.raises(JobError, match="disk"):
@@ -99,7 +99,7 @@ def test_a_scheduler_that_is_not_there_is_named(tmp_path):
 
 @pytest.mark.slow
 def test_a_killed_worker_loses_nothing(tmp_path):
-    """SIGKILL to a worker that is at a task: all are made, and only what it was at is made again."""
+    """SIGKILL to a worker at a task: all tasks are done, and only that one again."""
     names = [f"{i:02d}" for i in range(40)]
 
     def kill_one() -> None:

@@ -1,4 +1,4 @@
-"""memory: amounts are read, and what was freed goes back to the system."""
+"""Memory: amounts are parsed, and freed memory is returned to the system."""
 
 import subprocess
 import sys
@@ -72,7 +72,7 @@ def test_freed_memory_is_kept_but_near_a_limit():
 
 @pytest.mark.parametrize(("limit", "wanted"), [(None, 2.0), (1.5, 1.5), (3.0, 2.0)])
 def test_a_large_task_takes_what_is_planned_whatever_more_is_allowed(limit, wanted, monkeypatch):
-    """With 3 GiB allowed and 2.2 planned, 2.8 were taken: freed memory was kept until near the limit."""
+    """Freed memory is returned though the limit is far."""
     monkeypatch.setattr("pat.support.memory._keeps", True)
     assert planned(limit, 2.0, large=True) == wanted
     assert planned(limit, 2.0, large=False) == limit

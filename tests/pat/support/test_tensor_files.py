@@ -29,7 +29,7 @@ def test_no_room_names_the_file_and_leaves_the_former_one(tmp_path):
     ],
 )
 def test_what_is_damaged_is_named(tmp_path, damage, problem):
-    """Of the weights that ship, it was a traceback, and one changed bit nothing."""
+    """One changed bit of the weights is detected."""
     path = tmp_path / "a.safetensors"
     write_tensors(path, nn.Linear(3, 2).state_dict())
     assert with_weights(nn.Linear(3, 2), path).weight.shape == (2, 3)

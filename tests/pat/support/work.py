@@ -1,4 +1,4 @@
-"""What tasks do in the tests of jobs, in a module that processes import quickly."""
+"""Work of the tasks in the tests of jobs, in a module that processes import quickly."""
 
 import os
 import signal
@@ -10,7 +10,7 @@ from pat.support.jobs import JobError
 
 
 def note(path: Path, wait: float = 0.0) -> None:
-    """Writes the number of times it was called, and who did."""
+    """Note the calling process beside the file, and write it; raise for a file named "bad"."""
     calls = path.with_suffix(".calls")
     with calls.open("a") as file:
         file.write(f"{os.getpid()}\n")
@@ -21,7 +21,8 @@ def note(path: Path, wait: float = 0.0) -> None:
 
 
 def befallen(path: Path, fate: str) -> None:
-    """What may befall a task: at the first try, or at all."""
+    """Crash, hang or raise as `fate` says, at the first try or each time; else write the number
+    of threads."""
     first = not path.with_suffix(".tried").exists()
     path.with_suffix(".tried").touch()
     if fate == "crash" or (fate == "crash once" and first):

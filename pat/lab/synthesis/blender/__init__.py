@@ -1,7 +1,7 @@
 """Scenes rendered by Blender (Cycles), for any calibrated rig.
 
-bpy is imported when a scene is rendered: by `render` in a process of its own, by `render_here` in this one
-(for the workers of a farm).
+bpy is imported when a scene is rendered: by `render` in a separate process, by `render_here` in this one (for
+a farm's workers).
 """
 
 from .settings import RenderSettings

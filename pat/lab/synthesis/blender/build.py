@@ -1,4 +1,4 @@
-"""A scene's objects, materials and lights as Blender's data."""
+"""Construction of a scene's objects, materials and lights in Blender."""
 
 from __future__ import annotations
 
@@ -20,19 +20,31 @@ _STEPS = {"voronoi", "brick", "checker"}
 
 @dataclass(frozen=True)
 class BuiltScene:
-    """A scene in Blender: its objects in order, and what to do to light and paint it in a spectrum."""
+    """Scene built in Blender.
+
+    Attributes:
+        objects: Blender's objects, in the scene's order.
+        paints: functions that set one colour each for a spectrum.
+    """
 
     objects: list[Any]
     paints: list[Callable[[Spectrum], None]]
 
     def show(self, spectrum: Spectrum) -> None:
-        """Make all surfaces and lights those of a spectrum (near infrared is grey)."""
+        """Set all surfaces and lights to a spectrum, in place; near infrared is grey."""
         for paint in self.paints:
             paint(spectrum)
 
 
 def build(bpy: Any, scene: Scene, world: Any) -> BuiltScene:
-    """All objects and lights of a scene."""
+    """Build all objects and lights of a scene in Blender.
+
+    Returns:
+        The built scene; call `show` before rendering.
+
+    Raises:
+        ValueError: for a texture whose image file is missing.
+    """
     stage = BuiltScene([], [])
     for i, thing in enumerate(scene.objects):
         item = _object(bpy, thing)
@@ -47,7 +59,7 @@ def build(bpy: Any, scene: Scene, world: Any) -> BuiltScene:
 
 
 def colour(spectrum: Spectrum, rgb: tuple[float, float, float], nir: float) -> tuple[float, float, float]:
-    """What a spectrum's image shows: near infrared in all three channels."""
+    """Return the colour to render for a spectrum: near infrared in all three channels."""
     return rgb if spectrum == "rgb" else (nir, nir, nir)
 
 
@@ -87,7 +99,7 @@ def _light(bpy: Any, light: Light, stage: BuiltScene) -> None:
 
 
 def _towards(direction: tuple[float, float, float]) -> tuple[float, float, float, float]:
-    """The quaternion (w, x, y, z) that rotates -z, the lamps' axis, to a direction."""
+    """Quaternion (w, x, y, z) that rotates -z, the axis of lamps, to a direction."""
     d = np.asarray(direction) / np.linalg.norm(direction)
     if d[2] > 1 - 1e-9:
         return 0.0, 1.0, 0.0, 0.0
@@ -100,7 +112,7 @@ def _towards(direction: tuple[float, float, float]) -> tuple[float, float, float
 
 
 class _Nodes:
-    """A node tree, with shorthand for the operations used here."""
+    """Node tree with shorthand for the operations in use."""
 
     def __init__(self, tree: Any):
         self.tree = tree
@@ -128,7 +140,7 @@ class _Nodes:
         return node.outputs[0]
 
     def texture(self, kind: str, coordinates: Any, **inputs: Any) -> Any:
-        """A texture at these coordinates, with values of further inputs."""
+        """Add a texture node at these coordinates, with values of further inputs."""
         node = self.new(f"Tex{kind}")
         self.give(node.inputs["Vector"], coordinates)
         for name, value in inputs.items():
@@ -164,7 +176,7 @@ def _material(bpy: Any, thing: Object, stage: BuiltScene) -> Any:
 
 
 def _texture(bpy: Any, nodes: _Nodes, texture: Texture, stage: BuiltScene) -> tuple[Any, Any]:
-    """The outputs of colour and of bump height (None for images)."""
+    """Outputs of colour and of bump height (None for images)."""
     if texture.kind == "image":
         return _image(bpy, nodes, texture, stage), None
     height = _PATTERNS[texture.kind](nodes, texture)
@@ -176,7 +188,7 @@ def _texture(bpy: Any, nodes: _Nodes, texture: Texture, stage: BuiltScene) -> tu
 
 
 def _set_ramp(ramp: Any, texture: Texture) -> None:
-    """One stop for each paint; stepped patterns keep their steps."""
+    """Place one stop for each paint; stepped patterns stay stepped."""
     stepped = texture.kind in _STEPS
     ramp.interpolation = "CONSTANT" if stepped else "LINEAR"
     n = len(texture.paints)
@@ -194,7 +206,7 @@ def _paint_ramp(ramp: Any, paints: tuple[Paint, ...], spectrum: Spectrum) -> Non
 
 
 def _coordinates(nodes: _Nodes, texture: Texture, source: str = "Object", scale: float = 1.0) -> Any:
-    """Texture coordinates: the object's (or those along its surface) times the scale, shifted."""
+    """Texture coordinates, of the object or along its surface, times the scale, shifted."""
     where = nodes.new("TexCoord").outputs[source]
     return nodes.vector("MULTIPLY_ADD", where, (scale * texture.scale,) * 3, texture.offset)
 
@@ -275,7 +287,7 @@ def _image(bpy: Any, nodes: _Nodes, texture: Texture, stage: BuiltScene) -> Any:
 
 
 def _infrared(nodes: _Nodes, rgb: Any) -> Any:
-    """Red, and 1.5 times by how much green exceeds red and blue, in all channels; at most 1."""
+    """Near infrared in all channels: red plus 1.5 times the excess of green over red and blue, at most 1."""
     split = nodes.new("SeparateXYZ")
     nodes.give(split.inputs[0], rgb)
     red, green, blue = split.outputs

@@ -1,4 +1,4 @@
-"""Differences between versions of Blender, by feature detection; and the only import of bpy."""
+"""Differences between Blender versions, by feature detection; the only import of bpy."""
 
 from __future__ import annotations
 
@@ -7,15 +7,24 @@ import sys
 from collections.abc import Mapping
 from typing import Any
 
+from arraygeom.runtime.extras import install_line
+
 LIBRARIES = "libx11-6 libxrender1 libxfixes3 libxi6 libxkbcommon0 libsm6 libgl1"
 """Debian packages that `import bpy` needs (Cycles needs no more)."""
 
 PYTHONS = "Python 3.11 (bpy 4.5 and 5.0) or 3.13 (5.1 and newer)"
-INSTALL = "pip install 'arraygeom-pat[synthesis]'"
+INSTALL = install_line("bpy", "synthesis")
 
 
 def load() -> Any:
-    """The module bpy. Raises ValueError with what to install, in one line."""
+    """Import the module bpy.
+
+    Returns:
+        The module.
+
+    Raises:
+        ValueError: with the command to install what is missing, in one line.
+    """
     try:
         return importlib.import_module("bpy")
     except ModuleNotFoundError as error:
@@ -33,7 +42,11 @@ def load() -> Any:
 
 
 def new_scene(bpy: Any) -> Any:
-    """An empty scene, everything at its default. References to former data become invalid."""
+    """Replace Blender's data by an empty scene at default settings. References to former data become invalid.
+
+    Returns:
+        Blender's scene, with a world.
+    """
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
     scene.world = bpy.data.worlds.new("world")
@@ -42,13 +55,14 @@ def new_scene(bpy: Any) -> Any:
 
 
 def use_nodes(item: Any) -> None:
-    """Give a material or world its nodes, where they are not always there (before 5.0)."""
+    """Enable nodes of a material or a world where they are off by default (before 5.0)."""
     if item.node_tree is None:
         item.use_nodes = True
 
 
 def write_layers(scene: Any) -> None:
-    """Make renders one multi-layer float EXR file, one part: several fail if pixels are not square (5.0)."""
+    """Make a scene render to one multi-layer float EXR file in one part: several fail if pixels are not
+    square (5.0)."""
     images = scene.render.image_settings
     if hasattr(images, "media_type"):
         images.media_type = "MULTI_LAYER_IMAGE"
@@ -60,18 +74,26 @@ def write_layers(scene: Any) -> None:
 
 
 def factor(node: Any) -> Any:
-    """The single-valued output of a texture node: 'Factor', 'Fac' before 5.0, or the only one there is."""
+    """Return the single-valued output of a texture node: 'Factor', 'Fac' before 5.0, or its first."""
     outputs = node.outputs
     return outputs.get("Factor") or outputs.get("Fac") or outputs[0]
 
 
 def index_name(channels: Mapping[str, Any]) -> str:
-    """The channel of the object index among those of a file."""
+    """Return the name of the object-index channel among those of a file.
+
+    Raises:
+        StopIteration: if there is none.
+    """
     return next(name for name in ("Object Index.X", "IndexOB.X") if name in channels)
 
 
 def use_gpu(bpy: Any) -> bool:
-    """Turn on the GPUs that Cycles can use; False if there is none."""
+    """Enable the GPUs that Cycles can use.
+
+    Returns:
+        True if there is one.
+    """
     preferences = bpy.context.preferences.addons["cycles"].preferences
     for kind in ("OPTIX", "CUDA", "HIP", "METAL", "ONEAPI"):
         try:

@@ -1,4 +1,4 @@
-"""The pinhole that Blender renders for a camera, and the resampling of its image to the camera's."""
+"""The pinhole camera that Blender renders, and the resampling of its image to the true camera."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from arraygeom.sampling import sample
 from ..rendered import depth_between
 
 WIDEST = math.radians(80)
-"""The largest angle off axis that a plane image covers."""
+"""Largest angle off axis, in radians, that a plane image covers."""
 
 _MARGIN = 3
 _MOST_PIXELS = 64e6
@@ -27,16 +27,26 @@ _STEP = 0.01
 
 
 class Lens(NamedTuple):
-    """A pinhole camera, and where the pixels of the true camera are in its image (None: the same pixels)."""
+    """Pinhole camera to render with, and the resampling to the true camera.
+
+    Attributes:
+        pinhole: the pinhole camera.
+        x: positions (x, y) of the true camera's pixels in the pinhole's image; None if the pixels are the
+            same.
+        valid: True where the lens sees something; None if the pixels are the same.
+    """
 
     pinhole: Camera
     x: Float[Tensor, "h w 2"] | None
     valid: Bool[Tensor, "h w"] | None
 
     def resampled(self, image: Float[Tensor, "c h1 w1"]) -> Float[Tensor, "c h2 w2"]:
-        """Colours, by cubic splines; 0 where the lens sees nothing.
+        """Resample colours to the true camera by cubic splines; 0 where the lens sees nothing.
 
-        (The bicubic kernel of `grid_sample` shifts linear ramps by up to 0.05 pixels, splines do not.)
+        The bicubic kernel of `grid_sample` shifts linear ramps by up to 0.05 pixels, splines do not.
+
+        Returns:
+            Image (c, h2, w2), clipped at 0.
         """
         if self.x is None or self.valid is None:
             return image
@@ -45,16 +55,25 @@ class Lens(NamedTuple):
         return torch.where(self.valid, torch.from_numpy(np.stack(planes)).clamp(min=0), 0.0)
 
     def nearest(self, image: Float[Tensor, "c h1 w1"]) -> Float[Tensor, "c h2 w2"]:
-        """Values as they are at the nearest pixels; 0 where the lens sees nothing."""
+        """Resample values to the true camera from the nearest pixel; 0 where the lens sees nothing.
+
+        Returns:
+            Image (c, h2, w2).
+        """
         if self.x is None or self.valid is None:
             return image
         values = sample(image[None], self.x[None].to(image), interpolation="nearest").values[0]
         return torch.where(self.valid, values, 0)
 
     def depth(self, depth: Float[Tensor, "h1 w1"], index: Int[Tensor, "h1 w1"]) -> Float[Tensor, "h2 w2"]:
-        """Depth along exact rays, exact on planes: beside edges the nearest pixel's surface is extrapolated.
+        """Resample depth along exact rays, exact on planes; beside edges the nearest pixel's surface is
+        extrapolated.
 
-        NaN where nothing is seen.
+        Args:
+            index: object index of each pixel.
+
+        Returns:
+            Depth (h2, w2) in metres; NaN where the lens sees nothing.
         """
         if self.x is None or self.valid is None:
             return depth
@@ -64,9 +83,10 @@ class Lens(NamedTuple):
 
 
 def _continued(inverse: Float[Tensor, "h1 w1"], x: Float[Tensor, "h2 w2 2"]) -> Float[Tensor, "h2 w2"]:
-    """Inverse depth at positions by that of the nearest pixel and its slopes to the more even sides.
+    """Inverse depth at positions, extrapolated from the nearest pixel with its slopes to the smoother sides.
 
-    It stays within what the four pixels around have: no surface is nearer or farther than any that was seen.
+    It stays within the values of the four pixels around: no surface is nearer or farther than any that was
+    seen.
     """
     layers = torch.stack([inverse, _gentlest(inverse, 1), _gentlest(inverse, 0)])
     q, across, down = sample(layers[None], x[None], interpolation="nearest").values[0]
@@ -77,7 +97,7 @@ def _continued(inverse: Float[Tensor, "h1 w1"], x: Float[Tensor, "h2 w2 2"]) -> 
 
 
 def _gentlest(inverse: Float[Tensor, "h w"], dim: int) -> Float[Tensor, "h w"]:
-    """Of the differences to the two neighbours along an axis, the smaller."""
+    """The smaller of the differences to the two neighbours along an axis."""
     steps = inverse.diff(dim=dim)
     edge = torch.full_like(steps.narrow(dim, 0, 1), torch.inf)
     before, after = torch.cat([edge, steps], dim), torch.cat([steps, edge], dim)
@@ -85,7 +105,15 @@ def _gentlest(inverse: Float[Tensor, "h w"], dim: int) -> Float[Tensor, "h w"]:
 
 
 def lens_for(camera: View, name: str) -> Lens:
-    """The lens of a rig's camera. Raises ValueError, naming the camera, for one that cannot be rendered."""
+    """Make the lens of a rig's camera.
+
+    Returns:
+        The lens, float64 on the CPU.
+
+    Raises:
+        ValueError: naming the camera, if it is not calibrated, batched, skewed or mirrored, or its lens is
+            invalid or too wide for a plane image.
+    """
     if not isinstance(camera, Camera):
         raise ValueError(f"camera '{name}' is not calibrated: rendering needs its K, R and t")
     if camera.K.ndim != 2:
@@ -98,7 +126,8 @@ def lens_for(camera: View, name: str) -> Lens:
 
 
 def _upright(camera: Camera, name: str) -> Camera:
-    """The same pinhole, K upper triangular: K = K' Q, Q a rotation about the optical axis, in the pose."""
+    """The same pinhole with upper triangular K: K = K' Q, where Q, a rotation about the optical axis, goes to
+    the pose."""
     K = camera.K
     angle = torch.atan2(K[1, 0], K[1, 1])
     c, s = angle.cos(), angle.sin()
@@ -116,7 +145,7 @@ def _upright(camera: Camera, name: str) -> Camera:
 
 
 def _wide(camera: Camera, upright: Camera, name: str) -> Lens:
-    """A pinhole that covers all that the lens sees, at least as finely, with square pixels."""
+    """Pinhole that covers all that the lens sees, at least as finely, with square pixels."""
     rays, valid = camera.rays(pixel_grid(camera.hw, dtype=torch.float64))
     rays = rays @ (upright.R @ camera.R.T).T
     if not valid.any():
@@ -138,7 +167,7 @@ def _wide(camera: Camera, upright: Camera, name: str) -> Lens:
 
 
 def _finest(plane: Float[Tensor, "h w 2"], valid: Bool[Tensor, "h w"]) -> Float[Tensor, ""]:
-    """The focal length at which neighbouring lens pixels are a pixel or more apart nearly everywhere."""
+    """Focal length at which neighbouring lens pixels are a pixel or more apart nearly everywhere."""
     across, down = plane.diff(dim=1).norm(dim=-1), plane.diff(dim=0).norm(dim=-1)
     steps = torch.cat([across[valid[:, 1:] & valid[:, :-1]], down[valid[1:] & valid[:-1]]])
     return 1 / steps.quantile(0.1) if len(steps) < 1e6 else 1 / steps.kthvalue(len(steps) // 10).values

@@ -1,4 +1,4 @@
-"""How a scene is rendered: size and quality."""
+"""Settings of rendering: size and quality."""
 
 from __future__ import annotations
 
@@ -10,13 +10,20 @@ from ..check import CheckLimits
 
 @dataclass(frozen=True, kw_only=True)
 class RenderSettings:
-    """What is rendered, and how well.
+    """Settings of rendering by Blender.
 
-    `width` resizes the rig so that its widest image has that many pixels; None leaves it as it is. `infrared`
-    makes an image of the near infrared beside that of colours. `duration` seconds are rendered at each
-    camera's own frame rate and time offset; 0 renders one frame a camera. `threads` of 0 uses all cores.
-    `limits` are what the self-check holds the first frames to. `device` "auto" takes a GPU where one is
-    usable.
+    Attributes:
+        width: pixels of the rig's widest image, to which all are resized alike; None keeps the sizes.
+        samples: rays for each pixel.
+        denoise: denoiser.
+        fast_light: True for Blender's fast approximation of indirect light.
+        bounces: reflections of light.
+        device: "auto" takes a GPU if one is usable.
+        threads: CPU threads; 0 uses all cores.
+        infrared: True to render near infrared beside colours.
+        duration: seconds to render, at each camera's frame rate and time offset; 0 renders one frame of each
+            camera.
+        limits: limits of the self-check, applied to the first frames.
     """
 
     width: int | None = None
@@ -35,4 +42,5 @@ PRESETS: dict[str, dict[str, Any]] = {
     "fast": {"width": 512},
     "paper": {"width": 2048, "samples": 32, "denoise": "accurate", "fast_light": False, "bounces": 4},
 }
-"""What differs from the defaults, by name: 512 pixels wide, or as the paper's, 2048 and more of each."""
+"""Presets by name, as differences from the defaults: 512 pixels wide, or as the paper's 2048 at higher
+quality."""

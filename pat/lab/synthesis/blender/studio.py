@@ -1,4 +1,4 @@
-"""Renders of a built scene: cameras set, renders run, passes read."""
+"""Rendering of a built scene: set the camera, render, read the passes."""
 
 from __future__ import annotations
 
@@ -24,14 +24,18 @@ from .build import BuiltScene, Spectrum, build
 from .settings import RenderSettings
 
 NOTHING = 1e9
-"""Depths beyond this mean that the ray hit nothing."""
+"""Depth above which the ray hit nothing."""
 
 _FLIP = np.diag([1.0, -1.0, -1.0])
 _SENSOR = 36.0
 
 
 class Studio:
-    """Blender with one scene loaded: renders frames of any pinhole at any time."""
+    """Blender with one scene loaded; renders frames of any pinhole camera at any time.
+
+    Raises:
+        ValueError: if Blender is not installed, or no GPU is usable for device "gpu".
+    """
 
     def __init__(self, scene: Scene, settings: RenderSettings, scratch: Path):
         self.scene, self.settings, self.scratch = scene, settings, scratch
@@ -45,7 +49,14 @@ class Studio:
             self._quality()
 
     def channels(self, camera: Camera, time: float, spectrum: Spectrum) -> dict[str, Tensor]:
-        """Colours, depth and index by Blender's names (H, W)."""
+        """Render one frame.
+
+        Args:
+            time: seconds, for the objects' motion.
+
+        Returns:
+            Channels (h, w), float32, by Blender's names: colours, depth, object index.
+        """
         for item, thing in zip(self.stage.objects, self.scene.objects):
             _place(item, thing.motion, time)
         self.blender.frame_set(1)
@@ -60,7 +71,7 @@ class Studio:
         return channels
 
     def close(self) -> None:
-        """Drop Blender's persistent data: until then one of its threads spins, half a core."""
+        """Drop Blender's persistent data; until then one of its threads keeps half a core busy."""
         self.blender.render.use_persistent_data = False
 
     # Settings --------------------------------------------------------------------------------------------
@@ -107,7 +118,8 @@ class Studio:
     # One image -----------------------------------------------------------------------------------------
 
     def _aim(self, camera: Camera) -> None:
-        """Blender's camera as ours, 36 units wide whatever the sensor: Blender refuses less than 1 mm."""
+        """Set Blender's camera, with a sensor 36 units wide for any camera: Blender refuses less
+        than 1 mm."""
         data, render = self.camera.data, self.blender.render
         (h, w), K = camera.hw, camera.K
         fx, fy = float(K[0, 0]), float(K[1, 1])
@@ -122,7 +134,14 @@ class Studio:
 
 
 def read_layers(path: Path) -> dict[str, Tensor]:
-    """The channels of a multi-layer EXR file by `Pass.Channel`, each float32 (H, W)."""
+    """Read the channels of a multi-layer EXR file.
+
+    Returns:
+        Channels (h, w), float32, by `Pass.Channel`.
+
+    Raises:
+        ValueError: if OpenEXR is not installed.
+    """
     try:
         import OpenEXR
     except ImportError:
@@ -138,7 +157,7 @@ def read_layers(path: Path) -> dict[str, Tensor]:
 
 @contextmanager
 def quietly() -> Iterator[None]:
-    """Suppress Blender's output, which bypasses Python's standard output."""
+    """Context manager that suppresses Blender's output, which bypasses Python's standard output."""
     sys.stdout.flush()
     former, sink = os.dup(1), os.open(os.devnull, os.O_WRONLY)
     try:
@@ -151,7 +170,7 @@ def quietly() -> Iterator[None]:
 
 
 def _blender_pose(camera: Camera) -> Float[NDArray, "4 4"]:
-    """World from camera with Blender's axes: x right, y up, z back."""
+    """World from camera in Blender's axes: x right, y up, z back."""
     M = np.eye(4)
     M[:3, :3] = camera.R.numpy().T @ _FLIP
     M[:3, 3] = camera.centre.numpy()

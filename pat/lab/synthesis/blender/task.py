@@ -1,4 +1,4 @@
-"""One scene, rendered in this process."""
+"""Rendering of one scene in this process."""
 
 from __future__ import annotations
 
@@ -37,7 +37,13 @@ _SCRATCH = "pat-render-"
 
 
 class Shot(NamedTuple):
-    """One frame to render: camera, number, and time in seconds."""
+    """One frame to render.
+
+    Attributes:
+        camera: name of the camera.
+        number: number of the frame, from 0.
+        time: time in seconds.
+    """
 
     camera: str
     number: int
@@ -45,16 +51,28 @@ class Shot(NamedTuple):
 
 
 def render(scene: Scene, rig: Rig, out: Path, *, settings: RenderSettings) -> Rendered:
-    """`render_here` in a process of its own, so that this one does not import bpy."""
+    """Render a scene by `render_here` in a separate process, so that this one does not import bpy.
+
+    Returns:
+        The rendered folder.
+
+    Raises:
+        ValueError: as `render_here`.
+    """
     with ProcessPoolExecutor(1, get_context("spawn")) as process:
         return process.submit(render_here, scene, rig.to("cpu"), out, settings=settings).result()
 
 
 def render_here(scene: Scene, rig: Rig, out: Path, *, settings: RenderSettings) -> Rendered:
-    """Render a scene into the folder `out`, atomically, in this process, which imports bpy.
+    """Render a scene of a rig into the new folder `out`, atomically, in this process, which imports bpy.
 
-    Raises ValueError for what cannot be rendered (one line: skew, a camera inside an object, a missing
-    library).
+    Returns:
+        The rendered folder, with the outcome of the self-check in `about["check"]`; a scene that fails it is
+        kept.
+
+    Raises:
+        ValueError: in one line, if `out` exists or the scene cannot be rendered (skew, a camera inside an
+            object, a missing library).
     """
     out = Path(out)
     if out.exists():
@@ -86,7 +104,7 @@ def render_here(scene: Scene, rig: Rig, out: Path, *, settings: RenderSettings) 
 
 
 def fitted(rig: Rig, settings: RenderSettings) -> Rig:
-    """The rig at the size that is rendered."""
+    """Return the rig resized to the settings' width; the rig itself if there is none."""
     if settings.width is None:
         return rig
     scale = settings.width / max(camera.hw[1] for camera in rig.cameras.values())
@@ -97,7 +115,7 @@ def fitted(rig: Rig, settings: RenderSettings) -> Rig:
 
 
 def shots(rig: Rig, settings: RenderSettings) -> list[Shot]:
-    """All frames in order: each camera from its time offset on, at its frame rate, for the duration."""
+    """List all frames in order: each camera from its time offset on, at its frame rate, for the duration."""
     planned = []
     for name, camera in rig.cameras.items():
         rate = camera.sensor.frame_rate or _RATE
@@ -107,7 +125,11 @@ def shots(rig: Rig, settings: RenderSettings) -> list[Shot]:
 
 
 def refuse_inside(scene: Scene, rig: Rig, planned: list[Shot]) -> None:
-    """Raises ValueError if a camera is inside an object when it takes a frame."""
+    """Check that no camera is inside an object when it takes a frame.
+
+    Raises:
+        ValueError: naming camera and object, if one is.
+    """
     for shot in planned:
         centre = rig[shot.camera].centre.detach().cpu().double().numpy()
         for item in scene.objects:
@@ -117,7 +139,14 @@ def refuse_inside(scene: Scene, rig: Rig, planned: list[Shot]) -> None:
 
 
 def take(studio: Studio, lens: Lens, shot: Shot) -> RenderedFrame:
-    """One frame. Raises ValueError if the camera sees nothing."""
+    """Render one frame of a camera, resampled to its lens.
+
+    Returns:
+        The frame.
+
+    Raises:
+        ValueError: if the camera sees nothing.
+    """
     rendered = studio.channels(lens.pinhole, shot.time, "rgb")
     index = rendered[compat.index_name(rendered)].round().int()
     depth = torch.where(rendered["Depth.Z"] < NOTHING, rendered["Depth.Z"], torch.inf)
@@ -137,7 +166,7 @@ def take(studio: Studio, lens: Lens, shot: Shot) -> RenderedFrame:
 
 @contextmanager
 def _staged(out: Path) -> Iterator[Path]:
-    """A folder beside `out` that is renamed to it when complete."""
+    """Folder beside `out` that is renamed to it when complete."""
     out.parent.mkdir(parents=True, exist_ok=True)
     folder = out.with_name(f".{out.name}-{uuid4().hex[:8]}.part")
     folder.mkdir()
@@ -150,9 +179,9 @@ def _staged(out: Path) -> Iterator[Path]:
 
 @contextmanager
 def _scratch() -> Iterator[Path]:
-    """A temporary folder, in memory if possible, for the files that Blender writes.
+    """Temporary folder, in memory if possible, for the files that Blender writes.
 
-    Its name holds the process number: those of processes that were killed are removed.
+    Its name holds the process number: folders of killed processes are removed.
     """
     where = _SHARED_MEMORY if os.access(_SHARED_MEMORY, os.W_OK) else None
     for left in _SHARED_MEMORY.glob(f"{_SCRATCH}*") if where else ():

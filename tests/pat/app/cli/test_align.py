@@ -1,4 +1,5 @@
-"""`pat align`: its files and options on a wall with a post before it, and what is refused, one line each."""
+"""Alignment by `pat align`: its files and options on a wall with a post before it, and refusals, one line
+each."""
 
 import shutil
 from pathlib import Path
@@ -104,7 +105,7 @@ def test_options(folder, counts):  # noqa: F811
 
 
 def test_images_are_not_overwritten_by_what_is_made_of_them(folder, tmp_path, refusal):  # noqa: F811
-    """The cameras' own files, as deep as they were recorded, may have the names of the images themselves."""
+    """The cameras' own files, as deep as recorded, may have the names of the images themselves."""
     for name in ("mono", "colour"):
         tifffile.imwrite(tmp_path / f"{name}.tif", cv2.imread(str(folder / f"{name}.png"))[..., ::-1])
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
@@ -237,7 +238,7 @@ def test_a_rig_whose_lines_are_open_is_not_written(folder, counts):  # noqa: F81
 
 
 def test_frames_are_matched_by_their_names(folder, counts):  # noqa: F811
-    """Of each camera another is missing: in order, the middle ones would be taken for one frame."""
+    """Another frame of each camera is missing: in order, the middle ones would be taken for one frame."""
     for name, frames in {"mono": "012", "colour": "023"}.items():
         (counts / name).mkdir()
         for i in frames:

@@ -145,7 +145,7 @@ def test_rig_mistakes_name_the_entry(entry, value, message, small, refusal):
 
 
 def test_a_rig_without_depth_range_is_answered_with_the_option_that_gives_one(small, refusal):
-    """As other tools' files are; only the native file's entry and Python were named."""
+    """Other tools' files have no depth range; the message names --depth."""
     Rig.load(small / "rig.yaml").replace(depth=None).save(small / "rig.yaml")
     assert "`--depth NEAR FAR`" in refusal(*arguments(small))
 
@@ -201,7 +201,7 @@ def test_rig_convert_and_back(small, refusal):
 
 
 def test_the_size_of_files_that_state_none_or_several(small, tmp_path, refusal):
-    """The command had no way to say it: a ZED's file with images of 672x376 was of its largest size."""
+    """--size states the size, as for a ZED's file with images of 672x376."""
     zed, rig = str(FIXTURES / "zed.conf"), str(tmp_path / "rig.yaml")
     main(["rig", "convert", zed, rig, "--size", "672", "376"])
     assert Rig.load(rig)["left"].hw == (376, 672)
@@ -235,7 +235,7 @@ def test_rig_info_says_no_metres_of_a_rig_of_unknown_scale(small, tmp_path, caps
 
 @pytest.mark.parametrize("kind", ["colmap", "nerfstudio"])
 def test_rig_info_says_no_metres_of_a_file_that_states_no_unit(small, tmp_path, capsys, kind):
-    """Of COLMAP's arbitrary lengths it said metres and millimetres."""
+    """COLMAP's lengths are arbitrary."""
     path = tmp_path / ("transforms.json" if kind == "nerfstudio" else "sparse")
     cameras = Rig.load(small / "rig.yaml").cameras.items()
     write_rig(Rig({name: camera.replace(sensor=Sensor()) for name, camera in cameras}), path, format=kind)
@@ -249,7 +249,7 @@ def test_rig_info_says_no_metres_of_a_file_that_states_no_unit(small, tmp_path, 
 
 @pytest.mark.parametrize("read", [read_images, lambda *given: read_frames(*given)[0]])
 def test_images_are_read_as_the_rig_describes_them_outside_of_fuse_too(small, recwarn, read):
-    """Counts of 12 bits were nearly black to `pat show` and `pat rig`, which advised what the rig stated."""
+    """Counts of 12 bits are developed for `pat show` and `pat rig` as well."""
     rig, image = Rig.load(small / "rig.yaml"), read_image(small / "mono.png")
     write_image(small / "raw.png", linear_from_srgb(image) * 4095 / 65535, bits=16)
     sensor = dataclasses.replace(rig["mono"].sensor, bits=12, coding="linear")
@@ -426,7 +426,10 @@ def test_json_is_valid_where_the_rig_sees_to_infinity(small, capsys):
         ),
         (MemoryError(), "pat: out of memory"),
         (ImportError("drawing needs it: pip install plots"), "pat: drawing needs it: pip install plots"),
-        (ImportError("No module named 'dask'"), "No module named 'dask': pip install 'arraygeom-pat[all]'"),
+        (
+            ImportError("No module named 'dask'"),
+            "No module named 'dask': in a checkout, pip install '.[all]'",
+        ),
         (KeyError("mono"), "pat: KeyError: 'mono' (--debug shows where)"),
         (RuntimeError("CUDA\nout"), "pat: RuntimeError: CUDA out (--debug shows where)"),
         (OverflowError("big"), "pat: OverflowError: big (--debug shows where)"),
@@ -527,7 +530,7 @@ def test_a_bad_out_is_found_before_the_fusion(small, refusal, monkeypatch):
 
 @pytest.mark.parametrize("name", ["fused.png", "depth.png", "1_fused.png", "fused_red.png"])
 def test_images_that_results_would_replace_are_refused(small, name, refusal, monkeypatch):
-    """A colour image that was called fused.png was overwritten by the result."""
+    """An image named fused.png is not overwritten by the result."""
     monkeypatch.setattr("pat.app.front.fuse", lambda *_, **__: pytest.fail("fused"))
     (small / "out").mkdir()
     given = (small / "colour.png").rename(small / "out" / name)
@@ -572,7 +575,7 @@ def test_a_bad_out_is_found_before_the_work(command, out, text, tmp_path, monkey
     ],
 )
 def test_images_that_are_missing_are_asked_for(small, command, text, monkeypatch, refusal):
-    """Without any, there were an IndexError and a division by zero; matches were ignored."""
+    """Without any image the message asks for some; matches do not replace them."""
     monkeypatch.chdir(small)
     out = ["-o", "new.yaml"] if "--focal" in command else []
     said = refusal("rig", *command, *out)

@@ -1,4 +1,4 @@
-"""What --noise may be."""
+"""Values of --noise."""
 
 import pytest
 

@@ -49,7 +49,7 @@ def test_names_that_cannot_be_printed_are_no_cameras(name):
 
 
 def test_names_are_no_parts_of_a_page():
-    """`{{WARNINGS}}` as a camera's name was replaced in its turn."""
+    """A camera named `{{WARNINGS}}` is not replaced in turn."""
     names = ["{{WARNINGS}}", "<script>", "{{LAYERS}}"]
     page = filled_page(
         "{{NOTES}}", (1, 1), dict.fromkeys(names, "x"), {}, {"{{RATIO}}": "1"}, Facts(["note"]), RIG=""

@@ -177,7 +177,7 @@ def test_a_moved_rig_puts_the_match_off_the_line_by_as_much_as_it_says(scene, sa
 
 
 def test_a_networks_features_are_those_of_the_pair(sample):
-    """They were kept by camera alone, of another alpha's resolution, and all with the first beta's key."""
+    """They are cached by pair: alpha's resolution and beta's key differ between pairs."""
     rig = sample.rig.with_camera("third", sample.rig["colour"])
     rig = rig.replace(cameras={name: rig[name] for name in ("mono", "colour", "third")})
     images = {name: interpolate(image[None], scale_factor=0.25)[0] for name, image in sample.images.items()}

@@ -43,7 +43,7 @@ def status(port, path, data=None, **headers) -> int:
 
 
 def another_user(ask) -> bool:
-    """Whether a process of another user of this machine is refused all that it asks for."""
+    """Return True if a process of another user of this machine is refused all that it asks for."""
     child = os.fork()
     if not child:
         os.setgid(65534)
@@ -127,7 +127,7 @@ def test_a_port_in_use_is_one_line(server, refusal):
 
 
 def test_a_saved_grid_answers_for_the_pixels_of_its_cells():
-    """A column a pixel: each cell's is its own. Half a pixel off, every other one was its neighbour's."""
+    """One column per pixel: each cell has its own answer, not its neighbour's."""
     rig = load_sample().rig
     for name in rig.names:
         rig = rig.resize(name, (6, 8))

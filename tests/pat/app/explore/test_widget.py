@@ -167,7 +167,7 @@ def until(driver, true, seconds=60):
 
 
 def open_saved(driver, view, folder, **how):
-    """What is shown of a view's saved page, in the browser."""
+    """Open a view's saved page in the browser, and return its contents."""
     view.save(folder / "view.html", **how)
     driver.get((folder / "view.html").as_uri())
     until(driver, lambda told: len(told) == max(1, len(view.cameras)))
@@ -288,7 +288,7 @@ def test_what_is_wrong_is_drawn_in_the_saved_page(driver, tmp_path):
 
 
 def test_a_beta_at_alphas_centre_is_drawn_and_dragged_as_one_seen_from_above(driver, tmp_path):
-    """It was taken for alpha, which does not move."""
+    """It is not taken for alpha, which does not move."""
     open_saved(driver, explore(small_rig(baseline=0.0)), tmp_path)
     until(driver, lambda told: "match" in told[1])
     top = driver.find_element("css selector", "canvas.top")

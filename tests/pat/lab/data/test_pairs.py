@@ -87,7 +87,7 @@ def test_a_post_occludes_what_is_beside_it():
 
 
 def test_what_is_beyond_the_edge_hides_nothing_at_it():
-    """Disparities of 12 beyond the edge were counted as on its first column."""
+    """Disparities of points beyond the edge are not counted on its first column."""
     value = torch.full((1, 40), 12.0)
     value[:, 10:] = 10.0
     assert not Disparity(value, value > 0).regions().occluded.any()

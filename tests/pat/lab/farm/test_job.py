@@ -180,7 +180,7 @@ def test_other_mistakes_are_one_line(config, tmp_path, refusal):
 
 @pytest.mark.parametrize("text", ["", "[1]", "made from: 3", "made from: [rig]"])
 def test_a_file_that_is_no_manifest_is_named(config, tmp_path, text):
-    """It ended in an AttributeError."""
+    """The message names the file."""
     (tmp_path / "manifest.yaml").write_text(text)
     with pytest.raises(ValueError, match=r"manifest\.yaml: "):
         write_manifest(RenderConfig.load(config), tmp_path)

@@ -110,7 +110,7 @@ def test_limits_can_be_set(rig, frames):
 
 
 def test_no_more_pixels_than_stated_are_checked(frames):
-    """It was up to twice as many."""
+    """More than half of the limit, and never more than it."""
     frame = dataclasses.replace(frames["a"], depth=torch.ones(HW))
     for most in (HW[0] * HW[1], 3000, 2400, 7):
         assert most / 2 < len(_chosen(frame, most)[0]) <= most

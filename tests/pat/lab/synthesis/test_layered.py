@@ -21,7 +21,7 @@ HW = (48, 128)
 
 
 class Across(NamedTuple):
-    """Of every pixel of one view: its position in another, whether it is seen there, and its colour there."""
+    """Correspondence of every pixel of one view: position in another, visibility, and colour there."""
 
     x: Float[Tensor, "b h w 2"]
     visible: Bool[Tensor, "b h w"]
@@ -96,7 +96,7 @@ def test_no_shift_between_views_of_different_resolution(smooth, mode, resolution
 
 
 def test_occlusion_is_seen_from_both_sides(rich):
-    """What alpha sees and beta's image covers is either visible there or behind something nearer."""
+    """A point that alpha sees and beta's image covers is either visible there or behind a nearer one."""
     batch = draw(rich, RigDistribution(resolutions=(1.0,)), 8)
     across = transferred(batch)
     inside = batch.cameras[1].contains(across.x)

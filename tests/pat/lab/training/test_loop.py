@@ -33,7 +33,7 @@ ROOT = Path(__file__).parents[4]
 
 @pytest.fixture(scope="module", autouse=True)
 def one_thread():
-    """As in the processes of `command`: the rounding of convolutions depends on the number of threads."""
+    """One thread, as in the processes of `command`: the rounding of convolutions depends on their number."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     yield

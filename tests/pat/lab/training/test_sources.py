@@ -104,7 +104,7 @@ def at(given, position):
 
 
 def refused(crops, root, hw=(32, 48), **how):
-    """What is said, in one line, of a folder that cannot be used."""
+    """Return the one line that refuses a folder that cannot be used."""
     with pytest.raises(ValueError) as caught:
         crops([root], hw=hw, **how).sample(8, generator(), number=0)
     assert "\n" not in str(caught.value)
@@ -183,7 +183,7 @@ def test_true_depth_says_where_alphas_pixels_are_in_beta(lenses, broken):
 
 
 def test_scenes_behind_lenses_are_undistorted(rendered, broken):
-    """Colours and depth are where the same ray was in the image without a lens."""
+    """Colours and depth are those of the same ray in the image without a lens."""
     folder = through(broken) / "scenes" / "000001"
     before, view = Rendered(rendered / "scenes" / "000001"), undistorted(read_view(folder, "mono"))
     assert view.camera.distortion is None

@@ -90,7 +90,7 @@ def test_degradation_keeps_the_ground_truth_in_colour(config):
 
 
 def test_three_betas_have_a_band_each(config):
-    """As many cameras as the network is made for, at places of their own."""
+    """There are as many cameras as the network is made for, at places of their own."""
     three = replace(config, network=replace(config.network, betas=3, in_channels=1))
     for given in scenes(three)[0](4):
         assert [beta.shape[1] for beta in given.betas] == [1, 1, 1]

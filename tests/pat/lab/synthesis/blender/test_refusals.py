@@ -49,7 +49,7 @@ def test_another_version_of_python_is_refused(monkeypatch):
     with pytest.raises(ValueError, match=r"3.11 .*3.13 .*3.12$"):
         compat.load()
     monkeypatch.setattr(sys, "version_info", (3, 11, 2))
-    with pytest.raises(ValueError, match=r"pip install 'arraygeom-pat\[synthesis\]'$"):
+    with pytest.raises(ValueError, match=r"pip install bpy, .*'\.\[synthesis\]'$"):
         compat.load()
 
 
