@@ -110,7 +110,7 @@ class Batched:
         return map_tensors(self, lambda t, axes: t.clone())
 
     def pin_memory(self: T) -> T:
-        """Return a copy in page-locked memory, which `torch.utils.data.DataLoader(pin_memory=True)` asks for."""
+        """Return a copy in page-locked memory, as `torch.utils.data.DataLoader(pin_memory=True)` asks."""
         return map_tensors(self, lambda t, axes: t.pin_memory())
 
     def requires_grad_(self: T, requires_grad: bool = True) -> T:

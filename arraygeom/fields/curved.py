@@ -301,7 +301,7 @@ class RayCurve(NamedTuple):
         return fractions
 
     def _fractions(self, even: Tensor) -> Tensor:
-        """Return even fractions for each pixel; if not central, with others closer and closer to both ends."""
+        """Return even fractions for each pixel; if not central, others too, closer and closer to the ends."""
         if not self.beta.central:
             close = 10 ** (CLOSEST * (1 - self._even(len(even) // 2 + 1)[:-1]))
             even = torch.cat([even, close, 1 - close]).sort().values
