@@ -87,7 +87,7 @@ alignment: $(READY)
 
 paper-network: $(READY)
 	@$(BIN)/python -m experiments evaluate --middlebury $(DATA)/middlebury --rates 2 --half report \
-		--weights tests/benchmarks/paper-2-narrow.safetensors --out out/paper-network
+		--network tests/benchmarks/paper-2-narrow.safetensors --out out/paper-network
 	@$(BIN)/python -m docs.update_readme --document docs/reports/paper.md --block paper=out/paper-network/scores.md
 
 outside: $(READY)
@@ -96,9 +96,9 @@ outside: $(READY)
 
 paper-tables: $(READY)
 	@$(BIN)/python -m experiments evaluate --kitti $(DATA)/kitti --flickr1024 $(DATA)/flickr1024 \
-		--weights pat-supervised --out out/table1
+		--network pat-supervised --out out/table1
 	@$(BIN)/python -m experiments evaluate --kitti $(DATA)/kitti --flickr1024 $(DATA)/flickr1024 \
-		--protocol table2 --weights pat-supervised-4 --out out/table2
+		--protocol table2 --network pat-supervised-4 --out out/table2
 	@$(BIN)/python -m docs.update_readme --document docs/reports/paper.md \
 		--block table1=out/table1/scores.md --block table2=out/table2/scores.md
 

@@ -173,8 +173,9 @@ def check_batches(what: str, *shapes: tuple[int, ...]) -> None:
 
 
 def check_above(least: float, *, whole: bool = False, itself: bool = True, **values: Any) -> None:
-    """Check that each of the named values is a finite number from `least` up. None and tensors are not
-    checked.
+    """Check that each of the named values is a finite number from `least` up.
+
+    None and tensors are not checked.
 
     Args:
         whole: True for integers only.

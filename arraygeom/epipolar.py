@@ -128,8 +128,9 @@ def track(
     beta_from_alpha: Pose,
     x: Real[Tensor, "*n 2"],
 ) -> Track:
-    """Compute the track in beta of each alpha pixel of a pinhole pair. Batched rigs (*b, 3, 3) take pixels
-    (*b, ..., 2).
+    """Compute the track in beta of each alpha pixel of a pinhole pair.
+
+    Batched rigs (*b, 3, 3) take pixels (*b, ..., 2).
 
     Matrices are composed in their own precision, pixels computed in that of `x`.
 

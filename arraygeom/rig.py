@@ -201,8 +201,10 @@ class Rig(Batched):
         return self.transformed(name, resize_matrix(self[name].hw, hw), hw)
 
     def crop(self, name: str, top: int, left: int, hw: HW) -> Rig:
-        """Return the rig whose camera `name` keeps a window of its image; see `Camera.crop`. Its links
-        follow."""
+        """Return the rig whose camera `name` keeps a window of its image; see `Camera.crop`.
+
+        Its links follow.
+        """
         return self.transformed(name, shift_matrix(left, top), hw)
 
     def rot90(self, name: str, quarter_turns: int) -> Rig:

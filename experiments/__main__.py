@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 from pat.app.cli.main import main
-from pat.app.cli.options import MaybeOut, Memory, Out, Weights, progress, say, working, writable
+from pat.app.cli.options import MaybeOut, Memory, NetworkName, Out, progress, say, working, writable
 from pat.app.cli.parser import Option
 from pat.lab.data.windows import scene_folders
 from pat.sensors import seed_for
@@ -30,12 +30,12 @@ class Showcase:
     """Folder with kitti, middlebury, flickr1024, syntim and hfr_lfr."""
     out: Out = Path("out/showcase")
     """Folder for showcase.md, the figures and the rig files."""
-    weights: Weights = "mono-colour"
+    network: NetworkName = "mono-colour"
 
     def run(self) -> None:
         """Write and print the tables. Raises ValueError or FileNotFoundError naming what is missing."""
         writable(self.out, folder=True)
-        print(showcase(self.data, self.out, self.weights), end="")
+        print(showcase(self.data, self.out, self.network), end="")
         say(f"written: {self.out / 'showcase.md'}, and its figures and rig files")
 
 
@@ -86,7 +86,7 @@ class SystemsRun:
     """For fast-slow: the paper's frames, not a rendered scene: a folder with pillow_1 and the matrices."""
     out: MaybeOut = None
     """Folder for the results; by default out/systems/NAME."""
-    weights: Weights = "mono-colour"
+    network: NetworkName = "mono-colour"
     max_memory: Memory = None
     """Memory limit of fusing, such as 4GiB."""
 
@@ -97,7 +97,7 @@ class SystemsRun:
             same = ("full", "scene", "weights", "max_memory")
             result = run_system(self.name, out, say=say, **{name: getattr(self, name) for name in same})
         elif self.name == "fast-slow":
-            result = run_recorded(self.recording, out, weights=self.weights, say=say)
+            result = run_recorded(self.recording, out, weights=self.network, say=say)
         else:
             raise ValueError(f"--recording is of fast-slow, not of '{self.name}'")
         print(result.table, end="")

@@ -131,8 +131,9 @@ def read_rig(
 
 
 def write_rig(rig: Rig, path: str | Path, *, format: str = "native") -> None:
-    """Write a rig to a file atomically. Formats of several files make a folder, the last of them after the
-    others.
+    """Write a rig to a file atomically.
+
+    Formats of several files make a folder, the last of them after the others.
 
     What a format leaves out of the rig is named by one RigFileWarning: all but the native one the depth
     range, links, what a sensor records; OpenCV's where the first camera is in the world.

@@ -72,8 +72,10 @@ def read(source: RigSource) -> Rig:
 
 
 def _pose(stereo: Entry, name: str) -> Pose:
-    """Return the pose of the right camera: points are R X + t. Offsets may be stated for all resolutions at
-    once."""
+    """Return the pose of the right camera: points are R X + t.
+
+    Offsets may be stated for all resolutions at once.
+    """
     offsets = [stereo[f"{key}_{name}", key].words().number() for key in ("ty", "tz")]
     t = stereo.at([-stereo["baseline"].words().number(), *offsets], "baseline, ty, tz")
     rotation = stereo.listed(*(f"{key}_{name}" for key in ("rx", "cv", "rz"))).words()

@@ -125,8 +125,10 @@ class Splined(CameraModel, name="splined"):
         return norm(there - xy) >= SOLVED * torch.finfo(xy.dtype).eps * (1 + norm(xy)), there, jacobian
 
     def _within(self, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Clamp stereographic points to the border of knots and base. Returns them, and True for points
-        inside."""
+        """Clamp stereographic points to the border of knots and base.
+
+        Returns them, and True for points inside.
+        """
         spacing = beside_points(self.spacing, u, 1).detach()
         ny, nx = self.knots.shape[-3:-1]
         margin = 0.5 * (self.order - 1) + NEARLY

@@ -77,8 +77,9 @@ def write_together(
 
 
 def write_listed(path: Path, text: str, *, given: bool = False) -> None:
-    """Write one text file as a group of its own name; `given` as the user chose it. Errors as in
-    `write_together`.
+    """Write one text file as a group of its own name; `given` as the user chose it.
+
+    Errors as in `write_together`.
 
     Raises:
         FileExistsError: for an unlisted file in the way, unless `given`.

@@ -45,6 +45,8 @@ THUMBNAIL = 480
 """Width of a drawn image, pixels."""
 DRAWN = 6
 """Largest number of drawn images."""
+GOOD = 1.0
+"""Deviation of lines and predicted positions up to which fusion searches at the right place, pixels."""
 
 
 STYLE = """
@@ -85,7 +87,8 @@ def report_html(
     covers, has_covariance = coverages(calibration), calibration.fit.covariance is not None
     near, far = _depths(covers.values())
     parts = [
-        f"<h1>{escape(title)}</h1><p>{escape(summary(calibration))}</p><ul>",
+        f"<h1>{escape(title)}</h1><p><b>{escape(verdict(calibration))}</b></p>",
+        f"<p>{escape(summary(calibration))}</p><ul>",
         *(f'<li class="note">{escape(a)}</li>' for a in notes or ["No advice."]),
         "</ul><h2>Cameras</h2>",
         camera_table(calibration, covers),
@@ -160,6 +163,47 @@ def summary(calibration: Calibration) -> str:
             pooled = np.concatenate(list(errors.values()))
             text += f" Epipolar error{where} {_mean_and_quantile(pooled, ' px (mean; 95 % below ')})."
     return text
+
+
+def verdict(calibration: Calibration) -> str:
+    """Return a sentence on whether the rig is good enough to fuse, and between which depths.
+
+    It is if the positions predicted in every other camera for pixels of the first deviate by less than
+    `GOOD`, in the median over the image, and points of held-out frames lie no farther off their lines, in the
+    mean.
+
+    Returns:
+        The sentence, with depths in metres and deviations in pixels; empty for a single camera.
+    """
+    alpha, *betas = calibration.views
+    covariance, covers = rig_covariance(calibration.fit), coverages(calibration)
+    if not betas:
+        return ""
+    if covariance is None:
+        return "Not good enough to fuse: the images do not determine all parameters; take more, tilted ones."
+    off = max((float(errors.mean()) for errors in calibration.held_out.values() if len(errors)), default=0.0)
+    if off > GOOD:
+        return (
+            f"Not good enough to fuse: points of held-out frames lie {off:.2f} px off their lines; check "
+            "that images of one moment have the same number, and the lens model."
+        )
+    deviations: dict[float, float] = {}
+    for depth in np.geomspace(*_depths(covers.values()), 5):
+        x, _ = grid_points(calibration.rig[alpha], depth)
+        by_beta = (beta_covariance(calibration.rig, covariance, alpha, beta, x, depth) for beta in betas)
+        usable = [pixels[np.isfinite(pixels).all((1, 2))] for pixels in by_beta]
+        medians = [float(np.median(worst_deviation(pixels))) for pixels in usable if len(pixels)]
+        if medians:
+            deviations[float(depth)] = max(medians)
+    good = [depth for depth, deviation in deviations.items() if deviation < GOOD]
+    if not good:
+        least = min(deviations.values(), default=math.nan)
+        return f"Not good enough to fuse: predicted positions deviate by {least:.2g} px; take more images."
+    most = max(deviations[depth] for depth in good)
+    return (
+        f"Good enough to fuse at {min(good):.3g} to {max(good):.3g} m, where the boards were: predicted "
+        f"positions deviate by {most:.2g} px at most (standard deviation, median over the image)."
+    )
 
 
 def _depths(covers: Iterable[Coverage]) -> tuple[float, float]:
@@ -468,8 +512,10 @@ def _draw_image(
 
 
 def _draw_arrows(axes: Any, x: np.ndarray, r: np.ndarray, length: float, colour: str) -> float:
-    """Draw residuals as arrows, the longest one of a given length in pixels. Returns the longest residual,
-    pixels."""
+    """Draw residuals as arrows, the longest one of a given length in pixels.
+
+    Returns the longest residual, pixels.
+    """
     longest = float(np.linalg.norm(r, axis=1).max())
     arrows = length / max(longest, 1e-9) * r
     axes.quiver(*x.T, *arrows.T, angles="xy", scale_units="xy", scale=1, width=0.004, color=colour)

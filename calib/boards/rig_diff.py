@@ -191,8 +191,10 @@ def rig_difference(
 
 
 def _same_cameras(a: Rig, b: Rig) -> tuple[str, ...]:
-    """Names of the cameras. Raises ValueError unless both rigs have the same calibrated cameras, sizes and
-    unit."""
+    """Names of the cameras.
+
+    Raises ValueError unless both rigs have the same calibrated cameras, sizes and unit.
+    """
     if set(a.names) != set(b.names):
         listed = f"{', '.join(a.names)}; and {', '.join(b.names)}"
         raise ValueError(f"the rigs are of other cameras ({listed}): give two calibrations of the same")

@@ -25,7 +25,7 @@ from .detect import BoardViews, DetectedImage, Detection, Progress, board_views,
 from .intrinsics import Lens
 from .photos import FrameKey, Grey, Photos, find_photos
 from .poses import StartDeviations
-from .report import by_cameras, html_page, report_html, summary
+from .report import by_cameras, html_page, report_html, summary, verdict
 from .rig import Calibration, calibrate
 from .target import parse_boards
 from .uncertainty import intrinsics_of, rig_covariance
@@ -41,7 +41,7 @@ class CalibrationOutput(NamedTuple):
     """Output of a calibration.
 
     Attributes:
-        messages: summary and notes.
+        messages: verdict, summary and notes.
         written: files written.
     """
 
@@ -115,7 +115,10 @@ def calibrate_photos(
         if covariance is not None:
             covariance.save(folder / written[1].name, rig)
         rig.save(folder / out.name)
-    return CalibrationOutput([summary(calibration), *notes], [path for path in written if path.exists()])
+    return CalibrationOutput(
+        [*filter(None, [verdict(calibration)]), summary(calibration), *notes],
+        [path for path in written if path.exists()],
+    )
 
 
 # While images are taken -------------------------------------------------------------------------------------

@@ -270,8 +270,10 @@ def adjust(problem: BundleProblem, *, rounds: int = 4, equal_noise: bool = False
 
 
 def readjusted(problem: BundleProblem) -> BundleProblem:
-    """Adjust a problem again from the solution of nearly the same one, with its noise. Returns
-    the problem."""
+    """Adjust a problem again from the solution of nearly the same one, with its noise.
+
+    Returns the problem.
+    """
     return _minimised(problem, iterations=10)[0]
 
 

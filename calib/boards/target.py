@@ -120,8 +120,10 @@ def parse_board(text: str) -> Board:
 
 
 def _options(text: str, options_text: Sequence[str], patterns: Mapping[str, str]) -> dict[str, str]:
-    """Options by the name of the pattern that each matches. Raises ValueError for others, and for two of one
-    kind."""
+    """Options by the name of the pattern that each matches.
+
+    Raises ValueError for others, and for two of one kind.
+    """
     options: dict[str, str] = {}
     for option in options_text:
         name = next((n for n, p in patterns.items() if re.fullmatch(p, option)), None)

@@ -9,7 +9,7 @@ from typing import Annotated, Literal, TypeVar
 
 from arraygeom.runtime.atomic import write_text
 from experiments.names import refuse_unknown
-from pat.app.cli.options import Out, Weights, progress, say, writable
+from pat.app.cli.options import NetworkName, Out, progress, say, writable
 from pat.app.cli.parser import Option
 from pat.fusion.fuse import FuseSettings
 from pat.lab import commands as research
@@ -88,7 +88,7 @@ class Evaluate(Pairs, research.Evaluate):
         """Write and print the scores. Raises ValueError for no images, and for rates below 1."""
         if self.without_rig and self.protocol != "table1":
             raise ValueError("--without-rig needs --protocol table1")
-        sets, network, bands = self.sets(), load_weights(self.weights), self.protocol == "table2"
+        sets, network, bands = self.sets(), load_weights(self.network), self.protocol == "table2"
         compared = paper.controls(network, bands=bands) if self.controls else {}
         if self.without_rig:
             compared["fusion, rig found"] = paper.with_found_rig(network)
@@ -121,7 +121,7 @@ class Conditions(Pairs):
         """Write and print the tables. Raises ValueError for no images, and a condition that is none."""
         names = self.only or tuple(conditions.CONDITIONS)
         refuse_unknown("--only: no condition", names, conditions.CONDITIONS)
-        pairs, network = self.pairs(), load_weights(self.weights)
+        pairs, network = self.pairs(), load_weights(self.network)
         rows = conditions.evaluate_conditions(pairs, network, names, progress=progress("evaluating"))
         conditions.save_condition_curves(rows, self.out / "conditions.png")
         finished(self.out / "conditions.md", conditions.conditions_markdown(rows))
@@ -158,7 +158,7 @@ class Outside(Pairs):
         """Write and print the table. Raises ValueError for no images, and for none with a true disparity."""
         pairs = with_truth([pair for pair in self.pairs() if pair.disparity is not None], self.half)
         shown = progress("evaluating")(pairs, len(pairs))
-        rows = evaluate_outside(shown, load_weights(self.weights))
+        rows = evaluate_outside(shown, load_weights(self.network))
         finished(self.out / "outside.md", outside_markdown(rows))
 
 
@@ -185,7 +185,7 @@ class Certainty(Pairs):
         pairs = self.pairs()
         shown = progress("fusing")(pairs, len(pairs))
         judged_pixels = with_truth(
-            list(certainty.judged(load_weights(self.weights), shown, names, self.choices)), self.half
+            list(certainty.judged(load_weights(self.network), shown, names, self.choices)), self.half
         )
         if self.fit:
             write_tensors(self.fit, certainty.widened(judged_pixels).state_dict())
@@ -203,7 +203,7 @@ class Certainty(Pairs):
 class OnScenes:
     """Options that ablations on layered scenes share."""
 
-    weights: Weights = "pat-supervised"
+    network: NetworkName = "pat-supervised"
     without: tuple[str, ...] = ()
     """Fields to leave out, such as dense, which takes most of the time."""
     scenes: int = 6
@@ -217,15 +217,15 @@ class OnScenes:
             raise ValueError(f"--scenes: {self.scenes}: give at least 1")
         refuse_unknown("--without: no field", self.without, fields)
         writable(self.out, folder=True)
-        network: Network = load_weights(self.weights)
+        network: Network = load_weights(self.network)
         if not isinstance(network, Comparing):
             raise ValueError(
-                f"--weights {self.weights}: "
+                f"--network {self.network}: "
                 "this network matches without attention, too: `pat lab ablate` takes it"
             )
         if network.betas not in (1, 3):
             wanted = "give some for one beta in colour, or for three with a band each"
-            raise ValueError(f"--weights {self.weights}: they are for {network.betas} betas: {wanted}")
+            raise ValueError(f"--network {self.network}: they are for {network.betas} betas: {wanted}")
         return network
 
     def chosen(self, fields: Mapping[str, T]) -> dict[str, T]:

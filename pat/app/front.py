@@ -232,7 +232,7 @@ def _known(
     if network is None:
         betas = (shown[name] for name in rig.betas(alpha) if name in shown)
         network = weights_for([len(image) for image in betas if isinstance(image, Tensor)])
-        say(f"weights: {network}")
+        say(f"network: {network}")
     return _Complete(shown, rig, alpha, _loaded(network), settings, found=False)
 
 

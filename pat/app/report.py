@@ -92,7 +92,7 @@ def report_page(
         {name: urls[name] for name in overlays},
         _figures(frame, extent, facts),
         facts,
-        RIG=rig_drawing(rig, alpha),
+        RIG=rig_drawing(rig, alpha) if len(depths) else "",
         LEGEND=legend,
     )
 
@@ -118,11 +118,12 @@ def filled_page(
         The HTML.
     """
     h, w = hw
-    parts = {"LEGEND": "", **parts, "TITLE": html.escape(title), "RATIO": f"{w} / {h}"}
+    parts = {"LEGEND": "", **parts, "TITLE": html.escape(title), "RATIO": f"calc({w} / {h})"}
     rows = [f"<tr><th>{html.escape(key)}<td>{html.escape(value)}" for key, value in figures.items()]
     parts["FACTS"] = "\n".join(rows)
-    parts["NOTES"] = _listed("What was found", facts.notes, kind="notes")
-    parts["WARNINGS"] = _listed("Warnings", facts.warnings, kind="warnings")
+    parts["WARNINGS"] = _listed("<h2>Warnings</h2>", facts.warnings, kind="warnings")
+    folded = _listed("", facts.notes, kind="notes")
+    parts["NOTES"] = folded and f"<details><summary>What was found and corrected</summary>{folded}</details>"
     named = {name: html.escape(name) for name in (*layers, *overlays)}
     parts["LAYERS"] = "\n".join(
         f'<img class="layer" data-name="{named[name]}" alt="{named[name]}" src="{url}">'
@@ -209,6 +210,6 @@ def shares_layer(confidence: Float[Tensor, "h w"]) -> str:
 
 
 def _listed(title: str, lines: Iterable[str], *, kind: str) -> str:
-    """Section of the page with a list; empty without lines."""
+    """Section of the page with a title, as HTML, and a list; empty without lines."""
     items = "".join(f"<li>{html.escape(line)}" for line in lines)
-    return f'<section class="{kind}"><h2>{title}</h2><ul>{items}</ul></section>' if items else ""
+    return f'<section class="{kind}">{title}<ul>{items}</ul></section>' if items else ""

@@ -1,4 +1,4 @@
-"""Each beta's own values at alpha's pixels, and where they are seen: as fusion finds them, no fused image.
+"""Each beta's own values at alpha's pixels, by fusion's matches, and where they are seen; no fused image.
 
 Values are those that the cameras recorded, resampled once, at sub-pixel positions: no luminance of alpha and
 no colour of a network is in them.
@@ -47,12 +47,12 @@ OUTSIDE, OCCLUDED, SEEN = 0, 1, 2
 """Visibility of alpha's pixels in a beta: beyond its edge; occluded or unmatched (low confidence); seen."""
 
 LEAST_CONFIDENCE = 0.5
-"""Confidence from which a point counts as seen: that it is, and at this position, is likelier than not.
-Some occluded pixels exceed it: docs/reports/alignment.md, under "occluded pixels filled"."""
+"""Confidence from which a point counts as seen: the position is more likely right than not. Some occluded
+pixels exceed it: docs/reports/alignment.md, under "occluded pixels filled"."""
 
 SMOOTH = 1.0
-"""Pixels by which a disparity between alpha's may differ from the nearest one's, at most: beyond is a depth
-edge, where a mean is of neither surface."""
+"""Largest difference, in pixels, of a disparity between alpha's pixels from the nearest one's; beyond is a
+depth edge, where a mean is of neither surface."""
 
 Recorded = Mapping[str, Any]
 """Values (C, H, W) by camera, as recorded: NumPy arrays of any type, or tensors."""
@@ -62,12 +62,15 @@ Recorded = Mapping[str, Any]
 class AlignedView:
     """One camera's values at alpha's H x W pixels; `numpy.asarray` gives the values.
 
-    values: (C, H, W), in the recorded type; 0, of floats NaN, where the camera does not see the point, unless
-        filled.
-    positions: (H, W, 2), float32, where alpha's pixels are in the recorded image (x, y); NaN beyond its edge.
-    visibility: (H, W), `OUTSIDE`, `OCCLUDED` or `SEEN`.
-    confidence: (H, W), float32, 0 to 1: that this camera sees the point, and at this position.
-    bands: a name for each of the values' channels. response: the sensor's.
+    Attributes:
+        values: (C, H, W), in the recorded type; 0 (NaN for floats) where the camera does not see the point,
+            unless filled.
+        positions: (H, W, 2), float32, positions of alpha's pixels in the recorded image (x, y); NaN beyond
+            its edge.
+        visibility: (H, W), `OUTSIDE`, `OCCLUDED` or `SEEN`.
+        confidence: (H, W), float32, 0 to 1: that this camera sees the point at this position.
+        bands: a name for each of the values' channels.
+        response: the sensor's response.
     """
 
     values: NDArray[Any]
@@ -79,12 +82,12 @@ class AlignedView:
 
     @property
     def valid(self) -> NDArray[np.bool_]:
-        """(H, W), where the camera sees the point."""
+        """Mask (H, W) of the pixels whose point the camera sees."""
         return self.visibility == SEEN
 
     @property
     def wavelengths(self) -> tuple[float | None, ...]:
-        """The bands' centres in nanometres; None where the rig does not state them."""
+        """Centres of the bands in nanometres; None where the rig does not state them."""
         centre = self.response.centre if isinstance(self.response, Band) else None
         return (centre,) * len(self.bands)
 
@@ -96,7 +99,10 @@ class AlignedView:
 class Aligned(Mapping[str, AlignedView]):
     """All cameras' own values at the pixels of one: a mapping of names to views, that of `alpha` first.
 
-    depth: (H, W), float32, as of `Frame`.
+    Attributes:
+        alpha: name of the camera at whose pixels all values are.
+        views: view of each camera.
+        depth: (H, W), float32, as of `Frame`.
     """
 
     alpha: str
@@ -119,18 +125,22 @@ class Aligned(Mapping[str, AlignedView]):
 
     @property
     def wavelengths(self) -> tuple[float | None, ...]:
-        """Of all bands, nanometres."""
+        """Centres of all bands in nanometres; None where the rig does not state them."""
         return tuple(wave for view in self.views.values() for wave in view.wavelengths)
 
     def band(self, name: str) -> NDArray[Any]:
-        """One band (H, W). Raises KeyError, which lists them, for a name that none has."""
+        """Return one band (H, W) by name.
+
+        Raises:
+            KeyError: for an unknown name; the text lists the bands.
+        """
         for view in self.views.values():
             if name in view.bands:
                 return view.values[view.bands.index(name)]
         raise KeyError(f"no band '{name}' (there are: {', '.join(self.bands)})")
 
     def stack(self) -> NDArray[Any]:
-        """All bands (bands, H, W), in the type that holds all."""
+        """Return all bands (bands, H, W), in the type that holds all."""
         return np.concatenate([view.values for view in self.views.values()])
 
 
@@ -152,9 +162,16 @@ def align_frame(
     announce: Callable[[Plan], None] | None = None,
     matcher: Matcher = match,
 ) -> Aligned:
-    """Every camera's own values at the pixels of camera `alpha`, of a rig that is known.
+    """Bring every camera's own values to the pixels of camera `alpha`, for a rig that is known.
 
-    What `pat.align` calls, which says more; images and rig are as of `fuse_frame`. Raises as `pat.align`.
+    Called by `pat.align`, which describes the arguments; images and rig are as of `fuse_frame`.
+
+    Returns:
+        Values, masks and positions by camera, with alpha's depth.
+
+    Raises:
+        ValueError: as `pat.align`; for a network that uses no matches, and recorded values that are missing,
+            no numbers, or of another size.
     """
     rule = _ViewRule(interpolation, min_confidence, fill)
     rig = with_pixels(rig)
@@ -183,7 +200,7 @@ def align_frame(
 
 
 def _check_recorded(rig: Rig, recordings: Recorded, names: Iterable[str]) -> None:
-    """Raises ValueError unless there are values of all these cameras, of the sizes that the rig says."""
+    """Raise ValueError unless there are values of all these cameras, of the sizes that the rig states."""
     for name in names:
         if name not in recordings:
             raise ValueError(
@@ -194,7 +211,7 @@ def _check_recorded(rig: Rig, recordings: Recorded, names: Iterable[str]) -> Non
 
 
 def _as_recorded(confidence: Float[Tensor, "1 h w"], now: View, recorded: View) -> Float[Tensor, "h2 w2"]:
-    """Confidence at alpha's recorded pixels; 0 where the view that its lens was taken out of has none."""
+    """Return confidence at alpha's recorded pixels; 0 where alpha's undistorted view has none."""
     if _is_undistorted(recorded, now):
         assert isinstance(now, LensView)
         confidence = resampled(confidence, now, recorded, interpolation="bilinear").values[0]
@@ -204,7 +221,8 @@ def _as_recorded(confidence: Float[Tensor, "1 h w"], now: View, recorded: View) 
 def _located(
     inputs: FrameInputs, i: int, matches: BetaMatches, recorded: View
 ) -> tuple[Float[Tensor, "h w 2"], Bool[Tensor, "h w"]]:
-    """Where alpha's recorded pixels are in the i-th beta as prepared, by its matches; which are on it."""
+    """Return the positions of alpha's recorded pixels in the i-th beta as prepared, with a mask of those on
+    it."""
     h, w = inputs.hw
     beta, pinhole = inputs.inputs.betas[i], inputs.placements[i].pair.alpha
     hw = (beta.image.shape[-2], beta.image.shape[-1])
@@ -228,12 +246,12 @@ def _located(
 
 
 def _is_undistorted(recorded: View, now: View) -> TypeGuard[LensView]:
-    """Whether a camera's lens was taken out of its image: some are fused as they recorded."""
+    """Return True if a camera's image was undistorted: some are fused as they recorded."""
     return has_lens(recorded) and not has_lens(now)
 
 
 def _between_pixels(disparity: Float[Tensor, "1 h w"], x: Float[Tensor, "h2 w2 2"]) -> Float[Tensor, "h2 w2"]:
-    """Disparity between pixels: interpolated within surfaces, the nearest at depth edges."""
+    """Return disparity between pixels: interpolated within surfaces, the nearest at depth edges."""
     nearest, smooth = (
         sample(disparity[None], x[None], interpolation=kind, extended=True).values[0, 0]
         for kind in ("nearest", "bilinear")
@@ -242,7 +260,7 @@ def _between_pixels(disparity: Float[Tensor, "1 h w"], x: Float[Tensor, "h2 w2 2
 
 
 def _own_view(camera: View, name: str, recorded: Any) -> AlignedView:
-    """Alpha's own values, all of them seen where they are."""
+    """Return alpha's own values, all of them seen at their own pixels."""
     hw, values = camera.hw, _as_array(recorded, name, camera.hw)
     planes = pixel_grid(hw).numpy(), np.full(hw, SEEN, np.uint8), np.ones(hw, np.float32)
     return AlignedView(values, *planes, _band_names(name, len(values)), camera.sensor.response)
@@ -250,7 +268,7 @@ def _own_view(camera: View, name: str, recorded: Any) -> AlignedView:
 
 @dataclass(frozen=True)
 class _ViewRule:
-    """How a beta's values are taken, and from which confidence on they count as seen."""
+    """Rule by which a beta's values are resampled, and confidence from which they count as seen."""
 
     interpolation: Resampling
     min_confidence: float
@@ -274,7 +292,7 @@ class _ViewRule:
         confidence: Float[Tensor, "h w"],
         values: NDArray[Any],
     ) -> AlignedView:
-        """A beta's values at alpha's pixels, which are `located` in it as prepared."""
+        """Return a beta's values at alpha's pixels, which are `located` in it as prepared."""
         now = place.pair.beta
         assert isinstance(now, LensView)
         where, valid = chunked(lambda x: recorded_pixels(x, now, camera), located[0].double(), axis=0)
@@ -298,7 +316,11 @@ class _ViewRule:
 
 
 def _as_array(values: Any, name: str, hw: tuple[int, int]) -> NDArray[Any]:
-    """Recorded values as NumPy's. Raises ValueError for another shape than (C, H, W), and without numbers."""
+    """Return recorded values as a NumPy array.
+
+    Raises:
+        ValueError: for another shape than (C, H, W), and for values that are no numbers.
+    """
     if isinstance(values, Tensor):
         values = values.detach().cpu()
         values = values.float() if values.dtype == torch.bfloat16 else values  # which NumPy has not
@@ -322,10 +344,13 @@ def _band_names(name: str, count: int) -> tuple[str, ...]:
 def resampled_values(
     values: NDArray[Any], positions: NDArray[np.float32], interpolation: Resampling
 ) -> NDArray[Any]:
-    """Recorded values (C, H, W) at positions (h, w, 2), in their own type: (C, h, w). Of integers rounded.
+    """Resample recorded values (C, H, W) at positions (h, w, 2), in their own type; integers are rounded.
 
-    In float64: float32 would round positions by 1e-4 pixels in an image of 4000. Beyond the edge values are
+    In float64: float32 would round positions by 1e-4 pixels in an image of 4000. Values beyond the edge are
     0.
+
+    Returns:
+        Values (C, h, w).
     """
     kind, where = INTERPOLATIONS[interpolation], torch.from_numpy(positions)
 
@@ -350,7 +375,14 @@ def resampled_values(
 
 
 def filled(values: NDArray[Any], valid: NDArray[np.bool_], fill: Fill) -> NDArray[Any]:
-    """Values (C, H, W) with 0, floats NaN, where not valid; or with those of the nearest valid pixel."""
+    """Replace invalid values (C, H, W) by 0 (NaN for floats), or by those of the nearest valid pixel.
+
+    Args:
+        fill: "none" for 0 or NaN, "propagate" for the nearest valid value.
+
+    Returns:
+        Values of the same type; 0 or NaN everywhere if no pixel is valid.
+    """
     if fill == "none" or not valid.any():
         nothing = np.nan if np.issubdtype(values.dtype, np.floating) else 0
         return np.where(valid, values, np.asarray(nothing, values.dtype))

@@ -1,4 +1,4 @@
-"""Values as recorded from image files, and what an alignment leaves on disk."""
+"""Values as recorded in image files, and the files of an alignment."""
 
 from __future__ import annotations
 
@@ -21,11 +21,12 @@ from arraygeom.runtime.together import refuse_others, write_together
 from ..media.images import read_recorded, write_image
 from ..media.raw import demosaiced, recorded_bands
 from .align import Aligned
+from .results import with_links
 from .views import FilesOfCameras
 
 PositionFormat = Literal["npy", "tif", "none"]
 GREY = np.array([0, 128, 255], np.float32) / 255
-"""Of visibility in its image: beyond the edge, occluded, seen."""
+"""Grey levels of visibility in its image: beyond the edge, occluded, seen."""
 GDAL_METADATA, GDAL_NODATA = 42112, 42113
 """TIFF tags in which GDAL, QGIS and others read the bands' names and wavelengths, and the value of pixels
 without one (GDAL's documentation of GeoTIFF)."""
@@ -34,9 +35,9 @@ LARGEST_TIFF = 2**32 - 2**25
 
 
 class RecordedFiles(FilesOfCameras[NDArray[Any]]):
-    """The values of an image file of each camera, read when asked for: counts, linear of raw ones.
+    """Values of an image file of each camera, read when asked for: counts, linear for raw images.
 
-    Those behind a colour filter pattern are demosaiced: red, green and blue counts. Asking raises as
+    Images behind a colour filter pattern are demosaiced: red, green and blue counts. Access raises as
     `read_recorded`.
     """
 
@@ -71,15 +72,20 @@ def save_aligned(
 
     One file a camera, NAME.tif, if `separate`, or if their types differ: values keep theirs. With a `name`
     the files are name_aligned.tif and so on. `pages` are further text files. All are swapped in together, and
-    those of a former alignment of this name are gone (`write_together`). Returns what was written.
+    those of a former alignment of this name are removed (`write_together`).
 
-    Raises ValueError for two files of one name, and rather than write over a file of `keep`, such as the
-    images; FileExistsError for files in the way that no run wrote.
+    Returns:
+        Paths of the files, sorted.
+
+    Raises:
+        ValueError: for two files of one name, and rather than overwrite a file of `keep`, such as the images.
+        FileExistsError: for files in the way that no run wrote.
     """
     prefix = f"{name}_" if name else ""
     files = _files(aligned, separate, positions)
     files = [(f"{prefix}{file}", *how) for file, *how in files]
-    files += [(file, write_text, text) for file, text in (pages or {}).items()]
+    named = [file for file, *_ in files]
+    files += [(file, write_text, with_links(text, named)) for file, text in (pages or {}).items()]
     kept, count = {path.resolve() for path in keep}, Counter(file.casefold() for file, *_ in files)
     for file, *_ in files:
         if count[file.casefold()] > 1:
@@ -128,7 +134,7 @@ def _files(aligned: Aligned, separate: bool, positions: PositionFormat) -> list[
 
 
 def _shares(aligned: Aligned) -> str:
-    """A line for each camera but alpha: what share of alpha's pixels it sees."""
+    """Return a line for each camera but alpha with the share of alpha's pixels that it sees."""
     lines = []
     for camera, view in aligned.items():
         if camera != aligned.alpha:

@@ -1,4 +1,4 @@
-"""What is doubtful about a fusion that is done: the confidence with which its images match."""
+"""Doubts about a finished fusion: the confidence with which its images match."""
 
 from __future__ import annotations
 
@@ -30,7 +30,8 @@ PLAIN_NOISE = 4 / 255
 
 
 class LowConfidenceWarning(UserWarning):
-    """The images hardly match along the rig's search segments; commands end with `exit_status`."""
+    """Warning that the images hardly match along the rig's search segments; commands end with
+    `exit_status`."""
 
     exit_status = 3
 
@@ -57,7 +58,7 @@ def warn_of_confidence(network: FusionNetwork, frame: Frame, inputs: FrameInputs
 
 
 def noise_advice(inputs: Inputs) -> str:
-    """What to do about noise that the middle of an image shows plainly; empty if there is hardly any."""
+    """Return advice on noise that the middle of an image shows plainly; empty if there is hardly any."""
     shown = max(shown_noise(image[0]) for image in (inputs.alpha, *(beta.image for beta in inputs.betas)))
     advice = f"; noise of {255 * shown:.0f}/255 shows: try `--noise estimate` first"
     return "" if shown < PLAIN_NOISE else advice
@@ -65,7 +66,7 @@ def noise_advice(inputs: Inputs) -> str:
 
 @contextmanager
 def confidence_checked(*, strict: bool) -> Iterator[None]:
-    """A block in which, if `strict`, a `LowConfidenceWarning` is raised."""
+    """Context manager in which, if `strict`, a `LowConfidenceWarning` is raised."""
     with warnings.catch_warnings():
         if strict:
             warnings.simplefilter("error", LowConfidenceWarning)

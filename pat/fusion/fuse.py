@@ -42,34 +42,36 @@ LOG = logging.getLogger(__name__)
 T = TypeVar("T")
 
 Progress = Callable[[Iterable[Tile], int], Iterable[Tile]]
-"""Wraps the tiles (and their number) to show how far the work is, as `rich.progress.track` does."""
+"""Function that wraps the tiles (and their number) to show progress, as `rich.progress.track` does."""
 
 
 @dataclass(frozen=True)
 class FuseSettings:
-    """How frames are fused: what one frame, many and a sequence have in common.
+    """Settings of fusion that one frame, many and a sequence have in common.
 
-    depth: (near, far) in metres, instead of the rig's.
-    field: the receptive field, or one for each of some betas, by name; by default `arraygeom`'s
-        `default_field`.
-    max_memory: bytes, or like "4GiB": what the process may take in all, libraries and images included, if
-        there is nothing else in it. Default: no limit.
-    match_levels: bring each beta to alpha's mean and standard deviation first, for cameras whose exposures or
-        filters differ and which are not radiometrically calibrated.
-    response: how alpha weighs red, green and blue of its one colour beta. "fit" fits it to matches, with a
-        gain and a gamma, and leaves it at Rec. 601 luma ("rec601") where that explains the images as well;
-        three numbers state it. The result has alpha as this combination of its colours.
-    align: find how far the betas lie across their search segments, and put that right; by default unless the
-        fusion is differentiable, where a rig that is put right has no gradient of being off.
-    noise: the noise level of each camera that has some, or "estimate": views are denoised before they are
-        matched, and jointly once they are fused. "auto", as without rig: so where an image shows noise
-        plainly ({} never).
-    keep_alpha: leave alpha's values as recorded, noise included; otherwise so if alpha has no noise to speak
-        of.
-    luminance: the image's: "alpha", which the network keeps exactly, that of "beta" in alpha's detail, where
-        alpha sees another part of the spectrum, or their "mix".
+    Attributes:
+        depth: (near, far) in metres, in place of the rig's; None for the rig's.
+        field: receptive field, or one for each of some betas, by name; None for `arraygeom`'s
+            `default_field`.
+        max_memory: limit of memory in bytes, or like "4GiB": of the whole process, libraries and images
+            included, if nothing else runs in it; None for no limit.
+        match_levels: True to bring each beta to alpha's mean and standard deviation first, for cameras whose
+            exposures or filters differ and which are not radiometrically calibrated.
+        response: weights of red, green and blue of its one colour beta in alpha. "fit" fits them to matches,
+            with a gain and a gamma, and leaves them at Rec. 601 luma ("rec601") where that explains the
+            images as well; three numbers state them. The result has alpha as this combination of its colours.
+        align: True to estimate the betas' distance across their search segments, and correct it; None for
+            True unless the fusion is differentiable, where a corrected rig has no gradient of its error.
+        noise: noise level of each camera that has some, or "estimate": views are denoised before they are
+            matched, and jointly after they are fused. "auto", as without a rig: so where an image shows noise
+            plainly ({} never). None for no denoising.
+        keep_alpha: True to leave alpha's values as recorded, noise included; as is done too if alpha has no
+            noticeable noise.
+        luminance: luminance of the image: "alpha", which the network keeps exactly, that of "beta" in alpha's
+            detail, where alpha sees another part of the spectrum, or their "mix".
 
-    Raises ValueError for a noise or a response that is none.
+    Raises:
+        ValueError: for a noise or a response of another kind.
     """
 
     depth: tuple[float, float] | None = None
@@ -88,7 +90,7 @@ class FuseSettings:
 
     @property
     def limit(self) -> float | None:
-        """The memory limit in bytes, if there is one."""
+        """Memory limit in bytes; None for none."""
         return None if self.max_memory is None else parse_bytes(self.max_memory)
 
 
@@ -109,14 +111,21 @@ def fuse_frame(
     differentiable: bool = False,
     matcher: Matcher = match,
 ) -> Frame:
-    """Fuse one frame at camera `alpha`'s view, of a known rig: what `pat.fuse` calls, which says more.
+    """Fuse one frame at camera `alpha`'s view, for a rig that is known.
+
+    Called by `pat.fuse`, which describes the arguments, results, errors and warnings.
 
     Args:
         images: tensors by camera name, (C, H, W) in 0..1, each of the size that the rig states. A mapping
             that reads them when asked saves memory (`pat.fusion.views.ViewFiles`).
         rig: the cameras. Those without an image in `images` are left out.
 
-    Raises and warns as `pat.fuse`.
+    Returns:
+        The frame at alpha's pixels.
+
+    Raises:
+        ValueError: as `pat.fuse`.
+        NotImplementedError: within a transformation of `torch.func`.
     """
     align = not differentiable if settings.align is None else settings.align
     settings = replace(_given(FuseSettings, settings), align=align)
@@ -165,9 +174,16 @@ def fuse_frame(
 
 
 class ReadyFrame(NamedTuple):
-    """A frame ready to be matched: a network's inputs as they are put right, how a frame of these is taken
-    back to alpha's pixels, the plan, what was put right, what is known of noise, and whether alpha was in
-    colour."""
+    """A frame ready to be matched.
+
+    Attributes:
+        inputs: the network's inputs, corrected.
+        undo: functions that take a frame of these back to alpha's pixels.
+        plan: the plan of the fusion.
+        corrections: the corrections made.
+        low_light: the noisy views.
+        in_colour: True if alpha's image was in colour.
+    """
 
     inputs: FrameInputs
     undo: list[Undo]
@@ -190,9 +206,16 @@ def ready_frame(
     explain: Callable[[str], None] | None,
     announce: Callable[[Plan], None] | None,
 ) -> ReadyFrame:
-    """What fusion and alignment have in common: all that comes before alpha's pixels are matched.
+    """Prepare a frame for fusion or alignment: all steps before alpha's pixels are matched.
 
-    Arguments and errors are as of `fuse_frame`; `joined` takes co-located betas for one of several bands.
+    Arguments and errors are as of `fuse_frame`.
+
+    Args:
+        joined: True to join co-located betas to one of several bands.
+        stored: True if finished tiles are stored on disk.
+
+    Returns:
+        The prepared frame.
     """
     say = explain or (lambda line: None)
     views = Views.of(rig, images, alpha=alpha, depth=settings.depth, field=settings.field)
@@ -228,7 +251,7 @@ def ready_frame(
 
 
 def _check_gradients(differentiable: bool, *, in_parts: bool, noisy: bool) -> None:
-    """Raise for what has no gradients: ValueError if they are asked for, and within `torch.func`."""
+    """Raise ValueError for gradients that are not available, and NotImplementedError within `torch.func`."""
     if differentiable and in_parts:
         raise ValueError("differentiable=True fuses the whole frame at once: leave out max_memory and store")
     if differentiable and noisy:
@@ -249,9 +272,13 @@ def corrections_of(
     network: FusionNetwork,
     settings: FuseSettings = FuseSettings(),
 ) -> Corrections:
-    """What `fuse` finds and corrects before it fuses; give it to `fuse` for other frames of the same cameras.
+    """Estimate the corrections that `fuse` makes before it fuses, for use with other frames of the same
+    cameras.
 
     Arguments and errors are as of `fuse_frame`.
+
+    Returns:
+        The corrections, which `fuse` takes.
     """
     views = Views.of(rig, images, alpha=alpha, depth=settings.depth, field=settings.field)
     views, _ = denoised_views(views, settings.noise)
@@ -261,14 +288,26 @@ def corrections_of(
 
 
 def _given(kind: type[T], value: T) -> T:
-    """The value, if it is of this kind. Raises TypeError."""
+    """Return the value, if it is of this kind.
+
+    Raises:
+        TypeError: for another kind.
+    """
     if not isinstance(value, kind):
         raise TypeError(f"wanted {kind.__name__}, got a {type(value).__name__}")
     return value
 
 
 def matches_by(matcher: Matcher, inputs: Inputs) -> Matches:
-    """What a matcher finds. Raises TypeError or ValueError for what are no matches of these inputs."""
+    """Match inputs by a matcher, and check its result.
+
+    Returns:
+        The matches.
+
+    Raises:
+        TypeError: for a result of another type.
+        ValueError: for matches that do not belong to these inputs.
+    """
     matches = _given(Matches, matcher(inputs))
     matches.check(inputs)
     return matches

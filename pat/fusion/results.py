@@ -1,4 +1,4 @@
-"""What a fusion leaves on disk."""
+"""Files of a fusion."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
+from html import escape
 from pathlib import Path
 from typing import Literal
+from urllib.parse import quote
 
 import torch
 from jaxtyping import Float
@@ -34,23 +36,25 @@ from ..support.memory import how_many_fit
 from .frame import Frame, picture_of
 
 MOST = 65535
-"""The largest count of 16 bits."""
+"""Largest count of 16 bits."""
 
 ImageFormat = Literal["png", "tif", "exr"]
 
 FOUND_RIG = "found_rig.yaml"
 """The rig that was found from images. Not rig.yaml, which may be one that somebody wrote."""
+LINKS = "<!-- files -->"
+"""Place of the links to a run's files in its page."""
 HEALED_RIG = "healed_rig.yaml"
-"""A given rig as its images have it."""
+"""Name of the file of a given rig as corrected to its images."""
 RESULT = re.compile(
     r"(.*_)?((fused|confidence)(_.*)?|depth(_16|_nearest|_farthest)?)\.(png|tif|exr|mp4)"
     r"|(view|settings|found_rig|healed_rig)\.yaml|points\.ply|index\.html"
 )
-"""What files are called that a fusion writes."""
+"""Pattern of the names of files that a fusion writes."""
 
 
 def fused_group(name: str) -> str:
-    """The group (`write_together`) of a frame's files."""
+    """Return the group (`write_together`) of a frame's files."""
     return f"{name}_fused" if name else "fused"
 
 
@@ -67,7 +71,7 @@ def _files(out: Path) -> Iterable[Path]:
 
 
 def check_no_result(inputs: Iterable[Path], out: Path) -> None:
-    """Raise ValueError for a file that is called as a result and lies where those go."""
+    """Raise ValueError for a file that has the name of a result and lies in the results' folder."""
     for path in inputs:
         if path.resolve().parent == out.resolve() and RESULT.fullmatch(path.name):
             raise ValueError(f"{path}: is called as a result, which would go there: give another --out")
@@ -88,22 +92,33 @@ def save_frame(
     pages: Mapping[str, str] | None = None,
     about: Mapping[str, str] | None = None,
 ) -> list[Path]:
-    """Write fused.png, confidence.png, depth.tif (metres, float; NaN where unknown), depth_16.png
+    """Write the files of a frame to a folder.
+
+    The files are fused.png, confidence.png, depth.tif (metres, float; NaN where unknown), depth_16.png
     (`write_depth`), depth.png (red is near), depth_nearest.tif and depth_farthest.tif (the true depth is
-    between in 9 of 10 pixels).
+    between in 9 of 10 pixels). Without any known depth there are no depth files, and no bounds of it for a
+    view whose focal lengths are assumed. For other numbers of bands than one and three fused.png is the mean.
+    All are swapped in together, the image last, and those of a former frame of this name are removed
+    (`write_together`).
 
-    8 and 16 bits hold sRGB values; 32 bits (tif, exr) hold linear light as floats, nothing cut off. With
-    `view`, the rig of alpha alone goes to view.yaml and says so; with `rig`, that of all cameras to
-    found_rig.yaml; with `points`, the camera of alpha, the pixels of known depth, which is `along` its axis
-    or rays (`measured_along`), go to points.ply. With a `name` the files are name_fused.png and so on.
-    Without any known depth there are no depth files, and no bounds of it by a view whose focal lengths are
-    assumed. With `bands`, the names of bands that cameras record one by one, each goes to fused_NAME.png and
-    confidence_NAME.png too (NAME by `file_names`); bands without names that are not one or three go to
-    fused_1.png and so on. Of other numbers than one and three fused.png is the mean. `pages` are further text
-    files. All are swapped in together, the image last, and those of a former frame of this name are gone
-    (`write_together`, which keeps `about`). Returns what was written.
+    Args:
+        bits: 8 or 16 for sRGB values; 32 (tif, exr) for linear light as floats, not clipped.
+        view: rig of alpha alone, written to view.yaml.
+        rig: rig of all cameras, written to found_rig.yaml.
+        points: camera of alpha; the pixels of known depth are written to points.ply.
+        along: kind of depth (`measured_along`), for `points`.
+        name: prefix of the files, as in name_fused.png; empty for none.
+        bands: names of bands that cameras record one by one, each written to fused_NAME.png and
+            confidence_NAME.png too (NAME by `file_names`); without names, bands that are not one or three are
+            fused_1.png and so on.
+        pages: further text files by name.
+        about: texts that `write_together` keeps about the group.
 
-    Raises FileExistsError for files in the way that no fusion wrote.
+    Returns:
+        Paths of the files, the image first.
+
+    Raises:
+        FileExistsError: for files in the way that no fusion wrote.
     """
     frame = frame.mapped(lambda tensor: tensor.detach().cpu())
     prefix = f"{name}_" if name else ""
@@ -122,8 +137,6 @@ def save_frame(
             near = float(view.depth[0]) if view is not None and view.depth else None
             tasks.append(partial(write_depth, folder / f"{prefix}depth_16.png", frame.depth, near=near))
             tasks.append(lambda: write_image(folder / f"{prefix}depth.png", colour_depth(frame.depth)))
-        for file, text in (pages or {}).items():
-            write_text(folder / file, text)
         if view is not None and not name:
             view.save(folder / "view.yaml")
         if rig is not None:
@@ -140,8 +153,16 @@ def save_frame(
         image = picture_of(image)
         tasks.insert(0, partial(write_image, folder / last, image, bits=bits, profile=bits != 32))
         in_parallel(tasks, most=how_many_fit(4 * image.nbytes))
+        for file, text in (pages or {}).items():
+            write_text(folder / file, with_links(text, (path.name for path in folder.iterdir())))
         names = {file.name for file in folder.iterdir()} - {last}
     return [out / last, *(out / file for file in sorted(names, key=lambda name: ("fused" not in name, name)))]
+
+
+def with_links(page: str, names: Iterable[str]) -> str:
+    """Return a page with links to files beside it, by name, where it has `<!-- files -->`."""
+    links = ", ".join(f'<a href="{quote(name)}">{escape(name)}</a>' for name in sorted(names))
+    return page.replace(LINKS, f"<section><h2>Files</h2><p>{links}</p></section>")
 
 
 def _write_shared(path: Path, text: str) -> None:
@@ -153,14 +174,16 @@ def _write_shared(path: Path, text: str) -> None:
 
 
 def band_names(frame: Frame, betas: Iterable[str]) -> list[str]:
-    """The cameras that record a frame's bands one by one, in order; none if its bands are those of colour
-    cameras, or if cameras have several bands each."""
+    """Return the cameras that record a frame's bands one by one, in order.
+
+    Empty if its bands are those of colour cameras, or if cameras have several bands each.
+    """
     names = list(betas)
     return names if frame.by_band is not None and len(names) == len(frame.by_band) else []
 
 
 def describe_bands(frame: Frame, names: Sequence[str], kind: ImageFormat) -> str:
-    """Which files have a frame's bands, in a line; empty for an ordinary image."""
+    """Describe in a line which files have a frame's bands; empty for an ordinary image."""
     if not names and len(frame.image) in (1, 3):
         return ""
     listed = (
@@ -172,14 +195,21 @@ def describe_bands(frame: Frame, names: Sequence[str], kind: ImageFormat) -> str
 
 
 def depth_scale(near: float) -> float:
-    """Counts a metre in a 16-bit depth image: the power of ten with which `near` is at most a twentieth."""
+    """Return counts per metre in a 16-bit depth image: the power of ten with which `near` is at most a
+    twentieth."""
     return 10.0 ** math.floor(math.log10(MOST / 20 / near))
 
 
 def write_depth(path: Path, depth: Float[Tensor, "h w"], *, near: float | None = None) -> float:
-    """Write depth as a 16-bit PNG; returns its counts a metre, by `near` (metres; else the nearest depth).
+    """Write depth as a 16-bit PNG, in which 0 is unknown and 65535 is that far or farther.
 
-    The scale is in the file's text chunk "Description". 0 is unknown, 65535 that far or farther.
+    The scale is in the file's text chunk "Description" too.
+
+    Args:
+        near: depth in metres by which the scale is chosen; None for the nearest depth.
+
+    Returns:
+        The scale in counts per metre.
     """
     has_depth = depth.isfinite() & (depth > 0)
     scale = depth_scale(near or float(depth[has_depth].min() if has_depth.any() else 1.0))
@@ -195,7 +225,7 @@ def write_depth(path: Path, depth: Float[Tensor, "h w"], *, near: float | None =
 
 
 def view_of(rig: Rig, alpha: str, *, bits: int, bands: int = 3) -> Rig:
-    """The rig of fused images: alpha's camera alone, its values encoded as `save_frame` writes them."""
+    """Return the rig of fused images: alpha's camera alone, with the coding that `save_frame` writes."""
     coding = "linear" if bits == 32 else "srgb"
     response = "rgb" if bands == 3 else rig[alpha].sensor.response
     sensor = dataclasses.replace(developed(rig[alpha].sensor), coding=coding, response=response)

@@ -37,11 +37,11 @@ MATCHING_BYTES = 360.0
 FILLING_BYTES = 80.0
 """Working memory of filling for each pixel of the whole frame, counted."""
 FRAME_BYTES = 12.0
-"""A fused frame's for each pixel: depth, confidence and half-width."""
+"""Memory of a fused frame for each pixel: depth, confidence and half-width."""
 BAND_BYTES = (4.0, 2.0)
-"""And for each of its bands; its confidence, of several."""
+"""Memory for each of its bands, and for the band's confidence if there are several."""
 WRITING_BYTES = 65.0
-"""What taking a fused frame back to alpha's pixels and writing it takes for each pixel, measured."""
+"""Memory, for each pixel, to take a fused frame back to alpha's pixels and write it, measured."""
 PROBE = (192, 512)
 """Least and greatest side of the piece of alpha that is fused to estimate the time, pixels."""
 ESTIMATED = 4_000_000
@@ -49,12 +49,18 @@ ESTIMATED = 4_000_000
 LARGE = 16 * PROBE[0] ** 2
 """Alpha's pixels from which a piece is fused to learn matches' memory, and planned memory is kept to."""
 PROBED = 1 / 40
-"""The part of alpha that the piece is between these."""
+"""Part of alpha that the piece is between these."""
 
 
 class Plan(NamedTuple):
-    """How a frame will be fused: tiles, memory of the process at most (bytes), time, if estimated (seconds),
-    and in how many pieces it is matched first."""
+    """Plan of a frame's fusion.
+
+    Attributes:
+        tiles: tiles to fuse.
+        memory: largest memory of the process, bytes.
+        seconds: estimated time; None if it was not estimated.
+        pieces: number of pieces in which the frame is matched first.
+    """
 
     tiles: list[Tile]
     memory: float
@@ -63,7 +69,7 @@ class Plan(NamedTuple):
 
     @property
     def duration(self) -> str:
-        """The time in words; empty if it was not estimated."""
+        """Estimated time in words; empty if it was not estimated."""
         seconds = self.seconds
         return "" if seconds is None else f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
 
@@ -85,12 +91,21 @@ def plan_frame(
     after: float = 0.0,
     kept: float = 0.0,
 ) -> Plan:
-    """The tiles under a limit of memory (bytes); with `estimate`, a large frame's time by fusing a piece.
+    """Plan the tiles of a frame under a limit of memory.
 
-    `before` is the share of the frame's work that is done beforehand, by which the time is longer, and
-    `after` are seconds that follow. `stored` says that finished tiles are stored on disk until all are there.
-    `kept` are bytes that the caller holds beside the frame.
-    Raises ValueError as `tiles_within`.
+    Args:
+        limit: bytes; None for no limit.
+        estimate: True to estimate a large frame's time by fusing a piece.
+        stored: True if finished tiles are stored on disk until all are there.
+        before: share of the frame's work that is done beforehand, by which the time is longer.
+        after: seconds that follow.
+        kept: bytes that the caller holds beside the frame.
+
+    Returns:
+        The plan.
+
+    Raises:
+        ValueError: as `tiles_within`.
     """
     pieces, pixels = frame.inputs.pieces, math.prod(frame.hw)
     bands = frame.inputs.bands or sum(beta.image.shape[1] for beta in frame.inputs.betas)
@@ -111,10 +126,17 @@ def plan_frame(
 def tiles_within(
     network: FusionNetwork, frame: FrameInputs, limit: float | None, held: float = 0.0, matching: float = 0.0
 ) -> list[Tile]:
-    """The tiles with least work (halos overlap) of which none takes more than `limit` without `held` bytes.
+    """Choose the tiles with least work (halos overlap) of which none takes more than `limit` without `held`
+    bytes.
 
-    One tile if the whole frame does not. Raises ValueError if not even tiles of 64 pixels fit, or matching,
-    which takes `matching` bytes, does not.
+    Args:
+        matching: bytes of matching, which must fit too.
+
+    Returns:
+        The tiles; one if the whole frame fits, or without a limit.
+
+    Raises:
+        ValueError: if not even tiles of 64 pixels fit, or matching does not.
     """
     one = whole(frame.hw)
     if limit is None:
@@ -139,14 +161,20 @@ def tiles_within(
 
 
 def working_memory(network: FusionNetwork, inputs: Inputs, tile: Tile) -> float:
-    """Bytes of a tile: those for its part of alpha and the part of each beta that its segments touch."""
+    """Return the bytes of a tile: those for its part of alpha and the part of each beta that its segments
+    touch."""
     betas = [area(inputs.touched(beta, tile.outer, 16)) for beta in inputs.betas]
     return network.working_bytes(area(tile.outer), betas)
 
 
 class Probe(NamedTuple):
-    """What a piece from the middle of alpha took, for each of its pixels: bytes of its matches, seconds of
-    matching and of fusing."""
+    """Cost of a piece from the middle of alpha, per pixel.
+
+    Attributes:
+        matches: bytes of its matches.
+        matching: seconds of matching.
+        fusing: seconds of fusing.
+    """
 
     matches: float
     matching: float
@@ -155,7 +183,11 @@ class Probe(NamedTuple):
     @classmethod
     @torch.no_grad()
     def of(cls, network: FusionNetwork, frame: FrameInputs) -> Probe:
-        """Match and fuse a small piece, as loops may have to be compiled, and then one to measure."""
+        """Match and fuse a small piece, as loops may have to be compiled, and then one to measure.
+
+        Returns:
+            The measured cost.
+        """
         side = min(max(math.sqrt(math.prod(frame.hw) * PROBED), PROBE[0]), PROBE[1])
         for n in (PROBE[0], int(side)):
             top, left = (max((size - n) // 2, 0) // network.multiple * network.multiple for size in frame.hw)
@@ -171,21 +203,29 @@ class Probe(NamedTuple):
         return cls(nbytes / pixels, (middle - begin) / pixels, (end - middle) / pixels)
 
     def seconds(self, pieces: list[Tile], tiles: list[Tile]) -> float:
-        """About how long a frame will take here, if the machine stays as busy as it was."""
+        """Estimate the seconds of a frame here, if the machine stays as busy as it was."""
         matching, fusing = (sum(area(tile.outer) for tile in some) for some in (pieces, tiles))
         return self.matching * matching + self.fusing * fusing
 
 
 def _to_multiple(box: Box, multiple: int) -> Box:
-    """A box whose corner is at a whole multiple, its sides padded to whole multiples."""
+    """Return a box whose corner is at a whole multiple, its sides padded to whole multiples."""
     top, bottom, left, right = box
     return top, bottom + (top - bottom) % multiple, left, right + (left - right) % multiple
 
 
 class FusedTile(NamedTuple):
-    """The inner part of a tile: image (C, h, w), depth, confidence and half-width (h, w) as of `Frame`, and
-    where its pixels are in each whole beta, (betas, 3, h, w): x, y and the confidence of that;
-    `by_band` as of `Frame`, or empty."""
+    """Inner part of a tile.
+
+    Attributes:
+        image: (C, h, w).
+        depth: (h, w), as of `Frame`.
+        confidence: (h, w), as of `Frame`.
+        half_width: (h, w), as of `Frame`.
+        matched: positions of its pixels in each whole beta with their confidence, (betas, 3, h, w): x, y,
+            confidence; empty if not kept.
+        by_band: as of `Frame`, or empty.
+    """
 
     image: Tensor
     depth: Tensor
@@ -202,7 +242,11 @@ class FusedTile(NamedTuple):
 
 
 def fuse_tile(network: FusionNetwork, frame: FrameInputs, matches: Matches | None, tile: Tile) -> FusedTile:
-    """The inner part of a tile."""
+    """Fuse a tile.
+
+    Returns:
+        Its inner part.
+    """
     box = _to_multiple(tile.outer, network.multiple)
     return _fused(network, frame.inputs.cut(box), matches and matches.cut(box), frame, tile)
 
@@ -210,7 +254,7 @@ def fuse_tile(network: FusionNetwork, frame: FrameInputs, matches: Matches | Non
 def _fused(
     network: FusionNetwork, inputs: Inputs, matches: Matches | None, frame: FrameInputs, tile: Tile
 ) -> FusedTile:
-    """A tile by the network, cut to its inner part, with depth and confidence by the betas."""
+    """Fuse a tile by the network, cut to its inner part, with depth and confidence by the betas."""
     top, bottom, left, right = tile.inner
     box = (top - tile.outer[0], bottom - tile.outer[0], left - tile.outer[2], right - tile.outer[2])
     with convolutions_in_parallel():
@@ -239,8 +283,16 @@ def fused_in_tiles(
     progress: Callable[[Iterable[Tile], int], Iterable[Tile]] | None = None,
     store: Path | None = None,
 ) -> FusedTile:
-    """The frame put together from its tiles, or from a folder where finished tiles are; without what was
-    `matched` in the betas (it takes 12 bytes a pixel and beta) if that is not asked for."""
+    """Fuse a frame tile by tile, or take finished tiles from a folder.
+
+    Args:
+        keep_matched: False to leave out `matched`, which takes 12 bytes a pixel and beta.
+        progress: function that wraps the tiles, and their number, to show progress.
+        store: folder of finished tiles, read and written; None for none.
+
+    Returns:
+        The whole frame.
+    """
 
     def make(tile: Tile) -> FusedTile:
         made = fuse_tile(network, frame, matches, tile)
@@ -269,7 +321,7 @@ def _is_whole(file: Path) -> bool:
 
 
 def _digest(network: FusionNetwork, frame: FrameInputs) -> str:
-    """Of all that a frame's tiles depend on; of fields of positions, those of some pixels."""
+    """Return a digest of all that a frame's tiles depend on; of fields of positions, those of some pixels."""
     inputs = frame.inputs
     how = type(network).__name__, FusedTile._fields, inputs.luminance, inputs.bands, inputs.sees_luma
     module = network if isinstance(network, nn.Module) else nn.Module()

@@ -37,21 +37,28 @@ from ..media.raw import develop, developed_rig, recorded_bands
 
 T = TypeVar("T")
 Fields = Mapping[str, ReceptiveField | None]
-"""The field of each beta; None, or a beta that is missing, stands for the default."""
+"""Field of each beta; None, or a beta that is missing, stands for the default."""
 
 
 @dataclass(frozen=True)
 class Views:
-    """What is fused: images (C, H, W) by camera, the rig that describes them, alpha, the betas' fields."""
+    """The images to fuse.
+
+    Attributes:
+        rig: rig that describes them.
+        images: images (C, H, W) by camera.
+        alpha: name of alpha.
+        fields: the betas' fields.
+    """
 
     rig: Rig
     images: Mapping[str, Tensor]
     alpha: str
     fields: Fields = dataclasses.field(default_factory=dict)
     alpha_in_colour: bool = False
-    """Whether alpha's image was, before it was made grey."""
+    """True if alpha's image was in colour before it was made grey."""
     joined: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
-    """The cameras whose bands a beta's image has, if they are several."""
+    """Cameras whose bands a beta's image has, if they are several."""
 
     @classmethod
     def of(
@@ -88,16 +95,17 @@ class Views:
 
     @property
     def own(self) -> Float[Tensor, "1 h w"]:
-        """Alpha's image."""
+        """Image of alpha."""
         return self.images[self.alpha]
 
     @property
     def betas(self) -> list[str]:
-        """The betas that have images, in the rig's order."""
+        """Betas that have images, in the rig's order."""
         return [name for name in self.rig.betas(self.alpha) if name in self.images]
 
     def pair(self, beta: str) -> Pair:
-        """Alpha and a beta, with the depth range that is searched: fields may have bounds of their own."""
+        """Return alpha and a beta, with the depth range that is searched: fields may have bounds of their
+        own."""
         pair, field = self.rig.pair(self.alpha, beta), innermost(self.fields.get(beta))
         field = innermost(field.field) if isinstance(field, ThroughLenses) else field
         if not (pair.calibrated and isinstance(field, Curved | Epipolar)):
@@ -105,19 +113,19 @@ class Views:
         return dataclasses.replace(pair, depth=Epipolar(field.near, field.far).bounds(pair))
 
     def replace(self, images: Mapping[str, Tensor], *, rig: Rig | None = None) -> Views:
-        """The same with other images of some cameras, and another rig."""
+        """Return the views with other images of some cameras, and another rig."""
         return dataclasses.replace(self, rig=rig or self.rig, images={**self.images, **images})
 
 
 def innermost(field: ReceptiveField | None) -> ReceptiveField | None:
-    """The field that is widened or moved, if it is."""
+    """Return the field within `Widened` and `Moved`, or the field itself; None for None."""
     while isinstance(field, Widened | Moved):
         field = field.field
     return field
 
 
 def dense_bytes(alpha: HW, beta: HW, stride: int = 1) -> float:
-    """Bytes of the positions that the dense field has for every 2 x 2 pixels of alpha."""
+    """Return the bytes of the positions that the dense field has for every 2 x 2 pixels of alpha."""
     return math.prod(alpha) / 4 * math.prod(beta) / stride**2 * 8
 
 
@@ -136,18 +144,24 @@ def check_dense(views: Views, limit: float | None) -> None:
 
 
 LARGEST_VALUE = 32.0
-"""Of an image in 0..1: highlights exceed 1, and most of a short exposure may; 8 bits have values to 255."""
+"""Largest value of an image in 0..1: highlights exceed 1, and most of a short exposure may; 8 bits have
+values to 255."""
 SMALLEST_VALUE = -0.25
-"""Of an image in 0..1: noise goes below 0, and images as many networks take them, of mean 0, far below."""
+"""Least value of an image in 0..1: noise goes below 0, and images as many networks take them, of mean 0, far
+below."""
 
 
 def is_in_colour(image: Float[Tensor, "c h w"]) -> bool:
-    """Whether an image has three bands that are not all equal."""
+    """Return True if an image has three bands that are not all equal."""
     return len(image) == 3 and not all(torch.equal(image[0], band) for band in image[1:])
 
 
 def grey_alpha(name: str, image: Float[Tensor, "c h w"]) -> Float[Tensor, "1 h w"]:
-    """Alpha's image in grey. Raises ValueError for other bands."""
+    """Return alpha's image in grey.
+
+    Raises:
+        ValueError: for other numbers of bands than one and three.
+    """
     if len(image) not in (1, 3):
         raise ValueError(f"the image of alpha, '{name}', has {len(image)} bands: give one in grey or colour")
     return grey(image)
@@ -156,7 +170,8 @@ def grey_alpha(name: str, image: Float[Tensor, "c h w"]) -> Float[Tensor, "1 h w
 def check_precision(views: Views, network: Any) -> None:
     """Refuse images of another precision than a network's weights, and images or a rig on another device.
 
-    Raises ValueError that says what to do.
+    Raises:
+        ValueError: in either case; the text says what to do.
     """
     weights = next(network.parameters(), None) if isinstance(network, nn.Module) else None
     own = views.images[views.alpha].device
@@ -178,9 +193,13 @@ def check_precision(views: Views, network: Any) -> None:
 
 
 def check_bands(views: Views, wanted: int | None) -> None:
-    """Refuse betas whose bands are not what a network makes; warn of those whose three are equal.
+    """Refuse betas whose bands do not fit a network; warn of three equal bands.
 
-    Raises ValueError that says which weights to take.
+    Args:
+        wanted: number of bands of the network's image; None for any.
+
+    Raises:
+        ValueError: if they do not fit; the text says which weights to take.
     """
     bands = {name: len(views.images[name]) for name in views.betas}
     total = sum(bands.values())
@@ -202,7 +221,12 @@ def check_bands(views: Views, wanted: int | None) -> None:
 
 
 def checked_image(rig: Rig, images: Images, name: str) -> Tensor:
-    """A camera's image. Raises TypeError or ValueError unless it is (C, H, W), as large as the rig says."""
+    """Return a camera's image after checking it; warns if it is of one colour.
+
+    Raises:
+        TypeError: unless it is a tensor.
+        ValueError: unless it is (C, H, W), as large as the rig states, with plausible values.
+    """
     image = images[name]
     exposed = rig[name].sensor.exposure is not None
     smallest, largest = range_of(name, image, rig[name].hw, exposed=exposed)
@@ -212,9 +236,16 @@ def checked_image(rig: Rig, images: Images, name: str) -> Tensor:
 
 
 def range_of(name: str, image: Any, hw: HW | None = None, *, exposed: bool = False) -> tuple[float, float]:
-    """The least and the greatest value of an image; where the rig states an exposure, most may exceed 1.
+    """Return the least and the greatest value of an image.
 
-    Raises TypeError or ValueError unless it is (C, H, W), of this size, in 0..1 but for noise and highlights.
+    Args:
+        hw: size that it must have; None for any.
+        exposed: True if the rig states an exposure: most values may then exceed 1.
+
+    Raises:
+        TypeError: unless it is a tensor.
+        ValueError: unless it is a float image (C, H, W), of this size, in 0..1 except for noise and
+            highlights.
     """
     if not isinstance(image, Tensor):
         raise TypeError(
@@ -251,11 +282,12 @@ def range_of(name: str, image: Any, hw: HW | None = None, *, exposed: bool = Fal
 
 
 KEPT = 4_000_000
-"""Values of an image up to which it is kept: reading it again takes longer than the memory is worth."""
+"""Largest number of values of an image that is kept: reading it again takes longer than the
+memory is worth."""
 
 
 class FilesOfCameras(Mapping[str, T]):
-    """What an image file of each camera holds, read when asked for."""
+    """Mapping of cameras to the content of an image file of each, read when asked for."""
 
     def __init__(self, rig: Rig, files: Mapping[str, str | Path]) -> None:
         self.rig, self.files = rig, files
@@ -291,17 +323,26 @@ class ViewFiles(FilesOfCameras[Tensor]):
 
     @property
     def developed(self) -> Rig:
-        """The rig that describes the images as they are now."""
+        """Rig that describes the images after development."""
         return developed_rig(self.rig, self.files)
 
 
 def read_view(
     rig: Rig, name: str, path: str | Path, *, like: Sensor | None = None, sized: bool = True
 ) -> Float[Tensor, "c h w"]:
-    """Read and develop the image of one camera, on the scale of light of the sensor `like`, or its own.
+    """Read and develop the image of one camera.
 
-    Raises ValueError or FileNotFoundError naming the camera and the file for what cannot be read, has another
-    size than the rig says (if `sized`), or is in colour where the rig says raw.
+    Args:
+        like: sensor to whose scale of light the image is brought; None for its own.
+        sized: False to accept another size than the rig's.
+
+    Returns:
+        The image (C, H, W) in 0..1.
+
+    Raises:
+        FileNotFoundError: for a missing file, with camera and file.
+        ValueError: for a file that cannot be read, has another size than the rig states, or is in colour
+            where the rig states raw, with camera and file.
     """
     view = rig[name]
     hw = view.hw if sized else None
@@ -318,7 +359,7 @@ def read_view(
 
 
 SATURATED = 0.1
-"""Share of an image's pixels at the largest value from which that is said."""
+"""Share of an image's pixels at the largest value from which a warning is given."""
 
 
 def _warn_of_contradictions(image: Float[Tensor, "c h w"], sensor: Sensor, label: str) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from ..app.cli import options
-from ..app.cli.options import Address, FieldName, Out, Weights, say, writable
+from ..app.cli.options import Address, FieldName, NetworkName, Out, say, writable
 from ..app.cli.parser import Option
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ class StereoSets:
     """Folder of other pairs, named in any of these ways."""
     out: Out = Path("out/evaluate")
     """Folder for what is written."""
-    weights: Weights = "mono-colour"
+    network: NetworkName = "mono-colour"
 
     def sets(self) -> dict[str, Iterable[StereoPair]]:
         """Open the folders of stereo pairs, and check that results can be written.
@@ -79,7 +79,7 @@ class Evaluate(StereoSets):
         from .evaluation import protocols, stereo
 
         sets = self.sets()
-        network = load_weights(self.weights)
+        network = load_weights(self.network)
         methods = {**protocols.BASELINES, "fusion": protocols.rectified_fusion(network)}
         rows = stereo.evaluate_sets(sets, methods, self.rates, out=self.out)
         self.write(rows, stereo.sets_markdown(rows))
@@ -115,10 +115,10 @@ class Ablate:
     Scenes are layered, with exact positions, of unrectified rigs with focal lengths 1 to 3 times beta's; or
     rendered scenes of your own rig.
 
-    Example: pat lab ablate --rendered scenes --weights runs/mine/best.safetensors
+    Example: pat lab ablate --rendered scenes --network runs/mine/best.safetensors
     """
 
-    weights: Weights = "pat-supervised"
+    network: NetworkName = "pat-supervised"
     photos: tuple[Path, ...] = ()
     """Folders of photographs; those that scikit-image ships if none is given."""
     rendered: Path | None = None
@@ -151,7 +151,7 @@ class Ablate:
         if self.rendered is not None and layered:
             raise ValueError(f"--{', --'.join(layered)}: of layered scenes: leave out with --rendered")
         writable(self.out, folder=True)
-        network = load_weights(self.weights)
+        network = load_weights(self.network)
         if self.rendered is not None:
             cases = rendered_cases(self.rendered, seed=self.seed)
         else:
@@ -306,7 +306,7 @@ class Settings:
 
 @dataclass
 class Import:
-    """Convert a checkpoint of the paper's authors (best.pth.tar) to a weights file for `--weights`.
+    """Convert a checkpoint of the paper's authors (best.pth.tar) to a weights file for `--network`.
 
     The file is read as tensors and numbers; nothing in it is run.
 

@@ -31,8 +31,10 @@ from .spectral_mix import SpectralMix
 
 @dataclass(frozen=True)
 class ColourTransferSettings:
-    """Settings of the transfer. Brightness is 0 to 1. Middlebury and SYNTIM are the pairs of their tune
-    halves."""
+    """Settings of the transfer.
+
+    Brightness is 0 to 1. Middlebury and SYNTIM are the pairs of their tune halves.
+    """
 
     alike: float = tuned(
         2.0, "Middlebury, tune half: added to the logit of a match's confidence where brightness agrees"

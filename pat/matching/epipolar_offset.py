@@ -30,8 +30,10 @@ Image = NDArray[Any]
 
 @dataclass(frozen=True)
 class AlignmentSettings:
-    """Settings of the fit. Lengths are pixels of the images given, brightness is 0 to 1. Middlebury is its
-    tune half."""
+    """Settings of the fit.
+
+    Lengths are pixels of the images given, brightness is 0 to 1. Middlebury is its tune half.
+    """
 
     blur: float = tuned(
         1.0, "Middlebury, tune half: deviation of the blur before gradients, and before a response is fitted"

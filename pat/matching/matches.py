@@ -198,8 +198,10 @@ class Matches:
         return 2 * (own + sum(fills.values())) + sum(planes)
 
     def cut(self, box: Box) -> Matches:
-        """Return the part at alpha's (top, bottom, left, right). Fills that several betas share
-        stay shared."""
+        """Return the part at alpha's (top, bottom, left, right).
+
+        Fills that several betas share stay shared.
+        """
         shared: dict[int, Tensor] = {}
         return Matches(tuple(beta.cut(box, shared) for beta in self.betas))
 

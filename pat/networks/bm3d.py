@@ -360,8 +360,7 @@ def filter_groups(image, expected, variance, top, alike, cosines, window, out):
 def update_groups(
     share, spectrum, estimate, taken, variance, other, confidence, top, alike, cosines, window, out
 ):
-    """Add to `out` (2, 1, rows, w), from its first row of blocks, the updates with weights, and
-    the weights."""
+    """Add to `out` (2, 1, rows, w), from its first row of blocks, the weighted updates and their weights."""
     rows, columns = alike.shape[:2]
     group = np.empty((SIDE * SIDE, ALIKE), np.float32)
     pilot = np.empty((SIDE * SIDE, ALIKE), np.float32)

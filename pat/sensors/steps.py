@@ -198,8 +198,9 @@ class Quantise(Step):
 
 @dataclass(frozen=True)
 class Jitter(Step):
-    """Random gain, gamma and white balance for each image of the batch, clipped to 0..1. Meant for sRGB
-    values.
+    """Random gain, gamma and white balance for each image of the batch, clipped to 0..1.
+
+    Meant for sRGB values.
 
     Attributes:
         gain: standard deviation of the logarithm of the gain.

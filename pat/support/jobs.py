@@ -243,8 +243,10 @@ TRIES = 3
 
 
 def _in_processes(tasks: Sequence[Task], workers: Workers) -> Iterator[TaskOutcome]:
-    """Yield outcomes as they arrive. A thread waits for each process, so that the task is known with which it
-    dies."""
+    """Yield outcomes as they arrive.
+
+    A thread waits for each process, so that the task is known with which it dies.
+    """
     slots, before, others = threading.local(), dict(os.environ), {*active_children()}
     ended: list[JobError] = []
 

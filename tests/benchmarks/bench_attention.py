@@ -242,12 +242,12 @@ class Job(NamedTuple):
 
     @property
     def compiled(self) -> bool:
-        """Whether something has to be compiled before."""
+        """True if something has to be compiled before."""
         return self.method in ("cpu", ONE_THREAD, "triton")
 
     @property
     def name(self) -> tuple[str, str, str, str]:
-        """By which it is known in the table."""
+        """Texts that name the job in the table."""
         shape = f"{self.wa}x{self.ha}, {self.samples}, {self.dtype}"
         return shape, "forward + backward" if self.backward else "forward", self.method, self.interpolation
 

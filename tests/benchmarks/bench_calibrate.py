@@ -1,4 +1,4 @@
-"""How good `pat calibrate` is: real sets, published corner tracks, rendered photographs whose truth is known.
+"""Accuracy of `pat calibrate`: real sets, published corner tracks, rendered photographs whose truth is known.
 
     python -m tests.benchmarks.bench_calibrate --boards out/boards --out tests/benchmarks/RESULTS_calibrate.md
 

@@ -1,4 +1,4 @@
-"""What `pat rig refine` does to depth if a rig has drifted: simulated rigs, real pairs with published ones.
+"""Effect of `pat rig refine` on depth if a rig has drifted: simulated rigs, real pairs with published ones.
 
     python -m tests.benchmarks.bench_drift --draws 3 --out tests/benchmarks/RESULTS_drift.md
 

@@ -1,4 +1,4 @@
-"""How long the explorer takes in a browser from a moved pointer to what is drawn there.
+"""Time of the explorer in a browser from a moved pointer to the drawn result.
 
     python -m tests.benchmarks.bench_explorer [--points 40] [--out tests/benchmarks/RESULTS_explorer.md]
 
@@ -100,7 +100,7 @@ def measured(driver: Any, points: int) -> Iterator[tuple[str, str, list[float]]]
             word for camera in ("mono", "colour") for word in ("--image", f"{camera}={SAMPLE / camera}.png")
         ]
         for network in NETWORKS:
-            chosen = [] if network == "windows" else ["--weights", network]
+            chosen = [] if network == "windows" else ["--network", network]
             rig = str(SAMPLE / "rig.yaml")
             command = [*PAT, "explore", rig, *images, *chosen, "--no-browser"]
             with server(command, ROOT) as address:

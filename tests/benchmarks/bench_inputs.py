@@ -39,12 +39,12 @@ class Came(NamedTuple):
     said: str
 
     def as_wanted(self, kind: Kind) -> bool:
-        """Whether it is as is expected; a refusal is one line."""
+        """Return True if the outcome is the expected one; a refusal is one line."""
         refused = self.status != 2 or self.said.startswith("pat: ")
         return (self.status, self.depth) == (kind.status, kind.depth) and refused
 
     def row(self, kind: Kind) -> list[str]:
-        """Of the table."""
+        """Return the row of the table."""
         confidence = "" if self.status == 2 else f"{self.confidence:.2f}"
         depth = "depth" if kind.depth else "no depth"
         wanted = "" if self.as_wanted(kind) else f" (expected: {kind.status}, {depth})"

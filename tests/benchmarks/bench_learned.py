@@ -1,4 +1,4 @@
-"""What is learned of matching, by kind of rig: it was trained on rectified pairs, beta on the right.
+"""Worth of learned matching, by kind of rig: it was trained on rectified pairs, beta on the right.
 
     python -m tests.benchmarks.bench_learned [--out tests/benchmarks/RESULTS_learned.md]
 

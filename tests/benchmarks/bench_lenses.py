@@ -197,7 +197,7 @@ def drawn(name: str, lenses: int) -> Drawn:
 
 
 class Library(NamedTuple):
-    """Of all points: lenses c (l, k) with X (l, p, 3) to pixels, and pixels (l, p, 2) to directions."""
+    """Functions of points: lenses c (l, k) with X (l, p, 3) to pixels, and pixels (l, p, 2) to directions."""
 
     project: Callable[[Array, Array], Answer]
     unproject: Callable[[Array, Array], Answer]

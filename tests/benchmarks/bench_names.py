@@ -1,4 +1,4 @@
-"""What `pat rig doctor` calls mistakes, drifts, healthy rigs, its repair does to depth: a confusion table.
+"""Names that `pat rig doctor` gives to mistakes, drifts and healthy rigs, with depth after its repair.
 
     python -m tests.benchmarks.bench_names --draws 20 --out tests/benchmarks/RESULTS_names.md
 

@@ -84,7 +84,7 @@ NOT_CENTRAL = {
 
 
 class Row(NamedTuple):
-    """What, beside which library; values and gradients in words; how many times longer it takes there."""
+    """Row of the table: operator, library, values and gradients in words, and ratio of times."""
 
     what: str
     library: str

@@ -1,4 +1,4 @@
-"""What each shipped network costs: parameters, operations of its convolutions, seconds of a processor.
+"""Costs of each shipped network: parameters, operations of its convolutions, seconds of a processor.
 
 python -m tests.benchmarks.bench_weights
 """

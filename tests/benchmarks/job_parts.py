@@ -1,4 +1,4 @@
-"""What `bench_job` starts, each part a process of its own: `python -m tests.benchmarks.job_parts PART ...`.
+"""Parts of `bench_job`, each a process of its own: `python -m tests.benchmarks.job_parts PART ...`.
 
 `scene`: the sample array enlarged to any size, with several copies of the colour camera, through lenses or
 not. `classical`, `opencv`: other ways to the same image, from files to a file. `stages`: `pat fuse` with the

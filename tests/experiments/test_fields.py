@@ -121,5 +121,5 @@ def test_drawn_peaks_are_red_where_the_table_counts_them_wrong(network, pair):
 
 def test_weights_for_two_bands_are_refused_at_once(tmp_path, refusal):
     save_weights(PAT(PATConfig(betas=2, in_channels=1, dim=8)), tmp_path / "two.safetensors")
-    said = refusal("fields", "--weights", str(tmp_path / "two.safetensors"), "--out", str(tmp_path))
+    said = refusal("fields", "--network", str(tmp_path / "two.safetensors"), "--out", str(tmp_path))
     assert "they are for 2 betas: give some for one beta in colour, or for three" in said

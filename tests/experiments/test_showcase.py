@@ -187,13 +187,13 @@ def test_what_is_missing_is_named(data, tmp_path, refusal, missing):
     shutil.copytree(data, folder)
     gone, given = folder / missing, ["--data", str(folder), "--out", str(tmp_path / "out")]
     shutil.rmtree(gone) if gone.is_dir() else gone.unlink()
-    assert missing.split("/")[0] in refusal("showcase", *given, "--weights", data / "small.safetensors")
+    assert missing.split("/")[0] in refusal("showcase", *given, "--network", data / "small.safetensors")
     assert not (tmp_path / "out").exists()
 
 
 def test_evaluate_writes_and_prints_the_tables(data, tmp_path, capsys):
     given = ["--kitti", str(data / "kitti"), "--rates", "2", "--out", str(tmp_path)]
-    main(["lab", "evaluate", *given, "--weights", str(data / "small.safetensors")])
+    main(["lab", "evaluate", *given, "--network", str(data / "small.safetensors")])
     printed = capsys.readouterr().out
     assert printed == (tmp_path / "scores.md").read_text()
     assert printed.startswith("#### kitti\n\n| beta reduced 2x | alpha | beta | classical | fusion |\n")
@@ -243,7 +243,7 @@ def test_the_tables_commands_say_what_is_wrong(arguments, complaint, data, tmp_p
 
 def test_the_papers_figures_are_beside_ours(data, tmp_path, capsys):
     given = ["--kitti", str(data / "kitti"), "--rates", "2", "--controls", "--out", str(tmp_path)]
-    main(["evaluate", *given, "--weights", "mono-colour"], group=Experiments)
+    main(["evaluate", *given, "--network", "mono-colour"], group=Experiments)
     printed = capsys.readouterr().out
     assert printed == (tmp_path / "scores.md").read_text()
     assert "| shuffled fields | the paper, printed, on its own data |" in printed

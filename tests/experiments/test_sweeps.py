@@ -174,7 +174,7 @@ def test_reports_are_written_and_read_back(tmp_path):
         (["--scenes", "0"], "give at least 1"),
         (["--sweeps", "zoom"], "no sweep 'zoom'"),
         (["--without", "all"], "no field 'all'"),
-        (["--weights", "mono-colour"], "matches without attention"),
+        (["--network", "mono-colour"], "matches without attention"),
     ],
 )
 def test_the_command_refuses_in_a_line(arguments, words, tmp_path, refusal):

@@ -20,7 +20,7 @@ WAITING = 12
 
 
 class Outcome(NamedTuple):
-    """How a case ended: "read", "refused" or what was wrong, last line, core seconds, peak resident bytes.
+    """End of a case: "read", "refused" or the fault; last line, core seconds, peak resident bytes.
 
     What the child holds from its parent is not counted in the peak.
     """

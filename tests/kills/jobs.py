@@ -104,7 +104,7 @@ def _fuse(folder: Path, command: str = "fuse") -> list[str]:
         moving.rig(0.003).save(folder / "fusion" / "rig.yaml")
     made = folder / "fusion"
     weights = str(made / "tiny.safetensors")
-    return [command, str(made / "rig.yaml"), "--alpha", "fast", "--weights", weights, "--misfit", "warn"]
+    return [command, str(made / "rig.yaml"), "--alpha", "fast", "--network", weights, "--misfit", "warn"]
 
 
 def _images(folder: Path, fast: str, slow: str) -> list[str]:

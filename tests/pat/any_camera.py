@@ -78,8 +78,8 @@ def rig_of_two(model: CameraModel, focal: float, hw: tuple[int, int], *, around:
 
 
 class Fused(NamedTuple):
-    """What `rig_of_two` recorded; alpha's true depth; PSNR of alpha's own grey and of the image fused without
-    a warning; the median relative error of its depth."""
+    """Images and true depth of `rig_of_two`, the fused depth, and errors: PSNR of alpha's grey alone and of
+    the image fused without a warning, and the median relative error of depth."""
 
     images: dict[str, Tensor]
     truth: Tensor

@@ -101,7 +101,7 @@ class FuseBatch(Fusing):
             bits=self.bits,
             kind=self.kind,
             strict=self.misfit == "refuse",
-            weights=self.weights or "mono-colour",
+            weights=self.network or "mono-colour",
             **self.kind_of_job(),
         )
         several = self.workers > 1 or self.scheduler is not None

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from . import options
 from .fuse import fuse_with_progress
-from .options import Out, Weights, say
+from .options import NetworkName, Out, say
 
 
 @dataclass
@@ -23,7 +23,7 @@ class Demo:
 
     out: Out = Path("out/demo")
     """Folder for the results."""
-    weights: Weights = "mono-colour"
+    network: NetworkName = "mono-colour"
 
     def run(self) -> None:
         """Fuse both arrays; write and print the score of each method.
@@ -43,7 +43,7 @@ class Demo:
         options.writable(self.out, folder=True)
         refuse_to_replace(self.out)
         refuse_others(self.out, ["demo.png", "demo.md"])
-        network = load_weights(self.weights)
+        network = load_weights(self.network)
         sample = load_sample()
         arrays = {
             "photograph": as_real_cameras(load_motorcycle()),
@@ -57,9 +57,9 @@ class Demo:
                 "alpha alone": array.images[ALPHA].expand(3, -1, -1),
                 **classical_methods(network, array, noise),
             }
-            say(f"{name}: fusion with the weights '{self.weights}'")
+            say(f"{name}: fusion with the weights '{self.network}'")
             settings = FuseSettings(noise=noise)
-            frame = fuse_with_progress(self.weights, array.rig, array.images, alpha=ALPHA, settings=settings)
+            frame = fuse_with_progress(self.network, array.rig, array.images, alpha=ALPHA, settings=settings)
             methods["fusion"] = frame.image.clamp(0, 1)
             scores = {method: score(image, array.ground_truth) for method, image in methods.items()}
             columns[name] = {method: f"{psnr:.2f} / {ssim:.3f}" for method, (psnr, ssim) in scores.items()}

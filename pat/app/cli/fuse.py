@@ -153,7 +153,7 @@ class Fuse(Around, Fusing):
         rig, around = self.with_known(rig, frame.alpha, frame.first, field)
         settings = self.fuse_settings(noise_by_default=self.luminance in ("alpha", "recorded"))
         fused = fuse_with_progress(
-            self.weights or "mono-colour",
+            self.network or "mono-colour",
             rig,
             images,
             alpha=frame.alpha,
@@ -190,7 +190,7 @@ class Fuse(Around, Fusing):
         from ...support.memory import peak_memory
         from ..report import Facts
 
-        notes = [f"weights: {self.weights or 'mono-colour'}", *self._notes, *adopted]
+        notes = [f"network: {self.network or 'mono-colour'}", *self._notes, *adopted]
         warned = [str(message) for message in options.WARNED]
         return Facts(notes, warned, seconds, peak_memory(), length_unit(rig))
 

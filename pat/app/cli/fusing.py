@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 from ...media.suffixes import IMAGE_SUFFIXES, VIDEO_SUFFIXES
 from . import options
 from .known import Known
-from .options import WEIGHTS_HELP, FieldName, Numbers, Out, say
+from .options import NETWORK_HELP, FieldName, Numbers, Out, say
 from .parser import Option, UsageError
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ class Fusing(Known):
     """Without a rig: the focal length in pixels of a camera whose file does not state it."""
     out: Out = Path("out")
     """Folder for the results."""
-    weights: Annotated[str | None, Option("NAME|FILE", WEIGHTS_HELP)] = None
+    network: Annotated[str | None, Option("NAME|FILE", NETWORK_HELP)] = None
     field: FieldName = "auto"
     luminance: Literal["alpha", "recorded", "mix", "beta"] = "alpha"
     """Whose brightness the fused image has: alpha's, denoised where it is noisy, or as recorded; beta's, in
@@ -171,8 +171,8 @@ class Fusing(Known):
             files = {name: find_images(path) for name, path in cameras.items()}
             refuse_same(files)
         files = self._checked(files)
-        array = self.found_array(files, weights=self.weights, focal=focal)
-        self.weights = array.weights
+        array = self.found_array(files, weights=self.network, focal=focal)
+        self.network = array.weights
         return Recordings(array.recorded, {n: files[n] for n in array.rig.names}, array.alpha, array, rates)
 
     def known_files(self) -> list[Path]:
@@ -207,13 +207,13 @@ class Fusing(Known):
         from ...networks.weights import weights_for
 
         betas = [name for name in files if name != alpha]
-        if self.weights or any(rig[name].sensor.response == "rgb" for name in betas):
+        if self.network or any(rig[name].sensor.response == "rgb" for name in betas):
             return
         views = ViewFiles(rig, files, alpha=alpha)
         bands = [len(views[name]) for name in betas]
         if 3 not in bands and sum(bands) != 3:
-            self.weights = weights_for(bands)
-            say(f"weights: {self.weights} (--weights NAME takes others)")
+            self.network = weights_for(bands)
+            say(f"network: {self.network} (--network NAME takes others)")
 
     def healed(self, views: ViewFiles) -> Rig:
         """Return the rig of the views, or the one corrected by their images, which is written beside the

@@ -128,7 +128,7 @@ class Known:
         with options.working("finding the rig"):
             array = array_from_images(first, alpha=self.alpha, weights=weights, focal=focal, say=say)
         if weights is None:
-            say(f"weights: {array.weights} (--weights NAME takes others)")
+            say(f"network: {array.weights} (--network NAME takes others)")
         self.match_levels |= array.match_levels
         return array
 

@@ -112,8 +112,8 @@ Out = Annotated[Path, Option("PATH", short="-o")]
 MaybeOut = Annotated[Path | None, Option("PATH", short="-o")]
 Depth = Annotated[tuple[float, float] | None, Option("NEAR FAR")]
 Memory = Annotated[str | None, Option("SIZE")]
-WEIGHTS_HELP = f"Weights: {', '.join(WEIGHT_NAMES)}, or a file."
-Weights = Annotated[str, Option("NAME|FILE", WEIGHTS_HELP)]
+NETWORK_HELP = f"Network: {', '.join(WEIGHT_NAMES)}, or a file of weights."
+NetworkName = Annotated[str, Option("NAME|FILE", NETWORK_HELP)]
 Address = Annotated[str | None, Option("ADDRESS")]
 
 

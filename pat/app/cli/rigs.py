@@ -153,7 +153,7 @@ class Explore:
     alpha: Name = None
     """The camera to point in; by default the first with an image."""
     field: FieldName = "auto"
-    weights: Annotated[str | None, Option("NAME|FILE")] = None
+    network: Annotated[str | None, Option("NAME|FILE")] = None
     """A network of the paper whose attention to show, as pat-supervised; else correlations of windows."""
     save: Annotated[Path | None, Option("FILE.html")] = None
     """Write a page of one file that needs no server, and end."""
@@ -177,7 +177,7 @@ class Explore:
         if images:
             warn_of_misfit(rig, images)
         options.field_named(self.field)
-        explorer = opened(rig, images, alpha=self.alpha, network=self.weights, field=self.field)
+        explorer = opened(rig, images, alpha=self.alpha, network=self.network, field=self.field)
         if explorer.error:
             raise ValueError(explorer.error)
         if self.save is None:

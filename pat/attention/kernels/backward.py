@@ -79,8 +79,10 @@ def _backward_pixel(p, call, saved, here, gradients):
 
 @compiled
 def _score_gradient(n, here, statistics, upstream):
-    """Convert gradients by the weights to gradients by the scores. `slope` holds the gradients by the values'
-    weights."""
+    """Convert gradients by the weights to gradients by the scores.
+
+    `slope` holds the gradients by the values' weights.
+    """
     nothing = zero(upstream)
     x, y, spread = statistics[0], statistics[1], statistics[2]
     gx, gy, gspread = upstream[0], upstream[1], upstream[2]

@@ -51,8 +51,10 @@ def _forward_block(first, pixels, call, block, outputs):
 
 @compiled
 def _find_weights(p, call, measured, here):
-    """Convert the inner products of pixel p's taps to their weights, in place. Returns the log of the sum of
-    exponentials."""
+    """Convert the inner products of pixel p's taps to their weights, in place.
+
+    Returns the log of the sum of exponentials.
+    """
     n = here.sample_count[0]
     logsum = zero(here.by_key) - np.float32(np.inf)
     if call.geometry.nearest and n == here.tap_count[0] and n > 0:

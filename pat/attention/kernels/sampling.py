@@ -110,8 +110,10 @@ def _divide(start, along, geometry, out):
 
 @compiled
 def _find_taps(n, first, geometry, here):
-    """Find the taps of n samples. Returns their number. `first` is the index of the first pixel
-    of this beta."""
+    """Find the taps of n samples.
+
+    Returns their number. `first` is the index of the first pixel of this beta.
+    """
     if geometry.nearest:
         m = _find_pixels(n, np.int32(first), geometry, here)
     else:
@@ -165,8 +167,10 @@ def course_of(n, here):
 
 @compiled
 def _find_corners(n, first, geometry, here):
-    """Find a cell's four taps in a row: two behind, then two ahead, as the samples run. A sample one cell
-    further shares its first two with the last two of the sample before."""
+    """Find a cell's four taps in a row: two behind, then two ahead, as the samples run.
+
+    A sample one cell further shares its first two with the last two of the sample before.
+    """
     course = course_of(n, here)
     width = np.int32(geometry.width)
     right, down = np.int32(min(1, geometry.width - 1)), np.int32(min(1, geometry.height - 1)) * width

@@ -72,8 +72,10 @@ def find_scores(p, call, here):
 
 @compiled
 def softmax(n, score, weight):
-    """Compute the weights of n scores, written in place. Returns the log of the sum of exponentials (-inf for
-    no samples)."""
+    """Compute the weights of n scores, written in place.
+
+    Returns the log of the sum of exponentials (-inf for no samples).
+    """
     best = load(score, 0)
     for j in range(LANES, n, LANES):
         best = maximum(load(score, j), best)

@@ -153,8 +153,9 @@ def middlebury_pairs(root: str | Path) -> Iterator[StereoPair]:
 
 
 def folder_pairs(root: str | Path) -> Iterator[StereoPair]:
-    """Read every pair under `root` whose names follow one of `LEFT_AND_RIGHT`, such as KITTI's. Rectification
-    is assumed.
+    """Read every pair under `root` whose names follow one of `LEFT_AND_RIGHT`, such as KITTI's.
+
+    Rectification is assumed.
 
     Returns:
         Pairs, read one at a time, with `max_disparity` `PAPER_DISPARITY` and no true disparity.

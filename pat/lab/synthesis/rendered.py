@@ -153,8 +153,10 @@ def depth_between(
 
 
 def _creases(inverse: Float[Tensor, "h w"], uneven: float) -> tuple[Bool[Tensor, "h w"], Bool[Tensor, "h w"]]:
-    """Pixels at creases and steps of inverse depth, along rows and columns. Between two such pixels is an
-    edge."""
+    """Pixels at creases and steps of inverse depth, along rows and columns.
+
+    Between two such pixels is an edge.
+    """
     across, down = torch.zeros_like(inverse, dtype=torch.bool), torch.zeros_like(inverse, dtype=torch.bool)
     across[:, 1:-1] = inverse.diff(n=2, dim=1).abs() > uneven * inverse[:, 1:-1]
     down[1:-1] = inverse.diff(n=2, dim=0).abs() > uneven * inverse[1:-1]

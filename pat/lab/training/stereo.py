@@ -97,8 +97,9 @@ class MeasuredPairs(Crops):
         return Pictures(read_image(pair.left), read_image(pair.right), (left, right), pair.max_disparity)
 
     def sample(self, batch: int, generator: Generator, *, number: int, betas: int = 1) -> ArrayBatch:
-        """Draw windows from the pairs that are active for group `number`. Several betas are of the same
-        camera.
+        """Draw windows from the pairs that are active for group `number`.
+
+        Several betas are of the same camera.
 
         Returns:
             A batch of `batch` samples; depth is NaN where unknown.

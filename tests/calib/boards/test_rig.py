@@ -1,5 +1,6 @@
 """From detections to a rig: ground truth within its uncertainty, and a message for every unusable set."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -10,7 +11,7 @@ from arraygeom import Pose, Rig
 from calib.boards.adequacy import coverage
 from calib.boards.detect import BoardViews, Detection
 from calib.boards.poses import symmetry_poses
-from calib.boards.report import report_html
+from calib.boards.report import report_html, verdict
 from calib.boards.rig import calibrate
 from calib.boards.solve import calibrate_single, many_wrong
 from calib.boards.target import parse_board
@@ -100,6 +101,17 @@ def test_the_report_holds_the_figures_and_escapes_names(found):
     assert "<script>" not in text
     assert f"{found.rms:.3f} px (RMS)" in text
     assert text.count("data:image/png;base64,") == 6
+    assert text.index("Good enough to fuse at") < text.index(f"{found.rms:.3f} px (RMS)")
+
+
+def test_the_verdict_doubts_lines_that_miss_and_too_few_images(found, monkeypatch):
+    assert verdict(found).startswith("Good enough")
+    assert verdict(replace(found, fit=replace(found.fit, covariance=None))).startswith("Not good enough")
+    uncertain = replace(found.fit, covariance=1e6 * found.fit.covariance)
+    assert verdict(replace(found, fit=uncertain)).startswith("Not good enough")
+    missed = {pair: errors + 2 for pair, errors in found.held_out.items()}
+    monkeypatch.setitem(vars(found), "held_out", missed)  # where the cached property keeps it
+    assert verdict(found).startswith("Not good enough")
 
 
 def test_chessboards_that_are_numbered_from_either_end(pair):

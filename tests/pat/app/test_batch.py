@@ -237,7 +237,7 @@ def test_a_full_disk_leaves_whole_files_only(material, tmp_path, monkeypatch):
 def test_the_command_line_fuses_a_sequence(material, tmp_path, capsys, refusal):
     images = " ".join(f"--image {name}={material / name}" for name in ("fast", "slow"))
     given = f"sequence --rig {material / 'rig.yaml'} --alpha fast {images} --out {tmp_path / 'out'}"
-    given += f" --weights {material / 'tiny.safetensors'} --format png16"
+    given += f" --network {material / 'tiny.safetensors'} --format png16"
     pat(given)
     assert read_image(tmp_path / "out" / "fast_14_fused.png").shape == (3, *moving.HW)
     assert (tmp_path / "out" / "fused.mp4").stat().st_size > 1000

@@ -54,7 +54,7 @@ def test_files_and_a_rigs_file_are_what_they_hold(files):
     said: list[str] = []
     found = fuse({**images, "colour": str(paths["colour"])}, rig, alpha="mono", explain=said.append)
     assert torch.equal(found.image, wanted.image)
-    assert "weights: mono-colour" in said
+    assert "network: mono-colour" in said
 
 
 def test_alignment_takes_the_same(files):

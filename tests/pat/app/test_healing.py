@@ -32,7 +32,7 @@ def material(tmp_path_factory):
 
 def fused(folder, rig, out):
     files = images(folder, "mono", "colour")
-    how = "--weights mono-colour --extras none"
+    how = "--network mono-colour --extras none"
     pat(f"fuse {folder / rig} --alpha mono {files} {how} -o {folder / out}")
     return read_image(folder / out / "fused.png")
 

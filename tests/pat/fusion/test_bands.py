@@ -127,7 +127,7 @@ def test_sixteen_bits_are_written_for_sixteen(tmp_path):
         cv2.imwrite(str(tmp_path / f"{name}.png"), values)
     files = " ".join(str(tmp_path / f"{name}.png") for name in images)
     given = (
-        f"{tmp_path / 'rig.yaml'} {files} --alpha mono --weights mono-spectral --extras none --misfit warn"
+        f"{tmp_path / 'rig.yaml'} {files} --alpha mono --network mono-spectral --extras none --misfit warn"
     )
     for extra, kind in (("", np.uint16), ("--format png8", np.uint8)):
         pat(f"fuse {given} -o {tmp_path / 'out'} {extra}")

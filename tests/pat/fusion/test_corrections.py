@@ -166,7 +166,7 @@ def test_whether_alpha_sees_luma_is_found_whatever_response_is_stated(middle, ne
 
 
 def test_few_matches_judge_neither_the_spectrum_nor_vignetting(middle, network, monkeypatch):
-    """As with few textures: what little matches explains of alpha need not be much."""
+    """Few textures give few matches, which need not explain much of alpha."""
     sample, images, _ = middle
     w = images[BETA].shape[-1]
     shade = 1 - 0.4 * torch.linspace(-1, 1, w).square()

@@ -36,7 +36,7 @@ def test_frames_that_are_all_there_are_matched_without_a_word(a, b):
 
 @pytest.mark.parametrize(("prefix_a", "prefix_b"), [("", ""), ("m_", "c_"), ("cam0_", "cam1_")])
 def test_a_frame_that_a_camera_lacks_shifts_none(prefix_a, prefix_b):
-    """As many files of each camera are not fused one by one: 2 with 1, 3 with 2."""
+    """Equally many files are not paired one by one, which would fuse 2 with 1 and 3 with 2."""
     a = [f"{prefix_a}{i}" for i in (0, 2, 3, 4)]
     b = [f"{prefix_b}{i}" for i in (0, 1, 2, 4)]
     said = rf"'a' has none of {prefix_b}1; 'b' has none of {prefix_a}3: 3 of 5"

@@ -1,5 +1,6 @@
 """Files of a fusion: bands that no image holds together are written one by one."""
 
+import re
 from io import BytesIO
 
 import numpy as np
@@ -93,6 +94,12 @@ def test_files_of_the_user_stop_a_fusion_before_it_begins(tmp_path):
     with pytest.raises(FileExistsError, match=r"index\.html"):
         refuse_to_replace(out)
     refuse_to_replace(out, ["7"])
+
+
+def test_a_page_links_every_file_beside_it(tmp_path):
+    written = save_frame(frame_of(1), tmp_path, pages={"index.html": "<p>before</p><!-- files -->"})
+    linked = re.findall('href="([^"]+)"', (tmp_path / "index.html").read_text())
+    assert sorted(linked) == sorted(path.name for path in written if path.name != "index.html")
 
 
 def test_unknown_depth_is_nan_in_the_file_as_in_memory(tmp_path):

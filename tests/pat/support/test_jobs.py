@@ -127,7 +127,7 @@ def test_a_killed_command_is_resumed_to_the_same_bits(material, tmp_path):  # no
         os.link(material / "fast" / f"fast_{8 + i % 7}.png", tmp_path / "fast" / f"f{i}.png")
         os.link(material / "slow" / f"slow_{8 + i % 2}.png", tmp_path / "slow" / f"s{i}.png")
     images = [a for name in ("fast", "slow") for a in ("--image", f"{name}={tmp_path / name}")]
-    given = ["--rig", material / "rig.yaml", "--weights", material / "tiny.safetensors", "--alpha", "fast"]
+    given = ["--rig", material / "rig.yaml", "--network", material / "tiny.safetensors", "--alpha", "fast"]
     run = "import sys; from pat.app.cli.main import main\nif __name__ == '__main__': main(sys.argv[1:])"
     (tmp_path / "run.py").write_text(run)
 

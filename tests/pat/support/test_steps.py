@@ -78,7 +78,7 @@ def steps_of_a_rig_from_images(images):
 @pytest.mark.slow
 @pytest.mark.skipif(not ARRAY.is_dir(), reason="no images of the fast + slow array")
 def test_estimates_of_a_rig_from_images_are_within_half(clock):
-    """By each step's least processor time in three runs: other processes make it longer, never shorter."""
+    """Each step counts by its least processor time of three runs: other processes only make it longer."""
     images = {name: read_image(ARRAY / f"{name}.png")[:1] for name in ("141", "cam1_4", "cam2_4")}
     runs = [steps_of_a_rig_from_images(images) for _ in range(3)]
     ends = np.min([np.diff([at for at, _ in run], prepend=0.0) for run in runs], 0).cumsum()

@@ -69,7 +69,7 @@ def test_what_is_put_right_is_said_and_on_the_page(folder, counts, capsys):  # n
     said = capsys.readouterr().err
     assert "plan: 1 piece, " in said
     for words in (
-        "weights: mono-colour",
+        "network: mono-colour",
         "alpha is 0.33 R + 0.33 G + 0.33 B",
         "px off its search segments: put right",
     ):
@@ -224,7 +224,7 @@ def test_without_a_rig_the_files_rig_is_written(tmp_path, capsys):
     for name, path in files.items():
         write_image(path, avg_pool2d(load_sample().images[name], 2))
     pat(f"align {files['mono']} {files['colour']} -o {tmp_path / 'found'} --extras npy")
-    assert "weights: mono-colour (--weights NAME takes others)" in capsys.readouterr().err
+    assert "network: mono-colour (--network NAME takes others)" in capsys.readouterr().err
     rig = Rig.load(tmp_path / "found" / "found_rig.yaml")
     assert {name: rig[name].sensor.response for name in rig.names} == {"mono": "mono", "colour": "rgb"}
 

@@ -113,7 +113,7 @@ def test_demo_beats_alpha_and_every_classical_fusion_of_the_photograph(tmp_path,
         ({"extra": ["--depth", "-1", "2"]}, "0 < near <= far"),
         ({"extra": ["--max-memory", "lots"]}, "max_memory is 'lots'"),
         ({"extra": ["--image", "tele=x.png"]}, "no camera 'tele'"),
-        ({"extra": ["--weights", "mono-color"]}, "no weights 'mono-color'"),
+        ({"extra": ["--network", "mono-color"]}, "no weights 'mono-color'"),
         ({"mono": SAMPLE / "mono.png"}, "mono.png: is 640x400, the rig says 128x96"),
     ],
 )
@@ -488,7 +488,7 @@ def test_bands_are_listed_with_their_files(small, capsys):
     given = f"{images(small, *cameras)} --alpha mono --extras none"
     pat(f"fuse {small / 'rig.yaml'} {given} -o {small / 'out'}")
     said = " ".join(capsys.readouterr().err.split())
-    assert "weights: mono-spectral (--weights NAME takes others)" in said
+    assert "network: mono-spectral (--network NAME takes others)" in said
     assert "bands at alpha's view: fused_nir.png, fused_red.png; fused.png is their mean" in said
     for name, other in (("nir", "red"), ("red", "nir")):
         files = f"out/fused_{name}.png", f"{name}.png", f"{other}.png"

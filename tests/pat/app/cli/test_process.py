@@ -82,7 +82,7 @@ def test_the_version_is_printed(words, capsys):
 REFUSED = {
     "fuse --depth 2": "--depth",
     "fuse --format jpg": "--format",
-    "fuse --wieghts x": "--weights",
+    "fuse --netwrok x": "--network",
     "batch --workers x": "--workers",
     "fuse --alpha": "--alpha",
     "rig info r a=A": "--image",

@@ -140,5 +140,5 @@ def test_a_saved_grid_answers_for_the_pixels_of_its_cells():
 def test_weights_without_attention_are_refused_and_no_page_is_written(tmp_path, refusal):
     for weights, said in {"mono-colour": "are not of the paper's network", "foo": "no weights 'foo'"}.items():
         page = tmp_path / f"{weights}.html"
-        assert said in refusal(*EXPLORE, "--weights", weights, "--save", page)
+        assert said in refusal(*EXPLORE, "--network", weights, "--save", page)
         assert not page.exists()

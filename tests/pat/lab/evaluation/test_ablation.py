@@ -152,7 +152,7 @@ def test_the_true_depth_has_no_error(case):
 
 
 def test_rendered_folders(tmp_path, case):
-    """What a renderer would leave, with the images of a layered scene."""
+    """Folders as a renderer leaves them, with the images of a layered scene."""
     folder = tmp_path / "scenes" / "one"
     folder.mkdir(parents=True)
     with pytest.raises(ValueError, match="holds no rendered scene"):
