@@ -225,14 +225,14 @@ class RayCurve(NamedTuple):
         ends = (
             w_far + torch.where(visible.valid, s, 0.0) * (w_near - w_far) for s in (visible.high, visible.low)
         )
-        inverse = tuple(torch.where(visible.valid, v, 1.0) for v in ends)
+        near_end, far_end = (torch.where(visible.valid, v, 1.0) for v in ends)
         wide = beta.distortion is not None and limits is None and not beta.parallel
         valid = ahead & visible.valid
         if beta.central:
-            return cls.between(points, *inverse, valid, beta, wide)
+            return cls.between(points, near_end, far_end, valid, beta, wide)
         remote = REMOTE / beside(pose.t.norm(dim=-1) + near.to(x.dtype), x.ndim - 1)
-        inverse = tuple(torch.maximum(v, remote) for v in inverse)
-        whole = cls.between(points, *inverse, valid, beta, wide)
+        near_end, far_end = (torch.maximum(v, remote) for v in (near_end, far_end))
+        whole = cls.between(points, near_end, far_end, valid, beta, wide)
         return cls.between(points, *whole._ends_on_image(), valid, beta, wide)
 
     @classmethod
@@ -319,7 +319,8 @@ class RayCurve(NamedTuple):
         with torch.no_grad():
             fractions = self._fractions(self._even(NODES))
             covered = self._covered(fractions)
-            fractions = torch.lerp(*covered.split(1, -1), fractions)
+            low, high = covered[..., :1], covered[..., 1:]
+            fractions = torch.lerp(low, high, fractions)
             pieces = self._pieces(fractions, MARGIN)
             there = pieces.length.sum(-1, keepdim=True) > 0
             ends = torch.where(
