@@ -20,6 +20,8 @@ from .pose import Pose
 from .runtime.text import baseline_text, depth_text
 from .runtime.tracing import traced
 
+SAME_CENTRE = 1e-12
+"""Metres between centres, or entries of F, that are rounding."""
 Depths = tuple[Float[Tensor, "*b"], Float[Tensor, "*b"]]
 
 
@@ -30,7 +32,8 @@ class Link(Batched):
     For views with lenses x are undistorted pixels (`LensView.undistort`).
 
     Attributes:
-        F: fundamental matrix.
+        F: fundamental matrix; 0 for cameras at one place, or whose scene is one plane or far away, so that H
+            is all there is and depth has no effect.
         H: rough homography; None if unknown.
 
     Raises:
@@ -48,12 +51,17 @@ class Link(Batched):
                 if not (name == "H" and matrix is None):
                     check_numbers(matrix, (3, 3), name)
 
+    @classmethod
+    def from_homography(cls, H: Float[Tensor, "*b 3 3"]) -> Link:
+        """Make the link of images that H alone registers."""
+        return cls(torch.zeros_like(H), H)
+
     def reversed(self) -> Link:
         """Return the link with alpha and beta exchanged."""
         return Link(self.F.transpose(-1, -2), None if self.H is None else torch.linalg.inv(self.H))
 
     def _text(self) -> str:
-        return "F" if self.H is None else "F and H"
+        return "F" if self.H is None else "F and H" if self.F.any() else "H"
 
     def transformed(self, A_alpha: Float[Tensor, "3 3"], A_beta: Float[Tensor, "3 3"]) -> Link:
         """Return the link between images whose pixels are A x of the old ones."""
@@ -87,6 +95,14 @@ class Pair(Batched):
     def calibrated(self) -> bool:
         """True if both cameras are calibrated."""
         return isinstance(self.alpha, Camera) and isinstance(self.beta, Camera)
+
+    @property
+    def at_one_place(self) -> bool:
+        """True if depth moves no point between the images: of equal centres, or of a link of H alone."""
+        if traced() or (self.link is None and not self.calibrated):
+            return False
+        moves = self.beta_from_alpha.t if self.link is None else self.link.F
+        return float(moves.detach().abs().max()) < SAME_CENTRE
 
     @property
     def has_lens(self) -> bool:

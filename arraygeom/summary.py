@@ -69,6 +69,8 @@ class PairSummary(NamedTuple):
 
 NEXT = 1 + 1e-6
 """Factor from a depth to the next, for numerical changes."""
+ALONG = 257
+"""Points from the middle of an image to an edge, by which its lens's end is found."""
 MOST_BETAS = 50
 """Largest number of betas for one alpha."""
 MOST_PIXELS = 1 << 18
@@ -115,17 +117,20 @@ def field_of_view(camera: Camera) -> tuple[float, float]:
     """Compute the angles between the rays at the middles of opposite edges, through the lens.
 
     Returns:
-        Angles (across, down) in degrees; NaN for an edge outside the lens model's range.
+        Angles (across, down) in degrees; of an edge outside the lens model's range to where that ends, NaN if
+        the middle is outside too.
     """
     h, w = camera.hw
-    middle = ((w - 1) / 2, (h - 1) / 2)
-    ends = [(-0.5, middle[1]), (w - 0.5, middle[1]), (middle[0], -0.5), (middle[0], h - 0.5)]
-    rays, valid = camera.rays(camera.K.new_tensor([middle, *ends]))
-    halves = torch.where(valid[1:], _angles(rays[1:], rays[:1]), torch.nan).tolist()
-    return halves[0] + halves[1], halves[2] + halves[3]
+    middle = camera.K.new_tensor([(w - 1) / 2, (h - 1) / 2])
+    ends = middle + camera.K.new_tensor([[-w / 2, 0], [w / 2, 0], [0, -h / 2], [0, h / 2]])
+    parts = torch.linspace(0, 1, ALONG).to(camera.K)[:, None, None]
+    rays, valid = camera.rays(middle + parts * (ends - middle))
+    halves = torch.where(valid, _angles(rays, rays[:1, :1]), 0.0).amax(0)
+    left, right, top, bottom = torch.where(valid[0], halves, torch.nan).tolist()
+    return left + right, top + bottom
 
 
-def _angles(a: Float[Tensor, "n 3"], b: Float[Tensor, "1 3"]) -> Float[Tensor, " n"]:
+def _angles(a: Float[Tensor, "*n 3"], b: Float[Tensor, "1 1 3"]) -> Float[Tensor, "*n"]:
     cross = torch.linalg.cross(a, b.expand_as(a)).norm(dim=-1)
     return torch.rad2deg(torch.atan2(cross, (a * b).sum(-1)))
 

@@ -64,8 +64,8 @@ def dark_cat() -> tuple[Rig, dict[str, Tensor]]:
     dark = srgb_from_linear(luminance(linear_from_srgb(photo)) / DARKER)
     shifted = torch.cat([photo[..., DISPARITY:], photo[..., -1:].expand(-1, -1, DISPARITY)], -1)
     images = {
-        ALPHA: NoiseLevel.of_electrons(1000, 2.0).recorded(dark[None], generator)[0],
-        BETA: NoiseLevel.of_electrons(8000, 2.0).recorded(shifted[None], generator)[0],
+        ALPHA: NoiseLevel.from_electrons(1000, 2.0).recorded(dark[None], generator)[0],
+        BETA: NoiseLevel.from_electrons(8000, 2.0).recorded(shifted[None], generator)[0],
     }
     mono = Camera(K=intrinsics(FOCAL, hw).double(), cam_from_world=Pose.identity(), hw=hw)
     beside = Pose(mono.R, torch.tensor([-BASELINE, 0, 0]).double())

@@ -451,6 +451,7 @@ SCENES: Mapping[str, Callable[[Path], Iterator[AlignmentScene]]] = {
     "motorcycle": motorcycle_scene,
     "middlebury": middlebury_scenes,
     "rededge": capture("rededge", "IMG*.tif"),
+    "rededge_flight": capture("rededge_flight", "IMG*.tif"),
     "sequoia": capture("sequoia", "IMG*.TIF"),
     "nine-band": nine_band_scene,
 }

@@ -63,18 +63,18 @@ def default_field(pair: Pair) -> ReceptiveField:
     """Return the field that fusion uses for a pair; through lenses where a view has one.
 
     A pair with a link has `HomographyDisplacement`, also if it is calibrated: a link was measured between
-    these very images. A calibrated one has `Epipolar`, which raises ValueError when called if the pair has no
-    depth range: a search of the whole line is ambiguous and must be requested (`EpipolarLine`). A pair of
-    which only the sizes are known counts as rectified, with alpha on either side. With lenses these are
-    `Curved`, or `ThroughLenses` of the field without them. The bounds of `Curved` are those of
-    `natural_bounds`.
+    these very images; so have cameras at one place, whose segments are points. A calibrated one has
+    `Epipolar`, which raises ValueError when called if the pair has no depth range: a search of the whole line
+    is ambiguous and must be requested (`EpipolarLine`). A pair of which only the sizes are known counts as
+    rectified, with alpha on either side. With lenses these are `Curved`, or `ThroughLenses` of the field
+    without them. The bounds of `Curved` are those of `natural_bounds`.
     """
     return _through_lenses(straight_field(pair), pair)
 
 
 def straight_field(pair: Pair) -> ReceptiveField:
     """Return the `default_field` of the pair after its images are undistorted."""
-    if pair.link is not None:
+    if pair.link is not None or pair.at_one_place:
         return HomographyDisplacement(LINE_SHARE * max(pair.beta.hw))
     if pair.calibrated:
         return Epipolar()

@@ -48,7 +48,7 @@ class FieldOnGrid:
     blocks: Segments | None = None
 
     @classmethod
-    def of(
+    def from_field(
         cls, field: ReceptiveField, pair: Pair, *, hw: HW | None = None, blocks: bool = True
     ) -> FieldOnGrid:
         """Evaluate a pair's field on alpha's pixels, with about one sample a pixel of the longest segment.
@@ -77,7 +77,7 @@ class FieldOnGrid:
         sparse = (..., slice(0, h, 4), slice(0, w, 4))
         longest = torch.where(pixels.valid[sparse], pixels.length[sparse].detach().float(), 0.0).max()
         if longest > math.hypot(*pair.beta.hw) + 1:  # of one's own, and what is off the image does not count
-            return cls.of(_clipped(field), pair, hw=hw, blocks=blocks)
+            return cls.from_field(_clipped(field), pair, hw=hw, blocks=blocks)
         on_grid = cls(evaluate, int(torch.ceil(longest)) + 1, pixels)
         return replace(on_grid, blocks=on_grid.of_blocks(BLOCK)) if blocks and not on_grid.large else on_grid
 

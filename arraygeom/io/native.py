@@ -27,6 +27,7 @@ Units and the pixel convention stand in the file. Example:
         gain: [1.9, 1, 1.4]           # of red, green, blue; or one number
     links:                            # pairs of cameras that have only a size
       - {alpha: mono, beta: colour, F: [[...], [...], [...]], H: [[...], [...], [...]]}
+        # of cameras at one place H alone
 
 A camera that is not calibrated may have a lens all the same, which says itself how many pixels count as 1 and
 where its centre is: `distortion: {model: ..., coefficients: [...], scale: 320, centre: [319.5, 199.5]}`. F
@@ -291,6 +292,8 @@ def _link(fields: Entry, cameras: Mapping[str, View]) -> tuple[tuple[str, str], 
     _check_keys(fields, ("alpha", "beta", "F", "H"))
     alpha, beta = (_camera_named(fields.get(key), cameras) for key in ("alpha", "beta"))
     H = fields.get("H")
+    if H.value is not None and "F" not in fields:
+        return (alpha, beta), Link.from_homography(H.numbers((3, 3)))
     link = Link(fields.get("F").numbers((3, 3)), None if H.value is None else H.numbers((3, 3)))
     return (alpha, beta), link
 
@@ -304,6 +307,7 @@ def _camera_named(entry: Entry, cameras: Mapping[str, View]) -> str:
 def _check_keys(entry: Entry, allowed: tuple[str, ...]) -> None:
     if not isinstance(entry.value, dict):
         raise entry.fail(f"wanted a mapping with keys {', '.join(allowed)}")
+    entry.use()
     for key in entry.value:
         if key not in allowed:
             near = difflib.get_close_matches(str(key), allowed, 1)
@@ -395,7 +399,8 @@ def _sensor_entry(sensor: Sensor) -> dict[str, Any]:
 
 def _link_entry(alpha: str, beta: str, link: Link) -> dict[str, Any]:
     H = {} if link.H is None else {"H": link.H.tolist()}
-    return {"alpha": alpha, "beta": beta, "F": link.F.tolist()} | H
+    F = {"F": link.F.tolist()} if link.F.any() or not H else {}
+    return {"alpha": alpha, "beta": beta} | F | H
 
 
 class _Dumper(SafeDumper):

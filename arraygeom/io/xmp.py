@@ -38,6 +38,7 @@ from .source import Entry, RigSource
 
 PIX4D, DJI, MICASENSE = "pix4d.com", "drone-dji", "micasense.com/MicaSense"
 """Parts of the names of XMP's namespaces; those of Pix4D's `Camera:` differ between makers."""
+RDF = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}"
 EXIF, GPS = 0x8769, 0x8825
 """Tags of TIFF's directories with EXIF's fields (2.32)."""
 LARGEST_XMP = 1 << 20
@@ -89,6 +90,27 @@ def capture_of(path: Path) -> list[Path]:
         p for p in path.parent.iterdir() if p.suffix.lower() in SUFFIXES and p.stem.rpartition("_")[0] == stem
     )
     return [p for p in beside if _states_camera(image_tags(p))] if stem else [path]
+
+
+def by_capture(paths: Sequence[Path]) -> dict[str, list[Path]]:
+    """List the images of several captures by the names of their bands, with a warning of those left out.
+
+    Returns:
+        Files of whole captures, in their order; empty for a single capture, and for images without tags of
+        their cameras.
+    """
+    captures: dict[tuple[Path, str], dict[str, Path]] = {}
+    for path in paths:
+        stem, _, end = path.stem.rpartition("_")
+        captures.setdefault((path.parent, stem), {})[end] = path
+    most = max(captures.values(), key=len, default={})
+    whole = [capture for capture in captures.values() if capture.keys() == most.keys()]
+    if len(most) < 2 or len(whole) < 2 or not states_cameras(list(most.values())):
+        return {}
+    if left_out := len(paths) - len(whole) * len(most):
+        RigSource(paths[0].parent).warn(f"{left_out} images are left out, whose captures lack a band")
+    named = {name: path.stem.rpartition("_")[2] for name, path in named_by_band(list(most.values())).items()}
+    return {name: [capture[end] for capture in whole] for name, end in named.items()}
 
 
 def named_by_band(paths: Sequence[Path]) -> dict[str, Path]:
@@ -434,21 +456,24 @@ def image_tags(path: Path) -> ImageTags | None:
         return None
 
 
-def _xmp(content: bytes) -> dict[tuple[str, str], str]:
-    """Return XMP tags of the namespaces above; empty if there are none, or the packet is damaged."""
+def xmp_packet(content: bytes) -> bytes:
+    """Return the XMP packet in a file's bytes; empty if there is none that can be read safely."""
     begin = content.find(b"<x:xmpmeta")
     end = content.find(b"</x:xmpmeta>", begin)
     if begin < 0 or not 0 < end - begin < LARGEST_XMP:
-        return {}
+        return b""
     packet = content[begin : end + len(b"</x:xmpmeta>")]
-    if b"<!DOCTYPE" in packet or b"<!ENTITY" in packet:
-        return {}
+    return b"" if b"<!DOCTYPE" in packet or b"<!ENTITY" in packet else packet
+
+
+def _xmp(content: bytes) -> dict[tuple[str, str], str]:
+    """XMP tags of the namespaces above; empty if there are none, or the packet is damaged."""
     try:
-        root = ET.fromstring(packet)
+        root = ET.fromstring(xmp_packet(content))
     except ET.ParseError:
         return {}
     tags: dict[tuple[str, str], str] = {}
-    for described in root.iter("{http://www.w3.org/1999/02/22-rdf-syntax-ns#}Description"):
+    for described in root.iter(f"{RDF}Description"):
         parts = [(key, value) for key, value in described.attrib.items()]
         parts += [
             (child.tag, ",".join(text for raw in child.itertext() if (text := raw.strip())))

@@ -15,6 +15,8 @@ ASSUMED = f"{UNSCALED}; focal lengths are assumed, and the proportions of depth 
 """Name of a rig with assumed focal lengths: an interval of its depths would be a guess."""
 OPEN = "found from images that leave lines and depth open: of these images alone"
 """Name of a rig whose cameras one homography relates as well as any lines."""
+REGISTERED = "registered by a homography each: for scenes about as far away as those of these images"
+"""Name of such a rig that several captures agree on."""
 
 
 def length_unit(rig: Any) -> str:

@@ -46,6 +46,8 @@ APRIL_SHIFT = 0.5
 LARGEST_MISFIT = 0.35
 """Largest median distance (in spacings) of points from a smoothly distorted grid; above, the detection is
 false."""
+LOCAL_MISFIT = 0.1
+"""Largest distance of two markers' corners from their homography, in sides; above, it is another board."""
 SMALL = 640
 """Width to which images are reduced to identify the board in them."""
 OTHER_DICTIONARIES = ("4x4_1000", "5x5_1000", "6x6_1000", "7x7_1000", "aruco_original", "apriltag_36h11")
@@ -109,13 +111,18 @@ def detect(grey: Grey, board: Board) -> Detection | None:
     return None
 
 
-def explain(images: Iterable[Grey], board: Board) -> str:
+def explain(images: Iterable[Grey], board: Board, *, confirmed: bool = False) -> str:
     """Guess the likeliest reason why a board was not found in images.
+
+    Args:
+        images: the images.
+        board: the board.
+        confirmed: True if other images show it, so that it is not another board.
 
     Returns:
         A sentence.
     """
-    reasons = Counter(_reason(grey, board) for grey in images)
+    reasons = Counter(_reason(grey, board, confirmed=confirmed) for grey in images)
     return reasons.most_common(1)[0][0] if reasons else "there are no images"
 
 
@@ -173,10 +180,41 @@ def _charuco(grey: Grey, board: Charuco) -> Detection | None:
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     detector = cv2.aruco.CharucoDetector(board.opencv, cv2.aruco.CharucoParameters(), parameters)
-    corners, ids, _, _ = detector.detectBoard(grey)
-    if ids is None or len(ids) < FEWEST:
+    corners, ids, quads, markers = detector.detectBoard(grey)
+    numbers = [] if markers is None else markers.reshape(-1).tolist()
+    local = _between_markers({n: x.reshape(4, 2) for n, x in zip(numbers, quads)}, board)
+    count = 0 if ids is None else len(ids)
+    if max(count, len(local.ids)) < FEWEST:
         return None
+    if len(local.ids) > count:  # in steep or wide views OpenCV drops all of them
+        return local
     return Detection(ids.reshape(-1).astype(np.int64), corners.reshape(-1, 2).astype(np.float64))
+
+
+def _between_markers(seen: Mapping[int, np.ndarray], board: Charuco) -> Detection:
+    """Return the corners between two markers, by the homography of these two alone, if it fits them."""
+    layout = board.opencv
+    points = np.asarray(layout.getObjPoints())[..., :2]
+    squares = dict(zip(np.asarray(layout.getIds()).reshape(-1).tolist(), points))
+    known = [n for n in squares if n in seen]
+    middles = np.array([squares[n].mean(0) for n in known]).reshape(-1, 2)
+    ids, x = [], []
+    for i, corner in enumerate(np.asarray(layout.getChessboardCorners())[:, :2]):
+        beside = np.flatnonzero(np.linalg.norm(middles - corner, axis=-1) < board.spacing)
+        if len(beside) != 2:
+            continue
+        p, there = (
+            np.concatenate([of[known[j]] for j in beside]).astype(np.float64) for of in (squares, seen)
+        )
+        H, _ = cv2.findHomography(p, there)
+        if H is None:
+            continue
+        q = cv2.perspectiveTransform(np.vstack([p, corner])[:, None].astype(np.float64), H)[:, 0]
+        side = np.linalg.norm(there - np.roll(there, 1, 0), axis=-1)[1:4].max()
+        if np.linalg.norm(q[:-1] - there, axis=-1).max() < LOCAL_MISFIT * side:
+            ids.append(i)
+            x.append(q[-1])
+    return Detection(np.array(ids, dtype=np.int64), np.array(x).reshape(-1, 2))
 
 
 def _april_grid(grey: Grey, board: AprilGrid) -> Detection | None:
@@ -326,14 +364,20 @@ def _plausible(detection: Detection, board: Board) -> bool:
     return bool(np.median(left) < LARGEST_MISFIT * np.median(apart(flat)) and np.isfinite(left).all())
 
 
-def _reason(grey: Grey, board: Board) -> str:
+def _reason(grey: Grey, board: Board, *, confirmed: bool) -> str:
     """Guess why a board is not found, and what to do."""
     low, high = np.percentile(grey, (2, 98))
     if high - low < 40:
         return "the images have hardly any contrast: expose them longer, or light the board"
+    if confirmed and isinstance(board, MarkedBoard):
+        seen = len(_tags(grey, board.dictionary, board.border if isinstance(board, AprilGrid) else 1))
+        return (
+            f"{seen} of its markers are readable there, too few side by side: leave the image out, or take "
+            "it nearer, less steeply, or sharper"
+        )
     if isinstance(board, MarkedBoard) and (reason := _marker_reason(grey, board)):
         return reason
-    if other := other_size([grey], board):
+    if not confirmed and (other := other_size([grey], board)):
         return (
             f"a chessboard with {other} inner corners is visible: is the board's size right, "
             "and is all of it in the image?"
@@ -343,7 +387,8 @@ def _reason(grey: Grey, board: Board) -> str:
     if cv2.Laplacian(grey, cv2.CV_64F).std() < 4:
         return "the images are blurred: focus, and hold the board still"
     margin = "" if isinstance(board, MarkedBoard) else " completely and with its white margin"
-    return f"no such board is visible{margin}: is its name right, and is it in the image, large and lit?"
+    right = "" if confirmed else "is its name right, and "
+    return f"no such board is visible{margin}: {right}is it in the image, large and lit?"
 
 
 def _marker_reason(grey: Grey, board: MarkedBoard) -> str | None:
@@ -503,7 +548,7 @@ def _missing(
     why, missing = "", [photo for key, photo in moments.items() if key not in with_board]
     if missing:
         labels = named([photo.label for photo in missing], NAMED)
-        why = f"images ({labels}): {explain(_greys(missing), board.members[0])}"
+        why = f"images ({labels}): {explain(_greys(missing), board.members[0], confirmed=bool(with_board))}"
     if not with_board:
         raise ValueError(f"{name}: the board {board} is in none of {len(moments)} {why}")
     if missing:

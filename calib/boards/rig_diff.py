@@ -171,8 +171,8 @@ def rig_difference(
     if by_rig[0] is not None and by_rig[1] is not None:
         roots, blocks = [_root(by_rig[0]), _root(by_rig[1])], []
         for projected in parts:
-            by_a = -projected.jacobians[0] @ by_rig[0].of(projected.name, a[projected.name]) @ roots[0]
-            by_b = projected.jacobians[1] @ by_rig[1].of(projected.name, b[projected.name]) @ roots[1]
+            by_a = -projected.jacobians[0] @ by_rig[0].selection(projected.name, a[projected.name]) @ roots[0]
+            by_b = projected.jacobians[1] @ by_rig[1].selection(projected.name, b[projected.name]) @ roots[1]
             blocks.append(np.concatenate([by_a, by_b], -1))
         spread = np.concatenate(blocks).reshape(len(change), -1)
         spread -= by_motion @ (by_motion.T @ spread)

@@ -93,7 +93,7 @@ def calibrate_photos(
     nominal = None if start is None else Rig.load(start)
     if nominal is not None:
         if lens == "auto":
-            raise ValueError("--lens auto compares lenses on held-out frames: with --start name one")
+            raise ValueError("lens: auto compares lenses on held-out frames: with a start name one")
         named = {name: f"{glob.escape(name)}.*" for name in nominal.names}
         if not patterns and all(any(photos.glob(pattern)) for pattern in named.values()):
             patterns = named  # a file called like each camera

@@ -65,7 +65,7 @@ class RigCovariance:
     names: tuple[str, ...]
     matrix: Float[np.ndarray, "c c"]
 
-    def of(self, name: str, camera: Camera) -> Float[np.ndarray, "p c"]:
+    def selection(self, name: str, camera: Camera) -> Float[np.ndarray, "p c"]:
         """Return the selection matrix (p, c) from these parameters to a camera's, in the order of
         `parameter_names`."""
         entries = np.array([f"{name}.{entry}" for entry in parameter_names(camera)])
@@ -145,8 +145,8 @@ def beta_covariance(
     if usable.any():
         J_a, J_b = (camera_jacobian(camera, X.numpy()[usable]) for camera in (a, b))
         across = J_b[..., 3:6] @ (b.R @ a.R.T).numpy()[:, :2]
-        change = J_b @ covariance.of(beta, b) - across @ np.linalg.solve(
-            J_a[..., 3:5], J_a @ covariance.of(alpha, a)
+        change = J_b @ covariance.selection(beta, b) - across @ np.linalg.solve(
+            J_a[..., 3:5], J_a @ covariance.selection(alpha, a)
         )
         at_points[usable] = change @ covariance.matrix @ change.swapaxes(-1, -2)
     return at_points
@@ -157,7 +157,7 @@ def baseline_deviation(rig: Mapping[str, Camera], a: str, b: str, covariance: Ri
     baseline = (rig[b].centre - rig[a].centre).numpy()
     direction = baseline / max(float(np.linalg.norm(baseline)), 1e-12)
     of_a, of_b = (
-        direction @ rig[n].cam_from_world.centre_jacobian.numpy() @ covariance.of(n, rig[n])[:6]
+        direction @ rig[n].cam_from_world.centre_jacobian.numpy() @ covariance.selection(n, rig[n])[:6]
         for n in (a, b)
     )
     return float(np.sqrt((of_b - of_a) @ covariance.matrix @ (of_b - of_a)))
@@ -188,7 +188,7 @@ def intrinsics_of(fit: Solved, name: str) -> Intrinsics:
     """Extract one camera from a fit; without a covariance none of its intrinsics is free."""
     camera, points = in_own_frame(fit.problem, name)
     of_rig = rig_covariance(fit) or RigCovariance((), np.zeros((0, 0)))
-    mine = of_rig.of(name, camera)
+    mine = of_rig.selection(name, camera)
     mine[:6] = 0  # the pose
     free = mine.any(1)
     covariance = mine[free] @ of_rig.matrix @ mine[free].T

@@ -97,6 +97,14 @@ def explain(matches: PointMatches, pair: Pair) -> Explanation:
     return Explanation(H, len(x), beyond, wrong, noise)
 
 
+def registration(H: Float[Tensor, "3 3"], matches: PointMatches) -> Explanation:
+    """Return the explanation of a few points by a homography alone: how many are off it, and their noise."""
+    off = (apply_homography(H, matches.alpha.to(H)).x - matches.beta.to(H)).norm(dim=-1)
+    noise = normal_deviation(off, LOCALISED / OFF)
+    wrong = int((off > OFF * noise).sum())
+    return Explanation(H, len(off), wrong, wrong, noise)
+
+
 def _fit_to_most(x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"]) -> Float[Tensor, "3 3"]:
     H = None
     for method in (cv2.USAC_MAGSAC, 0):

@@ -18,16 +18,18 @@ from arraygeom.runtime.progress import part, stage
 from arraygeom.runtime.text import OPEN
 from arraygeom.runtime.threads import torch_in_one_thread
 
-from .explanations import Explanation, explain
+from .explanations import Explanation, explain, registration
 from .lenses import describe_lenses
 from .matches import (
     AGREE,
+    ENOUGH,
     MATCHING_SHARE,
     FittedLink,
     Pairs,
     PointMatches,
     agreeing_pairs,
     fit_fundamental,
+    fit_homography,
     fit_link,
     image_sizes,
     line_distance,
@@ -101,7 +103,8 @@ def rig_from_images(
         images: one image (C, H, W) in 0..1 per camera, by name.
         focal: rough focal lengths in pixels by camera; None or missing ones are unknown.
         alpha: match only this camera with each other one; None for every two cameras.
-        matches: points of pairs of images used instead of matching these.
+        matches: points of pairs of images used instead of matching these; of fewer than 20 points the rig
+            has a homography alone (`fit_homography`).
 
     Returns:
         The rig with statistics of its links.
@@ -113,11 +116,14 @@ def rig_from_images(
     focal = dict(focal or {})
     for name, length in focal.items():
         if name not in images or not 0 < length < math.inf:
-            raise ValueError(f"--focal: '{name}={length:g}' is no camera with an image, or not positive")
+            raise ValueError(f"focal: '{name}={length:g}' is no camera with an image, or not positive")
     sizes = image_sizes(images)
     K = {name: intrinsics(length, sizes[name]) for name, length in focal.items()}
     with part(0, MATCHING_SHARE):
-        matched = match_cameras(images, alpha=alpha) if matches is None else agreeing_pairs(matches)
+        given = None if matches is None else usable_matches(matches, alpha=alpha)
+        matched = match_cameras(images, alpha=alpha) if given is None else given
+    if all(len(points.alpha) < ENOUGH for points in matched.values()):
+        return _registered(Rig({name: View(hw=hw) for name, hw in sizes.items()}), matched)
     distance, by_focal, links = {}, {}, {}
     for names, points in matched.items():
         F, distance[names], by_focal[names] = _fundamental(points, *(K.get(name) for name in names))
@@ -143,18 +149,52 @@ def rig_from_images(
     return UncalibratedRig(rig, fits, distance, by_focal, explained, matched)
 
 
-def link_of_points(rig: Rig, pair: tuple[str, str], points: PointMatches) -> Link:
+def usable_matches(matches: Pairs, *, alpha: str | None = None) -> dict[tuple[str, str], PointMatches]:
+    """Select matches from elsewhere that agree, or, where no pair has enough for lines, all.
+
+    Args:
+        matches: points by pair of cameras.
+        alpha: the camera whose pairs are wanted; None for all.
+
+    Returns:
+        The matches, those of `alpha` first in their pairs.
+
+    Raises:
+        ValueError: for matches of no use.
+    """
+    if alpha is not None:
+        turned = {(b, a): PointMatches(*points[::-1]) for (a, b), points in matches.items()}
+        matches = {names: points for names, points in {**turned, **matches}.items() if names[0] == alpha}
+    few = matches and all(len(points.alpha) < ENOUGH for points in matches.values())
+    return dict(matches) if few else agreeing_pairs(matches)
+
+
+def _registered(rig: Rig, matches: Pairs) -> UncalibratedRig:
+    """Return the rig of views whose images a homography by a few points registers."""
+    fitted = {names: link_of_points(rig, names, points) for names, points in matches.items()}
+    links = {names: link for names, (link, _) in fitted.items()}
+    explained = {names: explanation for names, (_, explanation) in fitted.items()}
+    fits = {names: FittedLink(link, matches[names], 0.0) for names, link in links.items()}
+    rig = rig.replace(links=links, name=OPEN)
+    return UncalibratedRig(rig, fits, {}, dict.fromkeys(links, False), explained, dict(matches))
+
+
+def link_of_points(rig: Rig, pair: tuple[str, str], points: PointMatches) -> tuple[Link, Explanation]:
     """Fit F and a rough map of a pair to its points.
 
     Returns:
-        The link; its map is the homography that explains all points, if one does.
+        The link, of the homography alone if that explains all points, and for few points; and the
+        explanation taken.
 
     Raises:
         ValueError: for points that no F fits, or fewer than `ENOUGH` that agree with it.
     """
+    if len(points.alpha) < ENOUGH:
+        H = fit_homography(points)
+        return Link.from_homography(H), registration(H, points)
     link = fit_link(points, fit_fundamental(points), within=AGREE).link
     explained = explain(points, rig.replace(links={pair: link}).pair(*pair))
-    return link if explained.has_lines else link.replace(H=explained.H)
+    return link if explained.has_lines else Link.from_homography(explained.H), explained
 
 
 def _fundamental(

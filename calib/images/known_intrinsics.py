@@ -17,7 +17,9 @@ from torch import Tensor
 
 from arraygeom import Pose, Rig
 from arraygeom.pixels import map_homogeneous
+from arraygeom.runtime.text import OPEN, angle
 
+from .explanations import explain
 from .guided_matches import guided_matches
 from .matches import ENOUGH, Images, PointMatches, near_lines
 from .refinement import refine_matches
@@ -35,6 +37,8 @@ TRIALS = 500
 """Number of directions tried for each baseline (Fischler and Bolles 1981)."""
 SIGMA = {"rotation": math.radians(0.5), "translation": 0.3}
 """Standard deviations: of orientations, radians; of translations, as a share of the longest baseline."""
+TURNED = 2.0
+"""Standard deviations of orientations within which points count as moved by these, not by a baseline."""
 ROUNDS = (4.0, 2.0, 2.0)
 """Distances in pixels up to which matches are used, in one refinement after the other."""
 
@@ -52,12 +56,13 @@ def centres_found(
         shown: masks of the pixels that each camera recorded, by name.
 
     Returns:
-        The rig with its depth range; and for each beta the number of its points and their median distance
-        from their lines, pixels.
+        The rig with its depth range, named `OPEN` if orientations alone explain the points as well;
+        and for each beta the number of its points and their median distance from their lines, pixels.
 
     Raises:
         ValueError: if no camera matches with alpha, or no points have parallax.
     """
+    known = rig
     stated = {name: float(rig.pair(alpha, name).beta_from_alpha.t.norm()) for name in rig.betas(alpha)}
     pairs: dict[tuple[str, str], PointMatches] = {}
     for a, b in combinations(rig.names, 2):
@@ -81,7 +86,17 @@ def centres_found(
     for name in rig.betas(alpha):
         of_beta = {pair: matches for pair, matches in near.items() if name in pair}
         facts[name] = sum(len(matches.alpha) for matches in of_beta.values()), median_off(rig, of_beta)
-    return rig.replace(depth=_depths(rig, near)), facts
+    turned = all(_by_turning(known, rig, pair, matches) for pair, matches in near.items())
+    return rig.replace(depth=_depths(rig, near), name=OPEN if turned else ""), facts
+
+
+def _by_turning(known: Rig, rig: Rig, pair: tuple[str, str], matches: PointMatches) -> bool:
+    """Return True if no baseline is needed: another orientation, as likely as that known, explains points."""
+    explained = explain(matches, rig.pair(*pair))
+    a, b = (known[name] for name in pair)
+    U, _, Vh = torch.linalg.svd(torch.linalg.inv(b.K) @ explained.H.to(b.K) @ a.K)
+    R = U @ Vh * torch.linalg.det(U @ Vh)
+    return not explained.has_lines and float(angle(R @ (b.R @ a.R.mT).mT)) < TURNED * SIGMA["rotation"]
 
 
 def _normals(rig: Rig, a: str, b: str, matches: PointMatches) -> Float[Tensor, "n 3"]:

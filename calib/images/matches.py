@@ -31,6 +31,11 @@ MATCHED_AT_ONCE = 1024
 """Number of features whose distances from all of the other image are held at once."""
 ENOUGH = 20
 """Least number of consistent matches for any conclusion."""
+FEWEST = 4
+"""Least number of matches, clicked by hand say, that a homography is fitted to."""
+CLICKED, BENT = 2.0, 0.02
+"""Standard deviations of such points, pixels, and of how far the homography is from a similarity: shear,
+aspect and perspective across the points' spread."""
 LOCALISED = 1 / 3
 """A matched point's standard deviation, pixels, for its depth to be known: the middle of the bounds below."""
 LOCALISATION_BOUNDS = (0.15, 0.2, 0.3, np.inf)
@@ -82,7 +87,7 @@ def image_sizes(images: Mapping[str, Tensor]) -> dict[str, tuple[int, int]]:
         ValueError: in one line, for fewer than two images, and for one that is no float image (C, H, W).
     """
     if len(images) < 2:
-        raise ValueError("matching needs the images of two cameras or more: give --image NAME=FILE for each")
+        raise ValueError("matching needs the images of two cameras or more: give an image of each")
     for name, image in images.items():
         if image.ndim != 3 or 0 in image.shape or not image.is_floating_point():
             got = f"{str(image.dtype).removeprefix('torch.')} of shape {tuple(image.shape)}"
@@ -420,6 +425,50 @@ def fit_fundamental(matches: PointMatches) -> Float[Tensor, "3 3"]:
         if F is not None and F.shape == (3, 3):
             return torch.from_numpy(F)
     raise ValueError("no fundamental matrix fits the points seen in both images")
+
+
+def fit_homography(matches: PointMatches) -> Float[Tensor, "3 3"]:
+    """Fit H to a few points, as near to a similarity as they allow; wrong ones among them count little.
+
+    Returns:
+        H with beta ~ H alpha.
+
+    Raises:
+        ValueError: for fewer than `FEWEST` points, and for points in one spot.
+    """
+    from scipy.optimize import least_squares  # here, as it takes long to import
+
+    if len(matches.alpha) < FEWEST:
+        raise ValueError(
+            f"only {len(matches.alpha)} points are given for two images: give {FEWEST} or more; {ENOUGH} say "
+            "where lines are"
+        )
+    (to_x, x), (to_y, y) = (_evened(points.double().numpy()) for points in matches)
+    similarity, _ = cv2.estimateAffinePartial2D(x, y, method=cv2.LMEDS)
+    if similarity is None:
+        raise ValueError("no similarity maps the given points to one another: are they of these images?")
+
+    def homography(h: NDArray[np.float64]) -> NDArray[np.float64]:
+        a, b, p, q, tx, ty, g, k = h
+        return np.array([[a + p, q - b, tx], [b + q, a - p, ty], [g, k, 1]])
+
+    def off(h: NDArray[np.float64]) -> NDArray[np.float64]:
+        there = np.c_[x, np.ones(len(x))] @ homography(h).T
+        rest = (there[:, :2] / there[:, 2:] - y) / (CLICKED * to_y[0, 0])
+        return np.concatenate([rest.ravel(), h[[2, 3, 6, 7]] / BENT])
+
+    (a, _, tx), (b, _, ty) = similarity
+    H = homography(least_squares(off, [a, b, 0, 0, tx, ty, 0, 0], loss="cauchy").x)
+    return torch.from_numpy(np.linalg.inv(to_y) @ H @ to_x)
+
+
+def _evened(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """A map of pixels to a mean of 0 and a spread of 1, and the points (n, 2) by it."""
+    spread = float(points.std(0).max())
+    if spread < 1:
+        raise ValueError("all given points are in one spot: give some all over the images")
+    x, y = points.mean(0)
+    return np.array([[1, 0, -x], [0, 1, -y], [0, 0, spread]]) / spread, (points - [x, y]) / spread
 
 
 def _percentiles(values: Tensor, share: float) -> tuple[float, float]:

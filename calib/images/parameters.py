@@ -92,7 +92,7 @@ def free_parameters(
     """
     stated = {ALIASES.get(k, k): v for k, v in (sigma or {}).items()}
     if wrong := [k for k, v in stated.items() if k not in SIGMA or not v > 0]:
-        raise ValueError(f"--sigma: wanted a positive number for one of {', '.join(SIGMA)}; got '{wrong[0]}'")
+        raise ValueError(f"sigma: wanted a positive number for one of {', '.join(SIGMA)}; got '{wrong[0]}'")
     sigma = {**SIGMA, **stated}
     parameters = rig.parameters(free=["*"]) if any(isinstance(rig[n], LensView) for n in names) else {}
     parameters = {n: like for n, like in parameters.items() if n not in ("depth.near", "depth.far")}
@@ -157,7 +157,7 @@ def _matching(parameters: Sequence[str], free: Iterable[str]) -> list[str]:
         names = fnmatch.filter(parameters, kind if "." in kind else f"*.{kind}")
         if not names:
             kinds = ", ".join(dict.fromkeys(name.rpartition(".")[2] for name in parameters))
-            raise ValueError(f"--free: the rig has no '{pattern}' (it has: {kinds})")
+            raise ValueError(f"free: the rig has no '{pattern}' (it has: {kinds})")
         wanted |= dict.fromkeys(names)
     return list(wanted)
 

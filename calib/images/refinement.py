@@ -261,9 +261,7 @@ class RefinementProblem:
         names = cameras_of(rig, (*used, *held_out))
         parameters = free_parameters(rig, names, free=free, sigma=sigma)
         if not parameters:
-            raise ValueError(
-                "nothing is free: the first camera keeps its pose; free more with --free, such as centre"
-            )
+            raise ValueError("nothing is free: the first camera keeps its pose; free more, such as centre")
         considered = considered_parameters(rig, names, parameters, sigma=sigma)
         return cls(rig, tuple(parameters), used, held_out, tuple(considered))
 
@@ -416,7 +414,7 @@ class RefinementProblem:
         with_considered = self.after(solution.full[: self.uncertain])
         if not nearer(before, line_distances(with_considered, self.held_out)):
             return text
-        return f"{text} by what is free alone: leave out --free, or free {', '.join(kinds)} too"
+        return f"{text} by what is free alone: free {', '.join(kinds)} too"
 
     def _explained_by_lenses(self, distances: Tensor) -> list[str]:
         """Return an objection if other lenses, with the same poses, put held-out points as near to their
@@ -434,7 +432,7 @@ class RefinementProblem:
         if nearer(line_distances(explained, self.held_out), distances):
             return []
         all_kinds = ",".join((*FREE, *EXTRA_FREE, "distortion"))
-        freed = f"if those may be wrong, --free {all_kinds}"
+        freed = f"if those may be wrong, free {all_kinds}"
         what_to_do = freed if rig is self.rig else "state the lenses that were calibrated"
         return [
             f"other lenses explain the points as well as other poses, which would change depth: {what_to_do}"
@@ -463,7 +461,7 @@ def _contradictions(parameters: Sequence[FreeParameter], z: Tensor) -> list[str]
             contradictions.append(
                 f"{u.label(worst)} would change by {f'{size:+.3g} {u.unit}'.rstrip()}, "
                 f"{ratio:.0f} standard deviations of {sigma:.3g}: is something else wrong (`pat rig "
-                "doctor`)? If so large a change is plausible, say so with --sigma"
+                "doctor`)? If so large a change is plausible, say so by a larger sigma"
             )
     return contradictions
 

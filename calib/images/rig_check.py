@@ -8,10 +8,10 @@ from typing import NamedTuple
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from arraygeom import Rig
+from arraygeom import Pair, Rig, apply_homography
 
 from .depth_change import share_outside
-from .matches import Images, Pairs, match_cameras
+from .matches import Images, Pairs, PointMatches, match_cameras, undistort_matches
 from .residuals import median_off, own_distance, related
 
 LARGEST_SIDE = 1000
@@ -103,6 +103,16 @@ def _matched(rig: Rig, images: Mapping[str, Tensor], largest: int) -> tuple[Rig,
         rig = rig.resize(name, hw)
         reduced[name] = interpolate(image[None], hw, mode="area")[0] if scale < 1 else image
     try:
-        return rig, related(rig, match_cameras(reduced))
+        pairs = related(rig, match_cameras(reduced))
     except ValueError:
         return None
+    pairs = {names: points for names, points in pairs.items() if not _registered(rig.pair(*names), points)}
+    return (rig, pairs) if pairs else None
+
+
+def _registered(pair: Pair, matches: PointMatches) -> bool:
+    """Return True if cameras are at one place, by the rig, and the points are where that puts them."""
+    if not pair.at_one_place:
+        return False
+    x, y = undistort_matches(pair, matches)
+    return float((apply_homography(pair.homography, x).x - y).norm(dim=-1).median()) <= BADLY

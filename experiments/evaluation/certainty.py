@@ -88,7 +88,9 @@ class Reliability(NamedTuple):
     share: Float[Tensor, " bins"]
 
     @classmethod
-    def of(cls, probability: Float[Tensor, " n"], right: Bool[Tensor, " n"], bins: int = BINS) -> Reliability:
+    def from_samples(
+        cls, probability: Float[Tensor, " n"], right: Bool[Tensor, " n"], bins: int = BINS
+    ) -> Reliability:
         """Compute the share of right matches by stated probability."""
         which = (probability * bins).long().clamp(0, bins - 1)
         count = torch.bincount(which, minlength=bins).double()
@@ -219,7 +221,7 @@ def held(pixels: Sequence[Judged], stating: Callable[[Judged], Stated]) -> dict[
         right, error = (torch.cat([getattr(pixels[i], name) for i in some]) for name in ("right", "error"))
         probability, width = (torch.cat(planes) for planes in zip(*(stated[i] for i in some)))
         covered = float((error <= width).float().mean())
-        return Held(Reliability.of(probability, right), covered)
+        return Held(Reliability.from_samples(probability, right), covered)
 
     names = grouped(pixels, "condition")
     return {n: of([i for i, j in enumerate(pixels) if n in (j.condition, "all")]) for n in [*names, "all"]}

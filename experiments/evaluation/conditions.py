@@ -115,7 +115,7 @@ def _vignetted(image: Tensor) -> Tensor:
 
 
 def _low_light(electrons: float) -> Condition:
-    return Condition(noise=NoiseLevel.of_electrons(electrons, READ_NOISE))
+    return Condition(noise=NoiseLevel.from_electrons(electrons, READ_NOISE))
 
 
 CONDITIONS: dict[str, Condition] = {

@@ -250,8 +250,8 @@ def _row(
 def fused(network: Comparing, pair: Pair, alpha: Tensor, beta: Tensor, field: ReceptiveField) -> Result:
     """The network on two whole images (C, H, W); beta's bands are cameras to one of several betas."""
     betas = [beta[None]] if network.betas == 1 else list(beta[None].split(1, dim=1))
-    on_grid = FieldOnGrid.of(field, pair, blocks=False)
-    output, compared = network.compare(Inputs.of(alpha[None], betas, [on_grid] * len(betas)))
+    on_grid = FieldOnGrid.from_field(field, pair, blocks=False)
+    output, compared = network.compare(Inputs.from_images(alpha[None], betas, [on_grid] * len(betas)))
     peaks = [peak_position(one)[0].movedim(0, -1).double() for one in compared]
     return Result(output.image[0], torch.stack(peaks))
 

@@ -147,7 +147,7 @@ def fused_at_random(network: GuidedPAT, pair: StereoPair, seed: int, matcher: Ma
     alpha, beta, truth, _ = mono_colour_task(pair, int(rng.choice(RATES)))
     settings = FuseSettings(response="rec601", align=False)
     if rng.random() < NOISY:
-        level = NoiseLevel.of_electrons(float(np.exp(rng.uniform(np.log(50), np.log(2000)))), READ_NOISE)
+        level = NoiseLevel.from_electrons(float(np.exp(rng.uniform(np.log(50), np.log(2000)))), READ_NOISE)
         alpha, beta = (level.recorded(image[None], g)[0] for image in (alpha, beta))
         settings = replace(settings, noise={"alpha": level, "beta": level})
     rectified_fusion(network, settings=settings, matcher=matcher)(alpha, beta, pair.max_disparity)

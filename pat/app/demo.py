@@ -19,7 +19,7 @@ RESPONSE = (0.2, 0.4, 0.4)
 """Weights of red, green and blue in the real mono camera, whose luminance is not Rec. 601's."""
 EXPOSURE = 0.6
 """Ratio of the real colour camera's values to the mono camera's."""
-NOISE = NoiseLevel.of_electrons(300, 2.0)
+NOISE = NoiseLevel.from_electrons(300, 2.0)
 """Noise of both real cameras."""
 CROP = 4
 """Enlargement of the figure's lower row."""

@@ -7,8 +7,9 @@ import math
 import os
 import re
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -18,15 +19,17 @@ from torch import Tensor
 from torch.linalg import LinAlgError
 from torch.nn.functional import interpolate
 
-from arraygeom import LensView, Link, Rig, Sensor, View
+from arraygeom import LensView, Link, Rig, Sensor, View, apply_homography, resize_matrix
+from arraygeom.io.point_matches import read_matches
 from arraygeom.io.xmp import named_by_band, rig_of_images, states_cameras
 from arraygeom.runtime.progress import log_step, part, stage
-from arraygeom.runtime.text import ASSUMED, OPEN, UNSCALED
+from arraygeom.runtime.text import ASSUMED, OPEN, REGISTERED, UNSCALED
 from arraygeom.undistortion import pixels_between
 from calib.images.focal_length import common_focal_length
-from calib.images.from_images import UncalibratedRig, link_of_points, rig_from_images
+from calib.images.from_images import UncalibratedRig, link_of_points, rig_from_images, usable_matches
 from calib.images.known_intrinsics import centres_found
 from calib.images.lenses import describe_lenses
+from calib.images.matches import Pairs, PointMatches, image_sizes, match_cameras, undistort_matches
 from calib.images.self_calibration import RefinedPair, joined, refined_by_depth, self_calibrated
 
 from ..fusion.dense_matches import MatchedDepth, matched_depth
@@ -93,6 +96,8 @@ def array_from_images(
     alpha: str | None = None,
     weights: str | None = None,
     focal: Mapping[str, float] | None = None,
+    matches: str | Path | None = None,
+    further: Sequence[Mapping[str, Path]] = (),
     say: Say = lambda line: None,
 ) -> ImageArray:
     """Find the array of one image from each camera.
@@ -102,6 +107,9 @@ def array_from_images(
         alpha: camera whose view is wanted; None for the largest grey image, or else the largest.
         weights: weights by name; None chooses them by the bands.
         focal: focal lengths in pixels by camera, in place of those in the files' tags.
+        matches: a file of matched points (`read_matches`) from which the rig is found; None matches the
+            images.
+        further: files of other captures by camera, used too where tags state cameras without parallax.
         say: called with each line of what is found.
 
     Returns:
@@ -134,6 +142,15 @@ def array_from_images(
         raise ValueError("focal: the images' tags state the focal lengths: leave it out")
     for name in files:
         images[name] = read_image(files[name], name=name)
+    sizes = image_sizes(images)
+    given = (
+        None
+        if matches is None
+        else {
+            pair: PointMatches(*points)
+            for pair, points in read_matches(matches, {n: files.get(n, n) for n in sources}, sizes).items()
+        }
+    )
     images = {name: _textured(f"{name}: {files.get(name, 'the image')}", images[name]) for name in sources}
     alpha = _chosen_alpha(images, alpha, note)
     if tagged is not None:
@@ -143,16 +160,13 @@ def array_from_images(
     if tagged is None:
         lengths = _focal_lengths(images, files, focal, note)
         bands = load_weights(weights or _weights_of(images, alpha)).bands
-        rig, names = found_rig(images, alpha, lengths, bands, note)
+        rig, names = found_rig(images, alpha, lengths, bands, note, given)
         sensors = {name: Sensor({1: "mono", 3: "rgb"}.get(len(images[name]))) for name in names}
         recorded = rig = _with_sensors(rig, sensors)
     else:
-        try:
-            rig, names = _translated_rig(tagged, images, alpha, note)
-        except (ValueError, LinAlgError) as error:
-            why = "too little parallax" if isinstance(error, LinAlgError) else str(error).partition(":")[0]
-            note(f"no depth ({why}): maps between the bands by matched points")
-            rig, names = _mapped_rig(tagged, images, alpha, note)
+        like = tagged[alpha].sensor
+        others = ({n: read_view(tagged, n, one[n], like=like) for n in images} for one in further)
+        rig, names = _rig_of_bands(tagged, images, others, alpha, note, given)
         recorded = _with_sensors(rig, {name: tagged[name].sensor for name in names})
     images = {name: images[name] for name in names}
     weights = weights or _weights_of(images, alpha)
@@ -259,6 +273,31 @@ def _tagged_rig(files: Mapping[str, Path], note: Say) -> Rig | None:
     return rig
 
 
+def _rig_of_bands(
+    tagged: Rig, images: Images, further: Iterable[Images], alpha: str, note: Say, given: Pairs | None
+) -> tuple[Rig, list[str]]:
+    """Rig of tags with translations where images have parallax, else with maps by all captures' points; and
+    the cameras that match, alpha first."""
+    translated, why = None, "matches are given"
+    if given is None:
+        try:
+            translated = _translated_rig(tagged, images, alpha, note)
+            if translated[0].name != OPEN:
+                return translated
+            why = "the cameras' orientations alone explain the points"
+        except LinAlgError:
+            why = "too little parallax"
+        except ValueError as error:
+            why = str(error).partition(":")[0]
+    note(f"no depth ({why}): maps between the bands by matched points")
+    try:
+        return _mapped_rig(tagged, chain([images], further), alpha, note, given)
+    except ValueError:
+        if translated is None:
+            raise
+        return translated
+
+
 @stage()
 def _translated_rig(tagged: Rig, images: Images, alpha: str, note: Say) -> tuple[Rig, list[str]]:
     """Rig of tags with translations and depths from the images, and the cameras that match, alpha first."""
@@ -277,47 +316,72 @@ def _translated_rig(tagged: Rig, images: Images, alpha: str, note: Say) -> tuple
     note(f"depths are multiples of the baseline {alpha} to {translated.betas(alpha)[0]}")
     rig, names = developed_rig(tagged, images), [alpha, *translated.betas(alpha)]
     cameras = {name: rig[name].replace(cam_from_world=translated[name].cam_from_world) for name in names}
-    return Rig(cameras, depth=translated.depth, name=UNSCALED), names
+    return Rig(cameras, depth=translated.depth, name=translated.name or UNSCALED), names
 
 
-def _mapped_rig(tagged: Rig, images: Images, alpha: str, note: Say) -> tuple[Rig, list[str]]:
-    """Cameras of tags without poses: their lenses, and F and a homography by points, where those match.
+def _mapped_rig(
+    tagged: Rig, captures: Iterable[Images], alpha: str, note: Say, given: Pairs | None = None
+) -> tuple[Rig, list[str]]:
+    """Cameras of tags without poses: their lenses, and a homography, or F, by the points of all captures.
 
     A scene without parallax, as from a drone, leaves translations open and needs none.
     """
-    straight, pinhole = without_lenses(Rig({name: tagged[name] for name in images}), images)
-    factors = {name: min(MATCHED / max(image.shape[-2:]), 1.0) for name, image in pinhole.items()}
-    focal = {name: factors[name] * float(straight[name].K[0, 0]) for name in images}
-    reduced = {name: scaled(image, factors[name]) for name, image in pinhole.items()}
-    found = rig_from_images(reduced, focal=focal, alpha=alpha)
-    lensless = Rig({name: View(hw=found.rig[name].hw) for name in images})
-    fitted = {pair: link_of_points(lensless, pair, points) for pair, points in found.matches.items()}
-    links = resized_rig(lensless.replace(links=fitted), pinhole).links
-    names = [alpha, *(name for name in images if (alpha, name) in links)]
-    if len(names) < 2:
-        raise ValueError(f"no image shows enough of what '{alpha}' shows: choose another with --alpha NAME")
-    for name in names[1:]:
-        note(f"{alpha} > {name}: {found.describe(alpha, name)}")
-    for name in images.keys() - {*names}:
-        note(f"{name}: left out, too little in common with {alpha}")
+    pools: dict[tuple[str, str], list[PointMatches]] = {}
+    used = 0
+    for images in captures:
+        rig = Rig({name: tagged[name] for name in images})
+        straight, pinhole = without_lenses(rig, images)
+        factors = {name: min(MATCHED / max(image.shape[-2:]), 1.0) for name, image in pinhole.items()}
+        reduced = {name: scaled(image, factors[name]) for name, image in pinhole.items()}
+        sized = resized_rig(straight, reduced)
+        try:
+            if given is None:
+                matched = match_cameras(reduced, alpha=alpha)
+            else:
+                bare = {pair: undistort_matches(rig.pair(*pair), points) for pair, points in given.items()}
+                to_sized = {name: sized[name].K @ torch.linalg.inv(rig[name].K) for name in images}
+                matched = usable_matches(_moved(bare, to_sized), alpha=alpha)
+        except ValueError:
+            if not used:
+                raise
+            continue
+        used += 1
+        for pair, points in matched.items():
+            pools.setdefault(pair, []).append(points)
+    views = Rig({name: View(hw=sized[name].hw) for name in sized.names})
+    links, every = {}, []
+    for pair, parts in pools.items():
+        points = PointMatches(*(torch.cat(side) for side in zip(*parts)))
+        links[pair], explained = link_of_points(views, pair, points)
+        every.append(explained.has_lines)
+        note(f"{alpha} > {pair[1]}: {explained.as_text(focal_lengths=True)}")
+    names = [alpha, *(name for name in sized.names if (alpha, name) in links)]
+    for name in sized.names:
+        if name not in names:
+            note(f"{name}: left out, too little in common with {alpha}")
     cameras = {name: developed_rig(tagged, images)[name] for name in names}
-    to_tags = {name: cameras[name].K @ torch.linalg.inv(straight[name].K) for name in names}
-    views = {
+    to_tags = {name: cameras[name].K @ torch.linalg.inv(sized[name].K) for name in names}
+    lenses = {
         name: LensView(hw=camera.hw, K=camera.K, distortion=camera.distortion, sensor=camera.sensor)
         for name, camera in cameras.items()
     }
-    own = {(alpha, name): links[alpha, name].transformed(to_tags[alpha], to_tags[name]) for name in names[1:]}
-    return Rig(views, links=own, name=found.rig.name), names
+    own = {(a, b): link.transformed(to_tags[a], to_tags[b]) for (a, b), link in links.items()}
+    return Rig(lenses, links=own, name="" if all(every) else REGISTERED if used > 1 else OPEN), names
 
 
 @stage()
 def found_rig(
-    images: Images, alpha: str, focal: Mapping[str, float], bands: int | None, note: Say
+    images: Images,
+    alpha: str,
+    focal: Mapping[str, float],
+    bands: int | None,
+    note: Say,
+    given: Pairs | None = None,
 ) -> tuple[Rig, list[str]]:
     """Find the rig of images, and the cameras that it relates to alpha.
 
     A beta of `bands` is compared with alpha by its luma, others by the combination of bands most similar to
-    alpha.
+    alpha. `given` matches between the images take the place of what would be found.
 
     Args:
         focal: focal lengths in pixels, where known.
@@ -334,13 +398,14 @@ def found_rig(
     factors = {name: min(MATCHED / max(image.shape[-2:]), 1.0) for name, image in images.items()}
     reduced = {name: scaled(image, factors[name]) for name, image in images.items()}
     lengths = {name: length * factors[name] for name, length in focal.items()}
+    if given is not None:
+        old, new = image_sizes(images), image_sizes(reduced)
+        given = _moved(given, {name: resize_matrix(old[name], new[name]) for name in images})
     with part(0, LINES):
-        uncalibrated = rig_from_images(reduced, focal=lengths, alpha=alpha)
+        uncalibrated = rig_from_images(reduced, focal=lengths, alpha=alpha, matches=given)
     betas = [name for name in images if (alpha, name) in uncalibrated.rig.links]
     if not betas:
-        raise ValueError(
-            f"no image shows enough of what '{alpha}' shows: choose another alpha with --alpha NAME"
-        )
+        raise ValueError(f"no image shows enough of what '{alpha}' shows: choose another alpha")
     for name in images.keys() - {alpha, *betas}:
         note(f"{name}: left out, too little in common with {alpha}")
     with_lines = [name for name in betas if uncalibrated.explained[alpha, name].has_lines]
@@ -351,7 +416,7 @@ def found_rig(
             f"{name}: focal length {length / factors[name]:.0f} pixels +- {deviation:.0%}, by matched points"
         )
     lengths |= {name: length for name, (length, _) in observed.items()}
-    rig = _calibrated(uncalibrated, reduced, alpha, betas, lengths, bands, note)
+    rig = _calibrated(uncalibrated, reduced, alpha, betas, lengths, bands, note, given is None)
     if rig.name == UNSCALED and known != {alpha, *betas}:
         rig = rig.replace(name=ASSUMED)
     return resized_rig(rig, images), [alpha, *betas]
@@ -387,8 +452,10 @@ def _calibrated(
     focal: Mapping[str, float],
     bands: int | None,
     note: Say,
+    dense: bool,
 ) -> Rig:
-    """Rig of alpha and these betas, each pair calibrated and refined by dense matches at reduced size.
+    """Rig of alpha and these betas, each pair calibrated and refined by dense matches at reduced size; or
+    not refined, unless several have to be of one scale.
 
     A pair whose lines no poses fit as well as F alone keeps F's, with the nearest poses for rough depths; one
     without parallax has F alone. Each is reported in a line.
@@ -404,7 +471,7 @@ def _calibrated(
         if pair is None:
             continue
         pairs[name] = pair
-        if pair.exact or len(betas) > 1:
+        if (pair.exact and dense) or len(betas) > 1:
             pairs[name], depths[name] = _refined(pair, images, bands, links)
         if pairs[name] is not pair:
             points, distance = pairs[name].points, pairs[name].distance
@@ -476,6 +543,16 @@ def _relative_scale(first: MatchedDepth, other: MatchedDepth) -> float:
     return float((first.depth[both] / other.depth[both]).median()) if both.any() else 1.0
 
 
+def _moved(pairs: Pairs, maps: Mapping[str, Tensor]) -> dict[tuple[str, str], PointMatches]:
+    """The matches in images whose pixels are A x of the old ones, A by camera."""
+    return {
+        (a, b): PointMatches(
+            apply_homography(maps[a], points.alpha).x, apply_homography(maps[b], points.beta).x
+        )
+        for (a, b), points in pairs.items()
+    }
+
+
 def resized_rig(rig: Rig, images: Images) -> Rig:
     """Return the rig with its cameras resized to the images' sizes."""
     for name in rig.names:
@@ -507,7 +584,7 @@ def _chosen_alpha(images: Images, alpha: str | None, note: Say) -> str:
     """Alpha as requested, or the largest grey image, or the largest of all."""
     if alpha is not None:
         if alpha not in images:
-            raise ValueError(f"--alpha: no camera '{alpha}'; the images' names are {', '.join(images)}")
+            raise ValueError(f"alpha: no camera '{alpha}'; the images' names are {', '.join(images)}")
         return alpha
     grey = [name for name, image in images.items() if len(image) == 1]
     chosen = max(grey or images, key=lambda name: math.prod(images[name].shape[-2:]))

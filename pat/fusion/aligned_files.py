@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
 from xml.sax.saxutils import escape
@@ -20,6 +21,7 @@ from arraygeom.runtime.together import refuse_others, write_together
 
 from ..media.images import read_recorded, write_image
 from ..media.raw import demosaiced, recorded_bands
+from ..media.tags import RecordedTags, recorded_tags
 from .align import Aligned
 from .results import with_links
 from .views import FilesOfCameras
@@ -64,25 +66,36 @@ def save_aligned(
     positions: PositionFormat = "npy",
     name: str = "",
     keep: Iterable[Path] = (),
+    recorded: RecordedFiles | None = None,
     pages: Mapping[str, str] | None = None,
 ) -> list[Path]:
-    """Write aligned.tif (all bands, alpha's first, with their names and wavelengths), and of each camera
-    NAME_visibility.png (0 beyond its edge, 128 occluded, 255 seen), NAME_confidence.png and
-    NAME_positions.npy (or .tif: x, y); depth.tif (metres) if any is known. NAME is by `file_names`.
+    """Write the files of an alignment to a folder.
 
-    One file a camera, NAME.tif, if `separate`, or if their types differ: values keep theirs. With a `name`
-    the files are name_aligned.tif and so on. `pages` are further text files. All are swapped in together, and
-    those of a former alignment of this name are removed (`write_together`).
+    The files are aligned.tif (all bands, alpha's first, with their names and wavelengths), visibility.txt,
+    and of each camera but alpha NAME_visibility.png (0 beyond its edge, 128 occluded, 255 seen),
+    NAME_confidence.png and NAME_positions.npy (or .tif: x, y); and depth.tif (metres) if any depth is known.
+    NAME is by `file_names`. All are swapped in together, and those of a former alignment of this name are
+    removed (`write_together`).
+
+    Args:
+        separate: True for one file a camera, NAME.tif, in place of aligned.tif, as also for values of
+            different types.
+        name: prefix of the files, as in name_aligned.tif; empty for none.
+        keep: files that must not be overwritten, such as the images.
+        pages: further text files by name.
+        recorded: files from which the values were read: files of bands then have the tags of alpha's, by
+            which mapping software places them, and each band's exposure, gain and black level. None for
+            neither.
 
     Returns:
         Paths of the files, sorted.
 
     Raises:
-        ValueError: for two files of one name, and rather than overwrite a file of `keep`, such as the images.
+        ValueError: for two files of one name, and rather than overwrite a file of `keep`.
         FileExistsError: for files in the way that no run wrote.
     """
     prefix = f"{name}_" if name else ""
-    files = _files(aligned, separate, positions)
+    files = _files(aligned, separate, positions, recorded)
     files = [(f"{prefix}{file}", *how) for file, *how in files]
     named = [file for file, *_ in files]
     files += [(file, write_text, with_links(text, named)) for file, text in (pages or {}).items()]
@@ -91,7 +104,7 @@ def save_aligned(
         if count[file.casefold()] > 1:
             raise ValueError(f"{out / file}: two results would have this name: rename the camera")
         if (out / file).resolve() in kept:
-            raise ValueError(f"{out / file}: is one of the images: give another --out")
+            raise ValueError(f"{out / file}: is one of the images: give another folder")
     with write_together(out, group=f"{prefix}aligned", last=f"{prefix}visibility.txt") as folder:
         for file, write, *parts in files:
             write(folder / file, *parts)
@@ -107,18 +120,24 @@ def refuse_to_replace(out: Path, cameras: Iterable[str], *, separate: bool, name
     refuse_others(out, [*names, *["index.html"] * (not name)], group=f"{prefix}aligned")
 
 
-def _files(aligned: Aligned, separate: bool, positions: PositionFormat) -> list[tuple[Any, ...]]:
-    """Name of each file of an alignment, the function that writes it, and what that is given."""
+def _files(
+    aligned: Aligned, separate: bool, positions: PositionFormat, recorded: RecordedFiles | None
+) -> list[tuple[Any, ...]]:
+    """List the name of each file of an alignment, the function that writes it, and its arguments."""
     called = file_names(aligned)
+    tags = None if recorded is None else recorded_tags(Path(recorded.files[aligned.alpha]))
+    facts = {name: [_of_sensor(recorded, name)] * len(view.bands) for name, view in aligned.items()}
     files: list[tuple[Any, ...]] = [("visibility.txt", write_text, _shares(aligned))]
     if np.isfinite(aligned.depth).any():
         write_depth = partial(write_image, bits=32, unknown=True)
         files.append(("depth.tif", write_depth, torch.from_numpy(aligned.depth)[None]))
     if separate or len({view.values.dtype for view in aligned.values()}) > 1:
         for camera, view in aligned.items():
-            files.append((f"{called[camera]}.tif", write_bands, view.values, view.bands, view.wavelengths))
+            bands = view.bands, view.wavelengths, facts[camera], tags
+            files.append((f"{called[camera]}.tif", write_bands, view.values, *bands))
     else:
-        files.append(("aligned.tif", write_bands, aligned.stack(), aligned.bands, aligned.wavelengths))
+        bands = aligned.bands, aligned.wavelengths, [*chain.from_iterable(facts.values())], tags
+        files.append(("aligned.tif", write_bands, aligned.stack(), *bands))
     for camera, view in aligned.items():
         if camera != aligned.alpha:
             shown = {"visibility": GREY[view.visibility], "confidence": view.confidence}
@@ -146,25 +165,59 @@ def _shares(aligned: Aligned) -> str:
     return "".join(lines)
 
 
+def _of_sensor(recorded: RecordedFiles | None, name: str) -> dict[str, float]:
+    """Return black level, exposure and gain of a camera, as far as its rig states them."""
+    if recorded is None:
+        return {}
+    sensor = recorded.rig[name].sensor
+    gain = sensor.gain if isinstance(sensor.gain, int | float) else None
+    facts = {"BLACK_LEVEL": sensor.black_level, "EXPOSURE_SECONDS": sensor.exposure, "GAIN": gain}
+    return {name: value for name, value in facts.items() if value}
+
+
 def write_bands(
-    path: Path, values: NDArray[Any], bands: Sequence[str], wavelengths: Sequence[float | None]
+    path: Path,
+    values: NDArray[Any],
+    bands: Sequence[str],
+    wavelengths: Sequence[float | None],
+    facts: Sequence[Mapping[str, float]] = (),
+    tags: RecordedTags | None = None,
 ) -> None:
-    """Write bands (C, H, W) as one TIFF in their type, with names and wavelengths (nanometres) for GIS."""
-    items = []
+    """Write bands (C, H, W) as one TIFF file in their type, with names and wavelengths (nanometres) for GIS.
+
+    Args:
+        facts: further numbers of each band by name, written as its metadata.
+        tags: tags of the file whose pixels these are, written too; left out of files over `LARGEST_TIFF`.
+    """
+    items = [
+        f'<Item name="{name}" sample="{i}">{value:.9g}</Item>'
+        for i, of_band in enumerate(facts)
+        for name, value in of_band.items()
+    ]
     for i, (band, wave) in enumerate(zip(bands, wavelengths, strict=True)):
         items.append(f'<Item name="DESCRIPTION" sample="{i}" role="description">{escape(band)}</Item>')
         if wave is not None:
             of = f'name="CENTRAL_WAVELENGTH_UM" domain="IMAGERY" sample="{i}"'
             items.append(f"<Item {of}>{wave / 1000:g}</Item>")
     described = f"<GDALMetadata>{''.join(items)}</GDALMetadata>"
+    big = values.nbytes > LARGEST_TIFF
+    tags = None if big else tags
+    further = [] if tags is None else tags.extratags(bands, wavelengths)
     nothing = "nan" if np.issubdtype(values.dtype, np.floating) else "0"
     tifffile.imwrite(
         path,
         np.ascontiguousarray(values),
         photometric="minisblack",
         planarconfig="separate" if len(values) > 1 else None,
-        bigtiff=values.nbytes > LARGEST_TIFF,
+        bigtiff=big,
+        byteorder="<",
         metadata=None,
         description=", ".join(bands).encode(),
-        extratags=[(GDAL_METADATA, "s", 0, described.encode(), True), (GDAL_NODATA, "s", 0, nothing, True)],
+        extratags=[
+            *further,
+            (GDAL_METADATA, "s", 0, described.encode(), True),
+            (GDAL_NODATA, "s", 0, nothing, True),
+        ],
     )
+    if tags is not None:
+        tags.write_directories(path)

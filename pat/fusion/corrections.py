@@ -249,7 +249,7 @@ def _of_beta(alpha: Tensor, before: Beta, beta: Beta, matches: BetaMatches, hw: 
     unlike, margin, _ = matches.facts[0]
     reliable = (unlike < CONSISTENT) & (margin > SETTINGS.margin)
     weight = (enlarged(reliable)[:h, :w] & valid[0, :h, :w]).to(alpha)
-    whole = Normalisation.of(alpha, luma)
+    whole = Normalisation.from_images(alpha, luma)
     alpha_soft = whole.softened(alpha)[:, :, :h, :w]
     measured, wanted = (moments(image, weight[None, None]) for image in (values[-1:][None], alpha_soft))
     bright = measured.matched(luma, wanted, NORMALISATION.largest_gain)

@@ -19,8 +19,7 @@ from arraygeom.sampling import on_image
 from ..matching.inputs import Inputs
 from ..matching.match import match
 from ..matching.matches import Matches
-from ..matching.positions import Extent
-from ..matching.positions import matches as matches_at
+from ..matching.positions import Extent, match_positions
 from ..matching.radiometry import Response
 from ..media.images import Images
 from ..networks.protocol import FusionOutput, JoinsBands, required
@@ -75,7 +74,10 @@ class MatchesAlone:
             hw = beta.image.shape[-2], beta.image.shape[-1]
             segments = beta.field.straight.to(inputs.alpha.device, torch.float64)
             positions.append(matched.positions(segments, hw)[0].movedim(-1, 1))
-            middle, towards = matches_at(segments, matched.disparity), Extent.of(segments).towards
+            middle, towards = (
+                match_positions(segments, matched.disparity),
+                Extent.from_segments(segments).towards,
+            )
             near = (on_image(middle + step * towards, hw) for step in AROUND)
             confidences.append(reduce(torch.logical_or, near).to(inputs.alpha))
         return FusionOutput(inputs.alpha, positions, [0 * c for c in confidences], confidences)

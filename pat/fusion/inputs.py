@@ -132,7 +132,9 @@ def frame_inputs(network: FusionNetwork, views: Views) -> FrameInputs:
     for name, image in zip(views.betas, images):
         pair = views.pair(name)
         field = views.fields.get(name) or default_field(pair)
-        on_grid = FieldOnGrid.of(field, pair, hw=(alpha.shape[-2], alpha.shape[-1]), blocks=m % BLOCK == 0)
+        on_grid = FieldOnGrid.from_field(
+            field, pair, hw=(alpha.shape[-2], alpha.shape[-1]), blocks=m % BLOCK == 0
+        )
         if network.uses_matches and on_grid.pixels is None:
             on_grid = along_tangents(alpha, combined_bands(image), on_grid, name)
         place = Placement(pair, points_of(field), bounds_of(field))

@@ -20,7 +20,7 @@ from arraygeom.runtime.chunks import chunked
 from arraygeom.runtime.warned import warn
 
 from ..matching.radiometry import Response
-from ..networks.bm3d import Observation, seen_by_another, without_noise
+from ..networks.bm3d import Observation, other_camera_update, without_noise
 from ..networks.weights import load_denoiser
 from ..sensors import NoiseLevel, generator_for
 from ..sensors.steps import normal
@@ -231,7 +231,7 @@ def check_noise(noise: Noise | None) -> None:
     if not (isinstance(noise, Mapping) and all(isinstance(level, NoiseLevel) for level in noise.values())):
         raise ValueError(
             f"noise is 'estimate', 'auto' or a NoiseLevel of each camera; got {noise!r}: "
-            "give {NAME: NoiseLevel.of_electrons(200)}"
+            "give {NAME: NoiseLevel.from_electrons(200)}"
         )
 
 
@@ -325,7 +325,7 @@ def brightness_change(
 
     def changed(estimate: Tensor, *planes: Tensor) -> Tensor:
         first, deviation, *other = (plane[0] for plane in planes)
-        return seen_by_another(estimate[0], first, deviation, Observation(*other))[None]
+        return other_camera_update(estimate[0], first, deviation, Observation(*other))[None]
 
     estimate = alpha.denoised
     for beta, found in zip(betas, matched):

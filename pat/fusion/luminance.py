@@ -67,7 +67,7 @@ def with_alpha_detail(frame: Frame, alpha: Float[Tensor, "1 h w"]) -> Frame:
     """
     luma = luminance(frame.image)[None]
     alpha_luma, beta_luma = alpha[None].to(luma), torch.nan_to_num(luma)
-    normalisation = Normalisation.of(alpha_luma, beta_luma)
+    normalisation = Normalisation.from_images(alpha_luma, beta_luma)
     soft = normalisation.softened(alpha_luma)
     detail = local_slope(beta_luma, soft) * SETTINGS.detail(alpha_luma - soft)
     return frame._replace(image=frame.image + detail[0])

@@ -41,7 +41,7 @@ MOST = 65535
 ImageFormat = Literal["png", "tif", "exr"]
 
 FOUND_RIG = "found_rig.yaml"
-"""The rig that was found from images. Not rig.yaml, which may be one that somebody wrote."""
+"""Name of the file of a rig estimated from images. Not rig.yaml, which may be a user's."""
 LINKS = "<!-- files -->"
 """Place of the links to a run's files in its page."""
 HEALED_RIG = "healed_rig.yaml"
@@ -74,7 +74,7 @@ def check_no_result(inputs: Iterable[Path], out: Path) -> None:
     """Raise ValueError for a file that has the name of a result and lies in the results' folder."""
     for path in inputs:
         if path.resolve().parent == out.resolve() and RESULT.fullmatch(path.name):
-            raise ValueError(f"{path}: is called as a result, which would go there: give another --out")
+            raise ValueError(f"{path}: is called as a result, which would go there: give another folder")
 
 
 def save_frame(

@@ -111,7 +111,7 @@ def plan_frame(
     bands = frame.inputs.bands or sum(beta.image.shape[1] for beta in frame.inputs.betas)
     of_frame = FRAME_BYTES + bands * sum(BAND_BYTES[: len(frame.inputs.betas)])
     wanted = (pixels > LARGE and limit) or (pixels > ESTIMATED and estimate)
-    probe = Probe.of(network, frame) if wanted else None
+    probe = Probe.from_frame(network, frame) if wanted else None
     for_each = (probe.matches if probe else 0.0) + (0.0 if stored else of_frame)
     held = kept + LIBRARIES + frame.inputs.nbytes + pixels * for_each
     matching = max(MATCHING_BYTES * max(area(tile.outer) for tile in pieces), FILLING_BYTES * pixels)
@@ -182,7 +182,7 @@ class Probe(NamedTuple):
 
     @classmethod
     @torch.no_grad()
-    def of(cls, network: FusionNetwork, frame: FrameInputs) -> Probe:
+    def from_frame(cls, network: FusionNetwork, frame: FrameInputs) -> Probe:
         """Match and fuse a small piece, as loops may have to be compiled, and then one to measure.
 
         Returns:

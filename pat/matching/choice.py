@@ -160,7 +160,7 @@ def quarter_turns(segments: Segments) -> Int[Tensor, "b h w"]:
 
     That is the order of rectified views whose alpha is on the left.
     """
-    x, y = Extent.of(segments).towards.unbind(-1)
+    x, y = Extent.from_segments(segments).towards.unbind(-1)
     return (torch.atan2(0 - y, 0 - x) / (math.pi / 2)).round().to(torch.int8) % 4  # not -0: points are 0
 
 
@@ -191,7 +191,7 @@ def features(
     Returns:
         Channels of 2 x 2 pixels, at half the size.
     """
-    extent, (h, w) = Extent.of(segments), options.shape[-2:]
+    extent, (h, w) = Extent.from_segments(segments), options.shape[-2:]
     half = _at_half(matches, typical)
     sides = [-(-n // SETTINGS.multiple) * SETTINGS.multiple // FINE for n in (h, w)]
     stacked_planes = torch.empty(len(options), *sides, FACTS + 4 * (1 + 2 * CANDIDATES))

@@ -94,7 +94,7 @@ class MatchStatistics(NamedTuple):
     noise: Tensor
 
     @classmethod
-    def of(
+    def from_values(
         cls,
         alpha: Tensor,
         soft: Tensor,
@@ -262,7 +262,9 @@ def matched_colours(
     sampled, valid = at_matches(planes, beta.field.straight, matches.disparity)
     values, luma, brightness = sampled.split([bands, 1, 1], 1)
     consistent, soft = is_consistent(matches.facts), normalisation.softened(alpha)
-    statistics = statistics or MatchStatistics.of(alpha, soft, values, luma, brightness, valid, consistent)
+    statistics = statistics or MatchStatistics.from_values(
+        alpha, soft, values, luma, brightness, valid, consistent
+    )
     unlike = statistics.leveled(brightness) - soft
     alike = likeness(unlike) if sees_luma else torch.ones_like(unlike)
     if bands == 1:  # which may be unlike alpha
@@ -290,14 +292,14 @@ def _colours_of_bands(
         Bands, weight, likeness and statistics, as of `transferred_bands`.
     """
     values, valid = at_matches(beta.image, beta.field.straight, matches.disparity)
-    brightness, soft = mix.of(values), matches.comparison.whole.softened(alpha)
+    brightness, soft = mix.combined(values), matches.comparison.whole.softened(alpha)
     gain = mix.gain[:, None, None, None].to(alpha)
     beyond = (alpha - soft) + gain * (soft - brightness)
     rises = mix.rises(values)
     slope = rises + local_slope(values - rises * brightness, brightness)
     colours = values + slope * SETTINGS.detail(beyond) - alpha
     consistent = is_consistent(matches.facts)
-    statistics = statistics or MatchStatistics.of(
+    statistics = statistics or MatchStatistics.from_values(
         alpha, soft, values, brightness, brightness, valid, consistent
     )
     alike = likeness(brightness - soft)

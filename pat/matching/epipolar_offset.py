@@ -118,7 +118,7 @@ def fit_misalignment(
         The misalignment; none for too little texture, or if it explains the images hardly better.
     """
     arrays = (t.detach().cpu().float().numpy() for t in (alpha, beta, position, normal, weight))
-    views = _Windows.of(*arrays)
+    views = _Windows.from_arrays(*arrays)
     height, width = alpha.shape
     coefficients = np.zeros(3)
     for _ in range(SETTINGS.steps):
@@ -147,7 +147,9 @@ class _Windows(NamedTuple):
     design: Image
 
     @classmethod
-    def of(cls, alpha: Image, beta: Image, position: Image, normal: Image, weight: Image) -> _Windows:
+    def from_arrays(
+        cls, alpha: Image, beta: Image, position: Image, normal: Image, weight: Image
+    ) -> _Windows:
         height, width = alpha.shape
         y, x = np.mgrid[:height, :width].astype(np.float32)
         design = np.stack([np.ones_like(x), (x + 0.5) / width - 0.5, (y + 0.5 - height / 2) / width])

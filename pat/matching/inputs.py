@@ -81,7 +81,7 @@ class Inputs:
     sees_luma: bool = True
 
     @classmethod
-    def of(cls, alpha: Tensor, images: Sequence[Tensor], fields: Sequence[FieldOnGrid]) -> Inputs:
+    def from_images(cls, alpha: Tensor, images: Sequence[Tensor], fields: Sequence[FieldOnGrid]) -> Inputs:
         """Return inputs of alpha with each beta's image and field, in order."""
         return cls(alpha, tuple(Beta(image, field) for image, field in zip(images, fields, strict=True)))
 

@@ -98,7 +98,7 @@ def located_in_one(inputs: Inputs) -> BetaMatches:
     Returns:
         The matches.
     """
-    comparison = Comparison.of(inputs.alpha, inputs.betas[0].image, seen_mix(inputs))
+    comparison = Comparison.from_images(inputs.alpha, inputs.betas[0].image, seen_mix(inputs))
     halves = comparison.half_views(inputs.alpha, inputs.betas[0].image)
     half = matched_at_half_size(halves, inputs.betas[0].field.of_blocks(FINE))
 
@@ -146,7 +146,7 @@ def coarse_mix(
         The combination.
     """
     coarse_alpha, bands = avg_pool2d(alpha, factor), avg_pool2d(beta, factor)
-    comparison = Comparison.of(coarse_alpha, bands, SpectralMix.equal(bands))
+    comparison = Comparison.from_images(coarse_alpha, bands, SpectralMix.equal(bands))
     half = matched_at_half_size(comparison.half_views(coarse_alpha, bands), reduced(blocks, factor))
     values, valid = at_matches(bands, reduced(segments, factor), half.disparity)
     return SpectralMix.fitted(

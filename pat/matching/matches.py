@@ -16,7 +16,7 @@ from arraygeom.sampling import on_image
 
 from .inputs import Inputs
 from .normalisation import Comparison
-from .positions import FINE, enlarged, matches
+from .positions import FINE, enlarged, match_positions
 from .semi_global import CONSISTENT
 
 
@@ -128,7 +128,7 @@ class BetaMatches:
         Returns:
             Positions in beta's pixels, and a mask of those on it.
         """
-        where = matches(segments, self.surface, beyond_edge=True)
+        where = match_positions(segments, self.surface, beyond_edge=True)
         return where, segments.valid & on_image(where, hw)
 
     def check(self, inputs: Inputs) -> None:

@@ -80,7 +80,7 @@ class Ambiguity(NamedTuple):
     scale: float
     plane: tuple[float, float, float]
 
-    def of(self, track: Track, x: Float[Tensor, "*n 2"]) -> Track:
+    def applied(self, track: Track, x: Float[Tensor, "*n 2"]) -> Track:
         """Return a beta's tracks as functions of the other's inverse depth, of alpha's pixels `x`."""
         px, py, p = self.plane
         return Track(track.a + (px * x[..., :1] + py * x[..., 1:] + p) * track.b, self.scale * track.b)
@@ -110,7 +110,7 @@ class MatchedBeta:
     hw: tuple[int, int]
 
     @classmethod
-    def of(
+    def from_matches(
         cls, beta: Beta, matches: BetaMatches, rows: tuple[int, int], ambiguity: Ambiguity = NO_AMBIGUITY
     ) -> MatchedBeta:
         """Read a beta with a track and its own matches, at some rows of alpha: from an even to an
@@ -128,14 +128,14 @@ class MatchedBeta:
             assert matches.certainty is not None
             weight, disparity = enlarged(matches.certainty[0, :1, half])[0], matches.chosen
         segments = Segments(start, end, pixels.valid[0, top:bottom])
-        track = beta.track(x) if ambiguity == NO_AMBIGUITY else ambiguity.of(beta.track(x), x)
+        track = beta.track(x) if ambiguity == NO_AMBIGUITY else ambiguity.applied(beta.track(x), x)
         disparity = disparity[0, 0, top:bottom].to(end)
         return cls(segments, track, disparity, facts.to(end), weight.to(end), size)
 
     @cached_property
     def extent(self) -> Extent:
         """Lengths and directions of the segments."""
-        return Extent.of(self.segments)
+        return Extent.from_segments(self.segments)
 
     @cached_property
     def _end(self) -> Float[Tensor, "h w"]:
@@ -172,11 +172,11 @@ class MatchedBeta:
         """
         return self.disparity.new_zeros(math.prod(-(-n // FINE) for n in self.hw) + 1)
 
-    def enter(self, inverse_depth: Float[Tensor, "h w"], buffer: Float[Tensor, " n"]) -> None:
+    def splat(self, inverse_depth: Float[Tensor, "h w"], buffer: Float[Tensor, " n"]) -> None:
         """Enter points into a depth buffer, in place."""
         buffer.scatter_reduce_(0, self._index(inverse_depth).flatten(), inverse_depth.flatten(), "amax")
 
-    def hidden(
+    def distance_from_front(
         self, inverse_depth: Float[Tensor, "h w"], buffer: Float[Tensor, " n"]
     ) -> Float[Tensor, "h w"]:
         """Return the distance in pixels of the nearest point at the same pixel of beta; infinite off the
@@ -207,7 +207,7 @@ class Agreement(NamedTuple):
     facts: Tensor
 
     @classmethod
-    def of(cls, views: Sequence[MatchedBeta], like: Tensor) -> Agreement:
+    def from_views(cls, views: Sequence[MatchedBeta], like: Tensor) -> Agreement:
         """Compute the inverse depth with most support, in the type of `like`."""
         proposals = [view.inverse_depth for view in views]
         weights = torch.stack([valid * view.weight for view, (_, valid) in zip(views, proposals)])
@@ -239,7 +239,7 @@ def agreed(inputs: Inputs, matches: Matches) -> Matches:
 
     def views(of_betas: Sequence[BetaMatches]) -> list[Callable[[tuple[int, int]], MatchedBeta]]:
         given = zip(inputs.betas, of_betas)
-        return [partial(MatchedBeta.of, *one, ambiguity=same) for one, same in zip(given, between)]
+        return [partial(MatchedBeta.from_matches, *one, ambiguity=same) for one, same in zip(given, between)]
 
     betas = _of_all(inputs, views(of_betas), of_betas)
     if all(one.chosen is not None for one in matches.betas):
@@ -286,7 +286,7 @@ def _of_all(
     alpha."""
     height, width = inputs.hw
     strips = spans(height, max(STRIP // width // FINE, 1) * FINE)
-    parts = [Agreement.of([at(rows) for at in views], inputs.alpha) for rows in strips]
+    parts = [Agreement.from_views([at(rows) for at in views], inputs.alpha) for rows in strips]
     agreement = _dense(Agreement(*(torch.cat(planes, 1) for planes in zip(*parts))), inputs)
     del parts
     return (_of_beta(at, agreement, strips, one) for at, one in zip(views, initial))
@@ -300,7 +300,7 @@ def ambiguities(inputs: Inputs, of_betas: Sequence[BetaMatches]) -> list[Ambigui
     """
     step = max(inputs.hw[0] // SETTINGS.sampled_rows // FINE, 1) * FINE
     rows = [(top, top + FINE) for top in range(0, inputs.hw[0], step)]
-    sampled = [_Sampled.of(inputs.betas[i], of_betas[i], rows) for i in range(len(of_betas))]
+    sampled = [_Sampled.from_matches(inputs.betas[i], of_betas[i], rows) for i in range(len(of_betas))]
     reference = max(sampled, key=lambda one: float((one.known * one.pixels_per_w).sum()))
     columns = torch.arange(0, inputs.hw[1], SETTINGS.sampled_columns).to(reference.w)
     sampled_rows = reference.w.new_tensor([row for pair in rows for row in range(*pair)])
@@ -320,10 +320,10 @@ class _Sampled(NamedTuple):
     pixels_per_w: Tensor
 
     @classmethod
-    def of(cls, beta: Beta, matches: BetaMatches, rows: Sequence[tuple[int, int]]) -> _Sampled:
+    def from_matches(cls, beta: Beta, matches: BetaMatches, rows: Sequence[tuple[int, int]]) -> _Sampled:
         parts = []
         for pair in rows:
-            view = MatchedBeta.of(beta, matches, pair)
+            view = MatchedBeta.from_matches(beta, matches, pair)
             w, valid = view.inverse_depth
             little = 1e-3 * w + 1e-9
             rise = (view.disparity_of(w + little) - view.disparity_of(w)).abs() / little
@@ -403,14 +403,14 @@ def _of_beta(
     """Return the matches of the beta whose rows `view_of` returns."""
     buffer = view_of(strips[0]).depth_buffer()
     for top, bottom in strips:
-        view_of((top, bottom)).enter(agreement.inverse_depth[0, top:bottom].to(buffer), buffer)
+        view_of((top, bottom)).splat(agreement.inverse_depth[0, top:bottom].to(buffer), buffer)
     disparity, facts = torch.empty_like(initial.disparity), torch.empty_like(initial.facts)
     for top, bottom in strips:
         view, half = view_of((top, bottom)), slice(top // FINE, bottom // FINE)
         inverse_depth = agreement.inverse_depth[0, top:bottom].to(buffer)
         there = view.disparity_of(inverse_depth).clamp(min=0)
         disparity[0, 0, top:bottom] = there.minimum(view.extent.length)
-        unlike = (view.hidden(inverse_depth, buffer) / (FINE * SETTINGS.farthest)).clamp(0, 1)
+        unlike = (view.distance_from_front(inverse_depth, buffer) / (FINE * SETTINGS.farthest)).clamp(0, 1)
         unlike = torch.where(agreement.known[0, top:bottom], unlike, 1.0)
         facts[0, :1, half] = avg_pool2d(unlike[None], FINE)
         facts[0, 1:, half] = agreement.facts[:, half]

@@ -136,7 +136,7 @@ class Normalisation(NamedTuple):
     blurs: tuple[list[float], list[float]]
 
     @classmethod
-    def of(cls, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b 1 hb wb"]) -> Normalisation:
+    def from_images(cls, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b 1 hb wb"]) -> Normalisation:
         """Estimate the normalisation that makes means and standard deviations equal, and then the
         sharpness."""
         measured, wanted = moments(beta), moments(alpha)
@@ -214,13 +214,13 @@ class Comparison(NamedTuple):
     half: Normalisation
 
     @classmethod
-    def of(
+    def from_images(
         cls, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b c hb wb"], mix: SpectralMix | None = None
     ) -> Comparison:
         """Estimate the comparison of whole images of even sides, by this mix."""
         other = combined_bands(beta, mix)
-        half = Normalisation.of(avg_pool2d(alpha, 2), avg_pool2d(other, 2))
-        return cls(mix, Normalisation.of(alpha, other), half)
+        half = Normalisation.from_images(avg_pool2d(alpha, 2), avg_pool2d(other, 2))
+        return cls(mix, Normalisation.from_images(alpha, other), half)
 
     def combined(self, beta: Float[Tensor, "b c hb wb"]) -> Float[Tensor, "b 1 hb wb"]:
         """Return the combination of beta's bands, or of a part of it."""
@@ -240,5 +240,5 @@ def combined_bands(
 ) -> Float[Tensor, "b 1 h w"]:
     """Combine the bands by a mix; without one return Rec. 601 luma of three bands, the mean of others."""
     if mix is not None:
-        return mix.of(beta)
+        return mix.combined(beta)
     return luminance(beta) if beta.shape[1] == 3 else beta.mean(1, keepdim=True)

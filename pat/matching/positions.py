@@ -28,7 +28,7 @@ class Extent(NamedTuple):
     towards: Tensor
 
     @classmethod
-    def of(cls, segments: Segments) -> Extent:
+    def from_segments(cls, segments: Segments) -> Extent:
         """Compute the lengths and directions of segments."""
         length = segments.length
         return cls(length, (segments.start - segments.end) / torch.where(length > 0, length, 1.0)[..., None])
@@ -40,7 +40,7 @@ def reduced(segments: Segments, factor: int) -> Segments:
     return Segments(start, end, segments.valid)
 
 
-def matches(
+def match_positions(
     segments: Segments,
     disparity: Float[Tensor, "b 1 _ _"],
     *,
@@ -55,7 +55,7 @@ def matches(
         beyond_edge: True to allow positions beyond the segments' near ends.
         extent: extent of the segments; None to compute it.
     """
-    length, towards = extent or Extent.of(segments)
+    length, towards = extent or Extent.from_segments(segments)
     if disparity.shape[-2:] != length.shape[-2:]:
         disparity = interpolate(disparity, scale_factor=FINE, mode="bilinear")
     far = disparity[:, 0].to(length).clamp(min=0)
@@ -74,7 +74,10 @@ def at_matches(
         Bands at alpha's pixels, and a mask of the matches that are on beta. Matches of invalid segments are
         nowhere, and their bands mean nothing.
     """
-    hw, middle = (beta.shape[-2], beta.shape[-1]), matches(segments, disparity, extent=extent).to(beta)
+    hw, middle = (
+        (beta.shape[-2], beta.shape[-1]),
+        match_positions(segments, disparity, extent=extent).to(beta),
+    )
     position = middle.reshape(len(beta), -1, 2)
     inside = position.clamp(min=0).minimum(position.new_tensor([hw[1] - 1, hw[0] - 1]))
     values = sample(beta, inside, interpolation="bicubic").values
@@ -85,7 +88,7 @@ def at_matches(
 
 def normals(segments: Segments) -> Float[Tensor, "*n 2"]:
     """Compute unit vectors across the segments; zero where a segment is a point."""
-    direction = Extent.of(segments).towards
+    direction = Extent.from_segments(segments).towards
     return torch.stack([-direction[..., 1], direction[..., 0]], -1)
 
 

@@ -224,7 +224,7 @@ def fit(
     if int(unclipped.sum()) < fewest:
         return Response.rec601()
     points = _Points(x[:, unclipped], y[unclipped], place[unclipped])
-    groups = _Groups.of(*points)
+    groups = _Groups.from_points(*points)
     luma, any_weights = (groups.most_probable(kinds) for kinds in (LUMA, KINDS))
     response = points.held(luma, any_weights)
     explained = max(luma.explained, any_weights.explained)
@@ -396,7 +396,7 @@ class _Groups(NamedTuple):
     spread: Float[Tensor, "n n"]
 
     @classmethod
-    def of(cls, x: Tensor, y: Tensor, where: Tensor) -> _Groups:
+    def from_points(cls, x: Tensor, y: Tensor, where: Tensor) -> _Groups:
         """Group points. Points are wrong if no smooth function of colour and place explains them."""
         grey, least = x.mean(0), SETTINGS.least
         design = torch.cat([x, x * grey, x * grey.square(), _shading_terms(where) * grey])

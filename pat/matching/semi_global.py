@@ -143,7 +143,7 @@ def geometry_of(segments: Segments, batch: int, hw: tuple[int, int], factor: int
     Returns:
         Arrays for each of the batch.
     """
-    length, towards = Extent.of(segments)
+    length, towards = Extent.from_segments(segments)
     last = segments.start.new_tensor([hw[1] - 1, hw[0] - 1])
     at_edge = (segments.start < -SLACK) | (segments.start > last + SLACK)
     cut = segments.valid & at_edge.any(-1)

@@ -84,7 +84,7 @@ class SpectralMix(NamedTuple):
         parts = [_mix(*tensors) for tensors in zip(bands.double(), alpha.double(), weight.double())]
         return cls(*(torch.stack(tensors) for tensors in zip(*parts)))
 
-    def of(self, bands: Float[Tensor, "b c h w"]) -> Float[Tensor, "b 1 h w"]:
+    def combined(self, bands: Float[Tensor, "b c h w"]) -> Float[Tensor, "b 1 h w"]:
         """Return the combination of these bands."""
         products = self.weights[:, :, None, None] * bands.double()
         total = products.sort(1).values.sum(1, keepdim=True) + self.offset[:, None, None, None]
@@ -100,7 +100,7 @@ class SpectralMix(NamedTuple):
         """Return the bands corrected so that their combination is nearer to alpha, as far as it
         is reliable."""
         step = self.gain[:, None, None, None].to(bands) * self.rises(bands)
-        return bands + step * (alpha - self.of(bands))
+        return bands + step * (alpha - self.combined(bands))
 
 
 def _mix(bands: Tensor, alpha: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -24,7 +24,7 @@ from .filters import box_mean, numpy_of
 from .inputs import Inputs
 from .matches import Matches
 from .normalisation import ComparedViews
-from .positions import FINE, Extent, at_matches, matches
+from .positions import FINE, Extent, at_matches, match_positions
 from .semi_global import CONSISTENT, SemiGlobalSettings, Windows, geometry_of, matched_by_labels
 from .surfaces import Plane, Planes
 
@@ -168,13 +168,13 @@ def _compared(
     beta there."""
     across, down = (torch.gradient(beta, dim=side)[0] for side in (3, 2))
     still = Segments(segments.start.detach(), segments.end.detach(), segments.valid)
-    extent = Extent.of(segments)
+    extent = Extent.from_segments(segments)
     fixed = Extent(*(tensor.detach() for tensor in extent))
     there = at_matches(torch.cat([beta, across, down], 1), still, disparity, fixed)[0]
     sampled, across, down = there.split(1, 1)
     if segments.end.requires_grad or segments.start.requires_grad:
         # Along these slopes: those of bicubic sampling itself are half as much again at whole pixels.
-        x, y = matches(segments, disparity, extent=extent).to(beta)[:, None].unbind(-1)
+        x, y = match_positions(segments, disparity, extent=extent).to(beta)[:, None].unbind(-1)
         sampled = sampled + across.detach() * (x - x.detach()) + down.detach() * (y - y.detach())
     towards = fixed.towards.movedim(-1, 1).to(beta)
     return across * towards[:, :1] + down * towards[:, 1:], alpha - sampled

@@ -151,7 +151,7 @@ class _BlockCentres:
 def _labels(alpha: Tensor, guide: Tensor, grid: _BlockCentres, *, ordered: bool) -> NDArray:
     """Compute the label of each block of alpha."""
     half_alpha, half_guide = avg_pool2d(alpha, FINE), avg_pool2d(guide, FINE)
-    views = Normalisation.of(half_alpha, half_guide).views(half_alpha, half_guide)
+    views = Normalisation.from_images(half_alpha, half_guide).views(half_alpha, half_guide)
     a, b = (numpy_of(p[0, 0]) for p in views[:2])
     planes, other_planes = planes_of(a), flat(planes_of(b))
     label, margin = np.zeros((2, *a.shape), np.float32)

@@ -3,7 +3,7 @@
 Blocks of 8 x 8 pixels are stacked with the most similar ones near them. A cosine transform of each and a
 Hadamard transform over the stack gather their common content in few coefficients, and noise spreads over all
 of them. Coefficients are weighted by their strength in an earlier estimate (Wiener's filter). Another
-camera's recording of the same points is added likewise (`seen_by_another`).
+camera's recording of the same points is added likewise (`other_camera_update`).
 """
 
 from __future__ import annotations
@@ -140,7 +140,7 @@ class Observation(NamedTuple):
     confidence: Tensor
 
 
-def seen_by_another(
+def other_camera_update(
     estimate: Float[Tensor, "1 h w"],
     recorded: Float[Tensor, "1 h w"],
     deviation: Float[Tensor, "1 h w"],
@@ -316,7 +316,7 @@ def mean_of_group(plane, y0, x0, alike):
 
 
 @compiled(inline="always")
-def put_back(group, counts, y0, x0, alike, window, out):
+def accumulate(group, counts, y0, x0, alike, window, out):
     """Add to `out` (2, rows, w) a group's blocks with a weight, and the weights."""
     for n in range(ALIKE):
         y, x = y0 + alike[n, 0], x0 + alike[n, 1]
@@ -353,7 +353,7 @@ def filter_groups(image, expected, variance, top, alike, cosines, window, out):
                 group_transform(group)
                 block_transform(group, spare, back)
                 counts = 1 / ((noise + np.float32(1e-8)) * total)
-                put_back(group, counts, y0 - STEP * top, x0, alike[r, k], window, out[:, c])
+                accumulate(group, counts, y0 - STEP * top, x0, alike[r, k], window, out[:, c])
 
 
 @compiled(nogil=True, cache=True, fastmath=True)
@@ -385,4 +385,4 @@ def update_groups(
                     total += gain * gain
             group_transform(group)
             block_transform(group, spare, back)
-            put_back(group, 1 / total, y0 - STEP * top, x0, alike[r, k], window, out[:, 0])
+            accumulate(group, 1 / total, y0 - STEP * top, x0, alike[r, k], window, out[:, 0])

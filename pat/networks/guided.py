@@ -19,8 +19,7 @@ from arraygeom.sampling import on_image
 from ..matching.colour_transfer import LEAST
 from ..matching.inputs import Inputs
 from ..matching.matches import BetaMatches, Colours, Matches
-from ..matching.positions import at_matches
-from ..matching.positions import matches as positions_of
+from ..matching.positions import at_matches, match_positions
 from ..media.colour import luminance
 from ..support.blocks import enlarge
 from .configs import GuidedPATConfig
@@ -181,8 +180,8 @@ def _output_of(
     position, deviation, confidence = [], [], []
     for beta, matched in zip(inputs.betas, matches.betas):
         segments = beta.field.straight
-        position.append(positions_of(segments, matched.surface, beyond_edge=True).movedim(-1, 1))
-        within = positions_of(segments, matched.surface)
+        position.append(match_positions(segments, matched.surface, beyond_edge=True).movedim(-1, 1))
+        within = match_positions(segments, matched.surface)
         seen = segments.valid & on_image(within, (beta.image.shape[-2], beta.image.shape[-1]))
         confidence.append(matched.confidence[:, 0].to(image) * seen)
         deviation.append(torch.ones_like(confidence[-1]))

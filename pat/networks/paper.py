@@ -85,7 +85,7 @@ class PAT(nn.Module):
         """
         if len(inputs.betas) != self.config.betas:
             asked = f"this PAT is made for {self.config.betas} betas, got {len(inputs.betas)}"
-            raise ValueError(f"{asked}: give as many cameras beside alpha, or other --network")
+            raise ValueError(f"{asked}: give as many cameras beside alpha, or another network")
         alpha_features = self.features(self._channels(inputs.alpha))
         beta_features = [self.features(self._channels(beta.image)) for beta in inputs.betas]
         compared = self.engine.compare(alpha_features, beta_features, [beta.field for beta in inputs.betas])

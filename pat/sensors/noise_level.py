@@ -57,7 +57,7 @@ class NoiseLevel:
                 raise ValueError(f"noise: {name} must be 0 or more, got {getattr(self, name)}")
 
     @classmethod
-    def of_electrons(cls, electrons: float, read: float = 0.0, added_to: AddedTo = "light") -> NoiseLevel:
+    def from_electrons(cls, electrons: float, read: float = 0.0, added_to: AddedTo = "light") -> NoiseLevel:
         """Make the noise model of a camera that counts `electrons` at white.
 
         Args:

@@ -15,6 +15,8 @@ from threading import Event, Thread
 
 M_TRIM_THRESHOLD, M_MMAP_MAX, M_ARENA_MAX = -1, -4, -8
 """Options of glibc's mallopt (malloc.h)."""
+LEAST = 2.0**20
+"""Bytes below which a limit is a slip of the unit."""
 NEAR = 0.94
 """Share of a limit above which freed memory is returned to the system."""
 EVERY = 0.005
@@ -26,10 +28,10 @@ def parse_bytes(amount: float | str) -> float:
     (1024s).
 
     Returns:
-        Bytes; negative and infinite amounts are not refused.
+        Bytes; infinite amounts are not refused.
 
     Raises:
-        ValueError: for any other text, and NaN.
+        ValueError: for any other text, NaN, and less than any process takes.
     """
     units = {"B": 1, "KB": 1e3, "MB": 1e6, "GB": 1e9, "KIB": 2**10, "MIB": 2**20, "GIB": 2**30}
     text = str(amount)
@@ -39,8 +41,11 @@ def parse_bytes(amount: float | str) -> float:
         size = float(number) * units[unit]
     except (KeyError, ValueError):
         size = math.nan
-    if math.isnan(size):
-        raise ValueError(f"max_memory is '{amount}'; wanted bytes, or like 4GiB or 500MB")
+    if not size >= LEAST:
+        meant = f": is {number}GiB meant?" if 0 < size < LEAST and unit == "B" else ""
+        raise ValueError(
+            f"max_memory: '{amount}' is no memory for a process: give bytes, as 4GiB or 500MB{meant}"
+        )
     return size
 
 

@@ -222,7 +222,7 @@ def test_fields_are_asked_where_the_numbers_of_a_link_are():
         return Segments(zero, zero, zero[..., 0] == 0)
 
     pair = Pair(View(hw=(8, 8)), View(hw=(8, 8)), link=Link(torch.eye(3), torch.eye(3)).to("meta"))
-    FieldOnGrid.of(field, pair)
+    FieldOnGrid.from_field(field, pair)
     lazily(field, pair)(pixel_grid((8, 8)).reshape(-1, 2))
     assert set(asked) == {"meta"}
 
@@ -234,7 +234,7 @@ def test_ends_that_are_not_finite_are_not_on_a_grid():
         end = torch.where(x[..., :1] < 4, x, torch.nan)
         return Segments(end - 1, end, (x[..., 0] < 4) | (x[..., 1] < 2))
 
-    found = FieldOnGrid.of(field, Pair(View(hw=(8, 8)), View(hw=(8, 8)))).straight
+    found = FieldOnGrid.from_field(field, Pair(View(hw=(8, 8)), View(hw=(8, 8)))).straight
     assert found.start.isfinite().all()
     assert found.end.isfinite().all()
     assert torch.equal(found.valid[0], pixel_grid((8, 8))[..., 0] < 4)
@@ -247,7 +247,7 @@ def test_segments_far_beyond_the_image_are_clipped_to_it():
     def field(pair, x):
         return Segments(x - x.new_tensor([1e9, 0]), x, x[..., 0] < 6)
 
-    on_grid = FieldOnGrid.of(field, Pair(View(hw=(8, 8)), View(hw=(9, 16))))
+    on_grid = FieldOnGrid.from_field(field, Pair(View(hw=(8, 8)), View(hw=(9, 16))))
     assert on_grid.samples == 6
     for segments in (on_grid.straight, on_grid.at(torch.zeros(1, 2))):
         assert float(segments.start.min()) == pytest.approx(-0.5, abs=1e-6)

@@ -14,6 +14,7 @@ import torch
 
 from arraygeom import Camera, LensView, Link, Pose, Rig, View, intrinsics
 from arraygeom.distortion import Distortion
+from arraygeom.fields import default_field
 from arraygeom.io import READERS, WRITERS, RigFileError, read_rig, recognise, write_rig
 from arraygeom.pose import rotation_from_vector
 from arraygeom.sensor import Sensor
@@ -403,6 +404,24 @@ def test_an_image_upside_down_survives_the_native_file(tmp_path):
     rig = Rig({"a": Camera(K=K, cam_from_world=Pose.identity(), hw=(240, 320))}).rot90("a", 2)
     rig.save(tmp_path / "rig.yaml")
     assert torch.equal(Rig.load(tmp_path / "rig.yaml")["a"].K, rig["a"].K)
+
+
+def test_images_that_a_homography_registers_are_a_rig(tmp_path):
+    """A link of H alone was refused; two cameras at one place are nothing else."""
+    H = "H: [[1, 0, 5], [0, 1, 3], [0, 0, 1]]"
+    (tmp_path / "rig.yaml").write_text(
+        f"cameras: {{a: {{size: [64, 48]}}, b: {{size: [64, 48]}}}}\nlinks: [{{alpha: a, beta: b, {H}}}]\n"
+    )
+    rig = Rig.load(tmp_path / "rig.yaml")
+    rig.save(tmp_path / "again.yaml")
+    assert "F:" not in (tmp_path / "again.yaml").read_text()
+    for pair in (rig.pair("a", "b"), Rig.load(tmp_path / "again.yaml").pair("a", "b")):
+        assert pair.at_one_place
+        segments = default_field(pair)(pair, torch.tensor([[20.0, 20.0]]))
+        assert segments.start.tolist() == segments.end.tolist() == [[25.0, 23.0]]
+    one = Camera(K=intrinsics(50.0, (48, 64)), cam_from_world=Pose.identity(), hw=(48, 64))
+    pair = Rig({"a": one, "b": one}).pair("a", "b")
+    assert default_field(pair)(pair, torch.tensor([[20.0, 20.0]])).start.tolist() == [[20.0, 20.0]]
 
 
 def test_links_name_cameras_that_are_numbers(tmp_path):

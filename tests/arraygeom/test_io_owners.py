@@ -1,6 +1,7 @@
 """Rig files as their owners have them: other spellings, other makers, no lens or size stated."""
 
 import json
+import math
 import warnings
 from pathlib import Path
 
@@ -415,6 +416,9 @@ def test_a_lens_that_ends_within_its_image_is_said(tmp_path):
     (summary,) = summarise_cameras(rig)
     assert (summary.lens, summary.coefficients) == ("brown-conrady", tuple(POLE))
     assert summary.covered == pytest.approx(0.83, abs=0.01)
+    across, down = summary.field_of_view
+    assert across == pytest.approx(73, abs=1.5), "to the pole, which no number said"
+    assert down == pytest.approx(2 * math.degrees(math.atan(400 / 808)), abs=1)
 
 
 def test_a_lens_fitted_anew_has_no_pole():

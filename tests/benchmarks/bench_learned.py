@@ -157,7 +157,7 @@ def over(found: Sequence[tuple[tuple[float, ...], tuple[Tensor, Tensor]]]) -> li
     """The `COLUMNS` over frames; certainty over the pixels of all."""
     shares, pixels = zip(*found)
     stated, right = map(torch.cat, zip(*pixels))
-    error = Reliability.of(stated, right).error
+    error = Reliability.from_samples(stated, right).error
     return [*np.mean(shares, 0).tolist(), error, float(right.double().mean()), float(stated.double().mean())]
 
 

@@ -65,10 +65,10 @@ def main(steps: int = 3, profile: bool = False, write: bool = False) -> None:
     index = (y.reshape(-1, 1) * HW[1] + torch.arange(POSITIONS)) + 0 * x.reshape(-1, 1)
     xy = torch.stack([index % HW[1], index // HW[1]], -1).float()
     lists = FieldOnGrid(lambda p: _listed(xy, p), POSITIONS, None)
-    rows = FieldOnGrid.of(Rectified(), Pair(View(hw=HW), View(hw=HW)))
+    rows = FieldOnGrid.from_field(Rectified(), Pair(View(hw=HW), View(hw=HW)))
 
     def ours(field: FieldOnGrid) -> Callable[[Tensor, Tensor], Tensor]:
-        return lambda alpha, beta: network(Inputs.of(alpha, [beta], [field])).image
+        return lambda alpha, beta: network(Inputs.from_images(alpha, [beta], [field])).image
 
     ways = {
         "gathered, as the authors": lambda alpha, beta: gathered(network, alpha, beta, index),

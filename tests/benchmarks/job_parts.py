@@ -19,7 +19,7 @@ from typing import Any
 STAGES = {
     "read": ["pat.media.images.read_image", "pat.app.cli.options.load_rig"],
     "views": ["pat.fusion.fuse.prepared"],
-    "field": ["arraygeom.fields.grid.FieldOnGrid.of"],
+    "field": ["arraygeom.fields.grid.FieldOnGrid.from_field"],
     "plan": ["pat.fusion.fuse.plan_frame"],
     "pre-pass": ["pat.fusion.fuse.find_corrections"],
     "matching": [f"pat.matching.match.{name}" for name in ("located_in_one", "agreed", "transferred")],

@@ -71,7 +71,7 @@ def test_conditions_are_summed_up_for_themselves():
 
 
 def test_error_of_calibration_is_that_of_the_definition():
-    found = Reliability.of(
+    found = Reliability.from_samples(
         torch.tensor([0.1, 0.1, 0.9, 0.9]), torch.tensor([True, False, True, True]), bins=2
     )
     assert found.stated.tolist() == pytest.approx([0.1, 0.9])

@@ -92,9 +92,9 @@ def test_a_network_of_several_betas_gets_a_band_each(pair):
     case = next(rectified_cases([pair]))
     alpha, beta = case.scene.images[ALPHA], case.scene.images[BETA]
     found = fused(four, case.pair, alpha, beta, Epipolar())
-    on_grid = FieldOnGrid.of(Epipolar(), case.pair)
+    on_grid = FieldOnGrid.from_field(Epipolar(), case.pair)
     wanted, compared = four.compare(
-        Inputs.of(alpha[None], [band[None, None] for band in beta], [on_grid] * 3)
+        Inputs.from_images(alpha[None], [band[None, None] for band in beta], [on_grid] * 3)
     )
     torch.testing.assert_close(found.image, wanted.image[0])
     assert found.peak.shape == (3, *HW, 2)

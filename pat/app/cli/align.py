@@ -8,9 +8,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
+from ...media.suffixes import IMAGE_SUFFIXES
 from . import options
 from .fusing import files_by_camera, named_images
-from .known import Around, Known
+from .known import Around
 from .options import Out, say
 from .parser import Option, UsageError
 
@@ -26,15 +27,17 @@ EXTRAS = "page", "npy", "tif", "separate", "none"
 
 
 @dataclass
-class Align(Around, Known):
+class Align(Around):
     """Align an array's images: every camera's own values at the pixels of one, with masks; no fused image.
 
     Examples:
         pat align IMG_0000_*.TIF
+        pat align flight/
         pat align rig.yaml --alpha mono --image mono=a.png --image nir=b.tif --depth 2 20 --out out/
 
     Values keep their recorded type and bits. Without a rig it is found from the tags of the images, or from
-    the images, and written to found_rig.yaml beside the result. With folders, or quoted patterns, frames are
+    the images, and written to found_rig.yaml beside the result. A folder of a multispectral camera's captures
+    has one rig, found from several. With folders, or quoted patterns, frames are
     aligned one by one, matched by names or by the numbers or times in them.
     """
 
@@ -59,6 +62,11 @@ class Align(Around, Known):
     of alpha's pixels in each camera's image, as npy or tif; none. And separate: a file of each camera,
     NAME.tif, instead of one of all bands."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0 <= self.confidence <= 1:
+            raise UsageError("--confidence", "a number from 0 to 1", f"{self.confidence:g}")
+
     def run(self) -> None:
         """Align one frame or several, with the given rig or one found from the images.
 
@@ -66,15 +74,28 @@ class Align(Around, Known):
             UsageError: for invalid options.
             ValueError: for images or a rig that cannot be used.
         """
-        image, with_rig = named_images(self.given, self.image, "align")
+        flight = self._flight()
+        image, with_rig = ((), False) if flight else named_images(self.given, self.image, "align")
         options.writable(self.out, folder=True)
         self.settings()
         extras = self._extras = {*self.extras.split(",")}
         if unknown := extras - {*EXTRAS}:
             raise UsageError("--extras", f"some of {', '.join(EXTRAS)}", min(unknown))
         with self.judged():
-            for frame in self._frames_with_rig(image) if with_rig else self._frames_without():
+            for frame in self._frames_with_rig(image) if with_rig else self._frames_without(flight):
                 self._align(frame)
+
+    def _flight(self) -> dict[str, list[Path]]:
+        """Files of several captures, in one folder or listed, by band; empty for others."""
+        folders = [path for path in self.given if path.is_dir()]
+        listed = all(path.is_file() and path.suffix.lower() in IMAGE_SUFFIXES for path in self.given)
+        if self.image or not (len(folders) == len(self.given) == 1 or (listed and len(self.given) > 2)):
+            return {}
+        from arraygeom.io.xmp import by_capture
+
+        from ..batch import find_images
+
+        return by_capture(find_images(folders[0]) if folders else self.given)
 
     def _frames_with_rig(self, image: tuple[str, ...]) -> Iterator[_Frame]:
         """Frames of the given rig, which is checked against the first one."""
@@ -91,8 +112,8 @@ class Align(Around, Known):
                 checked_rig(views, heal=False)
             yield _Frame(views.developed, rig, views, one, alpha, name=_name_of(files, alpha, one))
 
-    def _frames_without(self) -> Iterator[_Frame]:
-        """Frames of the rig that is found from the first one."""
+    def _frames_without(self, flight: Mapping[str, list[Path]]) -> Iterator[_Frame]:
+        """Frames of the rig that is found from the first one, or from a flight's captures."""
         from ...fusion.frame_matching import matched_frames
         from ...fusion.views import ViewFiles
         from ..batch import find_images
@@ -100,11 +121,13 @@ class Align(Around, Known):
 
         if self.depth:
             raise UsageError("--depth", "a rig: give one with --rig RIG")
-        files = matched_frames({name: find_images(path) for name, path in camera_names(self.given).items()})
-        array = self.found_array(files)
+        cameras = {} if flight else camera_names(self.given)
+        files = flight or matched_frames({name: find_images(path) for name, path in cameras.items()})
+        array = self.found_array(files, flight=bool(flight))
         files = {name: files[name] for name in array.rig.names}
         for i, one in enumerate(options.by_frame(files)):
-            images = ViewFiles(array.recorded, one, alpha=array.alpha) if i else array.images
+            again = i or flight
+            images = ViewFiles(array.recorded, one, alpha=array.alpha) if again else array.images
             name = _name_of(files, array.alpha, one)
             yield _Frame(
                 array.rig,
@@ -122,7 +145,7 @@ class Align(Around, Known):
         from arraygeom.io.native import write
         from arraygeom.runtime.together import sweep, write_listed
 
-        from ...fusion.aligned_files import refuse_to_replace, save_aligned
+        from ...fusion.aligned_files import RecordedFiles, refuse_to_replace, save_aligned
         from ...fusion.results import FOUND_RIG
         from ...support.locks import folder_lock
 
@@ -144,6 +167,7 @@ class Align(Around, Known):
                 positions="tif" if "tif" in self._extras else "npy" if "npy" in self._extras else "none",
                 name=frame.name,
                 keep=frame.files.values(),
+                recorded=RecordedFiles(frame.recorded, frame.files),
                 pages={} if page is None else {"index.html": page},
             )
             if frame.rig_found:

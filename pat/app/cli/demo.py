@@ -118,7 +118,7 @@ class WarmUp:
         colour = sample.rig["colour"].replace(distortion=lens)
         rig = sample.rig.with_camera("colour", colour).with_camera("second", colour)
         images = {**sample.images, "second": sample.images["colour"]}
-        settings = FuseSettings(noise=dict.fromkeys(images, NoiseLevel.of_electrons(300)))
+        settings = FuseSettings(noise=dict.fromkeys(images, NoiseLevel.from_electrons(300)))
         fuse_frame(images, rig, alpha=ALPHA, network=load_weights("mono-colour"), settings=settings)
         folder = cache_folder(forward)
         kept = "" if folder is None else f", kept in {folder}"

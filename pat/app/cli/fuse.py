@@ -122,8 +122,8 @@ class Fuse(Around, Fusing):
                 rig, images = found.rig, found.images
             fused, along = self._fused(rig, images, frame)
             fused, gain = self._exposed(fused, found)
-            if found is None and not fused.depth.isfinite().any():
-                self.note("no depth: the rig knows its cameras by F alone, or the images match nowhere")
+            if not fused.depth.isfinite().any():
+                self.note(no_depth(rig, alpha))
             further, pages = self._options_of_saving(fused, rig, frame), {}
             if {"page", "classical"} & self._extras:
                 facts = self._facts(rig, () if found is None else found.notes, time.monotonic() - begin)
@@ -231,6 +231,17 @@ class Fuse(Around, Fusing):
             what = "dark" if gain > 1 else "overexposed"
             self.note(f"exposure: light times {gain:.2f}: the image is {what} (--exposure keep leaves it)")
         return frame._replace(image=exposed(frame.image, gain)), gain
+
+
+def no_depth(rig: Rig, alpha: str) -> str:
+    """Say why a fused frame has no depth."""
+    from arraygeom.runtime.text import OPEN
+
+    pairs = [rig.pair(alpha, name) for name in rig.betas(alpha)]
+    if rig.name == OPEN or all(pair.at_one_place for pair in pairs):
+        return "no depth: a homography registers the images (cameras at one place, or a far or flat scene)"
+    by_lines = "the rig knows its cameras by F alone" if not any(p.calibrated for p in pairs) else ""
+    return f"no depth: {by_lines or 'the images match nowhere'}"
 
 
 def fuse_with_progress(

@@ -257,7 +257,7 @@ def named_images(paths: Sequence[Path], image: Sequence[str], command: str) -> t
         FileNotFoundError: for files that do not exist.
     """
     if paths and (image or is_rig_file(paths[0])):
-        named = (*image, *(f"{path.stem}={path}" for path in paths[1:]))
+        named = (*image, *(f"{path}" if is_named(path) else f"{path.stem}={path}" for path in paths[1:]))
         if not named:
             raise ValueError(
                 f"{paths[0]}: {options.NO_IMAGE}; if it is a rig, give --image NAME=FILE for each camera"
@@ -295,7 +295,7 @@ def files_by_camera(
     if alpha is None:
         raise ValueError(f"--alpha: give the camera whose view is wanted, one of {', '.join(rig.names)}")
     files = options.files_by_name(image)
-    if unknown := [path for path in paths[1:] if path.stem not in rig.names]:
+    if unknown := [path for path in paths[1:] if path.stem not in rig.names and not is_named(path)]:
         raise ValueError(f"{unknown[0]}: no camera of the rig has its name: give --image NAME={unknown[0]}")
     files_of = {rig.require(name): find_images(path, name=name) for name, path in files.items()}
     refuse_same(files_of)
@@ -315,8 +315,15 @@ def refuse_same(files: Mapping[str, Sequence[Path]]) -> None:
             )
 
 
+def is_named(path: Path) -> bool:
+    """Return True for a NAME=FILE in a path's place, whose FILE exists and which is no file itself."""
+    _, _, file = f"{path}".partition("=")
+    return bool(file) and not path.exists() and (Path(file).exists() or any(c in file for c in "*?["))
+
+
 def is_rig_file(path: Path) -> bool:
     """Return True for a path meant as a rig: neither folder nor pattern, nor named like an image
     or a video."""
+    path = Path(f"{path}".partition("=")[2]) if is_named(path) else path
     suffixes = IMAGE_SUFFIXES | VIDEO_SUFFIXES
     return not (any(c in path.name for c in "*?[") or path.suffix.lower() in suffixes or path.is_dir())

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from ...media.suffixes import IMAGE_SUFFIXES
+from ...support.memory import parse_bytes
 from . import options
 from .options import Depth, Images, Memory, Name, say
 from .parser import Option, UsageError
@@ -26,6 +27,9 @@ MATCHES_HELP = "Matched points to use: CSV (x0,y0,x1,y1 a line, of two images in
 MatchesFile = Annotated[Path | None, Option("FILE", MATCHES_HELP)]
 
 NOISE = "NAME=ELECTRONS[,READ]|estimate|none"
+NEEDS_RIG = "a calibrated rig for a depth map: give --rig RIG and --depth NEAR FAR"
+FRAMES = 5
+"""Captures of a flight that its rig is found from."""
 OUT_OF_RANGE = 0.9
 """Share of a depth map outside the rig's depth range above which its unit must be wrong."""
 OFF_LINES = 5.0
@@ -57,6 +61,12 @@ class Known:
     A frame is by default fused so where an image shows noise plainly."""
     max_memory: Memory = None
     """Memory limit of the whole process, such as 4GiB; larger frames are done in tiles."""
+
+    def __post_init__(self) -> None:
+        try:
+            parse_bytes(self.max_memory or "inf")
+        except ValueError:
+            raise UsageError("--max-memory", "bytes, as 4GiB or 500MB", self.max_memory) from None
 
     @property
     def correct(self) -> bool:
@@ -112,8 +122,10 @@ class Known:
         *,
         weights: str | None = None,
         focal: Mapping[str, float] = {},
+        matches: Path | None = None,
+        flight: bool = False,
     ) -> ImageArray:
-        """Find the array from each camera's first image, and use its levels.
+        """Find the array from each camera's first image, or a flight's several, and use its levels.
 
         Returns:
             The array.
@@ -123,10 +135,21 @@ class Known:
         """
         from ..from_images import array_from_images
 
-        first = {name: paths[0] for name, paths in files.items()}
+        count = min(map(len, files.values()))
+        # the first frame, then others all over; of a flight, first and last ones may be of the ground
+        chosen = dict.fromkeys([count // 2 * flight, *(count * i // FRAMES for i in range(FRAMES) if flight)])
+        first, *further = ({name: paths[i] for name, paths in files.items()} for i in chosen)
         options.say_when_compiling()
         with options.working("finding the rig"):
-            array = array_from_images(first, alpha=self.alpha, weights=weights, focal=focal, say=say)
+            array = array_from_images(
+                first,
+                alpha=self.alpha,
+                weights=weights,
+                focal=focal,
+                matches=matches,
+                further=further if matches is None else (),
+                say=say,
+            )
         if weights is None:
             say(f"network: {array.weights} (--network NAME takes others)")
         self.match_levels |= array.match_levels
@@ -162,7 +185,10 @@ class KnownFile(NamedTuple):
         numbers = options.numbers_by_name(parts, "--around")
         if unknown := numbers.keys() - {"scale", "tolerance"}:
             raise UsageError("--around", "FILE[,scale=METRES][,tolerance=SHARE]", min(unknown))
-        return cls(Path(path), **numbers)
+        known = cls(Path(path), **numbers)
+        if not known.path.is_file():
+            raise UsageError("--around", "a file of matched points, or a depth map; no such file", path)
+        return known
 
     @property
     def is_depth(self) -> bool:
@@ -171,14 +197,30 @@ class KnownFile(NamedTuple):
 
 
 @dataclass
-class Around:
+class Around(Known):
     """Option for known depth or matches of one frame."""
 
-    around: Annotated[str | None, Option("FILE")] = None
+    around: Annotated[str | None, Option("FILE", also=("--matches", "--depth-map"))] = None
     """Search around what is known: a depth map of alpha's pixels (PFM, TIFF, 16-bit PNG), or matched points
-    (CSV with x0,y0,x1,y1 a line, of two images in order; a COLMAP database). For a depth map,
+    (CSV with x0,y0,x1,y1 a line, of two images in order; a COLMAP database), by which, without a rig, it is
+    found: ten of them are enough to lay one image on the other. For a depth map,
     FILE,scale=METRES says the metres of one unit (by default 1 of floats, and .001 of whole numbers),
     FILE,tolerance=SHARE by what share it may be off (by default .05; 0 takes it as it is)."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.around is not None:
+            KnownFile.parse(self.around)
+
+    def found_array(self, files: Mapping[str, Sequence[Path]], **further: Any) -> ImageArray:
+        """The array by the matches that are given, if any. Raises UsageError for a depth map."""
+        if self.around is None:
+            return super().found_array(files, **further)
+        known = KnownFile.parse(self.around)
+        if known.is_depth:
+            raise UsageError("--around", NEEDS_RIG)
+        self.around = None
+        return super().found_array(files, **further, matches=known.path)
 
     def with_known(
         self, rig: Rig, alpha: str, files: Mapping[str, str | Path], field: ReceptiveField | None
@@ -213,7 +255,7 @@ def _around_depth(known: KnownFile, rig: Rig, alpha: str) -> ReceptiveField:
 
     view = rig[alpha]
     if not isinstance(view, Camera) or rig.depth is None:
-        raise UsageError("--around", "a calibrated rig for a depth map: give --rig RIG and --depth NEAR FAR")
+        raise UsageError("--around", NEEDS_RIG)
     depth = read_depth(known.path, hw=view.hw, scale=known.scale)
     near, far = (float(bound) for bound in rig.depth)
     finite = depth[depth.isfinite()]

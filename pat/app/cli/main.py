@@ -102,6 +102,7 @@ def main(arguments: list[str] | None = None, *, group: Any = Pat, prog: str = "p
 
 def _run(arguments: list[str], group: Any, prog: str, *, debug: bool) -> None:
     """Run the command; exceptions become one line and an exit status."""
+    command = None
     try:
         with warnings.catch_warnings():
             warnings.showwarning = warn
@@ -118,7 +119,7 @@ def _run(arguments: list[str], group: Any, prog: str, *, debug: bool) -> None:
     except OSError as error:
         _fail(error, error_text(error), debug)
     except (ValueError, FloatingPointError) as error:
-        _fail(error, f"{error}", debug)
+        _fail(error, _as_option(f"{error}", command), debug)
     except ImportError as error:
         remedy = "" if "pip install" in f"{error}" else ": in a checkout, pip install '.[all]'"
         _fail(error, f"{error}{remedy}", debug)
@@ -143,6 +144,13 @@ def _with_plugins(arguments: list[str]) -> list[str]:
             rest.append(word)
     load_plugins(names)
     return rest
+
+
+def _as_option(text: str, command: Any) -> str:
+    """A message that begins with an argument of Python's, as "alpha: ...", with the command's option."""
+    name = text.partition(":")[0]
+    options = {*getattr(command, "__dataclass_fields__", {})} - {"rig", "given", "source", "target"}
+    return f"--{name.replace('_', '-')}{text[len(name) :]}" if name in options else text
 
 
 def _fail(error: BaseException, text: str, debug: bool) -> NoReturn:

@@ -100,7 +100,7 @@ def noise_of(texts: Iterable[str], *, by_default: bool = False) -> Any:
             ) from None
         if (count := 1 + len(read)) > 2:
             raise ValueError(f"--noise: '{entry}' has {count} numbers; wanted electrons at white, read noise")
-        levels.append((name, NoiseLevel.of_electrons(electrons, sum(read))))
+        levels.append((name, NoiseLevel.from_electrons(electrons, sum(read))))
     return dict(_once("--noise", levels))
 
 

@@ -45,6 +45,7 @@ class Option:
         metavar: name of its value in the help.
         help: help text; None for the field's docstring.
         short: short name, such as "-o".
+        also: further names, such as "--matches".
         positional: True for an argument without a name.
         repeat: True if the option is given once for each value.
     """
@@ -52,6 +53,7 @@ class Option:
     metavar: str | None = None
     help: str | None = None
     short: str | None = None
+    also: tuple[str, ...] = ()
     positional: bool = False
     repeat: bool = False
 
@@ -209,8 +211,8 @@ class _Entry:
         if self.option.positional:
             group.add_argument(self.name, **how, **({} if several or required else {"nargs": "?"}))
         else:
-            short = [self.option.short] if self.option.short else []
-            group.add_argument(flag, *short, required=required, **how)
+            names = (flag, *([self.option.short] if self.option.short else []), *self.option.also)
+            group.add_argument(*names, required=required, **how)
 
 
 class _Tuple(argparse.Action):

@@ -187,7 +187,7 @@ class Shard:
     def parse(cls, text: str) -> Shard:
         """Parse text such as "2/4".
 
-        >>> Shard.parse("2/4").of(10)
+        >>> Shard.parse("2/4").select(10)
         [1, 5, 9]
 
         Returns:
@@ -201,7 +201,7 @@ class Shard:
             raise ValueError(f"--shard: '{text}' is not i/n with i from 1 to n, such as 2/4")
         return cls(int(number), int(count))
 
-    def of(self, scenes: int) -> list[int]:
+    def select(self, scenes: int) -> list[int]:
         """List the scene numbers of this part among `scenes` scenes."""
         return list(range(self.number - 1, scenes, self.count))
 
@@ -244,7 +244,7 @@ def render(
             sweep(root)
         write_manifest(config, root)
         arguments = json.dumps(to_document(config)), work
-        folders = {i: root / "scenes" / f"{i:06d}" for i in shard.of(scenes)}
+        folders = {i: root / "scenes" / f"{i:06d}" for i in shard.select(scenes)}
         check_space(root, sum(not folder.exists() for folder in folders.values()), scene_bytes)
         return run_tasks(
             [

@@ -69,7 +69,7 @@ class Sample(NamedTuple):
     @property
     def inputs(self) -> Inputs:
         """Inputs of a network."""
-        return Inputs.of(self.alpha, self.betas, self.fields)
+        return Inputs.from_images(self.alpha, self.betas, self.fields)
 
 
 class Planned(NamedTuple):
@@ -291,7 +291,7 @@ def degraded(
         if two_views and _chance(recording.paper, g):
             alpha, betas[0], _ = augment(alpha, betas[0], paper_cases(), g)
         pair = pair_of(scene, i, g)
-        on_grid.append(FieldOnGrid.of(field, perturbed(pair, recording.miscalibrated, g)))
+        on_grid.append(FieldOnGrid.from_field(field, perturbed(pair, recording.miscalibrated, g)))
         where, seen = transfer(pair, scene.depth[0], scene.depth[i].masked_fill(~beta.valid, torch.nan))
         position.append(where)
         visible.append(seen)

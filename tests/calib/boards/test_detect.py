@@ -97,6 +97,40 @@ def test_a_part_of_a_charuco_board_is_enough():
     assert 8 <= len(found.ids) < len(board.points)
 
 
+def oblique(board, tilt):
+    """A view through a wide-angle lens, by ray casting, and the true corners."""
+    K, D = np.array([[574.0, 0, 629], [0, 574, 382], [0, 0, 1]]), np.array([-0.312, 0.127, 0, 0, -0.027])
+    scale, (h, w) = 40, (800, 1280)
+    sheet = cv2.copyMakeBorder(board.opencv.generateImage((31 * 40, 16 * 40)), *[40] * 4, 0, value=255)
+    R = cv2.Rodrigues(np.array([tilt, 0.0, 0.0]))[0]
+    t = np.array([0, 0, 0.75]) - R @ np.array([31, 16, 0]) * board.spacing / 2
+    pixels = (np.stack(np.meshgrid(np.arange(2 * w), np.arange(2 * h)), -1).reshape(-1, 1, 2) + 0.5) / 2 - 0.5
+    criteria = cv2.TERM_CRITERIA_COUNT, 40, 1e-9
+    rays = np.c_[cv2.undistortPointsIter(pixels, K, D, None, None, criteria)[:, 0], np.ones(len(pixels))]
+    back = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), K, D)[0][:, 0]
+    inside = np.linalg.norm(back - pixels[:, 0], axis=1) < 0.05
+    along, origin = rays @ R, -R.T @ t
+    depth = -origin[2] / along[:, 2]
+    there = (origin + depth[:, None] * along)[:, :2] / board.spacing * scale + scale - 0.5
+    there = np.where(((depth > 0) & inside)[:, None], there, -100).astype(np.float32).reshape(2 * h, 2 * w, 2)
+    fine = cv2.remap(sheet, there, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=90)
+    corners = board.opencv.getChessboardCorners().astype(np.float64)
+    x = cv2.projectPoints(corners, cv2.Rodrigues(R)[0], t, K, D)[0][:, 0]
+    return cv2.resize(fine, (w, h), interpolation=cv2.INTER_AREA), x
+
+
+def test_steep_and_wide_views_have_corners():
+    """OpenCV finds four markers in five, and drops all corners."""
+    board = parse_board("charuco:31x16:49.33mm:38.46mm:4x4_250")
+    grey, true = oblique(board, -1.05)
+    assert cv2.aruco.CharucoDetector(board.opencv).detectBoard(grey)[1] is None
+    found = detect(grey, board)
+    off = np.linalg.norm(found.x - true[found.ids], axis=1)
+    assert len(found.ids) > 150
+    assert np.median(off) < 0.03
+    assert np.quantile(off, 0.95) < 0.2
+
+
 def test_no_board_is_no_board():
     grey = np.random.default_rng(0).integers(0, 255, (240, 320)).astype(np.uint8)
     assert detect(cv2.GaussianBlur(grey, (0, 0), 3), parse_board("charuco:8x6:30mm")) is None
@@ -118,6 +152,14 @@ def test_another_board_is_named(shown, asked, words):
     board = parse_board(asked)
     assert detect(grey, board) is None
     assert words in explain([grey], board)
+
+
+def test_a_board_that_other_images_confirm_is_not_doubted():
+    grey, board = image("charuco:8x6:30mm", depth=0.09)
+    assert detect(grey, board) is None
+    assert "name" in explain([grey], board)
+    for shown in (board, parse_board("chessboard:9x6:25mm")):
+        assert not {"size", "name"} & {*explain([grey], shown, confirmed=True).replace("?", " ").split()}
 
 
 def test_causes_in_the_image_are_named():

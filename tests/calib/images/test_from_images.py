@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from arraygeom import Rig
+from arraygeom import Rig, apply_homography
 from calib.images.from_images import rig_from_images
-from calib.images.matches import PointMatches
+from calib.images.matches import PointMatches, fit_homography
 from calib.images.residuals import line_distances
 from pat.app.cli.main import main
 from pat.media.images import write_image
@@ -68,3 +68,37 @@ def test_points_in_one_spot_are_held_out_too():
     assert rig_from_images(images, matches=matches((22, 46))).distance["a", "b"] < 1
     with pytest.raises(ValueError, match="in one spot, so that none can be held out"):
         rig_from_images(images, matches=matches((22, 22)))
+
+
+TILTED = torch.tensor([[0.62, 0.01, -38], [-0.015, 0.63, -42], [-2e-5, 3e-5, 1]], dtype=torch.float64)
+"""Of a thermal camera beside one in colour."""
+
+
+def clicked(count: int, seed: int, noise: float = 1.0) -> PointMatches:
+    """Points clicked by hand in 640x480 and 320x240."""
+    generator = torch.Generator().manual_seed(seed)
+    alpha = 100 + torch.rand(count, 2, generator=generator).double() * torch.tensor([420.0, 280.0])
+    beta = apply_homography(TILTED, alpha).x
+    return PointMatches(alpha, beta + noise * torch.randn(count, 2, generator=generator))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_ten_clicked_points_are_a_homography(seed):
+    """Also with a wrong one among them; and all over the image, not only where points are."""
+    points = clicked(10, seed)
+    points.beta[3] += torch.tensor([40.0, -25.0])
+    corners = torch.tensor([[70.0, 80], [560, 80], [560, 430], [70, 430]], dtype=torch.float64)
+    off = apply_homography(fit_homography(points), corners).x - apply_homography(TILTED, corners).x
+    assert float(off.norm(dim=-1).max()) < 10
+
+
+def test_a_few_matches_register_images_that_have_nothing_in_common():
+    images = {"colour": texture(seed=1), "thermal": texture(seed=2)}
+    found = rig_from_images(images, matches={("colour", "thermal"): clicked(10, 0)}, alpha="thermal")
+    pair = found.rig.pair("thermal", "colour")
+    assert pair.at_one_place
+    x = torch.tensor([[100.0, 100.0]], dtype=torch.float64)
+    assert float((apply_homography(pair.homography, apply_homography(TILTED, x).x).x - x).norm()) < 6
+    assert "10 of 10" in found.as_text()
+    with pytest.raises(ValueError, match="3 points"):
+        rig_from_images(images, matches={("colour", "thermal"): clicked(3, 0)})

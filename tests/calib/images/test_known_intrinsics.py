@@ -7,7 +7,7 @@ import torch
 from kornia.geometry import axis_angle_to_rotation_matrix
 
 from arraygeom import Camera, Pose, Rig, intrinsics
-from calib.images.known_intrinsics import SIGMA, centres_found
+from calib.images.known_intrinsics import SIGMA, _by_turning, centres_found
 from calib.images.matches import PointMatches, line_distance
 from calib.images.refinement import refine_matches
 
@@ -66,3 +66,21 @@ def test_lengths_are_those_stated_of_cameras_that_match(lost, noise, monkeypatch
     assert lost not in found
     for name in found.names:
         assert (found[name].centre - rig[name].centre).norm() < 3e-3
+
+
+@pytest.mark.parametrize(
+    ("distance", "depth", "turned"), [(25.0, 0, False), (9e3, 0, True), (25.0, 9, False)]
+)
+def test_far_scenes_need_no_baseline(distance, depth, turned):
+    """Over far ground a baseline was found in what orientations leave open, and depths with it."""
+    torch.manual_seed(0)
+    K, hw = intrinsics(1450.0, (960, 1280)), (960, 1280)
+    known = {"a": Camera(K=K, cam_from_world=Pose.identity(), hw=hw)}
+    eye = torch.eye(3, dtype=torch.float64)
+    known["b"] = known["a"].replace(cam_from_world=Pose.from_centre(eye, eye[0]))
+    R = axis_angle_to_rotation_matrix(torch.tensor([[0.3, -0.2, 0.4]], dtype=torch.float64).deg2rad())[0]
+    true = {**known, "b": known["a"].replace(cam_from_world=Pose.from_centre(R, eye[0]))}
+    points = torch.rand(400, 3, dtype=torch.float64) - torch.tensor([0.5, 0.5, 0.0])
+    points = points * torch.tensor([0.8 * distance, 0.6 * distance, depth]) + distance * eye[2]
+    seen = [camera.project(points).x + 0.1 * torch.randn(400, 2) for camera in true.values()]
+    assert _by_turning(Rig(known), Rig(true), ("a", "b"), PointMatches(*seen)) == turned

@@ -8,7 +8,7 @@ import sys
 import pytest
 import torch
 
-from arraygeom import Pose
+from arraygeom import Pose, Rig
 from calib.images import rig_check
 from calib.images.depth_change import share_outside
 from calib.images.matches import PointMatches, match_cameras
@@ -59,6 +59,14 @@ def test_cameras_at_one_position_are_named():
     assert found.text.endswith(
         "'left' and 'right' are at the same position: between them depth has no effect"
     )
+
+
+def test_cameras_that_are_at_one_place_are_no_misfit():
+    """Every point was called behind the cameras, and the rotation in radians."""
+    one, image = rectified_pair()["left"], rectified_images()["left"]
+    rig = Rig({"left": one, "right": one.crop(0, 6, (one.hw[0], one.hw[1] - 6))})
+    assert rig.pair("left", "right").at_one_place
+    assert find_misfit(rig, {"left": image, "right": image[..., 6:]}) is None
 
 
 def test_a_depth_range_without_the_scene_is_named_with_the_scenes_depth():

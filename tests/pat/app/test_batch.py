@@ -384,7 +384,7 @@ def test_a_plan_comes_back_exactly(material, tmp_path, field):
     assert replace(again, rig=job.rig) == job
 
 
-@pytest.mark.parametrize("noise", ["estimate", {"fast": NoiseLevel.of_electrons(200.0, 2.0, "values")}])
+@pytest.mark.parametrize("noise", ["estimate", {"fast": NoiseLevel.from_electrons(200.0, 2.0, "values")}])
 def test_noise_and_luminance_are_planned_and_among_the_settings(material, tmp_path, noise):
     job = batch(material, tmp_path, noise=noise, keep_alpha=True)
     again = Batch.from_json(job.to_json())

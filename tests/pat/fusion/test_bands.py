@@ -112,7 +112,7 @@ def test_one_band_that_matches_badly_is_no_wrong_rig():
 def test_plain_noise_names_the_option_that_it_needs():
     rough = torch.rand(1, 1, 16, 16)
     image = torch.nn.functional.interpolate(rough, size=(200, 200), mode="bicubic").clamp(0, 1)
-    noisy = NoiseLevel.of_electrons(60, 2).recorded(image, torch.Generator().manual_seed(0))
+    noisy = NoiseLevel.from_electrons(60, 2).recorded(image, torch.Generator().manual_seed(0))
     assert noise_advice(Inputs(image, ())) == ""
     assert "try `--noise estimate`" in noise_advice(Inputs(noisy, ()))
 

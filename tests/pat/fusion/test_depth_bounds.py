@@ -28,8 +28,8 @@ def pair():
 @pytest.mark.parametrize("share", [-0.5, -1e-3, 0.0, 0.3, 1.0, 1.001, 1.2])
 def test_positions_beyond_a_segment_are_its_ends(share):
     p = pair()
-    field = FieldOnGrid.of(Epipolar(), p)
-    whole = Inputs.of(torch.zeros(1, 1, *HW), [torch.zeros(1, 3, *HW)], [field])
+    field = FieldOnGrid.from_field(Epipolar(), p)
+    whole = Inputs.from_images(torch.zeros(1, 1, *HW), [torch.zeros(1, 3, *HW)], [field])
     for box in ((0, 12, 0, 40), (4, 12, 8, 32)):
         part = whole.cut(box)
         hw = box[1] - box[0], box[3] - box[2]

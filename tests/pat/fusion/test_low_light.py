@@ -47,7 +47,7 @@ def network():
 
 def in_low_light(electrons, of=middle_of_sample):
     """The middle of the sample, or all of it; its images with noise; and the levels of that."""
-    sample, level = of(), NoiseLevel.of_electrons(electrons, 2)
+    sample, level = of(), NoiseLevel.from_electrons(electrons, 2)
     images = {n: level.recorded(i[None], generator_for(0, n))[0] for n, i in sample.images.items()}
     return sample, images, dict.fromkeys(images, level)
 
@@ -74,7 +74,7 @@ def psnr(image, sample):
     return score(image.clamp(0, 1), sample.ground_truth).psnr
 
 
-@pytest.mark.parametrize("noise", [{}, {ALPHA: NoiseLevel.of_electrons(1e6)}])
+@pytest.mark.parametrize("noise", [{}, {ALPHA: NoiseLevel.from_electrons(1e6)}])
 def test_views_without_noticeable_noise_are_fused_as_ever(network, noise):
     sample = middle_of_sample()
     plain, same = (
@@ -111,10 +111,10 @@ def test_averaged_colours_improve_on_denoising_alone(network, fused, monkeypatch
 def test_a_betas_light_improves_on_alphas_brightness(network, monkeypatch, electrons, gain):
     """The more, the more of it there is: of so many electrons where alpha has 50."""
     sample, images, noise = in_low_light(50)
-    noise[BETA] = NoiseLevel.of_electrons(electrons, 2)
+    noise[BETA] = NoiseLevel.from_electrons(electrons, 2)
     images[BETA] = noise[BETA].recorded(sample.images[BETA][None], generator_for(0, BETA))[0]
     joined = fuse(images, sample.rig, alpha=ALPHA, network=network, settings=FuseSettings(noise=noise)).image
-    monkeypatch.setattr("pat.fusion.low_light.seen_by_another", lambda estimate, *_: 0 * estimate)
+    monkeypatch.setattr("pat.fusion.low_light.other_camera_update", lambda estimate, *_: 0 * estimate)
     alone = fuse(images, sample.rig, alpha=ALPHA, network=network, settings=FuseSettings(noise=noise)).image
     seen, denoised, true = map(luminance, (joined, alone, sample.ground_truth))
     assert float((seen - true).square().mean()) < 10 ** (-gain / 10) * float(
@@ -255,7 +255,7 @@ def test_noise_stated_far_beyond_what_the_image_shows_is_said():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         denoised_views(Views.of(sample.rig, images, alpha=ALPHA), noise)
-    wrong = {ALPHA: NoiseLevel.of_electrons(2)}
+    wrong = {ALPHA: NoiseLevel.from_electrons(2)}
     said = f"noise of '{ALPHA}': a standard deviation of .* is stated, its image shows"
     with pytest.warns(UserWarning, match=said):
         denoised_views(Views.of(sample.rig, sample.images, alpha=ALPHA), wrong)
@@ -320,7 +320,7 @@ def test_positions_of_parts_are_in_the_whole_betas(network, monkeypatch):
     output = FusionOutput(torch.zeros(1, 3, 4, 5), [ones], [ones[:, 0]], [0.5 * ones[:, 0]])
     monkeypatch.setattr(network, "forward", lambda inputs, matches=None: output)
     pair = Pair(View(hw=(4, 5)), View(hw=(4, 5)))
-    part = Beta(torch.zeros(1, 3, 4, 5), FieldOnGrid.of(Rectified(3.0), pair), offset=(7, 2))
+    part = Beta(torch.zeros(1, 3, 4, 5), FieldOnGrid.from_field(Rectified(3.0), pair), offset=(7, 2))
     frame = FrameInputs(Inputs(torch.zeros(1, 1, 4, 5), (part,)), [Placement(pair, lambda x: x)], (4, 5))
     whole = (0, 4, 0, 5)
     monkeypatch.setattr(Inputs, "cut", lambda self, box: self)

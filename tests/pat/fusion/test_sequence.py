@@ -301,7 +301,7 @@ def psnr(frames, ground_truth):
 def test_a_noisy_sequence_is_denoised(fused):
     """One level for all frames, stated or estimated; alpha's values stay where that is asked for."""
     frames, ground_truth, _, _ = fused
-    level = NoiseLevel.of_electrons(60, 2)
+    level = NoiseLevel.from_electrons(60, 2)
     recorded, network, rig = noisy(frames, level), load_weights("mono-colour"), moving.rig(0.003)
 
     def fusion(**settings):

@@ -135,7 +135,7 @@ def test_confidence_is_the_share_of_depths_that_are_right(motorcycle):
     known = depth.isfinite() & frame.depth.isfinite()
     pixel = 1 / (994.978 * 0.193001)
     right = ((1 / frame.depth - 1 / depth).abs() <= pixel)[known]
-    found = Reliability.of(frame.confidence[known], right)
+    found = Reliability.from_samples(frame.confidence[known], right)
     assert found.error < 0.08
 
 

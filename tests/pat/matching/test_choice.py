@@ -152,7 +152,7 @@ def turned(inputs, k):
         rig = rig.with_camera(name, rig[name].resize((500, 740)).replace(hw=hw)).rot90(name, k)
     alpha, other = (image.rot90(k, (-2, -1)) for image in (inputs.alpha, beta.image))
     pair = rig.pair("mono", "colour")
-    field = FieldOnGrid.of(default_field(pair), pair, hw=alpha.shape[-2:], blocks=True)
+    field = FieldOnGrid.from_field(default_field(pair), pair, hw=alpha.shape[-2:], blocks=True)
     return replace(inputs, alpha=alpha, betas=(replace(beta, image=other, field=field),))
 
 
@@ -198,10 +198,12 @@ def test_sides_need_not_be_multiples():
     found = matches_of(disparity, torch.zeros(h // 2, w // 2))
     g = torch.Generator().manual_seed(1)
     rig = rectified_rig((h, w), {"beta": (h, w)}, 30.0)
-    field = FieldOnGrid.of(
+    field = FieldOnGrid.from_field(
         Rectified(30.0, alpha_is="left"), rig.pair("alpha", "beta"), hw=(h, w), blocks=True
     )
-    inputs = Inputs.of(torch.rand(1, 1, h, w, generator=g), [torch.rand(1, 3, h, w, generator=g)], [field])
+    inputs = Inputs.from_images(
+        torch.rand(1, 1, h, w, generator=g), [torch.rand(1, 3, h, w, generator=g)], [field]
+    )
     made = chosen(inputs, Matches((found,)), Wanting()).betas[0].chosen[0, 0]
     assert torch.equal(made[:, :-5], disparity[:, 5:])
     assert math.isfinite(float(made.sum()))

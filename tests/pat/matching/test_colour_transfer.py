@@ -129,11 +129,11 @@ def certain(
     segments, blocks = in_place((h, w))
     segments.valid[:] = False
     segments.valid[..., seen] = True
-    inputs = Inputs.of(alpha, [beta], [FieldOnGrid(lambda _: segments, 1, segments, blocks)])
+    inputs = Inputs.from_images(alpha, [beta], [FieldOnGrid(lambda _: segments, 1, segments, blocks)])
     inputs, sure = replace(inputs, sees_luma=sees_luma), torch.ones(1, 2, h // 2, w // 2)
     stated = None if certainty is None else certainty * sure
     planes = torch.full((1, 3, h // 2, w // 2), facts)
-    matched = BetaMatches(0 * alpha, planes, Comparison.of(alpha, beta), certainty=stated)
+    matched = BetaMatches(0 * alpha, planes, Comparison.from_images(alpha, beta), certainty=stated)
     (found,) = transferred(inputs, Matches((matched,))).betas
     return found.carried
 
@@ -198,7 +198,7 @@ def test_statistics_of_pieces_are_those_of_the_whole():
 
     def statistics(columns: slice) -> MatchStatistics:
         a, b, one = (image[..., columns] for image in (alpha, beta, ones))
-        return MatchStatistics.of(a, a, b, b, b, one, one)
+        return MatchStatistics.from_values(a, a, b, b, b, one, one)
 
     whole = statistics(slice(None))
     pieces = MatchStatistics.mean([statistics(slice(0, 20)), statistics(slice(20, 60))])
@@ -313,9 +313,9 @@ def test_pieces_show_no_border_even_far_from_what_beta_sees(tint, monkeypatch):
         return Segments(there, there, valid)
 
     field = FieldOnGrid.evaluated(evaluate, (h, w), 1)
-    inputs = replace(Inputs.of(alpha, [beta], [field]), multiple=16)
+    inputs = replace(Inputs.from_images(alpha, [beta], [field]), multiple=16)
     facts = torch.zeros(1, 3, h // 2, w // 2)
-    matches = Matches((BetaMatches(torch.zeros_like(alpha), facts, Comparison.of(alpha, beta)),))
+    matches = Matches((BetaMatches(torch.zeros_like(alpha), facts, Comparison.from_images(alpha, beta)),))
     (whole,) = transferred(inputs, matches).betas
     monkeypatch.setattr(inputs_module, "SETTINGS", InputsSettings(halo=64, at_once=40_000))
     assert len({piece.outer[0] for piece in inputs.pieces}) > 1 < len({p.outer[2] for p in inputs.pieces})

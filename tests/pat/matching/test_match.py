@@ -69,7 +69,7 @@ def test_explicit_positions_of_a_part_are_never_all_held(flat):
         return window(pair, x)
 
     alpha, beta = images["mono"][None], images["colour"][None]
-    inputs = Inputs.of(alpha, [beta], [FieldOnGrid.of(field, rig.pair("mono", "colour"))])
+    inputs = Inputs.from_images(alpha, [beta], [FieldOnGrid.from_field(field, rig.pair("mono", "colour"))])
     box = inputs.touched(inputs.betas[0], (16, 48, 32, 64))
     positions = window(rig.pair("mono", "colour"), pixel_grid((H, W))[16:48:2, 32:64:2].reshape(-1, 2))
     assert box == box_around(positions.xy[positions.mask], (H, W), inputs.beta_halo, inputs.multiple)

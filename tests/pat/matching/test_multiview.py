@@ -232,8 +232,8 @@ def test_the_depth_buffer_finds_what_is_hidden():
     depths = far.clone()
     depths[1, 7] = 1 / NEAR
     buffer = view.depth_buffer()
-    view.enter(depths, buffer)
-    found = view.hidden(depths, buffer)
+    view.splat(depths, buffer)
+    found = view.distance_from_front(depths, buffer)
     assert found[1, 7] == 0
     column = (track.at(depths)[1, 7, 0] + 0.5).div(2).floor()
     same = ((track.at(depths)[1, :, 0] + 0.5).div(2).floor() == column) & (depths[1] < 0.4)

@@ -24,7 +24,7 @@ from arraygeom import (
 )
 from pat.matching.matches import BetaMatches, Colours
 from pat.matching.normalisation import Comparison, Normalisation, equalising_blurs
-from pat.matching.positions import matches
+from pat.matching.positions import match_positions
 from pat.matching.semi_global import matched_at_half_size
 from pat.media.colour import luminance
 from pat.support.memory import limited
@@ -101,7 +101,7 @@ def test_a_plane_is_found_again_by_unrectified_cameras(turn):
     colours = beta * tint
     segments = sampled_at(pair, 1)
     found = semi_global_matching(alpha, colours, segments, sampled_at(pair, 2))
-    position = matches(segments, found.disparity)[0]
+    position = match_positions(segments, found.disparity)[0]
     inner = torch.zeros(HW, dtype=torch.bool)
     inner[8:-8, 8:-8] = True
     seen = inner & (where > 4).all(-1) & (where < torch.tensor([107.0, 75.0])).all(-1)
@@ -148,7 +148,7 @@ def test_no_more_blocks_at_once_than_memory_holds(monkeypatch, limit, at_once):
 
     pair = pair_of(0.1)
     alpha, beta, _ = plane_seen(pair, 2.0)
-    views = Comparison.of(alpha, beta).half_views(alpha, beta)
+    views = Comparison.from_images(alpha, beta).half_views(alpha, beta)
     monkeypatch.setattr(pat.matching.semi_global, "_block", block)
     in_blocks_of(monkeypatch, block=8, long_block=8)
     monkeypatch.setattr(arraygeom.runtime.threads, "threads", lambda: 4)
@@ -163,7 +163,7 @@ def test_blocks_know_what_others_claim(monkeypatch, threads):
     """Blocks whose margins hold the whole image find what a single one does."""
     pair = pair_of(0.1)
     alpha, beta, _ = plane_seen(pair, 2.0)
-    given = Comparison.of(alpha, beta).half_views(alpha, beta), sampled_at(pair, 2)
+    given = Comparison.from_images(alpha, beta).half_views(alpha, beta), sampled_at(pair, 2)
     whole = matched_at_half_size(*given)
     in_blocks_of(monkeypatch, block=12, long_block=20, margin=1000)
     monkeypatch.setattr(arraygeom.runtime.threads, "threads", lambda: threads)
@@ -196,7 +196,7 @@ def test_no_segment_is_nothing_found():
 def test_a_cut_is_where_it_says():
     half, whole = torch.arange(48.0).view(1, 1, 6, 8), torch.arange(192.0).view(1, 1, 12, 16)
     colours = Colours(whole + 1, whole + 2, whole + 3, whole[None])
-    made = BetaMatches(whole - 1, half, Comparison.of(whole, whole), colours=colours)
+    made = BetaMatches(whole - 1, half, Comparison.from_images(whole, whole), colours=colours)
     cut = made.cut((4, 10, 2, 16))
     assert torch.equal(cut.disparity, whole[..., 4:10, 2:16] - 1)
     assert torch.equal(cut.facts, half[..., 2:5, 1:8])
@@ -224,7 +224,7 @@ def test_parts_are_balanced_as_the_whole_is():
     alpha = torch.rand(1, 1, 60, 80, generator=torch.Generator().manual_seed(0))
     alpha[..., 40:] = 0.3 * blurred(alpha, 2.0)[..., 40:]
     beta = 0.5 * blurred(alpha, 1.0) + 0.2
-    normalisation = Normalisation.of(alpha, beta)
+    normalisation = Normalisation.from_images(alpha, beta)
     level = normalisation.normalised(beta)
     assert abs(float(level.mean() - alpha.mean())) < 1e-5
     assert abs(float(level.std() - alpha.std())) < 1e-5
@@ -232,7 +232,7 @@ def test_parts_are_balanced_as_the_whole_is():
     assert torch.equal(normalisation.normalised(beta[..., 40:]), level[..., 40:])
     sharp, part = (normalisation.views(alpha[..., n:], beta[..., n:]).alpha for n in (0, 40))
     assert torch.allclose(part[..., 20:], sharp[..., 60:], atol=1e-6)
-    assert Normalisation.of(alpha[..., 40:], beta[..., 40:]).blurs != normalisation.blurs
+    assert Normalisation.from_images(alpha[..., 40:], beta[..., 40:]).blurs != normalisation.blurs
 
 
 def test_what_lies_beyond_the_edge_of_beta_is_not_sought_within_it():

@@ -42,7 +42,7 @@ def test_the_combination_is_that_of_least_squares_around_each_pixel():
         < 0.01
     )
     assert abs(float(mix.weights.sum()) - 1) < 0.03
-    assert abs(float((mix.of(bands) - alpha - drift).mean())) < 1e-3
+    assert abs(float((mix.combined(bands) - alpha - drift).mean())) < 1e-3
 
 
 def test_slopes_are_those_of_detail_whatever_materials_do():
@@ -71,7 +71,7 @@ def test_alpha_corrects_bands_only_where_these_explain_it():
     assert float(foreign.gain) < 0.01
     wrong = bands + 0.05 * torch.randn(bands.shape, generator=torch.Generator().manual_seed(2))
     better = known.reconciled(wrong, alpha)
-    assert (known.of(better) - alpha).abs().max() < 2e-3
+    assert (known.combined(better) - alpha).abs().max() < 2e-3
     assert (better - bands).square().mean() < (wrong - bands).square().mean()
     assert (foreign.reconciled(wrong, other) - wrong).abs().max() < 2e-3
 
@@ -82,7 +82,7 @@ def test_the_order_of_bands_does_not_matter_to_the_last_bit():
     one, other = (SpectralMix.fitted(b, alpha, torch.ones_like(alpha)) for b in (bands, bands[:, order]))
     assert torch.equal(other.weights, one.weights[:, order])
     assert torch.equal(other.slopes, one.slopes[:, order])
-    assert torch.equal(other.of(bands[:, order]), one.of(bands))
+    assert torch.equal(other.combined(bands[:, order]), one.combined(bands))
 
 
 def test_the_combination_is_found_before_anything_is_matched():
@@ -90,7 +90,7 @@ def test_the_combination_is_found_before_anything_is_matched():
     hw = (96, 160)
     scene = texture(3, (hw[0], hw[1] + 12))
     alpha, beta = seen_in(scene[..., :-12]), scene[..., 12:]
-    field = FieldOnGrid.of(Rectified(24.0, alpha_is="left"), Pair(View(hw=hw), View(hw=hw)))
+    field = FieldOnGrid.from_field(Rectified(24.0, alpha_is="left"), Pair(View(hw=hw), View(hw=hw)))
     segments, blocks = (field.of_blocks(side) for side in (2, 4))
     mix = coarse_mix(alpha, beta, segments, blocks, 2)
     assert (mix.weights[0] - WEIGHTS).abs().max() < 0.06

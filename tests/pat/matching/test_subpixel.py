@@ -49,7 +49,7 @@ def scene() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, Segments, Segment
 
 def test_an_edge_is_found_to_the_pixel():
     alpha, beta, disparity, segments, blocks = scene()
-    comparison = Comparison.of(alpha, beta)
+    comparison = Comparison.from_images(alpha, beta)
     half, _ = matched_at_half_size(comparison.half_views(alpha, beta), blocks)
     found, facts = matched(alpha, beta, segments, blocks, comparison)
     near_edge = torch.zeros(H, W, dtype=torch.bool)
@@ -70,7 +70,7 @@ def test_a_match_is_found_to_a_tenth_of_a_pixel(disparity):
     shift = round(8 * disparity)
     alpha, beta = (avg_pool2d(scene[..., x : x + 8 * 160], 8) for x in (0, shift))
     _, _, segments = beside(alpha, 0, 160)
-    found, _ = matched(alpha, beta, *segments, Comparison.of(alpha, beta))
+    found, _ = matched(alpha, beta, *segments, Comparison.from_images(alpha, beta))
     error = (found - shift / 8)[..., 8:-8, 40:-8]
     assert abs(float(error.mean())) < 0.05
     assert float(error.abs().mean()) < 0.1
@@ -89,7 +89,7 @@ def test_a_slope_with_little_texture_is_found_to_a_fraction_of_a_pixel_in_noise(
     alpha = scene[0, 0][rows, (64 + 8 * (x - disparity)).round().long().clamp(min=0)]
     images = [p[None, None] + 0.01 * torch.randn(1, 1, 96, 160, generator=g) for p in (alpha, beta)]
     _, _, segments = beside(images[0], 0, 160)
-    found, _ = matched(*images, *segments, Comparison.of(*images))
+    found, _ = matched(*images, *segments, Comparison.from_images(*images))
     assert float((found[0, 0] - disparity).abs()[8:-8, 24:-8].mean()) < 0.2
 
 
@@ -133,5 +133,5 @@ def test_a_blurred_beta_is_matched_to_a_pixel():
     alpha = scene[0, 0][rows, (start + 8 * (x - disparity)).round().long().clamp(min=0)][None, None]
     coarse = interpolate(avg_pool2d(beta, 8), scale_factor=8, mode="bicubic", align_corners=False)
     _, _, segments = beside(alpha, 0, 384)
-    found, _ = matched(alpha, coarse, *segments, Comparison.of(alpha, coarse))
+    found, _ = matched(alpha, coarse, *segments, Comparison.from_images(alpha, coarse))
     assert float(((found[0, 0] - disparity).abs()[16:-16, 64:-16] < 1).float().mean()) > 0.78

@@ -98,7 +98,7 @@ def test_their_outputs_image_and_attention(case):
     facts, network, image, attention = case
     alpha, betas, positions = made_inputs(facts)
     fields = [listed(p, facts["alpha"][1]) for p in positions]
-    fused, compared = network.compare(Inputs.of(alpha, betas, fields))
+    fused, compared = network.compare(Inputs.from_images(alpha, betas, fields))
     assert np.abs(fused.image.numpy() - image).max() < 1e-9
     for one, where, wanted in zip(compared, positions, attention, strict=True):
         x, y = where.long().unbind(-1)
@@ -116,8 +116,8 @@ def test_our_fields_give_what_their_formula_gives_at_the_same_pixels(case, field
     view = View(hw=tuple(facts["alpha"]))
     pair = Pair(view, view, link=Link(F, torch.eye(3, dtype=torch.float64)))
     betas = [torch.nn.functional.interpolate(b, size=facts["alpha"], mode="bilinear") for b in betas]
-    ours = [FieldOnGrid.of(field, pair) for _ in betas]
-    found = network(Inputs.of(alpha, betas, ours)).image
+    ours = [FieldOnGrid.from_field(field, pair) for _ in betas]
+    found = network(Inputs.from_images(alpha, betas, ours)).image
     h, w = facts["alpha"]
     y, x = torch.meshgrid(torch.arange(h).double(), torch.arange(w).double(), indexing="ij")
     pixels = torch.stack([x, y], -1).reshape(-1, 2)

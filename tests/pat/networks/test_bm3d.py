@@ -16,8 +16,8 @@ from pat.networks.bm3d import (
     STEP,
     WINDOW,
     Observation,
+    other_camera_update,
     refined,
-    seen_by_another,
     wiener_filtered,
 )
 from pat.sensors import generator_for
@@ -61,7 +61,7 @@ def transformed(plane, places):
     return to_groups(np.stack([plane[i : i + SIDE, j : j + SIDE] for i, j in places]))
 
 
-def put_back(group, counts, places, total, weights):
+def accumulate(group, counts, places, total, weights):
     blocks = idctn(np.einsum("nm,mij->nij", HADAMARD.T, group), axes=(1, 2), norm="ortho")
     for (i, j), block in zip(places, blocks):
         total[i : i + SIDE, j : j + SIDE] += counts * WINDOW * block
@@ -85,7 +85,7 @@ def directly(image, expected, guide, deviation):
             variance = np.mean([noise[c, i + 4, j + 4] for i, j in places])
             share = model**2 / (model**2 + variance)
             counts = 1 / (variance + 1e-8) / (1 + np.square(1.0 * share).sum())
-            put_back(blocks * share, counts, places, total[c], weights[c])
+            accumulate(blocks * share, counts, places, total[c], weights[c])
     return inside(total, weights, hw)
 
 
@@ -114,7 +114,7 @@ def update_directly(estimate, recorded, deviation, other):
         error = model**2 * variance / (model**2 + variance)
         unlike = (spectrum * elsewhere + SETTINGS.unlike * model**2) / certain**2
         gain = blur * error / (blur**2 * error + unlike)
-        put_back(gain * (group - blur * model), 1 / (1 + np.square(gain).sum()), places, total, weights)
+        accumulate(gain * (group - blur * model), 1 / (1 + np.square(gain).sum()), places, total, weights)
     return inside(total, weights, estimate.shape[1:])[None]
 
 
@@ -192,7 +192,7 @@ def test_an_update_is_as_defined():
     seen = 0.9 * clean.roll(1, -1) + 0.1 + 0.03 * grain
     other = Observation(seen, (0.03 + 0.001 * x)[None], grain, (0.3 + 0.02 * y)[None])
     given = clean, recorded, (0.05 + 0.002 * y)[None], other
-    torch.testing.assert_close(seen_by_another(*given), update_directly(*given), atol=1e-5, rtol=0)
+    torch.testing.assert_close(other_camera_update(*given), update_directly(*given), atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize(("deviation", "least", "most"), [(0.01, 0.2, 0.6), (0.1, 0.6, 0.95)])
@@ -203,7 +203,7 @@ def test_another_camera_takes_errors_away_the_more_the_less_its_noise(deviation,
     sure = torch.full_like(clean, 0.1)
     recorded = clean + noise_of(clean.shape, 1, 0.1)
     estimate = wiener_filtered(recorded, clean, sure, clean)
-    change = seen_by_another(estimate, recorded, sure, observed(clean, deviation=deviation))
+    change = other_camera_update(estimate, recorded, sure, observed(clean, deviation=deviation))
     before, after = (float((x - clean).square().mean()) for x in (estimate, estimate + change))
     assert least < after / before < most
 
@@ -213,20 +213,20 @@ def test_what_another_camera_blurs_stays_sharp():
     clean = stripes(1, (64, 80))
     blurred = 0.5 + 0.5 * (clean - 0.5)
     sure = torch.full_like(clean, 0.1)
-    assert float(seen_by_another(clean, clean, sure, observed(blurred)).abs().max()) < 0.01
+    assert float(other_camera_update(clean, clean, sure, observed(blurred)).abs().max()) < 0.01
 
 
 @pytest.mark.parametrize("given", [{"confidence": 0.0}, {"deviation": 100.0}])
 def test_what_another_camera_cannot_say_changes_nothing(given):
     clean = stripes(1)
     other = observed(clean.flip(-1), **given)
-    change = seen_by_another(clean, clean, torch.full_like(clean, 0.1), other)
+    change = other_camera_update(clean, clean, torch.full_like(clean, 0.1), other)
     assert float(change.abs().max()) < 1e-3
 
 
 @pytest.mark.parametrize("hw", [(1, 1), (3, 50), (33, 40)])
 def test_updates_of_any_size(hw):
     image = torch.rand(1, *hw, generator=generator_for(1))
-    change = seen_by_another(image, image, torch.full_like(image, 0.1), observed(image, deviation=0.1))
+    change = other_camera_update(image, image, torch.full_like(image, 0.1), observed(image, deviation=0.1))
     assert change.shape == image.shape
     assert bool(change.isfinite().all())

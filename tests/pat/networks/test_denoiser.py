@@ -43,7 +43,7 @@ def denoised(part, electrons):
     """A part of the sample scene, as recorded, and denoised."""
     ideal = load_sample().ground_truth[None, :, :256, :320]
     ideal = luminance(ideal) if part == "band" else ideal
-    level = NoiseLevel.of_electrons(electrons, 2)
+    level = NoiseLevel.from_electrons(electrons, 2)
     recorded = level.recorded(ideal, generator_for(0, part, electrons))
     ours = getattr(load_denoiser(), part)(level.unbiased(recorded), level.deviation(recorded))
     return ideal, recorded, ours

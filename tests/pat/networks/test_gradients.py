@@ -72,8 +72,8 @@ def test_the_loss_is_differentiable_in_rotation_translation_K_and_lens(name):
 
     def loss(*given):
         pair = Pair(first, camera(*given), (torch.tensor(1.5).double(), torch.tensor(6.0).double()))
-        field = FieldOnGrid.of(FIELDS[name], pair, blocks=False)
-        fused = network()(Inputs.of(alpha, [beta], [field]))
+        field = FieldOnGrid.from_field(FIELDS[name], pair, blocks=False)
+        fused = network()(Inputs.from_images(alpha, [beta], [field]))
         return (fused.image - truth).square().mean() + 1e-2 * fused.position[0].mean()
 
     given = numbers(lens=name == "curved")

@@ -27,7 +27,7 @@ HW = (32, 48)
 
 
 def rectified(beta_hw: tuple[int, int] = HW) -> FieldOnGrid:
-    return FieldOnGrid.of(Rectified(10.0), Pair(View(hw=HW), View(hw=beta_hw)))
+    return FieldOnGrid.from_field(Rectified(10.0), Pair(View(hw=HW), View(hw=beta_hw)))
 
 
 @pytest.mark.parametrize("learned", [True, False])
@@ -35,7 +35,7 @@ def test_luminance_is_alphas(learned):
     torch.manual_seed(0)
     network = GuidedPAT(GuidedPATConfig(learned=learned))
     alpha, beta = torch.rand(2, 1, *HW), torch.rand(2, 3, 32, 64)
-    fused = fused_at_once(network, Inputs.of(alpha, [beta], [rectified((32, 64))]))
+    fused = fused_at_once(network, Inputs.from_images(alpha, [beta], [rectified((32, 64))]))
     assert (luminance(fused.image) - alpha).abs().max() < 1e-5
     assert (fused.image - alpha).abs().max() > 1e-2
 
@@ -45,8 +45,8 @@ def test_three_filtered_cameras_serve_as_one():
     torch.manual_seed(0)
     network = GuidedPAT()
     alpha, grey = torch.rand(1, 1, *HW), torch.rand(1, 1, *HW)
-    one = fused_at_once(network, Inputs.of(alpha, [grey.expand(-1, 3, -1, -1)], [rectified()]))
-    three = fused_at_once(network, Inputs.of(alpha, [grey] * 3, [rectified()] * 3))
+    one = fused_at_once(network, Inputs.from_images(alpha, [grey.expand(-1, 3, -1, -1)], [rectified()]))
+    three = fused_at_once(network, Inputs.from_images(alpha, [grey] * 3, [rectified()] * 3))
     assert (one.image - three.image).abs().max() < 1e-5
     assert len(three.confidence) == 3
 
@@ -54,7 +54,9 @@ def test_three_filtered_cameras_serve_as_one():
 def test_bands_must_add_up():
     network = GuidedPAT()
     with pytest.raises(ValueError, match=r"2 bands .* 3"):
-        fused_at_once(network, Inputs.of(torch.rand(1, 1, *HW), [torch.rand(1, 2, *HW)], [rectified()]))
+        fused_at_once(
+            network, Inputs.from_images(torch.rand(1, 1, *HW), [torch.rand(1, 2, *HW)], [rectified()])
+        )
 
 
 @pytest.mark.parametrize("change", [{}, {"learned": False}, {"bands": None}], ids=str)
@@ -67,10 +69,10 @@ def test_gradients_reach_the_rig(change):
     depth = tuple(torch.tensor(d, dtype=torch.float64) for d in (1.0, 8.0))
     fused = fused_at_once(
         network,
-        Inputs.of(
+        Inputs.from_images(
             torch.rand(1, 1, *HW),
             [torch.rand(1, 3, *HW)],
-            [FieldOnGrid.of(Epipolar(), Pair(camera, beta, depth))],
+            [FieldOnGrid.from_field(Epipolar(), Pair(camera, beta, depth))],
         ),
     )
     fused.image.square().sum().backward()
@@ -83,8 +85,12 @@ def test_no_valid_segment_is_no_confidence():
     torch.manual_seed(0)
     network = GuidedPAT()
     pair = Pair(View(hw=HW), View(hw=HW))
-    nowhere = FieldOnGrid.of(lambda _, x: Segments(x, x, torch.zeros_like(x[..., 0], dtype=torch.bool)), pair)
-    fused = fused_at_once(network, Inputs.of(torch.rand(1, 1, *HW), [torch.rand(1, 3, *HW)], [nowhere]))
+    nowhere = FieldOnGrid.from_field(
+        lambda _, x: Segments(x, x, torch.zeros_like(x[..., 0], dtype=torch.bool)), pair
+    )
+    fused = fused_at_once(
+        network, Inputs.from_images(torch.rand(1, 1, *HW), [torch.rand(1, 3, *HW)], [nowhere])
+    )
     assert fused.confidence[0].max() == 0
     assert fused.image.isfinite().all()
 
@@ -101,7 +107,7 @@ def changed_to(matches: Matches, **planes: float | torch.Tensor) -> Matches:
 def test_where_it_is_sure_the_image_is_what_was_matched():
     torch.manual_seed(0)
     network = GuidedPAT(GuidedPATConfig(keep_luminance=False))
-    inputs = Inputs.of(torch.rand(1, 1, *HW), [torch.rand(1, 3, *HW)], [rectified()])
+    inputs = Inputs.from_images(torch.rand(1, 1, *HW), [torch.rand(1, 3, *HW)], [rectified()])
     matches = changed_to(matched_for(network, inputs), weight=1.0)
     fused = network(inputs, matches)
     assert torch.allclose(fused.image - inputs.alpha, matches.betas[0].carried.bands, atol=1e-5)
@@ -110,7 +116,7 @@ def test_where_it_is_sure_the_image_is_what_was_matched():
 def test_what_no_beta_sees_is_half_by_attention_and_half_by_nearest_examples(monkeypatch):
     torch.manual_seed(0)
     network = GuidedPAT(GuidedPATConfig(keep_luminance=False))
-    inputs = Inputs.of(torch.rand(1, 1, *HW), [torch.rand(1, 3, *HW)], [rectified()])
+    inputs = Inputs.from_images(torch.rand(1, 1, *HW), [torch.rand(1, 3, *HW)], [rectified()])
     found = matched_for(network, inputs)
     images = {}
     for recalled, nearest in ((0.0, 0.0), (0.2, 0.0), (0.0, 0.2)):
@@ -126,7 +132,7 @@ def test_what_is_doubtful_lies_between_matched_and_filled():
     """The more certain, the nearer to the match."""
     torch.manual_seed(0)
     network = GuidedPAT(GuidedPATConfig(keep_luminance=False))
-    inputs = Inputs.of(torch.full((1, 1, *HW), 0.5), [torch.rand(1, 3, *HW)], [rectified()])
+    inputs = Inputs.from_images(torch.full((1, 1, *HW), 0.5), [torch.rand(1, 3, *HW)], [rectified()])
     found = changed_to(matched_for(network, inputs), bands=1.0, fills=0.0)
     means = [
         float((network(inputs, changed_to(found, weight=weight)).image - inputs.alpha).mean())
@@ -141,7 +147,7 @@ def test_brightness_tells_of_a_match_unless_alpha_sees_something_else():
     beta = torch.full((1, 3, *HW), 0.5)
     alpha = beta[:, :1].clone()
     alpha[..., 20:28] = 0.9
-    inputs = Inputs.of(alpha, [beta], [rectified()])
+    inputs = Inputs.from_images(alpha, [beta], [rectified()])
     network = GuidedPAT()
     alike, ignored = (
         matched_for(network, replace(inputs, sees_luma=sees)).betas[0].carried.likeness
@@ -155,7 +161,7 @@ def test_brightness_tells_of_a_match_unless_alpha_sees_something_else():
 def test_certain_colours_are_those_at_the_chosen_position_if_alpha_sees_something_else():
     torch.manual_seed(0)
     network = GuidedPAT()
-    inputs = Inputs.of(torch.rand(1, 1, *HW), [torch.rand(1, 3, *HW)], [rectified()])
+    inputs = Inputs.from_images(torch.rand(1, 1, *HW), [torch.rand(1, 3, *HW)], [rectified()])
     (matched,) = matched_for(network, inputs).betas
     sure = torch.ones(1, 2, HW[0] // 2, HW[1] // 2)
     elsewhere = {"chosen": torch.full((1, 1, *HW), 4.0), "disparity": torch.full((1, 1, *HW), 7.0)}
@@ -192,7 +198,7 @@ def banded():
 
 
 def field(disparity):
-    return FieldOnGrid.of(Rectified(disparity), Pair(View(hw=HW), View(hw=HW)))
+    return FieldOnGrid.from_field(Rectified(disparity), Pair(View(hw=HW), View(hw=HW)))
 
 
 def test_permuting_betas_of_one_band_permutes_the_output_bands(banded):
@@ -200,7 +206,9 @@ def test_permuting_betas_of_one_band_permutes_the_output_bands(banded):
     fields, order = [field(d) for d in (6.0, 9.0, 12.0, 4.0)], [2, 0, 1, 3]
     with torch.no_grad():
         first, second = (
-            fused_at_once(banded, Inputs.of(alpha, [bands[i] for i in which], [fields[i] for i in which]))
+            fused_at_once(
+                banded, Inputs.from_images(alpha, [bands[i] for i in which], [fields[i] for i in which])
+            )
             for which in (range(4), order)
         )
     assert first.image.shape == (2, 4, *HW)
@@ -214,9 +222,11 @@ def test_permuting_the_bands_of_a_beta_permutes_the_output_bands(banded, count):
     hw, order = (64, 96), torch.randperm(count, generator=torch.Generator().manual_seed(count)).tolist()
     scene = torch.cat([texture(count, (64, 104), seed=i) for i in range(2)])
     alpha, beta = scene[:, :1, :, :-8] * 0.4 + scene[:, 1:2, :, :-8] * 0.6, scene[..., 8:]
-    there = [FieldOnGrid.of(Rectified(16.0, alpha_is="left"), Pair(View(hw=hw), View(hw=hw)))]
+    there = [FieldOnGrid.from_field(Rectified(16.0, alpha_is="left"), Pair(View(hw=hw), View(hw=hw)))]
     with torch.no_grad():
-        first, second = (fused_at_once(banded, Inputs.of(alpha, [b], there)) for b in (beta, beta[:, order]))
+        first, second = (
+            fused_at_once(banded, Inputs.from_images(alpha, [b], there)) for b in (beta, beta[:, order])
+        )
     assert torch.equal(second.image, first.image[:, order])
     assert torch.equal(second.position[0], first.position[0])
     assert len(first.confidence) == 1
@@ -262,8 +272,8 @@ def test_bands_unlike_alpha_keep_their_own_brightness(banded):
     hw = (64, 96)
     scene = texture(1, (64, 104), seed=3)
     alpha, beta = scene[..., :-8], torch.cat([0.5 * scene, 1 - scene], 1)[..., 8:]
-    there = FieldOnGrid.of(Rectified(16.0, alpha_is="left"), Pair(View(hw=hw), View(hw=hw)))
-    fused = fused_at_once(banded, Inputs.of(alpha, [beta], [there])).image
+    there = FieldOnGrid.from_field(Rectified(16.0, alpha_is="left"), Pair(View(hw=hw), View(hw=hw)))
+    fused = fused_at_once(banded, Inputs.from_images(alpha, [beta], [there])).image
     wanted = torch.cat([0.5 * alpha, 1 - alpha], 1)
     off, unlike = ((image - wanted)[..., 12:-4].abs().mean() for image in (fused, alpha))
     assert off < 0.15 * unlike

@@ -41,7 +41,7 @@ def found_in(inputs):
         BetaMatches(
             5 * torch.rand(1, 1, h, w),
             torch.rand(1, 3, h // 2, w // 2),
-            Comparison.of(inputs.alpha, inputs.betas[i].image),
+            Comparison.from_images(inputs.alpha, inputs.betas[i].image),
             colours=Colours(torch.rand(1, 3, h, w), *torch.rand(2, 1, 1, h, w), fills),
         )
         for i in range(n)

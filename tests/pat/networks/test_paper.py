@@ -16,7 +16,10 @@ from tests.pat.layered_array import middle_of_sample
 
 def fields(network: PAT, alpha: torch.Tensor, betas: list[torch.Tensor]) -> list[FieldOnGrid]:
     hw = [tuple(p.shape[-2:]) for p in (alpha, *betas)]
-    return [FieldOnGrid.of(Rectified(8, alpha_is="left"), Pair(View(hw=hw[0]), View(hw=b))) for b in hw[1:]]
+    return [
+        FieldOnGrid.from_field(Rectified(8, alpha_is="left"), Pair(View(hw=hw[0]), View(hw=b)))
+        for b in hw[1:]
+    ]
 
 
 def test_the_rectified_field_is_parallax_attention():
@@ -47,7 +50,7 @@ def test_any_number_of_betas_of_any_sizes(scale):
     network = PAT(PATConfig(betas=3, dim=8, scale=scale))
     alpha = torch.rand(1, 1, 12, 20)
     betas = [torch.rand(1, 3, 12, 20), torch.rand(1, 1, 7, 11), torch.rand(1, 3, 24, 30)]
-    fused = network(Inputs.of(alpha, betas, fields(network, alpha, betas)))
+    fused = network(Inputs.from_images(alpha, betas, fields(network, alpha, betas)))
     assert fused.image.shape == (1, 3, 12 * scale, 20 * scale)
     assert [p.shape for p in fused.position] == [(1, 2, 12, 20)] * 3
     fused.image.sum().backward()
@@ -60,21 +63,23 @@ def test_the_residual_path_keeps_alpha():
     for residual, expected in ((True, alpha.expand(-1, 3, -1, -1)), (False, torch.zeros(1, 3, 12, 20))):
         network = PAT(PATConfig(dim=8, residual=residual))
         torch.nn.init.zeros_(network.post[-1].weight)
-        assert torch.equal(network(Inputs.of(alpha, betas, fields(network, alpha, betas))).image, expected)
+        assert torch.equal(
+            network(Inputs.from_images(alpha, betas, fields(network, alpha, betas))).image, expected
+        )
 
 
 def test_wrong_numbers_are_refused():
     network = PAT(PATConfig(betas=2, dim=8))
     alpha, beta = torch.rand(1, 1, 12, 20), torch.rand(1, 3, 12, 20)
     with pytest.raises(ValueError, match=r"2 betas.* 1"):
-        network(Inputs.of(alpha, [beta], fields(network, alpha, [beta])))
+        network(Inputs.from_images(alpha, [beta], fields(network, alpha, [beta])))
     with pytest.raises(ValueError, match="1 or 3 channels"):
-        network(Inputs.of(alpha, [beta, beta[:, :2]], fields(network, alpha, [beta, beta])))
+        network(Inputs.from_images(alpha, [beta, beta[:, :2]], fields(network, alpha, [beta, beta])))
 
 
 def test_samples_follow_the_longest_segment():
     rig = Rig({"a": View(hw=(10, 40)), "b": View(hw=(10, 40))})
-    assert FieldOnGrid.of(Rectified(12.0), rig.pair("a", "b")).samples == 13
+    assert FieldOnGrid.from_field(Rectified(12.0), rig.pair("a", "b")).samples == 13
 
 
 def test_four_inputs_a_band_each_give_the_colours():

@@ -8,9 +8,9 @@ from pat.sensors import Clip, Noise, NoiseLevel, generator_for, record
 from tests.pat.layered_array import load_sample
 
 LEVELS = {
-    "200 electrons": NoiseLevel.of_electrons(200, 2),
-    "50 electrons": NoiseLevel.of_electrons(50, 2),
-    "200 electrons, values": NoiseLevel.of_electrons(200, 2, "values"),
+    "200 electrons": NoiseLevel.from_electrons(200, 2),
+    "50 electrons": NoiseLevel.from_electrons(50, 2),
+    "200 electrons, values": NoiseLevel.from_electrons(200, 2, "values"),
     "10 of 255": NoiseLevel(read=10 / 255, added_to="values"),
 }
 
@@ -52,7 +52,7 @@ def test_light_is_recorded_as_the_forward_model_does():
     image = torch.full((1, 1, 300, 300), 0.4)
     chain = [DecodeSRGB(), Noise(100, 3, counts="poisson"), Clip(), EncodeSRGB()]
     other = record(image, chain, generator_for(0, "chain"))
-    ours = NoiseLevel.of_electrons(100, 3).recorded(image, generator_for(0, "ours"))
+    ours = NoiseLevel.from_electrons(100, 3).recorded(image, generator_for(0, "ours"))
     quantiles = torch.linspace(0.02, 0.98, 13)
     a, b = (x.flatten().quantile(quantiles) for x in (ours, other))
     assert float((a - b).abs().max()) < 0.01
@@ -82,8 +82,8 @@ def test_a_negative_level_is_refused(wrong):
 
 def test_what_is_no_level_is_refused():
     with pytest.raises(ValueError, match="must be 1 or more"):
-        NoiseLevel.of_electrons(0)
+        NoiseLevel.from_electrons(0)
     with pytest.raises(ValueError, match="0 or more"):
-        NoiseLevel.of_electrons(100, -2)
+        NoiseLevel.from_electrons(100, -2)
     with pytest.raises((ValueError, TypeError), match=r"light|values"):  # by type, where types are checked
         NoiseLevel(0.01, added_to="srgb")

@@ -13,6 +13,7 @@ from PIL import Image
 from torch.nn.functional import avg_pool2d
 
 from arraygeom import Rig
+from arraygeom.runtime.text import REGISTERED
 from pat.app.from_images import _tagged_rig, array_from_images, camera_names
 from pat.app.sample_array import load_sample
 from pat.media.images import write_image
@@ -169,28 +170,62 @@ def test_captures_that_do_not_go_together(capture, tmp_path, refusal, options, m
     assert not (tmp_path / "out" / "aligned.tif").exists()
 
 
-def test_a_flights_bands_have_no_parallax(tmp_path):
-    """Far ground: tags state lenses, no poses; one homography is the map, here of a rotation."""
-    ground = (texture((300, 400), seed=1)[0].numpy() * 60000).astype(np.uint16)
+K = np.array([[1466.667, 0, 180], [0, 1466.667, 140], [0, 0, 1]])
+MOVED = K @ cv2.Rodrigues(np.array([0.003, -0.004, 0.02]))[0] @ np.linalg.inv(K)
+"""Of far ground: tags state lenses, no poses; one homography is the map, here of a rotation."""
+
+
+def captures_of_ground(place, seeds):
+    """Captures in green and near infrared, whose bands see the same ground."""
     tags = {**PERSPECTIVE, "PrincipalPoint": "0.6,0.45", "PerspectiveDistortion": "-0.01,0,0,0,0"}
-    K = np.array([[1466.667, 0, 180], [0, 1466.667, 140], [0, 0, 1]])
-    A = K @ cv2.Rodrigues(np.array([0.003, -0.004, 0.02]))[0] @ np.linalg.inv(K)
-    moved = cv2.warpPerspective(ground, A, (400, 300), flags=cv2.INTER_CUBIC)
-    shown = {"Green": ground[20:260, 20:340], "NIR": moved[20:260, 20:340]}
-    for i, (band, image) in enumerate(shown.items()):
-        path = image_of(tmp_path / f"IMG_{i}.tif", {**tags, "BandName": band}, hw=image.shape)
-        with tifffile.TiffFile(path) as file:
-            offset = file.pages[0].dataoffsets[0]
-        with path.open("r+b") as file:
-            file.seek(offset)
-            file.write(image.astype("<u2").tobytes())
-    found = array_from_images([tmp_path / "IMG_0.tif", tmp_path / "IMG_1.tif"], alpha="green")
-    H = found.rig.links["green", "nir"].H
+    for seed in seeds:
+        ground = (texture((300, 400), seed=seed)[0].numpy() * 60000).astype(np.uint16)
+        moved = cv2.warpPerspective(ground, MOVED, (400, 300), flags=cv2.INTER_CUBIC)
+        for i, (band, image) in enumerate({"Green": ground, "NIR": moved}.items()):
+            path = place / f"IMG_{seed:04d}_{i}.tif"
+            image_of(path, {**tags, "BandName": band}, hw=(240, 320), taken=f"2018:04:13 08:06:{seed:02d}")
+            with tifffile.TiffFile(path) as file:
+                offset = file.pages[0].dataoffsets[0]
+            with path.open("r+b") as file:
+                file.seek(offset)
+                file.write(image[20:260, 20:340].astype("<u2").tobytes())
+    return sorted(place.glob("*.tif"))
+
+
+def off_ground(rig):
+    """How far two points of green are mapped to near infrared from where they are, pixels."""
+    H = rig.links["green", "nir"].H
     x = torch.tensor([[100.0, 80, 1], [200, 150, 1]], dtype=torch.float64) @ H.T
-    wanted = torch.from_numpy(np.array([[120.0, 100, 1], [220, 170, 1]]) @ A.T)
-    wanted = wanted[:, :2] / wanted[:, 2:] - 20
-    assert float((x[:, :2] / x[:, 2:] - wanted).norm(dim=-1).max()) < 0.5
+    wanted = torch.from_numpy(np.array([[120.0, 100, 1], [220, 170, 1]]) @ MOVED.T)
+    return float((x[:, :2] / x[:, 2:] - (wanted[:, :2] / wanted[:, 2:] - 20)).norm(dim=-1).max())
+
+
+def test_a_flights_bands_have_no_parallax(tmp_path):
+    found = array_from_images(captures_of_ground(tmp_path, [1]), alpha="green")
+    assert off_ground(found.rig) < 0.5
     assert found.rig["nir"].distortion is not None
+    assert found.rig.pair("green", "nir").at_one_place
+    assert found.lasting is None
+
+
+@pytest.mark.parametrize("listed", [True, False])
+def test_a_flight_has_one_rig(tmp_path, capsys, listed):
+    """Of a folder, or of its files in the shell's order; an image alone is left out, and said."""
+    (tmp_path / "flight").mkdir()
+    files = captures_of_ground(tmp_path / "flight", range(1, 5))
+    files.pop(6).unlink()
+    given = " ".join(map(str, files)) if listed else tmp_path / "flight"
+    pat(f"align {given} --alpha green -o {tmp_path / 'out'} --extras none")
+    written = {path.name for path in (tmp_path / "out").glob("*_aligned.tif")}
+    assert written == {f"IMG_{i:04d}_0_aligned.tif" for i in (1, 2, 3)}
+    rig = Rig.load(tmp_path / "out" / "found_rig.yaml")
+    assert off_ground(rig) < 0.2
+    assert rig.name == REGISTERED
+    assert "1 images are left out" in capsys.readouterr().err
+    bands = tifffile.imread(tmp_path / "out" / "IMG_0002_0_aligned.tif").astype(float)
+    seen = bands[1] > 0
+    assert seen.mean() > 0.7
+    assert np.corrcoef(bands[0][seen], bands[1][seen])[0, 1] > 0.98
 
 
 def test_translations_that_will_be_found_are_not_asked_for(capture):
@@ -206,7 +241,7 @@ def test_translations_that_will_be_found_are_not_asked_for(capture):
         ("--around {}/small.tif", "small.tif: is 80x48, alpha's image is 160x96"),
         ("--around {}/depth.png,scale=1", "state its unit with --around"),
         ("--around {}/far.csv", "outside"),
-        ("--confidence 2", "the least confidence is 2: give a number from 0 to 1"),
+        ("--confidence 2", "--confidence"),
         ("--alpha nir", "no camera 'nir'"),
     ],
 )

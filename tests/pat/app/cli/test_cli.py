@@ -7,6 +7,7 @@ import json
 import re
 import shutil
 import typing
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -20,6 +21,7 @@ from arraygeom.lenses import Equirectangular
 from arraygeom.runtime.text import UNSCALED
 from pat.app.cli.align import Align
 from pat.app.cli.fuse import Fuse
+from pat.app.cli.fusing import named_images
 from pat.app.cli.main import Pat, command_named, command_paths, main
 from pat.app.cli.options import read_frames, read_images, rig_first
 from pat.app.cli.parser import _entries, parse
@@ -111,7 +113,8 @@ def test_demo_beats_alpha_and_every_classical_fusion_of_the_photograph(tmp_path,
         ({"rig": "/none.yaml"}, "/none.yaml: no such rig file"),
         ({"extra": ["--depth", "20", "2"]}, "0 < near <= far"),
         ({"extra": ["--depth", "-1", "2"]}, "0 < near <= far"),
-        ({"extra": ["--max-memory", "lots"]}, "max_memory is 'lots'"),
+        ({"extra": ["--max-memory", "lots"]}, "--max-memory"),
+        ({"extra": ["--max-memory", "4"]}, "4GiB"),
         ({"extra": ["--image", "tele=x.png"]}, "no camera 'tele'"),
         ({"extra": ["--network", "mono-color"]}, "no weights 'mono-color'"),
         ({"mono": SAMPLE / "mono.png"}, "mono.png: is 640x400, the rig says 128x96"),
@@ -356,6 +359,16 @@ def test_several_frames_are_refused_before_a_rig_is_looked_for(small, refusal, m
     folders = {name: small / f"{name}s" for name in ("mono", "colour")}
     for several in (arguments(small, **folders), ["fuse", *map(str, folders.values())]):
         assert "`pat batch`" in refusal(*several)
+
+
+def test_images_with_a_name_and_a_path_are_images(small, refusal, monkeypatch):
+    """A folder was called no image, the name being taken for a part of its own."""
+    (small / "folder").mkdir(exist_ok=True)
+    said = refusal("fuse", f"mono={small / 'folder'}", f"colour={small / 'folder'}")
+    assert f"give {small / 'folder'} alone" in said
+    named = [f"mono={small / 'mono.png'}", f"colour={small / 'colour.png'}"]
+    images, with_rig = named_images([small / "rig.yaml", *map(Path, named)], (), "fuse")
+    assert (images, with_rig) == (tuple(named), True)
 
 
 def test_a_file_that_is_missing_or_a_video_is_named(small, refusal):

@@ -1,6 +1,7 @@
 """`--around` of fuse, align and the rig commands, on a wall with a post before it."""
 
 import re
+from contextlib import suppress
 
 import cv2
 import numpy as np
@@ -9,7 +10,7 @@ import tifffile
 import torch
 from torch.nn.functional import interpolate
 
-from arraygeom import Rig
+from arraygeom import Rig, epipolar_distance
 from pat import FuseSettings
 from pat import align as aligned
 from pat.app.cli.known import Around
@@ -113,6 +114,41 @@ def test_rig_commands_take_matches(folder, capsys):
     pat(f"rig refine {folder / 'rig.yaml'} {given} -o {folder / 'refined.yaml'} --no-photometric")
 
 
+@pytest.mark.parametrize("alpha", ["mono", "blind"])
+def test_matches_find_the_rig_of_images_that_do_not_match(folder, tmp_path, alpha, capsys):
+    """The rig was sought in the images alone, and refused."""
+    files = f"{folder / 'mono.png'} {folder / 'blind.png'}"
+    with suppress(SystemExit):  # as confidence is low
+        pat(f"align {files} --matches {folder / 'matches.csv'} --alpha {alpha} -o {tmp_path} --extras npy")
+    assert "204 " in capsys.readouterr().err
+    x = torch.from_numpy(np.loadtxt(folder / "matches.csv", delimiter=","))
+    rig = Rig.load(tmp_path / "found_rig.yaml")
+    assert rig.names[0] == alpha
+    F = rig.pair("mono", "blind").fundamental.to(x)
+    assert float(epipolar_distance(F, x[:, :2], x[:, 2:]).abs().median()) < 0.5
+
+
+def test_ten_matches_lay_one_image_on_the_other(folder, tmp_path, capsys):
+    rows = np.loadtxt(folder / "matches.csv", delimiter=",")
+    np.savetxt(tmp_path / "ten.csv", rows[rows[:, 0] - rows[:, 2] == FAR][::19], delimiter=",")
+    files = f"{folder / 'mono.png'} {folder / 'blind.png'}"
+    pat(f"fuse {files} --matches {tmp_path / 'ten.csv'} --alpha mono -o {tmp_path / 'out'} --extras none")
+    assert not (tmp_path / "out" / "depth.tif").exists()
+    assert "no depth: a homography" in capsys.readouterr().err
+    assert not (tmp_path / "out" / "found_rig.yaml").exists()
+    pat(
+        f"rig start --image mono={folder / 'mono.png'} --image blind={folder / 'blind.png'} "
+        f"--matches {tmp_path / 'ten.csv'} -o {tmp_path / 'rig.yaml'}"
+    )
+    assert Rig.load(tmp_path / "rig.yaml").pair("mono", "blind").at_one_place
+
+
+def test_a_depth_map_without_a_rig_is_refused_before_the_work(folder, tmp_path, refusal, monkeypatch):
+    monkeypatch.setattr("pat.app.from_images.array_from_images", None)
+    files = folder / "mono.png", folder / "colour.png"
+    assert "--around" in refusal("align", *files, "--depth-map", folder / "depth.tif", "-o", tmp_path)
+
+
 def test_matches_off_the_lines_of_the_rig_are_said(folder, capsys):
     """Those of another image were taken without a word; here beta's rows are counted from below."""
     rows = np.loadtxt(folder / "matches.csv", delimiter=",")
@@ -132,7 +168,7 @@ def test_matches_off_the_lines_of_the_rig_are_said(folder, capsys):
         ("--around {}/depth.tif --field line", "--field"),
         ("--around {}/depth.png,scale=1", "holds 1e+04 to 2e+04 m, the rig's"),
         ("--around {}/mono.png", "8 bits, too few"),
-        ("--around {}/none.png", "no such depth map"),
+        ("--around {}/none.png", "none.png"),
         ("--around {}/depth.tif,unit=1", "--around"),
         ("--around {}/depth.tif,scale=one", "--around"),
         ("--around {}/rig.yaml", "rig.yaml"),
@@ -151,6 +187,7 @@ def test_bad_input_is_one_line(folder, options, expected, capsys):
 def test_a_large_depth_map_in_another_unit_is_told_what_it_holds(folder, monkeypatch):
     """Torch's quantiles are of 2^24 numbers at most: of larger maps its words were the message."""
     monkeypatch.setattr("pat.media.depth_maps.read_depth", lambda *_, **__: torch.full((4097, 4097), 1e4))
-    rig = Rig.load(folder / "rig.yaml")
+    rig, large = Rig.load(folder / "rig.yaml"), folder / "large.tif"
+    large.touch()
     with pytest.raises(ValueError, match=r"holds 1e\+04 to 1e\+04 m, the rig's depth range"):
-        Around(around="large.tif").with_known(rig, rig.names[0], {}, None)
+        Around(around=str(large)).with_known(rig, rig.names[0], {}, None)

@@ -11,7 +11,7 @@ def test_levels_by_camera_or_estimated():
     assert noise_of([], by_default=True) == "auto"
     assert noise_of(["none"], by_default=True) is None
     assert noise_of(["estimate"]) == "estimate"
-    levels = {"mono": NoiseLevel.of_electrons(200, 2), "colour": NoiseLevel.of_electrons(50)}
+    levels = {"mono": NoiseLevel.from_electrons(200, 2), "colour": NoiseLevel.from_electrons(50)}
     assert noise_of(["mono=200,2", "colour=50"]) == levels
 
 

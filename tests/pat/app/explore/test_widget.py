@@ -135,9 +135,9 @@ def test_a_networks_weights_are_its_attention():
     colour = of_size(images["colour"], hw_at_alphas_resolution(rig.pair("mono", "colour")))
     assert colour.shape[1] > h * 1.5
     larger = rig.resize("colour", tuple(colour.shape[1:]))
-    field = FieldOnGrid.of(Epipolar(), larger.pair("mono", "colour"))
+    field = FieldOnGrid.from_field(Epipolar(), larger.pair("mono", "colour"))
     field = replace(field, samples=len(ours.answer["betas"]["colour"]["samples"]))
-    inputs = Inputs.of(images["mono"][None], [colour[None]], [field])
+    inputs = Inputs.from_images(images["mono"][None], [colour[None]], [field])
     with torch.no_grad():
         position = network.compare(inputs)[0].position[0][0, :, x[1], x[0]]
     beta = ours.answer["betas"]["colour"]

@@ -265,7 +265,7 @@ def test_publishing_keeps_what_is_there(tmp_path):
 
 
 def test_shards_share_the_scenes_out():
-    parts = [Shard.parse(f"{i}/3").of(10) for i in (1, 2, 3)]
+    parts = [Shard.parse(f"{i}/3").select(10) for i in (1, 2, 3)]
     assert sorted(i for part in parts for i in part) == list(range(10))
     for text in ("0/3", "4/3", "1", "a/b", "1/0"):
         with pytest.raises(ValueError, match="is not i/n"):

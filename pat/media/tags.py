@@ -1,0 +1,122 @@
+"""Tags of image files on where, when and by which camera they were taken, for images made of them."""
+
+from __future__ import annotations
+
+import re
+import struct
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from PIL import ExifTags, Image, TiffImagePlugin
+
+from arraygeom.io.xmp import DJI, MICASENSE, PIX4D, RDF, xmp_packet
+
+EXIF, GPS = int(ExifTags.IFD.Exif), int(ExifTags.IFD.GPSInfo)
+KEPT = {
+    EXIF: (
+        *(0x829A, 0x829D, 0x8827, 0x8833, 0x9000, 0x9003, 0x9004, 0x9202, 0x920A, 0xA20E, 0xA20F, 0xA210),
+        *(0xA405, 0xA431, 0xA432, 0xA433, 0xA434),
+    ),
+    GPS: tuple(range(32)),
+}
+"""Exposure, aperture, sensitivity, times, focal length, resolution of the sensor, serial number, lens."""
+TEXTS = {271: "Make", 272: "Model", 306: "DateTime"}
+XMP, LONG, ENTRY = 700, 4, 12
+"""The tag of a packet, TIFF's number of a type, and the bytes of an entry."""
+LISTED = "BandName", "CentralWavelength"
+OF_ONE = re.compile(
+    r"BandName|CentralWavelength|WavelengthFWHM|Rig.*|.*(Vignetting|Irradiance|Sensitivity|HMatrix).*"
+)
+"""XMP tags of one band of a camera, and its place among the others."""
+
+
+class RecordedTags(NamedTuple):
+    """Tags of an image file.
+
+    Attributes:
+        texts: make, model and time, by number.
+        directories: EXIF's and GPS's, values by number.
+        xmp: the XMP packet; empty without.
+    """
+
+    texts: dict[int, str]
+    directories: dict[int, dict[int, Any]]
+    xmp: bytes
+
+    def extratags(self, bands: Sequence[str], wavelengths: Sequence[float | None]) -> list[tuple[Any, ...]]:
+        """List entries for tifffile, which writes all but directories."""
+        tags: list[tuple[Any, ...]] = [(tag, "s", 0, text, True) for tag, text in self.texts.items()]
+        packet = packet_of_bands(self.xmp, bands, wavelengths) if self.xmp else b""
+        return [*tags, (XMP, "B", len(packet), packet, True)] if packet else tags
+
+    def write_directories(self, path: Path) -> None:
+        """Append EXIF's and GPS's directories to a little-endian TIFF file with offsets of 32 bits."""
+        content = bytearray(path.read_bytes())
+        first = int.from_bytes(content[4:8], "little")
+        count = int.from_bytes(content[first : first + 2], "little")
+        end = first + 2 + ENTRY * count
+        entries = [bytes(content[i : i + ENTRY]) for i in range(first + 2, end, ENTRY)]
+        for tag, values in self.directories.items():
+            directory = TiffImagePlugin.ImageFileDirectory_v2(group=tag)
+            for number, value in values.items():
+                directory[number] = TiffImagePlugin.IFDRational(value) if isinstance(value, float) else value
+            content += b"\0" * (-len(content) % 4)
+            entries.append(struct.pack("<HHII", tag, LONG, 1, len(content)))
+            content += directory.tobytes(len(content))
+        content += b"\0" * (-len(content) % 4)
+        content[4:8] = struct.pack("<I", len(content))
+        following = bytes(content[end : end + 4])
+        ordered = sorted(entries, key=lambda entry: int.from_bytes(entry[:2], "little"))
+        path.write_bytes(content + struct.pack("<H", len(ordered)) + b"".join(ordered) + following)
+
+
+def recorded_tags(path: Path) -> RecordedTags | None:
+    """Read the tags of an image file; None if it has none of these, or is damaged."""
+    try:
+        with Image.open(path) as image:
+            exif = image.getexif()
+            directories = {
+                tag: {number: value for number, value in exif.get_ifd(tag).items() if number in kept}
+                for tag, kept in KEPT.items()
+            }
+            texts = {tag: str(exif[tag]) for tag in TEXTS if tag in exif}
+    except Exception:  # whatever Pillow trips over in a damaged file
+        return None
+    tags = RecordedTags(texts, {tag: d for tag, d in directories.items() if d}, xmp_packet(path.read_bytes()))
+    return tags if any(tags) else None
+
+
+def packet_of_bands(packet: bytes, bands: Sequence[str], wavelengths: Sequence[float | None]) -> bytes:
+    """Adjust an XMP packet for an image of several bands at the pixels of the one that it is from.
+
+    Tags of that one alone are left out (vignetting, radiometry); the camera, its pose and its flight stay.
+
+    Returns:
+        The packet; empty for a damaged one.
+    """
+    for prefix, uri in re.findall(r'xmlns:(\w+)="([^"]+)"', packet.decode(errors="replace")):
+        if not re.fullmatch(r"ns\d+", prefix):
+            ET.register_namespace(prefix, uri)
+    try:
+        root = ET.fromstring(packet)
+    except ET.ParseError:
+        return b""
+    listed = dict(zip(LISTED, (bands, [] if None in wavelengths else [f"{w:g}" for w in wavelengths])))
+    for described in root.iter(f"{RDF}Description"):
+        keys = [*described.attrib, *(child.tag for child in described)]
+        for key in dict.fromkeys(keys):
+            uri, _, name = key.removeprefix("{").partition("}")
+            maker = next((maker for maker in (PIX4D, DJI, MICASENSE) if maker in uri), None)
+            of_one = maker == MICASENSE and name != "CaptureId"
+            if not (of_one or OF_ONE.fullmatch(name) or "DLS" in uri):
+                continue
+            described.attrib.pop(key, None)
+            for child in described.findall(key):
+                described.remove(child)
+            if values := listed.get(name) if maker == PIX4D else None:
+                sequence = ET.SubElement(ET.SubElement(described, key), f"{RDF}Seq")
+                for value in values:
+                    ET.SubElement(sequence, f"{RDF}li").text = value
+    return ET.tostring(root)
