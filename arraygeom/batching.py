@@ -75,18 +75,54 @@ class Batched:
             A copy; tensors that need no change are shared.
 
         Raises:
-            TypeError: for a dtype that is not floating point.
+            TypeError: for another dtype than float32 and float64; half precision holds no pixel position.
         """
 
         def moved(t: Tensor, axes: int) -> Tensor:
             there = t.to(*args, **kwargs)
-            if t.is_floating_point() and not there.is_floating_point():
+            if t.is_floating_point() and there.dtype not in (torch.float32, torch.float64):
                 raise TypeError(
-                    f"the numbers of a {type(self).__name__} are floating point; got {there.dtype}"
+                    f"the numbers of a {type(self).__name__} are float32 or float64, got {there.dtype}: "
+                    "half precision holds no pixel position; give features in it, and geometry as it is"
                 )
             return there if t.is_floating_point() else there.to(t.dtype)
 
         return map_tensors(self, moved)
+
+    def float(self: T) -> T:
+        """Return a copy in float32."""
+        return self.to(torch.float32)
+
+    def double(self: T) -> T:
+        """Return a copy in float64."""
+        return self.to(torch.float64)
+
+    def cpu(self: T) -> T:
+        """Return a copy in the CPU's memory."""
+        return self.to("cpu")
+
+    def detach(self: T) -> T:
+        """Return the same numbers without their history."""
+        return map_tensors(self, lambda t, axes: t.detach())
+
+    def clone(self: T) -> T:
+        """Return a copy with memory of its own; gradients go through."""
+        return map_tensors(self, lambda t, axes: t.clone())
+
+    def pin_memory(self: T) -> T:
+        """Return a copy in page-locked memory, as `torch.utils.data.DataLoader(pin_memory=True)` asks."""
+        return map_tensors(self, lambda t, axes: t.pin_memory())
+
+    def requires_grad_(self: T, requires_grad: bool = True) -> T:
+        """Let autograd record operations on its numbers, or not, in place.
+
+        Returns:
+            Itself.
+        """
+        for t, _ in tensors_of(self):
+            if t.is_floating_point():
+                t.requires_grad_(requires_grad)
+        return self
 
     def replace(self: T, **changes: Any) -> T:
         """Return a copy with some fields changed, checked as in the constructor."""

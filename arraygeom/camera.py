@@ -18,6 +18,7 @@ from .lenses.common import on_plane
 from .lenses.model import LensModel, check_model
 from .pixels import (
     HW,
+    broadcast_shapes,
     coarse_grid,
     floating,
     map_homogeneous,
@@ -228,6 +229,11 @@ class LensView(View):
         """True if all rays start in the camera's origin."""
         return self.distortion is None or self.distortion.central
 
+    @property
+    def parallel(self) -> bool:
+        """True if all rays are parallel, and the image plane is in metres."""
+        return self.distortion is not None and self.distortion.even == "distance"
+
     def undistort(self, x: Real[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
         """Map pixels of the image to those of a pinhole with the same K.
 
@@ -300,7 +306,7 @@ class Camera(LensView):
             ValueError: as `LensModel.scaled`.
         """
         K, lens = self.K, self.distortion
-        if lens is not None and lens.even == "distance":  # parallel rays: the image plane is in metres
+        if self.parallel:  # the image plane is in metres
             K = torch.cat([K[..., :2] / K.new_tensor([factor, factor, 1.0])[:, None], K[..., 2:]], -1)
         pose = Pose(self.R, self.t * factor)
         return self.replace(K=K, cam_from_world=pose, distortion=lens and lens.scaled(factor))
@@ -334,9 +340,13 @@ class Camera(LensView):
         Returns:
             World points (metres); NaN for pixels outside the lens's range (see `rays`), and for depths that
             their rays do not reach: below 0 for rays ahead, above 0 for rays at 90 degrees and more off axis.
+
+        Raises:
+            ValueError: if pixels and depths, broadcast, are more than either, as (n, 2) beside (n, 1).
         """
         rays, valid = self.rays(x)
         z = rays[..., 2]
+        _check_pairs(z.shape, depth.shape)
         valid = valid & (z != 0) & (z * depth >= 0)
         X = rays * (depth / torch.where(valid, z, 1.0))[..., None]
         if not self.central:
@@ -408,6 +418,18 @@ class Camera(LensView):
         pose = Pose(camera.extrinsics[..., :3, :3], camera.extrinsics[..., :3, 3])
         made = cls(K=camera.intrinsics[..., :3, :3], cam_from_world=pose, hw=sizes[0])
         return made[0] if made.batch_shape == (1,) and not batched else made
+
+
+def _check_pairs(pixels: torch.Size, depths: torch.Size) -> None:
+    """Raises ValueError unless pixels and depths, broadcast, are as many as one of both."""
+    try:
+        fits = broadcast_shapes(pixels, depths) in (pixels, depths)
+    except RuntimeError:
+        fits = False
+    if not fits:
+        raise ValueError(
+            f"depth has the shape {tuple(depths)} beside pixels {tuple(pixels)}: wanted one for each pixel"
+        )
 
 
 def intrinsics(

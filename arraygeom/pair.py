@@ -202,7 +202,7 @@ class Pair(Batched):
         link = None if self.link is None else self.link.transformed(eye, A)
         return dataclasses.replace(self, beta=self.beta.transformed(A, hw), link=link)
 
-    def homography_at(self, depth: Float[Tensor, "*d"]) -> Float[Tensor, "*b 3 3"]:
+    def homography_at(self, depth: Float[Tensor, "*d"] | float) -> Float[Tensor, "*b 3 3"]:
         """Compute the homography of the plane z = depth in alpha's frame (metres; may be infinite).
 
         Raises:
@@ -211,7 +211,9 @@ class Pair(Batched):
         alpha, beta = self._central("homography")
         normal = alpha.K.new_tensor([0.0, 0.0, 1.0])
         pose = self.beta_from_alpha
-        return plane_homography(alpha.K, beta.K, pose.R, pose.t, normal=normal, d=-depth.to(alpha.K))
+        return plane_homography(
+            alpha.K, beta.K, pose.R, pose.t, normal=normal, d=-torch.as_tensor(depth).to(alpha.K)
+        )
 
     def _central(self, what: str) -> tuple[Camera, Camera]:
         """Both cameras. Raises ValueError if the rays of one do not meet in a point."""
@@ -248,7 +250,8 @@ def depth_range(near: Any, far: Any) -> Depths:
         d if isinstance(d, Tensor) else torch.tensor(float(d), dtype=torch.float64) for d in (near, far)
     ]
     near, far = bounds
-    if not traced() and not bool(((near > 0) & near.isfinite() & (far >= near)).all()):
+    sound = traced() or near.is_meta or far.is_meta
+    if not sound and not bool(((near > 0) & near.isfinite() & (far >= near)).all()):
         raise ValueError(
             "depth bounds must satisfy 0 < near <= far, in metres; "
             f"got near = {_shown(near)}, far = {_shown(far)}"

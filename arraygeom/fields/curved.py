@@ -19,7 +19,7 @@ from ..checks import check_above, check_bounds, check_field
 from ..distortion import Distortion
 from ..epipolar import FRONT, Track, beside, clipped
 from ..pair import Pair
-from ..pixels import HW, floating, map_homogeneous, product
+from ..pixels import HW, floating, map_homogeneous, product, within
 from ..runtime.chunks import spans
 from ..runtime.threads import in_parallel
 from ..runtime.tracing import traced
@@ -35,10 +35,11 @@ class Curved:
 
     Needs a calibrated pair; without lenses it is `Epipolar` sampled. The part of each ray that can be on
     beta's image is clipped in closed form, followed at nodes (even in undistorted pixels, or in angle where
-    beta sees more than 75 degrees off axis), and its part on the image is divided evenly. Positions are exact
-    for their depths; with a lens the spacing, and where an edge of the image cuts the curve, are to the
-    accuracy of straight pieces between nodes. A point that alpha sees at 90 degrees or more off axis has no
-    depth along the axis and no samples, unless the bounds are of the `distance` along the ray.
+    beta sees more than 75 degrees off axis), and its part on the image is divided evenly. In a beta that is
+    not central the nodes are first moved to where its image is. Positions are exact for their depths; with a
+    lens the spacing, and where an edge of the image cuts the curve, are to the accuracy of straight pieces
+    between nodes. A point that alpha sees at 90 degrees or more off axis has no depth along the axis and no
+    samples, unless the bounds are of the `distance` along the ray.
 
     Attributes:
         samples: number of positions per pixel of alpha.
@@ -77,10 +78,10 @@ class Curved:
         curve = RayCurve.from_pixels(pair, near, far, x, self.bounds)
         if curve.compilable and curve.valid.numel() > FEW:
             return curve.positions(self.nodes, self.samples)
-        even = torch.linspace(0, 1, self.nodes, dtype=x.dtype, device=x.device).expand(*x.shape[:-1], -1)
-        nodes, visible = curve.at(even)
-        pieces = visible_pieces(nodes, visible & curve.valid[..., None], pair.beta.hw, curve.longest_piece)
-        xy, visible = curve.at(along_pieces(pieces, sample_fractions(self.samples, like=x)))
+        fractions = curve.nodes(self.nodes)
+        nodes, visible = curve.at(fractions)
+        pieces = visible_pieces(nodes, visible & curve.valid[..., None], pair.beta.hw, curve.turn)
+        xy, visible = curve.at(along_pieces(pieces, sample_fractions(self.samples, like=x), fractions))
         xy, inside = _onto_edge(xy, pair.beta.hw, EDGE)
         mask = inside & visible & (pieces.length.sum(-1, keepdim=True) > 0)
         return Positions(torch.where(mask[..., None], xy, 0.0), mask)
@@ -186,7 +187,7 @@ class RayCurve(NamedTuple):
         last: end towards far.
         valid: mask of the pixels whose ray beta may see.
         beta: the camera whose image holds the curve.
-        wide: True if fractions are even in angle.
+        wide: True if fractions are even in angle, as in all cameras that are not central.
         inverse: inverse depths (or distances) of both ends.
     """
 
@@ -224,23 +225,31 @@ class RayCurve(NamedTuple):
         ends = (
             w_far + torch.where(visible.valid, s, 0.0) * (w_near - w_far) for s in (visible.high, visible.low)
         )
-        inverse = (torch.where(visible.valid, v, 1.0) for v in ends)
-        near_end, far_end = inverse
-        if not beta.central:
-            remote = REMOTE / beside(pose.t.norm(dim=-1) + near.to(x.dtype), x.ndim - 1)
-            near_end, far_end = torch.maximum(near_end, remote), torch.maximum(far_end, remote)
+        near_end, far_end = (torch.where(visible.valid, v, 1.0) for v in ends)
+        wide = beta.distortion is not None and limits is None and not beta.parallel
+        valid = ahead & visible.valid
+        if beta.central:
+            return cls.between(points, near_end, far_end, valid, beta, wide)
+        remote = REMOTE / beside(pose.t.norm(dim=-1) + near.to(x.dtype), x.ndim - 1)
+        near_end, far_end = (torch.maximum(v, remote) for v in (near_end, far_end))
+        whole = cls.between(points, near_end, far_end, valid, beta, wide)
+        return cls.between(points, *whole._ends_on_image(), valid, beta, wide)
+
+    @classmethod
+    def between(
+        cls, points: Track, near_end: Tensor, far_end: Tensor, valid: Tensor, beta: Camera, wide: bool
+    ) -> RayCurve:
+        """Make the curve of a track of points in beta's frame between two inverse depths."""
         first, last = (points.a + v[..., None] * points.b for v in (near_end, far_end))
-        wide = beta.distortion is not None and limits is None and beta.central
-        return cls(first, last, ahead & visible.valid, beta, wide, (near_end, far_end))
+        return cls(first, last, valid, beta, wide, (near_end, far_end))
 
     @property
-    def longest_piece(self) -> float:
-        """Distance in beta's pixels from which two nodes are on either side of the seam of its image; inf
-        without a seam."""
+    def turn(self) -> Float[Tensor, "*n 2"] | None:
+        """Pixels of beta after which its image plane repeats itself; None if it does not."""
         lens = self.beta.distortion
         if lens is None or not lens.period:
-            return math.inf
-        return 0.5 * lens.period * float(self.beta.K[..., :2, :2].detach().det().abs().sqrt().amax())
+            return None
+        return beside(lens.period * self.beta.K[..., :2, 0].detach(), self.first.ndim + 1, trailing=1)
 
     @property
     def compilable(self) -> bool:
@@ -277,6 +286,71 @@ class RayCurve(NamedTuple):
             torch.from_numpy(xy).reshape(*axes, samples, 2), torch.from_numpy(mask).reshape(*axes, samples)
         )
 
+    @torch.no_grad()
+    def nodes(self, count: int) -> Float[Tensor, "*n k"]:
+        """Compute fractions (*n, count) at which to follow the curve: even, or even in pixels if not central.
+
+        In pixels too where the image repeats itself: by a pole the columns run away.
+        """
+        even = self._even(count)
+        fractions = self._fractions(even)
+        for _ in range(0 if self.beta.central and self.turn is None else PASSES):
+            pieces = self._pieces(fractions, NARROW)
+            there = pieces.length.sum(-1, keepdim=True) > 0
+            fractions = torch.where(there, along_pieces(pieces, even, fractions), even)
+        return fractions
+
+    def _fractions(self, even: Tensor) -> Tensor:
+        """Return even fractions for each pixel; if not central, others too, closer and closer to the ends."""
+        if not self.beta.central:
+            close = 10 ** (CLOSEST * (1 - self._even(len(even) // 2 + 1)[:-1]))
+            even = torch.cat([even, close, 1 - close]).sort().values
+        return even.expand(*self.valid.shape, -1)
+
+    def _even(self, count: int) -> Tensor:
+        return torch.linspace(0, 1, count, dtype=self.first.dtype, device=self.first.device)
+
+    def _ends_on_image(self) -> tuple[Tensor, Tensor]:
+        """Find the inverse depths between which an image larger by `MARGIN` shows the curve: constants.
+
+        A camera whose rays do not meet bounds no directions by its image, and what it has of a curve may be
+        a small part. An end that the image shows stays, with its gradient.
+        """
+        with torch.no_grad():
+            fractions = self._fractions(self._even(NODES))
+            covered = self._covered(fractions)
+            low, high = covered[..., :1], covered[..., 1:]
+            fractions = torch.lerp(low, high, fractions)
+            pieces = self._pieces(fractions, MARGIN)
+            there = pieces.length.sum(-1, keepdim=True) > 0
+            ends = torch.where(
+                there, along_pieces(pieces, covered.new_tensor([0.0, 1.0]), fractions), covered
+            )
+            near_end, far_end = self.inverse_depth(ends).unbind(-1)
+            xy, visible = self.at(torch.zeros_like(ends) + ends.new_tensor([0.0, 1.0]))
+            near_shown, far_shown = (visible & within(xy, self.beta.hw)).unbind(-1)
+        first, last = self.inverse
+        return torch.where(near_shown, first, near_end), torch.where(far_shown, last, far_end)
+
+    def _pieces(self, fractions: Tensor, share: float) -> Pieces:
+        """Find the pieces on an image that is larger by a share of its height plus width on each side."""
+        xy, visible = self.at(fractions)
+        margin = math.ceil(share * sum(self.beta.hw))
+        h, w = self.beta.hw
+        return visible_pieces(xy + margin, visible, (h + 2 * margin, w + 2 * margin), self.turn)
+
+    def _covered(self, fractions: Tensor) -> Tensor:
+        """Find the first and last fractions (*n, 2) of the curve that the model covers, by bisection."""
+        visible, last = self.at(fractions)[1], fractions.shape[-1] - 1
+        ends = torch.stack([visible.int().argmax(-1), last - visible.int().flip(-1).argmax(-1)], -1)
+        inner = fractions.gather(-1, ends)
+        outer = fractions.gather(-1, (ends + ends.new_tensor([-1, 1])).clamp(0, last))
+        for _ in range(HALVINGS):
+            middle = (inner + outer) / 2
+            covered = self.at(middle)[1]
+            inner, outer = torch.where(covered, middle, inner), torch.where(covered, outer, middle)
+        return torch.where(visible.any(-1, keepdim=True), inner, fractions[..., [0, -1]])
+
     def at(self, fraction: Tensor) -> tuple[Tensor, Tensor]:
         """Compute beta's pixels (*n, l, 2) at fractions (*n, l) of the way first to last, with a mask of the
         visible ones."""
@@ -301,9 +375,7 @@ class RayCurve(NamedTuple):
     def _weights_in_pixels(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """Return shares of first and of last in the point whose pixel, without the lens, is a fraction u
         along."""
-        lens = self.beta.distortion
-        parallel = lens is not None and not lens.central and lens.even == "distance"
-        ends = self.inverse if parallel else (self.first[..., 2], self.last[..., 2])
+        ends = self.inverse if self.beta.parallel else (self.first[..., 2], self.last[..., 2])
         z0, z1 = (torch.where(self.valid, z, 1.0)[..., None] for z in ends)
         return (1 - u) * z1, u * z0
 
@@ -320,6 +392,16 @@ class RayCurve(NamedTuple):
         return (1 - u) * torch.sinc((1 - u) * angle / math.pi) * r1, u * torch.sinc(u * angle / math.pi) * r0
 
 
+NODES, PASSES = 64, 2
+"""Points at which a curve is searched for the image of a camera that is not central, and how often its nodes
+are divided anew."""
+MARGIN, NARROW = 1 / 4, 1 / 32
+"""By how much larger than beta's image, in shares of its height plus width, to search and to divide in."""
+HALVINGS = 20
+"""Steps of the bisection for where a model's range ends."""
+CLOSEST = -6.0
+"""Log10 of the share of a curve from its ends to which first nodes go: most of beta's image may be there,
+by the plane of beta, and far away where one direction of its rays is parallel."""
 REMOTE = 1e-5
 """Inverse depth taken for infinity, in units of baseline plus near bound, for a beta whose rays do not meet:
 there a point is not only a direction."""
@@ -424,30 +506,38 @@ class Pieces(NamedTuple):
 
 
 def visible_pieces(
-    nodes: Float[Tensor, "*n k 2"], visible: Tensor, hw: HW, longest: float = math.inf
+    nodes: Float[Tensor, "*n k 2"], visible: Tensor, hw: HW, turn: Tensor | None = None
 ) -> Pieces:
     """Compute the parts of a polyline that lie on the image, of pieces with a node that is `visible`.
 
-    A visible piece of no length counts as 1e-3 pixels, so that a curve that is a point has a position.
+    Across the seam of an image that repeats itself a piece counts twice, as it leaves and as it returns:
+    then all pieces do. A visible piece of no length counts as 1e-3 pixels, so that a curve that is a point
+    has a position.
 
     Args:
         nodes: pixels of the polyline.
         visible: mask (*n, k) of the nodes.
-        longest: pixels; longer pieces are across a seam and left out.
+        turn: pixels (2) after which the image repeats itself; None if it does not.
     """
-    first, last = fractions_on_image(nodes[..., :-1, :], nodes[..., 1:, :], hw)
-    visible = (visible[..., :-1] | visible[..., 1:]) & (first <= last)
+    start, end = nodes[..., :-1, :], nodes[..., 1:, :]
+    visible = visible[..., :-1] | visible[..., 1:]
+    if turn is not None:
+        turns = (((end - start).detach() * turn).sum(-1) / turn.square().sum(-1)).round()
+        over = turns[..., None] * turn
+        start, end = (torch.stack(v, -2).flatten(-3, -2) for v in ((start, start + over), (end - over, end)))
+        visible = torch.stack([visible, visible & (turns != 0)], -1).flatten(-2)
+    first, last = fractions_on_image(start, end, hw)
+    visible = visible & (first <= last)
     first, last = torch.where(visible, first, 0.0), torch.where(visible, last, 1.0)
-    if longest < math.inf:
-        visible = visible & (nodes.detach().diff(dim=-2).square().sum(-1) < longest**2)
-    step = torch.where(visible[..., None], nodes.diff(dim=-2), 0.0)
+    step = torch.where(visible[..., None], end - start, 0.0)
     length = (step.square().sum(-1) + 1e-6).sqrt() * (last - first)
     return Pieces(first, last, torch.where(visible, length, 0.0))
 
 
-def along_pieces(pieces: Pieces, u: Float[Tensor, " l"]) -> Float[Tensor, "*n l"]:
-    """Compute the fractions of the whole polyline (first node 0, last 1) at fractions u of its visible
-    length."""
+def along_pieces(
+    pieces: Pieces, u: Float[Tensor, " l"], nodes: Float[Tensor, "*n k"]
+) -> Float[Tensor, "*n l"]:
+    """Compute the numbers, between those of the polyline's `nodes`, at fractions u of its visible length."""
     first, last, length = pieces
     ends = length.cumsum(-1)
     wanted = u * ends[..., -1:]
@@ -458,4 +548,6 @@ def along_pieces(pieces: Pieces, u: Float[Tensor, " l"]) -> Float[Tensor, "*n l"
     first, last, length, end = (v.gather(-1, index) for v in (first, last, length, ends))
     within = 1 - (end - wanted) / torch.where(length > 0, length, 1.0)
     within = torch.where(length > 0, within, 0.0).clamp(0, 1)
-    return (index + torch.lerp(first, last, within)) / pieces.length.shape[-1]
+    index = index // (pieces.length.shape[-1] // (nodes.shape[-1] - 1))
+    before, after = (nodes.gather(-1, index + step) for step in (0, 1))
+    return torch.lerp(before, after, torch.lerp(first, last, within))

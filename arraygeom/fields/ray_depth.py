@@ -57,12 +57,13 @@ def ray_depth(
         finite = x.isfinite().all(-1) & x_beta.isfinite().all(-1)
         x, x_beta = (torch.where(finite[:, None], p, 0.0) for p in (x, x_beta))
         curve = RayCurve.from_pixels(pair, near, far, x, bounds)
-        low, high = torch.zeros_like(x[:, :1]), torch.ones_like(x[:, :1])
-        for count in (NODES, FINER, FINER, FINER):
-            fraction = torch.lerp(low, high, torch.linspace(0, 1, count).to(x))
-            apart = _apart(curve, fraction, x_beta)
+        fraction = curve.nodes(NODES)
+        for finer in (FINER, FINER, FINER, 0):
+            apart, last = _apart(curve, fraction, x_beta), fraction.shape[-1] - 1
             best = apart.argmin(-1, keepdim=True)
-            low, high = (fraction.gather(-1, (best + step).clamp(0, count - 1)) for step in (-1, 1))
+            low, high = (fraction.gather(-1, (best + step).clamp(0, last)) for step in (-1, 1))
+            if finer:
+                fraction = torch.lerp(low, high, torch.linspace(0, 1, finer).to(x))
         there = _nearest(curve, fraction.gather(-1, best).detach(), x_beta)
         inverse = curve.inverse_depth(there)[:, 0]
         valid = finite & curve.valid & apart.gather(-1, best)[:, 0].isfinite() & (inverse > 0)

@@ -79,9 +79,9 @@ class BehindModel(CameraModel):
             raise ValueError(f"the lens has to be central, and {self.lens.model} is not")
 
     @property
-    def sees_behind(self) -> bool:
-        """True if its lens sees behind."""
-        return self.lens is not None and self.lens.sees_behind
+    def period(self) -> float:  # type: ignore[override]
+        """Period of its lens."""
+        return 0.0 if self.lens is None else self.lens.period
 
     def _through(self, X: Tensor) -> tuple[Tensor, Tensor]:
         return on_plane(X) if self.lens is None else self.lens.project(X)
@@ -229,6 +229,11 @@ class FlatPort(BehindModel, name="flat-port"):
         super().__post_init__()
         if checking() and not all(bool((n >= 1).all()) for n in (self.glass, self.water)):
             raise ValueError("glass and water are refractive indices, at least 1, as 1.52 and 1.333")
+
+    @property
+    def sees_behind(self) -> bool:
+        """Points beyond the pane alone are seen."""
+        return False
 
     def project(self, X: Tensor) -> tuple[Tensor, Tensor]:
         """Project points in the water by the ray that reaches them, found by Newton's method.

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
@@ -35,13 +36,13 @@ def needs(extra: str, purpose: str) -> Iterator[None]:
 
 
 def imported(name: str, what: str) -> Any:
-    """Import a user's "module:object", also from the current folder.
+    """Import a user's "module:object", or a module, also from the current folder.
 
     Args:
         what: what it is, for messages.
 
     Returns:
-        The object.
+        The object, or the module.
 
     Raises:
         ValueError: if it cannot be imported.
@@ -49,8 +50,23 @@ def imported(name: str, what: str) -> Any:
     module, _, attribute = name.partition(":")
     try:
         sys.path.insert(0, str(Path.cwd()))
-        return getattr(importlib.import_module(module), attribute)
+        found = importlib.import_module(module)
+        return getattr(found, attribute) if attribute or ":" in name else found
     except (ImportError, AttributeError, ValueError) as error:
         raise ValueError(f"the {what} '{name}' cannot be imported: {error}") from None
     finally:
         sys.path.pop(0)
+
+
+PLUGINS = "arraygeom.plugins"
+"""The group of entry points whose modules register cameras, fields and rig formats of one's own."""
+
+
+def load_plugins(names: Iterable[str] = ()) -> None:
+    """Import installed plugins (entry points of the group `PLUGINS`), and modules by name.
+
+    Importing registers: a camera by being defined with a name, a field in `arraygeom.fields.FIELDS`, a rig
+    format in `arraygeom.io.READERS` (and `WRITERS`). Raises ValueError for one that cannot be imported.
+    """
+    for name in [*(point.value for point in entry_points(group=PLUGINS)), *names]:
+        imported(name, "plugin")

@@ -104,7 +104,9 @@ def fuse(
         differentiable: keep gradients with respect to the numbers of the rig, the images and the network's
             weights (which `requires_grad_(True)` frees). A match moves along its segment as images and rig
             move the best agreement around it; which match is the best, the alignment and the response are
-            constants. Else the frame is detached, whatever requires gradients.
+            constants, and so is what enters or leaves a beta's image: leave its border out of an error.
+            `pat.fusion.gradients.without_gradient` names the parameters without a gradient. Else the frame
+            is detached, whatever requires gradients.
         matcher: the function that matches for a network that uses matches: `pat.matching.match.match`, or
             your own.
 

@@ -5,9 +5,11 @@ that area bilinear look-up clamps coordinates to the border's centres, and neare
 whose area contains the position. An alpha pixel without a sample that counts gets 0 everywhere, and passes no
 gradient.
 
-Gradients reach query, key, value, bias and the geometry. With `nearest` the value and the peak have no
-gradient by the geometry (they are constant almost everywhere); position and spread do, as weighted means of
-the positions.
+Gradients reach query, key, value, bias and the geometry. Which samples count is a constant in the graph: a
+sample that enters or leaves beta's image when a rig moves has no gradient, which is part of the truth near
+its border. A `value` that falls to 0 towards beta's border makes the output continuous there. With `nearest`
+the value and the peak have no gradient by the geometry (they are constant almost everywhere); position and
+spread do, as weighted means of the positions.
 """
 
 from __future__ import annotations

@@ -14,6 +14,7 @@ without gradients no more than `BAND_BYTES` of gathered keys and values exist at
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -114,6 +115,14 @@ def attend(inputs: AttentionInputs) -> Attended:
     return Attended(value, out.position.permute(0, 3, 1, 2), out.deviation, out.peak)
 
 
+def log_sum(inputs: AttentionInputs) -> Tensor:
+    """Compute log sum_l exp(score_l) over samples that count, (b, r, w); 0 without any. Gathers all keys."""
+    query = inputs.query.permute(0, 2, 3, 1)
+    score, counts, _ = _scores(inputs._replace(query=query, key=channels_last(inputs.key)))
+    some = counts.any(-1)
+    return torch.where(some, torch.where(counts | ~some[..., None], score, -torch.inf).logsumexp(-1), 0)
+
+
 def accumulated(tensor: Tensor) -> torch.dtype:
     """Return the type in which numbers of a tensor's type are summed: float64 for float64, else float32."""
     return torch.float64 if tensor.dtype == torch.float64 else torch.float32
@@ -126,19 +135,25 @@ def channels_last(image: Tensor) -> Tensor:
 
 def _band(inputs: AttentionInputs) -> Attended:
     """Attention of a band; images are channels last: (b, r, w, d) and (b, h, w, d)."""
-    q, key, value, positions, bias, nearest = inputs
+    score, counts, xy = _scores(inputs)
+    weight = _softmax(score, counts)
+    out = torch.einsum("brwl,brwld->brwd", weight, _look_up(inputs)(inputs.value, xy))
+    return Attended(out, *_statistics(weight, xy))
+
+
+def _scores(inputs: AttentionInputs) -> tuple[Tensor, Tensor, Tensor]:
+    """Scores (b, r, w, l), mask of the samples that count, positions of these; channels last."""
+    q, key, positions = inputs.query, inputs.key, inputs.positions
     b, r, w, _ = q.shape
     xy = positions.positions().to(q.dtype)  # p r w l 2
     counts = positions.mask & on_image(xy, (key.shape[1], key.shape[2]))  # p r w l
     xy = torch.where(counts[..., None], xy, 0).expand(b, r, w, positions.samples, 2)
-    interpolate = _nearest if nearest else _bilinear
+    score = torch.einsum("brwd,brwld->brwl", q, _look_up(inputs)(key, xy))
+    return score if inputs.bias is None else score + inputs.bias, counts, xy
 
-    score = torch.einsum("brwd,brwld->brwl", q, interpolate(key, xy))
-    if bias is not None:
-        score = score + bias
-    weight = _softmax(score, counts)
-    out = torch.einsum("brwl,brwld->brwd", weight, interpolate(value, xy))
-    return Attended(out, *_statistics(weight, xy))
+
+def _look_up(inputs: AttentionInputs) -> Callable[[Tensor, Tensor], Tensor]:
+    return _nearest if inputs.nearest else _bilinear
 
 
 def _nearest(image: Tensor, xy: Tensor) -> Tensor:

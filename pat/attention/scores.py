@@ -79,14 +79,18 @@ def log_sum(compared: Compared) -> Float[Tensor, "b ha wa"]:
     """Compute log sum_l exp(query . key(x_l)) over the samples that count.
 
     Returns:
-        (b, ha, wa); meaningless where none counts. Differentiable once, by query and key.
+        (b, ha, wa); meaningless where none counts. Differentiable by query and key once, and where positions
+        require a gradient by these too, any number of times: by the formula, which gathers all keys.
 
     Raises:
         ValueError: for explicit positions.
     """
-    positions = sample_positions(compared.segments, compared.query, compared.samples)
-    nearest = compared.interpolation == "nearest"
-    return _LogSum.apply(compared.query, compared.key, positions, nearest)
+    query, key, value, _, _, interpolation = compared
+    positions = sample_positions(compared.segments, query, compared.samples)
+    nearest = interpolation == "nearest"
+    if torch_op.wants_gradient(positions.points):
+        return reference.log_sum(AttentionInputs(query, key, value, positions, None, nearest))
+    return _LogSum.apply(query, key, positions, nearest)
 
 
 def mean_score(compared: Compared) -> Float[Tensor, "b ha wa"]:

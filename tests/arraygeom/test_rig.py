@@ -241,3 +241,25 @@ def test_fields_in_another_unit_are_the_same(field, moves, factor):
     found, wanted = (field(r.pair("alpha", "beta"), x) for r in (rig.scaled(factor), rig))
     for part, value in vars(wanted).items():
         torch.testing.assert_close(vars(found)[part], value, rtol=0, atol=1e-6)
+
+
+def test_what_torch_offers_of_a_tensor_a_rig_offers_too():
+    rig = two_cameras(centre=(0.3, 0.0, 0.0), depth=(1.0, 8.0))
+    name = rig.names[1]
+    assert rig.float()[name].K.dtype == torch.float32
+    assert rig.float().double()[name].K.dtype == torch.float64
+    assert rig.double() == rig.cpu() == rig
+    free = rig.clone().requires_grad_()
+    assert free[name].K.requires_grad
+    assert not rig[name].K.requires_grad
+    copied = free.clone()
+    copied[name].t.sum().backward()
+    assert free[name].cam_from_world.t.grad is not None
+    assert not free.detach()[name].K.requires_grad
+    assert free.requires_grad_(False)[name].K.requires_grad is False
+    meta = rig.to("meta")
+    assert meta[name].K.is_meta
+    assert meta.depth[0].is_meta
+    depth = torch.tensor(2.0, dtype=torch.float64)
+    pair = rig.pair(*rig.names)
+    assert torch.equal(pair.homography_at(2.0), pair.homography_at(depth))

@@ -173,6 +173,9 @@ WRONG: dict[str, Callable[[], Any]] = {
     "coding unknown": lambda: Sensor(coding="sRGB"),
     "band without width": lambda: Band(450, 0),
     "curve of unlike lengths": lambda: Curve((400.0, 500.0), (1.0,)),
+    "a rig in half precision": lambda: rig().to(torch.float16),
+    "a depth of each pixel as a column": lambda: camera().unproject(X.expand(5, 2), torch.ones(5, 1)),
+    "depths of other pixels": lambda: camera().unproject(X.expand(5, 2), torch.ones(3)),
     "triangulation of one view": lambda: triangulate([camera()], X[None]),
     # What nothing can know of:
     "pixels (y, x)": lambda: sampling_locations(Epipolar(), pair(), X.flip(-1)),

@@ -11,6 +11,8 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any, ClassVar, NoReturn
 
+from arraygeom.runtime.extras import load_plugins
+
 from ...support.folders import error_text
 from ...support.schema import near
 from . import align, batch, calibration, demo, fuse, rigs, sequence
@@ -105,7 +107,7 @@ def _run(arguments: list[str], group: Any, prog: str, *, debug: bool) -> None:
         with warnings.catch_warnings():
             warnings.showwarning = warn
             WARNED.clear()
-            command = _command(arguments, group, prog)
+            command = _command(_with_plugins(arguments), group, prog)
             if isinstance(rig := getattr(command, "rig", None), Path):
                 refuse_missing(rig, rig=True)
             command.run()
@@ -129,6 +131,19 @@ def _run(arguments: list[str], group: Any, prog: str, *, debug: bool) -> None:
             raise
         said = ", ".join([f"{type(error).__name__}: {error}", *notes])
         _fail(error, f"{said} (--debug shows where)", debug)
+
+
+def _with_plugins(arguments: list[str]) -> list[str]:
+    """The arguments without `--plugin MODULE`, once these and installed plugins are imported."""
+    rest, names, words = [], [], iter(arguments)
+    for word in words:
+        option, _, value = word.partition("=")
+        if option == "--plugin":
+            names.append(value or next(words, ""))
+        else:
+            rest.append(word)
+    load_plugins(names)
+    return rest
 
 
 def _as_option(text: str, command: Any) -> str:
@@ -180,7 +195,8 @@ def _help(path: str, group: Any) -> str:
     lines += [f"  {name:10s} {_first_line(command)}" for name, command in commands.items()]
     lines += [
         "",
-        f"`{path} COMMAND --help` explains a command's options; --debug shows an error's traceback.",
+        f"`{path} COMMAND --help` explains a command's options; --debug shows an error's traceback;",
+        "--plugin MODULE imports a camera, a field or a rig format of your own.",
     ]
     return "\n".join([*lines, *(["`pat --version` prints the version."] if group is Pat else [])])
 

@@ -84,3 +84,22 @@ def test_a_segment_of_one_sample_has_a_target():
     one = Compared(query, key, key, Segments(start, start, rows().valid), 1, "bilinear")
     loss = attention_loss([one], [start], [torch.ones(1, *HW, dtype=torch.bool)], stride=1)
     torch.testing.assert_close(loss, torch.zeros_like(loss))
+
+
+def test_the_loss_of_a_moving_rig_is_that_of_its_differences():
+    """Both parts follow the positions: the true score and the sum over the segment."""
+    query, key, position, _ = random()
+    visible = torch.rand(1, *HW, generator=torch.Generator().manual_seed(1)) < 0.6
+    start, end = (v.detach() + 0.3 for v in (rows().start, rows().end))
+
+    def loss(start, end, query, key):
+        segments = Segments(start, end, rows().valid)
+        one = Compared(query, key, key, segments, SAMPLES, "bilinear")
+        return attention_loss([one], [position + 0.37], [visible], stride=1)
+
+    numbers = [v.requires_grad_() for v in (start, end)]
+    assert torch.autograd.gradcheck(loss, (*numbers, query, key))
+    still = attention_loss([compared(query, key)], [position], [visible], stride=1)
+    moved = [v.detach().requires_grad_() for v in (rows().start, rows().end)]
+    by_formula = Compared(query, key, key, Segments(*moved, rows().valid), SAMPLES, "bilinear")
+    torch.testing.assert_close(attention_loss([by_formula], [position], [visible], stride=1), still)

@@ -1,0 +1,60 @@
+"""Which numbers of a rig `fuse(differentiable=True)` has no gradient by, found before the work."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from arraygeom import Rig
+
+from ..networks.protocol import FusionNetwork
+from .fuse import FuseSettings, fuse_frame
+
+LONGEST = 96
+"""Pixels of the longest side of an image on which gradients are tried."""
+
+
+def without_gradient(
+    images: Mapping[str, Tensor],
+    rig: Rig,
+    *,
+    alpha: str,
+    network: FusionNetwork,
+    settings: FuseSettings = FuseSettings(),
+    free: tuple[str, ...] = ("*",),
+) -> dict[str, tuple[str, ...]]:
+    """Name the parameters without a gradient: of the fused "image", and of its "depth".
+
+    Fuses the images at no more than 96 pixels a side, as `fuse_frame` with these arguments would; `free` are
+    patterns of `Rig.parameters`. A parameter is named if no pixel's derivative by it is anything but 0: of a
+    camera that is not used, of fields that do not ask for it, of look-ups at whole pixels. Raises as
+    `fuse_frame`, and for a field that is of images of one size (`Moved`).
+    """
+    small = {name: image for name, image in images.items() if name in rig}
+    for name, image in small.items():
+        h, w = image.shape[-2:]
+        share = min(1.0, LONGEST / max(h, w))
+        hw = max(1, round(h * share)), max(1, round(w * share))
+        small[name], rig = interpolate(image[None].float(), hw, mode="area")[0], rig.resize(name, hw)
+    changes = rig.parameters(free=free)
+    frame = fuse_frame(
+        *(small, rig.perturbed(changes)),
+        alpha=alpha,
+        network=network,
+        settings=settings,
+        differentiable=True,
+    )
+    depth = torch.where(frame.depth.isfinite(), frame.depth, 0.0)
+    return {name: _unmoved(values, changes) for name, values in (("image", frame.image), ("depth", depth))}
+
+
+def _unmoved(values: Tensor, changes: Mapping[str, Tensor]) -> tuple[str, ...]:
+    """The names of changes by which a random sum of values has no derivative but 0."""
+    if not values.requires_grad:
+        return tuple(changes)
+    weights = torch.randn(values.shape, generator=torch.Generator().manual_seed(0)).to(values)
+    slopes = torch.autograd.grad((weights * values).sum(), [*changes.values()], None, True, allow_unused=True)
+    return tuple(name for name, s in zip(changes, slopes) if s is None or not bool((s != 0).any()))
