@@ -60,9 +60,10 @@ class Array:
         """Entries of a camera in the rig file."""
         return self.rig["cameras"][name]
 
-    def image(self, name: str, change: Callable[[Image], Image]) -> None:
-        """Change an image's values, 0 to 255, or to 65535 if they have 16 bits."""
+    def image(self, name: str, change: Callable[[Image], Image]) -> Image:
+        """Change an image's values, 0 to 255, or to 65535 if they have 16 bits; return it."""
         self.images[name] = change(self.images[name])
+        return self.images[name]
 
     def arguments(self, folder: Path) -> list[str]:
         """The command's, once all files are written."""
