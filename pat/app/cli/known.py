@@ -67,8 +67,10 @@ class Known:
     """Memory limit of the whole process, such as 4GiB; larger frames are done in tiles."""
 
     def __post_init__(self) -> None:
+        if self.max_memory is None:
+            return
         try:
-            parse_bytes(self.max_memory or "inf")
+            parse_bytes(self.max_memory)
         except ValueError:
             raise UsageError("--max-memory", "bytes, as 4GiB or 500MB", self.max_memory) from None
 

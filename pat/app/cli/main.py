@@ -6,12 +6,11 @@ import os
 import sys
 import warnings
 from collections.abc import Iterator, Mapping
+from importlib.metadata import entry_points
 from inspect import getdoc
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any, ClassVar, NoReturn
-
-from arraygeom.runtime.extras import load_plugins
 
 from ...support.folders import error_text
 from ...support.schema import near
@@ -142,7 +141,10 @@ def _with_plugins(arguments: list[str]) -> list[str]:
             names.append(value or next(words, ""))
         else:
             rest.append(word)
-    load_plugins(names)
+    if names or entry_points(group="arraygeom.plugins"):
+        from arraygeom.runtime.extras import load_plugins  # imports torch
+
+        load_plugins(names)
     return rest
 
 
