@@ -123,6 +123,10 @@ def test_commands_in_the_pages_exist():
     assert shown <= known
 
 
+OF_ALL = {"--help", "--version", "--plugin"}
+"""Options of every command, which `pat --help` states."""
+
+
 def test_options_in_the_pages_exist():
     """Every option that a page shows with a `pat` command is in its --help; not a recipe's parts."""
     unknown = []
@@ -134,7 +138,7 @@ def test_options_in_the_pages_exist():
             if paths:
                 known = set(re.findall(r"--[a-z][\w-]*|-\w\b", help_of(max(paths, key=len))))
                 options = {word.partition("=")[0] for word in words if re.match("--?[a-z][^.]*$", word)}
-                unknown += [(page.name, line, name) for name in options - known - {"--help", "--version"}]
+                unknown += [(page.name, line, name) for name in options - known - OF_ALL]
     assert unknown == []
 
 
