@@ -226,8 +226,8 @@ def test_everything_has_a_short_text():
 
 
 def test_notebooks_show_an_escaped_table():
-    camera = random_rig(1)["alpha"].replace(sensor=Sensor(response="<script>alert(1)</script>"))
-    html = Rig({"<b>": camera, "b": random_rig(1)["beta"]}, depth=(1, 2), name="a & b")._repr_html_()
+    cameras = {"<b>": random_rig(1)["alpha"], "<script>alert(1)</script>": random_rig(1)["beta"]}
+    html = Rig(cameras, depth=(1, 2), name="a & b")._repr_html_()
     assert "<script>" not in html
     assert "<b>" not in html
     assert "&lt;b&gt;" in html

@@ -173,7 +173,7 @@ def test_one_photograph_of_each_camera(photos, capsys):
     [
         (["--deviation", "place=1"], "'place': it has position, rotation, focal, centre"),
         (["--deviation", "focal=0"], "focal=0"),
-        (["--lens", "auto"], "--start"),
+        (["--lens", "auto"], "--lens: auto"),
         (["--start", "other.yaml"], "c1: "),
         (["--start", "smaller.yaml"], "c0: its images are 640x480"),
     ],
