@@ -21,23 +21,24 @@ from .inputs import FrameInputs
 from .low_light import shown_noise
 
 LOW_CONFIDENCE, LOW_SHARE = 0.5, 0.25
-"""One is warned below this mean confidence, where all views overlap, or where more of it has under a half of
-that. Of ten of Middlebury's pairs with the right rig .66 to .84, up to 17 %; of six with a black third, with
-every other row shifted or in other light, .16 to .48 and from 22 %, but for one (.56 and 14 %)."""
+"""Mean confidence, where all views overlap, below which a warning is given, and the share of that area with
+less than half of it above which one is. Of ten of Middlebury's pairs the right rig gives .66 to .84 and up to
+17 %; six with a black third, with every other row shifted or in other light give .16 to .48 and from 22 %,
+but for one (.56 and 14 %)."""
 UNFIT_CONFIDENCE = 0.16
-"""The mean below which a rig is taken for wrong.
-
-Measured on Middlebury's tune half: with the sign of the baseline changed, or beta turned upside down, 36
-pairs had .05 to .24, 32 of them below .16; the same with the right rig .61 to .88, with beta reduced eight
-times .27 to .55, and with 50 electrons from .23.
-"""
+"""Mean confidence, where all views overlap, below which the rig counts as wrong; a warning begins at
+`LOW_CONFIDENCE`. Measured on Middlebury's tune half: with the sign of the baseline changed, or beta turned
+upside down, 36 pairs had .05 to .24, 32 of them below .16; the same with the right rig .61 to .88, with beta
+reduced eight times .27 to .55, and with 50 electrons from .23."""
 PLAIN_NOISE = 4 / 255
-"""The standard deviation from which noise is named as a reason."""
+"""Standard deviation from which noise is named as a reason."""
 
 
 class LowConfidenceWarning(UserWarning):
-    """Warning that the images hardly match along the rig's search segments; commands end with
-    `exit_status`."""
+    """Warning that the images hardly match along the rig's search segments.
+
+    Commands that show it end with `exit_status`.
+    """
 
     exit_status = 3
 
@@ -45,9 +46,9 @@ class LowConfidenceWarning(UserWarning):
 def warn_of_confidence(network: FusionNetwork, frame: Frame, inputs: FrameInputs) -> None:
     """Warn if confidence is low, in the mean or in a large part, where the segments of all betas are valid.
 
-    Below `UNFIT_CONFIDENCE` by a `LowConfidenceWarning`. Of bands that are each another beta's, by that of
-    the median band: some bands of nine are unlike alpha whatever the rig. Only for networks whose confidence
-    is a trained probability.
+    Below `UNFIT_CONFIDENCE` by a `LowConfidenceWarning`. For bands that are each another beta's, the median
+    band decides: some bands of nine differ from alpha whatever the rig. Only for networks whose confidence is
+    a trained probability.
     """
     overlap = _overlap(inputs).to(frame.confidence.device)
     if not (network.uses_matches and overlap.any()):
@@ -92,7 +93,7 @@ def confidence_checked(*, strict: bool) -> Iterator[None]:
 
 
 def _overlap(inputs: FrameInputs) -> Bool[Tensor, "h w"]:
-    """Where all betas' segments are valid."""
+    """Compute the mask of the pixels where all betas' segments are valid."""
     h, w = inputs.hw
     overlap = torch.ones(inputs.hw, dtype=torch.bool)
     for beta in inputs.inputs.betas:

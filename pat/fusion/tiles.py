@@ -27,8 +27,8 @@ from .frame import Frame
 from .inputs import FrameInputs
 
 MAX_HALO = 256
-"""The widest halo, pixels: what is farther off changes an image of KITTI's by 7e-6 with trained weights (at
-240 pixels 5e-5, at 224 2e-4), however far their convolutions reach."""
+"""Widest halo, pixels: points farther off change an image of KITTI's by 7e-6 with trained weights (at 240
+pixels 5e-5, at 224 2e-4), however far their convolutions reach."""
 MATCHING_BYTES = 360.0
 """Working memory of matching for each pixel of alpha, measured."""
 FILLING_BYTES = 80.0

@@ -72,9 +72,18 @@ class Views:
     ) -> Views:
         """Check names and images; each is asked for once, and alpha made grey.
 
-        Raises ValueError for a camera that the rig lacks, no image of alpha or of any beta, an image of
-        another size than the rig says, of another type, or with values that are not finite or far outside
-        0..1. TypeError for what is no tensor, and for images without names.
+        Args:
+            depth: (near, far) in place of the rig's depth range; None for the rig's.
+            field: field of all betas, or of each; None for the default.
+
+        Returns:
+            The views.
+
+        Raises:
+            ValueError: for a camera that the rig lacks, no image of alpha or of any beta, an image of another
+                size than the rig states, of another type, with values that are not finite or far outside
+                0..1, or so much brighter than another that the stated exposures must be wrong.
+            TypeError: for images that are no tensors, or have no names.
         """
         if not isinstance(images, Mapping):
             raise TypeError(f"the images are a {type(images).__name__}: give {{NAME: image}}, by camera")
@@ -149,10 +158,12 @@ BRIGHTER = 200.0
 
 
 def check_exposures(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> None:
-    """Check the stated exposures by the developed images' brightness.
+    """Check the stated exposures by the brightness of the developed images.
+
+    Only where the rig states the exposures of both; each image is compared with alpha's.
 
     Raises:
-        ValueError: for images so unlike in brightness that their exposures must be wrong.
+        ValueError: for images so different in brightness that their exposures must be wrong.
     """
     light = {n: float(i[:, ::4, ::4].detach().clamp(min=0).pow(2.2).mean()) for n, i in images.items()}
     for name, one in light.items():
@@ -325,9 +336,9 @@ class FilesOfCameras(Mapping[str, T]):
 
 
 class ViewFiles(FilesOfCameras[Tensor]):
-    """An image file of each camera, read and developed when asked for; kept if it is small (`KEPT`).
+    """Image files by camera, read and developed when asked for; kept if small (`KEPT`).
 
-    Asking raises as `read_view` does; making it, as `check_limit` does by alpha's size.
+    Access raises as `read_view` does; construction, as `check_limit` does for alpha's size.
     """
 
     def __init__(self, rig: Rig, files: Mapping[str, str | Path], *, alpha: str) -> None:

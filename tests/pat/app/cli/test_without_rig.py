@@ -257,6 +257,9 @@ def test_the_rate_that_is_asked_for_is_that_of_the_video(
     monkeypatch.setattr("pat.app.from_images.array_from_images", lambda *_, **__: array)
     monkeypatch.setattr("pat.app.batch.Batch.run", lambda *_, video, **__: rates.append(video) or JobReport())
     files = {name: [tmp_path / f"{name}{i}.png" for i in range(2)] for name in ("mono", "colour")}
+    for name, paths in files.items():
+        for path in paths:
+            write_image(path, halved[1][name])
     (tmp_path / "fused.mp4").write_bytes(b"of a former sequence")
     monkeypatch.setattr(
         "pat.app.from_images.frames_of_videos", lambda *_: (files, {"mono": 12.0, "colour": 24.0})
