@@ -47,7 +47,7 @@ FAMILIES = {
 
 
 DARKER = 8
-"""How many times less light the mono camera of the cat has."""
+"""Factor by which the mono camera of the cat has less light."""
 DISPARITY, FOCAL, BASELINE = 24, 600.0, 0.08
 """Where the cat's photograph hangs: pixels between its images, pixels, and metres between the cameras."""
 WIDE, GAP = 902, 8

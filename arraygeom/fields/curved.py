@@ -396,7 +396,7 @@ NODES, PASSES = 64, 2
 """Points at which a curve is searched for the image of a camera that is not central, and how often its nodes
 are divided anew."""
 MARGIN, NARROW = 1 / 4, 1 / 32
-"""By how much larger than beta's image, in shares of its height plus width, to search and to divide in."""
+"""Margins around beta's image in which to search and to divide, in shares of its height plus width."""
 HALVINGS = 20
 """Steps of the bisection for where a model's range ends."""
 CLOSEST = -6.0

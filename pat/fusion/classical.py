@@ -372,8 +372,10 @@ def _blended(values: Image, weight: Image, mono: Image, guide: NDArray[np.uint8]
 
 
 def _by_examples(values: Image, seen: NDArray[np.bool_], mono: Image) -> Image:
-    """Replace unseen values (c, h, w) by the mean of the seen ones nearest in luminance, texture
-    and place."""
+    """Replace unseen values (c, h, w) by the mean of the seen ones nearest in luminance, texture and place.
+
+    Not `pat.matching.examples`, on purpose: what the fusion is compared with shares none of its stages.
+    """
     columns, rows = _grid(mono.shape)
     texture = [np.sqrt(np.maximum(_mean(mono * mono, r) - _mean(mono, r) ** 2, 0)) for r in (2, 6)]
     what = [mono * 12, _mean(mono, 2) * 10, _mean(mono, 6) * 5, texture[0] * 12, texture[1] * 8]

@@ -259,6 +259,8 @@ def _of_beta(alpha: Tensor, before: Beta, beta: Beta, matches: BetaMatches, hw: 
 
 
 def _fitted(frame: FrameInputs, matches: list[_Matches]) -> Response:
+    """Response by all RGB betas' matches. Where few pixels match, its `explained` is raised: wrong matches
+    among few leave more of alpha unexplained, whatever alpha sees."""
     h, w = frame.hw
     soft = blurred(frame.inputs.alpha[:, :, :h, :w], [ALIGNMENT.blur])[0, 0]
     colour = [(m, m.weight > 0) for m in matches if len(m.before) == 3]
@@ -268,4 +270,4 @@ def _fitted(frame: FrameInputs, matches: list[_Matches]) -> Response:
     matched = float(torch.stack([counts for _, counts in colour]).any(0).double().mean())
     enough = min(matched / SETTINGS.matched, 1.0)
     found = fit(torch.cat(points, 1), alphas, torch.cat(places), vignetting=enough == 1)
-    return found._replace(explained=min(found.explained / max(enough, 1e-9), 1.0))
+    return found._replace(explained=min(found.explained, enough) / enough if enough else 1.0)

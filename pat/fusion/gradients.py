@@ -1,4 +1,4 @@
-"""Which numbers of a rig `fuse(differentiable=True)` has no gradient by, found before the work."""
+"""Numbers of a rig by which `fuse(differentiable=True)` has no gradient, found before the work."""
 
 from __future__ import annotations
 
@@ -40,13 +40,8 @@ def without_gradient(
         hw = max(1, round(h * share)), max(1, round(w * share))
         small[name], rig = interpolate(image[None].float(), hw, mode="area")[0], rig.resize(name, hw)
     changes = rig.parameters(free=free)
-    frame = fuse_frame(
-        *(small, rig.perturbed(changes)),
-        alpha=alpha,
-        network=network,
-        settings=settings,
-        differentiable=True,
-    )
+    there = rig.perturbed(changes)
+    frame = fuse_frame(small, there, alpha=alpha, network=network, settings=settings, differentiable=True)
     depth = torch.where(frame.depth.isfinite(), frame.depth, 0.0)
     return {name: _unmoved(values, changes) for name, values in (("image", frame.image), ("depth", depth))}
 

@@ -91,9 +91,9 @@ def give_back() -> None:
 
 
 LIBRARIES = 0.46 * 2**30
-"""What Python, torch and the compiled loops take, bytes (430 MiB were measured)."""
+"""Memory of Python, torch and the compiled loops, bytes (430 MiB were measured)."""
 SLACK = 1.05
-"""What a process may take over what is counted: freed blocks smaller than a page cannot be returned."""
+"""Memory that a process may take beyond the counted: freed blocks smaller than a page cannot be returned."""
 LEAST_BYTES, LEAST_MATCHED = 81.0, 110.0
 """Least bytes for each pixel of alpha, whatever the tiles: its image, its frame, and writing that; and of
 networks that use matches (plans had from 151)."""

@@ -35,7 +35,7 @@ Change = Callable[["Array"], object]
 USUAL = re.compile(
     r"plan: |weights: |network: |written to |to see|compiling|fusing: |finding |comparing |no depth"
 )
-"""What a command says of right inputs too."""
+"""Lines that a command prints for right inputs too."""
 LONGEST = 230
 """Characters of what is said that the table has."""
 BEGIN, END = "<!-- mistakes:begin -->\n", "<!-- mistakes:end -->\n"

@@ -57,7 +57,7 @@ class Demo:
                 "alpha alone": array.images[ALPHA].expand(3, -1, -1),
                 **classical_methods(network, array, noise),
             }
-            say(f"{name}: fusion with the weights '{self.network}'")
+            say(f"{name}: fusion with the network '{self.network}'")
             settings = FuseSettings(noise=noise)
             frame = fuse_with_progress(self.network, array.rig, array.images, alpha=ALPHA, settings=settings)
             methods["fusion"] = frame.image.clamp(0, 1)

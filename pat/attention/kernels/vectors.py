@@ -151,7 +151,7 @@ mul_int = _elementwise(lambda code, a, b: code.mul(a, b))
 minimum_int = _elementwise(lambda code, a, b: code.select(code.icmp_signed("<", a, b), a, b))
 minimum = _elementwise(lambda code, a, b: code.select(code.fcmp_ordered("<", a, b), a, b))
 maximum = _elementwise(lambda code, a, b: code.select(code.fcmp_ordered(">", a, b), a, b))
-"""Of minimum and maximum alike, b is the result where either number is NaN."""
+"""Minimum and maximum both return b where either number is NaN."""
 fma = _elementwise(lambda code, a, b, c: code.fused(a, b, c))
 """a b + c, rounded once."""
 exponentials64 = _elementwise(lambda code, a: code.intrinsic("llvm.exp.%", a.type, [a]))

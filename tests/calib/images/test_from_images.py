@@ -71,7 +71,7 @@ def test_points_in_one_spot_are_held_out_too():
 
 
 TILTED = torch.tensor([[0.62, 0.01, -38], [-0.015, 0.63, -42], [-2e-5, 3e-5, 1]], dtype=torch.float64)
-"""Of a thermal camera beside one in colour."""
+"""Homography from a colour camera to a thermal one beside it."""
 
 
 def clicked(count: int, seed: int, noise: float = 1.0) -> PointMatches:

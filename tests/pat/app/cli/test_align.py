@@ -172,7 +172,7 @@ def test_captures_that_do_not_go_together(capture, tmp_path, refusal, options, m
 
 K = np.array([[1466.667, 0, 180], [0, 1466.667, 140], [0, 0, 1]])
 MOVED = K @ cv2.Rodrigues(np.array([0.003, -0.004, 0.02]))[0] @ np.linalg.inv(K)
-"""Of far ground: tags state lenses, no poses; one homography is the map, here of a rotation."""
+"""Captures of far ground: tags state lenses, no poses; one homography is the map, here of a rotation."""
 
 
 def captures_of_ground(place, seeds):
@@ -193,7 +193,7 @@ def captures_of_ground(place, seeds):
 
 
 def off_ground(rig):
-    """How far two points of green are mapped to near infrared from where they are, pixels."""
+    """Distance in pixels of two points of green, mapped to near infrared, from where they are."""
     H = rig.links["green", "nir"].H
     x = torch.tensor([[100.0, 80, 1], [200, 150, 1]], dtype=torch.float64) @ H.T
     wanted = torch.from_numpy(np.array([[120.0, 100, 1], [220, 170, 1]]) @ MOVED.T)
@@ -210,7 +210,7 @@ def test_a_flights_bands_have_no_parallax(tmp_path):
 
 @pytest.mark.parametrize("listed", [True, False])
 def test_a_flight_has_one_rig(tmp_path, capsys, listed):
-    """Of a folder, or of its files in the shell's order; an image alone is left out, and said."""
+    """A folder, or its files in the shell's order; an image alone is left out, and named."""
     (tmp_path / "flight").mkdir()
     files = captures_of_ground(tmp_path / "flight", range(1, 5))
     files.pop(6).unlink()

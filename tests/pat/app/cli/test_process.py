@@ -111,6 +111,9 @@ def test_what_the_parser_refuses_is_one_line(line, refusal):
         ("align no.png nothing.png", "no.png: no such image"),
         ("fuse --image mono.png --image c=b.png", "the images alone: `pat fuse mono.png b.png`"),
         ("fues", "did you mean 'fuse'"),
+        ("fuse a.png b.png --max-memory 4gigs", "--max-memory"),
+        ("align a.png b.png --confidence 80", "--confidence"),
+        ("align a.png b.png --matches no.csv", "no.csv"),
     ],
 )
 def test_mistakes_that_need_no_torch_are_said_before_it_is_imported(line, said):
