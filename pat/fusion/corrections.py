@@ -54,7 +54,7 @@ class PrePassSettings:
     passes: int = size(3, "Pre-passes at most: matches are better where what was found is put right")
     matched: float = tuned(
         0.3,
-        "Share of alpha's pixels reliably matched, below which vignetting is not looked for, and less of its "
+        "Share of alpha's pixels reliably matched, below which only an exposure is fitted, and less of alpha's "
         "variance need be explained: Middlebury's tune half has .55 at least, plain scenes .26 at most",
     )
     settled: float = size(0.25, "Pixels by which the largest displacement changes, up to which passes end")
@@ -259,8 +259,7 @@ def _of_beta(alpha: Tensor, before: Beta, beta: Beta, matches: BetaMatches, hw: 
 
 
 def _fitted(frame: FrameInputs, matches: list[_Matches]) -> Response:
-    """Response by all RGB betas' matches. Where few pixels match, its `explained` is raised: wrong matches
-    among few leave more of alpha unexplained, whatever alpha sees."""
+    """Response by all RGB betas' matches."""
     h, w = frame.hw
     soft = blurred(frame.inputs.alpha[:, :, :h, :w], [ALIGNMENT.blur])[0, 0]
     colour = [(m, m.weight > 0) for m in matches if len(m.before) == 3]
@@ -269,5 +268,4 @@ def _fitted(frame: FrameInputs, matches: list[_Matches]) -> Response:
     alphas = torch.cat([soft[counts] for _, counts in colour])
     matched = float(torch.stack([counts for _, counts in colour]).any(0).double().mean())
     enough = min(matched / SETTINGS.matched, 1.0)
-    found = fit(torch.cat(points, 1), alphas, torch.cat(places), vignetting=enough == 1)
-    return found._replace(explained=min(found.explained, enough) / enough if enough else 1.0)
+    return fit(torch.cat(points, 1), alphas, torch.cat(places), enough=enough)
