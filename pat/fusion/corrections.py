@@ -16,7 +16,7 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
+from torch.nn.functional import avg_pool2d, max_pool2d
 
 from arraygeom import Segments
 from arraygeom.fields.grid import FieldOnGrid
@@ -54,7 +54,7 @@ class PrePassSettings:
     passes: int = size(3, "Pre-passes at most: matches are better where what was found is put right")
     matched: float = tuned(
         0.3,
-        "Share of alpha's pixels reliably matched, below which only an exposure is fitted, and less of alpha's "
+        "Share of alpha's pixels reliably matched, below which only an exposure is fitted, and less of its "
         "variance need be explained: Middlebury's tune half has .55 at least, plain scenes .26 at most",
     )
     settled: float = size(0.25, "Pixels by which the largest displacement changes, up to which passes end")
@@ -201,7 +201,8 @@ def _reduced_frame(frame: FrameInputs) -> FrameInputs:
         image = padded(avg_pool2d(beta.image, factor), inputs.multiple)
         track = beta.track and track_in(beta.track, whole, 1 / factor, offset)
         small = _reduced_field(beta.field, alpha, whole, factor)
-        betas.append(Beta(image, small, track=track, cameras=beta.cameras))
+        clipped = None if beta.clipped is None else padded(max_pool2d(beta.clipped, factor), inputs.multiple)
+        betas.append(Beta(image, small, track=track, cameras=beta.cameras, clipped=clipped))
     return frame._replace(inputs=replace(inputs, alpha=alpha, betas=tuple(betas)), hw=hw)
 
 
@@ -244,16 +245,17 @@ def _of_beta(alpha: Tensor, before: Beta, beta: Beta, matches: BetaMatches, hw: 
     positions, valid = matches.positions(beta.field.straight, (beta.image.shape[-2], beta.image.shape[-1]))
     where = positions[0, :h, :w]
     luma = combined_bands(beta.image)
-    sampled = sample(torch.cat([before.image, luma], 1), where.reshape(1, -1, 2).to(luma)).values
+    clipped = torch.zeros_like(luma) if before.clipped is None else before.clipped.amax(1, keepdim=True)
+    sampled = sample(torch.cat([before.image, luma, clipped], 1), where.reshape(1, -1, 2).to(luma)).values
     values = sampled.reshape(sampled.shape[1], h, w)
     unlike, margin, _ = matches.facts[0]
     reliable = (unlike < CONSISTENT) & (margin > SETTINGS.margin)
-    weight = (enlarged(reliable)[:h, :w] & valid[0, :h, :w]).to(alpha)
+    weight = (enlarged(reliable)[:h, :w] & valid[0, :h, :w] & (values[-1] < 0.5)).to(alpha)
     whole = Normalisation.from_images(alpha, luma)
     alpha_soft = whole.softened(alpha)[:, :, :h, :w]
-    measured, wanted = (moments(image, weight[None, None]) for image in (values[-1:][None], alpha_soft))
+    measured, wanted = (moments(image, weight[None, None]) for image in (values[-2:-1][None], alpha_soft))
     bright = measured.matched(luma, wanted, NORMALISATION.largest_gain)
-    soft = blurred(values[:-1][:, None], [ALIGNMENT.blur] * (len(values) - 1))[:, 0]
+    soft = blurred(values[:-2][:, None], [ALIGNMENT.blur] * (len(values) - 2))[:, 0]
     normal = normals(beta.field.straight)[0, :h, :w]
     return _Matches(soft, alpha_soft[0, 0], bright[0, 0], where, normal.to(where), weight)
 
