@@ -25,6 +25,11 @@ BROWN_TERMS = 8
 def to_kornia_model(K: Float[Tensor, "*b 3 3"], hw: HW, lens: LensModel | None) -> CameraModel:
     """Make kornia's camera model with these intrinsics and lens.
 
+    Args:
+        K: intrinsics, of one camera or a batch.
+        hw: height and width of the image.
+        lens: the lens; None for a pinhole.
+
     Returns:
         The model.
 

@@ -35,8 +35,8 @@ def in_srgb(values: NDArray, content: bytes, label: str) -> NDArray:
         label: prefix of warnings.
 
     Returns:
-        Values in sRGB. With a warning instead, unchanged values of 16 bits, or with a profile that cannot be
-        used.
+        Values in sRGB, of the same shape and type. Values of 16 bits, and values with a profile that cannot
+        be used, are returned unchanged with a warning.
     """
     profile = _embedded(content)
     if profile is None:

@@ -28,9 +28,10 @@ def develop(
     """Develop an image to sRGB: subtract the black level, demosaic, scale light to another camera's exposure.
 
     Args:
-        image: counts over 2^bits - 1.
-        sensor: the camera that recorded it.
-        like: sensor whose scale of light is wanted; None for its own. Exposures count only if both are known.
+        image: counts over 2^bits - 1; sRGB values unless `sensor.coding` is "linear".
+        sensor: the camera that recorded it; a black level without `bits` is in counts of 16 bits.
+        like: sensor whose scale of light (exposure, gain) is wanted; None for its own. Exposures count only
+            if both are known.
 
     Returns:
         sRGB values, 3 channels for a filter mosaic; at least 0 after a black level was subtracted, above 1

@@ -39,8 +39,14 @@ class DenoiserConfig:
 
 
 class Denoising(nn.Module):
-    """A network that subtracts noise, estimated in units of its standard deviation: at 0 an image stays as it
-    is."""
+    """Network that estimates noise in units of its standard deviation, and subtracts it.
+
+    Where the deviation is 0 an image stays as it is.
+
+    Args:
+        bands: number of channels of an image.
+        config: widths and depth of the U-Net.
+    """
 
     def __init__(self, bands: int, config: DenoiserConfig) -> None:
         super().__init__()
@@ -53,6 +59,7 @@ class Denoising(nn.Module):
         """Denoise images of any size.
 
         Args:
+            image: noisy images, values 0..1.
             deviation: standard deviation of each value's noise.
 
         Returns:
@@ -81,7 +88,12 @@ def rgb_of_opponent(bands: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]
 
 
 class LowLightNetwork(nn.Module):
-    """Denoisers of one band (`band`) and of a colour image (`colour`)."""
+    """Denoisers of images of one band and of three.
+
+    Attributes:
+        band: denoiser of each band by itself.
+        colour: denoiser of colour images.
+    """
 
     def __init__(self, config: DenoiserConfig = DenoiserConfig()) -> None:
         super().__init__()
