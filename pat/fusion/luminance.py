@@ -62,8 +62,12 @@ def check_luminance(network: FusionNetwork, kept: Luminance, *, noisy: bool) -> 
 def with_alpha_detail(frame: Frame, alpha: Float[Tensor, "1 h w"]) -> Frame:
     """Add to a frame of beta's luminance the detail that alpha has and beta lacks.
 
+    Args:
+        frame: frame of RGB bands with beta's luminance.
+        alpha: alpha's image, values 0..1.
+
     Returns:
-        The frame with this image.
+        The frame, with the same detail added to each band.
     """
     luma = luminance(frame.image)[None]
     alpha_luma, beta_luma = alpha[None].to(luma), torch.nan_to_num(luma)
@@ -76,10 +80,14 @@ def with_alpha_detail(frame: Frame, alpha: Float[Tensor, "1 h w"]) -> Frame:
 def with_own_colours(frame: Frame, alpha: Float[Tensor, "3 h w"]) -> Frame:
     """Replace a fused frame's chroma by alpha's own where confidence is low, converted to the betas' colours.
 
-    Luminance stays. The conversion of alpha's colours is fitted where the betas see the same points.
+    Luma stays. The conversion of alpha's colours is fitted where the betas see the same points.
+
+    Args:
+        frame: frame of RGB bands.
+        alpha: alpha's image in colour, values 0..1.
 
     Returns:
-        The frame with this image.
+        The frame with the new image.
     """
     alpha = alpha.to(frame.image)
     step = max(int((frame.confidence.numel() / OWN_COLOUR.pixels) ** 0.5), 1)

@@ -34,8 +34,8 @@ class Flow(NamedTuple):
     """Motion of each pixel between two frames.
 
     Attributes:
-        step: (2, H, W), pixels in x and y.
-        weight: (H, W), 0 to 1.
+        step: motion (2, H, W) from the first frame to the second, pixels in x and y.
+        weight: reliability of the motion (H, W), 0 to 1.
     """
 
     step: Float[Tensor, "2 h w"]
