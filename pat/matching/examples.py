@@ -87,8 +87,7 @@ def _between(plane: Plane, hw: tuple[int, int]) -> Plane:
     """Enlarge a plane of every second pixel, from the first, to all pixels, by linear interpolation."""
     back = np.array([[0.5, 0, 0], [0, 0.5, 0]], np.float32)
     how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    between: Plane = cv2.warpAffine(plane, back, (hw[1], hw[0]), flags=how, borderMode=cv2.BORDER_REPLICATE)
-        # type: ignore[assignment]
+    between: Plane = cv2.warpAffine(plane, back, (hw[1], hw[0]), flags=how, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[assignment]
     return between
 
 

@@ -176,7 +176,7 @@ class Normalisation(NamedTuple):
 def equalising_blurs(
     image: Float[Tensor, "b 1 h w"], other: Float[Tensor, "b 1 hb wb"]
 ) -> tuple[list[float], list[float]]:
-    """Compute the Gaussian blurs that make two images equally sharp, as detail of one alone cannot be matched.
+    """Compute the Gaussian blurs that make two images equally sharp: detail of one alone cannot be matched.
 
     Returns:
         Standard deviations in pixels for each image of the batch, of `image` and of `other`; 0 for the one
