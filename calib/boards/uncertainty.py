@@ -81,7 +81,7 @@ class RigCovariance:
         """Read a covariance file.
 
         Args:
-                path: JSON file.
+            path: JSON file.
             rig: rig to which the file must belong; None does not check.
 
         Returns:
