@@ -76,9 +76,9 @@ def view_figures(frame: RenderedFrame) -> dict[str, float]:
     """Measure brightness, texture and depths of one image.
 
     Returns:
-        Figures by name: "mean" brightness; shares, 0..1, of pixels that are "dark" or "bright", of patches with
-        "texture" and of pixels "covered" by a surface; "near" and "far" in metres, infinite if nothing is
-        hit.
+        Figures by name: "mean" brightness; shares, 0..1, of pixels that are "dark" or "bright", of patches
+        with "texture" and of pixels "covered" by a surface; "near" and "far" in metres, infinite if nothing
+        is hit.
     """
     finite = frame.depth.isfinite()
     depths = frame.depth[finite] if finite.any() else frame.depth.new_tensor([torch.inf])
