@@ -186,9 +186,10 @@ class Charuco(MarkedBoard):
 
 @dataclass(frozen=True)
 class AprilGrid(MarkedBoard):
-    """Kalibr's grid of AprilTags; `columns` x `rows` counts all tags' corners, `spacing` is twice the gap.
+    """Kalibr's grid of AprilTags. Its points are the corners of all tags, four each.
 
-    Tags are numbered row by row from below.
+    Tags are numbered row by row from below. `columns` and `rows` count points, two for each tag; `spacing` is
+    twice the gap between two tags, metres.
 
     Attributes:
         tag: side of a tag, metres.

@@ -44,7 +44,10 @@ LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class PrePassSettings:
-    """Settings of the pre-pass: reduced images are matched to estimate corrections before a frame is."""
+    """Settings of the pre-pass: reduced images are matched to estimate corrections before a frame is.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     pixels: int = size(400_000, "Alpha's pixels in the pre-pass, at most")
     small: int = size(50_000, "Alpha's pixels below which the pre-pass is at full size")

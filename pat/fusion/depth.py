@@ -26,7 +26,10 @@ from .inputs import Placement
 
 @dataclass(frozen=True)
 class DepthSettings:
-    """Settings of the depth of fused pixels."""
+    """Settings of the depth of fused pixels.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     unseen: float = size(1e-4, "Confidence up to which beta does not see the point, and gives no depth")
 

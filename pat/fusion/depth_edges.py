@@ -28,7 +28,10 @@ from .inputs import FrameInputs
 
 @dataclass(frozen=True)
 class EdgeSettings:
-    """Settings of the choice of depth next to depth edges."""
+    """Settings of the choice of depth next to depth edges.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     radius: int = size(5, "Pixels to each side of what counts around a pixel")
     near: int = size(2, "Pixels to an edge of depth up to which depth is chosen anew")

@@ -24,7 +24,10 @@ from .inputs import FrameInputs, Placement
 
 @dataclass(frozen=True)
 class FillSettings:
-    """Settings of filling in the depth of pixels whose own match has little confidence."""
+    """Settings of filling in the depth of pixels whose own match has little confidence.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     share: float = tuned(
         0.4,

@@ -40,7 +40,10 @@ only where an image shows noise plainly."""
 
 @dataclass(frozen=True)
 class LowLightSettings:
-    """Settings of fusion with noise."""
+    """Settings of fusion with noise.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     least_deviation: float = physics(
         1.5 / 255, "Images whose noise has a smaller standard deviation, in the mean, are left as they are"

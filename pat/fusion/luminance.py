@@ -32,7 +32,10 @@ SHARES: dict[Luminance, float] = {"alpha": 1.0, "mix": 0.5, "beta": 0.0}
 
 @dataclass(frozen=True)
 class OwnColourSettings:
-    """Settings of a fused image whose alpha was recorded in colour."""
+    """Settings of a fused image whose alpha was recorded in colour.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     unseen: float = size(0.2, "Confidence up to which alpha's own colours are taken")
     seen: float = size(0.5, "And from which the betas'")

@@ -24,7 +24,10 @@ from ..support.settings import size, tuned
 
 @dataclass(frozen=True)
 class NonLocalMeansSettings:
-    """Settings of means over similar pixels."""
+    """Settings of means over similar pixels.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     scale: float = tuned(
         0.18, "Middlebury, tune half: scale of unlikeness over the root of the noise's deviation"

@@ -20,7 +20,10 @@ from ..support.settings import tuned
 
 @dataclass(frozen=True)
 class FlowSettings:
-    """Settings of optical flow between frames."""
+    """Settings of optical flow between frames.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     astray: float = tuned(
         1.0, "Source not recorded: flow that does not lead back to so many pixels has a weight below 1 / e"

@@ -49,7 +49,10 @@ LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class SequenceSettings:
-    """Settings of sequences of cameras that record at different times."""
+    """Settings of sequences of cameras that record at different times.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     synchronous: float = physics(0.05, "Gaps shorter than this part of alpha's frame time count as none")
     unknown_motion: float = physics(

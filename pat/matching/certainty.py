@@ -35,7 +35,10 @@ FITTED = Path(__file__).with_name("certainty.safetensors")
 
 @dataclass(frozen=True)
 class CertaintySettings:
-    """Settings of the network's inputs and outputs."""
+    """Settings of the network's inputs and outputs.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     around: tuple[int, int] = size((2, 6), "Radii, at half the size, in which facts are averaged")
     apart: tuple[int, int] = size((1, 4), "Radii, at full size, in which disparities are compared")

@@ -44,7 +44,10 @@ FITTED = Path(__file__).with_name("choice.safetensors")
 
 @dataclass(frozen=True)
 class ChoiceSettings:
-    """Settings of the candidate disparities of a pixel and of the network that scores them."""
+    """Settings of the candidate disparities of a pixel and of the network that scores them.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     around: tuple[int, ...] = size((2, 5, 10), "Distances, in pixels, of those around a pixel")
     scales: tuple[float, float] = size(

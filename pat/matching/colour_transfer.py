@@ -34,6 +34,8 @@ class ColourTransferSettings:
     """Settings of the transfer of beta's colours to alpha's view.
 
     Brightness is 0 to 1. Middlebury and SYNTIM are the pairs of their tune halves.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
     """
 
     alike: float = tuned(

@@ -19,7 +19,10 @@ from ..support.settings import physics, tuned
 
 @dataclass(frozen=True)
 class CensusSettings:
-    """Settings of the matching cost, whose unit is one bit of the census transform."""
+    """Settings of the matching cost, whose unit is one bit of the census transform.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     brightness: float = tuned(30.0, "Source not recorded: what a difference of 1 in brightness costs")
     truncated: float = tuned(20.0, "Source not recorded: what brightness costs at most")

@@ -33,6 +33,8 @@ class AlignmentSettings:
     """Settings of the fit of the displacement across the search segments.
 
     Lengths are pixels of the images given, brightness is 0 to 1. Middlebury is its tune half.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
     """
 
     blur: float = tuned(

@@ -21,7 +21,10 @@ Plane = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class ExampleSettings:
-    """Settings of the nearest-neighbour search that fills in colours; lengths are pixels of alpha."""
+    """Settings of the nearest-neighbour search that fills in colours; lengths are pixels of alpha.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     neighbours: int = size(5, "Examples of a pixel; half or twice as many do as well")
     radii: tuple[int, int] = size((2, 6), "Radii of the windows of means and deviations")

@@ -22,7 +22,10 @@ from ..support.settings import size
 
 @dataclass(frozen=True)
 class InputsSettings:
-    """Settings of the tiles in which large frames are matched at full size, the same for any memory limit."""
+    """Settings of the tiles in which large frames are matched at full size, the same for any memory limit.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     halo: int = size(128, "Their halo, pixels")
     at_once: int = size(1_200_000, "Pixels of alpha matched at once")

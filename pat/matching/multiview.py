@@ -39,7 +39,10 @@ from .semi_global import CONSISTENT, DISPARITY_FILL
 
 @dataclass(frozen=True)
 class MultiviewSettings:
-    """Settings of the agreement on depth of several betas."""
+    """Settings of the agreement on depth of several betas.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     farthest: float = size(
         8.0, "Half-size pixels between disparities that are 1 in the facts, as in semi-global matching"

@@ -26,7 +26,10 @@ LEAST_WEIGHT = 1e-6
 
 @dataclass(frozen=True)
 class NormalisationSettings:
-    """Settings of the normalisation of one image's brightness and sharpness to another's."""
+    """Settings of the normalisation of one image's brightness and sharpness to another's.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     largest_gain: float = size(4.0, "Of brightness; images that differ by more show different things")
     blurs: tuple[float, ...] = size(

@@ -31,6 +31,8 @@ class ResponseSettings:
     """Settings of the fit of alpha's response: priors of cameras, and of how light differs between two views.
 
     Priors of cameras' properties are standard deviations, not chosen on images.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
     """
 
     sensor: tuple[float, float, float] = physics(

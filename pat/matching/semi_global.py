@@ -38,7 +38,10 @@ from .positions import FINE, Extent
 
 @dataclass(frozen=True)
 class SemiGlobalSettings:
-    """Settings of a run of semi-global matching; penalties are in the unit of `cost`."""
+    """Settings of a run of semi-global matching; penalties are in the unit of `cost`.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     step: float = tuned(12.0, "Source not recorded: penalty of neighbours' labels that differ by one")
     jump: float = tuned(100.0, "Source not recorded: of those that differ by more, where alpha has no edge")

@@ -22,7 +22,10 @@ from .likeness import UNLIKE
 
 @dataclass(frozen=True)
 class MixSettings:
-    """Settings of the fit of bands to alpha; brightness is 0 to 1."""
+    """Settings of the fit of bands to alpha; brightness is 0 to 1.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     equal: float = size(
         1e-4, "Share of the bands' mean variance by which the combination is drawn to equal parts"

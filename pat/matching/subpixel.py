@@ -34,7 +34,10 @@ FULL_SIZE = SemiGlobalSettings(step=20.0, jump=80.0, margin=48)
 
 @dataclass(frozen=True)
 class SubpixelSettings:
-    """Settings of matching at full size, and to a fraction of a pixel."""
+    """Settings of matching at full size, and to a fraction of a pixel.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     run: int = size(5, "Labels in a run, of which each pixel has two")
     neighbourhood: int = size(5, "Side of the neighbourhood at half the size, pixels")

@@ -25,7 +25,10 @@ Plane = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class SurfaceSettings:
-    """Settings of the fit of local planes to disparity."""
+    """Settings of the fit of local planes to disparity.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     level: float = tuned(
         0.005, "Middlebury, tune half: variance of position, over reach^2, below which planes are level"

@@ -29,7 +29,10 @@ from .denoiser import opponent, opponent_deviation, rgb_of_opponent
 
 @dataclass(frozen=True)
 class BM3DSettings:
-    """Settings of the filter of groups of similar blocks, BM3D (Dabov et al. 2007)."""
+    """Settings of the filter of groups of similar blocks, BM3D (Dabov et al. 2007).
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     side: int = size(8, "Side of a block, pixels")
     step: int = size(4, "Steps between blocks, pixels")

@@ -16,7 +16,10 @@ from ..support.settings import size
 
 @dataclass(frozen=True)
 class DenoiserSettings:
-    """Settings of the denoisers' inputs."""
+    """Settings of the denoisers' inputs.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     multiple: int = size(8, "Images are padded to multiples of this")
     scale: float = size(4.0, "So many times larger deviations are given to networks: about as values")

@@ -28,7 +28,10 @@ from ..support.settings import size, tuned
 
 @dataclass(frozen=True)
 class RecallSettings:
-    """Settings of filling in colour by example; pixels are of the half-size image, except for `last`."""
+    """Settings of filling in colour by example; pixels are of the half-size image, except for `last`.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     scales: int = tuned(3, "Middlebury, tune half: sizes of what is around a pixel, radii 2, 4, 8")
     alike: float = tuned(

@@ -256,6 +256,10 @@ def load_rig_or_say_no_image(path: Path, depth: tuple[float, float] | None) -> R
 def refuse_missing(path: Path, *, rig: bool) -> None:
     """Check that a rig file, or an image, folder or video, exists, before torch is imported to read it.
 
+    Args:
+        path: path, as the user gave it.
+        rig: True if it is to be a rig file; otherwise a pattern with *, ? or [ passes.
+
     Raises:
         FileNotFoundError: if it does not.
     """
