@@ -134,6 +134,12 @@ def track(
 
     Matrices are composed in their own precision, pixels computed in that of `x`.
 
+    Args:
+        K_alpha: alpha's K.
+        K_beta: beta's K.
+        beta_from_alpha: pose of alpha's frame in beta's.
+        x: pixels of alpha.
+
     Returns:
         The track.
     """

@@ -103,6 +103,8 @@ def robust_least_squares(
     """Solve `least_squares` in steps with weights from the residuals.
 
     Args:
+        terms: value of each of k terms at n points.
+        values: values at the points that the sum of terms times coefficients is to match.
         start: coefficients whose residuals give the first weights.
         weigh: function from residuals (n, *m) to weights (n).
         precision: inverse covariance of a prior of zero mean, or a function of the coefficients that returns

@@ -198,6 +198,9 @@ class _Image(NamedTuple):
     def from_source(cls, source: RigSource) -> _Image:
         """Read the tags of an image.
 
+        Returns:
+            The tags with their source.
+
         Raises:
             RigFileError: unless they state its camera.
         """
@@ -222,10 +225,13 @@ class _Image(NamedTuple):
         return None if words is None else words.numbers(count or None)
 
     def needed(self, name: str, count: int) -> Tensor:
-        """Return so many numbers of a tag of Pix4D's.
+        """Return the numbers of one of Pix4D's tags.
+
+        Returns:
+            Vector of `count` numbers, float64.
 
         Raises:
-            RigFileError: if it is not stated.
+            RigFileError: if it is not stated, or has another count.
         """
         numbers = self.numbers(name, count)
         if numbers is None:
@@ -234,7 +240,11 @@ class _Image(NamedTuple):
 
     @property
     def per_mm(self) -> Tensor:
-        """Pixels per millimetre of the sensor, (x, y)."""
+        """Pixels per millimetre of the sensor, (x, y), float64.
+
+        Raises:
+            RigFileError: if it is not stated.
+        """
         fields = self.tags.fields
         if RESOLUTION_X not in fields:
             raise self.source.fail(
@@ -255,7 +265,11 @@ class _Image(NamedTuple):
 
     @property
     def centre(self) -> Tensor:
-        """Camera's centre in the rig, metres; zero if it is not stated."""
+        """Camera's centre (3) in the rig, metres, float64; zero if it is not stated.
+
+        Raises:
+            RigFileError: for numbers too large for metres.
+        """
         if (translation := self.numbers("RigTranslations", 3)) is None:
             return torch.zeros(3, dtype=torch.float64)
         if float(translation.abs().max()) > LONGEST_TRANSLATION:

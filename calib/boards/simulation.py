@@ -71,6 +71,12 @@ def simulate_photos(
 def board_poses(rig: Rig, board: Board, count: int, *, seed: int = 0) -> Pose:
     """Draw random board poses whose centres all cameras see, at several depths and tilts.
 
+    Args:
+        rig: calibrated cameras that see the board.
+        board: the board.
+        count: number of poses, 1 or more.
+        seed: random seed.
+
     Returns:
         `world_from_board`, a batch (count).
 

@@ -254,6 +254,12 @@ def initial_poses(
 
     With parallel axes beta is to either side along the direction in which most points differ.
 
+    Args:
+        matches: points of alpha and beta.
+        link: link of the two views, with F and H.
+        K: alpha's intrinsics.
+        K_beta: beta's intrinsics.
+
     Returns:
         Two to four poses, beta from alpha.
     """

@@ -170,7 +170,10 @@ def align(
     occluded if the confidence that beta sees its point is low.
 
     Args:
-        network: network whose confidence is used, which must use matches.
+        images: image of each camera, as for `fuse`.
+        rig: rig or its file; None to find it from the images.
+        alpha: camera to align to; None for the camera that `fuse` takes.
+        network: network whose confidence is used, which must use matches; None for the default.
         recorded: values to align by camera, (C, H, W) of any type, as large as the images; None for the
             images.
         interpolation: "nearest" keeps recorded values; "bilinear" and "cubic" interpolate, rounded for
@@ -178,6 +181,10 @@ def align(
         min_confidence: confidence, 0 to 1, from which a camera counts as seeing a point.
         fill: "none" invents no values; "propagate" gives pixels that a camera does not see its nearest seen
             value.
+        explain: function that is called with lines about what was corrected; None for none.
+        progress: function that wraps the tiles to show progress; None for none.
+        announce: function that is called with the plan; None for none.
+        matcher: function that matches, instead of `match`.
 
     Returns:
         Values, masks and positions by camera, with alpha's depth.

@@ -124,6 +124,8 @@ def fuse_frame(
         progress: function that wraps the tiles to show progress; None for none.
         announce: function that is called with the plan; None for none.
         store: folder of finished tiles, from which a stopped fusion goes on; None for none.
+        differentiable: True to keep gradients; by default the frame has none.
+        matcher: function that matches, instead of `match`.
 
     Returns:
         The frame at alpha's pixels.

@@ -47,7 +47,17 @@ OWN_COLOUR = OwnColourSettings()
 
 
 def check_luminance(network: FusionNetwork, kept: Luminance, *, noisy: bool) -> None:
-    """Raise ValueError for a word that is not in `SHARES`, and where beta's luminance is not available."""
+    """Check that a network can keep the luminance that is asked for.
+
+    Args:
+        network: network that fuses.
+        kept: camera whose luminance the image keeps, one of `SHARES`.
+        noisy: True if the images are denoised.
+
+    Raises:
+        ValueError: for a word that is not in `SHARES`; and for another than "alpha" where the network has
+            alpha's alone, or with noise.
+    """
     if kept not in SHARES:
         raise ValueError(f"luminance is one of {', '.join(SHARES)}; got {kept!r}")
     if kept == "alpha":

@@ -84,6 +84,10 @@ def _converted(values: NDArray, profile: ImageCms.ImageCmsProfile) -> NDArray:
 def with_srgb_profile(content: bytes, suffix: str) -> bytes:
     """Add an sRGB profile to the bytes of an image file.
 
+    Args:
+        content: bytes of the file.
+        suffix: suffix of its name in small letters, such as ".png".
+
     Returns:
         The bytes of a PNG file in colour or a JPEG file with the profile; of other files unchanged. A grey
         JPEG gets it, too.

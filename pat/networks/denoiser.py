@@ -94,6 +94,7 @@ class LowLightNetwork(nn.Module):
     """Denoisers of images of one band and of three.
 
     Attributes:
+        config: size of the networks.
         band: denoiser of each band by itself.
         colour: denoiser of colour images.
     """

@@ -153,7 +153,12 @@ class Features(nn.Sequential):
 
 
 class AttentionEngine(nn.Module):
-    """Layers that make alpha's queries and each beta's keys and values, for attention along the segments."""
+    """Layers that make alpha's queries and each beta's keys and values, for attention along the segments.
+
+    Args:
+        config: configuration of the network, for `betas`, `dim`, `interpolation` and whether a block has
+            biases.
+    """
 
     def __init__(self, config: PATConfig) -> None:
         super().__init__()
@@ -195,7 +200,10 @@ class PostFusion(nn.Sequential):
     """Fusion of alpha's and the attended features: 1x1 convolution, four residual blocks, pixel shuffle.
 
     Called with features (b, (betas + 1) dim, h, w), alpha's first, it returns an image (b, out_channels,
-    scale h, scale w), of the `PATConfig` that it is made with.
+    scale h, scale w).
+
+    Args:
+        config: configuration of the network, for these numbers and whether layers have biases.
     """
 
     def __init__(self, config: PATConfig) -> None:

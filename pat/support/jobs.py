@@ -96,6 +96,10 @@ class JobReport:
         """Repeat a task's warnings in this process, once for each kind. Updates `warned`.
 
         Warnings that differ in numbers alone are one kind.
+
+        Args:
+            outcome: outcome of the task.
+            about: name of the task, put before the warning.
         """
         for warning in outcome.warnings:
             kind = re.sub(r"[\d.]+", "", f"{type(warning).__name__}: {warning}")
