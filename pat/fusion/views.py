@@ -436,7 +436,9 @@ def _warn_of_contradictions(image: Float[Tensor, "c h w"], sensor: Sensor, label
     """Warn of an image that is clipped, or in colour where the rig states one band."""
     share = float((image >= 1).any(0).float().mean())
     if share > SATURATED:
-        warn(f"{label}: {share:.0%} of its pixels are clipped: little to match, and colours are guessed there")
+        warn(
+            f"{label}: {share:.0%} of its pixels are clipped: little to match, and colours are guessed there"
+        )
     stated = sensor.response
     if len(image) == 3 and stated not in (None, "rgb") and is_in_colour(image):
         warn(f"{label}: is in colour, and the rig says response {stated}: give that band, or state rgb")
