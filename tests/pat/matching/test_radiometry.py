@@ -7,7 +7,7 @@ import torch
 
 from pat import FuseSettings, fuse
 from pat.matching import radiometry
-from pat.matching.radiometry import LUMA, SETTINGS, UNLIKE, Response, fit, stated_response
+from pat.matching.radiometry import SETTINGS, UNLIKE, Response, fit, stated_response
 from pat.media.colour import REC601, luminance
 from pat.networks.weights import load_weights
 from pat.support.metrics import score
