@@ -178,8 +178,8 @@ class Inputs:
         offset = (beta.offset[0] + x0, beta.offset[1] + y0)
         top, _, left, _ = box
         track = beta.track and track_in(beta.track, lambda x: x + x.new_tensor((left, top)), 1.0, (-x0, -y0))
-        image, clipped = (p if p is None else p[..., y0:y1, x0:x1] for p in (beta.image, beta.clipped))
-        field = beta.field.cut(box, (x0, y0))
+        part, field = (..., slice(y0, y1), slice(x0, x1)), beta.field.cut(box, (x0, y0))
+        image, clipped = beta.image[part], beta.clipped if beta.clipped is None else beta.clipped[part]
         return replace(beta, image=image, field=field, offset=offset, track=track, clipped=clipped)
 
 
