@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
 from .batching import Batched
-from .checks import check_batches, check_hw, check_K, checking
+from .checks import check_above, check_batches, check_hw, check_K, checking
 from .distortion import Distortion
 from .kornia_models import from_kornia_model, to_kornia_model
 from .lenses.common import on_plane
@@ -303,8 +303,9 @@ class Camera(LensView):
             The scaled camera.
 
         Raises:
-            ValueError: as `LensModel.scaled`.
+            ValueError: as `LensModel.scaled`, and for a factor that is not positive.
         """
+        check_above(0, itself=False, factor=factor)
         K, lens = self.K, self.distortion
         if self.parallel:  # the image plane is in metres
             K = torch.cat([K[..., :2] / K.new_tensor([factor, factor, 1.0])[:, None], K[..., 2:]], -1)

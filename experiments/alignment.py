@@ -130,9 +130,8 @@ def evaluate_alignment(data: Path, out: Path, names: Sequence[str], *, each: Cal
             layers = {} if scene.truth is not None else shown_layers(aligned, scene.recorded_rig)
             name = f"{scene.name.replace('/', '-')}.png"
             save_panels({**composites(scene, aligned), **layers}, out / name, columns=2)
-    text = alignment_markdown(rows)
-    write_text(out / "alignment.md", text)
-    return text
+            write_text(out / "alignment.md", alignment_markdown(rows))
+    return alignment_markdown(rows)
 
 
 def aligned_scene(scene: AlignmentScene, min_confidence: float = LEAST_CONFIDENCE) -> Aligned:
