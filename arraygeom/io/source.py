@@ -547,7 +547,7 @@ class Entry:
         """
         R, t, both = (self.find(name, side) for name in (R_NAME, T_NAME, POSE_NAME))
         if both.value is not None and R.value is None:
-            return both.pose_matrix()
+            return both.pose() if both.is_table else both.pose_matrix()
         if (R.value is None) != (t.value is None):
             raise self.fail(f"has {R.name or t.name} and no {'R' if R.value is None else 't'}: state both")
         return None if R.value is None else pose_of(R, t)

@@ -58,10 +58,11 @@ def cameras_of(nodes: Entry, *, alone: str) -> Iterator[tuple[str, Camera]]:
     """
     K, R, t = (nodes.find(name) for name in (K_NAME, R_NAME, T_NAME))
     pair, origin = R.value is not None and t.value is not None, Pose.identity()
-    if nodes.find(K_NAME, "2").value is not None:
+    both = next((ends for ends in ("01", "12") if all(nodes.find(K_NAME, end).value for end in ends)), "")
+    if both:
         if not pair:
             raise nodes.fail("R, T are missing: put the pair's extrinsics.yml beside its intrinsics.yml")
-        for side, name, pose in zip("12", SIDES, (origin, pose_of(R, t))):
+        for side, name, pose in zip(both, SIDES, (origin, pose_of(R, t))):
             yield str(nodes.get(f"name{side}", name).value), nodes.camera(pose, side=side)
     elif _is_listed(K):
         yield from _of_lists(nodes)

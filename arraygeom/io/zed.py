@@ -46,7 +46,7 @@ def read(source: RigSource) -> Rig:
     Raises:
         RigFileError: for a damaged file, no camera of a known or of the requested size, or missing numbers.
     """
-    parser = configparser.ConfigParser(interpolation=None)
+    parser = configparser.ConfigParser(interpolation=None, inline_comment_prefixes=("#", ";"))
     try:
         parser.read_string(source.text(LONGEST).replace(",", "."))  # some systems write a decimal comma
     except configparser.Error as error:

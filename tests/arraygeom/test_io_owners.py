@@ -118,6 +118,21 @@ USUAL = {
         **{"R": np.eye(3).tolist(), "T": [[-0.1], [0], [0]]},
     },
     "four.toml": f"[cam_1]\nintrinsics = [700, 700, 640, 360]\ndist = {C}\nresolution = [1280, 720]\n",
+    "zero.json": {
+        **{f"{name}{i}": value for i in "01" for name, value in (("K", MATRIX), ("D", C))},
+        **{"R": np.eye(3).tolist(), "T": [-0.1, 0, 0], "image_size": [1280, 720]},
+    },
+    "placed.json": {
+        "cameras": {
+            n: {
+                "intrinsics": NUMBERS,
+                "dist": C,
+                "size": [1280, 720],
+                "extrinsics": {"R": [0, 0, 0], "t": [0, 0, 1]},
+            }
+            for n in "ab"
+        }
+    },
     "extrinsic.json": {"K": MATRIX, "distCoeffs": C, "world_to_cam": IDENTITY, "imgSize": [1280, 720]},
     "slam.yaml": (
         '%YAML:1.0\n---\n# Camera\nCamera.type: "PinHole"\n'
@@ -136,6 +151,7 @@ def test_usual_names_are_read_in_any_language_and_depth(name, tmp_path):
         assert camera.distortion.coefficients.tolist() == C
         assert camera.hw == (720, 1280)
     assert not said
+    assert len(rig.names) == 2 or name not in ("zero.json", "placed.json")
     assert rig.names == {"list.json": ("a", "b"), "pair.json": ("left", "right")}.get(name, rig.names)
     if name == "pair.json":
         assert rig["right"].t.tolist() == [-0.1, 0, 0]
@@ -382,7 +398,7 @@ def test_zeds_lens_of_its_own_section(tmp_path):
         X, np.array([-0.001, 0.006, 0.0008]), np.array([-0.05, 0.0005, -0.0004]), K, c
     )[0][:, 0]
     np.testing.assert_allclose(rig["right"].project(torch.from_numpy(X)).x.numpy(), wanted, atol=1e-6)
-    four = ZED.replace("FHD1200", "4k")
+    four = ZED.replace("FHD1200", "4k").replace("fx = 735.4", "fx = 735.4 ; pixels")
     assert read(tmp_path / "SN1.conf", four)[0]["left"].hw == (2160, 3840)
     one = four[: four.index("[RIGHT_CAM")] + four[four.index("[LEFT_DISTO]") :]
     assert read(tmp_path / "SN1.conf", one)[0].names == ("left",)
