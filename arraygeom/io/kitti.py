@@ -6,7 +6,7 @@ The raw rig (S K D R T) has X_i = R X_0 + T. `calib.txt` states no image size. C
 
 Written by: KITTI 2012, 2015 and raw: rectified cameras, or with `kitti-raw` those before.
 Refused: files without P0 or K_00.
-Sample: real: calib_cam_to_cam.txt of 2011_09_26, the object benchmark's calib.txt.
+Sample: real: calib_cam_to_cam.txt of 2011_09_26, the object benchmark's calibration.
 """
 
 from __future__ import annotations

@@ -51,9 +51,9 @@ def read(source: RigSource) -> Rig:
 def _camera(source: RigSource) -> Camera:
     fields = _fields(source)
     rt, numbers = fields["rt_cam_ref", "extrinsics"], fields["intrinsics"]
-    pose = pose_of(*(source.at(half, rt.name) for half in rt.numbers((6,)).split(3)))
+    R, t = (source.at(half, rt.name) for half in rt.numbers((6,)).split(3))
     K = fields.at(numbers.numbers()[:4], "intrinsics").focal_and_centre()
-    return fields.camera(pose, K=K, distortion=_lens(fields["lensmodel"], numbers))
+    return fields.camera(pose_of(R, t), K=K, distortion=_lens(fields["lensmodel"], numbers))
 
 
 def _lens(model: Entry, numbers: Entry) -> LensModel | None:

@@ -26,7 +26,11 @@ from .source import Entry, RigSource, decoded
 def recognises(path: Path, head: str) -> bool:
     """Return True for the text of a CameraInfo, or a folder with one."""
     if path.is_dir():
-        return any(_is_camera_info(decoded(file.read_bytes()[:4096])) for file in path.glob("*.y*ml"))
+        return any(
+            _is_camera_info(decoded(file.read_bytes()[:4096]))
+            for file in path.glob("*.y*ml")
+            if file.is_file()
+        )
     return _is_camera_info(head)
 
 

@@ -21,7 +21,7 @@ from ..distortion import BROWN_CONRADY, COEFFICIENT_COUNTS, KANNALA_BRANDT, Dist
 from ..pixels import HW, shift_matrix
 from ..pose import Pose, rotation_error, rotation_from_vector
 from ..rig import Rig
-from ..runtime.safe_yaml import LARGEST_TEXT, load_json, load_yaml, text_problem
+from ..runtime.safe_yaml import DEEPEST, LARGEST_TEXT, load_json, load_yaml, text_problem
 from ..runtime.text import short
 from ..runtime.warned import warn
 
@@ -259,13 +259,14 @@ class RigSource:
         except (ValueError, yaml.YAMLError) as error:
             line, problem = text_problem(error)
             raise self.fail(
-                line and f"line {line}", f"is not {kind} ({problem}); is the file whole?"
+                f"line {line}" if line else None, f"is not {kind} ({problem}); is the file whole?"
             ) from None
         return self.at(document).mapping()
 
     def files(self, pattern: str) -> list[RigSource]:
         """Return the files of a folder whose names match, in order; of a file itself."""
-        paths = sorted(self.path.glob(pattern)) if self.path.is_dir() else [self.path]
+        inside = sorted(path for path in self.path.glob(pattern) if path.is_file())
+        paths = inside if self.path.is_dir() else [self.path]
         return [self.beside(path) for path in paths]
 
     def lines(self, separator: str, pattern: str) -> Entry:
@@ -873,20 +874,22 @@ def _spaced(value: str | list[Any]) -> list[float] | None:
         return None
 
 
-def _value_of_xml(entry: Entry) -> Any:
+def _value_of_xml(entry: Entry, depth: int = 0) -> Any:
     """Return what OpenCV's XML holds: mappings, lists, numbers, texts."""
+    if depth > DEEPEST:
+        raise entry.source.fail(None, f"is nested more than {DEEPEST} deep")
     parts = list(entry.value)
     if not parts:
         text = (entry.value.text or "").strip().strip('"')
         numbers = _spaced(text)
         return numbers[0] if numbers and len(numbers) == 1 else text
     if all(part.tag == "_" for part in parts):
-        return [_value_of_xml(entry.at(part, str(i))) for i, part in enumerate(parts)]
+        return [_value_of_xml(entry.at(part, str(i)), depth + 1) for i, part in enumerate(parts)]
     values: dict[str, Any] = {}
     for part in parts:
         if part.tag in values:
             raise entry.at(None, part.tag).fail("occurs twice; keep one")
-        values[part.tag] = _value_of_xml(entry.at(part, part.tag))
+        values[part.tag] = _value_of_xml(entry.at(part, part.tag), depth + 1)
     return values
 
 
