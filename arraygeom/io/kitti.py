@@ -2,7 +2,8 @@
 
 Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; metres. P0..P3 act on points of
 rectified camera 0, so P = K [I | t] and t = K^-1 P[:, 3]; that has small y and z terms, and t_x = -baseline.
-The raw rig (S K D R T) has X_i = R X_0 + T. `calib.txt` states no image size. Cameras are named cam0..cam3.
+The raw rig (S K D R T) has X_i = R X_0 + T. The rectified file states no image size. Cameras are named
+cam0..cam3.
 
 Written by: KITTI 2012, 2015 and raw: rectified cameras, or with `kitti-raw` those before.
 Refused: files without P0 or K_00.

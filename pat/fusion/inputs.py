@@ -9,9 +9,9 @@ from typing import Literal, NamedTuple
 
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import pad
+from torch.nn.functional import max_pool2d, pad
 
-from arraygeom import Curved, Moved, Pair, ReceptiveField, Widened, depth_of
+from arraygeom import Curved, Moved, Pair, ReceptiveField, Sensor, Widened, depth_of
 from arraygeom.epipolar import Depth, Track
 from arraygeom.fields import AroundDepth, AroundMatches, default_field, pinhole_track
 from arraygeom.fields.grid import BLOCK, FieldOnGrid
@@ -27,16 +27,18 @@ from .steps import FusionStep, Undo, takes_pinhole_views
 from .views import Views, check_precision, innermost
 
 LOG = logging.getLogger(__name__)
+CLIPPED = 0.995
+"""Share of the largest value from which a pixel counts as clipped: rounding, and interpolation."""
 
 
 class Placement(NamedTuple):
-    """Relation of a beta to alpha.
+    """Relation of a beta to alpha, by which positions in beta give depth.
 
     Attributes:
         pair: alpha and the beta.
-        points: function from alpha's pixels to their positions in alpha when beta records: others only if
-            they move (`Moved`).
-        bounds: quantity that the depth range bounds.
+        points: function from alpha's pixels (n, 2) to their positions in alpha at the time when beta records;
+            the pixels themselves unless the field is `Moved`.
+        bounds: quantity that the depth range bounds: "depth" along alpha's axis or "distance" along the ray.
     """
 
     pair: Pair
@@ -59,16 +61,17 @@ class Placement(NamedTuple):
     def depth(
         self, x: Float[Tensor, "n 2"], x_beta: Float[Tensor, "n 2"], deviation: Float[Tensor, " n"]
     ) -> Depth:
-        """Compute the depth of the points that alpha's pixels and beta's pixels see, or its distance if
-        `bounds` are such.
+        """Compute the depth of matches, or the distance along alpha's rays if `bounds` says so.
 
-        Through lenses within the pair's depth range.
+        With lenses it lies within the pair's depth range.
 
         Args:
+            x: pixels of alpha.
+            x_beta: positions in beta, pixels.
             deviation: standard deviation of `x_beta` along the segment, pixels.
 
         Returns:
-            Depth with its standard deviation and validity.
+            Depth in the rig's unit, with its standard deviation and validity.
         """
         pair, x = self.pair, self.points(x)
         on_curve = partial(ray_depth, pair, bounds=self.bounds)
@@ -106,7 +109,7 @@ def prepared(
         The inputs, and the functions that take a frame back to the views, last step first.
 
     Raises:
-        ValueError: as `frame_inputs`, and for images of another precision than the network's weights.
+        ValueError: for views that do not overlap, and images of another precision than the network's weights.
     """
     check_precision(views, network)
     LOG.info("preparing %d images", len(views.images))
@@ -145,6 +148,7 @@ def frame_inputs(network: FusionNetwork, views: Views) -> FrameInputs:
             track=place.track if place.has_track else None,
             around=around,
             cameras=views.joined.get(name, (name,)),
+            clipped=clipped_in(image, views.rig[name].sensor),
         )
         betas.append(beta)
         if not on_grid.any_valid(pair.alpha.hw):
@@ -158,6 +162,16 @@ def frame_inputs(network: FusionNetwork, views: Views) -> FrameInputs:
     return FrameInputs(inputs, placements, hw)
 
 
+def clipped_in(image: Float[Tensor, "1 c h w"], sensor: Sensor) -> Float[Tensor, "1 c h w"] | None:
+    """Compute the mask of bands at their largest value, or beside such a pixel; None if there are none.
+
+    The largest value is 1, or the image's own where exposures are stated, by which it was scaled.
+    """
+    largest = 1.0 if sensor.exposure is None else float(image.max())
+    clipped = image >= CLIPPED * largest
+    return max_pool2d(clipped.to(image), 3, 1, 1) if clipped.any() else None
+
+
 def bytes_beside(inputs: Inputs, images: Iterable[Tensor]) -> float:
     """Return the memory of images whose pixels are not those of the inputs, bytes: the caller's."""
     held = inputs.alpha, *(beta.image for beta in inputs.betas)
@@ -167,9 +181,10 @@ def bytes_beside(inputs: Inputs, images: Iterable[Tensor]) -> float:
 
 
 def points_of(field: ReceptiveField) -> Callable[[Tensor], Tensor]:
-    """Return the function from alpha's pixels to the positions, in alpha, for which a field searches.
+    """Return the function from alpha's pixels to the positions in alpha for which a field searches.
 
-    Others than the pixels only if they move, within a band too.
+    Returns:
+        The displacement of `Moved` fields, also within `Widened`; for other fields the identity.
     """
     if isinstance(field, Widened):
         return points_of(field.field)
