@@ -74,7 +74,7 @@ def test_fuse_writes_everything(small):
 
 @pytest.mark.slow
 def test_points_of_a_whole_sphere_are_on_its_rays(tmp_path):
-    """Its depth is the distance along them, which points took for z."""
+    """Its depth is the distance along them, not z."""
     hw = (64, 128)
     poses = Pose.identity(), Pose(torch.eye(3).double(), torch.tensor([-0.25, 0.01, 0.0]).double())
     here = {"K": intrinsics(hw[1] / (2 * torch.pi), hw), "hw": hw, "distortion": Equirectangular()}
@@ -362,7 +362,7 @@ def test_several_frames_are_refused_before_a_rig_is_looked_for(small, refusal, m
 
 
 def test_images_with_a_name_and_a_path_are_images(small, refusal, monkeypatch):
-    """A folder was called no image, the name being taken for a part of its own."""
+    """NAME=FOLDER is a camera's images, whatever the folder's own name."""
     (small / "folder").mkdir(exist_ok=True)
     said = refusal("fuse", f"mono={small / 'folder'}", f"colour={small / 'folder'}")
     assert f"give {small / 'folder'} alone" in said
