@@ -261,8 +261,8 @@ def named_images(paths: Sequence[Path], image: Sequence[str], command: str) -> t
         if not named:
             options.refuse_missing(paths[0], rig=False)
             raise ValueError(
-                f"{paths[0]}: {options.NO_IMAGE}; if it is a rig, give --alpha NAME and --image NAME=FILE for "
-                "each camera"
+                f"{paths[0]}: {options.NO_IMAGE}; if it is a rig, give --alpha NAME, and --image NAME=FILE "
+                "for each camera"
             )
         options.files_by_name(named)
         options.refuse_missing(paths[0], rig=True)

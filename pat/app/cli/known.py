@@ -212,9 +212,9 @@ class Around(Known):
     """Option for known depth or matches of one frame."""
 
     around: Annotated[str | None, Option("FILE", also=("--matches", "--depth-map"))] = None
-    """Search around known depths or matches only. FILE is a depth map of alpha's pixels (PFM, TIFF, 16-bit PNG),
-    or matched points: CSV with x0,y0,x1,y1 a line, of two images in order, or a COLMAP database. Without a rig,
-    matched points determine it; ten are enough to lay one image on the other. For a depth map,
+    """Search around known depths or matches only. FILE is a depth map of alpha's pixels (PFM, TIFF, 16-bit
+    PNG), or matched points: CSV with x0,y0,x1,y1 a line, of two images in order, or a COLMAP database.
+    Without a rig, matched points determine it; ten are enough to lay one image on the other. For a depth map,
     FILE,scale=METRES is the length of one unit (by default 1 for floats, .001 for whole numbers) and
     FILE,tolerance=SHARE its relative error (by default .05; 0 takes it as exact)."""
 
