@@ -285,8 +285,8 @@ class Convert:
     lens: Annotated[str | None, Option("MODEL")] = None
     """Lens model of the coefficients, as brown-conrady or kannala-brandt: for files that do not say."""
     refit: bool = False
-    """Replace a lens whose model ends within the image, as at a pole, by a fitted brown-conrady lens (k1 k2 p1
-    p2 k3)."""
+    """Replace a lens whose model ends within the image, as at a pole, by a fitted brown-conrady lens (k1 k2
+    p1 p2 k3)."""
     write_as: Annotated[str, Option("FORMAT")] = "native"
     """Format of the target."""
 
