@@ -39,7 +39,7 @@ help:
 	@echo "make synthesis  adds Blender to the environment (some 400 MB), to render scenes"
 	@echo "make notebooks  run the notebooks and keep what they put out"
 	@echo "make docs       the documentation as a site, in out/site"
-	@echo "make drawings   the documentation's drawings"
+	@echo "make drawings   the documentation's drawings, and the gallery's figures"
 	@echo "make wheel      build sdist and wheels, install them into empty environments and use them there;"
 	@echo "                PYTHONS='python3.11 python3.12' ARGS=--lowest: more of them"
 	@echo "make env        only the environment, in $(VENV)"
@@ -160,6 +160,7 @@ docs: $(READY)
 
 drawings: $(READY)
 	@$(BIN)/python docs/drawings.py
+	@$(BIN)/python -m docs.gallery
 
 wheel:
 	@$(PYTHON) tests/wheel/run.py --python $(or $(PYTHONS),$(PYTHON)) $(ARGS)

@@ -22,7 +22,7 @@ from torch.nn.functional import pad
 
 from arraygeom import Camera, Pose, Rig, Sensor, intrinsics, plane_homography, rotation_from_vector
 from arraygeom.runtime.atomic import write_atomically
-from docs.drawings import dark_cat, two_in_one_out
+from docs.drawings import two_in_one_out
 from experiments import load_system
 from experiments.stage import RenderedScene
 from pat.lab.evaluation.rectified import warped
@@ -34,6 +34,8 @@ OUT = Path(__file__).parent / "gallery"
 WALL = 4.0
 """Metres to the wall on which photographs hang."""
 
+DISPARITY = 24
+"""Pixels between the images of the cat."""
 PLASTER = 0.6
 """Grey of the wall."""
 
@@ -96,8 +98,18 @@ def astronaut() -> Pair:
 
 
 def cat() -> Pair:
-    """A mono camera in the dark, a colour camera beside it."""
-    return dark_cat()
+    """A mono camera with an eighth of the light, and a colour camera that looks the same way beside it."""
+    photo = photograph("chelsea")
+    generator, hw = Generator().manual_seed(0), (photo.shape[1], photo.shape[2])
+    dark = srgb_from_linear(luminance(linear_from_srgb(photo)) / 8)
+    shifted = torch.cat([photo[..., DISPARITY:], photo[..., -1:].expand(-1, -1, DISPARITY)], -1)
+    images = {
+        "mono": NoiseLevel.from_electrons(1000, 2.0).recorded(dark[None], generator)[0],
+        "colour": NoiseLevel.from_electrons(8000, 2.0).recorded(shifted[None], generator)[0],
+    }
+    mono = Camera(K=intrinsics(600.0, hw).double(), cam_from_world=Pose.identity(), hw=hw)
+    beside = Pose(mono.R, torch.tensor([-0.08, 0, 0]).double())
+    return Rig({"mono": mono, "colour": mono.replace(cam_from_world=beside)}, depth=(1, 8)), images
 
 
 def rendered(name: str) -> Pair:
@@ -171,7 +183,7 @@ def draw_pair(name: str) -> None:
         subprocess.run(["bash", "-c", words], check=True, cwd=OUT.parents[1])
         fused = read_image(Path(folder) / "fused.png")
         depth = None if name in ("cat", "coffee", "astronaut") else read_image(Path(folder) / "depth.png")
-    drawn = two_in_one_out({WORDS[name][0]: images[0], WORDS[name][1]: images[1], "out": fused}, depth=depth)
+    drawn = two_in_one_out({**dict(zip(WORDS[name], images)), "out: fused": fused}, depth=depth)
     save(drawn, OUT / f"{name}.jpg")
 
 

@@ -93,7 +93,6 @@ REFUSED = {
 
 @pytest.mark.parametrize("line", REFUSED)
 def test_what_the_parser_refuses_is_one_line(line, refusal):
-    """Boxes of ten lines."""
     words = line.split()
     path = " ".join(words[:2] if words[0] in ("rig", "lab") else words[:1])
     said = refusal(*words)
