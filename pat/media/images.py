@@ -141,7 +141,7 @@ def _planes(
         content = _png_of_heif(path, label, hw)
     header = image_header(content)
     if header is None:
-        raise ValueError(f"{label}: not an image that can be read: give a whole PNG, TIFF, JPEG or PNM file")
+        raise ValueError(f"{label}: is no image that can be read: give a PNG, TIFF, JPEG or PNM file")
     if content[:4] in TIFF and has_further_images(content):
         warn(f"{label}: holds several images: the first is taken; save the others as files of their own")
     applied = _applied(header, orientation, label)
@@ -168,7 +168,7 @@ def write_image(
         image: floats (1 or 3, h, w), in 0..1.
         bits: 8 or 16: values are clipped to 0..1 and rounded; 32 (.tif and .exr only): floats as they are.
         unknown: True allows NaN and infinity in 32-bit files.
-        profile: True adds an sRGB profile to JPEG files and to PNG files in colour.
+        profile: True adds an sRGB profile to JPEG and PNG files in colour.
 
     Raises:
         ValueError: for an image of integers, another number of channels, values that are not finite, or a
@@ -187,7 +187,8 @@ def write_image(
     if path.suffix.lower() == ".exr":
         return _write_exr(path, planes, bits)
     content = _encode(path, np.ascontiguousarray(planes[::-1].transpose(1, 2, 0)), bits)
-    content = with_srgb_profile(content, path.suffix.lower()) if profile else content
+    if profile and len(planes) == 3:
+        content = with_srgb_profile(content, path.suffix.lower())
     with write_atomically(path) as temporary:
         temporary.write_bytes(content)
 
@@ -276,7 +277,7 @@ def _decode(content: bytes, header: ImageHeader, label: str) -> tuple[NDArray, i
     if values is None and page is not None and page.dtype is not None and page.dtype not in DECODED:
         raise ValueError(f"{label}: has {page.dtype} values: {KINDS}")
     if values is None:
-        raise ValueError(f"{label}: not an image that can be read: give a whole PNG, TIFF or JPEG file")
+        raise ValueError(f"{label}: is damaged, or not whole: copy it again, or save it as PNG or TIFF")
     if values.shape[:2] != header.hw:
         raise ValueError(f"{label}: its header says another size than its pixels have: save it again")
     if page is not None and values.dtype == np.uint16 and header.bits < 16:
