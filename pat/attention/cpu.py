@@ -164,7 +164,7 @@ def backward(
         wants_points=wanted[3],
         wants_bias=wanted[4],
     )
-    taps = _part(b * ha * wa, call)
+    taps = _tap_list(b * ha * wa, call)
     step = len(taps.tap_count)
     for first in range(0, b * ha * wa, step):
         last, part = min(first + step, b * ha * wa), taps._replace(first=first)
@@ -238,7 +238,7 @@ def _shares(first: int, last: int, call: kernels.Call) -> list[kernels.Share]:
     ]
 
 
-def _part(pixels: int, call: kernels.Call) -> kernels.TapList:
+def _tap_list(pixels: int, call: kernels.Call) -> kernels.TapList:
     """Tap list for as many pixels as fit into `SCRATCH_TAPS`."""
     geometry = call.geometry
     stride = (geometry.samples * (1 if geometry.nearest else 4) // kernels.LANES + 2) * kernels.LANES
