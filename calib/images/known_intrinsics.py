@@ -107,19 +107,19 @@ def _normals(rig: Rig, a: str, b: str, matches: PointMatches) -> Float[Tensor, "
 
     Its product with a baseline of length 1 is then about a distance in pixels.
     """
-    rays_a, rays_b = _rays(rig, a, b, matches)
-    return float(rig[b].K[0, 0]) * torch.linalg.cross(rays_a, rays_b)
+    ray_a, ray_b = _rays(rig, a, b, matches)
+    return float(rig[b].K[0, 0]) * torch.linalg.cross(ray_a, ray_b)
 
 
 def _rays(
     rig: Rig, a: str, b: str, matches: PointMatches
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
     """Compute the matches' rays in the rig's frame, of both cameras."""
-    rays_a, rays_b = (
+    ray_a, ray_b = (
         map_homogeneous(rig[name].R.mT @ torch.linalg.inv(rig[name].K), x.double())
         for name, x in ((a, matches.alpha), (b, matches.beta))
     )
-    return rays_a, rays_b
+    return ray_a, ray_b
 
 
 def _consistent(rig: Rig, a: str, b: str, matches: PointMatches) -> PointMatches | None:
@@ -191,11 +191,11 @@ def _points_ahead(
 ) -> float:
     """Count how many more matches are in front of both cameras than behind."""
     a, b = pair
-    rays_a, rays_b = _rays(rig, a, b, matches)
-    baseline = (centres[b] - centres[a]).expand_as(rays_a)
+    ray_a, ray_b = _rays(rig, a, b, matches)
+    baseline = (centres[b] - centres[a]).expand_as(ray_a)
     # a z = baseline + b z2, and so z (a x b) = baseline x b
     return float(
-        (torch.linalg.cross(rays_a, rays_b) * torch.linalg.cross(baseline, rays_b)).sum(-1).sign().sum()
+        (torch.linalg.cross(ray_a, ray_b) * torch.linalg.cross(baseline, ray_b)).sum(-1).sign().sum()
     )
 
 

@@ -364,12 +364,8 @@ def _attend_by_rows(
         return answer
 
     def segments(x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
-        answer, rows = at(x, y, Segments), x.shape[-2:]
-        return (
-            answer.start.unflatten(-2, rows),
-            answer.end.unflatten(-2, rows),
-            answer.valid.unflatten(-1, rows),
-        )
+        spans, rows = at(x, y, Segments), x.shape[-2:]
+        return spans.start.unflatten(-2, rows), spans.end.unflatten(-2, rows), spans.valid.unflatten(-1, rows)
 
     def attended(q: Tensor, x: Tensor, y: Tensor, *bias_rows: Tensor) -> tuple[Tensor, ...]:
         positions = at(x, y, Positions)

@@ -110,12 +110,10 @@ class _AttendLocal(torch.autograd.Function):
         if torch.is_grad_enabled():
             asked = [t for t, want in zip(inputs, wanted) if want]
             of_asked = iter(torch.autograd.grad(ctx.again(*inputs), asked, upstream, create_graph=True))
-            gradients = [next(of_asked) if want else None for want in wanted]
+            grads = [next(of_asked) if want else None for want in wanted]
         else:
-            gradients = compiled("cpu").backward_local(
-                inputs, ctx.field, bias, (out, logsum), upstream, wanted
-            )
-        return *(g if want else None for g, want in zip(gradients, wanted)), None, None, None
+            grads = compiled("cpu").backward_local(inputs, ctx.field, bias, (out, logsum), upstream, wanted)
+        return *(g if want else None for g, want in zip(grads, wanted)), None, None, None
 
 
 def compiled(backend: str) -> ModuleType:
@@ -132,8 +130,8 @@ def compiled(backend: str) -> ModuleType:
 @torch.library.custom_op(
     "pat::attend", mutates_args=(), schema=f"({INPUTS}, {OPTIONS}) -> (Tensor, Tensor, Tensor, Tensor)"
 )
-def _attend(*arguments: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    tensors, (*form, measured, backend, _) = arguments[:6], arguments[6:]
+def _attend(*args: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    tensors, (*form, measured, backend, _) = args[:6], args[6:]
     return compiled(backend).forward(_inputs(tensors, form), measured)
 
 
@@ -156,10 +154,8 @@ def _(query, key, value, points, mask, bias, samples, straight, nearest, measure
 def _(info, in_dims, *inputs):
     """One call for each element of the axis: the kernels have a batch axis, but of images of one rig."""
     axes = zip(inputs, in_dims)
-    arguments = [
-        [t if axis is None else t.select(axis, i) for i in range(info.batch_size)] for t, axis in axes
-    ]
-    outputs = [torch.stack(parts) for parts in zip(*(_attend(*call) for call in zip(*arguments)))]
+    args = [[t if axis is None else t.select(axis, i) for i in range(info.batch_size)] for t, axis in axes]
+    outputs = [torch.stack(parts) for parts in zip(*(_attend(*call) for call in zip(*args)))]
     return tuple(outputs), (0,) * len(outputs)
 
 
@@ -168,9 +164,9 @@ def _(info, in_dims, *inputs):
     mutates_args=(),
     schema=f"({INPUTS}, {SAVED}, {OPTIONS}, bool[] wanted) -> (Tensor, Tensor, Tensor, Tensor, Tensor)",
 )
-def _attend_backward(*arguments: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    tensors, saved, cotangents = arguments[:6], arguments[6:10], arguments[10:12]
-    *form, _, backend, _, wanted = arguments[12:]
+def _attend_backward(*args: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    tensors, saved, cotangents = args[:6], args[6:10], args[10:12]
+    *form, _, backend, _, wanted = args[12:]
     return compiled(backend).backward(_inputs(tensors, form), saved, cotangents, wanted)
 
 

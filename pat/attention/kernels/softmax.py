@@ -60,14 +60,14 @@ def _exponentials32(x):
 
 
 @compiled
-def find_scores(p, call, scratch):
+def find_scores(p, call, work):
     """Compute the scores of pixel p's samples, padded with -inf; written in place."""
-    n = scratch.sample_count[0]
-    interpolate(scratch.by_key, call.geometry, scratch, scratch.score)
+    n = work.sample_count[0]
+    interpolate(work.by_key, call.geometry, work, work.score)
     if call.biased:
         for j in range(n):
-            scratch.score[j] += call.bias[p * call.geometry.samples + scratch.index[j]]
-    fill(scratch.score, n, n + LANES, zero(scratch.score) - np.float32(np.inf))
+            work.score[j] += call.bias[p * call.geometry.samples + work.index[j]]
+    fill(work.score, n, n + LANES, zero(work.score) - np.float32(np.inf))
 
 
 @compiled

@@ -229,10 +229,8 @@ def _named(root: Path) -> list[tuple[Path, Path]]:
     files: list[tuple[Path, Path]] = []
     for left in (file for file in files_below(root) if file.suffix.lower() in IMAGE_SUFFIXES):
         inside = left.as_posix()[len(before) :]
-        marks = [(left_mark, right_mark) for left_mark, right_mark in LEFT_AND_RIGHT if left_mark in inside]
-        rights = (
-            Path(before + right_mark.join(inside.rsplit(left_mark, 1))) for left_mark, right_mark in marks
-        )
+        marks = [(mark, other) for mark, other in LEFT_AND_RIGHT if mark in inside]
+        rights = (Path(before + other.join(inside.rsplit(mark, 1))) for mark, other in marks)
         files += [(left, right) for right in rights if right.is_file()][:1]
     return files
 
