@@ -144,8 +144,8 @@ class AroundMatches:
         for down, across in nearest_last:
             x, y = column + across, row + down
             inside = (x >= 0) & (y >= 0) & (x < hw[1]) & (y < hw[0])
-            here = torch.stack([x, y], -1)[inside]
-            positions[here[:, 1], here[:, 0]] = here + displacement[inside]
+            pixels = torch.stack([x, y], -1)[inside]
+            positions[pixels[:, 1], pixels[:, 0]] = pixels + displacement[inside]
         return cls(positions, tolerance, views, field)
 
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Segments:
@@ -165,15 +165,15 @@ class AroundMatches:
                 "matches are parts of straight segments: give a field of segments, such as Epipolar"
             )
         alpha, beta = self.views or (None, None)
-        there = _at_nearest(self.positions, x, pair.alpha, alpha).to(x)
-        matched = there.isfinite().all(-1)
-        there = torch.where(matched[..., None], there, 0.0)
+        match = _at_nearest(self.positions, x, pair.alpha, alpha).to(x)
+        matched = match.isfinite().all(-1)
+        match = torch.where(matched[..., None], match, 0.0)
         if beta is not None:
-            there, placed = straight_pixels(there.double(), pair.beta, beta)
-            there, matched = there.to(x), matched & placed
-        fraction, length = whole.fraction(there).clamp(0, 1), whole.length
+            match, placed = straight_pixels(match.double(), pair.beta, beta)
+            match, matched = match.to(x), matched & placed
+        fraction, length = whole.fraction(match).clamp(0, 1), whole.length
         matched = (
-            matched & whole.valid & ((whole.at(fraction) - there).norm(dim=-1) <= self.tolerance + BESIDE)
+            matched & whole.valid & ((whole.at(fraction) - match).norm(dim=-1) <= self.tolerance + BESIDE)
         )
         reach = self.tolerance / length.clamp(min=1e-6)
         low, high = ((fraction + step).clamp(0, 1) for step in (-reach, reach))

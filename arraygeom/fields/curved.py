@@ -132,8 +132,8 @@ class ThroughLenses:
         alpha, beta = (_Straight.from_view(view) for view in (pair.alpha, pair.beta))
         link = None if pair.link is None else pair.link.transformed(alpha.A, beta.A)
         straight = dataclasses.replace(pair, alpha=alpha.pinhole, beta=beta.pinhole, link=link)
-        there, valid = alpha.undistort(floating(x))
-        locations = answered(self.field, straight, there)
+        undistorted, valid = alpha.undistort(floating(x))
+        locations = answered(self.field, straight, undistorted)
         locations = locations.positions(self.samples) if isinstance(locations, Segments) else locations
         xy, shown = beta.distort(locations.xy)
         xy, inside = _onto_edge(xy, pair.beta.hw, ROUNDED)
@@ -323,8 +323,8 @@ class RayCurve(NamedTuple):
         fractions = self._fractions(even)
         for _ in range(0 if self.beta.central and self.turn is None else PASSES):
             pieces = self._pieces(fractions, NARROW)
-            there = pieces.length.sum(-1, keepdim=True) > 0
-            fractions = torch.where(there, along_pieces(pieces, even, fractions), even)
+            visible = pieces.length.sum(-1, keepdim=True) > 0
+            fractions = torch.where(visible, along_pieces(pieces, even, fractions), even)
         return fractions
 
     def _fractions(self, even: Tensor) -> Tensor:
@@ -349,9 +349,9 @@ class RayCurve(NamedTuple):
             low, high = covered[..., :1], covered[..., 1:]
             fractions = torch.lerp(low, high, fractions)
             pieces = self._pieces(fractions, MARGIN)
-            there = pieces.length.sum(-1, keepdim=True) > 0
+            visible = pieces.length.sum(-1, keepdim=True) > 0
             ends = torch.where(
-                there, along_pieces(pieces, covered.new_tensor([0.0, 1.0]), fractions), covered
+                visible, along_pieces(pieces, covered.new_tensor([0.0, 1.0]), fractions), covered
             )
             near_end, far_end = self.inverse_depth(ends).unbind(-1)
             xy, visible = self.at(torch.zeros_like(ends) + ends.new_tensor([0.0, 1.0]))

@@ -101,12 +101,12 @@ class Splined(CameraModel, name="splined"):
             start, _ = self._within(self._undisplaced(wanted))
             few = STEPS if not self.batch_shape and not traced() else MOST
             solved = self._solved(start, wanted, few)
-            off, there, jacobian = self._off(solved, wanted)
+            off, reached, jacobian = self._off(solved, wanted)
             if few < MOST and bool(off.any()):  # the few that take longer, or have no solution
                 solved[off] = self._solved(solved[off], wanted[off], MOST)
-                off, there, jacobian = self._off(solved, wanted)
+                off, reached, jacobian = self._off(solved, wanted)
             valid = finite & ~off & self._within(solved)[1] & keeps_orientation(jacobian)
-        u, target = solved, torch.where(valid[..., None], xy, there)
+        u, target = solved, torch.where(valid[..., None], xy, reached)
         for _ in range(2):
             u = u - newton_step(*self._displaced(u), target)
         u = torch.where(valid[..., None], u, solved)
@@ -124,8 +124,8 @@ class Splined(CameraModel, name="splined"):
     def _off(self, u: Tensor, xy: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
         """True for stereographic points that do not solve for the image plane's, with their projections and
         the Jacobian."""
-        there, jacobian = self._displaced(u)
-        return norm(there - xy) >= SOLVED * torch.finfo(xy.dtype).eps * (1 + norm(xy)), there, jacobian
+        reached, jacobian = self._displaced(u)
+        return norm(reached - xy) >= SOLVED * torch.finfo(xy.dtype).eps * (1 + norm(xy)), reached, jacobian
 
     def _within(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """Clamp stereographic points to the border of knots and base.

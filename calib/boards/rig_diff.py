@@ -198,9 +198,9 @@ def _same_cameras(a: Rig, b: Rig) -> tuple[str, ...]:
     if set(a.names) != set(b.names):
         listed = f"{', '.join(a.names)}; and {', '.join(b.names)}"
         raise ValueError(f"the rigs are of other cameras ({listed}): give two calibrations of the same")
-    if (one := length_unit(a)) != (other := length_unit(b)):
+    if (unit_a := length_unit(a)) != (unit_b := length_unit(b)):
         raise ValueError(
-            f"lengths of one rig are in {one}, of the other in {other}, as if found from images: "
+            f"lengths of one rig are in {unit_a}, of the other in {unit_b}, as if found from images: "
             'bring them to one unit, as by `rig.scaled(0.12).replace(name="")`, 0.12 m being its baseline'
         )
     for name in a.names:
@@ -225,8 +225,8 @@ def _points(camera: Camera, other: Camera, depth: tuple[float, float]) -> Grid:
     for inverse in np.linspace(1 / near, max(1 / far, 1 / (FARTHEST * near)), DEPTHS):
         x, X = grid_points(camera, 1 / inverse)
         local = torch.from_numpy(X) @ camera.R.T + camera.t
-        kept = other.project_local(local).valid.numpy()
-        parts.append((x[kept], X[kept], np.full(int(kept.sum()), 1 / inverse)))
+        seen = other.project_local(local).valid.numpy()
+        parts.append((x[seen], X[seen], np.full(int(seen.sum()), 1 / inverse)))
     return tuple(np.concatenate(arrays) for arrays in zip(*parts))  # type: ignore[return-value]
 
 
@@ -322,9 +322,9 @@ def _depths(
 ) -> Difference:
     """Depths of points by the second rig, triangulated from the first rig's pixels."""
     x, X, z = grid
-    there = a[beta].project(torch.from_numpy(X))
-    kept = (there.valid & a[beta].contains(there.x)).numpy()
-    x, z, y = x[kept], z[kept], there.x[torch.from_numpy(kept)]
+    projected = a[beta].project(torch.from_numpy(X))
+    seen = (projected.valid & a[beta].contains(projected.x)).numpy()
+    x, z, y = x[seen], z[seen], projected.x[torch.from_numpy(seen)]
     triangulated = triangulate([b[alpha], b[beta]], torch.stack([torch.from_numpy(x), y]), residual=np.inf)
     valid = triangulated.valid.numpy()
     change = b[alpha].cam_from_world.apply(triangulated.X)[:, 2].numpy() / z - 1
@@ -349,10 +349,10 @@ def _depths(
 def _sizes(values: np.ndarray, sigma: np.ndarray, unit: str = "") -> str:
     """Format RMS and maximum of values, and their standard deviation if known."""
     rms, most = np.sqrt(np.square(values).mean()), np.abs(values).max()
-    stated, finite = "", sigma[np.isfinite(sigma)]
+    deviations, finite = "", sigma[np.isfinite(sigma)]
     if len(finite):
-        stated = f" (both calibrations' deviations: {np.sqrt(np.square(finite).mean()):.3f})"
-    return f"{rms:.3f}{unit} (RMS), {most:.3f}{unit} at most{stated}"
+        deviations = f" (both calibrations' deviations: {np.sqrt(np.square(finite).mean()):.3f})"
+    return f"{rms:.3f}{unit} (RMS), {most:.3f}{unit} at most{deviations}"
 
 
 def draw_difference(difference: RigDifference) -> Figure:

@@ -51,9 +51,9 @@ def epipolar_errors(
         parts = []
         for key in views[a].seen:
             if key in views[b].seen:
-                one, other = views[a].seen[key], views[b].seen[key]
-                _, i, j = np.intersect1d(one.ids, other.ids, return_indices=True)
-                parts.append((one.x[i], other.x[j]))
+                seen_by_a, seen_by_b = views[a].seen[key], views[b].seen[key]
+                _, i, j = np.intersect1d(seen_by_a.ids, seen_by_b.ids, return_indices=True)
+                parts.append((seen_by_a.x[i], seen_by_b.x[j]))
         if not any(len(x) for x, _ in parts):
             continue
         xa, xb = (torch.from_numpy(np.concatenate(points)) for points in zip(*parts))
@@ -104,7 +104,7 @@ def half_difference(fit: Solved, depth: float) -> dict[str, tuple[np.ndarray, np
     """
     count = len(fit.problem.frames)
     even = np.arange(count) % 2 == 0
-    parts = [fit.problem.of_boards(kept) for kept in (even, ~even)]
+    parts = [fit.problem.of_boards(half) for half in (even, ~even)]
     if count < FEWEST_TO_HALVE or not all(
         len(observed.x) for half in parts for observed in half.seen.values()
     ):
@@ -184,11 +184,11 @@ def _compared(name: str, views: BoardViews, board: Board) -> LensComparison:
     """Errors of each lens model on held-out frames; empty for too few frames."""
     if len(views.seen) < FEWEST_TO_COMPARE:
         return LensComparison({})
-    kept = calibrate_single(name, views, board, final=False).views[name]
+    inliers = calibrate_single(name, views, board, final=False).views[name]
     fitted: dict[Lens, BundleProblem] = {}
     for lens in COMPARED:
         with suppress(ValueError):  # it does not fit at all, as a fisheye's model of a long lens may
-            fitted[lens] = calibrate_single(name, kept, board, lens=lens, final=False).problem
+            fitted[lens] = calibrate_single(name, inliers, board, lens=lens, final=False).problem
     frames = max((problem.frames for problem in fitted.values()), key=len, default=())
     parts = [np.arange(len(frames)) % LENS_FOLDS == fold for fold in range(LENS_FOLDS)]
     return LensComparison(

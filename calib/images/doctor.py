@@ -219,7 +219,7 @@ def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnos
     """
     pairs = {names: _thinned(matches) for names, matches in related(rig, pairs).items()}
     fits = all(rig[name].hw == hw for name, hw in sizes.items())
-    found = sum(len(matches.alpha) for matches in pairs.values())
+    points = sum(len(matches.alpha) for matches in pairs.values())
     pairs = within_lenses(rig, pairs) if fits else pairs
     tried = hypotheses(rig, sizes)
     if fits:
@@ -228,37 +228,37 @@ def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnos
     LOG.info("trying %d mistakes on %d pairs", len(tried), len(pairs))
     fit, inliers, noise = fit_statistics(tried, pairs)
     misfit = {h: f.penalised_misfit for h, f in fit.items()}
-    given = named = tried[0]
+    unchanged = named = tried[0]
     table = sorted(tried if fits else tried[1:], key=lambda h: misfit[h])
     odd = implausible(rig) if fits else []
     by_size = [h for h in table if odd and h.kind in OF_SIZES and is_plausible(h.rig, odd)]
-    by_size = [h for h in by_size if misfit[h] <= EQUAL[0] * misfit[given] + EQUAL[1]]
-    healthy = fits and misfit[given] < HEALTHY_MISFIT and not by_size
+    by_size = [h for h in by_size if misfit[h] <= EQUAL[0] * misfit[unchanged] + EQUAL[1]]
+    healthy = fits and misfit[unchanged] < HEALTHY_MISFIT and not by_size
     as_good: list[Hypothesis] = []
     if not fits:
         as_good = [h for h in table if misfit[h] <= EQUAL[0] * misfit[table[0]] + EQUAL[1]]
         named = min(as_good, key=tried.index)
     elif not healthy:
-        if not misfit[given] < HEALTHY_MISFIT:
+        if not misfit[unchanged] < HEALTHY_MISFIT:
             LOG.info("comparing the mistakes that leave least with a drift")
-            mirrored = fit[given].handed < 0.5
+            mirrored = fit[unchanged].handed < 0.5
             named, as_good = _by_evidence(misfit, table, pairs, inliers, noise, mirrored=mirrored)
-        if named is given and by_size:
+        if named is unchanged and by_size:
             named, as_good = min(by_size, key=lambda h: _far_from_range(h, fit[h].depth)), by_size
         usual = USUAL_MISFIT * max(max(hw) for hw in sizes.values())
-        healthy = named is given and not as_good and misfit[given] < usual
+        healthy = named is unchanged and not as_good and misfit[unchanged] < usual
     equal = {h.kind: h for h in reversed(as_good) if h.kind != named.kind}
     others = (h for h in as_good if h is not named)
     return Diagnosis(
         named,
         tuple(equal.values()),
-        before=fit[given],
+        before=fit[unchanged],
         after=fit[named],
         tried={h: fit[h] for h in table},
-        matches=(kept := sum(len(matches.alpha) for matches in pairs.values())),
-        beyond=found - kept,
+        matches=(points_used := sum(len(matches.alpha) for matches in pairs.values())),
+        beyond=points - points_used,
         healthy=healthy,
-        certain=named is not given and all(_same_rig(named.rig, h.rig, pairs) for h in others),
+        certain=named is not unchanged and all(_same_rig(named.rig, h.rig, pairs) for h in others),
         depth=depth_seen(named.rig, pairs) if named.rig.depth is None else None,
     )
 
@@ -286,34 +286,34 @@ def _by_evidence(
     Returns:
         The chosen hypothesis, and all that are as good as it, or as the drift, best first.
     """
-    given = next(iter(misfit))
-    limit = LARGEST_REMAINDER[0] * misfit[given]
-    some = [h for h in table if h is not given and misfit[h] <= limit][:MOST_COMPARED]
-    if not some:
-        return given, []
-    limit = misfit[some[0]] / LARGEST_REMAINDER[1] + EQUAL[1]
+    unchanged = next(iter(misfit))
+    limit = LARGEST_REMAINDER[0] * misfit[unchanged]
+    candidates = [h for h in table if h is not unchanged and misfit[h] <= limit][:MOST_COMPARED]
+    if not candidates:
+        return unchanged, []
+    limit = misfit[candidates[0]] / LARGEST_REMAINDER[1] + EQUAL[1]
     evidence_for = {
         h: DriftEvidence.from_points(h.rig, pairs, inliers, noise)
-        for h in (given, *some)
-        if misfit[h] <= limit or h is given
+        for h in (unchanged, *candidates)
+        if misfit[h] <= limit or h is unchanged
     }
-    drift = evidence_for.pop(given)
+    drift = evidence_for.pop(unchanged)
     least = min(evidence.cost for evidence in evidence_for.values())
     best = next(h for h in misfit if h in evidence_for and evidence_for[h].cost <= least + TIE)
-    allowed = max(ROUGHLY if best.approximate else EXPLAINED[0], EXPLAINED[1] * misfit[given])
-    parts = image_parts(given.rig, pairs)
-    rest = (inliers & (parts != number) for number in parts.unique().tolist())
+    allowed = max(ROUGHLY if best.approximate else EXPLAINED[0], EXPLAINED[1] * misfit[unchanged])
+    parts = image_parts(unchanged.rig, pairs)
+    parts_left_out = (inliers & (parts != number) for number in parts.unique().tolist())
     clear = (
         misfit[best] <= allowed
         and evidence_for[best].cost + MARGIN < drift.cost
-        and all(evidence_for[best].by(used) + MARGIN < drift.by(used) for used in rest)
+        and all(evidence_for[best].by(used) + MARGIN < drift.by(used) for used in parts_left_out)
     )
-    is_named = mirrored or (clear and (bool(given.rig.links) or best.kind not in SHIFTS))
+    is_named = mirrored or (clear and (bool(unchanged.rig.links) or best.kind not in SHIFTS))
     bound = MARGIN + (least if is_named else min(least, drift.cost))
     near = EQUAL[0] * misfit[best] + EQUAL[1] if is_named else 0.0
     ranked = sorted(evidence_for, key=lambda h: evidence_for[h].cost)
     as_good = [h for h in ranked if evidence_for[h].cost <= bound or misfit[h] <= near]
-    return best if is_named else given, as_good
+    return best if is_named else unchanged, as_good
 
 
 def _same_rig(rig: Rig, other: Rig, pairs: Pairs) -> bool:
@@ -371,7 +371,7 @@ def _zoomed(rig: Rig, pairs: Pairs) -> list[Hypothesis]:
     for pixels."""
     names = [name for name in cameras_of(rig, pairs) if isinstance(rig[name], Camera)]
     short = [name for name in names if is_short(rig[name])]
-    found = []
+    zooms = []
     for group in [short] if short else [[name] for name in names]:
         length, side = focal_length_of(rig[group[0]]), max(rig[group[0]].hw)
         low, high = (math.log(share * side / length) for share in FOCAL_SHARES)
@@ -384,8 +384,8 @@ def _zoomed(rig: Rig, pairs: Pairs) -> list[Hypothesis]:
             step = (high - low) / 24
             low, high = math.log(best) - step, math.log(best) + step
         if abs(math.log(best)) > LARGEST_CHANGE * SIGMA["focal"]:
-            found.append(zoomed(rig, group, best))
-    return found
+            zooms.append(zoomed(rig, group, best))
+    return zooms
 
 
 def _degrees(rig: Rig, pairs: Pairs) -> list[Hypothesis]:

@@ -24,7 +24,7 @@ SPACING = 8
 """Least distance of corners, pixels."""
 PATCH = 20
 """Pixels from a patch's middle to its edge."""
-ALIKE = 0.4
+LEAST_SIMILARITY = 0.4
 """Least squared correlation of patches that match."""
 DISTINCT = 0.9
 """Largest squared correlation of a second peak, as a share of the first one's, like Lowe's ratio
@@ -67,41 +67,41 @@ def guided_matches(
     )
     corners = cv2.goodFeaturesToTrack(alpha_image, POINTS, 1e-3, SPACING, mask=mask)
     x = np.zeros((0, 2)) if corners is None else corners[:, 0].astype(np.float64)
-    there = cv2.perspectiveTransform(x[:, None], beta_from_alpha.double().numpy())[:, 0] if len(x) else x
-    positions = [_most_alike(alpha_image, beta_image, valid, *points, window) for points in zip(x, there)]
-    kept = [i for i, y in enumerate(positions) if y is not None]
-    y = np.array([positions[i] for i in kept], np.float64).reshape(-1, 2)
-    return PointMatches(torch.from_numpy(x[kept].round()), torch.from_numpy(y))
+    predicted = cv2.perspectiveTransform(x[:, None], beta_from_alpha.double().numpy())[:, 0] if len(x) else x
+    positions = [_best_match(alpha_image, beta_image, valid, *points, window) for points in zip(x, predicted)]
+    matched = [i for i, y in enumerate(positions) if y is not None]
+    y = np.array([positions[i] for i in matched], np.float64).reshape(-1, 2)
+    return PointMatches(torch.from_numpy(x[matched].round()), torch.from_numpy(y))
 
 
-def _most_alike(
+def _best_match(
     alpha: NDArray[np.uint8],
     beta: NDArray[np.uint8],
     valid: NDArray[Any],
     x: NDArray[np.float64],
-    there: NDArray[np.float64],
+    predicted: NDArray[np.float64],
     window: int,
 ) -> NDArray[np.float64] | None:
     """Find the position in beta of the patch most similar to that around a pixel; None where none is clearly
     so."""
-    (column, row), (left, top) = (np.rint(p).astype(int) for p in (x, there - window))
+    (column, row), (left, top) = (np.rint(p).astype(int) for p in (x, predicted - window))
     patch = alpha[row - PATCH : row + PATCH + 1, column - PATCH : column + PATCH + 1]
     first, last = np.maximum([left, top], PATCH), np.array([left, top]) + 2 * window
     last = np.minimum(last, np.array(beta.shape[::-1]) - 1 - PATCH)
     if (last - first < 2 * PEAK).any() or patch.std() < 1:
         return None
     searched = beta[first[1] - PATCH : last[1] + PATCH + 1, first[0] - PATCH : last[0] + PATCH + 1]
-    alike = np.nan_to_num(cv2.matchTemplate(searched, patch, cv2.TM_CCOEFF_NORMED)) ** 2
-    alike = np.where(valid[first[1] : last[1] + 1, first[0] : last[0] + 1] > 0, alike, 0)
-    v, u = np.unravel_index(alike.argmax(), alike.shape)
-    best = alike[v, u]
-    if best < ALIKE or not (0 < u < alike.shape[1] - 1 and 0 < v < alike.shape[0] - 1):
+    similarity = np.nan_to_num(cv2.matchTemplate(searched, patch, cv2.TM_CCOEFF_NORMED)) ** 2
+    similarity = np.where(valid[first[1] : last[1] + 1, first[0] : last[0] + 1] > 0, similarity, 0)
+    v, u = np.unravel_index(similarity.argmax(), similarity.shape)
+    best = similarity[v, u]
+    if best < LEAST_SIMILARITY or not (0 < u < similarity.shape[1] - 1 and 0 < v < similarity.shape[0] - 1):
         return None
-    away = alike.copy()
-    away[max(v - PEAK, 0) : v + PEAK + 1, max(u - PEAK, 0) : u + PEAK + 1] = 0
-    if away.max() > DISTINCT * best:
+    elsewhere = similarity.copy()
+    elsewhere[max(v - PEAK, 0) : v + PEAK + 1, max(u - PEAK, 0) : u + PEAK + 1] = 0
+    if elsewhere.max() > DISTINCT * best:
         return None
-    du, dv = _vertex(alike[v, u - 1 : u + 2]), _vertex(alike[v - 1 : v + 2, u])
+    du, dv = _vertex(similarity[v, u - 1 : u + 2]), _vertex(similarity[v - 1 : v + 2, u])
     return first + np.array([u + du, v + dv])
 
 

@@ -107,19 +107,19 @@ def _normals(rig: Rig, a: str, b: str, matches: PointMatches) -> Float[Tensor, "
 
     Its product with a baseline of length 1 is then about a distance in pixels.
     """
-    one, two = _rays(rig, a, b, matches)
-    return float(rig[b].K[0, 0]) * torch.linalg.cross(one, two)
+    ray_a, ray_b = _rays(rig, a, b, matches)
+    return float(rig[b].K[0, 0]) * torch.linalg.cross(ray_a, ray_b)
 
 
 def _rays(
     rig: Rig, a: str, b: str, matches: PointMatches
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
     """Compute the matches' rays in the rig's frame, of both cameras."""
-    one, two = (
+    ray_a, ray_b = (
         map_homogeneous(rig[name].R.mT @ torch.linalg.inv(rig[name].K), x.double())
         for name, x in ((a, matches.alpha), (b, matches.beta))
     )
-    return one, two
+    return ray_a, ray_b
 
 
 def _consistent(rig: Rig, a: str, b: str, matches: PointMatches) -> PointMatches | None:
@@ -128,8 +128,8 @@ def _consistent(rig: Rig, a: str, b: str, matches: PointMatches) -> PointMatches
     if len(matches.alpha) < ENOUGH:
         return None
     normals = _normals(rig, a, b, matches)
-    some = torch.randint(len(normals), (TRIALS, 2), generator=torch.Generator().manual_seed(0))
-    trials = torch.linalg.cross(normals[some[:, 0]], normals[some[:, 1]])
+    trial_pairs = torch.randint(len(normals), (TRIALS, 2), generator=torch.Generator().manual_seed(0))
+    trials = torch.linalg.cross(normals[trial_pairs[:, 0]], normals[trial_pairs[:, 1]])
     length = trials.norm(dim=-1)
     near = (normals @ (trials / length.clamp(min=1e-12)[:, None]).T).abs() < NEAR
     near &= length > 1e-6  # else the two points say the same
@@ -191,10 +191,12 @@ def _points_ahead(
 ) -> float:
     """Count how many more matches are in front of both cameras than behind."""
     a, b = pair
-    one, two = _rays(rig, a, b, matches)
-    baseline = (centres[b] - centres[a]).expand_as(one)
-    # one z = baseline + two z2, and so z (one x two) = baseline x two
-    return float((torch.linalg.cross(one, two) * torch.linalg.cross(baseline, two)).sum(-1).sign().sum())
+    ray_a, ray_b = _rays(rig, a, b, matches)
+    baseline = (centres[b] - centres[a]).expand_as(ray_a)
+    # a z = baseline + b z2, and so z (a x b) = baseline x b
+    return float(
+        (torch.linalg.cross(ray_a, ray_b) * torch.linalg.cross(baseline, ray_b)).sum(-1).sign().sum()
+    )
 
 
 def _depths(rig: Rig, near: Mapping[tuple[str, str], PointMatches]) -> tuple[float, float]:

@@ -63,9 +63,9 @@ class PointMatches(NamedTuple):
     alpha: Float[Tensor, "n 2"]
     beta: Float[Tensor, "n 2"]
 
-    def only(self, kept: Bool[Tensor, " n"]) -> PointMatches:
+    def only(self, mask: Bool[Tensor, " n"]) -> PointMatches:
         """Return the matches selected by a mask."""
-        return PointMatches(self.alpha[kept], self.beta[kept])
+        return PointMatches(self.alpha[mask], self.beta[mask])
 
 
 Pairs = Mapping[tuple[str, str], PointMatches]
@@ -224,18 +224,18 @@ def match_cameras(images: Images, *, alpha: str | None = None) -> dict[tuple[str
     for i, (a, b) in enumerate(pairs, len(images)):
         log_step(LOG, i / total, "matching %s and %s", a, b)
         by_pair[a, b] = _agreeing(features[a], features[b], images[b])
-    kept = {names: matches for names, matches in by_pair.items() if len(matches.alpha) >= ENOUGH}
-    for (a, b), matches in kept.items():
+    consistent = {names: matches for names, matches in by_pair.items() if len(matches.alpha) >= ENOUGH}
+    for (a, b), matches in consistent.items():
         displacement = float((matches.alpha - matches.beta).norm(dim=-1).quantile(0.9))
         if images[a].shape[1:] == images[b].shape[1:] and displacement < STILL:
             raise ValueError(f"the images of '{a}' and '{b}' are the same image: give each camera its own")
-    if not kept:
+    if not consistent:
         (a, b), most = max(by_pair.items(), key=lambda item: len(item[1].alpha))
         raise ValueError(
             f"only {len(most.alpha)} points seen in both '{a}' and '{b}' agree, {ENOUGH} are needed: "
             "do the cameras see the same things, at the same time and in focus?"
         )
-    return kept
+    return consistent
 
 
 def _agreeing(a: SiftFeatures, b: SiftFeatures, image: Tensor) -> PointMatches:
@@ -270,14 +270,14 @@ def agreeing_pairs(pairs: Pairs) -> dict[tuple[str, str], PointMatches]:
         ValueError: if no pair has `ENOUGH`.
     """
     agreed = {names: agreeing(matches) for names, matches in pairs.items()}
-    kept = {names: matches for names, matches in agreed.items() if len(matches.alpha) >= ENOUGH}
-    if not kept:
+    consistent = {names: matches for names, matches in agreed.items() if len(matches.alpha) >= ENOUGH}
+    if not consistent:
         most = max((len(matches.alpha) for matches in agreed.values()), default=0)
         raise ValueError(
             f"only {most} of the given matches agree with any rig, "
             f"{ENOUGH} are needed: are they of these images?"
         )
-    return kept
+    return consistent
 
 
 def near_lines(matches: PointMatches, F: Float[Tensor, "3 3"], *, within: float) -> PointMatches:
@@ -471,13 +471,13 @@ def fit_homography(matches: PointMatches) -> Float[Tensor, "3 3"]:
         a, b, p, q, tx, ty, g, k = h
         return np.array([[a + p, q - b, tx], [b + q, a - p, ty], [g, k, 1]])
 
-    def off(h: NDArray[np.float64]) -> NDArray[np.float64]:
-        there = np.c_[x, np.ones(len(x))] @ homography(h).T
-        rest = (there[:, :2] / there[:, 2:] - y) / (CLICKED * to_y[0, 0])
-        return np.concatenate([rest.ravel(), h[[2, 3, 6, 7]] / BENT])
+    def errors(h: NDArray[np.float64]) -> NDArray[np.float64]:
+        projected = np.c_[x, np.ones(len(x))] @ homography(h).T
+        residual = (projected[:, :2] / projected[:, 2:] - y) / (CLICKED * to_y[0, 0])
+        return np.concatenate([residual.ravel(), h[[2, 3, 6, 7]] / BENT])
 
     (a, _, tx), (b, _, ty) = similarity
-    H = homography(least_squares(off, [a, b, 0, 0, tx, ty, 0, 0], loss="cauchy").x)
+    H = homography(least_squares(errors, [a, b, 0, 0, tx, ty, 0, 0], loss="cauchy").x)
     return torch.from_numpy(np.linalg.inv(to_y) @ H @ to_x)
 
 

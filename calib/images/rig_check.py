@@ -61,17 +61,17 @@ def find_misfit(rig: Rig, images: Images) -> Misfit | None:
         The misfit if the rig fits badly; None if it fits, and where nothing can be said: too few matched
         points, images of another size, cameras that are not related.
     """
-    some = {name: images[name] for name in list(images.keys())[:MOST_CAMERAS]}
-    if len(some) < 2 or any(rig[name].hw != tuple(image.shape[1:]) for name, image in some.items()):
+    chosen = {name: images[name] for name in list(images.keys())[:MOST_CAMERAS]}
+    if len(chosen) < 2 or any(rig[name].hw != tuple(image.shape[1:]) for name, image in chosen.items()):
         return None
     scales = {
-        side: min(_scale(image, side) for image in some.values()) for side in (ROUGH_SIDE, LARGEST_SIDE)
+        side: min(_scale(image, side) for image in chosen.values()) for side in (ROUGH_SIDE, LARGEST_SIDE)
     }
     limit = BADLY * scales[ROUGH_SIDE] / scales[LARGEST_SIDE]
-    rough = _matched(rig, some, ROUGH_SIDE)
+    rough = _matched(rig, chosen, ROUGH_SIDE)
     if rough is not None and median_off(*rough) <= limit and share_outside(*rough) <= OUTSIDE:
         return None
-    if (matched := _matched(rig, some, LARGEST_SIDE)) is None:
+    if (matched := _matched(rig, chosen, LARGEST_SIDE)) is None:
         return None
     rig, pairs = matched
     off, outside = median_off(rig, pairs), share_outside(rig, pairs)
@@ -87,7 +87,7 @@ def find_misfit(rig: Rig, images: Images) -> Misfit | None:
         text += f", {outside:.0%} of them behind the cameras or outside the depth range"
     from .doctor import diagnose_matches  # here, as SciPy's statistics take long to import
 
-    diagnosis = diagnose_matches(rig, {name: rig[name].hw for name in some}, pairs)
+    diagnosis = diagnose_matches(rig, {name: rig[name].hw for name in chosen}, pairs)
     verdict = "" if diagnosis.healthy else f"; `pat rig doctor` says: {diagnosis.verdict}"
     return Misfit(off, outside, diagnosis.named.kind != "nothing", text + verdict)
 
@@ -110,13 +110,13 @@ def share_unlike(
         return math.nan
     rig, pairs = matched
     pairs = {names: points for names, points in pairs.items() if names[0] == alpha}
-    found = match_depths(rig, pairs)
+    depths = match_depths(rig, pairs)
     (h, w), x = depth.shape, torch.cat([points.alpha for points in pairs.values()]).double()
     scale = x.new_tensor([w / rig[alpha].hw[1], h / rig[alpha].hw[0]])
     column, row = ((x + 0.5) * scale - 0.5).round().long().clamp(min=0).unbind(-1)
-    stated = depth[row.clamp(max=h - 1), column.clamp(max=w - 1)]
-    off = (stated / found.depth - 1).abs() > tolerance
-    return share(off[found.observable & found.front & stated.isfinite()])
+    measured = depth[row.clamp(max=h - 1), column.clamp(max=w - 1)]
+    wrong = (measured / depths.depth - 1).abs() > tolerance
+    return share(wrong[depths.observable & depths.front & measured.isfinite()])
 
 
 def _scale(image: Tensor, largest: int) -> float:

@@ -96,10 +96,10 @@ def ndvi(aligned: Aligned, rig: Rig | None = None) -> NDArray[np.float32] | None
     nir, red = (_band_near(aligned, wave) for wave in (NEAR_INFRARED, RED))
     if nir is None or red is None or nir.name == red.name:
         return None
-    one, other = (_light(band, rig) for band in (nir, red))
-    total = one + other
+    infrared, visible = (_light(band, rig) for band in (nir, red))
+    total = infrared + visible
     with np.errstate(all="ignore"):
-        index = (one - other) / total
+        index = (infrared - visible) / total
     return np.where(nir.valid & red.valid & (total > 0), index, np.float32(np.nan))
 
 

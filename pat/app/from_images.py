@@ -143,7 +143,7 @@ def array_from_images(
     for name in files:
         images[name] = read_image(files[name], name=name)
     sizes = image_sizes(images)
-    given = (
+    by_pair = (
         None
         if matches is None
         else {
@@ -160,13 +160,13 @@ def array_from_images(
     if tagged is None:
         lengths = _focal_lengths(images, files, focal, note)
         bands = load_weights(weights or _weights_of(images, alpha)).bands
-        rig, names = found_rig(images, alpha, lengths, bands, note, given)
+        rig, names = found_rig(images, alpha, lengths, bands, note, by_pair)
         sensors = {name: Sensor({1: "mono", 3: "rgb"}.get(len(images[name]))) for name in names}
         recorded = rig = _with_sensors(rig, sensors)
     else:
         like = tagged[alpha].sensor
         others = ({n: read_view(tagged, n, one[n], like=like) for n in images} for one in further)
-        rig, names = _rig_of_bands(tagged, images, others, alpha, note, given)
+        rig, names = _rig_of_bands(tagged, images, others, alpha, note, by_pair)
         recorded = _with_sensors(rig, {name: tagged[name].sensor for name in names})
     images = {name: images[name] for name in names}
     weights = weights or _weights_of(images, alpha)
@@ -209,13 +209,13 @@ def by_camera(sources: ImageSources) -> Mapping[str, str | Path | Tensor]:
 
 
 def _focal_lengths(
-    images: Images, files: Mapping[str, Path], given: Mapping[str, float], note: Say
+    images: Images, files: Mapping[str, Path], user_focal: Mapping[str, float], note: Say
 ) -> dict[str, float]:
     """Focal lengths in pixels, as given or else by the files' tags; cameras without either are absent."""
     by_tags = {n: focal_length(files[n], (x.shape[-2], x.shape[-1])) for n, x in images.items() if n in files}
-    lengths = {n: length for n, length in {**by_tags, **given}.items() if length and n in images}
+    lengths = {n: length for n, length in {**by_tags, **user_focal}.items() if length and n in images}
     for name, length in lengths.items():
-        note(f"{name}: focal length {length:.0f} pixels, {'as given' if name in given else 'by EXIF'}")
+        note(f"{name}: focal length {length:.0f} pixels, {'as given' if name in user_focal else 'by EXIF'}")
     return lengths
 
 
@@ -283,12 +283,12 @@ def _tagged_rig(files: Mapping[str, Path], note: Say) -> Rig | None:
 
 
 def _rig_of_bands(
-    tagged: Rig, images: Images, further: Iterable[Images], alpha: str, note: Say, given: Pairs | None
+    tagged: Rig, images: Images, further: Iterable[Images], alpha: str, note: Say, by_pair: Pairs | None
 ) -> tuple[Rig, list[str]]:
     """Rig of tags with translations where images have parallax, else with maps by all captures' points; and
     the cameras that match, alpha first."""
     translated, why = None, "matches are given"
-    if given is None:
+    if by_pair is None:
         try:
             translated = _translated_rig(tagged, images, alpha, note)
             if translated[0].name != OPEN:
@@ -300,7 +300,7 @@ def _rig_of_bands(
             why = str(error).partition(":")[0]
     note(f"no depth ({why}): maps between the bands by matched points")
     try:
-        return _mapped_rig(tagged, chain([images], further), alpha, note, given)
+        return _mapped_rig(tagged, chain([images], further), alpha, note, by_pair)
     except ValueError:
         if translated is None:
             raise
@@ -329,7 +329,7 @@ def _translated_rig(tagged: Rig, images: Images, alpha: str, note: Say) -> tuple
 
 
 def _mapped_rig(
-    tagged: Rig, captures: Iterable[Images], alpha: str, note: Say, given: Pairs | None = None
+    tagged: Rig, captures: Iterable[Images], alpha: str, note: Say, by_pair: Pairs | None = None
 ) -> tuple[Rig, list[str]]:
     """Cameras of tags without poses: their lenses, and a homography, or F, by the points of all captures.
 
@@ -344,10 +344,10 @@ def _mapped_rig(
         reduced = {name: scaled(image, factors[name]) for name, image in pinhole.items()}
         sized = resized_rig(straight, reduced)
         try:
-            if given is None:
+            if by_pair is None:
                 matched = match_cameras(reduced, alpha=alpha)
             else:
-                bare = {pair: undistort_matches(rig.pair(*pair), points) for pair, points in given.items()}
+                bare = {pair: undistort_matches(rig.pair(*pair), points) for pair, points in by_pair.items()}
                 to_sized = {name: sized[name].K @ torch.linalg.inv(rig[name].K) for name in images}
                 matched = usable_matches(_moved(bare, to_sized), alpha=alpha)
         except ValueError:
@@ -385,7 +385,7 @@ def found_rig(
     focal: Mapping[str, float],
     bands: int | None,
     note: Say,
-    given: Pairs | None = None,
+    by_pair: Pairs | None = None,
 ) -> tuple[Rig, list[str]]:
     """Find the rig of images, and the cameras that it relates to alpha.
 
@@ -396,7 +396,7 @@ def found_rig(
         bands: number of bands that the network takes as one colour image: a beta of so many is compared with
             alpha by its luma, others by the combination of bands most similar to alpha. None for no number.
         note: function that is called with a line of text for each finding.
-        given: matches between the images by pair; None to match the images.
+        by_pair: matches between the images by pair; None to match the images.
 
     Returns:
         The rig, calibrated up to a scale where points matched between alpha and a beta have parallax, else
@@ -408,11 +408,11 @@ def found_rig(
     factors = {name: min(MATCHED / max(image.shape[-2:]), 1.0) for name, image in images.items()}
     reduced = {name: scaled(image, factors[name]) for name, image in images.items()}
     lengths = {name: length * factors[name] for name, length in focal.items()}
-    if given is not None:
+    if by_pair is not None:
         old, new = image_sizes(images), image_sizes(reduced)
-        given = _moved(given, {name: resize_matrix(old[name], new[name]) for name in images})
+        by_pair = _moved(by_pair, {name: resize_matrix(old[name], new[name]) for name in images})
     with part(0, LINES):
-        uncalibrated = rig_from_images(reduced, focal=lengths, alpha=alpha, matches=given)
+        uncalibrated = rig_from_images(reduced, focal=lengths, alpha=alpha, matches=by_pair)
     betas = [name for name in images if (alpha, name) in uncalibrated.rig.links]
     if not betas:
         raise ValueError(f"no image shows enough of what '{alpha}' shows: choose another alpha")
@@ -426,7 +426,7 @@ def found_rig(
             f"{name}: focal length {length / factors[name]:.0f} pixels +- {deviation:.0%}, by matched points"
         )
     lengths |= {name: length for name, (length, _) in observed.items()}
-    rig = _calibrated(uncalibrated, reduced, alpha, betas, lengths, bands, note, given is None)
+    rig = _calibrated(uncalibrated, reduced, alpha, betas, lengths, bands, note, by_pair is None)
     if rig.name == UNSCALED and known != {alpha, *betas}:
         rig = rig.replace(name=ASSUMED)
     return resized_rig(rig, images), [alpha, *betas]

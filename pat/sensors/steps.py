@@ -100,18 +100,22 @@ class Resample(Step):
     """Change of the number of pixels for the same field of view: c' = (c + 0.5) s - 0.5.
 
     Attributes:
-        to: a factor (sizes are rounded, which changes the factor along each axis), or (height, width); not
-            positive raises ValueError.
+        to: a factor (sizes are rounded, which changes the factor along each axis), or (height, width).
         method: "area" models a sensor with larger pixels and keeps the image's mean exactly; "bicubic" is the
-            usual antialiased resize with a = -0.5, which may leave 0..1. Not checked.
+            usual antialiased resize with a = -0.5, which may leave 0..1.
+
+    Raises:
+        ValueError: for a factor or size that is not positive, or another method.
     """
 
     to: float | HW
     method: Literal["area", "bicubic"] = "area"
 
     def __post_init__(self) -> None:
-        if min(self.to if isinstance(self.to, tuple) else (self.to,)) <= 0:
+        if not min(self.to if isinstance(self.to, tuple) else (self.to,)) > 0:
             raise ValueError(f"resample: give a positive factor or a (height, width), got {self.to}")
+        if self.method not in ("area", "bicubic"):
+            raise ValueError(f"resample: method is 'area' or 'bicubic', got {self.method!r}")
 
     def hw(self, hw: HW) -> HW:
         if isinstance(self.to, tuple):
@@ -142,11 +146,14 @@ class Noise(Step):
     """Shot and read noise on linear values; the result is not clipped.
 
     Attributes:
-        full_well: electrons at value 1, more than 0; other values raise ValueError.
-        read: standard deviation of the read noise in electrons, 0 or more; negative raises ValueError.
+        full_well: electrons at value 1, more than 0.
+        read: standard deviation of the read noise in electrons, 0 or more.
         counts: "gaussian" draws from a normal distribution of variance signal + read² and is differentiable;
             "poisson" counts electrons, which differs visibly below about ten of them, with the gradient of
             the mean.
+
+    Raises:
+        ValueError: for numbers outside these ranges or NaN, or other counts.
     """
 
     full_well: float
@@ -154,9 +161,11 @@ class Noise(Step):
     counts: Literal["gaussian", "poisson"] = "gaussian"
 
     def __post_init__(self) -> None:
-        if self.full_well <= 0 or self.read < 0:
+        if not (self.full_well > 0 and self.read >= 0):
             got = f"{self.full_well:g} and {self.read:g}"
             raise ValueError(f"noise: wanted full_well > 0 and read >= 0 electrons, got {got}")
+        if self.counts not in ("gaussian", "poisson"):
+            raise ValueError(f"noise: counts is 'gaussian' or 'poisson', got {self.counts!r}")
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
         if self.counts == "poisson":
@@ -209,11 +218,19 @@ class Jitter(Step):
         gain: standard deviation of the natural logarithm of the gain of all channels.
         gamma: standard deviation of the natural logarithm of gamma.
         normalisation: standard deviation of the natural logarithm of each channel's own gain.
+
+    Raises:
+        ValueError: for a deviation that is negative, infinite or NaN.
     """
 
     gain: float = 0.05
     gamma: float = 0.05
     normalisation: float = 0.03
+
+    def __post_init__(self) -> None:
+        for name in ("gain", "gamma", "normalisation"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"jitter: {name} must be 0 or more, got {getattr(self, name):g}")
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
         b, c = image.shape[:2]

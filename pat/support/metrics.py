@@ -46,11 +46,11 @@ def score(image: Float[Tensor, "_ _ _"], ground_truth: Float[Tensor, "_ _ _"]) -
         raise ValueError(f"the image is {got} and the ground truth {wanted}: give equal shapes")
     if min(image.shape[-2:]) < SSIM_WINDOW:
         raise ValueError(f"SSIM needs sides of {SSIM_WINDOW} pixels or more, got {tuple(image.shape[-2:])}")
-    ours, theirs = (x.detach().cpu().double().numpy() for x in (image, ground_truth))
+    values, true_values = (x.detach().cpu().double().numpy() for x in (image, ground_truth))
     with np.errstate(divide="ignore"):
-        psnr = -10 * np.log10(np.square(ours - theirs).mean())
+        psnr = -10 * np.log10(np.square(values - true_values).mean())
     how = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
-    ssim = structural_similarity(theirs, ours, data_range=1, channel_axis=0, **how)
+    ssim = structural_similarity(true_values, values, data_range=1, channel_axis=0, **how)
     return Score(float(psnr), float(ssim))
 
 

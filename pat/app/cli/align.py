@@ -106,11 +106,11 @@ class Align(Around):
         rig = options.load_rig_or_say_no_image(self.given[0], self.depth)
         alpha, files = files_by_camera(rig, self.alpha, self.given, image)
         files = matched_frames(files)
-        for i, one in enumerate(options.by_frame(files)):
-            views = ViewFiles(rig, one, alpha=alpha)
+        for i, paths in enumerate(options.by_frame(files)):
+            views = ViewFiles(rig, paths, alpha=alpha)
             if i == 0:
                 checked_rig(views, heal=False)
-            yield _Frame(views.developed, rig, views, one, alpha, name=_name_of(files, alpha, one))
+            yield _Frame(views.developed, rig, views, paths, alpha, name=_name_of(files, alpha, paths))
 
     def _frames_without(self, flight: Mapping[str, list[Path]]) -> Iterator[_Frame]:
         """Frames of the rig that is found from the first one, or from a flight's captures."""
@@ -125,15 +125,15 @@ class Align(Around):
         files = flight or matched_frames({name: find_images(path) for name, path in cameras.items()})
         array = self.found_array(files, flight=bool(flight))
         files = {name: files[name] for name in array.rig.names}
-        for i, one in enumerate(options.by_frame(files)):
+        for i, paths in enumerate(options.by_frame(files)):
             again = i or flight
-            images = ViewFiles(array.recorded, one, alpha=array.alpha) if again else array.images
-            name = _name_of(files, array.alpha, one)
+            images = ViewFiles(array.recorded, paths, alpha=array.alpha) if again else array.images
+            name = _name_of(files, array.alpha, paths)
             yield _Frame(
                 array.rig,
                 array.recorded,
                 images,
-                one,
+                paths,
                 array.alpha,
                 array.notes,
                 name,
@@ -230,6 +230,6 @@ class _Frame:
     rig_found: bool = False
 
 
-def _name_of(files: Mapping[str, Sequence[Path]], alpha: str, one: Mapping[str, Path]) -> str:
+def _name_of(files: Mapping[str, Sequence[Path]], alpha: str, paths: Mapping[str, Path]) -> str:
     """Name of a frame among several: alpha's file without suffix; empty for a single frame."""
-    return one[alpha].stem if len(files[alpha]) > 1 else ""
+    return paths[alpha].stem if len(files[alpha]) > 1 else ""

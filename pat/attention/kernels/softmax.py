@@ -60,14 +60,14 @@ def _exponentials32(x):
 
 
 @compiled
-def find_scores(p, call, here):
+def find_scores(p, call, work):
     """Compute the scores of pixel p's samples, padded with -inf; written in place."""
-    n = here.sample_count[0]
-    interpolate(here.by_key, call.geometry, here, here.score)
+    n = work.sample_count[0]
+    interpolate(work.by_key, call.geometry, work, work.score)
     if call.biased:
         for j in range(n):
-            here.score[j] += call.bias[p * call.geometry.samples + here.index[j]]
-    fill(here.score, n, n + LANES, zero(here.score) - np.float32(np.inf))
+            work.score[j] += call.bias[p * call.geometry.samples + work.index[j]]
+    fill(work.score, n, n + LANES, zero(work.score) - np.float32(np.inf))
 
 
 @compiled

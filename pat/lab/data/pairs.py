@@ -229,8 +229,8 @@ def _named(root: Path) -> list[tuple[Path, Path]]:
     files: list[tuple[Path, Path]] = []
     for left in (file for file in files_below(root) if file.suffix.lower() in IMAGE_SUFFIXES):
         inside = left.as_posix()[len(before) :]
-        marks = [(ours, theirs) for ours, theirs in LEFT_AND_RIGHT if ours in inside]
-        rights = (Path(before + theirs.join(inside.rsplit(ours, 1))) for ours, theirs in marks)
+        marks = [(mark, other) for mark, other in LEFT_AND_RIGHT if mark in inside]
+        rights = (Path(before + other.join(inside.rsplit(mark, 1))) for mark, other in marks)
         files += [(left, right) for right in rights if right.is_file()][:1]
     return files
 

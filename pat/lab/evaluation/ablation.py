@@ -409,12 +409,12 @@ def point_errors(case: AblationCase, depth: Float[Tensor, "h w"]) -> tuple[float
     alpha, beta = case.rig.pair(ALPHA, BETA).cameras
     x = pixel_grid(alpha.hw, dtype=torch.float64).reshape(-1, 2)
     unproject = at_distance if natural_bounds(case.rig.pair(ALPHA, BETA)) == "distance" else Camera.unproject
-    ours, theirs = (beta.project(unproject(alpha, x, d.reshape(-1).double())) for d in (depth, case.depth))
-    has_truth = theirs.valid & theirs.x.isfinite().all(-1)
-    compared = has_truth & ours.valid & ours.x.isfinite().all(-1)
+    estimated, true = (beta.project(unproject(alpha, x, d.reshape(-1).double())) for d in (depth, case.depth))
+    has_truth = true.valid & true.x.isfinite().all(-1)
+    compared = has_truth & estimated.valid & estimated.x.isfinite().all(-1)
     if not compared.any():
         return math.nan, math.nan
-    error = (ours.x - theirs.x).norm(dim=-1)[compared]
+    error = (estimated.x - true.x).norm(dim=-1)[compared]
     return float(error.mean()), float((error <= 1).sum() / has_truth.sum())
 
 

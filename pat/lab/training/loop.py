@@ -166,9 +166,9 @@ class Run:
             FloatingPointError: for a loss or gradient that is not finite.
             OSError: if a checkpoint cannot be written.
         """
-        given = self.samples.steps(self.groups, start=self.step)
+        groups_by_step = self.samples.steps(self.groups, start=self.step)
         recipe = self.config
-        for samples in made_ahead(given):
+        for samples in made_ahead(groups_by_step):
             self.step += 1
             share = self.here.agreed(max(self.step / recipe.steps, self.minutes / recipe.minutes))
             self._advance(samples, share)
@@ -198,11 +198,11 @@ class Run:
         if self.watch:
             self.watch.step(self.step, self.loss, float(norm), rate, done=share)
 
-    def _backward(self, given: Sample, groups: int, *, last: bool) -> Tensor:
+    def _backward(self, sample: Sample, groups: int, *, last: bool) -> Tensor:
         """Add the gradients of one group; processes exchange them with the last group."""
         wait = isinstance(self.together, DistributedDataParallel) and not last
         with self.together.no_sync() if wait else nullcontext():  # type: ignore[operator]
-            loss = self.together(given)
+            loss = self.together(sample)
             (loss / groups).backward()
         return loss.detach()
 
@@ -248,10 +248,10 @@ class Run:
             f"(now {self.config.rate:g}); the last checkpoint and the best weights are as they were"
         )
 
-    def _is_finite(self, given: Sample) -> bool:
+    def _is_finite(self, sample: Sample) -> bool:
         """True if the loss of a sample and its gradients are finite."""
         self.objective.zero_grad()
-        loss = self.objective(given)
+        loss = self.objective(sample)
         loss.backward()
         gradients = [p.grad for p in self.objective.parameters() if p.grad is not None]
         return bool(loss.isfinite()) and all(bool(g.isfinite().all()) for g in gradients)

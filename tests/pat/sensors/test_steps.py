@@ -241,8 +241,19 @@ def test_mistakes_are_named():
         run(noise_image(1, 3, 4, 4), Spectral("nir"))
     with pytest.raises(ValueError, match="collects no light"):
         run(noise_image(1, 3, 4, 4), Spectral(Curve((1500.0, 1600.0), (1.0, 1.0))))
-    with pytest.raises(ValueError, match="full_well > 0"):
-        Noise(0)
+    for numbers in ((0.0, 0.0), (math.nan, 0.0), (100.0, math.nan)):
+        with pytest.raises(ValueError, match="full_well > 0"):
+            Noise(*numbers)
+    with pytest.raises(ValueError, match="counts"):
+        Noise(100, counts="normal")
+    for factor in (0.0, math.nan):
+        with pytest.raises(ValueError, match="resample"):
+            Resample(factor)
+    with pytest.raises(ValueError, match="method"):  # it was taken for "area"
+        Resample(0.5, "bilinear")
+    for wrong in ({"gain": -0.1}, {"gamma": math.nan}, {"normalisation": math.inf}):
+        with pytest.raises(ValueError, match=next(iter(wrong))):
+            Jitter(**wrong)
     with pytest.raises(ValueError, match="bits must be 1 or more, got 0"):  # every value was NaN
         Quantise(0)
     for sigma in (-1.0, math.nan):
