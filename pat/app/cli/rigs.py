@@ -381,11 +381,10 @@ NEARER = 4.0
 
 @dataclass
 class Refine:
-    """Refine a rig by ordinary images of its cameras: matched points first, then the fusion's own error.
+    """Refine a rig by points matched between ordinary images of its cameras.
 
     No rig is written unless held-out points come nearer to their epipolar lines, the changes agree with their
-    standard deviations, and depth does not become less certain. What happens to depth is printed and written
-    into the file.
+    standard deviations, and depth changes by one per cent at most, as matched points do not determine it.
 
     Example: pat rig refine rig.yaml --image mono=a.png --image colour=b.png --out better.yaml
     """
@@ -396,13 +395,11 @@ class Refine:
     out: Out
     """Rig file to write."""
     matches: MatchesFile = None
-    free: tuple[str, ...] = ("rotation", "centre")
+    free: tuple[str, ...] = ("rotation", "translation", "focal", "centre")
     """Free parameters: rotation, translation, focal, centre (principal_point), distortion; or
-    CAMERA.rotation. By default, focal and translation too if that brings held-out points nearer."""
+    CAMERA.rotation."""
     sigma: Annotated[tuple[str, ...], Option("KIND=NUMBER")] = ()
     """Standard deviation of a parameter before refinement: degrees, pixels; translation, focal relative."""
-    photometric: bool = True
-    """Also minimise the fusion's own error, after that of the points."""
     force: bool = False
     """Write the refined rig in spite of objections."""
 
@@ -416,8 +413,6 @@ class Refine:
         from arraygeom.io.native import write
         from arraygeom.runtime.atomic import write_text
         from calib.images.refinement import refine
-
-        from ...attention import attend_with_statistics
 
         options.writable(self.out)
         rig = load_rig(self.rig)
@@ -436,7 +431,6 @@ class Refine:
                 matches=None if matches is None else [matches],
                 free=[kind for text in self.free for kind in text.split(",")],
                 sigma={kind: math.radians(s) if kind == "rotation" else s for kind, s in deviations.items()},
-                attend=attend_with_statistics if self.photometric else None,
                 force=self.force,
             )
         print(refined.as_text())
