@@ -42,11 +42,11 @@ not depend on are not computed."""
 
 
 class Evaluated(NamedTuple):
-    """Residuals at a point, still functions of it, to be differentiated there if wanted.
+    """Residuals evaluated at given parameters, with the graph to differentiate them.
 
     Attributes:
-        z: the point, requiring gradients.
-        parts: residuals, one tensor per part.
+        z: parameters, requiring gradients.
+        parts: residuals as functions of z, in one tensor or several.
     """
 
     z: Float[Tensor, " k"]
@@ -89,7 +89,9 @@ def solve(residuals: Residuals, count: int, considered: int = 0) -> Solution:
     again.
 
     Args:
-        residuals: function of `count` free parameters followed by the `considered` ones.
+        residuals: function of all parameters, the free ones first, that returns residuals in parts.
+        count: number of free parameters.
+        considered: number of further parameters that are uncertain, but not changed.
 
     Returns:
         The solution.
@@ -119,7 +121,9 @@ def shifts_left_out(
     To first order, from the most probable z on.
 
     Args:
-        parts: part in which each residual is.
+        residuals: function of the parameters.
+        z: most probable parameters, in prior deviations.
+        parts: number of the part in which each residual is.
 
     Returns:
         One row per part, in prior deviations.
@@ -149,6 +153,9 @@ def most_probable(
     observable, as poses by a flat scene are.
 
     Args:
+        residuals: function of the parameters.
+        z: parameters to start from, in prior deviations.
+        basis: columns of which the change is a combination.
         steps: largest number of steps; no error if they do not suffice.
 
     Returns:

@@ -98,10 +98,10 @@ def refine(
 
     Args:
         frames: one image (C, H, W) in 0..1 per camera, by name, of the rig's sizes.
-        free: kinds or patterns, as of `parameters.free_parameters`.
-        sigma: prior standard deviations by kind, as there.
-        force: follow the lines however depth changes, and accept the result in spite of objections.
-        matches: points of each frame used instead of matching its images.
+        free: free parameters: kinds such as "rotation" or "focal", or patterns over "camera.kind".
+        sigma: prior standard deviations by kind, in the rig's units; None for the usual ones (`SIGMA`).
+        force: True to follow the lines however depth changes, and accept the result in spite of objections.
+        matches: points of each frame used instead of matching its images; None to match them.
 
     Returns:
         The refined rig if accepted, else the given one, with changes and objections.
@@ -139,10 +139,12 @@ def refine_matches(
 
     Args:
         frames: matched points of each frame, by pair of names.
-        force: as there.
+        free: free parameters: kinds such as "rotation" or "focal", or patterns over "camera.kind".
+        sigma: prior standard deviations by kind, in the rig's units; None for the usual ones (`SIGMA`).
+        force: True to follow the lines however depth changes, and accept the result in spite of objections.
 
     Returns:
-        As of `refine`.
+        The refined rig if accepted, else the given one, with changes and objections.
 
     Raises:
         ValueError: for a rig that relates none of the pairs, points of which none are left to use, or nothing
@@ -162,11 +164,18 @@ def fitted(
 ) -> tuple[RefinementProblem, Solution]:
     """Fit a rig to matched points; with lenses for views known by F alone if held-out points come nearer.
 
+    Args:
+        frames: matched points of each frame, by pair of names.
+        free: free parameters: kinds or patterns.
+        sigma: prior standard deviations by kind; None for the usual ones (`SIGMA`).
+        near_depth: False to let depth change in any way.
+
     Returns:
         The problem that was solved, and its solution.
 
     Raises:
-        ValueError: as `refine_matches`.
+        ValueError: for a rig that relates none of the pairs, points of which none are left to use, or nothing
+            free.
     """
     free, best = tuple(free), None
     rigs = [rig] if (with_lens := with_lenses(rig)) is rig else [rig, with_lens]
@@ -210,6 +219,14 @@ class RefinementProblem:
         sigma: Mapping[str, float] | None = None,
     ) -> RefinementProblem:
         """Split the frames' points into used and held-out ones, and list the free and considered parameters.
+
+        Args:
+            free: free parameters: kinds or patterns.
+            frames: matched points of each frame, by pair of names.
+            sigma: prior standard deviations by kind; None for the usual ones (`SIGMA`).
+
+        Returns:
+            The problem.
 
         Raises:
             ValueError: if nothing is free, no pair is related by the rig, or no points are left to use.
@@ -354,7 +371,7 @@ def _contradictions(parameters: Sequence[FreeParameter], z: Tensor) -> list[str]
 
 
 def systematic_columns(rig: Rig, pairs: Pairs) -> Float[Tensor, "m s"]:
-    """Compute derivatives of all distances by what the calibrated cameras' lens models leave.
+    """Compute derivatives of all Sampson distances by the distortion that lens models leave uncorrected.
 
     Returns:
         One row a point, four columns a camera, in pixels per prior deviation (`SYSTEMATIC`); 0 for pairs
