@@ -81,7 +81,7 @@ def centres_found(
         near = {pair: matches for pair, matches in near.items() if len(matches.alpha) >= ENOUGH}
         rig, near = _matched(rig, alpha, near)
         free = [f"{name}.{kind}" for name in rig.betas(alpha) for kind in SIGMA]
-        rig = refine_matches(rig, [near], free=free, sigma=SIGMA, force=True).rig
+        rig = refine_matches(rig, [near], free=free, sigma=SIGMA, keep_depth=False).rig
     first = rig.betas(alpha)[0]
     rig = rig.scaled((stated[first] or 1.0) / float(rig.pair(alpha, first).beta_from_alpha.t.norm()))
     facts = {}

@@ -134,6 +134,7 @@ def refine_matches(
     free: Iterable[str] = FREE,
     sigma: Mapping[str, float] | None = None,
     force: bool = False,
+    keep_depth: bool = True,
 ) -> Refinement:
     """Refine a rig by matched points.
 
@@ -142,6 +143,8 @@ def refine_matches(
         free: free parameters: kinds such as "rotation" or "focal", or patterns over "camera.kind".
         sigma: prior standard deviations by kind, in the rig's units; None for the usual ones (`SIGMA`).
         force: True to follow the lines however depth changes, and accept the result in spite of objections.
+        keep_depth: False for a rig whose depths are only assumed: nothing but the free parameters is
+            uncertain then, depth may change in any way, and nothing is refused.
 
     Returns:
         The refined rig if accepted, else the given one, with changes and objections.
@@ -150,6 +153,9 @@ def refine_matches(
         ValueError: for a rig that relates none of the pairs, points of which none are left to use, or nothing
             free.
     """
+    if not keep_depth:
+        problem = RefinementProblem.from_frames(rig, free, frames=frames, sigma=sigma)
+        return problem.report(problem.solve_freely(), force=True)
     fit, solution = fitted(rig, frames, free=free, sigma=sigma, near_depth=not force)
     return fit.report(solution, force=force)
 
@@ -280,18 +286,28 @@ class RefinementProblem:
         solution = solution._replace(depth=relative_change(self.rig, suggested, self.used))
         return self._near_depth(solution, residuals, values) if near_depth else solution
 
+    def solve_freely(self) -> Solution:
+        """Compute the posterior given the used points, however depth changes."""
+        return solve(lambda z: sampson_of_pairs(self.after(z), self.used), self.count)
+
     def _near_depth(self, solution: Solution, residuals: Residuals, log_depth: Residuals) -> Solution:
-        """Return the most probable parameters if the points' depth, as given, is known to `DEPTH_KEPT`."""
+        """Return the most probable parameters if the points' depth, as given, is known to `DEPTH_KEPT`.
+
+        From the solution that follows the lines: the noise that it leaves is that of the points.
+        """
         free = solution.active
         G = jacobian(log_depth, torch.zeros_like(solution.z))[1][:, free] / DEPTH_KEPT
-        prior = torch.linalg.inv(G.T @ G / len(G) + torch.eye(G.shape[1], dtype=G.dtype))
-        directions = torch.zeros(self.count, G.shape[1], dtype=G.dtype)
-        directions[free] = torch.linalg.cholesky(prior)
-        rest = torch.eye(len(solution.full) - self.count, dtype=G.dtype)
-        root = torch.block_diag(directions, rest)
-        y = torch.zeros(root.shape[1], dtype=G.dtype)
-        y = most_probable(lambda y: residuals(root @ y), y, torch.eye(len(y), dtype=G.dtype))
-        return solution._replace(z=(root @ y)[: self.count])
+        information = G.T @ G / len(G) + torch.eye(G.shape[1], dtype=G.dtype)
+        parameters = torch.eye(len(solution.full), dtype=G.dtype)
+        root = torch.block_diag(
+            torch.linalg.cholesky(torch.linalg.inv(information)),
+            torch.eye(len(solution.full) - self.count, dtype=G.dtype),
+        )
+        kept = torch.cat([free, torch.ones(len(solution.full) - self.count, dtype=torch.bool)])
+        to_full = parameters[:, kept] @ root
+        y = torch.linalg.solve_triangular(root, solution.full[kept, None], upper=False)[:, 0]
+        y = most_probable(lambda y: residuals(to_full @ y), y, torch.eye(len(y), dtype=G.dtype))
+        return solution._replace(z=(to_full @ y)[: self.count])
 
     def report(self, solution: Solution, *, force: bool = False) -> Refinement:
         """Report a solution's changes, and whether held-out points, the prior and depth's uncertainty support

@@ -297,7 +297,7 @@ def _refined_pair(
     alpha, beta = rig.names
     free = [f"{beta}.{kind}" for kind in (*SIGMA, "centre") if kind not in fixed]
     sigma = {**SIGMA, "centre": CENTRE_SHARE * max(rig[beta].hw)}
-    refined = refine_matches(rig, [{(alpha, beta): matches}], free=free, sigma=sigma, force=True).rig
+    refined = refine_matches(rig, [{(alpha, beta): matches}], free=free, sigma=sigma, keep_depth=False).rig
     length = float(refined[beta].t.norm())
     if not length > SHORTEST:
         return None

@@ -389,7 +389,7 @@ class Refine:
     """Refine a rig by points matched between ordinary images of its cameras.
 
     No rig is written unless held-out points come nearer to their epipolar lines, the changes agree with their
-    standard deviations, and depth changes by one per cent at most, as matched points do not determine it.
+    standard deviations, and depth changes by 1.5 per cent at most, as matched points do not determine it.
 
     Example: pat rig refine rig.yaml --image mono=a.png --image colour=b.png --out better.yaml
     """
