@@ -380,8 +380,8 @@ class Doctor:
 
 REFUSED = 4
 """Exit status of a refused refinement of a rig that does not fit."""
-NEARER = 4.0
-"""Factor by which points come nearer to their lines in that case."""
+BADLY = 1.0
+"""Median distance of held-out points from their lines, pixels, above which a rig does not fit."""
 
 
 @dataclass
@@ -446,14 +446,15 @@ class Refine:
         say(f"written: {self.out}")
 
     def _refused(self, refined: Refinement) -> None:
-        """Say why no rig is written, and what to do; exits if points come far nearer."""
-        force = ": --force writes it all the same" if refined.objections else ""
-        if not refined.held_out[1].median < refined.held_out[0].median / NEARER:
-            return say(f"no rig written{force}")
+        """Say why no rig is written, and what to do; exits if the given rig does not fit."""
+        off = refined.held_out[0].median
+        force = "--force follows the lines, whatever that does to depth" if refined.objections else ""
+        if not off > BADLY:
+            return say(f"no rig written: {force}".rstrip(": "))
         first = {text.partition("=")[0]: text.partition("=")[2] for text in self.image[::-1]}
         say(
-            "no rig written, though points come far nearer to their lines: --force writes it all the "
-            f"same; or fuse without a rig: `pat fuse {' '.join(first.values())}`",
+            f"no rig written, though points lie {off:.1f} px from their lines: {force}; or fuse without a "
+            f"rig: `pat fuse {' '.join(first.values())}`",
             style="yellow",
         )
         sys.exit(REFUSED)
