@@ -6,7 +6,6 @@ import json
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
 
 import cv2
@@ -17,6 +16,7 @@ from safetensors import safe_open
 from arraygeom.io import read_rig
 from calib.boards.simulation import photograph
 from calib.boards.target import parse_board
+from pat.lab.synthesis.blender.environment import blender_python
 from pat.lab.training.checkpoints import newest_checkpoint, read_checkpoint
 from pat.lab.training.config import save_config
 from pat.media.images import write_image
@@ -233,7 +233,9 @@ def all_jobs(folder: Path) -> Iterator[Job]:
     yield training_job(folder)
     yield calibration_job(folder)
     yield rendering_job(folder)
-    if find_spec("bpy"):
-        yield rendering_job(folder, "blender", scenes=3)
+    try:
+        blender_python()
+    except ValueError as error:
+        print(f"rendering by Blender is left out: {error}", file=sys.stderr)
     else:
-        print("rendering by Blender is left out: pip install '.[synthesis]'", file=sys.stderr)
+        yield rendering_job(folder, "blender", scenes=3)

@@ -284,7 +284,7 @@ def write_manifest(config: RenderConfig, root: Path) -> None:
 def versions() -> dict[str, str]:
     """Return the versions of the installed packages that rendering uses, by name."""
     versions = {"python": platform.python_version()}
-    for package in ("arraygeom-pat", "torch", "numpy", "bpy", "OpenEXR"):
+    for package in ("arraygeom-pat", "torch", "numpy", "OpenEXR"):
         try:
             versions[package] = version(package)
         except PackageNotFoundError:
