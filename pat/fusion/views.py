@@ -142,7 +142,7 @@ def dense_bytes(alpha: HW, beta: HW, stride: int = 1) -> float:
 def check_dense(views: Views, limit: float | None) -> None:
     """Raise ValueError if a dense field takes more than a limit (bytes), or than this machine has."""
     has = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") if os.name == "posix" else math.inf
-    most, (h, w) = limit or has, views.rig[views.alpha].hw
+    most, (h, w) = min(limit or math.inf, has), views.rig[views.alpha].hw
     for name in views.betas:
         field, beta = innermost(views.fields.get(name)), views.rig[name].hw
         if isinstance(field, Dense) and (needed := dense_bytes((h, w), beta, field.stride)) > most:
