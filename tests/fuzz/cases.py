@@ -300,6 +300,8 @@ COMPRESSIONS: dict[str, dict[str, Any]] = {
     "webp lossless.webp": {"lossless": True},
 }
 """Formats of compressed pixels, with Pillow's options."""
+UNKNOWABLE = ("jpeg baseline", "jpeg optimised", "tiff JPEG", "tiff PackBits", "webp lossy", "webp lossless")
+"""Formats in which nearly all bytes are a code of some pixels, and no checksum says of which."""
 
 
 def pixel_seeds(folder: Path) -> Iterator[Seed]:
