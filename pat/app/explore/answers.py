@@ -103,11 +103,15 @@ def clicked(scene: ExplorerScene, alpha: str, controls: Controls) -> tuple[Contr
 
 
 def moved_rig(rig: Rig, alpha: str, controls: Controls) -> Rig:
-    """Move every calibrated beta, rotate it about its centre, and change its focal length and lens, as the
-    controls say.
+    """Move every calibrated beta as the controls say: position, rotation, focal length and lens.
+
+    Args:
+        alpha: name of alpha, which stays, as do its axes for positions; uncalibrated, nothing moves.
+        controls: values of the controls (`explore`): baseline and focal length as factors, rotation about the
+            beta's y axis in degrees, k1 to add, and shifts (right, forward) in metres by beta.
 
     Returns:
-        The rig; the same one for unchanged controls.
+        The moved rig; the same one for unchanged controls.
 
     Raises:
         ValueError: for a lens without k1, if that is changed.
@@ -133,7 +137,13 @@ def moved_rig(rig: Rig, alpha: str, controls: Controls) -> Rig:
 
 
 def with_k1(camera: Camera, k1: float) -> Any:
-    """Return the camera's lens with `k1` added to its own.
+    """Add a number to the first radial coefficient of a camera's lens.
+
+    Args:
+        k1: number to add; 0 leaves the lens.
+
+    Returns:
+        The lens; for a pinhole one of Brown-Conrady.
 
     Raises:
         ValueError: for a lens without k1.
@@ -164,7 +174,13 @@ def explorer_state(rig: Rig, alpha: str, controls: Controls) -> ExplorerState:
 
 
 def drawn(beta: BetaReport) -> dict[str, Any]:
-    """Convert a beta's report to plain numbers: positions in its pixels, depths in metres; or a `problem`."""
+    """Convert a beta's report to plain values for JSON.
+
+    Returns:
+        `samples` and `match` in beta's pixels, `weights`, `depths` and `depth` in metres (None where
+        unknown), and `off`, the distance of the images' match from the line, pixels; or a `problem` if no
+        sample is on the image.
+    """
     if not bool(beta.valid.any()):
         return {"problem": "no part of the segment lies in this image: the views do not overlap here"}
     best = int(beta.weight.argmax())
@@ -207,7 +223,12 @@ def number(value: float) -> float | None:
 
 
 def slider_ranges(rig: Rig) -> list[list[Any]]:
-    """List name, label and (low, high, step, value) of each slider that suits the rig."""
+    """List the sliders that suit a rig.
+
+    Returns:
+        Name, label and [low, high, step, value] of each; depths only with a depth range, others only with
+        calibrated cameras.
+    """
     ranges: list[list[Any]] = []
     if rig.depth is not None:
         unit = length_unit(rig)
@@ -225,7 +246,11 @@ def slider_ranges(rig: Rig) -> list[list[Any]]:
 
 
 def choices(scene: ExplorerScene, controls: Controls) -> list[list[Any]]:
-    """List name, label and options of each choice."""
+    """List the drop-down choices of the explorer: field, second field, and weights.
+
+    Returns:
+        Name, label and options of each.
+    """
     fields = [*FAMILIES, *scene.fields]
     unlisted = [name for name in (controls["field"], controls["second"]) if name not in ("none", *fields)]
     weights = [WINDOWS, *(scene.networks or [SHIPPED])]
@@ -238,7 +263,12 @@ def choices(scene: ExplorerScene, controls: Controls) -> list[list[Any]]:
 
 
 def shown_cameras(scene: ExplorerScene, alpha: str) -> list[dict[str, Any]]:
-    """Describe alpha and each beta with an image, in this order: name, size, image and unit of depth."""
+    """Describe alpha and each beta with an image, in this order, for the page.
+
+    Returns:
+        Plain values: `name`, `hw`, `src` (the image as a data URL), `alpha` (True for alpha), and `unit` of
+        depths.
+    """
     names = [alpha, *(n for n in scene.rig.betas(alpha) if n in scene.images)]
     unit = length_unit(scene.rig)
     return [
@@ -254,9 +284,9 @@ def shown_cameras(scene: ExplorerScene, alpha: str) -> list[dict[str, Any]]:
 
 
 def data_url(image: Tensor) -> str:
-    """Encode an image (c, h, w) as the URL of a PNG whose longer side is at most `WIDEST` pixels.
+    """Encode an image (c, h, w) as the data URL of a PNG whose longer side is at most `WIDEST` pixels.
 
-    Grey unless it has three bands; values are clipped to 0..1.
+    Images of other numbers of bands than three are shown as their mean; values are clipped to 0..1.
     """
     image = image if len(image) == 3 else image.mean(0, keepdim=True).expand(3, -1, -1)
     scale = min(1.0, WIDEST / max(image.shape[1:]))

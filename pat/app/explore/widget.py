@@ -21,7 +21,13 @@ with needs("explore", "the explorer in a notebook"):
 
 
 class FieldWidget(anywidget.AnyWidget):
-    """Widget with alpha and betas side by side; `controls` come from the browser, `answer` goes to it."""
+    """Notebook widget that shows alpha and the betas side by side, with segments, samples and controls.
+
+    The browser changes `controls`; the widget then sets `answer`.
+
+    Args:
+        explorer: scene to show, or an error.
+    """
 
     _esm = MODULE
     cameras: Any = traitlets.List().tag(sync=True)
@@ -62,12 +68,13 @@ def explore(
     rig.
 
     Args:
-        images: (C, H, W) by camera; None for a checkered room.
-        alpha: its name; None for the first camera with an image.
-        x: its pixel; None for the middle.
+        rig: the rig.
+        images: images (C, H, W) by camera; None for a checkered room.
+        alpha: name of alpha; None for the first camera with an image.
+        x: pixel (x, y) of alpha; None for the middle.
         network: network of the paper, or weights such as "pat-supervised", whose attention is shown; None for
             correlations of windows.
-        fields: further fields by name, which can then be chosen.
+        fields: further fields by name, which can then be chosen; None for none.
         controls: initial values of the controls: `field` and `second` (names of fields), `weights`, `near`
             and `far` (metres), `baseline` and `focal` (factors), `rotation` (degrees), `lens` (added to k1),
             `moved` (metres).

@@ -35,6 +35,11 @@ _SERVE = "import sys; sys.path.append(sys.argv[1]); from child.serve import serv
 class Studio:
     """Blender with one scene loaded; renders frames of any pinhole camera at any time.
 
+    Args:
+        scene: scene to render.
+        settings: settings of rendering.
+        scratch: existing folder for temporary files.
+
     Attributes:
         version: Blender's version.
 
@@ -62,7 +67,9 @@ class Studio:
         """Render one frame.
 
         Args:
+            camera: pinhole camera; a lens model is ignored.
             time: seconds, for the objects' motion.
+            spectrum: "rgb" for colours, "nir" for near infrared.
 
         Returns:
             Channels (h, w), float32, by Blender's names: colours, depth, object index.

@@ -50,6 +50,12 @@ class Shot(NamedTuple):
 def render(scene: Scene, rig: Rig, out: Path, *, settings: RenderSettings) -> Rendered:
     """Render a scene of a rig into the new folder `out`, atomically.
 
+    Args:
+        scene: scene to render.
+        rig: calibrated cameras to render.
+        out: new folder.
+        settings: settings of rendering.
+
     Returns:
         The rendered folder, with the outcome of the self-check in `about["check"]`; a scene that fails it is
         kept.
@@ -100,7 +106,11 @@ def fitted(rig: Rig, settings: RenderSettings) -> Rig:
 
 
 def shots(rig: Rig, settings: RenderSettings) -> list[Shot]:
-    """List all frames in order: each camera from its time offset on, at its frame rate, for the duration."""
+    """List the frames to render: each camera from its time offset on, at its frame rate, for the duration.
+
+    Returns:
+        Frames by camera, then by time; at least one for each camera.
+    """
     planned = []
     for name, camera in rig.cameras.items():
         rate = camera.sensor.frame_rate or _RATE
@@ -110,7 +120,7 @@ def shots(rig: Rig, settings: RenderSettings) -> list[Shot]:
 
 
 def refuse_inside(scene: Scene, rig: Rig, planned: list[Shot]) -> None:
-    """Check that no camera is inside an object when it takes a frame.
+    """Check that no camera is inside an object when it takes one of the frames `planned`.
 
     Raises:
         ValueError: naming camera and object, if one is.
@@ -126,8 +136,13 @@ def refuse_inside(scene: Scene, rig: Rig, planned: list[Shot]) -> None:
 def take(studio: Studio, lens: Lens, shot: Shot) -> RenderedFrame:
     """Render one frame of a camera, resampled to its lens.
 
+    Args:
+        studio: Blender with the scene loaded.
+        lens: lens of the frame's camera.
+        shot: camera and time.
+
     Returns:
-        The frame.
+        The frame, with near infrared if the studio's settings ask for it.
 
     Raises:
         ValueError: if the camera sees nothing.
