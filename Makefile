@@ -131,7 +131,8 @@ synthesis: $(READY)
 	@echo "== installing Blender in $(VENV)/blender"
 	@$(PIP) --editable '.[dev,synthesis]'
 	@$(VENV)/blender/bin/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv --clear $(VENV)/blender
-	@$(VENV)/blender/bin/python -m pip install -qq --disable-pip-version-check --no-input --requirement blender.txt
+	@$(VENV)/blender/bin/python -m pip install -qq --disable-pip-version-check --no-input --requirement blender.txt \
+		|| { rm -r $(VENV)/blender; exit 1; }
 
 bench: $(READY)
 	@$(BIN)/python -m tests.benchmarks.bench_attention

@@ -115,9 +115,9 @@ def _all(rig: Rig) -> Iterator[str]:
     if unit := unit_oddity(rig):
         yield f"the rig {unit}"
     views = {name: camera for name, camera in rig.cameras.items() if isinstance(camera, LensView)}
-    yield from lens_ends(views.items())
+    yield from lens_ends(view for view in views.items() if not _round_trip(view[1])[1])
     for name, camera in views.items():
-        if not (off := _lens_error(camera)) <= OFF_BACK:
+        if not (off := _round_trip(camera)[0]) <= OFF_BACK:
             yield (
                 f"the model of '{name}', {camera.distortion.model}, projects the rays of its pixels up to "
                 f"{off:.3g} px off them: project and unproject are to be the inverse of one another"
@@ -178,15 +178,15 @@ def _of_K(name: str, camera: Camera) -> Iterator[str]:
 
 
 @once_a_lens
-def _lens_error(camera: LensView) -> float:
-    """Largest error in pixels of projecting the rays of pixels back; 0 for a pinhole and without rays."""
+def _round_trip(camera: LensView) -> tuple[float, bool]:
+    """Largest error in pixels of projecting the rays of pixels back, and whether all of them have rays."""
     if (lens := camera.distortion) is None:
-        return 0.0
+        return 0.0, True
     points = map_homogeneous(torch.linalg.inv(camera.K)[..., :2, :], _grid(camera).to(camera.K))
     directions, has_ray = lens.unproject(points)
     back, has_image = lens.project(lens.origins(points) + directions)
-    off = ((back - points) @ camera.K[:2, :2].mT).norm(dim=-1)
-    return float(torch.where(has_ray & has_image, off, 0.0).max())
+    valid, off = has_ray & has_image, ((back - points) @ camera.K[:2, :2].mT).norm(dim=-1)
+    return float(torch.where(valid, off, 0.0).max()), bool(valid.all())
 
 
 def _reduced(hw: HW) -> HW:
