@@ -73,7 +73,7 @@ def alignment_job(folder: Path) -> Job:
     """Aligned images of one frame, over those of another one."""
 
     def arguments(i: int) -> Arguments:
-        images = _images(folder, f"fast_{i}.png", f"slow_{i}.png")
+        images = _images(folder, f"fast_{i}.png", "slow_0.png")
         return lambda out: [
             *_fuse(folder, "align")[:-4],
             *images,
@@ -95,7 +95,7 @@ def batch_job(folder: Path, *more: str, name: str = "batch", frames: int = FRAME
     further = more or ("--threads", "1")
 
     def arguments(beta: str) -> Arguments:
-        images = _images(folder, f"fast_[0-{frames - 1}].png", beta)
+        images = _images(folder, f"fast_[0-{frames - 1}].png", f"{beta}/[0-{frames - 1}].png")
         return lambda out: [*_fuse(folder, "batch"), *images, "--out", str(out), *further]
 
     job = Job(name, arguments("many"), _frames_of, _frames_mixed, again=("--resume",), kept=_times)
@@ -132,7 +132,7 @@ def _fuse(folder: Path, command: str = "fuse") -> list[str]:
 
 def _images(folder: Path, fast: str, slow: str) -> list[str]:
     made = folder / "fusion"
-    beta = made / slow if slow in ("many", "darker") else made / "slow" / slow
+    beta = made / slow if slow.startswith(("many", "darker")) else made / "slow" / slow
     return ["--image", f"fast={made / 'fast' / fast}", "--image", f"slow={beta}"]
 
 
