@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache, wraps
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -15,6 +15,7 @@ from .pixels import coarse_grid, map_homogeneous
 from .rig import Rig
 
 T = TypeVar("T")
+V = TypeVar("V", bound=LensView)
 
 SAMPLES, ROUNDS = 160, 30
 """Points across the disc that a lens is fitted to, and rounds of reweighted fits."""
@@ -51,7 +52,7 @@ class Refit(NamedTuple):
 class _Lens:
     """Key of a camera: equal for equal images, K and lenses, wherever the cameras are."""
 
-    def __init__(self, camera: LensView) -> None:
+    def __init__(self, camera: Any) -> None:
         self.camera, lens = camera, camera.distortion
         numbers = lens.coefficients.tolist() if isinstance(lens, Distortion) else id(lens)
         self.key = str((camera.hw, camera.K.dtype, camera.K.tolist(), getattr(lens, "model", None), numbers))
@@ -63,13 +64,13 @@ class _Lens:
         return isinstance(other, _Lens) and self.key == other.key
 
 
-def once_a_lens(function: Callable[[LensView], T]) -> Callable[[LensView], T]:
+def once_a_lens(function: Callable[[V], T]) -> Callable[[V], T]:
     """Decorate a function of a camera's image, K and lens alone: cameras with equal ones share its result.
 
     Returns:
         The function; it remembers the last 64 results.
     """
-    known = lru_cache(maxsize=64)(lambda lens: function(lens.camera))
+    known: Callable[[_Lens], T] = lru_cache(maxsize=64)(lambda lens: function(lens.camera))
     return wraps(function)(lambda camera: known(_Lens(camera)))
 
 

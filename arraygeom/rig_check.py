@@ -117,9 +117,9 @@ def _all(rig: Rig) -> Iterator[str]:
     views = {name: camera for name, camera in rig.cameras.items() if isinstance(camera, LensView)}
     yield from lens_ends(view for view in views.items() if not _round_trip(view[1])[1])
     for name, camera in views.items():
-        if not (off := _round_trip(camera)[0]) <= OFF_BACK:
+        if (lens := camera.distortion) is not None and not (off := _round_trip(camera)[0]) <= OFF_BACK:
             yield (
-                f"the model of '{name}', {camera.distortion.model}, projects the rays of its pixels up to "
+                f"the model of '{name}', {lens.model}, projects the rays of its pixels up to "
                 f"{off:.3g} px off them: project and unproject are to be the inverse of one another"
             )
         if isinstance(camera, Camera):
