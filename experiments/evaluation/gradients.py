@@ -187,7 +187,7 @@ WRONG = {
     "focal length": 1.0,
     "k1": 0.03,
 }
-"""Units by which each parameter is wrong at first: translations change the baseline's direction by 3 degrees."""
+"""Units by which each parameter is wrong at first: translations turn the baseline by 3 degrees."""
 RECOVERED = [*((name,) for name in WRONG), ("rotation x", "rotation y", "rotation z"), tuple(WRONG)]
 """Sets of parameters that are wrong together."""
 

@@ -43,20 +43,20 @@ betas), each by the names of `ERRORS`; `camera` is the one that the sliders chan
 `pins` are pixels of alpha that stay drawn. `clicked` is a beta and a pixel of it, whose match becomes alpha's
 pixel.
 """
-ERRORS: dict[str, tuple[str, float, float, float]] = {
-    "rx": ("rotation x (degrees)", -3.0, 3.0, 0.0),
-    "ry": ("rotation y (degrees)", -3.0, 3.0, 0.0),
-    "rz": ("rotation z (degrees)", -3.0, 3.0, 0.0),
-    "right": ("right ({unit})", -1.0, 1.0, 0.0),
-    "down": ("down ({unit})", -1.0, 1.0, 0.0),
-    "forward": ("forward ({unit})", -1.0, 1.0, 0.0),
-    "cx": ("principal point x (px)", -20.0, 20.0, 0.0),
-    "cy": ("principal point y (px)", -20.0, 20.0, 0.0),
-    "focal": ("focal length (times)", 0.8, 1.25, 1.0),
+ERRORS: dict[str, tuple[str, float, float, float, float]] = {
+    "rx": ("rotation x (degrees)", -3.0, 3.0, 0.01, 0.0),
+    "ry": ("rotation y (degrees)", -3.0, 3.0, 0.01, 0.0),
+    "rz": ("rotation z (degrees)", -3.0, 3.0, 0.01, 0.0),
+    "right": ("right ({unit})", -1.0, 1.0, 0.005, 0.0),
+    "down": ("down ({unit})", -1.0, 1.0, 0.005, 0.0),
+    "forward": ("forward ({unit})", -1.0, 1.0, 0.005, 0.0),
+    "cx": ("principal point x (px)", -20.0, 20.0, 0.1, 0.0),
+    "cy": ("principal point y (px)", -20.0, 20.0, 0.1, 0.0),
+    "focal": ("focal length (times)", 0.8, 1.25, 0.005, 1.0),
 }
-"""Label, least, most and usual value of each change of a camera.
+"""Label, least, most, step and usual value of each change of a camera.
 
-Rotations are about its own axes, steps along those of alpha (least and most in longest baselines), pixels are
+Rotations are about its own axes, steps along those of alpha (in longest baselines), pixels are
 added, the focal length is multiplied. "lens0", "lens1", ... are added to the numbers of the lens.
 """
 WIDEST = 1280
@@ -254,9 +254,9 @@ def slider_ranges(rig: Rig) -> list[list[Any]]:
         return ranges
     ranges.append(["baseline", "baseline (times)", [0.1, 4.0, 0.05, 1.0], False])
     longest = max(float((camera.centre - cameras[0].centre).norm()) for camera in cameras) or 1.0
-    for name, (label, low, high, usual) in ERRORS.items():
+    for name, (label, low, high, step, usual) in ERRORS.items():
         size = longest if "{unit}" in label else 1.0
-        steps = [size * low, size * high, size * (high - low) / 400, usual]
+        steps = [size * low, size * high, size * step, usual]
         ranges.append([name, label.format(unit=unit), steps, True])
     lenses = [camera.distortion.coefficients for camera in cameras if camera.distortion is not None]
     largest = max(lenses, key=lambda numbers: numbers.numel(), default=torch.zeros(1))

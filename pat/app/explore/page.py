@@ -94,8 +94,8 @@ class Explorer:
         Raises:
             OSError: if writing fails.
         """
-        values, all_choices = self.values(), self.values()["choices"]
-        values["choices"] = []
+        values = self.values()
+        all_choices, values["choices"] = values["choices"], []
         if self.scene is not None and is_pinhole(self.scene.rig) and self.usual:
             values["ranges"] = [entry for entry in values["ranges"] if not entry[0].startswith("lens")]
             values["choices"] = [choice for choice in all_choices if choice[0] == "camera"]

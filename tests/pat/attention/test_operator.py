@@ -97,7 +97,7 @@ def test_betas_of_several_sizes_in_one_call_are_those_of_several_calls():
 
 
 def test_a_soft_border_makes_the_output_continuous():
-    """A segment that leaves the image: the output falls to 0; without, it jumps. Its gradient is the slope."""
+    """Where a segment leaves the image the output falls to 0; its gradient is the slope."""
     g = torch.Generator().manual_seed(0)
     query, key = (torch.rand(1, 4, *hw, generator=g).double() for hw in ((1, 1), (6, 20)))
 
