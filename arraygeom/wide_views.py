@@ -62,7 +62,7 @@ def rectify_spherical(pair: Pair, *, focal: float | None = None) -> Pair:
 def _angles(camera: Camera, R: Tensor) -> Float[Tensor, "n 2"]:
     """Longitudes and latitudes of a camera's pixels, some of them, about a rotated frame."""
     rays, valid = camera.rays(coarse_grid(camera.hw).to(camera.K))
-    return Equirectangular().project(matvec(R, rays[valid]))[0]
+    return Equirectangular().project(rays[valid] @ R.mT)[0]
 
 
 def _focal(camera: Camera) -> float:
@@ -109,7 +109,7 @@ def cube_faces(camera: Camera, *, overlap: float = 5.0) -> dict[str, Camera]:
     for name, (x, y) in FACES.items():
         up, right = (rotation_from_vector(camera.K.new_tensor(v)) for v in ((-x, 0, 0), (0, -y, 0)))
         turn = product(up, right)
-        seen = matvec(turn, rays[valid])
+        seen = rays[valid] @ turn.mT
         if bool(((seen[:, 2] > 0) & (seen[:, :2].abs().amax(-1) <= seen[:, 2])).any()):
             pose = Pose(product(turn, camera.R), matvec(turn, camera.t))
             faces[name] = camera.replace(K=K, cam_from_world=pose, hw=(side, side), distortion=None)

@@ -66,7 +66,7 @@ def to_gsplat(camera: Camera) -> GSplatCamera:
     Raises:
         ValueError: for a lens.
     """
-    return GSplatCamera(_pinhole(camera).cam_from_world.matrix(), _shifted(camera.K, HALF))
+    return GSplatCamera(_pinhole(camera).cam_from_world.matrix, _shifted(camera.K, HALF))
 
 
 def from_gsplat(viewmats: Float[Tensor, "*b 4 4"], Ks: Float[Tensor, "*b 3 3"], hw: HW) -> Camera:
@@ -93,7 +93,7 @@ def to_opengl(camera: Camera, near: float, far: float) -> OpenGLCamera:
         -2 * far * near / (far - near),
     )
     projection[..., 3, 2] = -1
-    return OpenGLCamera(_flipped(camera.cam_from_world, "opengl").matrix(), projection)
+    return OpenGLCamera(_flipped(camera.cam_from_world, "opengl").matrix, projection)
 
 
 def from_opengl(view: Float[Tensor, "*b 4 4"], projection: Float[Tensor, "*b 4 4"], hw: HW) -> Camera:

@@ -130,7 +130,7 @@ def pinned(scene: ExplorerScene, alpha: str, controls: Controls) -> dict[str, An
     found = {
         name: {k: beta[k] for k in ("samples", "match")} for name, beta in shown.items() if "match" in beta
     }
-    return {"x": list(image_pixel(*controls["x"], scene.rig[alpha].hw)), "betas": found}
+    return {"x": list(image_pixel(controls["x"][0], controls["x"][1], scene.rig[alpha].hw)), "betas": found}
 
 
 def moved_rig(rig: Rig, alpha: str, controls: Controls) -> Rig:

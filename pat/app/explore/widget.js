@@ -93,7 +93,7 @@ function drawPart(context, { camera, image }, answer, [x, y], wide, left, width)
   context.scale(width / wide, width / wide);
   context.translate(-from[0], -from[1]);
   context.drawImage(image, -0.5, -0.5, w, h);
-  drawMarks(context, camera, answer, 1.2 * wide / width);
+  drawMarks(context, camera, answer, 2.5 * wide / width);
   context.restore();
 }
 

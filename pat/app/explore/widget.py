@@ -94,5 +94,8 @@ def explore(
     Raises:
         TypeError: for an unknown argument.
     """
-    given = {"alpha": alpha, "x": x, "network": network, "fields": fields, "covariance": covariance}
-    return FieldWidget(opened(rig, images, **given, **controls))
+    return FieldWidget(
+        opened(
+            rig, images, alpha=alpha, x=x, network=network, fields=fields, covariance=covariance, **controls
+        )
+    )
