@@ -62,8 +62,8 @@ class View(Batched):
     """Properties of any camera, calibrated or not.
 
     Attributes:
-        hw: image size (height, width).
-        sensor: what the camera records.
+        hw: image size (height, width), pixels.
+        sensor: properties of what the camera records: spectral response, bits, exposure, ...
 
     Raises:
         ValueError: for an invalid size.
@@ -282,6 +282,10 @@ class Camera(LensView):
 
     Attributes:
         cam_from_world: pose, X_cam = R X_world + t in metres, x right, y down, z forward.
+
+    Raises:
+        ValueError: for an invalid size or K, or batch axes that do not broadcast.
+        TypeError: for fields of other types.
     """
 
     cam_from_world: Pose
@@ -303,7 +307,7 @@ class Camera(LensView):
             The scaled camera.
 
         Raises:
-            ValueError: as `LensModel.scaled`.
+            ValueError: for a lens that is not central and does not state which of its numbers are lengths.
         """
         K, lens = self.K, self.distortion
         if self.parallel:  # the image plane is in metres

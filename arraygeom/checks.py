@@ -43,7 +43,12 @@ def unchecked() -> Iterator[None]:
 
 
 def derived(make: Callable[..., T], *args: Any, **kwargs: Any) -> T:
-    """Call `make` without checks, for results made of checked numbers.
+    """Call `make` with the checks of cameras, poses and lenses left out, for results made of checked numbers.
+
+    Args:
+        make: function or class to call.
+        args: its arguments.
+        kwargs: its named arguments.
 
     Returns:
         The result of the call.

@@ -223,7 +223,8 @@ def lens_derivatives(
     the coefficients for each point.
 
     Args:
-        lens: the lens; None for a pinhole.
+        lens: one lens, not a batch; None for a pinhole.
+        X: points in the camera's frame, in any unit.
 
     Returns:
         Distorted normalised points (n, 2), derivatives by the points (n, 2, 3), and by the coefficients (n,

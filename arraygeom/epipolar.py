@@ -134,6 +134,12 @@ def track(
 
     Matrices are composed in their own precision, pixels computed in that of `x`.
 
+    Args:
+        K_alpha: alpha's K.
+        K_beta: beta's K.
+        beta_from_alpha: pose of alpha's frame in beta's.
+        x: pixels of alpha.
+
     Returns:
         The track.
     """
@@ -148,11 +154,13 @@ def segments_between(
     """Compute the part of each track between two depths and inside beta's image, in closed form (`clipped`).
 
     Args:
-        near: metres.
-        far: metres, may be infinite.
+        near: depth in alpha, metres, above 0; not checked.
+        far: depth in alpha, metres, at least `near`; may be infinite.
+        beta_hw: height and width of beta.
 
     Returns:
-        Segments from near to far, also clipped to the front of beta; invalid where nothing is left.
+        Segments (*n) from near to far, pixels of beta, also clipped to the front of beta; invalid where
+        nothing is left.
     """
     h, w = beta_hw
     visible = clipped(track, near, far, (-0.5, -0.5, w - 0.5, h - 0.5))
@@ -164,13 +172,13 @@ def segments_between(
 
 
 class Clipped(NamedTuple):
-    """Part of a track: the homogeneous points P + s D.
+    """Part of a track: the homogeneous pixels P + s D, with s from `low` to `high`.
 
     Attributes:
         P: points at s = 0 (far).
         D: their change to s = 1 (near).
-        low: least s.
-        high: largest s.
+        low: least s, at least 0.
+        high: largest s, at most 1.
         valid: False where nothing is left.
     """
 
@@ -195,7 +203,9 @@ def clipped(
     slope that is one number for the whole image.
 
     Args:
-        limits: x low, y low, x high, y high; None for no limits.
+        near: depth in alpha, metres.
+        far: depth in alpha, metres, may be infinite.
+        limits: x low, y low, x high, y high, in the unit of the track's points; None for no limits.
         in_front: False to keep points behind beta.
 
     Returns:
@@ -287,8 +297,8 @@ def depth_from_track(
             order, d depth = depth^2 / |dx/dw|.
 
     Returns:
-        Depth; invalid where the baseline gives none, the depth is not positive, or the point is not in front
-        of beta.
+        Depth in metres, with its deviation; invalid where the baseline gives none, the depth is not positive,
+        or the point is not in front of beta.
     """
     a, b = track
     x = floating(x)

@@ -104,14 +104,14 @@ def fit_similarity(x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"]) -> Float[Te
 
 
 def fit_homography(x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"]) -> Float[Tensor, "3 3"]:
-    """Fit the homography from x to y, in least squares of y's pixels; n >= 4.
+    """Fit the homography from points x to points y, four or more, in least squares of y's pixels.
 
     Levenberg-Marquardt steps from the better of the affine and the linear fit (Hartley & Zisserman, algorithm
     4.2), on points centred and scaled (section 4.4), in float64. Outliers are not down-weighted.
 
     Returns:
-        Matrix (3, 3), oriented so that the scale is positive at the points; differentiable, through ten
-        Gauss-Newton steps at the end.
+        Matrix (3, 3) of the points' type, oriented so that the scale is positive at the points;
+        differentiable, through ten Gauss-Newton steps at the end.
 
     Raises:
         ValueError: if there is no such homography: points on a line, or some that would be behind.

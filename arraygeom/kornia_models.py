@@ -25,6 +25,11 @@ BROWN_TERMS = 8
 def to_kornia_model(K: Float[Tensor, "*b 3 3"], hw: HW, lens: LensModel | None) -> CameraModel:
     """Make kornia's camera model with these intrinsics and lens.
 
+    Args:
+        K: intrinsics, of one camera or a batch.
+        hw: height and width of the image.
+        lens: the lens; None for a pinhole.
+
     Returns:
         The model.
 
@@ -69,7 +74,7 @@ def from_kornia_model(model: CameraModel) -> tuple[Float[Tensor, "*b 3 3"], HW, 
     """Extract intrinsics and lens from a camera model of kornia, one or a batch.
 
     Returns:
-        K, the image's (height, width), and the lens (None for a pinhole).
+        K, the image's (height, width), and the lens; None for kornia's pinhole with its affine "distortion".
     """
     from kornia.sensors.camera.distortion_model import BrownConradyTransform, KannalaBrandtK3Transform
     from kornia.sensors.camera.projection_model import OrthographicProjection

@@ -31,10 +31,10 @@ class LensCoverage(NamedTuple):
 
 
 class Refit(NamedTuple):
-    """Camera with a replaced lens.
+    """Camera whose lens was replaced by one fitted to it.
 
     Attributes:
-        camera: the camera.
+        camera: camera with the new lens.
         largest: largest difference to the old lens, pixels.
         usual: 95th percentile of the difference, pixels.
     """
@@ -109,7 +109,8 @@ def refit_rig(rig: Rig) -> tuple[Rig, list[str]]:
         The rig, and a sentence on each refitted lens.
 
     Raises:
-        ValueError: as `refit_lens`.
+        ValueError: for a lens of another model than Brown-Conrady, or with a tilted sensor, and if no new one
+            covers the image.
     """
     cameras, said = dict(rig.cameras), []
     for name, camera in rig.cameras.items():

@@ -166,6 +166,8 @@ def consistent_depth(
     Args:
         depths: depth maps in metres, by camera; values that are not finite and positive are unknown.
         views: least number of agreeing other views.
+        pixels: largest distance in alpha, pixels.
+        relative: largest difference of depth, as a share of it.
 
     Returns:
         The fused map, differentiable in depths and cameras.

@@ -76,9 +76,9 @@ class Pair(Batched):
     """Alpha and one beta with their relation: two calibrated cameras, or a link, or only sizes.
 
     Attributes:
-        alpha: first view.
-        beta: second view.
-        depth: (near, far) along alpha's axis; None if unknown.
+        alpha: view whose pixels are matched.
+        beta: view in which their matches are searched.
+        depth: (near, far) along alpha's axis, in `unit`; None if unknown.
         link: F and H of an uncalibrated pair; None if there is none.
         unit: unit of lengths; "baselines" for rigs of unknown scale.
         memo: cache of what fields compute once for a pair; never copied.
@@ -142,7 +142,7 @@ class Pair(Batched):
 
     @property
     def depth_range(self) -> Depths:
-        """(near, far) in metres.
+        """Depth range (near, far) along alpha's axis, metres.
 
         Raises:
             ValueError: if the rig states none.
@@ -157,7 +157,9 @@ class Pair(Batched):
 
     @property
     def fundamental(self) -> Float[Tensor, "*b 3 3"]:
-        """F with x_beta^T F x_alpha = 0, from cameras or as given; between undistorted pixels for lenses.
+        """Fundamental matrix F with x_beta^T F x_alpha = 0: the link's, else that of the cameras.
+
+        For views with lenses it relates undistorted pixels.
 
         Zero without a baseline.
 
@@ -175,7 +177,8 @@ class Pair(Batched):
 
     @property
     def homography(self) -> Float[Tensor, "*b 3 3"]:
-        """H with x_beta ~ H x_alpha, roughly: as given, or for the plane at the middle inverse depth.
+        """Homography H with x_beta ~ H x_alpha, roughly: the link's, else of the plane at the middle inverse
+        depth.
 
         Calibrated cameras without a depth range give the plane at infinity; a pair known only by sizes, or by
         F alone, is assumed to have the same field of view.
@@ -203,7 +206,13 @@ class Pair(Batched):
         return dataclasses.replace(self, beta=self.beta.transformed(A, hw), link=link)
 
     def homography_at(self, depth: Float[Tensor, "*d"] | float) -> Float[Tensor, "*b 3 3"]:
-        """Compute the homography of the plane z = depth in alpha's frame (metres; may be infinite).
+        """Compute the homography from alpha's to beta's pixels of the plane z = depth in alpha's frame.
+
+        Args:
+            depth: metres; may be infinite.
+
+        Returns:
+            H (*b, 3, 3), scaled so that its third coordinate is positive in front of both cameras.
 
         Raises:
             ValueError: unless both cameras are calibrated and central.

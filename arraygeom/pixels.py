@@ -55,8 +55,9 @@ def shift_matrix(left: float, top: float) -> Float[Tensor, "3 3"]:
 
 
 def rot90_matrix(hw: HW, quarter_turns: int) -> Float[Tensor, "3 3"]:
-    """Return the pixel map of a counter-clockwise rotation by quarter turns, as `torch.rot90(image, k, (-2,
-    -1))`.
+    """Return the matrix from an image's pixels to those after `torch.rot90(image, quarter_turns, (-2, -1))`.
+
+    The rotation is counter-clockwise; `hw` is the size before it.
 
     >>> (rot90_matrix((2, 3), 1) @ torch.tensor([2.0, 0.0, 1.0], dtype=torch.float64)).tolist()
     [0.0, 0.0, 1.0]
@@ -94,7 +95,7 @@ def product(A: Float[Tensor, "*b i j"], B: Float[Tensor, "*c j k"]) -> Float[Ten
     to ten or eight bits.
 
     Returns:
-        A B.
+        The product A B, with the batch axes of both broadcast.
     """
     dtype = torch.promote_types(torch.promote_types(A.dtype, B.dtype), torch.float32)
     A, B = A.to(dtype), B.to(dtype)
@@ -133,7 +134,7 @@ def map_homogeneous(M: Float[Tensor, "*b k 3"], x: Real[Tensor, "*n 2"]) -> Floa
     ten or eight bits.
 
     Returns:
-        (*m, k).
+        Homogeneous coordinates (*m, k), not divided; *m are the points' axes, broadcast with the batch's.
 
     Raises:
         ValueError: for points without the batch's axes.

@@ -21,8 +21,8 @@ class Rectification(NamedTuple):
     """Rectification of a pair.
 
     Attributes:
-        R_alpha: rotation of alpha's frame.
-        R_beta: rotation of beta's frame.
+        R_alpha: rotation from alpha's frame to its rectified frame.
+        R_beta: rotation from beta's frame to its rectified frame.
         H_alpha: map from alpha's old pixels to new ones.
         H_beta: map from beta's old pixels to new ones.
         pair: rectified cameras: same K and orientation, baseline along x. Its depth range has the old
@@ -106,7 +106,17 @@ def rotation_to(a: Float[Tensor, "3"], b: Float[Tensor, "3"]) -> Float[Tensor, "
 def middle_intrinsics(
     cameras: tuple[Camera, Camera], rotations: tuple[Float[Tensor, "3 3"], Float[Tensor, "3 3"]], hw: HW
 ) -> Float[Tensor, "3 3"]:
-    """Make K of the smaller focal length, with the old images' middles about the middle of the new one."""
+    """Make the K that both rectified cameras share.
+
+    Args:
+        cameras: alpha and beta before rectification.
+        rotations: rotation of each to its rectified frame.
+        hw: height and width of the rectified images.
+
+    Returns:
+        K with the smaller of the focal lengths, and the middles of both old images, on average, at the middle
+        of the new ones.
+    """
     focal = torch.stack([(c.K[:2, :2].det().abs()).sqrt() for c in cameras]).min()
     rays = [_middle_ray(camera, R) for camera, R in zip(cameras, rotations)]
     normalised = torch.stack([ray[:2] / ray[2] for ray in rays])

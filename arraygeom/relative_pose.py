@@ -41,8 +41,8 @@ class TwoViewPose(NamedTuple):
     """Relative pose from two views.
 
     Attributes:
-        beta_from_alpha: the pose, |t| = 1.
-        in_front: True for matches in front of both cameras.
+        beta_from_alpha: pose (*b), |t| = 1.
+        in_front: True for matches that this pose puts in front of both cameras.
     """
 
     beta_from_alpha: Pose

@@ -69,9 +69,9 @@ class Bundle(NamedTuple):
     """Result of a bundle adjustment.
 
     Attributes:
-        rig: the adjusted rig.
-        X: the adjusted points.
-        cost: sum of squared residuals before the first and after each step, pixels².
+        rig: the adjusted rig, float64.
+        X: the adjusted world points (n, 3), metres.
+        cost: sums of squared residuals (steps + 1): before the first and after each step, pixels².
     """
 
     rig: Rig
@@ -100,6 +100,8 @@ def bundle_adjusted(
         x: their pixels in the rig's cameras, in its order.
         free: free parameters, as for `Rig.parameters`.
         seen: True where a camera sees a point; None for all.
+        steps: number of steps.
+        damping: factor of the information's diagonal that is added to it at the first step.
 
     Returns:
         Rig and points. Gradients follow the steps made: at the optimum those of the least error, in

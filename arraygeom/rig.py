@@ -116,7 +116,10 @@ class Rig(Batched):
         return cls(made, **fields)
 
     def to_kornia(self) -> dict[str, PinholeCamera]:
-        """Convert to kornia's pinholes by name, each a batch as long as the rig's (one for a single rig).
+        """Convert to kornia's pinholes.
+
+        Returns:
+            Cameras by name, each a batch as long as the rig's (of one for a single rig).
 
         Raises:
             ValueError: for cameras with lenses, and cameras that are not calibrated.
@@ -182,7 +185,11 @@ class Rig(Batched):
         return tuple(n for n in self.names if n != self.require(alpha))
 
     def pair(self, alpha: str, beta: str) -> Pair:
-        """Return the pair of two cameras, with the rig's depth range and their link if there is one.
+        """Return the pair of two cameras.
+
+        Returns:
+            The pair, with the rig's depth range, and the cameras' link (reversed if stated the other way
+            round) if there is one.
 
         Raises:
             ValueError: for an unknown name.
@@ -213,8 +220,16 @@ class Rig(Batched):
         return self.transformed(name, A, self[name].rot90(quarter_turns).hw)
 
     def transformed(self, name: str, A: Float[Tensor, "3 3"], hw: HW) -> Rig:
-        """Return the rig in which the pixels of camera `name` are x' ~ A x and its image's size is `hw`; its
-        links follow."""
+        """Change the pixels of one camera's image, as a crop, resize or rotation does.
+
+        Args:
+            name: name of the camera.
+            A: matrix from pixels before to pixels after.
+            hw: height and width after.
+
+        Returns:
+            The rig, in which the camera's K and its links have changed.
+        """
         eye = torch.eye(3, dtype=torch.float64)
         links = {
             (a, b): link.transformed(A if a == name else eye, A if b == name else eye)
@@ -266,9 +281,12 @@ class Rig(Batched):
         return chosen
 
     def perturbed(self, changes: Mapping[str, Tensor]) -> Rig:
-        """Return the rig after changes named as in `parameters`. Everything else stays bit-identical.
+        """Apply changes of parameters, named and in the units as in `parameters`.
 
-        Rotations step on the manifold, exp(change) R, so that they remain rotations.
+        Rotations step on the manifold, exp(change) R, so that they remain rotations. Other changes are added.
+
+        Returns:
+            The rig; everything without a change is bit-identical.
 
         Raises:
             ValueError: for an unknown name.

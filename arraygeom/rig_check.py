@@ -69,7 +69,8 @@ def unit_oddity(rig: Rig) -> str | None:
 
 
 def lens_end(name: str, camera: LensView) -> str | None:
-    """Return a sentence on a lens model that ends within its image; None if it covers the image.
+    """Return a sentence on the lens model of a camera called `name` that ends within the camera's image; None
+    if it covers the image.
 
     Camera models state themselves where they end (a pole, the rim of a fisheye's circle), which is no mistake
     unless they cover nothing.

@@ -32,9 +32,9 @@ class RobustFit(NamedTuple):
     """Result of a robust fit.
 
     Attributes:
-        coefficients: the coefficients.
-        rest: residuals, values minus their explanation.
-        weight: weights of the values in the last step.
+        coefficients: fitted coefficients.
+        rest: residuals: values minus coefficients times terms.
+        weight: weights of the values in the last step, from the residuals before it.
     """
 
     coefficients: Float[Tensor, " k *m"]
@@ -75,6 +75,9 @@ def least_squares(
     """Minimise the weighted sum of squares of values - c terms, plus c precision c.
 
     Args:
+        terms: k explaining terms of each of n values.
+        values: values to explain; axes *m are solved at once.
+        weight: weight of each value.
         precision: inverse covariance of a prior of zero mean; None for no prior, when terms may be dependent.
 
     Returns:
@@ -100,9 +103,13 @@ def robust_least_squares(
     """Solve `least_squares` in steps with weights from the residuals.
 
     Args:
+        terms: value of each of k terms at n points.
+        values: values at the points that the sum of terms times coefficients is to match.
         start: coefficients whose residuals give the first weights.
         weigh: function from residuals (n, *m) to weights (n).
-        precision: inverse covariance of a prior, or a function of the coefficients that returns it.
+        precision: inverse covariance of a prior of zero mean, or a function of the coefficients that returns
+            it; None for no prior.
+        steps: number of steps, at least 1.
 
     Returns:
         The fit after `steps` steps; with 0 steps there are no weights, which fails.
@@ -121,8 +128,8 @@ class LocalModel(NamedTuple, Generic[State]):
     Attributes:
         cost: cost of the state.
         cost_of: function that returns the cost of any state.
-        step: function from a damping to the state after a Gauss-Newton step, with the diagonal of the
-            information raised by that share.
+        step: function from a damping to the state after a Gauss-Newton step: the information matrix's
+            diagonal is multiplied by 1 + damping.
     """
 
     cost: float
@@ -143,9 +150,11 @@ def levenberg_marquardt(
     The damping rises tenfold until a step does not raise the cost, and falls tenfold after it.
 
     Args:
+        state: state to start from, of any type.
         model: function that returns the local model of a state.
         is_converged: function of the states before and after a step, and their costs.
         steps: largest number of steps.
+        damping: damping of the first step.
 
     Returns:
         The state, and True if it converged, or if no step lowers the cost.

@@ -53,10 +53,13 @@ def invert_increasing(
     """Find r in [0, high] with f(r) = y, by Newton's method inside a bracket.
 
     Args:
-        f: returns its value and its slope; f(0) = 0, rising on the bracket.
+        f: function that returns its value and its slope; f(0) = 0, rising on the bracket.
+        y: values (*n).
+        high: ends of the brackets, which broadcast to y.
+        iterations: largest number of iterations.
 
     Returns:
-        r; `high` where f never reaches y.
+        r (*n); `high` where f never reaches y.
     """
     reached = f(high)[0] > y
     y = torch.where(reached, y, 0.0)
@@ -104,11 +107,14 @@ def solve_in_plane(
     Steps are halved where a whole one leaves the allowed region or does not help.
 
     Args:
+        f: function from points to their images, and its Jacobian.
+        start: points (*n, 2) to start from.
         within: function that returns True (*n) for allowed points.
         rounding: rounding of f's values, in units of the last place.
+        steps: largest number of steps.
 
     Returns:
-        The points; where there is no solution, the nearest found.
+        The points; where there is no solution, those with the nearest images that were found.
     """
     xy = start
     value, jacobian = f(xy)
@@ -128,10 +134,15 @@ def solve_in_plane(
 
 
 def newton_step(value: Tensor, jacobian: Sequence[Tensor], target: Tensor) -> Tensor:
-    """Return the Newton step to subtract from points whose images are `value` for `target`, each (*n, 2).
+    """Compute the Newton step towards points of the plane whose images are `target`.
 
     Args:
-        jacobian: the Jacobian of a `PlaneMap`.
+        value: images (*n, 2) of the present points.
+        jacobian: Jacobian of a `PlaneMap` there: dx'/dx, dx'/dy, dy'/dx, dy'/dy, each (*n).
+        target: wanted images (*n, 2).
+
+    Returns:
+        Steps (*n, 2) to subtract from the points.
     """
     xx, xy, yx, yy = jacobian
     ex, ey = (value - target).unbind(-1)

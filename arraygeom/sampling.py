@@ -21,8 +21,8 @@ class Sampled(NamedTuple):
     """Values of images at positions.
 
     Attributes:
-        values: (b, c, *n).
-        valid: (b, *n), True for positions on the image's area.
+        values: sampled values (b, c, *n).
+        valid: mask (b, *n), True for positions on the image's area.
     """
 
     values: Float[Tensor, "b c *n"]

@@ -122,7 +122,8 @@ class Segments(Batched):
 
 
 def clip_to_image(start: Float[Tensor, "*n 2"], end: Float[Tensor, "*n 2"], hw: HW) -> Segments:
-    """Clip each segment to the image's area (Liang and Barsky 1984).
+    """Clip each segment, from `start` to `end` in pixels, to the area of an image of size `hw` (Liang and
+    Barsky 1984).
 
     Returns:
         Segments, invalid where nothing is left.

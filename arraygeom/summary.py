@@ -28,7 +28,7 @@ class CameraSummary(NamedTuple):
         wh: image size (width, height).
         field_of_view: angles (across, down), degrees.
         focal: focal lengths (x, y), pixels.
-        footprint: millimetres of a pixel at the near and the far bound.
+        footprint: width that a pixel covers at the near and the far bound, millimetres.
         lens: name of the lens model; None for a pinhole.
         coefficients: coefficients of a `Distortion`; empty for other models.
         covered: share of the image whose pixels have a ray.
@@ -84,6 +84,9 @@ def summarise_cameras(rig: Rig) -> list[CameraSummary]:
 
 def summarise_pairs(rig: Rig, alpha: str | None = None) -> list[PairSummary]:
     """Summarise each ordered pair of calibrated cameras, or one alpha with its `MOST_BETAS` nearest betas.
+
+    Args:
+        alpha: name of the one alpha; None for all.
 
     Returns:
         Summaries; none if alpha is not calibrated.

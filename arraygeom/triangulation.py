@@ -23,8 +23,8 @@ class Triangulated(NamedTuple):
     """Triangulated points.
 
     Attributes:
-        X: world points, metres; 0 where not valid.
-        covariance: their covariance, m².
+        X: world points (*n, 3), metres; 0 where not valid.
+        covariance: covariance (*n, 3, 3) of the points, m².
         valid: True for usable points.
         residual: largest distance between a match and the point's image over the views that count, pixels.
     """

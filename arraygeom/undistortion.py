@@ -59,6 +59,8 @@ def pixels_between(
 ) -> tuple[Float[Tensor, "h w 2"], Bool[Tensor, "h w"]]:
     """Compute the positions in `source` of the pixels of a co-located `target`.
 
+    Views that are not calibrated count as having the same orientation.
+
     Args:
         x: pixels of target; None for all.
 
@@ -167,7 +169,12 @@ def sampled_between(
     *,
     extended: bool = False,
 ) -> Sampled:
-    """Resample as `resampled`, with the result of `pixels_between`, which several images of one camera share.
+    """Resample an image as `resampled`, at known positions, which several images of one camera can share.
+
+    Args:
+        source: camera of the image.
+        pixels: result of `pixels_between`: positions in `source`, and their mask.
+        extended: True to fill pixels that source does not see from its nearest pixel.
 
     Returns:
         Values (1, C, H, W), and validity.

@@ -117,6 +117,10 @@ def frustum(camera: Camera, length: float) -> list[np.ndarray]:
 def depth_outline(rig: Rig, cameras: Mapping[str, Camera], alpha: str | None) -> list[np.ndarray]:
     """Return the lines around alpha's view: borders at near and at far, and edges between them.
 
+    Args:
+        cameras: calibrated cameras of the rig.
+        alpha: name of alpha; None for the first camera.
+
     Returns:
         Arrays (n, 3) of world points; empty without a depth range, or for bounds too far away.
     """
@@ -175,7 +179,7 @@ def draw_fields(
 
     Args:
         field: field of all betas, or fields by name; None for `recorded_field`.
-        images: images (H, W), (H, W, 3) or (3, H, W) by camera.
+        images: images (H, W), (H, W, 3) or (3, H, W) by camera; None for empty frames.
 
     Returns:
         The figure.
@@ -201,7 +205,10 @@ def draw_fields(
 
 
 def draw_sampling_locations(axes: Axes, field: ReceptiveField, pair: Pair, x: Float[Tensor, "n 2"]) -> None:
-    """Draw the sampling locations in beta of some alpha pixels into `axes`, each in its own colour."""
+    """Draw the sampling locations in beta of some alpha pixels into `axes`, each in its own colour.
+
+    Segments are lines with a dot at their near end; positions are dots.
+    """
     locations = sampling_locations(field, pair, x)
     for i, colour in enumerate(_colours(len(x))):
         if isinstance(locations, Segments):

@@ -33,6 +33,10 @@ class AroundDepth:
         depth: map (H, W) of depth z in the rig's unit (metres), at the pixels of `view`.
         tolerance: relative tolerance of the depth, at least 0.
         view: alpha as it was recorded; None for the pair's alpha.
+
+    Raises:
+        ValueError: for a negative or infinite tolerance, or a depth map of another size than `view`.
+        TypeError: for a tolerance that is no number.
     """
 
     depth: Float[Tensor, "h w"]
@@ -87,6 +91,10 @@ class AroundMatches:
         views: alpha and beta as they were recorded, to whose pixels `positions` refers; None for the pair's
             views.
         field: field of straight segments; None for the pair's default field without lenses.
+
+    Raises:
+        ValueError: for a negative or infinite tolerance, or positions of another size than the first view.
+        TypeError: for a tolerance that is no number, or an object that is no field.
     """
 
     positions: Float[Tensor, "h w 2"]
@@ -115,9 +123,19 @@ class AroundMatches:
         Each match is taken for 3 x 3 pixels of alpha, as far as no other is nearer.
 
         Args:
-            tolerance: pixels of beta.
+            alpha: points of alpha, pixels; those outside `hw` are left out.
+            beta: their matches in beta, pixels.
+            hw: height and width of alpha.
+            tolerance: pixels of beta, at least 0.
             views: alpha and beta as recorded; None for the pair's.
-            field: as of the class.
+            field: field of straight segments; None for the pair's default field without lenses.
+
+        Returns:
+            The field, on alpha's device; elsewhere its segments are whole.
+
+        Raises:
+            ValueError: as the class.
+            TypeError: as the class.
         """
         positions = torch.full((*hw, 2), torch.nan, dtype=torch.float32, device=alpha.device)
         column, row = alpha.round().long().unbind(-1)

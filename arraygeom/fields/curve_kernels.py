@@ -21,10 +21,20 @@ SERIES = 1e-3
 
 @compiled(nogil=True, cache=True, error_model="numpy")
 def curved_positions(begin, end, first, last, valid, lens, even, fractions, hw, xy, mask):
-    """Write the positions xy (n, samples, 2) and mask (n, samples) of alpha's pixels `begin` to `end`.
+    """Write the positions `xy` and the `mask` of the samples of some of alpha's pixels, on beta's image.
 
-    `first`, `last` (n, 3) and `valid` (n) are of the curve; `lens` is a `LensNumbers`; `even` are the
-    fractions of the nodes and `fractions` those of the samples.
+    Args:
+        begin: first pixel of alpha.
+        end: pixel after the last.
+        first: near ends of the curves (n, 3) in beta's frame, as in `RayCurve`, float64.
+        last: far ends (n, 3).
+        valid: mask (n) of the pixels whose ray beta may see.
+        lens: beta's `LensNumbers`.
+        even: fractions of the nodes along the curve, 0..1.
+        fractions: fractions of the samples along the visible part, 0..1.
+        hw: height and width of beta.
+        xy: positions (n, samples, 2) to write, pixels of beta; 0 where masked.
+        mask: mask (n, samples) to write.
     """
     nodes, samples = len(even), len(fractions)
     s, x, y, visible = np.empty(nodes), np.empty(nodes), np.empty(nodes), np.empty(nodes, np.bool_)

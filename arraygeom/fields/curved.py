@@ -47,6 +47,10 @@ class Curved:
         far: far bound in the rig's unit, possibly infinite; None for the pair's own.
         nodes: number of points at which a curve is followed, at least 2.
         bounds: quantity that near and far bound: "depth" along alpha's axis or "distance" along the ray.
+
+    Raises:
+        ValueError: for other `bounds`, under 1 sample or 2 nodes, and depths unless 0 < near <= far.
+        TypeError: for values that are no numbers.
     """
 
     samples: int = 96
@@ -102,6 +106,10 @@ class ThroughLenses:
     Attributes:
         field: field of the pair without lenses.
         samples: number of positions per segment, evenly spaced before distortion.
+
+    Raises:
+        ValueError: for under 1 sample.
+        TypeError: for an object that is no field, or `samples` that is no whole number.
     """
 
     field: ReceptiveField
@@ -177,18 +185,19 @@ WIDE = math.tan(math.radians(75))
 
 
 class RayCurve(NamedTuple):
-    """The points from `first` (towards near) to `last` in beta's frame, in units of their depth in alpha.
+    """Curves in beta on which the rays of alpha's pixels are seen, as straight pieces of beta's space.
 
+    Points are divided by their depth (or distance) in alpha, so that a point at infinity is finite too.
     Fractions of the way are even in undistorted pixels, in angle if `wide`, or in metres where beta's rays
     are parallel.
 
     Attributes:
-        first: end towards near.
-        last: end towards far.
+        first: end towards near, in beta's frame.
+        last: end towards far, in beta's frame.
         valid: mask of the pixels whose ray beta may see.
         beta: the camera whose image holds the curve.
         wide: True if fractions are even in angle, as in all cameras that are not central.
-        inverse: inverse depths (or distances) of both ends.
+        inverse: inverse depths (or distances) in alpha of both ends (*n), 1 / metres.
     """
 
     first: Float[Tensor, "*n 3"]
@@ -205,7 +214,10 @@ class RayCurve(NamedTuple):
         Args:
             near: near bound, metres.
             far: far bound, metres, possibly infinite.
-            bounds: "depth" or "distance".
+            bounds: "depth" along alpha's axis, or "distance" along the ray.
+
+        Returns:
+            The curves, in the precision of x; not valid where nothing is on beta's image.
         """
         pose = pair.beta_from_alpha.to(x.dtype)
         alpha, beta = (c.to(x.dtype) for c in pair.cameras)
@@ -265,7 +277,15 @@ class RayCurve(NamedTuple):
         return not free and lens_compiled and not self.beta.batch_shape and compilable(self.first)
 
     def positions(self, nodes: int, samples: int) -> Positions:
-        """Compute the positions of `Curved` by a compiled loop in float64."""
+        """Compute the positions of `Curved` by a compiled loop in float64; the curve must be `compilable`.
+
+        Args:
+            nodes: number of points at which each curve is followed.
+            samples: number of positions per pixel.
+
+        Returns:
+            Positions (*n, samples, 2) in beta's pixels, in the precision of `first`, without gradient.
+        """
         from .curve_kernels import curved_positions
 
         like, n = self.first, self.valid.numel()
@@ -288,9 +308,16 @@ class RayCurve(NamedTuple):
 
     @torch.no_grad()
     def nodes(self, count: int) -> Float[Tensor, "*n k"]:
-        """Compute fractions (*n, count) at which to follow the curve: even, or even in pixels if not central.
+        """Compute the fractions of the way from `first` to `last`, 0..1, at which to follow the curve.
 
-        In pixels too where the image repeats itself: by a pole the columns run away.
+        They are even in the curve's own measure. In a beta that is not central, or whose image repeats
+        itself (near its pole columns lie far apart), they are moved until they are even in pixels.
+
+        Args:
+            count: number of fractions.
+
+        Returns:
+            Fractions (*n, count), rising.
         """
         even = self._even(count)
         fractions = self._fractions(even)
@@ -352,8 +379,12 @@ class RayCurve(NamedTuple):
         return torch.where(visible.any(-1, keepdim=True), inner, fractions[..., [0, -1]])
 
     def at(self, fraction: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute beta's pixels (*n, l, 2) at fractions (*n, l) of the way first to last, with a mask of the
-        visible ones."""
+        """Compute beta's pixels at fractions (*n, l) of the way from `first` to `last`.
+
+        Returns:
+            Pixels (*n, l, 2), and True (*n, l) where the lens model sees the point; whether it is on the
+            image is not checked.
+        """
         weights = self._weights_in_angle(fraction) if self.wide else self._weights_in_pixels(fraction)
         s = (weights[1] / (weights[0] + weights[1]))[..., None]
         X = torch.lerp(self.first[..., None, :], self.last[..., None, :], s)
@@ -432,8 +463,8 @@ class LensNumbers(NamedTuple):
     Attributes:
         model: 0 for a pinhole, else a number of `COMPILED_LENSES`.
         c: 14 coefficients, padded with zeros.
-        limit: squared limit of the lens model's domain.
-        K: intrinsics.
+        limit: squared limit of the lens model's domain (`Distortion.squared_limit`); 0 for a pinhole.
+        K: intrinsics (3, 3).
         wide: True if fractions are even in angle.
     """
 
@@ -445,7 +476,11 @@ class LensNumbers(NamedTuple):
 
     @classmethod
     def from_camera(cls, camera: Camera, *, wide: bool) -> LensNumbers:
-        """Read the numbers of one camera."""
+        """Read the numbers of one camera, not a batch, with a lens of `COMPILED_LENSES` or none.
+
+        Returns:
+            The numbers, without gradient.
+        """
         K, lens = camera.K.detach().double().numpy(), camera.distortion
         if lens is None:
             return cls(0, np.zeros(14), 0.0, np.ascontiguousarray(K), wide)
@@ -492,12 +527,12 @@ def _each(M: Tensor, v: Tensor) -> Tensor:
 
 
 class Pieces(NamedTuple):
-    """Visible part of each of a polyline's m pieces.
+    """Visible part of each of a polyline's m pieces; a piece joins two neighbouring nodes.
 
     Attributes:
-        first: fraction of the piece at which the part begins.
-        last: fraction at which it ends.
-        length: visible length, pixels; 0 for invisible pieces.
+        first: fraction of the piece at which the visible part begins, 0..1.
+        last: fraction at which it ends, 0..1.
+        length: length of the visible part, pixels; 0 for invisible pieces.
     """
 
     first: Float[Tensor, "*n m"]
@@ -510,14 +545,16 @@ def visible_pieces(
 ) -> Pieces:
     """Compute the parts of a polyline that lie on the image, of pieces with a node that is `visible`.
 
-    Across the seam of an image that repeats itself a piece counts twice, as it leaves and as it returns:
-    then all pieces do. A visible piece of no length counts as 1e-3 pixels, so that a curve that is a point
-    has a position.
+    A visible piece of no length counts as 1e-3 pixels, so that a curve that is a point has a position.
 
     Args:
         nodes: pixels of the polyline.
         visible: mask (*n, k) of the nodes.
+        hw: height and width of the image.
         turn: pixels (2) after which the image repeats itself; None if it does not.
+
+    Returns:
+        The k - 1 pieces; with `turn` two for each, as a piece leaves across the seam and as it returns.
     """
     start, end = nodes[..., :-1, :], nodes[..., 1:, :]
     visible = visible[..., :-1] | visible[..., 1:]
@@ -537,7 +574,16 @@ def visible_pieces(
 def along_pieces(
     pieces: Pieces, u: Float[Tensor, " l"], nodes: Float[Tensor, "*n k"]
 ) -> Float[Tensor, "*n l"]:
-    """Compute the numbers, between those of the polyline's `nodes`, at fractions u of its visible length."""
+    """Interpolate numbers given at a polyline's nodes at fractions of its visible length.
+
+    Args:
+        pieces: visible parts of the polyline (`visible_pieces`).
+        u: fractions of the visible length, 0..1, rising.
+        nodes: number at each of the k nodes, such as its fraction of a curve.
+
+    Returns:
+        Numbers (*n, l); those of an invisible polyline mean nothing.
+    """
     first, last, length = pieces
     ends = length.cumsum(-1)
     wanted = u * ends[..., -1:]

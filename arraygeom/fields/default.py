@@ -35,6 +35,9 @@ def named_field(name: str) -> ReceptiveField:
     A class is instantiated without arguments. Importing runs the module's code; the current directory is
     searched too.
 
+    Returns:
+        The field, to be called with a pair and pixels of alpha.
+
     Raises:
         ValueError: for a name that is neither, or an object that is no field.
     """
@@ -62,12 +65,13 @@ ROW_SHARE = 0.12
 def default_field(pair: Pair) -> ReceptiveField:
     """Return the field that fusion uses for a pair; through lenses where a view has one.
 
-    A pair with a link has `HomographyDisplacement`, also if it is calibrated: a link was measured between
-    these very images; so have cameras at one place, whose segments are points. A calibrated one has
-    `Epipolar`, which raises ValueError when called if the pair has no depth range: a search of the whole line
-    is ambiguous and must be requested (`EpipolarLine`). A pair of which only the sizes are known counts as
-    rectified, with alpha on either side. With lenses these are `Curved`, or `ThroughLenses` of the field
-    without them. The bounds of `Curved` are those of `natural_bounds`.
+    Returns:
+        `HomographyDisplacement` for a pair with a link, also if it is calibrated (a link was measured between
+        these very images), and for cameras at one place, whose segments are points. `Epipolar` for another
+        calibrated pair; called, it raises ValueError for a pair without a depth range, as a search of the
+        whole line is ambiguous and must be requested (`EpipolarLine`). `Rectified` with alpha on either side
+        where only sizes are known. With lenses `Curved` in place of `Epipolar`, with the bounds of
+        `natural_bounds`, and `ThroughLenses` of any other.
     """
     return _through_lenses(straight_field(pair), pair)
 
@@ -113,6 +117,9 @@ def recorded_field(pair: Pair, *, samples: int = 256, nodes: int = 64) -> Recept
     Args:
         samples: positions per pixel of `Curved` and `ThroughLenses`.
         nodes: nodes of `Curved`.
+
+    Returns:
+        The field, through lenses where a view has one.
     """
     field = straight_field(pair)
     if isinstance(field, Epipolar) and pair.depth is None:

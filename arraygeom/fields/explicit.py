@@ -32,8 +32,12 @@ class NearestVoxels:
     where there is no line (the epipole, no baseline) all are.
 
     Attributes:
-        count: number of pixels.
-        window: pixels from H x to the edge of the window, in x and y.
+        count: number of pixels, at least 1.
+        window: pixels from H x to the edge of the window, in x and y, at least 0.
+
+    Raises:
+        ValueError: for a smaller `count` or `window`.
+        TypeError: for one that is no whole number.
     """
 
     count: int = 96
@@ -145,8 +149,12 @@ class Local:
     """A square window around H x; from H only (the CNN-like case).
 
     Attributes:
-        size: samples per side.
-        spacing: pixels between samples.
+        size: samples per side, at least 1.
+        spacing: pixels of beta between samples, at least 0.
+
+    Raises:
+        ValueError: for a smaller `size` or `spacing`, infinity or NaN.
+        TypeError: for a `size` that is no whole number, or a `spacing` that is no number.
     """
 
     size: int = 5
@@ -180,7 +188,11 @@ class Dense:
     """Every `stride`-th pixel of beta, from sizes alone (small images, and the unphysical control).
 
     Attributes:
-        stride: pixels between samples in x and y.
+        stride: pixels between samples in x and y, at least 1.
+
+    Raises:
+        ValueError: for a smaller stride.
+        TypeError: for one that is no whole number.
     """
 
     stride: int = 1

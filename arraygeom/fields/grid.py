@@ -28,11 +28,12 @@ _CHUNK = 1 << 18
 
 @dataclass(frozen=True)
 class FieldOnGrid:
-    """Search segments of every pixel of alpha, in float64: 33 bytes a pixel, and 8 for its share of a block.
+    """Receptive field of a pair, evaluated on every pixel of alpha.
 
-    Float32 would round positions by up to 3e-5 px, which is enough to change which of two equally good
-    matches is taken: 7e-4 in the fused image. Those of a large grid are stored as float32 (17 bytes)
-    nevertheless, without blocks, and cut to float64: the rounding is the same whatever the parts.
+    Segments are float64 (33 bytes a pixel, and 8 for its share of a block): float32 would round positions by
+    up to 3e-5 px, which is enough to change which of two equally good matches is taken: 7e-4 in the fused
+    image. Those of a large grid are stored as float32 (17 bytes) nevertheless, without blocks, and converted
+    to float64 when they are cut: the rounding is the same whatever the parts.
 
     Attributes:
         at: function from any pixels of alpha (n, 2) to segments or positions, (n) or (B, n).
@@ -92,8 +93,10 @@ class FieldOnGrid:
         return replace(on_grid, blocks=on_grid.of_blocks(BLOCK))
 
     def of_blocks(self, side: int) -> Segments:
-        """Evaluate the segments at the centres of blocks of `side` x `side` pixels, (B or 1, H / side, W /
-        side).
+        """Evaluate the segments at the centres of blocks of `side` x `side` pixels.
+
+        Returns:
+            Segments (B or 1, H / side, W / side) in beta's pixels, rounded down where `side` is no divisor.
 
         Raises:
             ValueError: for a field of explicit positions.
@@ -104,10 +107,13 @@ class FieldOnGrid:
         return _on_grid(self.at, (h // side, w // side), side, self.straight.start.device)
 
     def displaced(self, step: Callable[[Segments, Tensor], Tensor]) -> FieldOnGrid:
-        """Return the straight field with its segments moved.
+        """Move the segments of a straight field.
 
         Args:
-            step: function from segments and alpha's pixels (*n, 2) to the step in beta's pixels.
+            step: function from segments and alpha's pixels (*n, 2) to the step (*n, 2) in beta's pixels.
+
+        Returns:
+            A new field; both ends of each segment are moved by the step.
 
         Raises:
             ValueError: for a field of explicit positions.
@@ -146,7 +152,7 @@ class FieldOnGrid:
 
     @property
     def straight(self) -> Segments:
-        """Segments of every pixel of alpha, as `pixels`.
+        """Segments (B or 1, H, W) of every pixel of alpha, in beta's pixels; float32 if `large`.
 
         Raises:
             ValueError: for a field of explicit positions.
@@ -164,10 +170,14 @@ class FieldOnGrid:
         return sum(t.nbytes for segments in parts for t in (segments.start, segments.end, segments.valid))
 
     def cut(self, box: Box, shift: tuple[int, int] = (0, 0)) -> FieldOnGrid:
-        """Return the field of alpha's pixels in a box (even sides), for a beta cut at `shift` (x, y).
+        """Return the field of a window of alpha, for a beta cut at `shift`.
 
         Args:
-            box: rows and columns: top, bottom, left, right.
+            box: window of alpha: top, bottom, left, right; all even, which is not checked.
+            shift: pixel (x, y) of beta that becomes (0, 0).
+
+        Returns:
+            The field on the window's pixels, in pixels of the cut beta, float64.
         """
         top, _, left, _ = box
 

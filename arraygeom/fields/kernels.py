@@ -14,11 +14,19 @@ MORE = 1.15
 
 @compiled(nogil=True, cache=True, error_model="numpy")
 def nearest_pixels(first, last, line, centre, usable, window, tie, hw, xy, mask):
-    """Write the window's pixels nearest to the line, for pixels `first` to `last` of alpha.
+    """Write the pixels of a window that are nearest to a line, for some of alpha's pixels.
 
-    Written are xy (n, count, 2), the nearest first, and mask (n, count). `line` (n, 3) and `centre` (n, 2)
-    are of the type in which distances are computed; `tie` is the distance by which a pixel counts as farther
-    than the one before it in the image.
+    Args:
+        first: first pixel of alpha.
+        last: pixel after the last.
+        line: lines (n, 3) in beta, scaled to distances in pixels, in the type of computation.
+        centre: whole pixels (n, 2) at the windows' centres, of the same type.
+        usable: mask (n); others get no pixels.
+        window: pixels from the centre to the edge of the window.
+        tie: distance by which a pixel counts as farther than the one before it in the image.
+        hw: height and width of beta.
+        xy: pixels (n, count, 2) to write, the nearest first; 0 where masked.
+        mask: mask (n, count) to write.
     """
     count, most = mask.shape[1], (2 * window + 1) ** 2
     keys, pixels = np.empty(most, line.dtype), np.empty((most, 2), np.int32)

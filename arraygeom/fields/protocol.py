@@ -109,9 +109,11 @@ def _check_parts(answer: SamplingLocations, name: str) -> None:
 
 
 def lazily(field: ReceptiveField, pair: Pair) -> Callable[[Tensor], SamplingLocations]:
-    """Return the field as a function of alpha pixels (n, 2) alone, which attention calls chunk by chunk.
+    """Make a function of alpha's pixels alone of a field and a pair; attention calls it chunk by chunk.
 
-    For a batch of rigs the result is for each of them, (*b, n), on the device of the pair's numbers.
+    Returns:
+        Function from pixels (n, 2) to segments or positions, (n) or for a batch of rigs (*b, n), on the
+        device of the pair's numbers. It raises as `answered`.
 
     Raises:
         TypeError: for an object that is no field.

@@ -32,10 +32,10 @@ def ray_depth(
     *,
     deviation: Float[Tensor, " n"] | None = None,
 ) -> Depth:
-    """Compute depth, or distance along the ray, of the point that alpha and beta see, within the pair's depth
-    range.
+    """Compute the depth, or distance along the ray, of matched pixels, within the pair's depth range.
 
-    It is that of the nearest point of the curve on which beta sees the ray.
+    It is the depth of the point of alpha's ray whose image is nearest to the position in beta, through any
+    lenses.
 
     Args:
         x: pixels of alpha.

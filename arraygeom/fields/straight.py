@@ -35,6 +35,10 @@ class Epipolar:
     Attributes:
         near: near bound in the rig's unit (metres); None for the pair's own.
         far: far bound, possibly infinite; None for the pair's own.
+
+    Raises:
+        ValueError: unless 0 < near <= far.
+        TypeError: for a bound that is no number.
     """
 
     near: float | None = None
@@ -110,7 +114,9 @@ NEAREST = 1e-3
 
 @dataclass(frozen=True)
 class HomographyDisplacement:
-    """The part of the epipolar line within +-`displacement` pixels of H x; from F and H, or from calibration.
+    """Part of the epipolar line up to `displacement` pixels either way from the point nearest to H x.
+
+    Made from F and H, or from calibration.
 
     The paper's homography-based field. For a calibrated pair H is that of the plane at the middle of the
     depth range (`approximated` fits a better one), and a segment starts towards near and ends towards far.
@@ -119,6 +125,10 @@ class HomographyDisplacement:
     Attributes:
         displacement: pixels of beta, at least 0; None for the smallest that covers near to far at every pixel
             of alpha's image, which needs calibration.
+
+    Raises:
+        ValueError: for a negative or infinite displacement.
+        TypeError: for one that is no number.
     """
 
     displacement: float | None = None
@@ -212,11 +222,16 @@ SIDES = Literal["left", "right", "either"]
 
 @dataclass(frozen=True)
 class Rectified:
-    """A horizontal run of pixels of beta, from the two sizes alone (the PAM case).
+    """Horizontal segment in beta of a rectified pair, from the two sizes alone (the PAM case).
 
     Attributes:
-        max_disparity: largest disparity, pixels of beta; None for the whole row.
-        alpha_is: the camera of the rectified pair that alpha is; for "either" the run goes both ways.
+        max_disparity: largest disparity, pixels of beta, at least 0; None for the whole row.
+        alpha_is: "left" or "right", the camera of the rectified pair that alpha is; for "either" the segment
+            goes both ways.
+
+    Raises:
+        ValueError: for a negative or infinite disparity, or another side.
+        TypeError: for a disparity that is no number.
     """
 
     max_disparity: float | None = None
@@ -275,11 +290,13 @@ def require_pinholes(pair: Pair) -> tuple[Camera, Camera]:
 
 
 def approximated(pair: Pair) -> Pair:
-    """Return the pair with its exact F and the H that fits best to the middles of its depth-bounded segments.
+    """Fit H to the middles of a calibrated pair's depth-bounded segments: the paper's homography.
 
-    Least squares in pixels of beta, over the segments that beta's image holds of every 16th alpha pixel: the
-    paper's homography-based approximation. `HomographyDisplacement()` on the result takes the displacement
-    that covers near to far. Differentiable.
+    Least squares in pixels of beta, over the segments that beta's image holds of every 16th alpha pixel.
+    `HomographyDisplacement()` on the result takes the displacement that covers near to far.
+
+    Returns:
+        The pair with a link of its exact F and this H, differentiable.
 
     Raises:
         ValueError: for uncalibrated or batched pairs, lenses, no depth range, and where beta sees nothing
@@ -321,9 +338,17 @@ def foot_on_line(line: Float[Tensor, "*#n 3"], point: Float[Tensor, "*#n 2"]) ->
 def line_piece(
     line: Float[Tensor, "*#n 3"], point: Float[Tensor, "*#n 2"], reach: Float[Tensor, "*#d"], hw: HW
 ) -> Segments:
-    """Return the piece of each line within `reach` pixels of the foot of `point`, clipped to the image.
+    """Compute the piece of each line within `reach` pixels of its point nearest to `point`.
 
-    It runs along (l1, -l0), which for a calibrated F is from near to far. Without a line: the point itself.
+    Args:
+        line: lines (l0, l1, l2), scaled as `epipolar_lines` does; zeros where there is none.
+        point: pixels.
+        reach: pixels to either side.
+        hw: height and width of the image.
+
+    Returns:
+        Segments along (l1, -l0), which for a calibrated F is from near to far, clipped to the image; the
+        point itself where there is no line.
     """
     foot = foot_on_line(line, point)
     along = reach[..., None] * torch.stack([-line[..., 1], line[..., 0]], -1)

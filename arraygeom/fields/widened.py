@@ -36,6 +36,10 @@ class Moved:
         field: field of the point after it has moved.
         displacement: (2, H, W), motion in x and y of each of alpha's pixels from alpha's exposure to beta's,
             pixels of alpha, for instance by optical flow between alpha's own frames.
+
+    Raises:
+        ValueError: for a displacement of another shape.
+        TypeError: for an object that is no field.
     """
 
     field: ReceptiveField
@@ -52,7 +56,7 @@ class Moved:
         """Compute the field's sampling locations for the points to which alpha's pixels x move.
 
         Returns:
-            As of `field`.
+            Segments or positions in beta's pixels, as `field` gives them.
 
         Raises:
             ValueError: if alpha has another size than the displacement, or the field's result is invalid.
@@ -92,8 +96,12 @@ class Widened:
         field: the field to widen.
         across: pixels of beta to either side, at least 0.
         along: pixels of beta at either end, at least 0.
-        samples: number of positions along a segment that becomes wider.
+        samples: number of positions along a segment that becomes wider, at least 1.
         margins: more pixels, of each pixel's own, as `from_covariance` finds them; None for none.
+
+    Raises:
+        ValueError: for numbers below these bounds, infinity or NaN.
+        TypeError: for an object that is no field, or values that are no numbers.
     """
 
     field: ReceptiveField

@@ -13,7 +13,14 @@ from ..rig import Rig
 
 
 def calibrated(rig: Rig, format: str) -> list[tuple[str, Camera]]:
-    """Return the rig's cameras with their names.
+    """Return the rig's cameras with their names, for a file format that holds calibrated cameras only.
+
+    Args:
+        rig: the rig.
+        format: name of the format, for messages.
+
+    Returns:
+        Names and cameras, in the rig's order; at least one.
 
     Raises:
         ValueError: if there are none, or one is uncalibrated or a batch.
@@ -37,7 +44,15 @@ def calibrated(rig: Rig, format: str) -> list[tuple[str, Camera]]:
 def focal_and_centre(
     name: str, camera: Camera, *, first_pixel: float = 0.0
 ) -> tuple[float, float, float, float]:
-    """Return fx, fy, cx, cy of a camera, in pixels whose first centre is `first_pixel`.
+    """Return fx, fy, cx, cy of a camera, for a file format that holds nothing else of K.
+
+    Args:
+        name: name of the camera, for messages.
+        camera: camera, not a batch.
+        first_pixel: coordinate of the first pixel's centre in the format.
+
+    Returns:
+        Four numbers, pixels.
 
     Raises:
         ValueError: if K has skew, or is rotated or mirrored.
@@ -52,7 +67,15 @@ def focal_and_centre(
 
 
 def brown_conrady(name: str, lens: LensModel | None, *, at_most: int) -> list[float]:
-    """Return Brown-Conrady coefficients, four or more and no more than `at_most`; zeros for no lens.
+    """Return a lens's Brown-Conrady coefficients, for a file format that holds at most `at_most`.
+
+    Args:
+        name: name of the camera, for messages.
+        lens: the lens; None for a pinhole.
+        at_most: number of coefficients, 4 or more.
+
+    Returns:
+        Four coefficients or more in OpenCV's order; four zeros for a pinhole.
 
     Raises:
         ValueError: for another lens model, or more coefficients that are not 0.

@@ -58,7 +58,10 @@ def load_variables(source: RigSource) -> dict[str, Any]:
 
 
 def readable_variables(content: bytes) -> list[str]:
-    """List the names of the variables that consist of structs, cells, text and numbers only.
+    """List the variables of a MAT-file's bytes that consist of structs, cells, text and numbers only.
+
+    Returns:
+        Their names, in the file's order.
 
     Raises:
         ValueError: for a file that is not a MAT-file of version 5, too large, or damaged.

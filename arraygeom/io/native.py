@@ -92,10 +92,14 @@ def read_text(text: str, path: str | Path) -> Rig:
     """Read the rig of a native file's text.
 
     Args:
+        text: content of the file, YAML.
         path: name of the file in errors; nothing is read from it.
 
+    Returns:
+        The rig.
+
     Raises:
-        RigFileError: as `read`.
+        RigFileError: for a damaged text; its message names the file, the entry and what to do.
     """
     return _rig(RigSource(Path(path)).yaml(text))
 

@@ -41,8 +41,7 @@ def recognises(path: Path, head: str) -> bool:
 
 
 def read(source: RigSource) -> Rig:
-    """Read one camera "camera" at the origin, or a pair "left" and "right", or cameras by the names that the
-    file states.
+    """Read one camera "camera" at the origin, a stereo pair "left" and "right", or cameras named in the file.
 
     Raises:
         RigFileError: for a damaged file, half a pair, or cameras without a common frame.

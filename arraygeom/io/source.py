@@ -65,11 +65,13 @@ NO_MAPPING = "is not a mapping of names to values, or an empty one; is the file 
 
 
 def decoded(content: bytes, errors: str = "replace") -> str:
-    """Decode the text of a file in UTF-8, or in UTF-16 with a mark, as PowerShell's `>` writes the output of
-    tools.
+    """Decode the bytes of a text file: UTF-8, or UTF-16 with a byte order mark, as PowerShell's `>` writes.
 
     Args:
-        errors: as of `bytes.decode`.
+        errors: treatment of bytes that are no text, as for `bytes.decode`: "strict", "replace", ...
+
+    Returns:
+        The text, without a byte order mark.
 
     Raises:
         UnicodeDecodeError: if `errors` is "strict", for bytes that are no such text.
@@ -105,8 +107,8 @@ class RigSource:
     Attributes:
         path: the file or folder.
         hw: height and width of the images as stated by the user; None if unstated.
-        lens: lens model as stated by the user; None if unstated.
-        lookups: entries with the names that readers have looked up in each.
+        lens: name of the lens model as stated by the user; None if unstated.
+        lookups: mappings of the file, by identity, with the names that readers have looked up in each.
     """
 
     def __init__(self, path: Path, *, hw: HW | None = None, lens: str | None = None) -> None:
@@ -184,7 +186,10 @@ class RigSource:
         return text
 
     def json(self) -> Entry:
-        """Return the file as a JSON object without repeated keys.
+        """Parse the file as a JSON object that is not empty and has no repeated keys.
+
+        Returns:
+            The entry of the whole document, whose value is a mapping.
 
         Raises:
             RigFileError: for any other file.
@@ -201,7 +206,10 @@ class RigSource:
         return self.at(document).mapping()
 
     def toml(self) -> Entry:
-        """Return the file as a TOML document that is not empty.
+        """Parse the file as a TOML document that is not empty.
+
+        Returns:
+            The entry of the whole document, whose value is a mapping.
 
         Raises:
             RigFileError: for any other file.
@@ -213,7 +221,13 @@ class RigSource:
             raise self.fail(None, f"is not TOML ({error}); is the file whole?") from None
 
     def yaml(self, text: str | None = None) -> Entry:
-        """Return the file, or a text instead of it, as a YAML mapping without repeated keys.
+        """Parse the file as a YAML mapping that is not empty and has no repeated keys.
+
+        Args:
+            text: text to parse in place of the file's; None for the file's.
+
+        Returns:
+            The entry of the whole document, whose value is a mapping.
 
         Raises:
             RigFileError: for any other file.
@@ -227,10 +241,19 @@ class RigSource:
             ) from None
 
     def lines(self, separator: str, pattern: str) -> Entry:
-        """Return numbers by name, one a line, of the names that a pattern matches; the text of others.
+        """Parse a text of lines "name separator numbers", such as "P0: 721 0 609 ...".
+
+        Args:
+            separator: text between name and numbers, such as ":".
+            pattern: regular expression of the names whose values are numbers. Their values may be in
+                brackets, with commas and semicolons.
+
+        Returns:
+            The entry of a mapping: for names that the pattern matches lists of numbers, for others the text.
+            Lines without the separator are left out.
 
         Raises:
-            RigFileError: for a name that occurs twice, or values that are no numbers.
+            RigFileError: for such a name that occurs twice, or whose values are no numbers.
         """
         entries: dict[str, Tensor | str] = {}
         for line in self.text().splitlines():
@@ -275,10 +298,14 @@ class RigSource:
         return h, w
 
     def rig(self, cameras: Iterable[tuple[str, Camera]], **fields: Any) -> Rig:
-        """Return the rig of named cameras.
+        """Make the rig of named cameras.
 
         Args:
-            fields: further fields of the rig.
+            cameras: names and cameras, in the rig's order.
+            fields: further fields of the rig, such as `depth`.
+
+        Returns:
+            The rig.
 
         Raises:
             RigFileError: for no camera, or a name that occurs twice.
@@ -294,7 +321,7 @@ class RigSource:
 
 
 class Entry:
-    """A value in a rig file and its name there. Its methods raise RigFileError, which begins with that name.
+    """Value in a rig file with its name there; its methods raise RigFileError, which begins with that name.
 
     Attributes:
         source: the file.
@@ -375,11 +402,14 @@ class Entry:
         return [(str(key), self.at(value, str(key))) for key, value in self._named().items()]
 
     def find(self, name: str, side: str = "") -> Entry:
-        """Find the entry whose name matches a pattern (small letters, no signs), of one side of a pair or of
-        none.
+        """Find the entry of a mapping whose name matches a pattern.
+
+        Names are compared in lower case without punctuation, as `plain` returns them.
 
         Args:
-            side: "1" for the left camera, "2" for the right one, else "". Names with the side are preferred.
+            name: regular expression of such a name.
+            side: camera of a stereo pair that the name must state: "1" for the left one ("left", "l", "1"),
+                "2" for the right one; "" for names that state none.
 
         Returns:
             The entry; its value is None if no name matches.
@@ -405,7 +435,13 @@ class Entry:
         return self.at(self.value[keys[0]], keys[0]) if keys else self.at(None, "")
 
     def model(self, side: str = "") -> Entry:
-        """Find the entry that names the lens's model, of one side or of all; its value is None if none does.
+        """Find the entry that names the lens model.
+
+        Args:
+            side: camera of a stereo pair, as for `find`; names without a side are taken where none has it.
+
+        Returns:
+            The entry; its value is None if no entry names a model.
 
         Raises:
             RigFileError: if two names match whose values differ.
@@ -418,8 +454,12 @@ class Entry:
         return self.at(None, "")
 
     def sized(self, *keys: str, K: Tensor | None) -> HW:
-        """Return the image size under two keys (width, height) or one, else that of a file without
-        (`size_unstated`).
+        """Return the image size under two keys (width, height), or under one that holds both.
+
+        Args:
+            keys: the two keys, or the one.
+            K: intrinsic matrix in our pixels, for a file that states no size (`size_unstated`); None if K
+                itself depends on the size.
 
         Returns:
             Height and width in pixels.
@@ -453,8 +493,11 @@ class Entry:
         """Return the numbers, nested in lists or not, as a float64 tensor.
 
         Args:
-            infinite: accept infinite numbers.
+            infinite: True to accept infinite numbers.
             also: end of the message for other values.
+
+        Returns:
+            Tensor of the list's shape; of no axes for one number.
 
         Raises:
             RigFileError: for NaN, infinity unless accepted, and values that are no numbers.
@@ -471,7 +514,10 @@ class Entry:
 
         Args:
             shape: wanted shape; None for a vector of any length.
-            infinite: accept infinite numbers.
+            infinite: True to accept infinite numbers.
+
+        Returns:
+            The numbers, float64.
 
         Raises:
             RigFileError: for another number of numbers, and as `tensor`.
@@ -483,7 +529,10 @@ class Entry:
         return tensor.reshape(shape or (-1,))
 
     def words(self) -> Entry:
-        """Return the numbers of which a text, or several, consist, between spaces, as one list.
+        """Split a text, or several, at spaces into numbers.
+
+        Returns:
+            The entry of one list of numbers, under the same name.
 
         Raises:
             RigFileError: for words that are no numbers.
@@ -527,7 +576,13 @@ class Entry:
         return int(h), int(w)
 
     def intrinsics(self, first_pixel: float = 0.0) -> Tensor:
-        """Return K (3, 3) with the first pixel's centre moved from `first_pixel` to 0.
+        """Return the intrinsic matrix K, converted to pixels whose first centre is (0, 0).
+
+        Args:
+            first_pixel: coordinate of the first pixel's centre in the file, such as 0.5 or 1.
+
+        Returns:
+            K (3, 3), float64.
 
         Raises:
             RigFileError: for another last row, or focal lengths that are not positive.
@@ -554,6 +609,9 @@ class Entry:
 
         A deviation below 1e-3, as rounding in text files makes, is removed (nearest rotation).
 
+        Returns:
+            Matrix (3, 3), float64.
+
         Raises:
             RigFileError: for other matrices, vectors longer than `LARGEST_ANGLE`, and another number of
                 numbers.
@@ -575,10 +633,16 @@ class Entry:
         return R if error < 1e-12 else U @ Vh
 
     def pose_matrix(self, metres: float = 1.0) -> Pose:
-        """Return a pose from a 4 x 4 or 3 x 4 matrix with translations in units of `metres`.
+        """Return a pose from a 4 x 4 or 3 x 4 matrix.
+
+        Args:
+            metres: metres of the file's unit of length.
+
+        Returns:
+            The pose X' = R X + t, with t in metres.
 
         Raises:
-            RigFileError: for another last row, and as `rotation`.
+            RigFileError: for another last row, a matrix that is no rotation, and another number of numbers.
         """
         M = self.numbers((3, 4) if self.numbers().numel() == 12 else (4, 4))
         if len(M) == 4 and (M[3] - M.new_tensor([0, 0, 0, 1])).abs().max() > 1e-9:
@@ -586,7 +650,10 @@ class Entry:
         return Pose(Entry(self.source, M[:3, :3], self.name).rotation(), M[:3, 3] * metres)
 
     def brown_conrady(self) -> Distortion | None:
-        """Return a lens from OpenCV's coefficients, zero-padded to a number the model has; None if all are 0.
+        """Return a Brown-Conrady lens from OpenCV's coefficients, zero-padded to a number the model has.
+
+        Returns:
+            The lens; None if all coefficients are 0, or none are stated.
 
         Raises:
             RigFileError: for more than 14.
@@ -600,7 +667,10 @@ class Entry:
         return Distortion(BROWN_CONRADY, torch.nn.functional.pad(c, (0, count - c.numel())))
 
     def kannala_brandt(self) -> Distortion:
-        """Return a fisheye lens from one to four coefficients.
+        """Return a Kannala-Brandt fisheye from one to four coefficients, zero-padded to four.
+
+        Returns:
+            The lens.
 
         Raises:
             RigFileError: for another number of them.
@@ -665,8 +735,15 @@ class Entry:
         return self.lens(model)
 
     def lens(self, model: str) -> Distortion | None:
-        """Return a lens of any model; models other than Brown-Conrady and Kannala-Brandt need all their
-        coefficients.
+        """Return a lens of a named model from the entry's coefficients.
+
+        Models other than Brown-Conrady and Kannala-Brandt need all of them.
+
+        Args:
+            model: name of a model of `Distortion`.
+
+        Returns:
+            The lens; None for a Brown-Conrady lens whose coefficients are all 0.
 
         Raises:
             RigFileError: for another number of coefficients, or values that no lens has.

@@ -80,10 +80,13 @@ def read(source: RigSource) -> Rig:
 
 
 def capture_of(path: Path) -> list[Path]:
-    """List the images of the same capture: those beside it whose names differ only in what follows the last
-    "_".
+    """List the images of the capture that an image belongs to.
 
-    Images whose tags state no camera are left out. An image without "_" in its name is alone.
+    Its images lie in one folder, and their names differ only after the last "_".
+
+    Returns:
+        Files, sorted, `path` included; those whose tags state no camera are left out. For a name without "_"
+        `path` alone.
     """
     stem = path.stem.rpartition("_")[0]
     beside = sorted(
@@ -93,7 +96,12 @@ def capture_of(path: Path) -> list[Path]:
 
 
 def by_capture(paths: Sequence[Path]) -> dict[str, list[Path]]:
-    """List the images of several captures by the names of their bands, with a warning of those left out.
+    """Group the images of several captures by the names of their bands.
+
+    Warns of captures that lack a band, which are left out.
+
+    Args:
+        paths: files of one band each, in any order.
 
     Returns:
         Files of whole captures, in their order; empty for a single capture, and for images without tags of
@@ -114,8 +122,13 @@ def by_capture(paths: Sequence[Path]) -> dict[str, list[Path]]:
 
 
 def named_by_band(paths: Sequence[Path]) -> dict[str, Path]:
-    """Return images by the names of their bands; where not given, by what follows the last "_" of
-    the files'."""
+    """Name images by their bands, as their tags state them.
+
+    Returns:
+        Files by name: the band's, in lower case, "rgb" for three bands. If a tag is missing or two are equal,
+        all are named by the end of the file's name after the last "_", else by the whole name, else
+        "camera1", "camera2", ...
+    """
     bands = []
     for path in paths:
         tags = image_tags(path)
@@ -185,6 +198,9 @@ class _Image(NamedTuple):
     def from_source(cls, source: RigSource) -> _Image:
         """Read the tags of an image.
 
+        Returns:
+            The tags with their source.
+
         Raises:
             RigFileError: unless they state its camera.
         """
@@ -209,10 +225,13 @@ class _Image(NamedTuple):
         return None if words is None else words.numbers(count or None)
 
     def needed(self, name: str, count: int) -> Tensor:
-        """Return so many numbers of a tag of Pix4D's.
+        """Return the numbers of one of Pix4D's tags.
+
+        Returns:
+            Vector of `count` numbers, float64.
 
         Raises:
-            RigFileError: if it is not stated.
+            RigFileError: if it is not stated, or has another count.
         """
         numbers = self.numbers(name, count)
         if numbers is None:
@@ -221,7 +240,11 @@ class _Image(NamedTuple):
 
     @property
     def per_mm(self) -> Tensor:
-        """Pixels per millimetre of the sensor, (x, y)."""
+        """Pixels per millimetre of the sensor, (x, y), float64.
+
+        Raises:
+            RigFileError: if it is not stated.
+        """
         fields = self.tags.fields
         if RESOLUTION_X not in fields:
             raise self.source.fail(
@@ -242,7 +265,11 @@ class _Image(NamedTuple):
 
     @property
     def centre(self) -> Tensor:
-        """Camera's centre in the rig, metres; zero if it is not stated."""
+        """Camera's centre (3) in the rig, metres, float64; zero if it is not stated.
+
+        Raises:
+            RigFileError: for numbers too large for metres.
+        """
         if (translation := self.numbers("RigTranslations", 3)) is None:
             return torch.zeros(3, dtype=torch.float64)
         if float(translation.abs().max()) > LONGEST_TRANSLATION:
@@ -417,7 +444,7 @@ class ImageTags(NamedTuple):
 
     Attributes:
         hw: height and width of the stored pixels.
-        fields: values of TIFF, EXIF and GPS fields by their number, as tuples.
+        fields: values of TIFF, EXIF and GPS fields by their number, as tuples; 0 for NaN.
         xmp: XMP tags by namespace and name (lists joined by commas).
     """
 

@@ -19,11 +19,12 @@ from .model import CameraModel, beside_points
 class PolynomialFisheye(CameraModel, name="polynomial-fisheye"):
     """Fisheye that maps the angle theta off axis to the radius theta + k2 theta^2 + k3 theta^3 + ...
 
-    Without coefficients it is the equidistant fisheye. It ends earlier where the radius stops increasing.
+    Without coefficients it is the equidistant fisheye. It ends at `widest`, or earlier where the radius stops
+    increasing.
 
     Attributes:
-        k: coefficients k2, k3, ...
-        widest: largest calibrated angle, radians, at most pi.
+        k: coefficients (*b, n) k2, k3, ...
+        widest: largest calibrated angle off axis, radians; above pi counts as pi.
     """
 
     item_axes: ClassVar = {"k": 1}
@@ -31,10 +32,11 @@ class PolynomialFisheye(CameraModel, name="polynomial-fisheye"):
     widest: Float[Tensor, "*b"] = field(default_factory=lambda: torch.tensor(math.pi, dtype=torch.float64))
 
     def project(self, X: Tensor) -> tuple[Tensor, Tensor]:
-        """Project points or directions (*n, 3).
+        """Project points or directions (*n, 3) in the camera's frame.
 
         Returns:
-            Points of the image plane, and True up to `widest` off axis; (0, 0, 0) is not valid.
+            Points of the image plane (*n, 2), and True (*n) up to the angle at which the lens ends; NaN,
+            infinity and (0, 0, 0) are not valid.
         """
         X, finite = finite_points(X)
         squared = X[..., :2].square().sum(-1)
@@ -48,10 +50,11 @@ class PolynomialFisheye(CameraModel, name="polynomial-fisheye"):
         return X[..., :2] * (ratio * scale)[..., None], valid
 
     def unproject(self, xy: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute unit directions: the inverse of `project`.
+        """Compute the unit directions of points of the image plane (*n, 2): the inverse of `project`.
 
         Returns:
-            Directions, and validity.
+            Directions (*n, 3) in the camera's frame, and True (*n) up to the radius at which the lens ends;
+            further out the direction at its end.
         """
         xy, finite = finite_points(xy)
         squared = xy.square().sum(-1)
@@ -114,10 +117,11 @@ class Equirectangular(CameraModel, name="equirectangular"):
     period: ClassVar[float] = 2 * math.pi
 
     def project(self, X: Tensor) -> tuple[Tensor, Tensor]:
-        """Project directions (*n, 3).
+        """Project directions (*n, 3) of any length in the camera's frame.
 
         Returns:
-            Longitude and latitude; every direction is valid, (0, 0, 0) is not.
+            Longitude and latitude in radians (*n, 2), and True (*n) for every direction; NaN, infinity and
+            (0, 0, 0) are not valid.
         """
         X, finite = finite_points(X)
         x, y, z = X.unbind(-1)
@@ -129,10 +133,11 @@ class Equirectangular(CameraModel, name="equirectangular"):
         return torch.stack([longitude, torch.atan2(y, torch.where(valid, level, 1.0))], -1), valid
 
     def unproject(self, xy: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute unit directions: the inverse of `project`.
+        """Compute the unit directions of longitudes and latitudes (*n, 2): the inverse of `project`.
 
         Returns:
-            Directions, and True within the sphere's range.
+            Directions (*n, 3) in the camera's frame, and True (*n) for a longitude up to pi and a latitude up
+            to pi / 2 either way.
         """
         xy, finite = finite_points(xy)
         longitude, latitude = xy.unbind(-1)

@@ -20,11 +20,11 @@ class Brown:
     """Coefficients by name, each of shape (*b, 1..).
 
     Attributes:
-        k: k1 to k3, or to k6 if the lens is rational.
-        p: tangential coefficients.
-        s: prism coefficients; empty if there are none.
-        tilt: angles of the sensor; None if there are none.
-        eighth: factor of r^8; None if there is none.
+        k: radial coefficients k1 to k3, or to k6 if the lens is rational.
+        p: tangential coefficients p1 and p2.
+        s: thin-prism coefficients s1 to s4; empty if there are none.
+        tilt: angles of the sensor about x and y, radians; None if there are none.
+        eighth: factor of r^8 in the numerator; None if there is none.
     """
 
     k: tuple[Tensor, ...]
@@ -45,10 +45,15 @@ class Brown:
 
 
 def brown_distort(c: Tensor, xy: Tensor) -> tuple[Tensor, Tensor]:
-    """Distort points (*n, 2).
+    """Distort normalised points (*n, 2), which lie in the plane z = 1 of the camera's frame.
+
+    Args:
+        c: coefficients (*b, 4 to 15), as `Brown.named` takes them.
+        xy: points (*b, ..., 2).
 
     Returns:
-        Distorted points, and True within the model's range.
+        Distorted points, and True (*n) within the model's range: up to `brown_limit`, without a fold, and
+        ahead of a tilted sensor. Points beyond the limit are moved back to it.
     """
     lens, limit = Brown.named(c), once(brown_limit, c).to(xy)
     squared = xy.square().sum(-1)
@@ -60,7 +65,12 @@ def brown_distort(c: Tensor, xy: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def brown_derivatives(c: Tensor, xy: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Distort points (n, 2) by a lens (k,) without tilt, with derivatives in closed form.
+    """Distort normalised points (n, 2), with derivatives in closed form.
+
+    Args:
+        c: coefficients (k,) in OpenCV's order, up to the prism's; a tilt and a factor of r^8 are not refused,
+            but not differentiated.
+        xy: points; those beyond `brown_limit` are moved back to it.
 
     Returns:
         Distorted points, derivatives by the points (n, 2, 2) and by the coefficients (n, 2, k).
@@ -100,8 +110,12 @@ def brown_undistort(c: Tensor, xy_d: Tensor) -> tuple[Tensor, Tensor]:
     first derivatives and the next one the second (the error of a Newton step is the square of the one
     before).
 
+    Args:
+        c: coefficients (*b, 4 to 15), as `Brown.named` takes them.
+        xy_d: distorted normalised points (*b, ..., 2).
+
     Returns:
-        Undistorted points, and True within the model's range.
+        Undistorted normalised points (*n, 2), and True (*n) within the model's range.
     """
     lens = Brown.named(c)
     H = _tilt_matrix(lens)
@@ -156,8 +170,11 @@ def brown_limit(c: Tensor) -> Tensor:
 
     With g = N / D the slope is P / D^2, P(u) = (N + 2 u N') D - 2 u N D', of degree 6 (or 7) with P(0) = 1.
 
+    Args:
+        c: coefficients (*b, 1.., 4 to 15).
+
     Returns:
-        Limits (*b, 1..), float64 on the CPU.
+        Squared radii (*b, 1..) of undistorted normalised points, float64 on the CPU, without gradient.
     """
     lens = Brown.named(c)
     k1, k2, k3, *rational = (k.detach().to("cpu", torch.float64) for k in lens.k)

@@ -48,10 +48,15 @@ class _Model(NamedTuple):
 
 
 def central_project(model: str, c: Tensor, X: Tensor) -> tuple[Tensor, Tensor]:
-    """Project directions (*n, 3) of any length.
+    """Project directions (*n, 3) of any length in the camera's frame.
+
+    Args:
+        model: name of a model in `MODELS`, such as "double-sphere"; another one raises KeyError.
+        c: coefficients (*b, 1.., k) of the model, in its order.
 
     Returns:
-        Distorted normalised points (*n, 2), and validity.
+        Distorted normalised points (*n, 2), and True (*n) within the cone that the model sees and for
+        coefficients within its bounds. Other directions give the nearest point of the cone's border.
     """
     kind = MODELS[model]
     c, sound = _sound(kind, c)
@@ -74,10 +79,14 @@ def central_project(model: str, c: Tensor, X: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def central_unproject(model: str, c: Tensor, xy_d: Tensor) -> tuple[Tensor, Tensor]:
-    """Compute unit directions (*n, 3) of distorted normalised points (*n, 2).
+    """Compute the unit directions of distorted normalised points (*n, 2): the inverse of `central_project`.
+
+    Args:
+        model: name of a model in `MODELS`; another one raises KeyError.
+        c: coefficients (*b, 1.., k) of the model.
 
     Returns:
-        Directions, and validity.
+        Directions (*n, 3) in the camera's frame, and True (*n) for points within the model's image.
     """
     kind = MODELS[model]
     c, valid = _sound(kind, c)

@@ -29,8 +29,15 @@ SOLVED = 64
 
 
 def angle_over_radius(u: Tensor, z: Tensor) -> Tensor:
-    """Compute theta / r from the squared radius u = r^2 and the depth z, each (*n), by a series near the
-    axis."""
+    """Compute the ratio of a direction's angle off axis (radians) to its radius r, by a series near the axis.
+
+    Args:
+        u: squared radius r^2 = x^2 + y^2 (*n).
+        z: depth along the axis (*n).
+
+    Returns:
+        theta / r (*n); on the axis 1 / z ahead, and a finite number without meaning behind.
+    """
     near = (z > 0) & (u < 1e-3 * z.square())
     z_near = torch.where(near, z, 1.0)
     t = torch.where(near, u, 0.0) / z_near.square()
@@ -60,9 +67,13 @@ def polynomial_product(a: tuple[Tensor, ...], b: tuple[Tensor, ...]) -> list[Ten
 
 @torch.no_grad()
 def once(bound: Callable[[Tensor], Tensor], c: Tensor) -> Tensor:
-    """Compute a bound of lenses by coefficients (*b, n) once for copies of one lens made by `expand`.
+    """Compute a bound of lenses, such as `brown_limit`, once for the copies of one lens that `expand` makes.
 
-    It is cached for recent lenses, unless torch has to see its computation.
+    The bound is cached for recent lenses, unless torch has to see its computation.
+
+    Args:
+        bound: function from coefficients (*b, n) to bounds (*b).
+        c: coefficients (*b, n).
 
     Returns:
         Bounds (*b).

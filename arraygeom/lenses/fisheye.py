@@ -12,10 +12,14 @@ from .common import MARGIN, SOLVED, TINY, angle_over_radius, cosine_and_sinc, on
 
 
 def fisheye_project(c: Tensor, X: Tensor) -> tuple[Tensor, Tensor]:
-    """Project points (*n, 3) of the camera's frame.
+    """Project points (*n, 3) of the camera's frame by the Kannala-Brandt fisheye.
+
+    Args:
+        c: coefficients k1 to k4 (*b, 1.., 4).
 
     Returns:
-        Distorted normalised points (*n, 2), and True within the model's range.
+        Distorted normalised points (*n, 2), and True (*n) up to the angle off axis of `fisheye_limit`; points
+        further off give a point at that angle. (0, 0, 0) and points straight behind are not valid.
     """
     xy, z = X[..., :2], X[..., 2]
     u = xy.square().sum(-1)
@@ -29,11 +33,15 @@ def fisheye_project(c: Tensor, X: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def fisheye_unproject(c: Tensor, xy_d: Tensor) -> tuple[Tensor, Tensor]:
-    """Compute unit directions (*n, 3): solve v p(v)^2 = |xy_d|^2 for the squared angle v, smooth on the axis
-    too.
+    """Compute the unit directions of distorted normalised points (*n, 2): the inverse of `fisheye_project`.
+
+    Solves v p(v)^2 = |xy_d|^2 for the squared angle v, smooth on the axis too.
+
+    Args:
+        c: coefficients k1 to k4 (*b, 1.., 4).
 
     Returns:
-        Directions, and validity.
+        Directions (*n, 3) in the camera's frame, and True (*n) up to the radius of `fisheye_limit`.
     """
     limit = once(fisheye_limit, c).to(xy_d)
     u_d = xy_d.square().sum(-1)

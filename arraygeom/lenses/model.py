@@ -21,7 +21,12 @@ CAMERA_MODELS: dict[str, type[CameraModel]] = {}
 
 
 class LensModel(Batched):
-    """Lens of a camera (`Camera.distortion`): a `Distortion` or a `CameraModel`."""
+    """Base class of the lens of a camera (`Camera.distortion`): a `Distortion` or a `CameraModel`.
+
+    Attributes:
+        model: name of the model in rig files.
+        coefficients: numbers of the model (*b, n), one after the other.
+    """
 
     central: ClassVar[bool] = True
     """True if all rays start in the camera's origin."""
@@ -38,7 +43,7 @@ class LensModel(Batched):
         """Project points in the camera's frame (*n, 3).
 
         Returns:
-            Points of the image plane (*n, 2), and True where seen.
+            Points of the image plane (*n, 2), which `Camera.K` takes to pixels, and True where seen.
 
         Raises:
             NotImplementedError: in this base class.
@@ -148,13 +153,13 @@ class CameraModel(LensModel):
         return torch.cat([t.expand(*batch, -1) for t in numbers], -1) if numbers else torch.zeros(0).double()
 
     def scaled(self: AnyLens, factor: float) -> AnyLens:
-        """Multiply the model's `lengths` by a factor.
+        """Multiply the numbers of the model that are named in `lengths` by a factor.
 
         Returns:
-            The model.
+            A copy of the model.
 
         Raises:
-            ValueError: if it is not central and does not state them.
+            ValueError: for a model that is not central and states no `lengths`.
         """
         names = self.lengths  # type: ignore[attr-defined]
         if names is None and not self.central:
@@ -162,7 +167,11 @@ class CameraModel(LensModel):
         return dataclasses.replace(self, **{n: getattr(self, n) * factor for n in names or ()})  # type: ignore
 
     def with_coefficients(self: AnyLens, coefficients: Float[Tensor, "*b n"]) -> AnyLens:
-        """Return the same model with other numbers."""
+        """Return the same model with other numbers.
+
+        Args:
+            coefficients: numbers (*b, n), in the order of the property `coefficients`; another count fails.
+        """
         tensors = self._own()  # type: ignore[attr-defined]
         sizes = [t.shape[t.ndim - axes :].numel() for t, axes in tensors.values()]
         parts = zip(tensors.items(), coefficients.split(sizes, -1))

@@ -26,8 +26,10 @@ SETTLED = 64
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Orthographic(CameraModel, name="orthographic"):
-    """Parallel rays along the axis, as of a telecentric lens: (x, y) in metres, focal length in pixels for
-    each metre."""
+    """Camera of parallel rays along its axis, as of a telecentric lens.
+
+    Points of the image plane are (x, y) in metres, and K's focal length is in pixels for each metre.
+    """
 
     central: ClassVar[bool] = False
     lengths: ClassVar = ()
@@ -102,9 +104,10 @@ class RollingShutter(BehindModel, name="rolling-shutter"):
     by a quarter turn have columns for rows.
 
     Attributes:
-        velocity: velocity of the camera along its axes, metres for each second.
-        rotation: angular velocity about its axes, radians for each second.
-        readout: seconds in which as many rows are read as the focal length has pixels, `row_time * fy`.
+        lens: central lens model; None for a pinhole. Another one raises ValueError.
+        velocity: velocity (*b, 3) of the camera along its axes, metres for each second.
+        rotation: angular velocity (*b, 3) about its axes, radians for each second.
+        readout: seconds (*b) in which as many rows are read as the focal length has pixels, `row_time * fy`.
     """
 
     item_axes: ClassVar = {"velocity": 1, "rotation": 1}
@@ -115,10 +118,10 @@ class RollingShutter(BehindModel, name="rolling-shutter"):
     readout: Float[Tensor, "*b"]
 
     def project(self, X: Tensor) -> tuple[Tensor, Tensor]:
-        """Project points by the secant method for the row that sees them.
+        """Project points (*n, 3) of the frame of time 0, with the secant method for the row that sees them.
 
         Returns:
-            Points of the image plane; not valid where no row is found.
+            Points of the image plane (*n, 2), and True (*n) where a row is found.
         """
         X, finite = finite_points(X)
         with torch.no_grad():
@@ -209,7 +212,7 @@ class FlatPort(BehindModel, name="flat-port"):
     (Treibitz, Schechner, Kunz and Singh 2012).
 
     Attributes:
-        distance: from the camera's centre to the pane, metres.
+        distance: distance from the camera's centre to the pane, metres.
         thickness: thickness of the pane, metres.
         glass: refractive index of the glass, at least 1.
         water: refractive index of the water, at least 1.
@@ -236,13 +239,13 @@ class FlatPort(BehindModel, name="flat-port"):
         return False
 
     def project(self, X: Tensor) -> tuple[Tensor, Tensor]:
-        """Project points in the water by the ray that reaches them, found by Newton's method.
+        """Project points (*n, 3) in the water by the ray that reaches them, found by Newton's method.
 
         The unknown is the ray's tangent in air over the radius, started from its value on the axis: how far
         off axis a ray gets is concave in its tangent, so that no step goes too far.
 
         Returns:
-            Points of the image plane, and True for points behind the pane that a ray reaches.
+            Points of the image plane (*n, 2), and True (*n) for points beyond the pane that a ray reaches.
         """
         X, finite = finite_points(X)
         distance, thickness = self._layers(X)
@@ -264,10 +267,10 @@ class FlatPort(BehindModel, name="flat-port"):
         return xy, valid & settled & lens_valid
 
     def unproject(self, xy: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute unit directions in the water, by Snell's law.
+        """Compute the unit directions in the water of points of the image plane (*n, 2), by Snell's law.
 
         Returns:
-            Directions, and validity.
+            Directions (*n, 3) in the camera's frame, and True (*n) for rays ahead that the lens has.
         """
         ray, valid = self._ray(xy)
         across = ray[..., :2] / beside_points(self.water, ray)[..., None]

@@ -73,10 +73,11 @@ class Splined(CameraModel, name="splined"):
         return self.base == STEREOGRAPHIC
 
     def project(self, X: Tensor) -> tuple[Tensor, Tensor]:
-        """Project directions (*n, 3).
+        """Project directions (*n, 3) of any length in the camera's frame.
 
         Returns:
-            Points of the image plane, and True within the knots; (0, 0, 0) is not valid.
+            Points of the image plane (*n, 2), and True (*n) within the knots and before any fold; NaN,
+            infinity, (0, 0, 0) and straight behind are not valid.
         """
         X, finite = finite_points(X)
         length = _length(X)
@@ -87,10 +88,12 @@ class Splined(CameraModel, name="splined"):
         return xy, finite & some & inside & keeps_orientation(jacobian)
 
     def unproject(self, xy: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute unit directions: the inverse of `project`. The last two Newton steps are differentiable.
+        """Compute the unit directions of points of the image plane (*n, 2): the inverse of `project`.
+
+        Found by Newton's method, whose last two steps are differentiable.
 
         Returns:
-            Directions, and validity.
+            Directions (*n, 3) in the camera's frame, and True (*n) where there is one within the knots.
         """
         xy, finite = finite_points(xy)
         with torch.no_grad():

@@ -49,10 +49,12 @@ def speaks_for_itself(error: OSError) -> bool:
 
 
 def naming(path: Path, error: OSError, temporary: Path) -> OSError:
-    """Replace a temporary path by `path` in an error; NumPy's errors have a text alone, without a file.
+    """Make the error of a failed write that names `path` in place of the temporary file.
+
+    NumPy's errors have only a text, without a number and a file; the path is replaced in it, or put before.
 
     Returns:
-        The new error.
+        The new error, for the caller to raise.
     """
     if error.errno is not None:
         return OSError(error.errno, error.strerror, str(path))
@@ -61,7 +63,9 @@ def naming(path: Path, error: OSError, temporary: Path) -> OSError:
 
 
 def flush(path: Path) -> None:
-    """Wait until a file's content, or the names in a folder, are on the disk.
+    """Wait until a file's content, or the names in a folder, are on the disk (fsync).
+
+    Does nothing for a folder on Windows, which opens none.
 
     Raises:
         OSError: if the system reports an error.

@@ -24,8 +24,8 @@ class Tile(NamedTuple):
     """Box of a result, and the box of the input that it needs.
 
     Attributes:
-        inner: box of the result.
-        outer: the same box with a halo.
+        inner: box of the result: first row, row after the last, first column, column after the last.
+        outer: the same box with a halo, as far as the frame goes.
     """
 
     inner: Box
@@ -84,6 +84,10 @@ def chunked(
     On the CPU parts are computed `in_order` on several threads. Gradients pass through.
 
     Args:
+        function: function of tensors that returns a tensor or a tuple of tensors.
+        tensors: tensors of one length along the axis (or axes).
+        rows: length of a part along the axis, or lengths along each.
+        halo: rows to add on either side.
         axis: axis, or axes, to cut along.
 
     Returns:
@@ -132,10 +136,13 @@ def sides_by_work(hw: Sequence[int], halo: int, multiple: int, most: float) -> l
     """List sizes of tiles of at most `most` pixels with their halos, the least total work first.
 
     Args:
-        multiple: number that sides are multiples of; they are 64 or more.
+        hw: height and width of the frame.
+        halo: pixels around each tile.
+        multiple: number that sides are multiples of, unless they are 64, the least.
+        most: largest number of pixels of a tile with its halo.
 
     Returns:
-        (height, width) of tiles; empty if none fits.
+        (height, width) of tiles without halos; empty if none fits.
     """
     h, w = hw
     sides: dict[tuple[int, int], int] = {}

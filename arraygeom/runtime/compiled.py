@@ -20,8 +20,12 @@ LONGEST = 300.0
 def compiled(function=None, **options):
     """Compile a function by numba's njit, without the type checker that tests wrap around it.
 
-    With `cache` it is called from Python; without, mostly by compiled functions. If no folder can be written,
-    each process compiles for itself, with a warning.
+    With `cache=True` the machine code is stored in a folder, for functions that are called from Python. If no
+    folder can be written, each process compiles for itself, with a warning.
+
+    Args:
+        function: function to compile; None when used as a decorator with options.
+        options: njit's options.
 
     Returns:
         The compiled function; without `function` a decorator.

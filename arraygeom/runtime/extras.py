@@ -23,10 +23,14 @@ def install_line(module: str, extra: str) -> str:
 
 @contextmanager
 def needs(extra: str, purpose: str) -> Iterator[None]:
-    """Context manager for the import of an optional module.
+    """Context manager for a block that imports an optional module.
+
+    Args:
+        extra: extra of this package that has the module.
+        purpose: purpose of the import, which begins the message, such as "writing video".
 
     Raises:
-        ImportError: in one line that names the extra to install, if the import fails.
+        ImportError: in one line that names the module and how to install it, if the block's import fails.
     """
     try:
         yield
@@ -39,13 +43,15 @@ def imported(name: str, what: str) -> Any:
     """Import a user's "module:object", or a module, also from the current folder.
 
     Args:
-        what: what it is, for messages.
+        name: dotted name of a module, and after a colon of an object in it.
+        what: kind of object, for messages, such as "field".
 
     Returns:
-        The object, or the module.
+        The object, or the module where no object is named.
 
     Raises:
-        ValueError: if it cannot be imported.
+        ValueError: for a module or object that does not exist, or a module that fails with ImportError,
+            AttributeError or ValueError; other errors of the module pass.
     """
     module, _, attribute = name.partition(":")
     try:

@@ -85,10 +85,10 @@ def first_tiff_page(content: bytes) -> Any:
 
 
 def tiff_colours(content: bytes) -> Any:
-    """Read the values of a TIFF file's first image of several bands, by tifffile.
+    """Read the values of a TIFF file's first image, which has several bands, by tifffile.
 
     Returns:
-        (h, w, c); None for a damaged file, and a compression that needs imagecodecs.
+        Array (h, w, c) of the file's type; None for a damaged file, and a compression that needs imagecodecs.
     """
     try:
         with _quiet_tiff(content) as file:
@@ -188,10 +188,10 @@ def _is_sound(content: bytes) -> bool:
 
 
 def jpeg_colours(content: bytes) -> Any:
-    """Decode a JPEG file, with the values of OpenCV.
+    """Decode the bytes of a JPEG file by libjpeg-turbo, to the same values as OpenCV.
 
     Returns:
-        (h, w, 1 or 3), red first; None for other colours than RGB and grey.
+        Array (h, w, 1 or 3), uint8, red first; None for other colours than RGB and grey, such as CMYK.
 
     Raises:
         Exception: where libjpeg warns; OpenCV would print the warning, and return the pixels that it has.

@@ -36,7 +36,10 @@ def stage(name: str = "", *, new: bool = False) -> Iterator[None]:
 
 @contextmanager
 def part(begin: float, end: float) -> Iterator[None]:
-    """Context manager of a part of the current stage or part, from one share of it (0..1) to another."""
+    """Context manager of a part of the current stage or part, from share `begin` of it to share `end`, 0..1.
+
+    Does nothing outside a stage.
+    """
     outer = _CURRENT.get()
     if outer is None:
         yield

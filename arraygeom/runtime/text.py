@@ -25,8 +25,15 @@ def length_unit(rig: Any) -> str:
 
 
 def baseline_text(cameras: Mapping[str, Any], unit: str = "m") -> str:
-    """Describe the distances between cameras of known pose; metres are converted to a suitable unit. Empty
-    without any."""
+    """Describe the distances between cameras of known pose, such as "baselines 10-20 mm".
+
+    Args:
+        cameras: cameras by name; those without a pose do not count.
+        unit: unit of their lengths. Metres are converted to a suitable unit; others are named as they are.
+
+    Returns:
+        The text; empty for fewer than two cameras of known pose.
+    """
     centres = [c.centre.detach() for c in cameras.values() if hasattr(c, "cam_from_world")]
     pairs = [(a - b).norm(dim=-1) for i, a in enumerate(centres) for b in centres[:i]]
     if not pairs:

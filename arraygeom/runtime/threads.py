@@ -37,8 +37,7 @@ def limited_to(count: int | None) -> Iterator[None]:
 
 @contextmanager
 def torch_in_one_thread() -> Iterator[None]:
-    """Context manager that runs torch's own loops in the calling thread alone; `in_parallel` keeps its
-    `threads`.
+    """Context manager that sets torch to one thread, while `in_parallel` may still use as many as before.
 
     For work that is mostly in compiled loops, beside which torch's own threads spin between short loops:
     without this a frame of 640x400 took twice the time of the cores where other processes wanted them.
@@ -58,6 +57,7 @@ def in_parallel(tasks: Sequence[Callable[[], Any]], *, most: int | None = None) 
     After an error no further task begins; it is raised once the running ones have ended.
 
     Args:
+        tasks: functions without arguments.
         most: largest number of threads; None for `threads`.
 
     Returns:
@@ -93,6 +93,10 @@ def in_order(function: Callable[[Any], Any], parts: Sequence[Any]) -> Iterator[A
     A single part is computed in this thread, and so are all if torch itself uses several threads, or has to
     see each operation (`followed`, a function mode, autocast). An error is raised once no part is being
     computed.
+
+    Args:
+        function: function of one part.
+        parts: arguments to call it with.
 
     Returns:
         Iterator over the results, in order.

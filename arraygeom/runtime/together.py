@@ -45,9 +45,9 @@ def write_together(
     run, which the next call does. Missing folders are made.
 
     Args:
-        group: name of the group.
+        group: name of the group, whose files, with their digests, are listed in a hidden folder.
         last: name of the file that completes the group.
-        about: texts stored in the list (`read_about`).
+        about: texts by name to store in the list (`read_about`); None for none.
         given: file names that the user chose, which may replace unlisted files.
 
     Yields:
@@ -77,9 +77,12 @@ def write_together(
 
 
 def write_listed(path: Path, text: str, *, given: bool = False) -> None:
-    """Write one text file as a group of its own name; `given` as the user chose it.
+    """Write one text file as a group of its own name, as `write_together` does.
 
-    Errors as in `write_together`.
+    Args:
+        path: file to write.
+        text: content, written as UTF-8.
+        given: True if the user chose the name: an unlisted file of that name is then replaced.
 
     Raises:
         FileExistsError: for an unlisted file in the way, unless `given`.
@@ -131,7 +134,11 @@ def _undo(folder: Path, temporary: Path) -> None:
 
 
 def recover(folder: Path, group: str | None = None) -> None:
-    """Restore the files that a killed swap had moved, of one group or (None) of any.
+    """Restore the files that a killed `write_together` had moved away.
+
+    Args:
+        folder: folder of the files.
+        group: name of the group; None for all groups of the folder.
 
     Raises:
         OSError: if that is not possible.
@@ -182,8 +189,9 @@ def refuse_others(
     """Check that no unlisted or changed files of these names are in a folder.
 
     Args:
+        folder: the folder; a missing one has no files.
         names: file names, or a mapping to digests: files of the same content are no obstacle.
-        group: name of the likeliest list.
+        group: name of the group whose list is read first; the lists of other groups count too.
         by_name: True to accept a file whose name is listed, without reading it.
 
     Raises:

@@ -20,10 +20,13 @@ def followed() -> bool:
 
 
 def needs_numbers(what: str, *tensors: Tensor) -> None:
-    """Declare that a call depends on values: it breaks `torch.compile`'s graph, an error with `fullgraph`.
+    """Declare that a result depends on tensors' values: `torch.compile`'s graph breaks here.
+
+    With `fullgraph=True` the break is an error of torch's. Does nothing outside compilation and vmap.
 
     Args:
         what: the result that depends on them, for messages.
+        tensors: tensors whose values are needed.
 
     Raises:
         NotImplementedError: for tensors that `torch.func.vmap` has batched.

@@ -11,7 +11,10 @@ OWN, WRAPPERS = {"arraygeom", "calib", "pat"}, {"contextlib", "torch"}
 
 
 def warn(text: str, category: type[Warning] = UserWarning) -> None:
-    """Warn at the line outside these packages that led here; at the outermost line if there is none."""
+    """Issue a warning that points to the line outside these packages from which they were called.
+
+    It points to the outermost line if there is none.
+    """
     roots: list[str] = []
     frame: FrameType | None = sys._getframe(1)
     while frame is not None:

@@ -38,10 +38,10 @@ TILTS = {(0, 1): "right", (0, -1): "left", (1, 0): "upper", (-1, 0): "lower"}
 
 
 class Coverage(NamedTuple):
-    """Coverage of one camera's image and depths by its boards.
+    """Coverage of one camera's image and depths by the boards that it saw.
 
     Attributes:
-        cells: number of points in each cell of the image.
+        cells: number of points in each cell (row, column) of the image.
         depths: depth of the nearest and the farthest point, metres.
         tilts: least and largest angle between a board's normal and the optical axis, degrees.
         missing: advice, one sentence each.
@@ -61,8 +61,12 @@ class Coverage(NamedTuple):
 def coverage(views: BoardViews, cam_from_board: Mapping[FrameKey, Pose], board: Board) -> Coverage:
     """Compute a camera's coverage from its detections and the boards' poses in its frame.
 
+    Args:
+        views: detections, at least one.
+        cam_from_board: pose of the board at the moment of each detection; a missing one raises KeyError.
+
     Returns:
-        Coverage and advice. Every detection needs a pose, at least one is required.
+        Coverage, with advice on what is missing.
     """
     cells = point_counts([d.x for d in views.seen.values()], views.hw)
     poses = {key: cam_from_board[key] for key in views.seen}
@@ -109,12 +113,12 @@ def _missing(coverage: Coverage, board: Board) -> Iterator[str]:
 
 
 class NextView(NamedTuple):
-    """Proposed view of a board.
+    """Proposed view of a board, which lowers a camera's uncertainty of projection.
 
     Attributes:
         text: the view in words.
         before: median uncertainty of projection without it, pixels.
-        after: the same with it and the proposals before it.
+        after: median uncertainty with it and the proposals before it, pixels.
     """
 
     text: str

@@ -24,7 +24,7 @@ ON_A_LINE = 0.01
 
 @dataclass(frozen=True)
 class Board:
-    """Flat grid of points.
+    """Base class of calibration boards: a flat grid of points in the plane z = 0, x across, y down.
 
     Attributes:
         columns: points in a row.
@@ -55,11 +55,11 @@ class Board:
 
     @cached_property
     def symmetries(self) -> tuple[Int[np.ndarray, " n"], ...]:
-        """Renumberings of the points under rotations of the board, the identity first; only that one with
-        markers.
+        """Renumberings of the points under rotations that map the board onto itself, the identity first.
 
         A detector may number the points in any of these ways: colours do not disambiguate them, as they are
-        inverted in some images (near infrared).
+        inverted in some images (near infrared). Each is an array with the new number of every point. Boards
+        with markers have the identity only.
         """
         if self.identified:
             return (np.arange(len(self.points)),)
@@ -103,8 +103,8 @@ class MarkedBoard(Board):
     """Board whose points are identified by markers: a part of it is enough, its orientation is unambiguous.
 
     Attributes:
-        dictionary: name of OpenCV's dictionary, such as "4x4_50".
-        markers: numbers of its markers, in order.
+        dictionary: name of OpenCV's dictionary of markers, such as "4x4_50".
+        markers: number in the dictionary of each marker of the board, in the board's order.
     """
 
     dictionary: str
@@ -186,9 +186,10 @@ class Charuco(MarkedBoard):
 
 @dataclass(frozen=True)
 class AprilGrid(MarkedBoard):
-    """Kalibr's grid of AprilTags; `columns` x `rows` counts all tags' corners, `spacing` is twice the gap.
+    """Kalibr's grid of AprilTags. Its points are the corners of all tags, four each.
 
-    Tags are numbered row by row from below.
+    Tags are numbered row by row from below. `columns` and `rows` count points, two for each tag; `spacing` is
+    twice the gap between two tags, metres.
 
     Attributes:
         tag: side of a tag, metres.

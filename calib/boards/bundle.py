@@ -46,12 +46,12 @@ Masks = Mapping[str, Bool[np.ndarray, " _"]]
 
 
 class Observations(NamedTuple):
-    """Points that one camera observed.
+    """Board points that one camera observed, of all its images.
 
     Attributes:
         block: index of each point's board pose.
-        p: position on the board, metres.
-        x: pixel.
+        p: position of each on the board, metres.
+        x: pixel of each.
     """
 
     block: Int[np.ndarray, " n"]
@@ -61,16 +61,16 @@ class Observations(NamedTuple):
 
 @dataclass(frozen=True)
 class BundleProblem:
-    """Cameras, boards and observations.
+    """Bundle adjustment problem: cameras, board poses and observed points.
 
     Attributes:
         cameras: cameras by name.
-        boards: `world_from_board`, a batch.
+        boards: poses `world_from_board`, a batch, one for each moment.
         seen: observations by camera.
         frames: moment of each board pose.
-        free: parameters that may change.
-        sigma: noise along x or y by camera, pixels.
-        priors: priors by camera.
+        free: mask by camera of the parameters that may change, in the order of `parameter_names`.
+        sigma: standard deviation of the noise along x or y by camera, pixels; empty before it is estimated.
+        priors: priors of parameters by camera.
         deformation: shapes of the boards, adjusted with the cameras; None for flat boards.
     """
 
@@ -130,8 +130,14 @@ class BundleProblem:
 
     @cached_property
     def loss(self) -> float:
-        """Robust loss: the sum over residuals of s standard deviations of s^2 / 2 up to k, k^2 (1/2 + log(s /
-        k)) beyond, plus priors."""
+        """Compute the robust loss that the adjustment minimises; `sigma` must be known.
+
+        A residual of length s, in standard deviations, costs s^2 / 2 up to k = `ROBUST`, and
+        k^2 (1/2 + log(s / k)) beyond. Priors of cameras and of board shapes are added.
+
+        Returns:
+            The sum over all points.
+        """
         total = sum(prior.loss(self.cameras[name]) for name, prior in self.priors.items())
         if self.deformation is not None:
             total += self.deformation.loss()
@@ -142,7 +148,14 @@ class BundleProblem:
         return total
 
     def of_boards(self, kept: Bool[np.ndarray, " b"]) -> BundleProblem:
-        """Return the problem with the boards of a mask only."""
+        """Select board poses, with the points that were observed on them.
+
+        Args:
+            kept: mask of the board poses.
+
+        Returns:
+            The smaller problem, with the same cameras.
+        """
         index, observations = np.cumsum(kept) - 1, {}
         for name, s in self.seen.items():
             mine = kept[s.block]
@@ -156,8 +169,15 @@ class BundleProblem:
         )
 
     def stepped(self, change: Float[np.ndarray, " c"], boards: Float[np.ndarray, "b 6"]) -> BundleProblem:
-        """Return the problem after a step of its free parameters (deformations last) and of the boards' poses
-        (b, 6)."""
+        """Change the free parameters and the boards' poses by a step.
+
+        Args:
+            change: steps of the cameras' free parameters, then of the boards' shapes.
+            boards: steps of each board's pose: rotation vector in radians, translation in metres.
+
+        Returns:
+            The problem after the step.
+        """
         cameras, offset = {}, 0
         for name, camera in self.cameras.items():
             full = np.zeros(len(self.free[name]))
@@ -175,7 +195,7 @@ class BundleProblem:
 
 
 class InitialRig(NamedTuple):
-    """Initial values of a fit.
+    """Initial values of a bundle adjustment.
 
     Attributes:
         cameras: cameras by name.
@@ -195,8 +215,9 @@ class InitialRig(NamedTuple):
     deformation: BoardDeformation | None = None
 
     def problem(self, board: Board) -> BundleProblem:
-        """Make the bundle adjustment problem, all parameters free except the first camera's pose without
-        priors.
+        """Make the bundle adjustment problem.
+
+        All parameters are free, except the first camera's pose if there are no priors.
 
         Returns:
             The problem, without noise levels.
@@ -284,7 +305,11 @@ class Linearised(NamedTuple):
 
 
 def linearised(problem: BundleProblem) -> dict[str, Linearised]:
-    """Compute the weighted residuals and derivatives of each camera, by name."""
+    """Linearise a problem about its present values; `sigma` must be known.
+
+    Returns:
+        Residuals and derivatives by camera, weighted by robustness and noise.
+    """
     shapes = 0 if problem.deformation is None else len(problem.deformation)
     first, rows = 0, {}
     total = len(problem.names) + shapes
@@ -369,7 +394,14 @@ class NormalEquations:
 
 
 def normal_equations(problem: BundleProblem, parts: Mapping[str, Linearised]) -> NormalEquations:
-    """Assemble the Gauss-Newton equations of free camera parameters, deformations and board poses."""
+    """Assemble the Gauss-Newton equations of free camera parameters, board shapes and board poses.
+
+    Args:
+        parts: result of `linearised`.
+
+    Returns:
+        The equations, priors included.
+    """
     shapes = 0 if problem.deformation is None else len(problem.deformation)
     b, c = len(problem.frames), len(problem.names) + shapes
     H, g = np.zeros((c, c)), np.zeros(c)
@@ -396,10 +428,15 @@ def normal_equations(problem: BundleProblem, parts: Mapping[str, Linearised]) ->
 def block_sums(
     block: Int[np.ndarray, " n"], values: Float[np.ndarray, " n *k"], count: int
 ) -> Float[np.ndarray, " b *k"]:
-    """Sum values by their block, of which there are `count`.
+    """Sum values that belong to the same block.
+
+    Args:
+        block: block of each value, 0 to `count` - 1.
+        values: values (n, *k).
+        count: number of blocks.
 
     Returns:
-        Sums (b, *k).
+        Sums (count, *k); 0 for a block without values.
     """
     marks = csr_array((np.ones(len(block)), (block, np.arange(len(block)))), (count, len(block)))
     return np.asarray(marks @ values.reshape(len(values), -1)).reshape(count, *values.shape[1:])
@@ -436,9 +473,13 @@ def intrinsic_values(camera: Camera) -> Float[np.ndarray, " p"]:
 
 
 def changed(camera: Camera, change: torch.Tensor) -> Camera:
-    """Return the camera after a change of all its parameters, in the order of `parameter_names`.
+    """Change a camera's parameters.
 
-    Lens coefficients stay within their model's bounds, such as 0 for unified's xi.
+    Args:
+        change: changes of all parameters, in the order of `parameter_names`; rotations in radians.
+
+    Returns:
+        The camera; lens coefficients stay within their model's bounds, such as 0 for unified's xi.
     """
     sizes = parameter_sizes(camera)
     moved = Rig({"": camera}).perturbed(dict(zip(sizes, change.split(list(sizes.values())))))[""]
@@ -541,8 +582,11 @@ class CameraPrior(NamedTuple):
 
 
 def typical_sizes(camera: Camera) -> Float[np.ndarray, " p"]:
-    """Return typical errors of a camera's parameters before any measurement, in the order of
-    `parameter_names`."""
+    """Return typical errors of a camera's parameters before any measurement.
+
+    Returns:
+        Errors in the order of `parameter_names`: radians, metres, pixels, and numbers of the lens.
+    """
     lens = camera.distortion
     coefficients = () if lens is None else typical_coefficients(lens)
     scaled = lens is not None and term(lens, 0) == "xi"  # in the middle, by 1 / (1 + xi)

@@ -51,12 +51,12 @@ Map = Callable[[Float[np.ndarray, "n 2"]], Float[np.ndarray, "n 2"]]
 
 
 class EdgeGeometry(NamedTuple):
-    """The two edges through each corner.
+    """Geometry of the two edges through each chessboard corner.
 
     Attributes:
-        along: direction of each edge, pixels for each square.
+        along: tangent of each edge, pixels for each square.
         normal: unit normal, towards the next square.
-        curvature: pixels along the normal by which the edge leaves its tangent, for each square pixel.
+        curvature: pixels along the normal by which the edge leaves its tangent, per squared pixel along it.
     """
 
     along: Float[np.ndarray, "n 2 2"]
@@ -100,7 +100,7 @@ def smooth_map(p: Float[np.ndarray, "n 2"], x: Float[np.ndarray, "n 2"], good: B
         good: points to fit to, 4 or more.
 
     Returns:
-        Function from board positions (n, 2) to pixels (n, 2).
+        Function from board positions (n, 2), in the unit of p, to pixels (n, 2).
     """
 
     def weigh(rest: torch.Tensor) -> torch.Tensor:

@@ -28,13 +28,13 @@ STEP = 1e-5
 
 @dataclass(frozen=True)
 class BoardDeformation:
-    """Shapes of boards.
+    """Shapes of boards that are not flat or not printed true.
 
     Attributes:
         values: stretch (y / x - 1) and curvatures xx, xy, yy (1/m, positive where the middle lies in front)
             of each board.
-        middle: each board's middle, metres.
-        part: board of each block.
+        middle: middle (x, y) of each board, metres.
+        part: number of the board at each board pose.
     """
 
     values: Float[np.ndarray, "k 4"]
@@ -53,7 +53,8 @@ class BoardDeformation:
         """Deform points of flat boards.
 
         Args:
-            part: board of each point.
+            p: points of flat boards, metres.
+            part: number of each point's board.
 
         Returns:
             Points in their board's frame, metres.
@@ -63,10 +64,14 @@ class BoardDeformation:
     def jacobian(
         self, p: Float[np.ndarray, "n 3"], part: Int[np.ndarray, " n"]
     ) -> Float[np.ndarray, "n 3 s"]:
-        """Differentiate the deformed points by all values, by central differences.
+        """Differentiate the deformed points by the shapes, by central differences.
+
+        Args:
+            p: points of flat boards, metres.
+            part: number of each point's board.
 
         Returns:
-            Derivatives (n, 3, s).
+            Derivatives (n, 3, s) by all `values`, board by board; 0 for other boards.
         """
         jacobian = np.zeros((len(p), 3, *self.values.shape))
         rows, middle, values = np.arange(len(p)), self.middle[part], self.values[part]
@@ -101,11 +106,15 @@ def _deformed(p: np.ndarray, middle: np.ndarray, values: np.ndarray) -> np.ndarr
 def is_significant(
     values: Float[np.ndarray, " s"], covariance: Float[np.ndarray, "s s"], frames: int
 ) -> bool:
-    """Test whether shapes differ from flat by more than the jackknife over frames explains (Hotelling's
-    test).
+    """Test whether boards' shapes differ significantly from flat, by Hotelling's test.
+
+    Args:
+        values: stretches and curvatures.
+        covariance: covariance of these by a jackknife over frames.
+        frames: number of frames.
 
     Returns:
-        True for a chance below `SIGNIFICANCE`.
+        True if chance explains them with a probability below `SIGNIFICANCE`.
     """
     count = len(values)
     squared = float(values @ np.linalg.solve(covariance, values))
@@ -119,6 +128,8 @@ def described(
     """Yield sentences on boards whose estimated stretch or bend exceeds three standard deviations.
 
     Args:
+        shape: shapes of the boards.
+        deviations: standard deviation of each of its values.
         extents: width and height of each board, metres.
     """
     for k, (extent, deviation) in enumerate(zip(extents, deviations)):

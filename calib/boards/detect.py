@@ -77,11 +77,11 @@ class Detection(NamedTuple):
 
 @dataclass(frozen=True)
 class BoardViews:
-    """Detections of one camera.
+    """Detections of a board in the images of one camera.
 
     Attributes:
-        hw: image size.
-        seen: detected points by moment.
+        hw: height and width of the images, pixels.
+        seen: detected points by moment; images without the board are missing.
     """
 
     hw: HW
@@ -115,7 +115,7 @@ def explain(images: Iterable[Grey], board: Board, *, confirmed: bool = False) ->
     """Guess the likeliest reason why a board was not found in images.
 
     Args:
-        images: the images.
+        images: grey images, uint8.
         board: the board.
         confirmed: True if other images show it, so that it is not another board.
 
@@ -442,7 +442,7 @@ DetectedImage = tuple[HW, dict[FrameKey, Detection]]
 
 
 class CollectedViews(NamedTuple):
-    """Detections in a folder of images.
+    """Detections of a board in a folder of images.
 
     Attributes:
         views: detections by camera.
@@ -466,7 +466,8 @@ def collect_folder(
 
     Args:
         patterns: file name patterns by camera; None derives cameras from folders or names.
-        progress: wraps the iterable of results and their number, to show progress.
+        progress: function of the iterable of results and their number that yields them, to show progress;
+            None for none.
 
     Returns:
         Detections, images and notes.
@@ -524,8 +525,13 @@ def board_views(
 ) -> BoardViews:
     """Combine the detections in a camera's images.
 
+    Args:
+        name: name of the camera, for messages.
+        moments: its images by moment.
+        images: size and detections of each, as `detected` returns them.
+
     Returns:
-        The views.
+        The detections by moment.
 
     Raises:
         ValueError: if the images differ in size.

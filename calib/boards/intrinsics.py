@@ -52,13 +52,13 @@ OpenCVSolution = tuple[np.ndarray, np.ndarray, list[np.ndarray], list[np.ndarray
 
 @dataclass(frozen=True)
 class CalibratedViews:
-    """One calibrated camera with its views.
+    """One calibrated camera with its detections of a board.
 
     Attributes:
         name: name of the camera.
         camera: the camera, at the origin.
-        views: its detections.
-        poses: `cam_from_board` by moment.
+        views: detections by moment.
+        poses: poses `cam_from_board` by moment, metres.
     """
 
     name: str
@@ -68,10 +68,13 @@ class CalibratedViews:
 
 
 def initial_camera(name: str, views: BoardViews, board: Board, lens: Lens) -> CalibratedViews:
-    """Estimate a camera's intrinsics, lens and board poses from its own images, and drop outlying points.
+    """Estimate a camera's intrinsics, lens and board poses from its own images, by OpenCV.
+
+    Args:
+        lens: name of the lens model.
 
     Returns:
-        The camera with its remaining points.
+        The camera, with board poses and the detections without outlying points.
 
     Raises:
         ValueError: for fewer than three images with a board (one, for points that are not coplanar), and if
@@ -96,8 +99,12 @@ def initial_camera(name: str, views: BoardViews, board: Board, lens: Lens) -> Ca
 def without_bad_images(views: BoardViews, initial: CalibratedViews, board: Board) -> BoardViews:
     """Drop the images whose reprojection error is far above the others'.
 
+    Args:
+        views: all detections.
+        initial: camera and board poses that were estimated from them.
+
     Returns:
-        The remaining views.
+        The detections in the remaining images: those below 2 pixels, or ten times the median error.
     """
     rms = {}
     for key, pose in initial.poses.items():

@@ -34,13 +34,13 @@ MOST_CANDIDATES = 15
 
 
 class RelativePose(NamedTuple):
-    """Relative pose of two cameras.
+    """Relative pose of two cameras, with the frames in which both see the board.
 
     Attributes:
-        a_from_b: the pose.
+        a_from_b: pose of the first camera from the second, metres.
         agreeing: shared frames that agree with it.
         shared: all shared frames.
-        score: number of agreeing frames, then minus their total error in pixels.
+        score: number of agreeing frames, then minus their total error in pixels; larger is better.
     """
 
     a_from_b: Pose
@@ -91,7 +91,13 @@ class StartDeviations:
 
 
 def start_prior(camera: Camera, deviations: StartDeviations) -> CameraPrior:
-    """Make the prior of a camera from its start, completed by that of an ordinary camera.
+    """Make the prior of a camera whose parameters are roughly known from a start rig.
+
+    Lens and aspect ratio have the prior of an ordinary camera.
+
+    Args:
+        camera: camera of the start rig.
+        deviations: standard deviations about it.
 
     Returns:
         The prior, with the start's pose as mean.
@@ -133,10 +139,15 @@ def rig_near_start(
     lens: Mapping[str, Lens],
     deviations: StartDeviations,
 ) -> InitialRig:
-    """Initialise cameras at the start's positions, rotated to agree on the boards, and boards in the start's
-    world.
+    """Initialise cameras at a start rig's positions, rotated so that they agree on the boards.
 
     The camera with most images keeps its orientation.
+
+    Args:
+        start: roughly known rig.
+        views: detections by camera.
+        lens: name of the lens model by camera.
+        deviations: standard deviations about the start.
 
     Returns:
         Initial values, with priors about the start.
@@ -211,7 +222,7 @@ def _aligned(cameras: Sequence[CalibratedViews], board: Board) -> dict[str, Pose
 
 
 def pair_pose(a: CalibratedViews, b: CalibratedViews, board: Board) -> RelativePose | None:
-    """Find the relative pose of two cameras that most shared frames agree with.
+    """Find the relative pose of two cameras with which most shared frames agree.
 
     Returns:
         The pose; None without shared frames.

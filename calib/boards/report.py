@@ -73,13 +73,13 @@ def report_html(
     detected: Mapping[str, BoardViews] | None = None,
     photos: Photos | None = None,
 ) -> str:
-    """Compose the report: notes, accuracy by camera, pair and image, coverage, residual fields, uncertainty,
-    the rig.
+    """Compose the HTML report of a calibration: verdict, notes, accuracy, coverage, residuals, uncertainty.
 
     Args:
         notes: sentences at the top; "No advice." without any.
-        detected: all detections by camera; with `photos`, the images that fit worst are drawn.
-        photos: images by camera and moment.
+        detected: all detections by camera; with `photos`, the images that fit worst are drawn. None to draw
+            none.
+        photos: images by camera and moment; None to draw none.
 
     Returns:
         The page as HTML, figures embedded.
@@ -150,8 +150,11 @@ def by_cameras(notes: Iterable[str]) -> list[str]:
 
 
 def summary(calibration: Calibration) -> str:
-    """Summarise a calibration in a sentence or two: numbers of cameras, frames and points, errors
-    in pixels."""
+    """Summarise a calibration: numbers of cameras, frames and points, reprojection and epipolar errors.
+
+    Returns:
+        A sentence or two, errors in pixels.
+    """
     points = sum(len(observed.x) for observed in calibration.fit.problem.seen.values())
     cameras, frames = len(calibration.views), len(calibration.frames)
     text = (
@@ -217,6 +220,9 @@ def _depths(covers: Iterable[Coverage]) -> tuple[float, float]:
 
 def camera_table(calibration: Calibration, covers: Mapping[str, Coverage]) -> str:
     """Format a table with one row for each camera: points, residuals, parameters with standard deviations.
+
+    Args:
+        covers: coverage by camera.
 
     Returns:
         HTML.
@@ -298,7 +304,11 @@ def _table(rows: Sequence[Mapping[str, str]]) -> str:
 
 
 def draw_scene(calibration: Calibration) -> Figure:
-    """Draw the rig alone, and the rig with the boards from above."""
+    """Draw the rig alone, and the rig with the boards from above.
+
+    Returns:
+        The figure.
+    """
     figure = draw_rig(Rig({escaped(n): c for n, c in calibration.rig.cameras.items()}))
     figure.set_size_inches(10.4, 4.6)
     axes: Any = figure.axes[0]
@@ -325,7 +335,11 @@ def draw_scene(calibration: Calibration) -> Figure:
 
 
 def draw_by_image(calibration: Calibration) -> Figure:
-    """Plot the root mean square residual of every image of every camera, by frame."""
+    """Plot the root mean square residual of every image of every camera, by frame.
+
+    Returns:
+        The figure.
+    """
     frames = calibration.frames
     figure = Figure(figsize=(10.4, 2.8), layout="constrained")
     axes = figure.subplots()
@@ -343,8 +357,15 @@ def draw_by_image(calibration: Calibration) -> Figure:
 
 
 def draw_camera(calibration: Calibration, name: str, covered: Coverage) -> Figure:
-    """Draw one camera's observed points, median residuals over the image (enlarged), and scatter of
-    residuals."""
+    """Draw one camera's observed points, median residuals over the image (enlarged), and residuals' scatter.
+
+    Args:
+        name: name of the camera.
+        covered: coverage of its image; cells without points are red.
+
+    Returns:
+        The figure.
+    """
     observed, r = calibration.fit.problem.seen[name], calibration.fit.problem.residuals[name]
     hw = calibration.views[name].hw
     figure = Figure(
@@ -462,8 +483,16 @@ def draw_images(
     detected: Mapping[str, BoardViews],
     photos: Photos,
 ) -> Figure:
-    """Draw images (camera, moment) with used points (dots), left-out ones (red circles) and enlarged
-    residuals."""
+    """Draw images with used points (dots), left-out ones (red circles) and enlarged residuals.
+
+    Args:
+        chosen: camera and moment of each image, at least one.
+        detected: all detections by camera.
+        photos: images by camera and moment.
+
+    Returns:
+        The figure.
+    """
     columns = min(3, len(chosen))
     rows = -(-len(chosen) // columns)
     figure = Figure(figsize=(10.4, 2.9 * rows), layout="constrained")

@@ -32,7 +32,7 @@ class Calibration:
         board: the board.
         fit: result of the bundle adjustment.
         single: reprojection error (RMS, pixels) of each camera calibrated alone; empty with a start.
-        epipolar: epipolar errors by pair, undistorted pixels.
+        epipolar: distances of matched points from their epipolar lines by pair, undistorted pixels.
         notes: sentences on the calibration.
     """
 
@@ -84,10 +84,12 @@ def calibrate(
     """Calibrate a rig from detected board points.
 
     Args:
+        views: detections by camera.
+        board: the board.
         lens: lens model of all cameras, or of each by name.
         start: rig known to within `deviations`; one image of each camera is then enough, and the start's
             world and lenses are kept.
-        deviations: deviations from the start; None for the defaults.
+        deviations: standard deviations about the start; None for the defaults.
 
     Returns:
         The calibration; its world is the first camera's frame, or the start's.

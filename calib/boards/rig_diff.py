@@ -59,16 +59,16 @@ class Difference(NamedTuple):
 
 
 class Significance(NamedTuple):
-    """Test of the difference against the calibrations' covariances.
+    """Test of two rigs' difference against their calibrations' covariances.
 
     Attributes:
         chi_square: chi-square of the difference.
-        freedom: its degrees of freedom.
-        probability: probability of a larger one by chance.
-        camera: camera whose motion explains most of it.
-        degrees: rotation of that camera.
-        metres: shift of that camera.
-        share: share of chi-square that this motion explains.
+        freedom: degrees of freedom of chi-square.
+        probability: probability of a larger chi-square by chance.
+        camera: camera whose motion explains most of the difference.
+        degrees: rotation of that camera, degrees.
+        metres: shift of that camera, metres.
+        share: share of chi-square that this motion explains, 0..1.
     """
 
     chi_square: float
@@ -93,7 +93,7 @@ class RigDifference:
         cameras: difference of pixels by camera.
         depths: difference of depths by the other cameras that see alpha's points.
         alpha: camera of the depths.
-        motion: rigid motion from the first rig's world to the second's.
+        motion: rigid motion from the first rig's world to the second's that is taken out before comparing.
         significance: result of the test; None without covariances.
         unit: unit of depths; "baselines" for rigs of unknown scale.
     """
@@ -356,8 +356,11 @@ def _sizes(values: np.ndarray, sigma: np.ndarray, unit: str = "") -> str:
 
 
 def draw_difference(difference: RigDifference) -> Figure:
-    """Draw the differences of pixels at the nearest and farthest depth, and those of depths by pair, in
-    percent."""
+    """Draw differences of pixels by camera and of depths by pair, at the nearest and the farthest depth.
+
+    Returns:
+        The figure; pixels in pixels, depths in percent.
+    """
     maps = [(f"{n}: pixels", c, np.linalg.norm(c.change, axis=1)) for n, c in difference.cameras.items()]
     maps += [
         (f"depth by {difference.alpha} and {n}: %", d, 100 * d.change) for n, d in difference.depths.items()

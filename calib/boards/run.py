@@ -38,11 +38,11 @@ COLOURS = (60, 60, 230), (80, 200, 80)
 
 
 class CalibrationOutput(NamedTuple):
-    """Output of a calibration.
+    """Output of a calibration from a folder of images.
 
     Attributes:
-        messages: verdict, summary and notes.
-        written: files written.
+        messages: sentences: verdict, summary and notes.
+        written: paths of the files written.
     """
 
     messages: list[str]
@@ -61,18 +61,22 @@ def calibrate_photos(
     deviations: StartDeviations | None = None,
     progress: Progress | None = None,
 ) -> CalibrationOutput:
-    """Calibrate from a folder of images; write the rig file and its HTML report, and a covariance file if the
-    parameters are observable.
+    """Calibrate from a folder of images, and write a rig file with its HTML report.
+
+    A covariance file is written too if the parameters are observable.
 
     Args:
         photos: folder of images; see `find_photos`.
         board: board, or several that may be in the images at once, as text.
         out: rig file (.yaml); the others get its name with other suffixes. All appear together.
-        patterns: file name patterns by camera.
+        patterns: file name patterns by camera; None derives cameras from folders or names.
         lens: lens model; "auto" chooses for each camera the model that its images support.
-        depth: depth range of the rig, metres; None keeps the start's.
+        depth: depth range of the rig, metres; None keeps the start's, if there is one.
         start: file of a rig known to within `deviations`; one image of each camera is then enough, such as a
-            file named like the camera.
+            file named like the camera. None for none.
+        deviations: standard deviations about the start; None for the defaults.
+        progress: function of the iterable of images and their number that yields them, to show progress; None
+            for none.
 
     Returns:
         Messages and files.
@@ -126,14 +130,14 @@ def calibrate_photos(
 
 @dataclass
 class Session:
-    """State of a calibration while images are taken.
+    """State of a live calibration, repeated while images arrive in a folder.
 
     Attributes:
         board: the board.
         lens: lens model of all cameras.
-        seen: detections by camera and moment.
+        seen: size and detections of each image, by camera and moment.
         calibration: last calibration; None if it failed.
-        problem: reason why there is none; empty if there is one.
+        problem: reason why there is no calibration; empty if there is one.
         photos: images by camera and moment.
     """
 
@@ -163,6 +167,9 @@ class Session:
 
     def views(self) -> dict[str, BoardViews]:
         """Combine the detections of all cameras that have images.
+
+        Returns:
+            Detections by camera.
 
         Raises:
             ValueError: if a camera's images differ in size.
@@ -197,12 +204,16 @@ def watch(
     interval: float = 1.0,
     finished: Callable[[], bool] = lambda: False,
 ) -> Session:
-    """Write a page about the images in a folder whenever some arrive, until `finished` or Ctrl-C.
+    """Calibrate again and write a page whenever images arrive in a folder, until `finished` or Ctrl-C.
 
-    It shows detections, coverage, current uncertainty, and the view that would help most.
+    The page shows detections, coverage, current uncertainty, and the view that would help most.
 
     Args:
+        page: HTML file to write.
+        patterns: file name patterns by camera; None derives cameras from folders or names.
+        lens: lens model of all cameras.
         interval: seconds between looks at the folder.
+        finished: function that returns True to stop.
 
     Returns:
         The final state.

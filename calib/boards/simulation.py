@@ -37,10 +37,12 @@ WALL = 90
 def simulate_photos(
     rig: Rig, board: Board, folder: Path, *, count: int = 12, noise: float = 1.5, seed: int = 0
 ) -> Pose:
-    """Render a board in `count` random poses into `folder`/CAMERA/000.png and so on.
+    """Render photographs of a board in `count` random poses, into `folder`/CAMERA/000.png and so on.
 
     Args:
-        noise: standard deviation in grey values of 255.
+        count: number of poses, and of images of each camera.
+        noise: standard deviation of the noise, in grey values of 255.
+        seed: seed of poses and noise.
 
     Returns:
         The true `world_from_board`, a batch (count).
@@ -68,6 +70,12 @@ def simulate_photos(
 @torch.no_grad()
 def board_poses(rig: Rig, board: Board, count: int, *, seed: int = 0) -> Pose:
     """Draw random board poses whose centres all cameras see, at several depths and tilts.
+
+    Args:
+        rig: calibrated cameras that see the board.
+        board: the board.
+        count: number of poses, 1 or more.
+        seed: random seed.
 
     Returns:
         `world_from_board`, a batch (count).
@@ -105,7 +113,7 @@ def photograph(
     """Render the image of a printed board by a camera, through its lens, as the mean of four samples a pixel.
 
     Args:
-        rays: `fine_rays(camera)`, if precomputed.
+        rays: result of `fine_rays(camera)`; None to compute it.
 
     Returns:
         Grey image (h, w), uint8, without noise; `WALL` around the print.
@@ -144,6 +152,9 @@ def _resolution(camera: Camera, cam_from_board: Pose, board: Board) -> float:
 @lru_cache(maxsize=32)
 def printed(board: Board, dpi: float) -> tuple[UInt8[np.ndarray, "h w"], float, Float[np.ndarray, "2"]]:
     """Draw the printed board as an image.
+
+    Args:
+        dpi: pixels for each inch.
 
     Returns:
         Grey values (uint8), pixels for each metre, and the pixel (x, y) of the board's first point.

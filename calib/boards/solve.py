@@ -76,6 +76,9 @@ def calibrate_single(
     """Calibrate one camera's intrinsics and lens from its images.
 
     Args:
+        name: name of the camera.
+        views: its detections.
+        lens: lens model.
         final: False accepts a poorly constrained focal length, as other cameras will add constraints.
 
     Returns:
@@ -117,6 +120,9 @@ def solve(initial: InitialRig, board: Board, *, final: bool = True) -> Solved:
     Parameters fixed before the fit, when the noise was overestimated, may return after it; boards that are
     clearly neither flat nor printed true are deformed.
 
+    Args:
+        final: False accepts a focal length that is not observable.
+
     Returns:
         The solution, with a note for each fixed parameter.
 
@@ -148,13 +154,18 @@ def solve_inliers(
     *,
     final: bool = True,
 ) -> Solved:
-    """Run `solve` in rounds, each without the `detected` points that the round before shows to be outliers.
+    """Run `solve` in rounds, each without the points that the round before shows to be outliers.
+
+    Args:
+        initial: initial values, with the points of the first round.
+        detected: all detections by camera.
+        final: False accepts a focal length that is not observable.
 
     Returns:
         The last solution.
 
     Raises:
-        ValueError: as `solve`.
+        ValueError: for a `final` fit without an observable focal length.
     """
     solved = solve(initial, board, final=final)
     for _ in range(ROUNDS - 1):
@@ -175,10 +186,13 @@ def solve_inliers(
 def observable(problem: BundleProblem, *, final: bool) -> tuple[BundleProblem, list[str]]:
     """Fix unobservable parameters of lenses and principal points at their defaults, the worst first.
 
-    They are judged by pixels and stated priors, in units of typical sizes.
+    Observability follows from the pixels and the priors of a start rig, in units of typical sizes.
+
+    Args:
+        final: False to leave an unobservable focal length free.
 
     Returns:
-        The problem, and a note for each fixed parameter.
+        The problem with fewer free parameters, and a note for each fixed one.
 
     Raises:
         ValueError: for an unobservable focal length if `final`.
@@ -249,6 +263,7 @@ def adjust(problem: BundleProblem, *, rounds: int = 4, equal_noise: bool = False
     the camera that starts worst.)
 
     Args:
+        rounds: largest number of rounds with noise estimated from residuals.
         equal_noise: True for one noise of all cameras: where the board moves between exposures, a camera with
             a noise of its own would attract every board pose.
 
@@ -340,13 +355,13 @@ def _covariance(problem: BundleProblem) -> Array | None:
 
 
 class FrameMisfit(NamedTuple):
-    """Frame that does not fit a camera.
+    """Frame whose residuals in one camera are conspicuously large.
 
     Attributes:
-        camera: the camera.
-        frame: the moment.
-        rms: its residuals (RMS, pixels).
-        typical: residuals of the camera's median frame.
+        camera: name of the camera.
+        frame: moment of the frame.
+        rms: root mean square length of the frame's residuals, pixels.
+        typical: root mean square of the camera's median frame, pixels.
     """
 
     camera: str
@@ -356,7 +371,11 @@ class FrameMisfit(NamedTuple):
 
 
 def frame_rms(problem: BundleProblem) -> dict[str, dict[FrameKey, float]]:
-    """Compute the root mean square residual in pixels, by camera and frame."""
+    """Compute the root mean square length of the residuals of each camera's image of each frame.
+
+    Returns:
+        Pixels, by camera and then by moment; moments at which a camera saw no board are missing.
+    """
     by_camera = {}
     for name, r in problem.residuals.items():
         block = problem.seen[name].block
@@ -401,10 +420,11 @@ def solve_together(initial: InitialRig, board: Board, singles: Mapping[str, Solv
     A few images that contradict the others (boards detected a square off, for instance) are left out.
 
     Args:
-        singles: each camera's own solution.
+        initial: initial values of all cameras and boards.
+        singles: solution of each camera alone, by name.
 
     Returns:
-        The solution; for one camera its own.
+        The solution; that of the single camera if there is only one.
 
     Raises:
         ValueError: if a camera contradicts the others altogether.

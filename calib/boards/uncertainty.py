@@ -60,7 +60,7 @@ class RigCovariance:
         names: parameters as in `Rig.parameters` with the index of a component, "left.rotation.0",
             "left.focal.1": rotation vectors in radians about the camera's axes, metres, pixels, distortion
             coefficients.
-        matrix: the covariance.
+        matrix: covariance of these, in their units.
     """
 
     names: tuple[str, ...]
@@ -82,7 +82,8 @@ class RigCovariance:
         """Read a covariance file.
 
         Args:
-            rig: rig that the file must belong to; None does not check.
+            path: JSON file.
+            rig: rig to which the file must belong; None does not check.
 
         Returns:
             The covariance.
@@ -161,11 +162,11 @@ class Intrinsics(NamedTuple):
     """One camera's intrinsics with their uncertainty.
 
     Attributes:
-        camera: the camera in its own frame.
-        covariance: covariance of the free intrinsics.
-        free: mask of the free intrinsics among all parameters.
-        sigma: noise along x or y, pixels.
-        seen: some board points that it observed, in its frame, metres.
+        camera: the camera, at the origin.
+        covariance: covariance of the free intrinsics, in their units (pixels, lens coefficients).
+        free: mask of the free intrinsics among all parameters, in the order of `parameter_names`.
+        sigma: standard deviation of the noise along x or y, pixels.
+        seen: some board points that the camera observed, in its frame, metres.
     """
 
     camera: Camera
@@ -240,11 +241,11 @@ def compensation(by_pose: np.ndarray, moved: np.ndarray) -> np.ndarray:
     """Fit the camera motion whose effect on pixels is closest to given changes, in least squares.
 
     Args:
-        by_pose: derivatives by the pose (m, 2, 6).
-        moved: changes (m, 2, f), or (m, 2).
+        by_pose: derivatives (m, 2, 6) of pixels by the pose.
+        moved: changes of the pixels (m, 2, f), each of f to be fitted, or (m, 2) for one.
 
     Returns:
-        Motions (6, f).
+        Motions (6, f): rotation vector in radians, translation in metres.
     """
     return np.asarray(
         np.linalg.lstsq(by_pose.reshape(-1, 6), moved.reshape(len(by_pose) * 2, -1), rcond=None)[0]
@@ -264,13 +265,13 @@ def covered(
 
 
 class Jackknife(NamedTuple):
-    """Covariances from the disagreement of frames.
+    """Covariances of a bundle adjustment from the disagreement of its frames.
 
     Attributes:
-        covariance: covariance of the cameras' parameters.
-        left_out: the same by leaving out each frame in turn.
-        deformations: covariance of the boards' deformations.
-        step: deformations after a Gauss-Newton step.
+        covariance: covariance of the cameras' free parameters, by the corrected estimate.
+        left_out: covariance of these by a plain jackknife, which leaves out each frame in turn.
+        deformations: covariance of the boards' shapes.
+        step: boards' shapes after a Gauss-Newton step.
     """
 
     covariance: Float[np.ndarray, "c c"]
@@ -328,18 +329,18 @@ def _clustered(total: Array, H: Array, g: Array) -> Array:
 
 
 def with_disagreement(solved: Solved, board: Board, *, unchecked: bool = False) -> Solved:
-    """Raise a solution's covariance where frames disagree considerably, and add notes on that and on the
-    boards.
+    """Raise a solution's covariance where frames disagree considerably, and add notes on that and on boards.
 
     The raised covariance is the mean of the jackknife's, which few frames make noisy, and that of the points'
     noise scaled to the jackknife's level: the median over the parameters, as frames that disagree about a
     focal length say nothing of the lens.
 
     Args:
-        unchecked: True to raise it by `UNCHECKED` where frames are too few to tell.
+        unchecked: True to raise standard deviations by the factor `UNCHECKED` where frames are too few to
+            tell.
 
     Returns:
-        The solution.
+        The solution with that covariance, the factor in `raised`, and notes.
     """
     problem, covariance, notes = solved.problem, solved.covariance, list[str]()
     raised, frames = 1.0, len(problem.frames)

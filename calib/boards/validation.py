@@ -41,8 +41,7 @@ EQUAL = 0.01
 def epipolar_errors(
     rig: Rig, views: Mapping[str, BoardViews]
 ) -> dict[tuple[str, str], Float[np.ndarray, " _"]]:
-    """Compute epipolar errors by pair: the mean of the distances of each camera's points from the other's
-    lines.
+    """Compute epipolar errors by pair: distances of points from their lines, averaged over both directions.
 
     Returns:
         Errors in undistorted pixels, one for each common point; pairs without common points are absent.
@@ -94,10 +93,10 @@ def held_out_errors(
 
 
 def half_difference(fit: Solved, depth: float) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Compare the fits to every other frame with those to the rest.
+    """Compare the fit to every other frame with the fit to the rest.
 
     Args:
-        depth: metres.
+        depth: depth at which projections are compared, metres.
 
     Returns:
         By camera, pixels (n, 2) near points of both halves and differences (n, 2) of projections there,
@@ -132,7 +131,7 @@ def _difference(a: Camera, b: Camera, X: np.ndarray) -> Float[np.ndarray, "n 2"]
 
 @dataclass(frozen=True)
 class LensComparison:
-    """Held-out errors of the lens models of one camera.
+    """Errors of several lens models of one camera on held-out frames.
 
     Attributes:
         errors: mean square error of a coordinate (pixels²) of each frame, by model; empty for too few frames.
@@ -224,7 +223,16 @@ def _held_out(problem: BundleProblem, out: np.ndarray) -> Float[np.ndarray, " f"
 def left_out_notes(
     detected: Mapping[str, BoardViews], singles: Mapping[str, Solved], solved: Solved
 ) -> Iterator[str]:
-    """Yield notes on images and points that were left out, of each camera alone (`singles`) and together."""
+    """Yield notes on images and points that were left out.
+
+    Args:
+        detected: all detections by camera.
+        singles: solution of each camera alone.
+        solved: solution of all cameras together.
+
+    Yields:
+        Sentences "camera: note".
+    """
     for name, v in detected.items():
         used = singles[name].views[name]
         if rejected := [str(key) for key in v.seen if key not in used.seen]:
@@ -237,8 +245,17 @@ def left_out_notes(
 def start_notes(
     detected: Mapping[str, BoardViews], solved: Solved, deviations: StartDeviations, lens: Mapping[str, Lens]
 ) -> Iterator[str]:
-    """Yield notes on a calibration from a start: gains by the images, distance from the start, lenses, points
-    left out."""
+    """Yield notes on a calibration from a start rig.
+
+    Args:
+        detected: all detections by camera.
+        solved: solution of all cameras together.
+        deviations: standard deviations about the start.
+        lens: lens model by camera that was asked for.
+
+    Yields:
+        Sentences on gains by the images, distance from the start, lenses, and points left out.
+    """
     yield _gains(solved, deviations)
     for name, camera in solved.problem.cameras.items():
         if (distortion := camera.distortion) is not None and distortion.model != LENSES[lens[name]][0]:

@@ -135,14 +135,16 @@ def share_outside(rig: Rig, pairs: Pairs) -> float:
 def log_depths(
     after: Callable[[Tensor], Rig], rigs: Sequence[Rig], pairs: Pairs
 ) -> Callable[[Tensor], list[Tensor]] | None:
-    """Build the function from parameters to the logarithm of the depth of the points observable in all these
-    rigs.
+    """Build a function from a change of a rig's parameters to the logarithms of its points' depths.
 
     Args:
-        after: the rig after a change z of its parameters.
+        after: function from a change z of the parameters to the rig after it.
+        rigs: rigs in all of which a point's depth must be observable, for the point to be used.
+        pairs: matched points by pair of cameras.
 
     Returns:
-        A function of z with one tensor of logarithms, differentiable; None for fewer than `FEW` points.
+        A function of z that returns a list of one tensor, the logarithms of the depths in alpha,
+        differentiable in z; None for fewer than `FEW` points.
     """
     observable = ~torch.stack([observed_depths(rig, pairs) for rig in rigs]).isnan().any(0)
     if int(observable.sum()) < FEW:

@@ -96,9 +96,9 @@ class Diagnosis:
         matches: number of points used.
         healthy: True if the given rig fits the images.
         certain: True if all explanations as good as the named one lead to the same rig.
-        depth: near and far of the points by the named rig, as of `depth_seen`; None if that rig states a
+        depth: depth bounds (near, far) of the points by the named rig, in its unit; None if that rig states a
             depth range or too few points have depth.
-        beyond: number of points left out because a lens model of the given rig has ended there.
+        beyond: number of points left out because they lie beyond the range of a lens model of the given rig.
     """
 
     named: Hypothesis
@@ -138,7 +138,7 @@ class Diagnosis:
         ) + (f". As plausible as a drift, but not more: {others}" if others else "")
 
     def as_text(self) -> str:
-        """Return the verdict and the statistics before and after as lines of text."""
+        """Return the verdict and the statistics before and after as lines of text, joined by line breaks."""
         unit = length_unit(self.named.rig)
         lines = [self.verdict, f"as given: {self.before.as_text(unit)}"]
         if self.beyond:
@@ -189,7 +189,7 @@ def diagnose(rig: Rig, images: Images, matches: Pairs | None = None) -> Diagnosi
 
     Args:
         images: one image (C, H, W) in 0..1 per camera, by name; any size.
-        matches: matched points used instead of matching the images.
+        matches: matched points by pair of cameras, used instead of matching the images; None to match them.
 
     Returns:
         The mistake with its repaired rig, and what else was compared.
@@ -207,8 +207,12 @@ def diagnose(rig: Rig, images: Images, matches: Pairs | None = None) -> Diagnosi
 def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnosis:
     """Find the usual mistake, if any, in a rig, by points matched between images of these sizes.
 
+    Args:
+        sizes: height and width of each camera's image, which the rig may state otherwise.
+        pairs: matched points by pair of cameras.
+
     Returns:
-        As of `diagnose`.
+        The mistake with its repaired rig, and what else was compared.
 
     Raises:
         ValueError: for a rig that relates none of the pairs.

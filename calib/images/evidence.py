@@ -250,10 +250,14 @@ class DriftEvidence:
 
     @classmethod
     def from_points(cls, rig: Rig, pairs: Pairs, used: Bool[Tensor, " n"], noise: float) -> DriftEvidence:
-        """Fit the drift of a rig to those of the points that are `used`.
+        """Fit the drift of a rig to some of its matched points.
 
         Args:
+            used: mask of the points to use, among all points of all pairs.
             noise: standard deviation of the points' distances, pixels.
+
+        Returns:
+            The rig's drift with its evidence.
         """
         parameters = free_parameters(rig, cameras_of(rig, pairs), free=UNCERTAIN)
 

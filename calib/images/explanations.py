@@ -53,7 +53,7 @@ class Explanation(NamedTuple):
         return self.beyond >= max(self.wrong + FEW, 2 * self.wrong)
 
     def as_text(self, *, focal_lengths: bool = False) -> str:
-        """Return the explanation taken and what it leaves undetermined, in words.
+        """Return the explanation taken and what it leaves undetermined, as a phrase without a full stop.
 
         Args:
             focal_lengths: True if focal lengths are known, which fixes the proportions of depth.

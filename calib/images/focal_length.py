@@ -104,15 +104,15 @@ def _is_mirrored(matches: PointMatches) -> bool:
 
 @dataclass(frozen=True)
 class TwoViews:
-    """Two cameras of one size, a pose of beta from which changes count, and the points.
+    """Model of two uncalibrated cameras of one image size, whose parameters are changes from a start.
 
-    A change z has the log focal length, the log ratio, rotation (3), direction of the baseline (2), principal
-    points (4), radial terms (their mean and half their difference) and displacements (8), all in prior
-    deviations.
+    A change z has the log focal length, the log ratio of both, rotation (3), direction of the baseline (2),
+    principal points (4), radial terms (their mean and half their difference) and displacements (8), all in
+    prior standard deviations. At z = 0 the focal length is the assumed one, and the pose is `pose`.
 
     Attributes:
         hw: height and width of both images, pixels.
-        pose: beta from alpha, with a baseline of 1.
+        pose: pose at the start, beta from alpha, with a baseline of 1.
         points: matched points, pixels.
     """
 
@@ -160,7 +160,11 @@ class TwoViews:
         return [self.distances(z)]
 
     def distances(self, z: Float[Tensor, " k"]) -> Float[Tensor, " n"]:
-        """Compute the Sampson distances of the points after a change, pixels."""
+        """Compute the Sampson distances of the points from their epipolar lines after a change z.
+
+        Returns:
+            Signed distances in pixels, differentiable in z.
+        """
         change, pose = self.sigma * z, self.moved(z)
         f = self.length(z)
         rays = []

@@ -46,11 +46,11 @@ class UncalibratedRig(NamedTuple):
 
     Attributes:
         rig: views related by links; named `OPEN` if the points of some link leave its lines undetermined.
-        fits: links with the points that agree, and the points' distance from the rough map.
+        fits: links with the points that agree, and their reach along the lines from the rough map.
         distance: median distance of held-out points from their lines, pixels of beta.
         by_focal: True where the given focal lengths were used.
-        explained: what the points determine.
-        matches: all consistent matches.
+        explained: simplest explanation of the points, lines or one homography.
+        matches: all consistent matches, in pixels as recorded.
     """
 
     rig: Rig
@@ -103,15 +103,15 @@ def rig_from_images(
         images: one image (C, H, W) in 0..1 per camera, by name.
         focal: rough focal lengths in pixels by camera; None or missing ones are unknown.
         alpha: match only this camera with each other one; None for every two cameras.
-        matches: points of pairs of images used instead of matching these; of fewer than 20 points the rig
-            has a homography alone (`fit_homography`).
+        matches: points by pair of images used instead of matching these, None to match them; from fewer than
+            20 points the rig has a homography alone (`fit_homography`).
 
     Returns:
         The rig with statistics of its links.
 
     Raises:
-        ValueError: in one line, for images as of `match_cameras`, too few points, or a focal length that is
-            not positive or of no camera.
+        ValueError: in one line, for images that cannot be matched (too few, equal, without texture), too few
+            points, or a focal length that is not positive or of no camera.
     """
     focal = dict(focal or {})
     for name, length in focal.items():
@@ -160,7 +160,7 @@ def usable_matches(matches: Pairs, *, alpha: str | None = None) -> dict[tuple[st
         The matches, those of `alpha` first in their pairs.
 
     Raises:
-        ValueError: for matches of no use.
+        ValueError: for no matches, and if no pair has enough that agree.
     """
     if alpha is not None:
         turned = {(b, a): PointMatches(*points[::-1]) for (a, b), points in matches.items()}

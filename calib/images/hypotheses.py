@@ -142,10 +142,17 @@ def _centre_offset(view: LensView) -> float:
 
 
 def ignored_lens(rig: Rig, bare: Sequence[str], k1: float) -> Hypothesis:
-    """Build the hypothesis that distortion of about `k1` was ignored in all these cameras, which have none.
+    """Build the hypothesis that distortion of about `k1` was ignored in some cameras.
 
     k2 is 1.5 k1^2, as lenses tend to have it (a fisheye's r = theta has 1.8, ordinary wide ones about 1.3):
     one parameter, and one to one at any radius.
+
+    Args:
+        bare: names of the cameras, which have no lens.
+        k1: first radial coefficient of Brown-Conrady.
+
+    Returns:
+        The hypothesis, with the rig whose cameras have that lens.
     """
     words = f"distortion ignored: about k1 = {k1:.3f} in {', '.join(map(repr, bare))}"
     lens = Distortion("brown-conrady", torch.tensor([k1, 1.5 * k1**2, 0, 0], dtype=torch.float64))
@@ -154,10 +161,14 @@ def ignored_lens(rig: Rig, bare: Sequence[str], k1: float) -> Hypothesis:
 
 
 def from_degrees(R: Float[Tensor, "3 3"], turns: Int[Tensor, "*b"]) -> Float[Tensor, "*b 3 3"]:
-    """Compute the rotations whose vector was in degrees and was taken for radians, with whole turns added.
+    """Correct a rotation whose vector was in degrees and was taken for radians.
 
     Args:
-        turns: number of turns to add to the vector's length.
+        R: rotation as read.
+        turns: numbers of whole turns to add to its angle first, as a vector in degrees is longer than a turn.
+
+    Returns:
+        The corrected rotation for each number of turns.
     """
     vector = rotation_vector(R)
     angle = vector.norm()
@@ -166,9 +177,15 @@ def from_degrees(R: Float[Tensor, "3 3"], turns: Int[Tensor, "*b"]) -> Float[Ten
 
 
 def zoomed(rig: Rig, names: Sequence[str], factor: float) -> Hypothesis:
-    """Build the hypothesis that the focal lengths of these cameras are `factor` times as long.
+    """Build the hypothesis that the true focal lengths of some cameras are `factor` times those of the rig.
 
-    They were in another unit, or the image was zoomed.
+    They were stated in another unit, or the image was zoomed or cropped.
+
+    Args:
+        names: names of the cameras.
+
+    Returns:
+        The hypothesis, with the rig whose focal lengths are multiplied.
     """
     who = ", ".join(map(repr, names))
     short = all(is_short(rig[name]) for name in names)
@@ -187,7 +204,10 @@ def in_degrees(rig: Rig, turns: Mapping[str, int]) -> Hypothesis:
     """Build the hypothesis that rotation vectors in degrees were taken for radians.
 
     Args:
-        turns: whole turns missing from the vector of each camera, by name.
+        turns: whole turns missing from the vector of each camera, by name; other cameras stay.
+
+    Returns:
+        The hypothesis, with the rig whose rotations are corrected.
     """
     cameras = dict(rig.cameras)
     for name, missing in turns.items():
@@ -211,6 +231,9 @@ ROTATIONS = {
 
 def rotated_view(view: View, words: str) -> tuple[Float[Tensor, "3 3"], HW]:
     """Compute the pixel map and image size of a view after one of `ROTATIONS`.
+
+    Args:
+        words: key of `ROTATIONS`, such as "rotated by 180 degrees".
 
     Returns:
         A of x' ~ A x, and the new height and width.

@@ -52,8 +52,10 @@ def centres_found(
     scale is kept. Cameras that match with none are left out.
 
     Args:
+        rig: pinhole cameras of known intrinsics and roughly known orientation.
         images: one image (C, H, W) in 0..1 per camera, by name.
         shown: masks of the pixels that each camera recorded, by name.
+        alpha: name of alpha.
 
     Returns:
         The rig with its depth range, named `OPEN` if orientations alone explain the points as well;

@@ -42,11 +42,11 @@ not depend on are not computed."""
 
 
 class Evaluated(NamedTuple):
-    """Residuals at a point, still functions of it, to be differentiated there if wanted.
+    """Residuals evaluated at given parameters, with the graph to differentiate them.
 
     Attributes:
-        z: the point, requiring gradients.
-        parts: residuals, one tensor per part.
+        z: parameters, requiring gradients.
+        parts: residuals as functions of z, in one tensor or several.
     """
 
     z: Float[Tensor, " k"]
@@ -73,8 +73,8 @@ class Solution(NamedTuple):
         covariance: posterior covariance of the free parameters, the prior's for fixed ones.
         directions: columns of which z is a combination; along others the images do not determine it.
         full: most probable free and considered parameters without that restriction.
-        gained: variance of depth that the changes lose, relative to depth squared.
-        known: relative deviation of depth that is left if the full solution is right.
+        gained: variance of depth that the changes remove, relative to depth squared.
+        known: relative standard deviation of depth that would be left with the full solution.
     """
 
     z: Float[Tensor, " n"]
@@ -93,7 +93,9 @@ def solve(residuals: Residuals, count: int, considered: int = 0) -> Solution:
     again.
 
     Args:
-        residuals: function of `count` free parameters followed by the `considered` ones.
+        residuals: function of all parameters, the free ones first, that returns residuals in parts.
+        count: number of free parameters.
+        considered: number of further parameters that are uncertain, but not changed.
 
     Returns:
         The solution; its `directions` span the observable parameters.
@@ -125,7 +127,9 @@ def shifts_left_out(
     To first order, from the most probable z on.
 
     Args:
-        parts: part in which each residual is.
+        residuals: function of the parameters.
+        z: most probable parameters, in prior deviations.
+        parts: number of the part in which each residual is.
         kept: mask of the parameters that may change; None for all.
 
     Returns:
@@ -157,6 +161,9 @@ def most_probable(
     observable, as poses by a flat scene are.
 
     Args:
+        residuals: function of the parameters.
+        z: parameters to start from, in prior deviations.
+        basis: columns of which the change is a combination.
         steps: largest number of steps; no error if they do not suffice.
 
     Returns:

@@ -81,7 +81,10 @@ def cameras_of(rig: Rig, pairs: Iterable[tuple[str, str]]) -> list[str]:
 
 
 def image_sizes(images: Mapping[str, Tensor]) -> dict[str, tuple[int, int]]:
-    """Return height and width of each camera's image.
+    """Check images for matching, and return their sizes.
+
+    Returns:
+        Height and width by camera.
 
     Raises:
         ValueError: in one line, for fewer than two images, and for one that is no float image (C, H, W).
@@ -130,7 +133,14 @@ class SiftFeatures(NamedTuple):
 
 
 def detect_features(image: Float[Tensor, "_ h w"]) -> SiftFeatures:
-    """Detect SIFT features of an image's luminance, with equalised contrast."""
+    """Detect SIFT features of an image's luminance, with equalised contrast.
+
+    Args:
+        image: image (C, H, W) in 0..1.
+
+    Returns:
+        At most `FEATURES` features, possibly none.
+    """
     even = contrast_equalised(image)
     sift = cv2.SIFT.create(FEATURES, enable_precise_upscale=True)
     keypoints, descriptors = sift.detectAndCompute(even, np.empty(0, np.uint8))
@@ -193,8 +203,8 @@ def match_cameras(images: Images, *, alpha: str | None = None) -> dict[tuple[str
         Matches by pair of names; pairs with fewer than `ENOUGH` are left out.
 
     Raises:
-        ValueError: in one line, for images as of `image_sizes`, hardly any texture, two equal images, no
-            image of `alpha`, or if no pair is left.
+        ValueError: in one line, for fewer than two images, one that is no float image (C, H, W), hardly any
+            texture, two equal images, no image of `alpha`, or if no pair is left.
     """
     image_sizes(images)
     if alpha is not None and alpha not in images:
@@ -251,10 +261,10 @@ def agreeing(matches: PointMatches) -> PointMatches:
 
 
 def agreeing_pairs(pairs: Pairs) -> dict[tuple[str, str], PointMatches]:
-    """Select consistent matches of pairs that have enough, from matches of another source.
+    """Select matches of another source that agree with some fundamental matrix.
 
     Returns:
-        Matches by pair of names; the other pairs are left out.
+        Consistent matches by pair of names; pairs with fewer than `ENOUGH` are left out.
 
     Raises:
         ValueError: if no pair has `ENOUGH`.
@@ -281,12 +291,14 @@ def line_distance(matches: PointMatches, F: Float[Tensor, "3 3"]) -> Float[Tenso
 
 
 class FittedLink(NamedTuple):
-    """A link fitted to matches.
+    """Link of two views that is fitted to matches.
 
     Attributes:
-        link: F, and a similarity H that is centred on the points along their lines.
+        link: F, and as H a similarity from which the matches lie as far to one side along their lines as to
+            the other.
         matches: the consistent matches.
-        displacement: pixels of beta along their lines, to either side of H x, that contain 98 % of them.
+        displacement: pixels of beta along the lines, to either side of H x, within which 98 % of the matches
+            lie.
     """
 
     link: Link
@@ -295,9 +307,13 @@ class FittedLink(NamedTuple):
 
 
 def fit_link(matches: PointMatches, F: Float[Tensor, "3 3"], *, within: float = 6.0) -> FittedLink:
-    """Improve F, and fit a rough map, by the matches within so many pixels of their lines.
+    """Improve F, and fit a rough map H, by the matches near their epipolar lines.
 
     F is fitted by MAGSAC++ (Barath et al. 2020) to 1 px; the given one stays if fewer than `ENOUGH` are near.
+
+    Args:
+        F: fundamental matrix to start from, beta from alpha.
+        within: pixels of beta from its line up to which a match is used.
 
     Returns:
         The link with the matches within 3 px of its lines.
@@ -395,10 +411,13 @@ def seen_depths(pair: Pair, matches: PointMatches) -> tuple[float, float]:
 
 
 def depth_seen(rig: Rig, pairs: Pairs) -> tuple[float, float] | None:
-    """Estimate the depth bounds of all pairs related by their poses, together.
+    """Estimate the depth bounds of the matched points of all calibrated pairs together.
+
+    Pairs with a link are left out.
 
     Returns:
-        Near and far, as of `seen_depths`; None if no pair has enough points.
+        Near and far along alpha's axis, in the rig's unit, with the margins of `seen_depths`; None if no pair
+        has enough points.
     """
     depths = []
     for names, matches in pairs.items():

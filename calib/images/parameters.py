@@ -42,11 +42,11 @@ uninformative."""
 
 @dataclass(frozen=True)
 class FreeParameter:
-    """One parameter vector of a rig.
+    """One parameter vector of a rig that may change.
 
     Attributes:
-        name: "camera.rotation" and so on, or "alpha > beta" for an F.
-        sigma: prior standard deviations, in the rig's units.
+        name: name as in `Rig.parameters`, such as "left.rotation", or "alpha > beta" for an F.
+        sigma: prior standard deviation of each component, in the rig's units (radians, metres, pixels).
         unit: unit for display.
         factor: factor that converts to that unit.
         correlation: prior correlation between components, as fx and fy change together.
@@ -117,6 +117,11 @@ def considered_parameters(
 
     Their uncertainty counts, but they are not changed.
 
+    Args:
+        names: names of the cameras.
+        free: free parameters.
+        sigma: standard deviations by kind that override `SIGMA`; None for none.
+
     Returns:
         One parameter vector per camera and kind.
 
@@ -131,10 +136,14 @@ def considered_parameters(
 
 
 def apply_change(rig: Rig, parameters: Sequence[FreeParameter], z: Float[Tensor, " n"]) -> Rig:
-    """Return the rig after a change of each component by z prior deviations; differentiable in z.
+    """Change a rig's parameters.
 
     Args:
-        z: all components of `parameters`, one vector after the other.
+        z: changes of all components of `parameters`, one vector after the other, in prior standard
+            deviations.
+
+    Returns:
+        The changed rig, differentiable in z.
     """
     parts = z.split([len(u.sigma) for u in parameters])
     values = {u.name: u.root.to(deviations) @ deviations for u, deviations in zip(parameters, parts)}

@@ -68,7 +68,7 @@ def refine_points(
         beta_from_alpha: rough affine maps between neighbourhoods of the points.
 
     Returns:
-        The positions, unchanged where rejected, with their deviations.
+        The positions, unchanged where rejected, with their deviations, infinite where rejected.
     """
     if not len(x):
         return RefinedPoints(y, np.zeros(0))

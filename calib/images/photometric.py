@@ -38,9 +38,9 @@ class PhotometricImage(NamedTuple):
     """A reduced image, ready for attention.
 
     Attributes:
-        keys: features (1, D, h, w).
-        values: values (1, 1, h, w), in local standard deviations.
-        grid: query pixels (r, c, 2), as (x, y).
+        keys: features (1, D, h, w) by which pixels are compared.
+        values: differences from the local mean (1, 1, h, w), in local standard deviations.
+        grid: pixels (r, c, 2), as (x, y) of the reduced image, at which errors are computed.
     """
 
     keys: Tensor
@@ -65,8 +65,10 @@ def photometric_errors(
     confidence.
 
     Args:
+        rig: rig of the images at full size.
         views: reduced images by camera.
-        names: alpha and beta.
+        names: names of alpha and beta.
+        attend: attention operator (`pat.attention.attend_with_statistics`).
 
     Returns:
         The errors (r, c), in local standard deviations, 0 where invalid; and the mask of valid pixels.

@@ -16,7 +16,7 @@ class ParameterChange:
     """Change of a parameter vector with its posterior standard deviation.
 
     Attributes:
-        name: name of the parameter vector, as of `FreeParameter`.
+        name: name of the parameter vector, such as "left.rotation".
         amount: change of each component, in `unit`.
         deviation: posterior standard deviation of each, in `unit`.
         unit: unit for display; "F" for a fundamental matrix.

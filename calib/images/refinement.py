@@ -113,12 +113,12 @@ def refine(
 
     Args:
         frames: one image (C, H, W) in 0..1 per camera, by name, of the rig's sizes.
-        free: kinds or patterns, as of `parameters.free_parameters`.
-        sigma: prior standard deviations by kind, as there.
+        free: free parameters: kinds such as "rotation" or "focal", or patterns over "camera.kind".
+        sigma: prior standard deviations by kind, in the rig's units; None for the usual ones (`SIGMA`).
         attend: attention by which the photometric error of the fusion is then minimised, with the posterior
             of the points as its prior; None leaves that stage out.
-        force: accept a result in spite of objections.
-        matches: points of each frame used instead of matching its images.
+        force: True to accept a result in spite of objections.
+        matches: points of each frame used instead of matching its images; None to match them.
 
     Returns:
         The refined rig if accepted, else the given one, with changes and objections.
@@ -165,11 +165,14 @@ def refine_matches(
 
     Args:
         frames: matched points of each frame, by pair of names.
-        keep_depth: if False, the rig's depths are only assumed: they may change in any way, and nothing is
+        free: free parameters: kinds such as "rotation" or "focal", or patterns over "camera.kind".
+        sigma: prior standard deviations by kind, in the rig's units; None for the usual ones (`SIGMA`).
+        force: True to accept a result in spite of objections.
+        keep_depth: False for a rig whose depths are only assumed: they may change in any way, and nothing is
             refused.
 
     Returns:
-        As of `refine`.
+        The refined rig if accepted, else the given one, with changes and objections.
 
     Raises:
         ValueError: for a rig that relates none of the pairs, points of which none are left to use, or nothing
@@ -189,11 +192,17 @@ def fitted(
 
     Those are focal lengths and translations, if `free` is the default, and lenses of views known by F.
 
+    Args:
+        frames: matched points of each frame, by pair of names.
+        free: free parameters: kinds or patterns.
+        sigma: prior standard deviations by kind; None for the usual ones (`SIGMA`).
+
     Returns:
         The problem that was solved, and its solution.
 
     Raises:
-        ValueError: as `refine_matches`.
+        ValueError: for a rig that relates none of the pairs, points of which none are left to use, or nothing
+            free.
     """
     free = tuple(free)
     candidates = [(rig, free)]
@@ -253,6 +262,14 @@ class RefinementProblem:
         sigma: Mapping[str, float] | None = None,
     ) -> RefinementProblem:
         """Split the frames' points into used and held-out ones, and list the free and considered parameters.
+
+        Args:
+            free: free parameters: kinds or patterns.
+            frames: matched points of each frame, by pair of names.
+            sigma: prior standard deviations by kind; None for the usual ones (`SIGMA`).
+
+        Returns:
+            The problem.
 
         Raises:
             ValueError: if nothing is free, no pair is related by the rig, or no points are left to use.
@@ -467,7 +484,7 @@ def _contradictions(parameters: Sequence[FreeParameter], z: Tensor) -> list[str]
 
 
 def systematic_columns(rig: Rig, pairs: Pairs) -> Float[Tensor, "m s"]:
-    """Compute derivatives of all distances by what the calibrated cameras' lens models leave.
+    """Compute derivatives of all Sampson distances by the distortion that lens models leave uncorrected.
 
     Returns:
         One row a point, four columns a camera, in pixels per prior deviation (`SYSTEMATIC`); 0 for pairs
@@ -492,6 +509,12 @@ def polish(
 
     Errors are scaled by their own deviation and count as one measurement per `CORRELATED_PIXELS` pixels, as
     neighbours are correlated.
+
+    Args:
+        fit: problem that the points were fitted to.
+        solution: its solution; only its `directions` change further.
+        frames: images (C, H, W) in 0..1 by camera, of each frame.
+        attend: attention operator (`pat.attention.attend_with_statistics`).
 
     Returns:
         The solution, and the errors; accepted if the error on held-out pixels falls and held-out points are

@@ -67,11 +67,11 @@ PARTS = 3
 
 
 def epipolar_residuals(pair: Pair, matches: PointMatches) -> EpipolarResiduals:
-    """Compute the algebraic error x_beta^T F x_alpha divided by its gradient in the pixels, taken as
-    constant.
+    """Compute the signed distances of matches from the epipolar geometry: Sampson's, and that from the line.
 
-    With cameras, rays replace pixels and E replaces F, so that lenses are respected to first order in the
-    distance.
+    The algebraic error x_beta^T F x_alpha is divided by its gradient in the pixels, which is taken as
+    constant. With cameras, rays replace pixels and E replaces F, so that lenses are respected to first order
+    in the distance.
 
     Returns:
         Signed distances in pixels, differentiable in the rig, with their validity.
@@ -83,10 +83,11 @@ def epipolar_residuals(pair: Pair, matches: PointMatches) -> EpipolarResiduals:
 
 
 def residuals_and_depths(pair: Pair, matches: PointMatches) -> tuple[EpipolarResiduals, MatchDepths]:
-    """Compute the epipolar residuals and, by the same rays, the depths, which are detached.
+    """Compute the epipolar residuals of matches and, by the same rays, their depths.
 
     Returns:
-        As of `epipolar_residuals`, and depths in alpha.
+        Signed distances in pixels (`epipolar_residuals`), differentiable in the rig; and depths in alpha in
+        the rig's unit, detached.
 
     Raises:
         ValueError: if neither cameras nor F are known.
@@ -137,11 +138,10 @@ def sampson_of_pairs(rig: Rig, pairs: Pairs) -> list[Float[Tensor, " n"]]:
 
 
 def match_depths(rig: Rig, pairs: Pairs) -> MatchDepths:
-    """Compute depths of all points of all pairs, where rays are closest to each other; differentiable in the
-    rig.
+    """Compute the depths of all points of all pairs, where rays are closest to each other.
 
     Returns:
-        Depths in alpha, the pairs' points one after the other.
+        Depths in alpha, in the rig's unit, the pairs' points one after the other; differentiable in the rig.
 
     Raises:
         ValueError: for pairs with neither cameras nor F.
@@ -216,11 +216,12 @@ def displacements(hw: HW, points: Float[Tensor, "n 2"]) -> Float[Tensor, "n 2 4"
 
 
 def lines_basis(pair: Pair, matches: PointMatches) -> Float[Tensor, "n 8"]:
-    """Compute derivatives of the line distances by the eight degrees of freedom of F (of E, for rays) up to
-    scale.
+    """Compute derivatives of the matches' line distances by the eight degrees of freedom of F up to scale.
+
+    For calibrated pairs the matrix is E, between rays.
 
     Returns:
-        One row a match; 0 where a pixel has no ray.
+        Pixels per unit of each degree of freedom, one row a match; 0 where a pixel has no ray.
 
     Raises:
         ValueError: for a pair with neither cameras nor F.
@@ -302,11 +303,10 @@ def _rays(pair: Pair, x: Tensor, y: Tensor) -> tuple[tuple[Tensor, Tensor], Tens
 
 
 def own_distance(rig: Rig, pairs: Pairs) -> float:
-    """Compute how near points can be to any lines: their median distance from the lines of an F fitted to
-    them.
+    """Compute the median distance of points from the lines of an F fitted to them: no rig can be nearer.
 
     Returns:
-        Undistorted pixels of beta; 0 if no F fits.
+        Distance in undistorted pixels of beta; 0 if no F fits.
     """
     distances = []
     for names, matches in pairs.items():

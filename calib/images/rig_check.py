@@ -95,10 +95,16 @@ def find_misfit(rig: Rig, images: Images) -> Misfit | None:
 def share_unlike(
     rig: Rig, images: Images, alpha: str, depth: Float[Tensor, "h w"], tolerance: float
 ) -> float:
-    """Compare a depth map of `alpha`'s pixels with the depths of points matched between the images.
+    """Compare a depth map with the depths of points matched between the images.
+
+    Args:
+        images: one image (C, H, W) in 0..1 per camera, by name.
+        alpha: camera at whose pixels the map is.
+        depth: depth along alpha's axis, in the rig's unit; it may have another size than alpha's image.
+        tolerance: tolerance relative to depth.
 
     Returns:
-        The share of points at which the map is off by more than a tolerance relative to depth; NaN for few.
+        Share of the points, 0..1, at which the map is off by more than the tolerance; NaN for too few points.
     """
     if (matched := _matched(rig, {alpha: images[alpha], **images}, LARGEST_SIDE)) is None:
         return math.nan

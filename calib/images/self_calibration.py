@@ -102,11 +102,12 @@ def self_calibrated(
 
     Args:
         views: alpha's and beta's view, by name, alpha first.
-        matches: points of the distorted images.
+        link: F between the undistorted views.
+        matches: points of the images as recorded, distorted.
         focal: focal lengths in pixels by camera; missing ones are assumed.
 
     Returns:
-        The pair; None for points that no poses explain.
+        The pair, with the depth range of the points; None for points that no poses explain.
     """
     alpha, beta = views
     lenses = {
@@ -164,11 +165,14 @@ def refined_by_depth(
 
 
 def joined(pairs: Mapping[str, RefinedPair], scales: Mapping[str, float]) -> Rig:
-    """Join pairs with one alpha into one rig named `UNSCALED`, with the depth range of all.
+    """Join calibrated pairs with one alpha into one rig.
 
     Args:
         pairs: pairs by beta's name.
         scales: factor of each pair's lengths, by beta's name.
+
+    Returns:
+        The rig named `UNSCALED`, alpha first, with the depth range of all.
     """
     rigs = {name: pair.rig.scaled(scales[name]) for name, pair in pairs.items()}
     first = next(iter(rigs.values()))
@@ -249,6 +253,12 @@ def initial_poses(
     matrix.
 
     With parallel axes beta is to either side along the direction in which most points differ.
+
+    Args:
+        matches: points of alpha and beta.
+        link: link of the two views, with F and H.
+        K: alpha's intrinsics.
+        K_beta: beta's intrinsics.
 
     Returns:
         Two to four poses, beta from alpha.

@@ -50,8 +50,12 @@ def aligned_page(aligned: Aligned, rig: Rig, facts: Facts) -> str:
 
 
 def shown_layers(aligned: Aligned, rig: Rig | None = None) -> dict[str, Float[Tensor, "_ h w"]]:
-    """Make the layers of the page: each camera's bands stretched, composites and NDVI (see `ndvi`) if
-    wavelengths allow, and known depth.
+    """Make the layers of the page: each camera's bands, composites, NDVI (see `ndvi`) and depth.
+
+    Bands are stretched to 0..1. Composites and NDVI need bands of suitable wavelengths.
+
+    Args:
+        rig: rig of the recorded files, for NDVI; None to take values as light.
 
     Returns:
         Images (1 or 3, h, w), 0..1, by name; a derived layer with a camera's name, such as "colour", is
@@ -77,9 +81,13 @@ def shown_layers(aligned: Aligned, rig: Rig | None = None) -> dict[str, Float[Te
 def ndvi(aligned: Aligned, rig: Rig | None = None) -> NDArray[np.float32] | None:
     """Compute (near infrared - red) / (near infrared + red) of light.
 
-    Black level, exposure and gain are removed as the sensors of `rig` state them for the recorded files;
-    without a rig values count as light. Only reflectance, which a panel of known reflectance gives, yields
-    the index of the literature (Tucker 1979).
+    Only reflectance, which a panel of known reflectance gives, yields the index of the literature (Tucker
+    1979).
+
+    Args:
+        aligned: values of the cameras at alpha's pixels.
+        rig: rig of the recorded files, whose sensors' black level, exposure and gain are removed; None to
+            take values as light.
 
     Returns:
         The index (h, w), -1..1; NaN where a camera does not see the point. None without bands near 840 and

@@ -70,7 +70,7 @@ FIELD_CLASSES = {kind.__name__: kind for kind in (*FIELDS.values(), ThroughLense
 
 @dataclass(frozen=True)
 class Batch:
-    """Job of fusing many frames.
+    """Job of fusing many frames, with all that its processes need to know.
 
     Attributes:
         rig: the rig of the files.
@@ -176,9 +176,10 @@ class Batch:
 
         Args:
             workers: processes that frames are fused in.
-            resume: keep complete frames of the same images and settings.
+            resume: True to keep complete frames of the same images and settings.
             on_error: "stop" at the first frame that fails, or "skip" it.
             video: frames for each second of fused.mp4, written at the end; None for no video.
+            console: console for progress and messages; None for standard error.
 
         Returns:
             Frames made, kept and failed.
@@ -305,10 +306,11 @@ class Batch:
         write_tensors(self._key_file(key), colour._asdict())
 
     def fuse_one(self, i: int, inputs: str = "") -> None:
-        """Fuse and write frame `i`.
+        """Fuse frame `i`, and write its files into the folder `out`.
 
         Args:
-            inputs: the frame's `inputs`, if known; empty to compute them.
+            i: number of the frame.
+            inputs: digest of what the frame depends on (`inputs`), if known; empty to compute it.
 
         Raises:
             ValueError: if it cannot be fused.
@@ -418,7 +420,8 @@ def find_images(text: str | Path, *, name: str = "") -> list[Path]:
     """Find the images of a folder, a pattern such as "a/mono_*.png", or one file.
 
     Args:
-        name: camera, for messages.
+        text: folder, pattern or file.
+        name: name of the camera, for messages.
 
     Returns:
         Files in natural order, numbers in names counting as such.

@@ -26,10 +26,10 @@ CROP = 4
 
 
 def as_real_cameras(array: SampleArray) -> tuple[SampleArray, dict[str, NoiseLevel]]:
-    """Simulate an array's images with another response and exposure, in low light.
+    """Simulate an array's images as real cameras record them: another response and exposure, in low light.
 
     Returns:
-        The array, and the noise of each camera.
+        The array with these images, and the noise level of each camera.
     """
     generator = Generator().manual_seed(0)
     ideal = {ALPHA: luminance(array.ground_truth, RESPONSE), BETA: EXPOSURE * array.images[BETA]}
@@ -42,8 +42,13 @@ def classical_methods(
 ) -> dict[str, Tensor]:
     """Run the classical fusion: plain, with alpha's response corrected, denoised first, and both.
 
-    The response is what our fusion finds in the denoised images; these are denoised by non-local means with
-    known noise.
+    Images are denoised by non-local means with known noise; the response is the one that this package's
+    fusion estimates from the denoised images.
+
+    Args:
+        network: network of that fusion.
+        array: array to fuse.
+        noise: noise level by camera; None for ideal cameras.
 
     Returns:
         Fused images (3, h, w) by method; the plain one alone for ideal cameras (`noise` None).
@@ -70,7 +75,9 @@ def save_demo_figure(panels: Mapping[str, Tensor], corner: tuple[int, int], path
     """Write a figure of images of one size, three in a row, with an enlarged window of each below.
 
     Args:
-        corner: (row, column) of the window.
+        panels: images (c, h, w), values 0..1, by title.
+        corner: (row, column) of the window's first pixel.
+        path: file to write.
     """
     h, w = next(iter(panels.values())).shape[-2:]
     top, left = corner

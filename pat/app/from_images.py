@@ -106,11 +106,11 @@ def array_from_images(
         sources: files or tensors by camera, or a list of files.
         alpha: camera whose view is wanted; None for the largest grey image, or else the largest.
         weights: weights by name; None chooses them by the bands.
-        focal: focal lengths in pixels by camera, in place of those in the files' tags.
-        matches: a file of matched points (`read_matches`) from which the rig is found; None matches the
+        focal: focal lengths in pixels by camera, in place of those in the files' tags; None for none.
+        matches: file of matched points (`read_matches`) from which the rig is found; None matches the
             images.
         further: files of other captures by camera, used too where tags state cameras without parallax.
-        say: called with each line of what is found.
+        say: function that is called with a line of text for each finding.
 
     Returns:
         The array.
@@ -181,7 +181,10 @@ def _with_sensors(rig: Rig, sensors: Mapping[str, Sensor]) -> Rig:
 
 
 def by_camera(sources: ImageSources) -> Mapping[str, str | Path | Tensor]:
-    """Name the images of a list by camera; a mapping is only checked.
+    """Name the images of a list by camera (`camera_names`); a mapping is only checked.
+
+    Args:
+        sources: files or tensors by camera, or a list of files.
 
     Returns:
         Files or tensors by camera.
@@ -217,8 +220,10 @@ def _focal_lengths(
 
 
 def camera_names(paths: Sequence[Path]) -> dict[str, Path]:
-    """Name the cameras of files: by the bands in their tags, or their names without suffix, or their folders,
-    or numbers.
+    """Name the cameras of files.
+
+    Names are the bands in the files' tags, else the files' names without suffix, else their folders, else
+    "camera1", "camera2", ...: the first kind in which no two are equal.
 
     Returns:
         Files by camera.
@@ -237,7 +242,11 @@ def frames_of_videos(
 ) -> tuple[dict[str, list[Path]], dict[str, float]]:
     """Write the frames of videos as image files into a folder.
 
-    Files get their video's time: a resumed job recognises them by it.
+    Files get their video's modification time, by which a resumed job recognises them.
+
+    Args:
+        videos: video file by camera.
+        folder: folder to write to, with a subfolder for each camera.
 
     Returns:
         Files, and frames for each second, by camera.
@@ -380,13 +389,14 @@ def found_rig(
 ) -> tuple[Rig, list[str]]:
     """Find the rig of images, and the cameras that it relates to alpha.
 
-    A beta of `bands` is compared with alpha by its luma, others by the combination of bands most similar to
-    alpha. `given` matches between the images take the place of what would be found.
-
     Args:
-        focal: focal lengths in pixels, where known.
-        bands: bands that the network takes as one colour image; None for any.
-        note: called with each line of what is found.
+        images: images (c, h, w) by camera.
+        alpha: name of alpha.
+        focal: focal lengths in pixels by camera, where known.
+        bands: number of bands that the network takes as one colour image: a beta of so many is compared with
+            alpha by its luma, others by the combination of bands most similar to alpha. None for no number.
+        note: function that is called with a line of text for each finding.
+        given: matches between the images by pair; None to match the images.
 
     Returns:
         The rig, calibrated up to a scale where points matched between alpha and a beta have parallax, else

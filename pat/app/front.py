@@ -92,22 +92,24 @@ def fuse(
         alpha: the camera whose view is wanted; without a rig by default the largest grey image.
         network: weights by name or file, or a network; by default "mono-colour" for betas in colour, else
             "mono-spectral".
-        settings: what frames of the same cameras have in common.
-        corrections: what is known of response and alignment from another frame of the same cameras
-            (`corrections_of`), instead.
-        explain: called with a line of text for each detected and corrected problem.
-        progress: shows the tiles as they are done.
-        announce: called with the plan before the work begins; the time of a large frame is estimated by
-            fusing a piece.
-        store: a folder for finished tiles of a frame of several, so that one that was stopped goes on;
-            tiles of other images, rigs or weights are not taken. The caller deletes it.
-        differentiable: keep gradients with respect to the numbers of the rig, the images and the network's
-            weights (which `requires_grad_(True)` frees). A match moves along its segment as images and rig
-            move the best agreement around it; which match is the best, the alignment and the response are
-            constants, and so is what enters or leaves a beta's image: leave its border out of an error.
-            `pat.fusion.gradients.without_gradient` names the parameters without a gradient. Else the frame
-            is detached, whatever requires gradients.
-        matcher: the function that matches for a network that uses matches: `pat.matching.match.match`, or
+        settings: settings that frames of the same cameras have in common.
+        corrections: response and alignment estimated from another frame of the same cameras
+            (`corrections_of`); None to estimate them from this one.
+        explain: function that is called with a line of text for each detected and corrected problem; None for
+            none.
+        progress: function of the tiles and their number that yields the tiles, to show progress; None for
+            none.
+        announce: function that is called with the plan before the work begins; the time of a large frame is
+            then estimated by fusing a part. None for none.
+        store: folder for finished tiles of a frame of several, so that one that was stopped goes on; tiles of
+            other images, rigs or weights are not taken. The caller deletes it. None for none.
+        differentiable: True to keep gradients with respect to the numbers of the rig, the images and the
+            network's weights (which `requires_grad_(True)` frees). A match moves along its segment as images
+            and rig move the best agreement around it; which match is the best, the alignment and the response
+            are constants, and so is what enters or leaves a beta's image: leave its border out of an error.
+            `pat.fusion.gradients.without_gradient` names the parameters without a gradient. False to detach
+            the frame, whatever requires gradients.
+        matcher: function from inputs to matches, for a network that uses them: `pat.matching.match.match`, or
             your own.
 
     Returns:
@@ -168,7 +170,10 @@ def align(
     occluded if the confidence that beta sees its point is low.
 
     Args:
-        network: network whose confidence is used, which must use matches.
+        images: image of each camera, as for `fuse`.
+        rig: rig or its file; None to find it from the images.
+        alpha: camera to align to; None for the camera that `fuse` takes.
+        network: network whose confidence is used, which must use matches; None for the default.
         recorded: values to align by camera, (C, H, W) of any type, as large as the images; None for the
             images.
         interpolation: "nearest" keeps recorded values; "bilinear" and "cubic" interpolate, rounded for
@@ -176,13 +181,17 @@ def align(
         min_confidence: confidence, 0 to 1, from which a camera counts as seeing a point.
         fill: "none" invents no values; "propagate" gives pixels that a camera does not see its nearest seen
             value.
+        explain: function that is called with lines about what was corrected; None for none.
+        progress: function that wraps the tiles to show progress; None for none.
+        announce: function that is called with the plan; None for none.
+        matcher: function that matches, instead of `match`.
 
     Returns:
         Values, masks and positions by camera, with alpha's depth.
 
     Raises:
-        ValueError: as `fuse`, for a network that uses no matches, and for recorded values that are missing,
-            no numbers, or of another size than the rig says.
+        ValueError: for what `fuse` refuses, a network that uses no matches, and recorded values that are
+            missing, no numbers, or of another size than the rig says.
         TypeError: for arguments in the wrong order, and settings of another type.
     """
     known = _known(images, rig, alpha, network, settings, explain)

@@ -26,7 +26,7 @@ from .from_images import MATCHED, resized_rig, scaled
 
 @dataclass(frozen=True)
 class HealingSettings:
-    """Settings for refining a rig by the frame that is fused."""
+    """Settings for correcting a rig by the images that are fused."""
 
     nearer: float = size(4.0, "How many times nearer to their lines held-out points must come")
     of_own: float = size(
@@ -51,15 +51,17 @@ class Healed(NamedTuple):
 
 
 def checked_rig(views: ViewFiles, *, heal: bool) -> Healed | None:
-    """Compare a rig with its images, and refine it or warn.
+    """Compare a rig with its images, and refine it, or warn that it fits badly.
+
+    The warning is a `LowConfidenceWarning` if the rig is wrong: mistaken by the doctor's verdict, or with
+    points behind cameras or outside its depth range. Images that cannot be read are left to the fusion.
 
     Args:
-        heal: True to refine the rig if its images clearly say more.
+        views: images by camera, with their rig.
+        heal: True to refine the rig where it is not wrong and points determine it far better; False to warn.
 
     Returns:
-        The refined rig; None if it fits or is only warned of. The warning is a `LowConfidenceWarning` if the
-        rig is wrong: mistaken by the doctor's verdict, or matches fall where nothing is seen. Images that
-        cannot be read are left to the fusion.
+        The refined rig; None if the rig fits, or there was a warning.
     """
     try:
         images = dict(views)
@@ -77,7 +79,12 @@ def checked_rig(views: ViewFiles, *, heal: bool) -> Healed | None:
 
 
 def healed_rig(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> Healed | None:
-    """Refine a rig by points matched between alpha and the betas, whatever its deviations.
+    """Refine a rig by points matched between alpha and the betas, however far its parameters have to move.
+
+    Args:
+        rig: rig of the image files.
+        images: images (c, h, w) by camera.
+        alpha: name of alpha.
 
     Returns:
         The refined rig; None unless held-out points then lie about as near to their lines as to those of an F

@@ -37,11 +37,11 @@ PAGE = Path(__file__).with_name("report.html")
 
 
 class Facts(NamedTuple):
-    """Texts and figures of the page.
+    """Texts and figures for the page of a result.
 
     Attributes:
-        notes: what was found or normalised.
-        warnings: warnings, with what to do.
+        notes: sentences on what was found and corrected.
+        warnings: warnings, with advice.
         seconds: duration of the fusion; None if unknown.
         memory: peak memory in bytes; None if unknown.
         unit: unit of depths.
@@ -59,10 +59,14 @@ class Facts(NamedTuple):
 def report_page(
     frame: Frame, images: Mapping[str, Float[Tensor, "_ _ _"]], rig: Rig, alpha: str, facts: Facts
 ) -> str:
-    """Compose the page: images under a slider, overlays, the rig, figures; it needs no other file.
+    """Compose the HTML page of a fused frame: images under a slider, overlays, the rig, figures.
 
     Args:
-        images: images of alpha and the betas.
+        frame: fused frame.
+        images: images (c, h, w), values 0..1, of alpha and the betas.
+        rig: rig of the images.
+        alpha: name of alpha.
+        facts: notes, warnings and figures.
 
     Returns:
         The HTML.
@@ -109,9 +113,12 @@ def filled_page(
     """Fill the page's template.
 
     Args:
+        title: title of the page.
+        hw: height and width of the images.
         layers: URLs of images to compare, by name.
         overlays: URLs of overlays to switch, by name.
         figures: values of the table, by title.
+        facts: notes and warnings.
         parts: further parts as HTML, by placeholder.
 
     Returns:
@@ -143,7 +150,14 @@ def filled_page(
 
 
 def rig_drawing(rig: Rig, alpha: str) -> str:
-    """Draw the calibrated cameras from above as inline SVG: x to the right, z upwards; empty without any."""
+    """Draw the calibrated cameras from above as inline SVG, the world's x to the right and z upwards.
+
+    Args:
+        alpha: name of alpha, which is marked.
+
+    Returns:
+        The SVG; empty without a calibrated camera.
+    """
     cameras = {name: camera for name, camera in rig.cameras.items() if isinstance(camera, Camera)}
     if not cameras:
         return ""

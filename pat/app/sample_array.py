@@ -19,12 +19,12 @@ ALPHA, BETA = "mono", "colour"
 
 
 class SampleArray(NamedTuple):
-    """Mono alpha and colour beta of different focal length and pose.
+    """Array of a mono alpha and a colour beta of different focal length and pose, with ground truth.
 
     Attributes:
-        rig: the rig.
-        images: images (c, h, w) by camera.
-        ground_truth: alpha's view in true colour.
+        rig: rig of the images.
+        images: images (c, h, w), values 0..1, by camera.
+        ground_truth: image of alpha's view in true colour.
     """
 
     rig: Rig

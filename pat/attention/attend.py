@@ -83,7 +83,7 @@ def attend(
                 `scaled_dot_product_attention`.
         samples: how many samples a segment has. None: one for each beta pixel of the longest valid one.
         interpolation: `bilinear` (differentiable in the geometry) or `nearest` (the paper's).
-        bias: added to the scores; anything that broadcasts to (B, Ha, Wa, L).
+        bias: added to the scores; anything that broadcasts to (B, Ha, Wa, L); None for none.
         border: pixels from beta's border within which weights and values fall smoothly to 0, so that nothing
             jumps when a sample enters or leaves the image. Takes one number of memory for each sample.
         backend: `reference` (plain torch, differentiable any number of times and in forward mode), `cpu`,
@@ -91,6 +91,9 @@ def attend(
             `auto`: `local` where that serves, or the compiled one of the tensors' device, with forward-mode
             derivatives and gradients of gradients by the reference, or the reference if there is none. An
             explicit compiled backend that cannot serve raises.
+
+    Returns:
+        Weighted means of the values (B, Dv, Ha, Wa), in the type of `value`; 0 where no sample counts.
 
     Raises:
         ValueError: shapes, devices or options that do not fit together.
@@ -115,11 +118,12 @@ def attend_with_statistics(
     border: float = 0.0,
     backend: Backend = "auto",
 ) -> Attended:
-    """Compute `attend`, and statistics of its weights; arguments and errors as there.
+    """Compute `attend` together with statistics of its weights; arguments as there.
 
     Returns:
-        The values, with the match's expected position in beta's pixels, the weights' spread, and the largest
-        weight: float32 (float64 for float64 inputs), and differentiable. All are 0 where no sample counts.
+        The values (B, Dv, Ha, Wa); the expected position of the match (B, 2, Ha, Wa) and the spread of the
+        weights (B, Ha, Wa), pixels of beta; and the largest weight (B, Ha, Wa). Statistics are float32
+        (float64 for float64 inputs) and differentiable. All are 0 where no sample counts.
 
     Raises:
         ValueError: as `attend`.

@@ -58,7 +58,9 @@ def forward_local(
     """Attend to windows around the same pixel of a view of equal size: nearest look-up, float32.
 
     Args:
-        bias: (samples), equal for all pixels, or None; samples of -inf are skipped.
+        field: size and spacing of the windows.
+        bias: score (size²) added to each sample, the same for all pixels, where -inf skips the sample; None
+            for none.
 
     Returns:
         Values (b, dv, h, w), channels first; log of the sum of exponentials (b, h, w), inf where no sample
@@ -82,11 +84,15 @@ def backward_local(
     """Differentiate `forward_local` by query, key and value.
 
     Args:
+        inputs: query, key and value, as given to `forward_local`.
+        field: as given to it.
+        bias: as given to it; gets no gradient.
         outputs: results of `forward_local`.
         upstream: gradient by the values.
+        wanted: True for each of the three gradients to compute.
 
     Returns:
-        Three gradients; zeros where not `wanted`.
+        Three gradients of the inputs' shapes; zeros where not `wanted`.
     """
     planes, wide = [_planes(x) for x in inputs], _planes(upstream)
     sums = _planes(torch.stack([outputs[1], (upstream * outputs[0]).sum(1)], 1))
@@ -122,8 +128,10 @@ def backward(
     of alpha; then channels are, for the additions to beta's pixels.
 
     Args:
-        saved: statistics and log sums of `forward`.
+        inputs: inputs of `forward`.
+        saved: results of `forward`: statistics, log sums, and two that only the GPU's needs.
         cotangents: gradients by values and statistics.
+        wanted: True for each of the five gradients to compute.
 
     Returns:
         Five gradients, images channels last in memory; empty where not `wanted`.

@@ -60,7 +60,9 @@ def backward(
     """Differentiate `forward` as `cpu.backward`, on the GPU.
 
     Args:
-        saved: statistics, log sums, best samples, and values of `forward`.
+        saved: results of `forward`: statistics, log sums, samples of largest weight, and values.
+        cotangents: gradients by values and statistics.
+        wanted: True for each of the five gradients to compute.
 
     Returns:
         Five gradients; empty where not `wanted`.

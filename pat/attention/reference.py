@@ -74,7 +74,7 @@ class AttentionInputs(NamedTuple):
 
 
 class Attended(NamedTuple):
-    """Outputs of C3 attention for each alpha pixel; 0 where no sample counts.
+    """Outputs of attention along the search segments (C3) for each alpha pixel; 0 where no sample counts.
 
     Attributes:
         value: (b, dv, ha, wa), weighted mean of the values.
@@ -90,10 +90,10 @@ class Attended(NamedTuple):
 
 
 def attend(inputs: AttentionInputs) -> Attended:
-    """Evaluate the formula, some rows of alpha at a time.
+    """Compute attention by its formula in plain torch, some rows of alpha at a time.
 
     Returns:
-        Values and statistics.
+        Values in the query's type, and statistics in `accumulated` precision; differentiable.
     """
     query, positions, bias = inputs.query, inputs.positions, inputs.bias
     counted = accumulated(query)

@@ -67,7 +67,10 @@ class Compared(NamedTuple):
         return self.locations
 
     def strided(self, stride: int) -> Compared:
-        """Keep every `stride`-th row and column of alpha.
+        """Keep every `stride`-th row and column of alpha, from the first on.
+
+        Returns:
+            The features with fewer queries and segments; key and value are shared.
 
         Raises:
             ValueError: for explicit positions.
@@ -82,8 +85,9 @@ def log_sum(compared: Compared) -> Float[Tensor, "b ha wa"]:
     """Compute log sum_l exp(query . key(x_l)) over the samples that count.
 
     Returns:
-        (b, ha, wa); meaningless where none counts. Differentiable by query and key once, and where positions
-        require a gradient by these too, any number of times: by the formula, which gathers all keys.
+        Log sums (b, ha, wa); meaningless where no sample counts. Differentiable once by query and key. If the
+        segments require a gradient, the formula is used, which gathers all keys, and is differentiable by
+        these too and any number of times.
 
     Raises:
         ValueError: for explicit positions.
@@ -97,10 +101,10 @@ def log_sum(compared: Compared) -> Float[Tensor, "b ha wa"]:
 
 
 def mean_score(compared: Compared) -> Float[Tensor, "b ha wa"]:
-    """Compute the mean score of a pixel's samples that count; 0 where none does.
+    """Compute the mean score (query . key) of a pixel's samples that count.
 
     Returns:
-        (b, ha, wa), differentiable.
+        Scores (b, ha, wa), differentiable; 0 where no sample counts.
     """
     query, key, _, locations, samples, interpolation, _ = compared
     nothing = torch.zeros_like(query), torch.zeros_like(key)
@@ -110,10 +114,12 @@ def mean_score(compared: Compared) -> Float[Tensor, "b ha wa"]:
 
 @torch.no_grad()
 def peak_position(compared: Compared) -> Float[Tensor, "b 2 ha wa"]:
-    """Find the position of the largest weight.
+    """Compute the position of the largest weight, as the mean under a much sharper softmax.
+
+    Scores are multiplied by `SHARPENED`; samples whose scores are nearly equal are averaged.
 
     Returns:
-        (x, y) in beta's pixels, (b, 2, ha, wa), without gradient; the mean of equal ones, 0 if no sample
+        Positions (x, y) in beta's pixels, (b, 2, ha, wa), float32, without gradient; 0 where no sample
         counts.
     """
     query, key, _, locations, samples, interpolation, _ = compared

@@ -32,6 +32,7 @@ def attend(inputs: AttentionInputs, *, measured: bool, backend: str, strict: boo
     """Compute attention by the `cpu` or the `triton` backend, with gradients.
 
     Args:
+        backend: "cpu" or "triton".
         measured: False leaves out the statistics, whose fields then hold an empty tensor.
         strict: True refuses gradients of gradients instead of using the reference.
 
@@ -81,7 +82,10 @@ def attend_local(
     """Compute `cpu.forward_local` with gradients by query, key and value.
 
     Args:
-        again: computes the values of the three by the general operator, for gradients of gradients.
+        field: size and spacing of the windows.
+        bias: score added to each sample, without gradient; None for none.
+        again: function of query, key and value that computes the values by the general operator, for
+            gradients of gradients.
 
     Returns:
         Values (b, dv, h, w).

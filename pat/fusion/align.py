@@ -68,9 +68,9 @@ class AlignedView:
         positions: (H, W, 2), float32, positions of alpha's pixels in the recorded image (x, y); NaN beyond
             its edge.
         visibility: (H, W), `OUTSIDE`, `OCCLUDED` or `SEEN`.
-        confidence: (H, W), float32, 0 to 1: that this camera sees the point at this position.
-        bands: a name for each of the values' channels.
-        response: the sensor's response.
+        confidence: (H, W), float32: probability that this camera sees the point at this position, 0 to 1.
+        bands: name of each channel of the values.
+        response: spectral response of the sensor; None if the rig does not state it.
     """
 
     values: NDArray[Any]
@@ -102,7 +102,8 @@ class Aligned(Mapping[str, AlignedView]):
     Attributes:
         alpha: name of the camera at whose pixels all values are.
         views: view of each camera.
-        depth: (H, W), float32, as of `Frame`.
+        depth: (H, W), float32: depth along alpha's axis, or its rays (`measured_along`), in the rig's unit;
+            NaN where unknown.
     """
 
     alpha: str
@@ -164,7 +165,22 @@ def align_frame(
 ) -> Aligned:
     """Bring every camera's own values to the pixels of camera `alpha`, for a rig that is known.
 
-    Called by `pat.align`, which describes the arguments; images and rig are as of `fuse_frame`.
+    `pat.align` calls it, and describes the settings, warnings and the alignment.
+
+    Args:
+        images: tensors by camera name, (C, H, W) in 0..1, which are matched.
+        rig: the cameras. Those without an image are left out.
+        alpha: name of the camera whose pixels are kept.
+        network: network that uses matches.
+        settings: settings of fusion.
+        recorded: values to resample, of the images' sizes; None for the images themselves.
+        interpolation: interpolation of values.
+        min_confidence: confidence below which a pixel counts as occluded.
+        fill: "none" for 0 or NaN where a camera does not see the point, "propagate" for the nearest value.
+        explain: function that is called with lines about what was corrected; None for none.
+        progress: function that wraps the tiles to show progress; None for none.
+        announce: function that is called with the plan; None for none.
+        matcher: function from inputs to matches.
 
     Returns:
         Values, masks and positions by camera, with alpha's depth.
@@ -344,13 +360,12 @@ def _band_names(name: str, count: int) -> tuple[str, ...]:
 def resampled_values(
     values: NDArray[Any], positions: NDArray[np.float32], interpolation: Resampling
 ) -> NDArray[Any]:
-    """Resample recorded values (C, H, W) at positions (h, w, 2), in their own type; integers are rounded.
+    """Resample recorded values (C, H, W) at positions (h, w, 2), pixels (x, y).
 
-    In float64: float32 would round positions by 1e-4 pixels in an image of 4000. Values beyond the edge are
-    0.
+    Computed in float64: float32 would round positions by 1e-4 pixels in an image of 4000.
 
     Returns:
-        Values (C, h, w).
+        Values (C, h, w) in the type given, integers rounded; 0 beyond the edge.
     """
     kind, where = INTERPOLATIONS[interpolation], torch.from_numpy(positions)
 

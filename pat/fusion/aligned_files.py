@@ -78,11 +78,14 @@ def save_aligned(
     removed (`write_together`).
 
     Args:
+        aligned: the alignment.
+        out: folder, made if missing.
         separate: True for one file a camera, NAME.tif, in place of aligned.tif, as also for values of
             different types.
+        positions: format of the positions, "npy", "tif" or "none".
         name: prefix of the files, as in name_aligned.tif; empty for none.
         keep: files that must not be overwritten, such as the images.
-        pages: further text files by name.
+        pages: further text files by name; None for none.
         recorded: files from which the values were read: files of bands then have the tags of alpha's, by
             which mapping software places them, and each band's exposure, gain and black level. None for
             neither.
@@ -186,8 +189,13 @@ def write_bands(
     """Write bands (C, H, W) as one TIFF file in their type, with names and wavelengths (nanometres) for GIS.
 
     Args:
+        path: file, replaced if there is one.
+        values: values (C, H, W).
+        bands: name of each band.
+        wavelengths: central wavelength of each band, nanometres; None where unknown.
         facts: further numbers of each band by name, written as its metadata.
         tags: tags of the file whose pixels these are, written too; left out of files over `LARGEST_TIFF`.
+            None for none.
     """
     items = [
         f'<Item name="{name}" sample="{i}">{value:.9g}</Item>'

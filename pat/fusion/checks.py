@@ -46,9 +46,9 @@ class LowConfidenceWarning(UserWarning):
 def warn_of_confidence(network: FusionNetwork, frame: Frame, inputs: FrameInputs) -> None:
     """Warn if confidence is low, in the mean or in a large part, where the segments of all betas are valid.
 
-    Below `UNFIT_CONFIDENCE` by a `LowConfidenceWarning`. For bands that are each another beta's, the median
-    band decides: some bands of nine differ from alpha whatever the rig. Only for networks whose confidence is
-    a trained probability.
+    A mean below `UNFIT_CONFIDENCE` gives a `LowConfidenceWarning`, others a UserWarning. If each band is of
+    another beta, the median band decides: some bands of nine differ from alpha whatever the rig. Networks
+    without matches, whose confidence is no probability, are not checked.
     """
     overlap = _overlap(inputs).to(frame.confidence.device)
     if not (network.uses_matches and overlap.any()):

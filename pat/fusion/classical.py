@@ -55,13 +55,13 @@ UNRECTIFIABLE = "the cameras look along the line between them: such a pair canno
 
 
 def classical_baseline(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> Float[Tensor, "_ h w"]:
-    """Fuse by `classical` with the one colour beta, or with each beta that records one band.
+    """Fuse by `classical` with the first beta if it is in colour, else with each beta, one band each.
 
     Returns:
-        The fused bands, those of several betas concatenated, 0..1.
+        The fused bands (C, h, w), those of several betas concatenated, 0..1.
 
     Raises:
-        ValueError: as `classical`.
+        ValueError: for lenses, no depth range, and cameras that cannot be rectified.
     """
     betas = [name for name in rig.betas(alpha) if name in images]
     if images[betas[0]].shape[0] == 3:
@@ -72,8 +72,10 @@ def classical_baseline(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> Fl
 def classical_view(
     rig: Rig, images: Mapping[str, Tensor], alpha: str, *, longest: int
 ) -> Float[Tensor, "_ h w"]:
-    """Fuse by `classical_baseline` at alpha's own view, reduced to at most `longest` pixels along its longer
-    side.
+    """Fuse reduced images by `classical_baseline` at alpha's own view, through lenses.
+
+    Args:
+        longest: largest number of pixels of an image's longer side.
 
     Returns:
         The fused bands at alpha's pixels, lenses included.
@@ -94,14 +96,18 @@ def classical_view(
 
 
 def classical(rig: Rig, images: Mapping[str, Tensor], alpha: str, beta: str) -> Float[Tensor, "_ h w"]:
-    """Bring beta's colours, or its one band, to alpha's view, for two pinholes with any pose and a depth
-    range.
+    """Fuse two pinholes of any pose by semi-global matching: beta's colours, or one band, at alpha's view.
 
     Both are rectified to one image plane with about alpha's resolution and matched there for depths near to
     far; the colour differences (for one band: the excess of beta over alpha) are warped back to alpha.
 
+    Args:
+        images: images (C, h, w), 0..1, by camera.
+        alpha: name of alpha.
+        beta: name of the beta, of three bands or one.
+
     Returns:
-        Three bands with alpha's luminance, or one, 0..1.
+        Three bands with alpha's luminance, or one, 0..1, at alpha's pixels.
 
     Raises:
         ValueError: for lenses, no depth range, and for cameras that look along the line between them or have
@@ -129,8 +135,8 @@ def classical_fusion(
 ) -> Float[Tensor, "3 h w"]:
     """Bring beta's colours to alpha, for a (near-)rectified pair with alpha on the left.
 
-    Beta may have another size than alpha, as long as both show the same field: the point at (x, y) in alpha
-    is at (x - d, y) in beta enlarged to alpha's size, 0 <= d <= `max_disparity`.
+    Beta may have another size than alpha, as long as both have the same field of view: the point at (x, y) in
+    alpha is at (x - d, y) in beta enlarged to alpha's size, 0 <= d <= `max_disparity`.
 
     Args:
         max_disparity: largest disparity, in alpha's pixels.
@@ -267,10 +273,15 @@ def _correspondence(
 def checked_disparity(
     left: NDArray[np.uint8], right: NDArray[np.uint8], max_disparity: float
 ) -> tuple[Image, NDArray[np.bool_]]:
-    """Compute the disparity of left (h, w) by OpenCV's semi-global matching, with a left-right check.
+    """Compute the disparity of the left image by OpenCV's semi-global matching, with a left-right check.
+
+    Args:
+        left: left rectified image (h, w).
+        right: right rectified image of the same size.
+        max_disparity: largest disparity, pixels.
 
     Returns:
-        Disparity in pixels, negative where unknown, and a mask of the pixels that pass the check.
+        Disparity (h, w) in pixels, negative where unknown, and a mask of the pixels that pass the check.
     """
     ours = raw_disparity(left, right, max_disparity)
     # Seen from beta, alpha's points lie to the right: mirrored, to the left again.
@@ -317,11 +328,12 @@ def _softened(mono: Image, sharpness: float) -> Image:
 
 
 def raw_disparity(left: NDArray[np.uint8], right: NDArray[np.uint8], max_disparity: float) -> Image:
-    """Compute disparity by semi-global matching, on padded images: OpenCV leaves columns at the left without
-    one.
+    """Compute the disparity of the left image by OpenCV's semi-global matching, without a left-right check.
+
+    Images are padded, as OpenCV leaves columns at the left without disparity.
 
     Returns:
-        Disparity of the left image's pixels, pixels; negative where unknown.
+        Disparity (h, w) of the left image's pixels, in pixels; negative where unknown.
     """
     count = 16 * int(np.ceil((min(max_disparity, left.shape[1]) + 1) / 16))
     costs = {"P1": 8 * BLOCK**2, "P2": 32 * BLOCK**2, "disp12MaxDiff": 1, "preFilterCap": 31}

@@ -44,7 +44,10 @@ LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class PrePassSettings:
-    """Settings of the matching of reduced images before a frame is matched."""
+    """Settings of the pre-pass: reduced images are matched to estimate corrections before a frame is.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     pixels: int = size(400_000, "Alpha's pixels in the pre-pass, at most")
     small: int = size(50_000, "Alpha's pixels below which the pre-pass is at full size")
@@ -76,12 +79,16 @@ class Corrections:
     misalignments: Mapping[str, Misalignment] = field(default_factory=dict)
 
     def applied(self, inputs: Inputs, hw: HW) -> Inputs:
-        """Return the corrected inputs.
+        """Apply the corrections to a frame's inputs.
 
-        Cameras of the same place may be one beta in one frame, and several in another.
+        Co-located cameras may be one beta in one frame, and several in another.
 
         Args:
+            inputs: inputs of a frame of the same cameras.
             hw: alpha's size without padding.
+
+        Returns:
+            The corrected inputs: alpha and RGB betas by the response, segments by the misalignments.
 
         Raises:
             ValueError: for misalignments of other cameras.
@@ -105,10 +112,13 @@ class Corrections:
         return [self.misalignments.get(names[0], Misalignment()) for names in inputs.cameras]
 
     def described(self, hw: HW) -> list[str]:
-        """Return a line of text for each correction.
+        """Describe the corrections in lines of text, a line each.
 
         Args:
-            hw: alpha's size.
+            hw: alpha's size, in whose pixels displacements are stated.
+
+        Returns:
+            The lines; none if nothing is corrected.
         """
         lines = [] if self.response.is_rec601 else [str(self.response)]
         if self.response.exchanged:
@@ -131,9 +141,13 @@ class Corrections:
 def find_corrections(
     network: FusionNetwork, frame: FrameInputs, response: ResponseSpec, *, align: bool
 ) -> Corrections:
-    """Estimate alpha's response if it is to be fitted, and the betas' misalignments if `align`.
+    """Estimate alpha's response and the betas' misalignments, by matching reduced images.
 
     A response is fitted for RGB betas only; nothing is estimated for a network without matches.
+
+    Args:
+        response: "fit" to estimate it, "rec601", three weights of red, green and blue, or a `Response`.
+        align: True to estimate misalignments.
 
     Returns:
         The corrections; the stated or the Rec. 601 response where none is fitted.

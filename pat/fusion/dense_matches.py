@@ -40,8 +40,8 @@ class MatchedDepth(NamedTuple):
     """Depth at alpha's pixels by matches.
 
     Attributes:
-        depth: (H, W), in the rig's unit; NaN where unknown.
-        confidence: (H, W), as of `Frame`.
+        depth: (H, W), along alpha's axis, in the rig's unit; NaN where unknown.
+        confidence: (H, W): probability that every beta sees the point and its position is right, 0 to 1.
     """
 
     depth: Float[Tensor, "h w"]
@@ -49,7 +49,11 @@ class MatchedDepth(NamedTuple):
 
 
 class MatchesAlone:
-    """A `FusionNetwork` whose image is alpha, and whose positions and confidences are the matches'."""
+    """Network that fuses nothing: its image is alpha, its positions and confidences are those of the matches.
+
+    Args:
+        bands: number of beta's bands, with whose luma alpha is compared; None for any combination of bands.
+    """
 
     uses_matches = equal_resolution = learned = True
     keeps_luminance = False
@@ -65,6 +69,10 @@ class MatchesAlone:
 
     def __call__(self, inputs: Inputs, matches: Matches | None = None) -> FusionOutput:
         """Return alpha's image with the matches' positions and confidences.
+
+        Returns:
+            Alpha; the chosen positions; deviations of 0; and confidences, 1 where a position within a pixel
+            of the match is on beta's image.
 
         Raises:
             ValueError: without matches.
@@ -97,7 +105,7 @@ def matched_depth(images: Images, rig: Rig, *, alpha: str, bands: int | None) ->
         Depth and confidence at alpha's pixels.
 
     Raises:
-        ValueError: as `fuse_frame`, for images that do not fit the rig, and views that do not overlap.
+        ValueError: for images that do not fit the rig, and views that do not overlap.
     """
     network = MatchesAlone(bands)
     views = Views.of(rig, images, alpha=alpha)

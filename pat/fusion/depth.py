@@ -26,7 +26,10 @@ from .inputs import Placement
 
 @dataclass(frozen=True)
 class DepthSettings:
-    """Settings of the depth of fused pixels."""
+    """Settings of the depth of fused pixels.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     unseen: float = size(1e-4, "Confidence up to which beta does not see the point, and gives no depth")
 
@@ -52,13 +55,17 @@ def _within(
 
 
 def certain(output: FusionOutput, matches: Matches | None, inputs: Inputs) -> FusionOutput:
-    """Replace a network's confidence and deviation by the certainty of the matches it was given, where known.
+    """Replace a network's confidence and deviation by those of the matches that it was given, where known.
 
     Where segments are around a known depth of each pixel, the higher confidence counts: a match there is
-    hardly better than the few others, which certainty takes for doubt.
+    hardly better than the few other candidates, which the confidence network takes for doubt.
+
+    Args:
+        output: the network's output.
+        matches: matches that it was given; None for none.
 
     Returns:
-        The network's output with these.
+        The output with these; unchanged without matches.
     """
     if matches is None:
         return output
@@ -90,8 +97,8 @@ def measured_depth(
         corner: (x, y) of the inputs' first pixel in alpha.
 
     Returns:
-        Depth (h, w), NaN where unknown; the half-width of its interval, as of `Frame`; and the image's
-        confidence.
+        Depth (h, w) in the rig's unit, NaN where unknown; the half-width (h, w) of the interval of its
+        inverse, as in `Frame`; and the image's confidence (h, w), 0 to 1.
     """
 
     def of_rows(tile: Tile) -> tuple[Tensor, ...]:

@@ -28,7 +28,10 @@ from .inputs import FrameInputs
 
 @dataclass(frozen=True)
 class EdgeSettings:
-    """Settings of depth beside its edges."""
+    """Settings of the choice of depth next to depth edges.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     radius: int = size(5, "Pixels to each side of what counts around a pixel")
     near: int = size(2, "Pixels to an edge of depth up to which depth is chosen anew")
@@ -45,16 +48,18 @@ ROWS, STRIP = 512, 16
 def beside_edges(
     depth: Float[Tensor, "h w"], frame: Frame, frame_inputs: FrameInputs
 ) -> Float[Tensor, "h w"]:
-    """Replace a frame's depth near its edges by that of a nearby pixel that looks similar in alpha.
+    """Replace depth near depth edges by that of a nearby pixel: the median weighted by similarity in alpha.
 
     An edge is a change of inverse depth by more than the width of its interval. Gradients are those of the
     pixel whose depth is taken.
 
     Args:
-        depth: depth of the frame, NaN where unknown.
+        depth: depth to change, metres; NaN where unknown.
+        frame: fused frame with the confidence and interval of depth.
+        frame_inputs: inputs of the frame.
 
     Returns:
-        Depth (H, W); as given where the search was around a known depth of each pixel.
+        Depth (H, W); unchanged where segments were around a known depth of each pixel, or no depth is known.
     """
     has_depth = depth.isfinite() & (frame.confidence > 0)
     if any(beta.around for beta in frame_inputs.inputs.betas) or not bool(has_depth.any()):

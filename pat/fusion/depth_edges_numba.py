@@ -18,12 +18,21 @@ def below(some, share, n, most):
 
 @compiled(nogil=True, cache=True)
 def weighted_medians(values, alpha, where, weights, radius, top, bottom, out):
-    """Write, for rows `top` to `bottom`, the number of the pixel with the weighted median of the values
-    around.
+    """Find the pixel whose value is the weighted median of the values in a window around each pixel.
 
-    `out` (h, w) has the pixel's own number outside `where`. The window is a square of this `radius`; NaN does
-    not count. `weights`, integers, are by 255ths of the difference in alpha. Values that are nearer to each
-    other than a 4096th of the range around count as one.
+    Values that are nearer to each other than a 4096th of the window's range count as equal; NaN does not
+    count.
+
+    Args:
+        values: values (h, w), float32.
+        alpha: brightness (h, w), 0 to 1.
+        where: mask (h, w) of the pixels to compute.
+        weights: weight, an integer, for each difference in alpha in steps of 1/255; the last one holds
+            beyond.
+        radius: pixels from the centre of the square window to its edge.
+        top: first row.
+        bottom: row after the last.
+        out: number of the pixel found, y w + x, to write (h, w); a pixel's own outside `where`.
     """
     height, width = values.shape
     some = np.empty((2 * radius + 1) ** 2, np.float32)

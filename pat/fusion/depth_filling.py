@@ -24,7 +24,10 @@ from .inputs import FrameInputs, Placement
 
 @dataclass(frozen=True)
 class FillSettings:
-    """Settings of the depth of pixels whose own match is not certain."""
+    """Settings of filling in the depth of pixels whose own match has little confidence.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     share: float = tuned(
         0.4,
@@ -52,7 +55,7 @@ those nearby."""
 
 
 def background_filled(frame: Frame, frame_inputs: FrameInputs) -> Float[Tensor, "h w"]:
-    """Replace depth that is far less certain than around it by that of the plane through the background.
+    """Replace depth of far less confidence than around it by that of a plane through the background.
 
     A point that a beta does not see is occluded: farther away than its neighbours along the segments' rows or
     columns. Planes of inverse depth are fitted to matches weighted by confidence; a point beyond an edge of
@@ -60,8 +63,8 @@ def background_filled(frame: Frame, frame_inputs: FrameInputs) -> Float[Tensor, 
     bounds that were searched. No gradient passes through planes.
 
     Returns:
-        Depth (H, W), NaN where it was unknown; unchanged where betas on several sides see occluded points,
-        and where segments were around a known depth.
+        Depth (H, W), metres, NaN where it was unknown; the frame's own where betas on several sides see
+        occluded points, and where segments were around a known depth.
     """
     depth, confidence, inputs = frame.depth, frame.confidence, frame_inputs.inputs
     if any(beta.around for beta in inputs.betas):

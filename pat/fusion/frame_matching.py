@@ -29,7 +29,7 @@ class MissingFramesWarning(UserWarning):
 
 
 def matched_frames(files: Files) -> dict[str, list[Path]]:
-    """Return the files of the frames that every camera has, in order.
+    """Relate the files of several cameras by the names and numbers in them, frame by frame.
 
     Warns of frames that some camera lacks, and where nothing but their order relates files.
 
@@ -37,7 +37,7 @@ def matched_frames(files: Files) -> dict[str, list[Path]]:
         files: files of each camera, in order.
 
     Returns:
-        As many files per camera, by name; as given if one has a single file.
+        Files of the frames that every camera has, in order, by camera; all files if a camera has only one.
 
     Raises:
         ValueError: if nothing relates the files and their numbers differ.
@@ -62,7 +62,11 @@ def matched_frames(files: Files) -> dict[str, list[Path]]:
 
 
 def warn_of_gaps(files: Files) -> None:
-    """Warn of missing numbers in a camera's frames, which a sequence counts one by one at its frame rate."""
+    """Warn of a gap in the numbers of a camera's files: a sequence takes all frames to be equally far apart.
+
+    Args:
+        files: files of each camera, in order.
+    """
     for name, numbers in (_numbers(files) or {}).items():
         counted = [n for n in numbers if isinstance(n, float)]
         steps = [b - a for a, b in pairwise(counted)] if len(counted) == len(numbers) else []

@@ -36,6 +36,9 @@ class ImageFiles:
     """Image files of one camera, read and developed (`pat.media.raw`) when asked for.
 
     Args:
+        paths: files, in the order of time.
+        rig: the cameras.
+        name: name of the camera.
         alpha: camera to whose scale of light the images are brought.
     """
 
@@ -60,6 +63,7 @@ class CachedFrames:
     """Frames with a cache of the last used ones, up to `CACHED` bytes: neighbours in time need them again.
 
     Args:
+        frames: images of one camera.
         level: noise level of the images, which are then denoised; None leaves them.
     """
 

@@ -113,18 +113,26 @@ def fuse_frame(
 ) -> Frame:
     """Fuse one frame at camera `alpha`'s view, for a rig that is known.
 
-    Called by `pat.fuse`, which describes the arguments, results, errors and warnings.
+    `pat.fuse` calls it, and describes the other arguments and the warnings.
 
     Args:
         images: tensors by camera name, (C, H, W) in 0..1, each of the size that the rig states. A mapping
             that reads them when asked saves memory (`pat.fusion.views.ViewFiles`).
         rig: the cameras. Those without an image in `images` are left out.
+        corrections: response and misalignments to apply; None to estimate them.
+        explain: function that is called with lines about what was corrected; None for none.
+        progress: function that wraps the tiles to show progress; None for none.
+        announce: function that is called with the plan; None for none.
+        store: folder of finished tiles, from which a stopped fusion goes on; None for none.
+        differentiable: True to keep gradients; by default the frame has none.
+        matcher: function that matches, instead of `match`.
 
     Returns:
         The frame at alpha's pixels.
 
     Raises:
-        ValueError: as `pat.fuse`.
+        ValueError: for images that do not fit the rig or the network, views that do not overlap, settings
+            that contradict each other, and a memory limit that is too small.
         NotImplementedError: within a transformation of `torch.func`.
     """
     align = not differentiable if settings.align is None else settings.align
@@ -174,14 +182,14 @@ def fuse_frame(
 
 
 class ReadyFrame(NamedTuple):
-    """A frame ready to be matched.
+    """Inputs of a frame that is ready to be matched, and what its fusion needs later.
 
     Attributes:
         inputs: the network's inputs, corrected.
         undo: functions that take a frame of these back to alpha's pixels.
         plan: the plan of the fusion.
         corrections: the corrections made.
-        low_light: the noisy views.
+        low_light: views before and after denoising.
         in_colour: True if alpha's image was in colour.
     """
 
@@ -208,14 +216,22 @@ def ready_frame(
 ) -> ReadyFrame:
     """Prepare a frame for fusion or alignment: all steps before alpha's pixels are matched.
 
-    Arguments and errors are as of `fuse_frame`.
+    Views are denoised, undistorted and resized, tiles planned, and corrections estimated and applied. Other
+    arguments are those of `fuse_frame`.
 
     Args:
         joined: True to join co-located betas to one of several bands.
+        corrections: corrections to apply; None to estimate them.
         stored: True if finished tiles are stored on disk.
+        explain: function that is called with lines about what was corrected; None for none.
+        announce: function that is called with the plan; None for none.
 
     Returns:
         The prepared frame.
+
+    Raises:
+        ValueError: for images that do not fit the rig or the network, views that do not overlap, and a memory
+            limit that is too small.
     """
     say = explain or (lambda line: None)
     least = LEAST_MATCHED if network.uses_matches else LEAST_BYTES
@@ -274,13 +290,20 @@ def corrections_of(
     network: FusionNetwork,
     settings: FuseSettings = FuseSettings(),
 ) -> Corrections:
-    """Estimate the corrections that `fuse` makes before it fuses, for use with other frames of the same
-    cameras.
+    """Estimate the corrections that `fuse` makes, to use them for other frames of the same cameras.
 
-    Arguments and errors are as of `fuse_frame`.
+    Args:
+        images: tensors by camera name, (C, H, W) in 0..1.
+        rig: the cameras.
+        alpha: name of alpha.
+        network: network that will fuse.
+        settings: settings of fusion; `response` and `align` say what to estimate.
 
     Returns:
-        The corrections, which `fuse` takes.
+        The response and misalignments, which `fuse` takes as `corrections`.
+
+    Raises:
+        ValueError: for images that do not fit the rig or the network, and views that do not overlap.
     """
     views = Views.of(rig, images, alpha=alpha, depth=settings.depth, field=settings.field)
     views, _ = denoised_views(views, settings.noise)

@@ -26,12 +26,20 @@ def without_gradient(
     settings: FuseSettings = FuseSettings(),
     free: tuple[str, ...] = ("*",),
 ) -> dict[str, tuple[str, ...]]:
-    """Name the parameters without a gradient: of the fused "image", and of its "depth".
+    """Name the rig's parameters by which the fused image, or its depth, has no gradient.
 
-    Fuses the images at no more than 96 pixels a side, as `fuse_frame` with these arguments would; `free` are
-    patterns of `Rig.parameters`. A parameter is named if no pixel's derivative by it is anything but 0: of a
-    camera that is not used, of fields that do not ask for it, of look-ups at whole pixels. Raises as
-    `fuse_frame`, and for a field that is of images of one size (`Moved`).
+    The images are fused as `fuse_frame` would, at no more than 96 pixels a side. The derivative of every
+    pixel is 0 by parameters of a camera that is not used, those for which a field does not ask, and for
+    look-ups at whole pixels.
+
+    Args:
+        free: patterns of the parameters to look at, as for `Rig.parameters`.
+
+    Returns:
+        Names of the parameters, under "image" and under "depth".
+
+    Raises:
+        ValueError: as `fuse_frame`, and for a field that only fits images of the full size (`Moved`).
     """
     small = {name: image for name, image in images.items() if name in rig}
     for name, image in small.items():

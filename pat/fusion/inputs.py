@@ -30,13 +30,13 @@ LOG = logging.getLogger(__name__)
 
 
 class Placement(NamedTuple):
-    """Relation of a beta to alpha.
+    """Relation of a beta to alpha, by which positions in beta give depth.
 
     Attributes:
         pair: alpha and the beta.
-        points: function from alpha's pixels to their positions in alpha when beta records: others only if
-            they move (`Moved`).
-        bounds: quantity that the depth range bounds.
+        points: function from alpha's pixels (n, 2) to their positions in alpha at the time when beta records;
+            the pixels themselves unless the field is `Moved`.
+        bounds: quantity that the depth range bounds: "depth" along alpha's axis or "distance" along the ray.
     """
 
     pair: Pair
@@ -59,16 +59,17 @@ class Placement(NamedTuple):
     def depth(
         self, x: Float[Tensor, "n 2"], x_beta: Float[Tensor, "n 2"], deviation: Float[Tensor, " n"]
     ) -> Depth:
-        """Compute the depth of the points that alpha's pixels and beta's pixels see, or its distance if
-        `bounds` are such.
+        """Compute the depth of matches, or the distance along alpha's rays if `bounds` says so.
 
-        Through lenses within the pair's depth range.
+        With lenses it lies within the pair's depth range.
 
         Args:
+            x: pixels of alpha.
+            x_beta: positions in beta, pixels.
             deviation: standard deviation of `x_beta` along the segment, pixels.
 
         Returns:
-            Depth with its standard deviation and validity.
+            Depth in the rig's unit, with its standard deviation and validity.
         """
         pair, x = self.pair, self.points(x)
         on_curve = partial(ray_depth, pair, bounds=self.bounds)
@@ -106,7 +107,7 @@ def prepared(
         The inputs, and the functions that take a frame back to the views, last step first.
 
     Raises:
-        ValueError: as `frame_inputs`, and for images of another precision than the network's weights.
+        ValueError: for views that do not overlap, and images of another precision than the network's weights.
     """
     check_precision(views, network)
     LOG.info("preparing %d images", len(views.images))
@@ -167,9 +168,10 @@ def bytes_beside(inputs: Inputs, images: Iterable[Tensor]) -> float:
 
 
 def points_of(field: ReceptiveField) -> Callable[[Tensor], Tensor]:
-    """Return the function from alpha's pixels to the positions, in alpha, for which a field searches.
+    """Return the function from alpha's pixels to the positions in alpha for which a field searches.
 
-    Others than the pixels only if they move, within a band too.
+    Returns:
+        The displacement of `Moved` fields, also within `Widened`; for other fields the identity.
     """
     if isinstance(field, Widened):
         return points_of(field.field)

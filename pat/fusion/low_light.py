@@ -40,7 +40,10 @@ only where an image shows noise plainly."""
 
 @dataclass(frozen=True)
 class LowLightSettings:
-    """Settings of fusion with noise."""
+    """Settings of fusion with noise.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     least_deviation: float = physics(
         1.5 / 255, "Images whose noise has a smaller standard deviation, in the mean, are left as they are"
@@ -84,13 +87,13 @@ class NoisyView(NamedTuple):
 
 @dataclass(frozen=True)
 class LowLight:
-    """Views as given and denoised, and those that had noise.
+    """Views of a frame before and after denoising, kept to restore recorded detail once it is fused.
 
     Attributes:
-        given: views as given; without images if no view had noise.
-        views: views without noise; without images if no view had noise.
-        noisy: noisy views by camera.
-        seconds_left: estimated time of the correction, seconds.
+        given: views as recorded; without images if no view had noticeable noise.
+        views: views after denoising; without images if no view had noticeable noise.
+        noisy: recorded and denoised image, and noise, of each camera that had noticeable noise.
+        seconds_left: estimated time of `corrected`, seconds.
     """
 
     given: Views
@@ -128,9 +131,9 @@ class LowLight:
         combination of beta's bands is similar to alpha.
 
         Args:
+            frame: frame fused from the denoised views, its steps not undone yet.
             matched: positions of its pixels in each beta, x and y, with their confidence.
-            steps: steps taken before it was fused, except radiometry: values keep their scale; they are not
-                undone yet.
+            steps: steps before it was fused, without the one of radiometry: values keep their scale.
             response: response that brings betas to alpha's exposure.
             keep_alpha: True for the luma of alpha as recorded.
 
@@ -180,8 +183,13 @@ class LowLight:
 def denoised_views(views: Views, noise: Noise | None) -> tuple[Views, LowLight]:
     """Denoise the views that have noticeable noise.
 
+    Args:
+        noise: noise level by camera, "estimate" to estimate each, "auto" to do so only if an image shows
+            noise plainly; None for no denoising.
+
     Returns:
-        The views, and the noisy ones for the correction; the views as given if `noise` is None or too small.
+        The views after denoising (as given where noise is not noticeable), and both versions for
+        `LowLight.corrected`.
 
     Raises:
         ValueError: for a camera that is not among the views, or a `noise` of another kind.
@@ -204,7 +212,13 @@ def denoised_views(views: Views, noise: Noise | None) -> tuple[Views, LowLight]:
 
 
 def warn_of_noise(name: str, image: Float[Tensor, "c h w"], view: NoisyView) -> None:
-    """Warn if the noise that is stated for an image is far more than it shows."""
+    """Warn if the noise that is stated for an image is far more than it shows.
+
+    Args:
+        name: name of the camera.
+        image: image as recorded, values 0..1.
+        view: the image with the stated noise.
+    """
     shown = NoiseLevel.estimated(image[None])
     deviations = view.deviation, shown.deviation(image[None])
     stated, measured = (255 * float(deviation.mean()) for deviation in deviations)
@@ -236,7 +250,14 @@ def check_noise(noise: Noise | None) -> None:
 
 
 def noise_levels(images: Mapping[str, Tensor], noise: Noise | None) -> Mapping[str, NoiseLevel]:
-    """Return the level of each camera that has noise: as stated, or estimated from its image (C, H, W).
+    """Return the noise level of each camera that has noise: as stated, or estimated from its image.
+
+    Args:
+        images: images (C, H, W), values 0..1, by camera.
+        noise: levels by camera, "estimate", "auto" to estimate them if an image shows noise plainly, or None.
+
+    Returns:
+        Levels by camera; empty for None, and for "auto" if no image shows noise plainly.
 
     Raises:
         ValueError: for a `noise` of another kind.
@@ -285,12 +306,12 @@ def denoised(
 
 
 class Brightness(NamedTuple):
-    """Brightness that alpha would have seen in a beta, each tensor (1, 1, H, W).
+    """A beta's bands combined as alpha's response combines them, in planes (1, 1, H, W).
 
     Attributes:
-        recorded: brightness as recorded.
-        deviation: its standard deviation.
-        grain: its noise at unit deviation.
+        recorded: brightness as recorded, noise included.
+        deviation: standard deviation of its noise.
+        grain: a sample of its noise, at unit deviation.
     """
 
     recorded: Tensor
@@ -299,10 +320,15 @@ class Brightness(NamedTuple):
 
 
 def brightness(view: NoisyView, grain: Float[Tensor, "1 3 h w"], response: Response) -> Brightness:
-    """Compute the brightness of an RGB beta at alpha's exposure, whose bands have independent noise.
+    """Combine the bands of an RGB beta to the brightness that alpha sees; their noise is independent.
 
     Args:
-        grain: noise of unit deviation in each band.
+        view: the beta at alpha's exposure.
+        grain: sample of noise of unit deviation in each band.
+        response: response whose weights combine the bands.
+
+    Returns:
+        The brightness, with its noise.
     """
     weights = response.weights.to(view.recorded)[:, None, None]
     deviation = (weights * view.deviation).square().sum(1, keepdim=True).sqrt()
@@ -314,9 +340,11 @@ def brightness(view: NoisyView, grain: Float[Tensor, "1 3 h w"], response: Respo
 def brightness_change(
     alpha: NoisyView, betas: Sequence[Brightness], matched: Float[Tensor, "n 3 h w"]
 ) -> Float[Tensor, "1 h w"]:
-    """Compute the change of alpha's denoised brightness by the betas' recordings, of one after another.
+    """Compute the update of alpha's denoised brightness by the betas' recordings, one beta after another.
 
     Args:
+        alpha: alpha as recorded and denoised.
+        betas: brightness in each beta, at its own pixels.
         matched: positions of alpha's pixels in each beta, x and y, with their confidence.
 
     Returns:
@@ -339,13 +367,15 @@ def brightness_change(
 def colours_averaged(
     image: Float[Tensor, "3 h w"], betas: Sequence[NoisyView], matched: Float[Tensor, "n 3 h w"]
 ) -> Float[Tensor, "3 h w"]:
-    """Average colours of the image fused from denoised views with those that RGB betas recorded.
+    """Average the fused image's colours with those that RGB betas recorded, over similar pixels nearby.
 
     Args:
+        image: image fused from the denoised views.
+        betas: recorded and denoised images of each beta, at alpha's exposure.
         matched: positions of alpha's pixels in each beta, x and y, with their confidence.
 
     Returns:
-        The image; as given without noise in the betas.
+        The image with the same luma; unchanged without noise in the betas.
     """
     beta, confidence = warped(betas, matched)
     deviation = float(beta.deviation.mean())
@@ -361,10 +391,13 @@ def colours_averaged(
 def warped(
     betas: Sequence[NoisyView], matched: Float[Tensor, "n 3 h w"]
 ) -> tuple[NoisyView, Float[Tensor, "1 1 h w"]]:
-    """Warp all betas to alpha's pixels, mixed by their confidences.
+    """Warp all betas to alpha's pixels, and average them weighted by their confidences.
+
+    Args:
+        matched: positions of alpha's pixels in each beta, x and y, with their confidence.
 
     Returns:
-        The mixture, and its confidence.
+        The average, as recorded, denoised and deviation, and the largest confidence of a beta.
     """
     positions, confidence = matched[:, :2].movedim(1, -1), matched[:, 2]
     images = [

@@ -32,7 +32,10 @@ SHARES: dict[Luminance, float] = {"alpha": 1.0, "mix": 0.5, "beta": 0.0}
 
 @dataclass(frozen=True)
 class OwnColourSettings:
-    """Settings of a fused image whose alpha was recorded in colour."""
+    """Settings of a fused image whose alpha was recorded in colour.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     unseen: float = size(0.2, "Confidence up to which alpha's own colours are taken")
     seen: float = size(0.5, "And from which the betas'")
@@ -44,7 +47,17 @@ OWN_COLOUR = OwnColourSettings()
 
 
 def check_luminance(network: FusionNetwork, kept: Luminance, *, noisy: bool) -> None:
-    """Raise ValueError for a word that is not in `SHARES`, and where beta's luminance is not available."""
+    """Check that a network can keep the luminance that is asked for.
+
+    Args:
+        network: network that fuses.
+        kept: camera whose luminance the image keeps, one of `SHARES`.
+        noisy: True if the images are denoised.
+
+    Raises:
+        ValueError: for a word that is not in `SHARES`; and for another than "alpha" where the network has
+            alpha's alone, or with noise.
+    """
     if kept not in SHARES:
         raise ValueError(f"luminance is one of {', '.join(SHARES)}; got {kept!r}")
     if kept == "alpha":
@@ -62,8 +75,12 @@ def check_luminance(network: FusionNetwork, kept: Luminance, *, noisy: bool) -> 
 def with_alpha_detail(frame: Frame, alpha: Float[Tensor, "1 h w"]) -> Frame:
     """Add to a frame of beta's luminance the detail that alpha has and beta lacks.
 
+    Args:
+        frame: frame of RGB bands with beta's luminance.
+        alpha: alpha's image, values 0..1.
+
     Returns:
-        The frame with this image.
+        The frame, with the same detail added to each band.
     """
     luma = luminance(frame.image)[None]
     alpha_luma, beta_luma = alpha[None].to(luma), torch.nan_to_num(luma)
@@ -76,10 +93,14 @@ def with_alpha_detail(frame: Frame, alpha: Float[Tensor, "1 h w"]) -> Frame:
 def with_own_colours(frame: Frame, alpha: Float[Tensor, "3 h w"]) -> Frame:
     """Replace a fused frame's chroma by alpha's own where confidence is low, converted to the betas' colours.
 
-    Luminance stays. The conversion of alpha's colours is fitted where the betas see the same points.
+    Luma stays. The conversion of alpha's colours is fitted where the betas see the same points.
+
+    Args:
+        frame: frame of RGB bands.
+        alpha: alpha's image in colour, values 0..1.
 
     Returns:
-        The frame with this image.
+        The frame with the new image.
     """
     alpha = alpha.to(frame.image)
     step = max(int((frame.confidence.numel() / OWN_COLOUR.pixels) ** 0.5), 1)

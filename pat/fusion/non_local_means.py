@@ -24,7 +24,10 @@ from ..support.settings import size, tuned
 
 @dataclass(frozen=True)
 class NonLocalMeansSettings:
-    """Settings of means over similar pixels."""
+    """Settings of means over similar pixels.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     scale: float = tuned(
         0.18, "Middlebury, tune half: scale of unlikeness over the root of the noise's deviation"
@@ -42,12 +45,13 @@ def averaged_with_alike(
     confidence: Float[Tensor, "1 h w"],
     deviation: float,
 ) -> Float[Tensor, "3 h w"]:
-    """Replace an image's colour by the mean over similar pixels nearby, of its own and of beta's recorded
-    colour.
+    """Replace an image's chroma by the mean over similar pixels nearby, of its own and of beta's chroma.
 
-    Luma stays.
+    Luma stays. Similarity is that of the image's 3 x 3 patches.
 
     Args:
+        image: RGB image, values 0..1.
+        confidence: confidence of beta's values, 0 to 1.
         beta: beta's values at alpha's pixels, which count as much as the image's own where `confidence` is 1.
         deviation: mean standard deviation of beta's noise.
 
@@ -89,9 +93,17 @@ def sums_of_alike(
 
 @compiled(nogil=True, cache=True, fastmath=True)
 def add_alike(guide, values, radius, sharpness, top, out):
-    """Add to `out` (k, rows, w), from row `top`, the weighted values.
+    """Add the weighted values of the pixels around each pixel, for some rows (see `sums_of_alike`).
 
-    The weight is (1 - d / 8)^8, or 0 where d is over 8, in place of the exponential.
+    The weight is (1 - d / 8)^8, or 0 where d is over 8, in place of the exponential exp(-d).
+
+    Args:
+        guide: image (c, h + 2 p, w + 2 p), padded by p = radius + 1, whose 3 x 3 patches are compared.
+        values: values (k, h + 2 p, w + 2 p), padded alike.
+        radius: rows and columns to either side.
+        sharpness: factor from a sum of squared differences of two patches to d / 8.
+        top: first row.
+        out: sums (k, rows, w) to add to.
     """
     around = radius + 1
     bands, rows, width = out.shape

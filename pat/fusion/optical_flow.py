@@ -20,7 +20,10 @@ from ..support.settings import tuned
 
 @dataclass(frozen=True)
 class FlowSettings:
-    """Settings of optical flow between frames."""
+    """Settings of optical flow between frames.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     astray: float = tuned(
         1.0, "Source not recorded: flow that does not lead back to so many pixels has a weight below 1 / e"
@@ -34,8 +37,8 @@ class Flow(NamedTuple):
     """Motion of each pixel between two frames.
 
     Attributes:
-        step: (2, H, W), pixels in x and y.
-        weight: (H, W), 0 to 1.
+        step: motion (2, H, W) from the first frame to the second, pixels in x and y.
+        weight: reliability of the motion (H, W), 0 to 1.
     """
 
     step: Float[Tensor, "2 h w"]

@@ -103,16 +103,16 @@ def save_frame(
 
     Args:
         bits: 8 or 16 for sRGB values; 32 (tif, exr) for linear light as floats, not clipped.
-        view: rig of alpha alone, written to view.yaml.
-        rig: rig of all cameras, written to found_rig.yaml.
-        points: camera of alpha; the pixels of known depth are written to points.ply.
+        view: rig of alpha alone, written to view.yaml; None for no such file.
+        rig: rig of all cameras, written to found_rig.yaml; None for no such file.
+        points: camera of alpha; the pixels of known depth are written to points.ply. None for no such file.
         along: kind of depth (`measured_along`), for `points`.
         name: prefix of the files, as in name_fused.png; empty for none.
         bands: names of bands that cameras record one by one, each written to fused_NAME.png and
             confidence_NAME.png too (NAME by `file_names`); without names, bands that are not one or three are
             fused_1.png and so on.
-        pages: further text files by name.
-        about: texts that `write_together` keeps about the group.
+        pages: further text files by name; None for none.
+        about: texts that `write_together` keeps about the group; None for none.
 
     Returns:
         Paths of the files, the image first.
@@ -183,7 +183,15 @@ def band_names(frame: Frame, betas: Iterable[str]) -> list[str]:
 
 
 def describe_bands(frame: Frame, names: Sequence[str], kind: ImageFormat) -> str:
-    """Describe in a line which files have a frame's bands; empty for an ordinary image."""
+    """Describe in a line which files hold the bands of a frame.
+
+    Args:
+        names: names of cameras that record the bands one by one; empty for none.
+        kind: format of the files.
+
+    Returns:
+        The line; empty for an ordinary image of one band or three.
+    """
     if not names and len(frame.image) in (1, 3):
         return ""
     listed = (

@@ -49,7 +49,10 @@ LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class SequenceSettings:
-    """Settings of sequences of cameras with frames of their own."""
+    """Settings of sequences of cameras that record at different times.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     synchronous: float = physics(0.05, "Gaps shorter than this part of alpha's frame time count as none")
     unknown_motion: float = physics(
@@ -64,12 +67,13 @@ SETTINGS = SequenceSettings()
 
 
 class KeyColour(NamedTuple):
-    """Colour of a key frame.
+    """Colour of a key frame, to be warped to the frames around it.
 
     Attributes:
         added: values that fusion adds to alpha, (C, H, W).
-        confidence: (H, W).
-        inverse_depth: inverse depth (0: unknown) with its half-width as of `Frame`, (2, H, W).
+        confidence: confidence of these, 0 to 1, (H, W).
+        inverse_depth: inverse depth and the half-width of its interval, 1 / metres, (2, H, W); 0 where
+            unknown.
     """
 
     added: Float[Tensor, "c h w"]
@@ -79,10 +83,12 @@ class KeyColour(NamedTuple):
 
 @dataclass(frozen=True)
 class SequenceFusion:
-    """A sequence to fuse: the `colour` of its key frames, and any `frame`.
+    """Fusion of a sequence of cameras that record at different times.
+
+    `colour` fuses a key frame of alpha with betas; `frame` warps the colours of key frames to any frame.
 
     Attributes:
-        network: network as of `fuse`.
+        network: network that fuses key frames.
         rig: cameras with `frame_rate` and `time_offset`.
         frames: frames by camera name, in the order of time; cached.
         alpha: camera whose frames are wanted.
@@ -137,10 +143,13 @@ class SequenceFusion:
         return self._fused(i, self.timeline.at(i), {}, alone=True)
 
     def colour(self, key: KeyFrame) -> KeyColour:
-        """Fuse a key frame, each beta searched where alpha's points are at its time.
+        """Fuse a key frame; in each beta points are searched where they are at its time.
 
         Returns:
-            Its colour, with confidence and depth.
+            The colour that fusion adds to alpha, with confidence and depth.
+
+        Raises:
+            ValueError: if the frame cannot be fused, or an image cannot be read.
         """
         fields, weight = {}, torch.ones(self.rig[self.alpha].hw)
         for name, i in key.betas.items():
@@ -335,12 +344,15 @@ def readable(read: Callable[[int], Tensor], numbers: Iterable[int]) -> Iterator[
 
 
 def mixed(base: Float[Tensor, "1 h w"], sources: Sequence[tuple[float, KeyColour]]) -> Frame:
-    """Mix the sources' colours into alpha's frame, weighted by nearness in time and confidence.
+    """Mix the colours of key frames into alpha's frame, weighted by nearness in time and confidence.
 
-    Confidence is the sources' own weighted mean, lowered where sources of about the same weight disagree.
+    Args:
+        base: alpha's frame.
+        sources: nearness in time, above 0, and the colour of each key frame, warped to this frame.
 
     Returns:
-        The frame.
+        The frame. Its confidence is the weighted mean of the sources', lowered where sources of about the
+        same weight disagree.
     """
     weights = torch.stack([nearness * (s.confidence + SETTINGS.floor) for nearness, s in sources])
     share = (weights / weights.sum(0))[:, None]
@@ -371,11 +383,11 @@ def fuse_sequence(
         frames: frames by camera name, in the order of time. Cameras without are left out.
         rig: cameras with `frame_rate` (per second) and `time_offset` (seconds after a common clock).
         alpha: camera whose frames are wanted.
-        network: network as of `fuse`.
+        network: network that fuses key frames.
         speed: largest speed of motion, pixels of alpha a second, for the margin of fields where a beta did
             not record at a key frame's time. None for a quarter of the motion seen between alpha's frames.
-        settings: as of `fuse`; response, alignment and noise are estimated once, at the key frame in the
-            middle.
+        settings: settings of fusion; response, alignment and noise are estimated once, at the key frame in
+            the middle.
 
     Yields:
         Frames at alpha's pixels.

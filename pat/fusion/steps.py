@@ -50,11 +50,11 @@ Undo = Callable[[Frame], Frame]
 
 
 class StepResult(NamedTuple):
-    """Result of a step.
+    """Result of a step that prepares views for fusion.
 
     Attributes:
-        views: views after it.
-        undo: function that takes the fused frame back to the views before it.
+        views: views after the step.
+        undo: function that takes the fused frame back to the views before the step.
     """
 
     views: Views
@@ -69,7 +69,10 @@ def steps_for(network: FusionNetwork, *, normalise: bool, joined: bool = True) -
 
     Args:
         normalise: True to bring betas to alpha's mean and standard deviation.
-        joined: False if each beta is wanted by itself.
+        joined: True to join co-located betas to one, False to keep each by itself.
+
+    Returns:
+        Functions from views to a `StepResult`.
     """
     resize = [partial(equal_resolution, network)] if network.equal_resolution else []
     radiometry = [partial(normalise_betas, undone=not network.keeps_luminance)] if normalise else []
@@ -108,9 +111,10 @@ def takes_pinhole_views(views: Views) -> bool:
 
 
 def linear_luminance(views: Views) -> StepResult:
-    """Leave the views; undone, a frame in RGB betas' colours is as bright as alpha's camera saw it.
+    """Schedule the correction of luminance for an alpha that measured light; the views stay as they are.
 
-    Only if alpha measured the luminance of light (`match_luminance`).
+    Undone, a frame in RGB betas' colours has the luminance of light that alpha measured (`match_luminance`).
+    For other alphas nothing happens.
 
     Returns:
         The views, and the function that undoes the step.
@@ -199,12 +203,13 @@ def with_own_levels(
 
 
 def join(which: JoinsBands, views: Views) -> StepResult:
-    """Join betas that differ at most in sensors to one of several bands, under the first one's name.
+    """Join co-located betas of the same size, lens and field to one of several bands.
 
-    Undone, bands are in the rig's order.
+    Undone, the frame's bands are in the rig's order. For "neighbours" nothing is joined if a beta has three
+    bands.
 
     Args:
-        which: kind of joining, as of `co_located`.
+        which: "neighbours" to join only those that follow each other in the rig, "all", or "no" for none.
 
     Returns:
         The views, and the function that undoes the step.
@@ -251,7 +256,7 @@ def without_lenses(rig: Rig, images: Images) -> tuple[Rig, dict[str, Tensor]]:
     """Replace cameras with lenses, and their images, by pinhole views; see `arraygeom.pinhole_view`.
 
     Returns:
-        The rig and the images.
+        The rig, and the images resampled; pixels outside a lens's range repeat the nearest one inside.
 
     Raises:
         ValueError: for an image without a pixel inside its lens's range.

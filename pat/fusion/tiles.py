@@ -54,9 +54,9 @@ class Plan(NamedTuple):
 
     Attributes:
         tiles: tiles to fuse.
-        memory: largest memory of the process, bytes.
-        seconds: estimated time; None if it was not estimated.
-        pieces: number of pieces in which the frame is matched first.
+        memory: expected peak memory of the process, bytes.
+        seconds: estimated time, seconds; None if it was not estimated.
+        pieces: number of tiles in which the frame is matched first.
     """
 
     tiles: list[Tile]
@@ -91,18 +91,18 @@ def plan_frame(
     """Plan the tiles of a frame under a limit of memory.
 
     Args:
-        limit: bytes; None for no limit.
-        estimate: True to estimate a large frame's time by fusing a piece.
+        limit: memory limit of the process, bytes; None for no limit.
+        estimate: True to estimate a large frame's time by fusing a small part.
         stored: True if finished tiles are stored on disk until all are there.
-        before: share of the frame's work that is done beforehand, by which the time is longer.
-        after: seconds that follow.
+        before: work before fusion, as a share of it, to add to the time.
+        after: seconds of work after fusion, to add to the time.
         kept: bytes that the caller holds beside the frame.
 
     Returns:
-        The plan.
+        The plan; its time is None unless it was measured.
 
     Raises:
-        ValueError: as `tiles_within`.
+        ValueError: for a limit that is too small even for tiles of 64 pixels.
     """
     pieces, pixels = frame.inputs.pieces, math.prod(frame.hw)
     bands = frame.inputs.bands or sum(beta.image.shape[1] for beta in frame.inputs.betas)
@@ -123,11 +123,12 @@ def plan_frame(
 def tiles_within(
     network: FusionNetwork, frame: FrameInputs, limit: float | None, held: float = 0.0, matching: float = 0.0
 ) -> list[Tile]:
-    """Choose the tiles with least work (halos overlap) of which none takes more than `limit` without `held`
-    bytes.
+    """Choose the tiles of a frame that fit into memory with the least work, as halos are computed twice.
 
     Args:
-        matching: bytes of matching, which must fit too.
+        limit: memory limit of the process, bytes; None for no limit.
+        held: bytes that the process holds beside the tile in work.
+        matching: bytes that matching takes, which must fit too.
 
     Returns:
         The tiles; one if the whole frame fits, or without a limit.
@@ -165,12 +166,12 @@ def working_memory(network: FusionNetwork, inputs: Inputs, tile: Tile) -> float:
 
 
 class Probe(NamedTuple):
-    """Cost of a piece from the middle of alpha, per pixel.
+    """Measured cost of matching and fusing a part from the middle of alpha, per pixel.
 
     Attributes:
-        matches: bytes of its matches.
-        matching: seconds of matching.
-        fusing: seconds of fusing.
+        matches: bytes of its matches, per pixel.
+        matching: seconds of matching, per pixel.
+        fusing: seconds of fusing, per pixel.
     """
 
     matches: float
@@ -180,7 +181,9 @@ class Probe(NamedTuple):
     @classmethod
     @torch.no_grad()
     def from_frame(cls, network: FusionNetwork, frame: FrameInputs) -> Probe:
-        """Match and fuse a small piece, as loops may have to be compiled, and then one to measure.
+        """Measure the cost of matching and fusing a part from the middle of alpha.
+
+        A small part comes first, as loops may have to be compiled.
 
         Returns:
             The measured cost.
@@ -212,16 +215,16 @@ def _to_multiple(box: Box, multiple: int) -> Box:
 
 
 class FusedTile(NamedTuple):
-    """Inner part of a tile.
+    """Inner part of a fused tile.
 
     Attributes:
-        image: (C, h, w).
-        depth: (h, w), as of `Frame`.
-        confidence: (h, w), as of `Frame`.
-        half_width: (h, w), as of `Frame`.
-        matched: positions of its pixels in each whole beta with their confidence, (betas, 3, h, w): x, y,
-            confidence; empty if not kept.
-        by_band: as of `Frame`, or empty.
+        image: fused image (C, h, w), not clipped.
+        depth: depth in alpha (h, w), in the rig's unit; NaN where unknown.
+        confidence: confidence of the image (h, w), 0 to 1.
+        half_width: half-width of the interval of inverse depth (h, w), as in `Frame`.
+        matched: positions of its pixels in each whole beta with their confidence, (betas, 3, h, w): x, y in
+            beta's pixels, confidence; empty if not kept.
+        by_band: confidence of each band (C, h, w), where each is another beta's; else empty.
     """
 
     image: Tensor
@@ -283,8 +286,11 @@ def fused_in_tiles(
     """Fuse a frame tile by tile, or take finished tiles from a folder.
 
     Args:
+        matches: matches of the whole frame; None for a network that uses none.
+        tiles: tiles to fuse.
         keep_matched: False to leave out `matched`, which takes 12 bytes a pixel and beta.
-        progress: function that wraps the tiles, and their number, to show progress.
+        progress: function of the tiles and their number that yields the tiles to show progress; None for
+            none.
         store: folder of finished tiles, read and written; None for none.
 
     Returns:

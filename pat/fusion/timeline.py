@@ -11,11 +11,11 @@ from arraygeom.runtime.warned import warn
 
 
 class KeyFrame(NamedTuple):
-    """A frame of alpha that betas colour.
+    """Key frame of a sequence: a frame of alpha that is fused with betas.
 
     Attributes:
-        alpha: its number.
-        betas: number of the frame nearest in time, for each beta.
+        alpha: number of alpha's frame.
+        betas: number of the frame nearest in time, for each beta by name.
     """
 
     alpha: int
@@ -76,8 +76,12 @@ class Timeline:
         return 1 / min(max(self.rate(name) for name in self.betas), self.rate(self.alpha))
 
     def key_frames(self) -> list[KeyFrame]:
-        """List the key frames: for each frame of the fastest beta the nearest of alpha, if within half an
-        interval.
+        """List the key frames: for each frame of the fastest beta the nearest one of alpha.
+
+        Frames of alpha further away than half of `interval` are none.
+
+        Returns:
+            Key frames, in the order of time.
 
         Raises:
             ValueError: for a beta without a frame near any of them: the recordings do not overlap.
@@ -100,7 +104,10 @@ class Timeline:
         return [KeyFrame(i, self.at(i)) for i in sorted(gains)]
 
     def warn_of_ends(self) -> None:
-        """Warn of betas without frames in a part of alpha's time: their first or last gives colour there."""
+        """Warn of each beta that recorded nothing during a part of alpha's time.
+
+        Its first or last frame gives colour there.
+        """
         times = [self.time(self.alpha, i) for i in range(self.counts[self.alpha])]
         for name in self.betas:
             nearest = (self.time(name, self.nearest(name, t)) for t in times)

@@ -42,13 +42,15 @@ Fields = Mapping[str, ReceptiveField | None]
 
 @dataclass(frozen=True)
 class Views:
-    """The images to fuse.
+    """Images to fuse, with the rig and the fields that hold for them; steps change all three together.
 
     Attributes:
-        rig: rig that describes them.
-        images: images (C, H, W) by camera.
+        rig: rig of the images as they are now.
+        images: images (C, H, W), values 0..1, by camera; alpha's is grey.
         alpha: name of alpha.
-        fields: the betas' fields.
+        fields: receptive fields of betas; None, or no entry, for the pair's default field.
+        alpha_in_colour: True if alpha's image was recorded in colour.
+        joined: names of the betas that a beta of several bands was joined from.
     """
 
     rig: Rig
@@ -70,9 +72,12 @@ class Views:
         depth: tuple[float, float] | None = None,
         field: ReceptiveField | Mapping[str, ReceptiveField | None] | None = None,
     ) -> Views:
-        """Check names and images; each is asked for once, and alpha made grey.
+        """Make views of a rig and images, after checking names, sizes and values; alpha is made grey.
 
         Args:
+            rig: the cameras. Those without an image are left out.
+            images: images (C, H, W) by camera; each is asked for once.
+            alpha: name of alpha.
             depth: (near, far) in place of the rig's depth range; None for the rig's.
             field: field of all betas, or of each; None for the default.
 
@@ -140,7 +145,14 @@ def dense_bytes(alpha: HW, beta: HW, stride: int = 1) -> float:
 
 
 def check_dense(views: Views, limit: float | None) -> None:
-    """Raise ValueError if a dense field takes more than a limit (bytes), or than this machine has."""
+    """Check that dense fields fit into memory.
+
+    Args:
+        limit: memory limit, bytes; None for the memory of this machine.
+
+    Raises:
+        ValueError: for a `Dense` field of a beta that takes more.
+    """
     has = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") if os.name == "posix" else math.inf
     most, (h, w) = limit or has, views.rig[views.alpha].hw
     for name in views.betas:
@@ -158,9 +170,9 @@ BRIGHTER = 200.0
 
 
 def check_exposures(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> None:
-    """Check the stated exposures by the brightness of the developed images.
+    """Check the exposures that the rig states by the brightness of the developed images.
 
-    Only where the rig states the exposures of both; each image is compared with alpha's.
+    Each image is compared with alpha's; pairs without two stated exposures are not checked.
 
     Raises:
         ValueError: for images so different in brightness that their exposures must be wrong.
@@ -254,7 +266,10 @@ def check_bands(views: Views, wanted: int | None) -> None:
 
 
 def checked_image(rig: Rig, images: Images, name: str) -> Tensor:
-    """Return a camera's image after checking it; warns if it is of one colour.
+    """Look up a camera's image and check it; warns if all its values are equal.
+
+    Returns:
+        The image (C, H, W).
 
     Raises:
         TypeError: unless it is a tensor.
@@ -269,11 +284,16 @@ def checked_image(rig: Rig, images: Images, name: str) -> Tensor:
 
 
 def range_of(name: str, image: Any, hw: HW | None = None, *, exposed: bool = False) -> tuple[float, float]:
-    """Return the least and the greatest value of an image.
+    """Check an image, and return its least and its greatest value.
 
     Args:
-        hw: size that it must have; None for any.
+        name: name of the camera, for messages.
+        image: image (C, H, W), float32 or float64.
+        hw: height and width that it must have; None for any.
         exposed: True if the rig states an exposure: most values may then exceed 1.
+
+    Returns:
+        Least and greatest value.
 
     Raises:
         TypeError: unless it is a tensor.
@@ -320,7 +340,12 @@ memory is worth."""
 
 
 class FilesOfCameras(Mapping[str, T]):
-    """Mapping of cameras to the content of an image file of each, read when asked for."""
+    """Base class of a mapping of cameras to the content of an image file of each, read when asked for.
+
+    Args:
+        rig: the cameras.
+        files: image file of each camera.
+    """
 
     def __init__(self, rig: Rig, files: Mapping[str, str | Path]) -> None:
         self.rig, self.files = rig, files
@@ -336,9 +361,17 @@ class FilesOfCameras(Mapping[str, T]):
 
 
 class ViewFiles(FilesOfCameras[Tensor]):
-    """Image files by camera, read and developed when asked for; kept if small (`KEPT`).
+    """Images by camera, read from files and developed when asked for; small ones (`KEPT`) stay in memory.
 
-    Access raises as `read_view` does; construction, as `check_limit` does for alpha's size.
+    Looking up a camera raises FileNotFoundError or ValueError as `read_view` does.
+
+    Args:
+        rig: the cameras.
+        files: image file of each camera.
+        alpha: camera to whose scale of light the images are brought.
+
+    Raises:
+        ValueError: for an alpha too large for the memory limit (`check_limit`).
     """
 
     def __init__(self, rig: Rig, files: Mapping[str, str | Path], *, alpha: str) -> None:
@@ -367,11 +400,14 @@ def read_view(
     """Read and develop the image of one camera.
 
     Args:
+        rig: the cameras.
+        name: name of the camera.
+        path: image file.
         like: sensor to whose scale of light the image is brought; None for its own.
-        sized: False to accept another size than the rig's.
+        sized: True to require the size that the rig states.
 
     Returns:
-        The image (C, H, W) in 0..1.
+        The image (C, H, W), sRGB values in 0..1, or above where light exceeds white.
 
     Raises:
         FileNotFoundError: for a missing file, with camera and file.

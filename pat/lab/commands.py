@@ -70,10 +70,12 @@ class Evaluate(StereoSets):
     """Folder for scores.md, scores.csv and, for each data set, a strip of images a pair."""
 
     def run(self) -> None:
-        """Score all methods on all pairs; write and print the scores.
+        """Score all methods on all pairs; write scores and strips of images to `out`, and print the scores.
 
         Raises:
-            ValueError: if there are no images, or a rate is below 1.
+            FileNotFoundError: for a missing folder.
+            ValueError: for no folder, one without a pair, no rates or one below 1, and images that are grey
+                or of unequal sizes.
         """
         from ..networks.weights import load_weights
         from .evaluation import protocols, stereo
@@ -85,17 +87,26 @@ class Evaluate(StereoSets):
         self.write(rows, stereo.sets_markdown(rows))
 
     def sets(self) -> dict[str, Iterable[StereoPair]]:
-        """Open the stereo pairs, by data set; see `StereoSets.sets`.
+        """Open the folders of stereo pairs, and check the rates.
+
+        Returns:
+            The pairs, read on demand, by data set.
 
         Raises:
-            ValueError: for no rates, or a rate below 1, and as `StereoSets.sets`.
+            ValueError: for no rates or one below 1, for no folder, and for one without a pair.
+            FileNotFoundError: for a missing folder.
         """
         if not self.rates or min(self.rates) < 1:
             raise ValueError(f"--rates: {' '.join(map(str, self.rates))}: give whole numbers from 1 up")
         return super().sets()
 
     def write(self, rows: Mapping[str, Sequence[StereoRow]], text: str) -> None:
-        """Write scores.md and scores.csv, and print `text`."""
+        """Write scores.md and scores.csv into `out`, and print `text`.
+
+        Args:
+            rows: scores by data set, for the CSV file.
+            text: scores in Markdown, for scores.md.
+        """
         from arraygeom.runtime.atomic import write_text
 
         from .evaluation.stereo import StereoRow
@@ -138,7 +149,9 @@ class Ablate:
         """Compare the families; write and print the table.
 
         Raises:
-            ValueError: for fewer than one scene, and options of layered scenes next to --rendered.
+            FileNotFoundError: for a missing folder.
+            ValueError: for fewer than one scene, options of layered scenes next to --rendered, and a folder
+                without scenes or photographs.
         """
         from ..networks.weights import load_weights
         from .evaluation.ablation import FieldFamily, ablate, families, layered_cases, rendered_cases
@@ -218,7 +231,9 @@ class Render:
         """Render the missing scenes; exits with status 1 if some are still missing afterwards.
 
         Raises:
+            FileNotFoundError: for a missing configuration file.
             ValueError: for code named in the file and not in --generator, and as `pat.lab.farm.job.render`.
+            pat.support.jobs.JobError: if the job cannot go on, such as on a full disk.
             SystemExit: with status 1, if a scene failed.
         """
         from .farm.job import RenderConfig, Shard, render

@@ -35,7 +35,10 @@ FITTED = Path(__file__).with_name("certainty.safetensors")
 
 @dataclass(frozen=True)
 class CertaintySettings:
-    """Settings of the network's inputs and outputs."""
+    """Settings of the network's inputs and outputs.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     around: tuple[int, int] = size((2, 6), "Radii, at half the size, in which facts are averaged")
     apart: tuple[int, int] = size((1, 4), "Radii, at full size, in which disparities are compared")
@@ -50,8 +53,11 @@ MEASURED = 3 * (1 + len(SETTINGS.around)) + len(SETTINGS.apart) + 4 + 2
 
 
 class CertaintyNetwork(nn.Sequential):
-    """Network from each pixel's numbers to the logit of the probability, and the logarithm of the
-    half-width."""
+    """Network of a match's confidence, from the `measured` numbers of its pixel.
+
+    It returns two numbers for each pixel: the logit of the probability that the match is right, and the
+    logarithm of the half-width, pixels of beta, of the interval that holds the true position.
+    """
 
     def __init__(self) -> None:
         width = SETTINGS.width
@@ -67,10 +73,10 @@ def fitted_network() -> CertaintyNetwork:
 
 @torch.no_grad()
 def with_certainty(matches: Matches) -> Matches:
-    """Add the certainty of each match, after the choice has stated its own.
+    """Add the confidence of each match, by the network that ships.
 
-    For matches on which several betas agree, whose certainty alone was known before, a beta sees a point only
-    if both state so.
+    The choice network must have run before (`stated` is not None). Where matches had a confidence before, of
+    each beta alone, the smaller one counts.
 
     Returns:
         The matches with `certainty`, detached.
@@ -104,10 +110,14 @@ def typical_facts(matches: BetaMatches) -> Float[Tensor, "b 2"]:
 
 
 def measured(matches: BetaMatches, typical: Float[Tensor, "b 2"]) -> Float[Tensor, "b n h2 w2"]:
-    """Compute the `MEASURED` numbers of each pixel, at half the size.
+    """Compute the confidence network's inputs: `MEASURED` numbers of each pixel at half the size.
 
     Args:
+        matches: matches in one beta, after the choice network.
         typical: `typical_facts` of the whole frame.
+
+    Returns:
+        Numbers (B, `MEASURED`, H / 2, W / 2).
     """
     assert matches.stated is not None
     facts = [matches.facts, *(box_mean(matches.facts, radius) for radius in SETTINGS.around)]

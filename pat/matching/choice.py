@@ -44,7 +44,10 @@ FITTED = Path(__file__).with_name("choice.safetensors")
 
 @dataclass(frozen=True)
 class ChoiceSettings:
-    """Settings of the candidates and of the network."""
+    """Settings of the candidate disparities of a pixel and of the network that scores them.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     around: tuple[int, ...] = size((2, 5, 10), "Distances, in pixels, of those around a pixel")
     scales: tuple[float, float] = size(
@@ -66,11 +69,13 @@ its views."""
 
 
 class Choice(nn.Module):
-    """Network of the candidates' scores, the logit of the best one's probability, and the logarithm of its
-    error.
+    """U-Net that scores a pixel's candidate disparities.
 
-    The probability is that beta sees the point and the best candidate is right to a pixel; the error is in
-    pixels.
+    It also estimates the logit of the probability that beta sees the point and the best candidate is right to
+    a pixel, and the logarithm of that candidate's error in pixels of beta.
+
+    Args:
+        widths: channels at 1/2, 1/4 and 1/8 of alpha's size.
     """
 
     def __init__(self, widths: tuple[int, ...] = SETTINGS.widths) -> None:
@@ -90,13 +95,13 @@ def fitted_choice() -> Choice:
 
 
 def chosen(inputs: Inputs, matches: Matches, network: Choice | None = None) -> Matches:
-    """Choose the disparity of each pixel's candidate of the highest score, in each beta.
+    """Choose each pixel's candidate disparity of the highest score, in each beta.
 
-    Where each segment is around a known depth of its own pixel, disparities of others mean nothing: the
-    choice states the certainty of a match, and changes none.
+    Where each segment is around a known depth of its own pixel, candidates from other pixels mean nothing:
+    then matches stay as they are, and only their confidence is estimated.
 
     Args:
-        network: network of the scores; None for the one that ships.
+        network: network that scores the candidates; None for the one that ships.
 
     Returns:
         The matches with `chosen` and `stated`, detached.
@@ -182,14 +187,17 @@ def features(
     options: Float[Tensor, "b n h w"],
     typical: Float[Tensor, "b 2"],
 ) -> Float[Tensor, "b i h2 w2"]:
-    """Compute the network's inputs, padded to whole multiples.
+    """Compute the choice network's inputs, padded to multiples of `SETTINGS.multiple` pixels.
 
     Args:
-        options: disparities of the candidates.
+        views: alpha and beta, equally bright and sharp.
+        segments: segments of alpha's pixels.
+        matches: semi-global matches.
+        options: disparities of the candidates, pixels of beta.
         typical: `typical_facts` of the whole frame.
 
     Returns:
-        Channels of 2 x 2 pixels, at half the size.
+        Channels at half the size, in which full-size planes have four for each 2 x 2 pixels.
     """
     extent, (h, w) = Extent.from_segments(segments), options.shape[-2:]
     half = _at_half(matches, typical)

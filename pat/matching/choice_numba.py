@@ -18,12 +18,20 @@ def soft(x):
 
 @compiled(nogil=True, cache=True)
 def compared(alpha, beta, end, towards, candidates, scales, out):
-    """Write the comparisons of alpha and beta at each candidate, 2 x 2 pixels as channels.
+    """Compare alpha with beta at each candidate disparity, with 2 x 2 pixels as channels.
 
-    Into `out` (h / 2, w / 2, 4 + 8 n): `alpha` (h, w); the difference of each candidate's disparity (n, h, w)
-    from the first one's, which is the pixel's own; the excess of alpha's brightness over `beta` there; and 1
-    where the first is on beta. Beyond h or w the last row or column is repeated. `scales` are the differences
-    of disparity and of brightness that count as a half, 1 at most.
+    Beyond h or w the last row or column is repeated.
+
+    Args:
+        alpha: brightness (h, w) of alpha.
+        beta: brightness of beta.
+        end: ends (h, w, 2) of the segments, pixels of beta.
+        towards: unit vectors (h, w, 2) from end to start.
+        candidates: disparities (n, h, w), pixels from the end; the first is the pixel's own match.
+        scales: differences of disparity and of brightness that are mapped to 1/2.
+        out: numbers (h / 2, w / 2, 4 + 8 n) to write, four for the 2 x 2 pixels of each plane: alpha minus
+            1/2; for each candidate but the first the difference of its disparity from the first one's; for
+            each the excess of alpha's brightness over beta's; and 1 where the first is on beta.
     """
     n, height, width = candidates.shape
     rows, columns = beta.shape

@@ -31,9 +31,11 @@ from .spectral_mix import SpectralMix
 
 @dataclass(frozen=True)
 class ColourTransferSettings:
-    """Settings of the transfer.
+    """Settings of the transfer of beta's colours to alpha's view.
 
     Brightness is 0 to 1. Middlebury and SYNTIM are the pairs of their tune halves.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
     """
 
     alike: float = tuned(
@@ -76,15 +78,16 @@ DIRECTIONS = 8
 
 
 class MatchStatistics(NamedTuple):
-    """Statistics of a frame's consistent matches: those of each piece of a large frame would differ, and
-    borders show.
+    """Statistics over a frame's consistent matches (those that pass the left-right check).
+
+    They are taken over the whole frame: statistics of its tiles would differ, and their borders show.
 
     Attributes:
-        matches: number of matches, plus one, (B, 1, 1, 1).
+        matches: number of consistent matches, plus one, (B, 1, 1, 1).
         colour: mean of beta's bands minus alpha, (B, C, 1, 1).
         level: means of beta's brightness and of its square, and of alpha and of its square, (4, B, 1, 1, 1).
-        explained: as of `explained_share`, (B, 1, 1, 1).
-        noise: as of `colour_noise`, (B, 1, 1, 1).
+        explained: share of the variance of beta's combined bands that alpha explains, 0 to 1, (B, 1, 1, 1).
+        noise: variance of the noise in colour, all bands together, (B, 1, 1, 1); 0 for one band.
     """
 
     matches: Tensor
@@ -107,12 +110,16 @@ class MatchStatistics(NamedTuple):
         """Compute the statistics of matches.
 
         Args:
-            soft: alpha, as sharp as beta.
-            values: beta's bands at its matches.
-            combined: the combination of these bands.
-            brightness: beta's brightness at its matches.
+            alpha: alpha's image (B, 1, H, W).
+            soft: alpha, blurred to be no sharper than beta.
+            values: beta's bands (B, C, H, W) at the matches.
+            combined: combination of these bands that is compared with alpha (B, 1, H, W).
+            brightness: that combination, normalised to alpha's brightness.
             valid: mask of the matches that are on beta.
-            consistent: 1 where a match is consistent.
+            consistent: 1 where a match passes the left-right check, else 0.
+
+        Returns:
+            The statistics.
         """
         both = valid * consistent
         count = both.sum((-2, -1), keepdim=True) + 1
@@ -142,13 +149,13 @@ class MatchStatistics(NamedTuple):
 
 
 def transferred(inputs: Inputs, matches: Matches) -> Matches:
-    """Transfer beta's bands to alpha's view, also for matches from another source.
+    """Transfer the betas' bands to alpha's view, also for matches from another source.
 
-    Of betas that agree on depth, those that have all of the result's bands share their fills; any other has
-    its own. With gradients if images or fields have some and gradients are recorded.
+    Fills are colours for pixels that beta does not see. Of several betas matched together, those with all of
+    the result's bands share one fill; any other has its own. Gradients reach images and fields.
 
     Returns:
-        The matches with `colours`, of a large frame as float16.
+        The matches with `colours` (bands minus alpha); float16 for a large frame without gradients.
 
     Raises:
         ValueError: for matches of another size or number of betas.
@@ -228,9 +235,10 @@ def transferred_bands(
     *,
     sees_luma: bool = True,
 ) -> tuple[Tensor, Tensor, Tensor, MatchStatistics]:
-    """Compute the first three `Colours` of a beta.
+    """Compute a beta's colours at the matches: all of `Colours` but its fills.
 
     Args:
+        alpha: alpha's image (B, 1, H, W).
         statistics: statistics to use; None for those of these pixels.
         sees_luma: True if alpha sees about the luma of RGB betas.
 
@@ -252,10 +260,16 @@ def matched_colours(
 ) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 1 h w"], Float[Tensor, "b 1 h w"], MatchStatistics]:
     """Compute beta's bands minus alpha at the matches, with the detail that alpha has and beta lacks.
 
-    Colour is as in alpha's light if that sees about the luma of colours.
+    The bands are combined to luma or their mean, as where their spectra are known.
+
+    Args:
+        statistics: statistics to use; None for those of these pixels.
+        sees_luma: True if alpha sees about the luma of RGB betas: photometric similarity then counts in the
+            weight, and colours grow with alpha's brightness.
 
     Returns:
-        Bands, weight, likeness and statistics, as of `transferred_bands`.
+        Bands minus alpha (the frame's mean where the match is not on beta); the weight of these colours, 0 to
+        1; the photometric similarity, 0 to 1, with 1 for what it cannot tell; and the statistics.
     """
     guide, normalisation = combined_bands(beta.image), matches.comparison.whole
     bands, planes = beta.image.shape[1], torch.cat([beta.image, guide, normalisation.normalised(guide)], 1)
@@ -327,14 +341,17 @@ def _scaled_to_alpha(
 def match_weight(
     alike: Float[Tensor, "b 1 h w"], matches: BetaMatches, valid: Tensor
 ) -> Float[Tensor, "b 1 h w"]:
-    """Compute the weight of a match's colours, 0 to 1.
+    """Compute the weight of the colours at the matches.
 
-    The photometric likeness, halved where the left-right check fails. Where certainty is known, the geometric
-    mean of that and of the probability that the match is right, given the likeness.
+    It is the photometric similarity, halved where the left-right check fails. Where a confidence is known, it
+    is the geometric mean of that and of the probability that the match is right, given the similarity.
 
     Args:
-        alike: photometric likeness, 0 to 1.
+        alike: photometric similarity, 0 to 1.
         valid: mask of the matches that are on beta.
+
+    Returns:
+        Weights, 0 to 1; 0 off beta.
     """
     checked = alike * (1 + is_consistent(matches.facts)) / 2
     if matches.certainty is None:
@@ -351,15 +368,18 @@ def filled_from(
     *,
     regressed: bool = False,
 ) -> Float[Tensor, "b fills c h w"]:
-    """Fill in the colours of pixels that beta does not see, by nearest examples.
+    """Fill in the colours of pixels that beta does not see by those of the most similar pixels that it sees.
 
     Args:
-        directions: as of `directions_of`, for the search of examples.
-        regressed: True to compute the regression on brightness over connected regions of alpha first, above
-            which the examples are.
+        colour: bands minus alpha.
+        alpha: alpha's image.
+        weight: weight of each pixel's colour, 0 to 1.
+        directions: mean outer product of the unit vectors along the searched segments (`directions_of`).
+        regressed: True to fit the regression of colour on brightness over connected regions of alpha first,
+            and take only the difference from it from examples.
 
     Returns:
-        One fill, or the regression and the fill, at all pixels.
+        One fill at all pixels, or with `regressed` the regression and the fill.
     """
     planes = zip(numpy_of(colour), numpy_of(alpha[:, 0]), numpy_of(weight[:, 0]), to_bytes(alpha[:, 0]))
     fills = []
@@ -374,14 +394,18 @@ def filled_from(
 def colour_noise(
     unlike: Float[Tensor, "b 1 h w"], texture: Float[Tensor, "b 1 h w"], weight: Float[Tensor, "b 1 h w"]
 ) -> Float[Tensor, "b 1 1 1"]:
-    """Estimate the variance of noise in colour at the matches, of all bands.
+    """Estimate the variance of noise in colour at the matches, all bands together.
 
-    It is that of the fine part of the difference of brightness (`unlike`), beyond the change of fine texture
-    by sampling.
+    It is taken from the fine part of the difference of brightness, less the share that texture causes when it
+    is resampled.
 
     Args:
+        unlike: difference of brightness between beta at the match and alpha, values 0..1.
         texture: brightness of alpha.
-        weight: pixels count where it is above a half.
+        weight: weight of each pixel, 0 to 1; those above a half count.
+
+    Returns:
+        Variance for each of the batch; 0 where there is none, or no pixel counts.
     """
     parts, radius = torch.cat([unlike, texture], 1), SETTINGS.detail_radius
     fine = box_mean((parts - box_mean(parts, radius)).square(), radius)
@@ -428,11 +452,16 @@ def local_slope(
     """Compute the slope of the regression of colour on brightness around each pixel.
 
     The guided filter's linear model (He et al. 2013): it restores the detail that beta lost by its
-    resolution. The less of colour's variance the regression explains, the flatter it is: few of a window's
-    pixels are independent, so that even noise seems to be explained in part.
+    resolution. The slope is multiplied by the cube of the share of colour's variance that the regression
+    explains: few of a window's pixels are independent, so that even noise seems to be explained in part.
 
     Args:
+        colour: bands.
+        brightness: guide.
         radius: pixels to either side of a window.
+
+    Returns:
+        Slope of each band at each pixel.
     """
     local = LocalMoments.within(radius, colour, brightness)
     variances = (local.variance_of_image + 1e-6) * (local.variance_of_bands + 1e-6)

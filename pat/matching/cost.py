@@ -19,7 +19,10 @@ from ..support.settings import physics, tuned
 
 @dataclass(frozen=True)
 class CensusSettings:
-    """Settings of this cost, whose unit is a bit of the census."""
+    """Settings of the matching cost, whose unit is one bit of the census transform.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     brightness: float = tuned(30.0, "Source not recorded: what a difference of 1 in brightness costs")
     truncated: float = tuned(20.0, "Source not recorded: what brightness costs at most")
@@ -63,7 +66,12 @@ def _count(bits):
 
 @compiled(nogil=True, cache=True)
 def census(image, out):
-    """Write one bit for each of the 48 pixels around: 1 if it is darker (Zabih and Woodfill 1994)."""
+    """Compute the 7 x 7 census transform (Zabih and Woodfill 1994): a bit for each neighbour that is darker.
+
+    Args:
+        image: brightness (h, w); beyond its borders it is extended by the nearest pixel.
+        out: 48 bits of each pixel (h, w), uint64, to write.
+    """
     height, width = image.shape
     # A row around at a time, continued by three pixels to either side: then the loop along it is of vectors.
     row = np.empty(width + 6, image.dtype)

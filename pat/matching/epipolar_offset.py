@@ -30,9 +30,11 @@ Image = NDArray[Any]
 
 @dataclass(frozen=True)
 class AlignmentSettings:
-    """Settings of the fit.
+    """Settings of the fit of the displacement across the search segments.
 
     Lengths are pixels of the images given, brightness is 0 to 1. Middlebury is its tune half.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
     """
 
     blur: float = tuned(
@@ -53,11 +55,11 @@ SETTINGS = AlignmentSettings()
 
 @dataclass(frozen=True)
 class Misalignment:
-    """Displacement across the segments, in widths of alpha: `shift` + `across` u + `down` v.
+    """Displacement of beta's image across the search segments: shift + across u + down v, in widths of alpha.
 
-    (u, v) is a pixel's position from the middle of alpha, in widths of alpha. Beta has about alpha's angular
-    resolution. Across is the direction along the segment from its end, turned by a right angle from x towards
-    y.
+    (u, v) is a pixel's position from the middle of alpha, in widths of alpha. Beta is taken to have alpha's
+    angular resolution. A displacement is positive along `normals`: the direction from the segment's end to
+    its start, turned by a right angle from x towards y.
 
     Attributes:
         shift: displacement in the middle of alpha.
@@ -109,13 +111,15 @@ def fit_misalignment(
     """Estimate the displacement of beta across its segments, from matches.
 
     Args:
-        alpha: brightness, as bright and sharp as `beta`.
+        alpha: brightness of alpha.
+        beta: brightness of beta, as bright and sharp as alpha.
         position: positions of alpha's pixels in beta, by the matches.
-        normal: unit vectors across the segments.
+        normal: unit vectors across the segments (`normals`).
         weight: weight of each match, 0 to 1.
 
     Returns:
-        The misalignment; none for too little texture, or if it explains the images hardly better.
+        The misalignment; all zeros for too little texture, for less than `SETTINGS.least` pixels anywhere, or
+        if it explains the images hardly better.
     """
     arrays = (t.detach().cpu().float().numpy() for t in (alpha, beta, position, normal, weight))
     views = _Windows.from_arrays(*arrays)

@@ -21,7 +21,10 @@ Plane = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class ExampleSettings:
-    """Settings of the search for examples. Lengths are pixels of alpha."""
+    """Settings of the nearest-neighbour search that fills in colours; lengths are pixels of alpha.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     neighbours: int = size(5, "Examples of a pixel; half or twice as many do as well")
     radii: tuple[int, int] = size((2, 6), "Radii of the windows of means and deviations")
@@ -52,12 +55,14 @@ def by_examples(
     interpolated.
 
     Args:
-        weight: 0 to 1; a pixel counts as seen above a half.
+        colour: bands of each pixel.
+        alpha: brightness, in which pixels are compared together with their positions.
+        weight: weight of each pixel's colour, 0 to 1; a pixel counts as seen above a half.
         directions: mean outer product of the unit vectors (x, y) along the segments that were searched;
             examples count as nearer along these.
 
     Returns:
-        Colour at all pixels; as given where fewer are seen than a mean takes.
+        Colour at all pixels; seen ones keep theirs. `colour` itself if fewer are seen than a mean takes.
     """
     seen = weight > SETTINGS.seen
     near = cv2.dilate((~seen).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0

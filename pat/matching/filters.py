@@ -18,12 +18,13 @@ from arraygeom.fields.protocol import compilable
 
 
 def blurred(images: Float[Tensor, "b 1 h w"], blurs: Sequence[float]) -> Float[Tensor, "b 1 h w"]:
-    """Blur each image by a Gaussian with its standard deviation in pixels; 0 leaves it.
+    """Blur each image of a batch by its own Gaussian.
 
-    With gradients if the images have some.
+    Args:
+        blurs: standard deviation for each image, pixels; 0 leaves it.
 
     Returns:
-        Images of the same shape.
+        Images of the same shape, with gradients if the images have some.
     """
 
     def one(image: Tensor, blur: float) -> Tensor:
@@ -98,26 +99,29 @@ class LocalMoments(NamedTuple):
 
 
 def filled(planes: NDArray, weight: NDArray, guide: NDArray, how: tuple[float, float]) -> NDArray:
-    """Compute the weighted mean of planes (c, h, w) over connected regions of the guide.
+    """Compute the weighted mean of planes over connected regions of a guide (Min et al. 2014).
 
     Args:
-        weight: positive weight (h, w) of each pixel.
-        guide: bytes (h, w).
+        planes: planes (c, h, w).
+        weight: weight (h, w) of each pixel, above 0.
+        guide: image (h, w), uint8, whose edges bound the regions.
         how: strength of smoothing, and 8-bit difference of an edge.
 
     Returns:
-        Planes at all pixels.
+        Planes (c, h, w), float32.
     """
     total, *sums = smoothed([weight, *(plane * weight for plane in planes)], guide, how)
     return np.stack([plane / total for plane in sums])
 
 
 def smoothed(planes: Sequence[NDArray], guide: NDArray[np.uint8], how: tuple[float, float]) -> list[NDArray]:
-    """Smooth planes where the guide shows no edge.
+    """Smooth planes where the guide shows no edge, by the fast global smoother (Min et al. 2014).
 
-    One after the other: the smoother is not for several threads, but has its own.
+    Planes are smoothed one after the other: OpenCV's smoother is not thread-safe, but has threads of its own.
 
     Args:
+        planes: planes (h, w).
+        guide: image (h, w).
         how: strength of smoothing, and 8-bit difference of an edge.
 
     Returns:
@@ -130,9 +134,16 @@ def smoothed(planes: Sequence[NDArray], guide: NDArray[np.uint8], how: tuple[flo
 def nearest_known(
     x: Float[Tensor, "*b h w"], valid: Bool[Tensor, "*b h w"], axis: int, back: bool
 ) -> Float[Tensor, "*b h w"]:
-    """Return the value of the nearest known pixel before (or, if `back`, after) along an axis.
+    """Replace each pixel by the nearest known one along an axis, itself included.
 
-    The pixel's own value if there is none.
+    Args:
+        x: planes.
+        valid: mask of the known pixels.
+        axis: axis to search along, -1 or -2.
+        back: False to search towards lower indices, True towards higher ones.
+
+    Returns:
+        Planes of the same shape; a pixel's own value where none is known in that direction.
     """
     if back:
         return nearest_known(x.flip(axis), valid.flip(axis), axis, False).flip(axis)

@@ -22,8 +22,10 @@ from ..support.settings import size
 
 @dataclass(frozen=True)
 class InputsSettings:
-    """Settings of the pieces in which large frames are matched at full size, the same for any
-    memory limit."""
+    """Settings of the tiles in which large frames are matched at full size, the same for any memory limit.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     halo: int = size(128, "Their halo, pixels")
     at_once: int = size(1_200_000, "Pixels of alpha matched at once")
@@ -37,8 +39,8 @@ class Beta:
     """One beta's image with the field of alpha's pixels in it.
 
     Attributes:
-        image: (B, C, H, W).
-        field: segments or positions of alpha's pixels.
+        image: image (B, C, H, W), values 0..1.
+        field: segments or positions of alpha's pixels, in pixels of `image`.
         offset: (x, y) of its first pixel in the whole image; other than (0, 0) for a part of an image.
         track: function from alpha's pixels (*n, 2) to their tracks in the image; None for an uncalibrated
             beta.
@@ -57,17 +59,17 @@ class Beta:
 
 @dataclass(frozen=True)
 class Inputs:
-    """Alpha's image and the betas, which may be of any sizes.
+    """Inputs of matching and of a network: alpha's image and the betas, which may be of any sizes.
 
     Attributes:
-        alpha: image (B, C, H, W).
+        alpha: image (B, C, H, W), values 0..1; one channel for matching.
         betas: the betas.
         multiple: pixels at whose multiples parts of betas are cut.
         beta_halo: pixels around the segments that parts of betas include.
         luminance: alpha's share of the result's luminance, for networks that keep it; the rest is beta's.
         bands: number of the result's bands, whose luminance (the mean, if they are not three) alpha sees;
             None for the bands of all betas, of which alpha may see any combination.
-        learned: True if the networks of choice and certainty take part in matching.
+        learned: True if the trained networks of choice and confidence take part in matching.
         sees_luma: True if alpha sees about RGB betas' luma, as far as is known: not in the near infrared.
     """
 
@@ -110,7 +112,12 @@ class Inputs:
         return list(tiles_of(self.hw, sides[0], SETTINGS.halo))
 
     def in_pieces(self, make: Callable[..., Any], *more: Any) -> Any:
-        """Apply a function to each piece of these inputs, and of `more`, cut alike, and assemble the results.
+        """Apply a function to each tile of these inputs, and assemble the results.
+
+        Args:
+            make: function of `Inputs` (and of each of `more`) that returns one plane or several, of the
+                tile's size or smaller by a whole factor.
+            more: values with a method `cut(box)`, which are cut to the same tiles.
 
         Returns:
             Planes (..., h, w), one or several, as the function returns.
@@ -152,8 +159,15 @@ class Inputs:
         )
 
     def touched(self, beta: Beta, box: Box, step: int = 2) -> Box:
-        """Return the part of a beta that the segments of every `step`-th pixel of a box of alpha touch, with
-        the halo."""
+        """Compute the part of a beta that the segments of a part of alpha touch, with the halo.
+
+        Args:
+            box: part of alpha: top, bottom, left, right.
+            step: distance of the rows and columns of alpha that are looked at.
+
+        Returns:
+            Rows and columns of beta: top, bottom, left, right, at multiples of `multiple`.
+        """
         hw = beta.image.shape[-2], beta.image.shape[-1]
         return box_around(_ends_in(beta.field, box, step), hw, self.beta_halo, self.multiple)
 
@@ -172,8 +186,17 @@ def track_in(
     scale: float,
     offset: tuple[float, float],
 ) -> Callable[[Tensor], Track]:
-    """Return tracks of pixels x that are `whole(x)` in alpha, in pixels of beta times a scale
-    plus an offset."""
+    """Convert a function of tracks to a part of alpha and a resized or cropped beta.
+
+    Args:
+        track: function from pixels of the whole alpha to tracks in the whole beta.
+        whole: function from pixels of the part of alpha to those of the whole.
+        scale: factor of beta's pixels.
+        offset: (x, y) added after that.
+
+    Returns:
+        Function from pixels of the part to tracks in the new pixels of beta.
+    """
 
     def changed(v: Tensor) -> Tensor:
         return torch.cat([scale * v[..., :2] + v.new_tensor(offset) * v[..., 2:], v[..., 2:]], -1)
@@ -189,13 +212,18 @@ def ends_of(locations: Segments | Positions) -> Float[Tensor, "n 2"]:
 
 
 def box_around(points: Float[Tensor, "n 2"], hw: HW, halo: int, multiple: int) -> Box:
-    """Return the part of an image around points (x, y), with a halo and corners at whole multiples or the
-    end.
+    """Compute the part of an image around points (x, y).
 
     Points off the image count as the nearest pixel.
 
+    Args:
+        points: pixels.
+        hw: height and width of the image.
+        halo: pixels to add on each side.
+        multiple: number to whose multiples the part is widened, as far as the image goes.
+
     Returns:
-        Rows and columns: top, bottom, left, right.
+        Rows and columns: top, bottom, left, right; the first `multiple` of each without points.
     """
     if not len(points):
         return 0, multiple, 0, multiple

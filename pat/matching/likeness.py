@@ -14,7 +14,10 @@ from .filters import box_mean
 
 @dataclass(frozen=True)
 class LikenessSettings:
-    """Settings of the similarity. Brightness is 0 to 1."""
+    """Settings of the similarity. Brightness is 0 to 1.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     unlike: float = tuned(0.07, "Middlebury: difference of brightness at which likeness is 1 / e")
 

@@ -35,17 +35,17 @@ your own."""
 
 
 def match(inputs: Inputs, choice: Choice | None = None) -> Matches:
-    """Match alpha with every beta, estimate the certainty of each match, and transfer the betas' bands to
-    alpha's view.
+    """Match alpha with every beta, estimate the confidence of each match, and transfer the betas' bands.
 
-    With gradients as `transferred`, and of the positions. Without `inputs.learned` matches have no certainty,
-    and are semi-global ones with a left-right check.
+    Gradients reach images and fields, through the positions too. Without `inputs.learned` matches are
+    semi-global ones with a left-right check, and have no trained confidence.
 
     Args:
-        choice: network of the choice between disparities; None for the one that ships.
+        inputs: alpha, of one channel and even sides, and the betas.
+        choice: network that chooses between candidate disparities; None for the one that ships.
 
     Returns:
-        The matches, with `colours`.
+        The matches in each beta, with `colours` at alpha's view.
 
     Raises:
         ValueError: for a beta whose field is not of straight segments, and for an alpha of odd sides.
@@ -92,11 +92,13 @@ def in_each_beta(inputs: Inputs) -> Matches:
 
 
 def located_in_one(inputs: Inputs) -> BetaMatches:
-    """Match the one beta semi-globally: at half the size for the whole frame, then at full size around those
-    matches.
+    """Match a single beta semi-globally: at half the size for the whole frame, then at full size around that.
+
+    Args:
+        inputs: inputs with one beta.
 
     Returns:
-        The matches.
+        The matches, detached, without choice, confidence or colours.
     """
     comparison = Comparison.from_images(inputs.alpha, inputs.betas[0].image, seen_mix(inputs))
     halves = comparison.half_views(inputs.alpha, inputs.betas[0].image)
@@ -112,10 +114,14 @@ def located_in_one(inputs: Inputs) -> BetaMatches:
 
 
 def seen_mix(inputs: Inputs) -> SpectralMix | None:
-    """Estimate the combination of the one beta's bands that is most similar to alpha, on reduced images.
+    """Estimate the combination of a single beta's bands that is most similar to alpha, on reduced images.
+
+    Args:
+        inputs: inputs with one beta.
 
     Returns:
-        The combination; None, for luma, where the result's bands are known or the beta has one band.
+        The combination; None where luma or the mean of the bands is compared: the number of the result's
+        bands is stated (`inputs.bands`), or the beta has one band.
     """
     alpha, (beta,) = inputs.alpha, inputs.betas
     if inputs.bands is not None or beta.image.shape[1] == 1:
@@ -140,7 +146,8 @@ def coarse_mix(
     Args:
         segments: segments (B or 1, h / factor, w / factor) of the centres of blocks of alpha's pixels, in
             pixels of the whole beta.
-        blocks: the same of half as many blocks.
+        blocks: segments (B or 1, h / 2 factor, w / 2 factor) of blocks of twice the side.
+        factor: whole number by which both images are reduced.
 
     Returns:
         The combination.

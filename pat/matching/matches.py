@@ -34,8 +34,8 @@ class Colours(NamedTuple):
     """Bands of one beta carried to alpha's view, each minus alpha.
 
     Attributes:
-        bands: (B, C, H, W), at the match, with the detail that alpha has and beta lacks.
-        weight: (B, 1, H, W), share to which `bands` count as those of the point that alpha sees, 0 to 1.
+        bands: (B, C, H, W), bands minus alpha at the match, with the detail that alpha has and beta lacks.
+        weight: (B, 1, H, W), weight of `bands` against the fills, 0 to 1.
         likeness: (B, 1, H, W), photometric similarity of alpha and beta at the match, 0 to 1; 1 where alpha
             does not see luma.
         fills: (B, F, C, H, W), the bands by nearest examples at pixels that beta does not see; before it,
@@ -66,8 +66,8 @@ class BetaMatches:
     Attributes:
         disparity: (B, 1, H, W), the distance of the match from the end of its segment, pixels of beta; where
             no match passes the left-right check, diffused from where one does.
-        facts: (B, 3, H / 2, W / 2), the left-right error, the margin over other candidates, and the cost;
-            each 0 to 1.
+        facts: (B, 3, H / 2, W / 2), statistics of the match: left-right error (1 for 8 pixels and more),
+            margin of its cost to the next best, and its cost; each 0 to 1.
         comparison: the images that were compared.
         chosen: (B, 1, H, W), the disparity of the surface that alpha sees, which may be occluded in beta; of
             several betas, the one on which they agree; None before it is chosen.
@@ -119,14 +119,14 @@ class BetaMatches:
         return self.colours
 
     def positions(self, segments: Segments, hw: HW) -> tuple[Float[Tensor, "b h w 2"], Bool[Tensor, "b h w"]]:
-        """Compute match positions (x, y) in a beta of this size.
+        """Compute the positions (x, y) in beta of the surface that alpha sees.
 
         Args:
             segments: segments of alpha's pixels.
-            hw: size of the beta.
+            hw: height and width of the beta.
 
         Returns:
-            Positions in beta's pixels, and a mask of those on it.
+            Positions (B, H, W, 2) in beta's pixels, and a mask (B, H, W) of those on its image.
         """
         where = match_positions(segments, self.surface, beyond_edge=True)
         return where, segments.valid & on_image(where, hw)

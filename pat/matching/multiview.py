@@ -39,7 +39,10 @@ from .semi_global import CONSISTENT, DISPARITY_FILL
 
 @dataclass(frozen=True)
 class MultiviewSettings:
-    """Settings of the agreement of several betas."""
+    """Settings of the agreement on depth of several betas.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     farthest: float = size(
         8.0, "Half-size pixels between disparities that are 1 in the facts, as in semi-global matching"
@@ -66,15 +69,15 @@ STRIP = 1 << 16
 
 
 class Ambiguity(NamedTuple):
-    """Difference that two betas' inverse depths of alpha's pixels may have: own = scale other + plane (x, y,
-    1).
+    """Projective ambiguity between two betas' inverse depths of alpha's pixels.
 
-    As far as it is known from the images alone, the geometry of two views is known up to this (Hartley,
-    Zisserman 2004, chapter 10). Cameras that were calibrated by pairs agree on depth only by it.
+    The inverse depth by one beta is `scale` times that by the other, plus the plane at alpha's pixel (x, y).
+    The geometry of two views is known up to this from images alone (Hartley, Zisserman 2004, chapter 10), so
+    cameras that were calibrated in pairs agree on depth only after it is applied.
 
     Attributes:
         scale: factor of the other's inverse depth.
-        plane: coefficients of x, y and 1.
+        plane: coefficients of x, y and 1, for pixels of alpha.
     """
 
     scale: float
@@ -91,15 +94,15 @@ NO_AMBIGUITY = Ambiguity(1.0, (0.0, 0.0, 0.0))
 
 @dataclass(frozen=True)
 class MatchedBeta:
-    """One beta at alpha's pixels, (h, w).
+    """Matches of some rows of alpha's pixels (h, w) in one calibrated beta.
 
     Attributes:
-        segments: search segments.
-        track: tracks by inverse depth.
-        disparity: matches, pixels from the segments' ends.
-        facts: facts of the matches, (3, h, w).
-        weight: amount by which they support an inverse depth; 0 if they propose none.
-        hw: size of the beta.
+        segments: search segments, pixels of beta.
+        track: positions in beta by inverse depth.
+        disparity: matches, pixels of beta from the segments' ends.
+        facts: left-right error, margin and cost of the matches, (3, h, w), as in `BetaMatches`.
+        weight: weight with which a match votes for its inverse depth; 0 for none.
+        hw: height and width of the beta.
     """
 
     segments: Segments
@@ -113,8 +116,17 @@ class MatchedBeta:
     def from_matches(
         cls, beta: Beta, matches: BetaMatches, rows: tuple[int, int], ambiguity: Ambiguity = NO_AMBIGUITY
     ) -> MatchedBeta:
-        """Read a beta with a track and its own matches, at some rows of alpha: from an even to an
-        even one."""
+        """Read the matches in a beta, at some rows of alpha.
+
+        Args:
+            beta: a calibrated beta (its `track` is not None).
+            matches: its matches; if a disparity was chosen, that is taken, with its confidence.
+            rows: first row, and row after the last, both even.
+            ambiguity: relation of its inverse depths to those of a reference beta.
+
+        Returns:
+            The matches at these rows, float64.
+        """
         (top, bottom), pixels = rows, beta.field.straight
         half = slice(top // FINE, bottom // FINE)
         start, end = (x[0, top:bottom].double() for x in (pixels.start, pixels.end))
@@ -194,12 +206,12 @@ class MatchedBeta:
 
 
 class Agreement(NamedTuple):
-    """Result on which the matches of all betas agree, at alpha's pixels.
+    """Inverse depths on which the matches of all betas agree, at alpha's pixels.
 
     Attributes:
-        inverse_depth: (1, h, w).
-        known: (1, h, w), mask of the pixels at which any match is consistent.
-        facts: (2, h / 2, w / 2), margin and cost of the matches that were taken.
+        inverse_depth: inverse depth in alpha (1, h, w), 1 / metres.
+        known: mask (1, h, w) of the pixels for which any match has a vote.
+        facts: margin and cost (2, h / 2, w / 2), 0 to 1: the best of the matches that agree.
     """
 
     inverse_depth: Tensor
@@ -208,7 +220,17 @@ class Agreement(NamedTuple):
 
     @classmethod
     def from_views(cls, views: Sequence[MatchedBeta], like: Tensor) -> Agreement:
-        """Compute the inverse depth with most support, in the type of `like`."""
+        """Compute the inverse depth with the most votes at each pixel.
+
+        Each match proposes one; the mean of those near the best, by votes and precision, is taken.
+
+        Args:
+            views: matches in each beta, at the same rows.
+            like: tensor whose type the result has.
+
+        Returns:
+            The inverse depths, and statistics of the matches that agree.
+        """
         proposals = [view.inverse_depth for view in views]
         weights = torch.stack([valid * view.weight for view, (_, valid) in zip(views, proposals)])
         near = [[(v.disparity_of(w) - v.disparity).abs() < NEAR for v in views] for w, _ in proposals]
@@ -227,12 +249,17 @@ class Agreement(NamedTuple):
 
 
 def agreed(inputs: Inputs, matches: Matches) -> Matches:
-    """Replace `disparity` and `facts` of each beta by those of the inverse depths on which all betas agree.
+    """Replace the matches in each beta by the inverse depths on which all betas agree.
 
-    If one was chosen for each beta, `chosen` is replaced by that of the inverse depths on which these agree.
+    Occluded pixels are found with a z-buffer. `disparity` and `facts` are replaced; `chosen` too if it is
+    known for every beta, by agreement of the chosen disparities.
+
+    Args:
+        inputs: inputs for which `can_agree` is True.
+        matches: matches of each beta alone.
 
     Returns:
-        The matches.
+        The matches, consistent in all betas.
     """
     of_betas = [replace(one, chosen=None) for one in matches.betas]
     between = ambiguities(inputs, of_betas)
@@ -250,16 +277,18 @@ def agreed(inputs: Inputs, matches: Matches) -> Matches:
 
 @torch.no_grad()
 def with_likeliest_colours(inputs: Inputs, own: Matches, agreed: Matches) -> Matches:
-    """Return the agreed matches, with the origin of colours at the own match where beta is more similar
-    there.
+    """Choose where each beta's colours are taken: at its own match, or at the one on which all betas agree.
 
-    Only for betas that show all bands of the result, whose colours stand in for each other's: `disparity` is
-    their own match, or the agreed one if beta is more similar to alpha there; and `facts` are of their own
-    matches.
+    The one at which beta is more similar to alpha is taken. This holds for betas that show all bands of the
+    result, whose colours can replace each other's; others keep the agreed match.
 
     Args:
         own: matches of each beta alone.
-        agreed: matches on which all agree.
+        agreed: matches on which all betas agree.
+
+    Returns:
+        The agreed matches (`chosen` is unchanged), with `disparity` where colours are taken, and `facts` of
+        the own matches.
     """
     betas = list(agreed.betas)
     for i, (one, found, same) in enumerate(zip(inputs.by_beta, own.betas, agreed.betas)):
@@ -293,10 +322,10 @@ def _of_all(
 
 
 def ambiguities(inputs: Inputs, of_betas: Sequence[BetaMatches]) -> list[Ambiguity]:
-    """Estimate the ambiguity of each beta against that with the most informative matches.
+    """Estimate the projective ambiguity of each beta against the one with the most informative matches.
 
     Returns:
-        One per beta, in order; none unless clearly more pixels agree with one.
+        One per beta, in order; `NO_AMBIGUITY` unless clearly more pixels agree with another.
     """
     step = max(inputs.hw[0] // SETTINGS.sampled_rows // FINE, 1) * FINE
     rows = [(top, top + FINE) for top in range(0, inputs.hw[0], step)]

@@ -26,7 +26,10 @@ LEAST_WEIGHT = 1e-6
 
 @dataclass(frozen=True)
 class NormalisationSettings:
-    """Settings of the normalisation of one image's brightness and sharpness to another's."""
+    """Settings of the normalisation of one image's brightness and sharpness to another's.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     largest_gain: float = size(4.0, "Of brightness; images that differ by more show different things")
     blurs: tuple[float, ...] = size(
@@ -39,11 +42,11 @@ SETTINGS = NormalisationSettings()
 
 
 class Moments(NamedTuple):
-    """Mean and standard deviation of images, over their last three dimensions, which are kept.
+    """Mean and standard deviation of images, over their last three dimensions.
 
     Attributes:
-        mean: mean.
-        deviation: standard deviation.
+        mean: means (*b, 1, 1, 1).
+        deviation: standard deviations (*b, 1, 1, 1).
     """
 
     mean: Tensor
@@ -79,9 +82,14 @@ def normalised(
     Statistics of whole images mean little where these show different parts of a scene.
 
     Args:
+        image: image to change.
+        like: image whose mean and standard deviation are wanted.
         weight: weight of pixels at which both show the same point, for images of one size; None for whole
             images.
         largest_gain: largest factor of the standard deviation.
+
+    Returns:
+        The image, scaled and shifted as a whole, not clipped.
     """
     return moments(image, weight).matched(image, moments(like, weight), largest_gain)
 
@@ -94,9 +102,18 @@ def mean_moments(images: Iterable[Float[Tensor, "c h w"]]) -> Moments:
 def explained_share(
     image: Float[Tensor, "b 1 h w"], of: Float[Tensor, "b 1 h w"], weight: Float[Tensor, "b 1 h w"]
 ) -> Float[Tensor, "b 1 1 1"]:
-    """Compute the share of one image's variance that another explains where weighted, 0 if they are opposite.
+    """Compute the weighted share of one image's variance that a linear regression on another explains.
 
-    Small for an alpha in the near infrared: its detail says little of visible colours.
+    It is the squared correlation, and small for an alpha in the near infrared, whose detail says little of
+    visible colours.
+
+    Args:
+        image: image to explain.
+        of: image to explain it by.
+        weight: weight of each pixel, at least 0.
+
+    Returns:
+        Share for each of the batch, 0 to 1; 0 for a negative correlation.
     """
     a, b = (p - _weighted_mean(p, weight) for p in (image, of))
     common, one, other = (_weighted_mean(p, weight) for p in (a * b, a * a, b * b))
@@ -112,9 +129,9 @@ class ComparedViews(NamedTuple):
     """Alpha and beta for comparison, equally bright and sharp.
 
     Attributes:
-        alpha: (B, 1, h, w).
-        beta: (B, 1, hb, wb).
-        guides: alpha in 8 bits, (B, h, w).
+        alpha: alpha's image (B, 1, h, w).
+        beta: combination of beta's bands (B, 1, hb, wb).
+        guides: alpha before it is blurred, in 8 bits, (B, h, w).
         blurs: standard deviation, in pixels, by which each alpha was blurred to be as sharp as beta.
     """
 
@@ -162,12 +179,11 @@ class Normalisation(NamedTuple):
 def equalising_blurs(
     image: Float[Tensor, "b 1 h w"], other: Float[Tensor, "b 1 hb wb"]
 ) -> tuple[list[float], list[float]]:
-    """Compute standard deviations that blur either image to the sharpness of the other; 0 for the less sharp.
-
-    Detail that only one has cannot be matched.
+    """Compute the Gaussian blurs that make two images equally sharp: detail of one alone cannot be matched.
 
     Returns:
-        Pixels for each image of the batch, of `image` and of `other`.
+        Standard deviations in pixels for each image of the batch, of `image` and of `other`; 0 for the one
+        that is not the sharper.
     """
     image_sharpness, other_sharpness = ([_sharpness(p) for p in images] for images in (image, other))
     return [_equal_blur(p, s) for p, s in zip(image, other_sharpness)], [

@@ -47,13 +47,16 @@ def match_positions(
     beyond_edge: bool = False,
     extent: Extent | None = None,
 ) -> Float[Tensor, "b h w 2"]:
-    """Compute the positions of matches, `disparity` from the ends of segments (B or 1, H, W), in beta's
-    pixels.
+    """Compute the positions of matches in beta.
 
     Args:
-        disparity: pixels of beta; may be at half the size.
+        segments: segments (B or 1, H, W) of alpha's pixels.
+        disparity: distance of the match from the segment's end, pixels of beta; may be at half the size.
         beyond_edge: True to allow positions beyond the segments' near ends.
         extent: extent of the segments; None to compute it.
+
+    Returns:
+        Positions (x, y) in beta's pixels, in the type of the segments.
     """
     length, towards = extent or Extent.from_segments(segments)
     if disparity.shape[-2:] != length.shape[-2:]:
@@ -68,7 +71,11 @@ def at_matches(
     disparity: Float[Tensor, "b 1 _ _"],
     extent: Extent | None = None,
 ) -> tuple[Float[Tensor, "b c h w"], Bool[Tensor, "b 1 h w"]]:
-    """Sample beta at the matches; beyond its edge, at the edge.
+    """Sample beta bicubically at the matches; beyond its edge, at the edge.
+
+    Args:
+        disparity: distance of the match from the segment's end, pixels of beta; may be at half the size.
+        extent: extent of the segments; None to compute it.
 
     Returns:
         Bands at alpha's pixels, and a mask of the matches that are on beta. Matches of invalid segments are

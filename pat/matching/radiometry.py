@@ -28,9 +28,11 @@ from ..support.settings import physics, size, tuned
 
 @dataclass(frozen=True)
 class ResponseSettings:
-    """Settings of the expectations of cameras, and of light, which differs between two views of a surface.
+    """Settings of the fit of alpha's response: priors of cameras, and of how light differs between two views.
 
-    Widths of cameras' properties are standard deviations, not chosen on images.
+    Priors of cameras' properties are standard deviations, not chosen on images.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
     """
 
     sensor: tuple[float, float, float] = physics(
@@ -164,7 +166,13 @@ ResponseSpec = Literal["fit", "rec601"] | tuple[float, float, float] | Response
 
 
 def stated_response(weights: Sequence[float]) -> Response:
-    """Return the response of an alpha that is weights . beta.
+    """Make the response of an alpha that is a known combination of beta's bands.
+
+    Args:
+        weights: weights of red, green and blue.
+
+    Returns:
+        The response, with weights that sum to 1 and their sum as the gain.
 
     Raises:
         ValueError: unless there are three weights, none negative or infinite, not all 0.
@@ -177,7 +185,13 @@ def stated_response(weights: Sequence[float]) -> Response:
 
 
 def given_response(response: ResponseSpec) -> Response:
-    """Return the stated response, or Rec. 601's if it is to be fitted.
+    """Return the response that the user stated; Rec. 601's for "rec601", and for "fit" until it is fitted.
+
+    Args:
+        response: "fit", "rec601", three weights of red, green and blue, or a `Response`.
+
+    Returns:
+        The response.
 
     Raises:
         ValueError: for a value of another kind.
@@ -198,7 +212,7 @@ def fit(
     *,
     vignetting: bool = True,
 ) -> Response:
-    """Estimate the most probable response by matched points: weights, gain, gamma and vignetting.
+    """Estimate alpha's most probable response from matched points: weights, gain, gamma and vignetting.
 
     Each explanation is judged by its evidence, the probability of alpha under all responses that it allows
     (MacKay 1992): an explanation that allows more must explain more. Light differs between the views as a

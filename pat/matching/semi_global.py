@@ -38,7 +38,10 @@ from .positions import FINE, Extent
 
 @dataclass(frozen=True)
 class SemiGlobalSettings:
-    """Settings of a run of semi-global matching; penalties are in the unit of `cost`."""
+    """Settings of a run of semi-global matching; penalties are in the unit of `cost`.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     step: float = tuned(12.0, "Source not recorded: penalty of neighbours' labels that differ by one")
     jump: float = tuned(100.0, "Source not recorded: of those that differ by more, where alpha has no edge")
@@ -63,11 +66,12 @@ CONSISTENT, DISPARITY_FILL = HALF_SIZE.consistent, HALF_SIZE.fill
 
 
 class HalfSizeMatches(NamedTuple):
-    """Matches at half size.
+    """Matches of alpha's pixels at half the size.
 
     Attributes:
-        disparity: (B, 1, H / 2, W / 2), pixels of beta.
-        facts: as of `BetaMatches`.
+        disparity: distance of the match from the segment's end (B, 1, H / 2, W / 2), pixels of the full-size
+            beta.
+        facts: left-right error, margin and cost (B, 3, H / 2, W / 2), each 0 to 1, as in `BetaMatches`.
     """
 
     disparity: Tensor
@@ -80,7 +84,9 @@ class HalfSizeMatches(NamedTuple):
 
 
 class Windows(NamedTuple):
-    """Labels of each pixel: one or two runs of consecutive labels, which do not overlap.
+    """Labels (positions along its segment) to compare at each pixel: one or two runs of consecutive ones.
+
+    Runs do not overlap.
 
     Attributes:
         first: first labels (B, h, w, runs), int32.
@@ -116,10 +122,11 @@ class _Geometry(NamedTuple):
 
 
 def matched_at_half_size(views: ComparedViews, blocks: Segments) -> HalfSizeMatches:
-    """Match views at half size.
+    """Match views semi-globally at half the size.
 
     Args:
-        blocks: segments of their pixels, in pixels of the whole beta.
+        views: alpha and beta at half the size, equally bright and sharp.
+        blocks: segments of alpha's pixels at half the size, in pixels of the full-size beta.
 
     Returns:
         The matches, detached.
@@ -138,10 +145,14 @@ def geometry_of(segments: Segments, batch: int, hw: tuple[int, int], factor: int
     outermost pixels may have been cut there.
 
     Args:
-        hw: size of the beta in pixels of the segments.
+        segments: segments (1 or batch, h, w).
+        batch: number of images.
+        hw: height and width of the beta in pixels of the segments.
+        factor: whole number by which beta is reduced.
 
     Returns:
-        Arrays for each of the batch.
+        Arrays (batch, h, w, ...), float32: ends, unit vectors from end to start, lengths, and 1 where the
+        start may have been cut.
     """
     length, towards = Extent.from_segments(segments)
     last = segments.start.new_tensor([hw[1] - 1, hw[0] - 1])
@@ -166,10 +177,14 @@ def matched_by_labels(
     regions of alpha.
 
     Args:
-        facts: number of facts to compute, 1 or 3.
+        views: alpha and beta, equally bright and sharp.
+        geometry: segments in pixels of that beta (`geometry_of`).
+        windows: labels to compare at each pixel.
+        settings: settings of the run.
+        facts: number of statistics to compute: 1 (left-right error), or 3 (margin and cost too).
 
     Returns:
-        Disparity in pixels of the beta given, and the first facts of `BetaMatches`.
+        Disparity, pixels of the beta given, and the statistics, 0 to 1, as in `BetaMatches`.
     """
     alpha, beta = (numpy_of(image[:, 0]) for image in (views.alpha, views.beta))
     disparity, measured = _matched_blocks(alpha, beta, geometry, windows, settings, facts)

@@ -68,10 +68,23 @@ def _count_within(length, first, count):
 
 @compiled(nogil=True, cache=True)
 def costs(alpha, beta, first, count, end, along, length, cut, rows, columns, out):
-    """Write the cost of alpha's pixel and beta's by label: out (h, w, runs, lanes), of flat `cost` planes.
+    """Compute the matching cost of each label of each pixel.
 
-    The label l lies l pixels from `end` along the unit vectors `along`; those beyond `length` are nowhere,
-    or, where it is beta's edge that cuts the segment, not seen.
+    Label l lies l pixels from the segment's end. A label beyond its length costs `NOWHERE`, or `UNSEEN` where
+    it is beta's edge that cuts the segment.
+
+    Args:
+        alpha: flat planes of alpha, as `planes_of` computes them.
+        beta: flat planes of beta.
+        first: first label of each run (h, w, runs).
+        count: labels per run.
+        end: ends of the segments (h, w, 2), pixels of beta.
+        along: unit vectors (h, w, 2) from end to start.
+        length: lengths (h, w), pixels of beta; negative for none.
+        cut: 1 where beta's edge may cut the segment (h, w).
+        rows: height of beta.
+        columns: width of beta.
+        out: costs (h, w, runs, lanes), uint8, to write; lanes from `count` on have no label.
     """
     height, width, runs, lanes = out.shape
     size, places, best_label = runs * lanes, np.empty(runs * lanes, np.int32), np.empty(lanes, np.uint8)
@@ -171,11 +184,16 @@ def _jumps(guide, beside, small, large, out):
 
 @compiled(nogil=True, cache=True)
 def aggregate(cost, guide, first, count, small, large, total):
-    """Write the sum over eight semi-global paths (Hirschmüller 2008), in parts: total (h, w, runs, lanes),
-    int16.
+    """Sum costs over eight semi-global paths (Hirschmüller 2008).
 
-    Penalties of neighbours whose labels differ by one (small), and by more (large, where alpha shows no
-    edge).
+    Args:
+        cost: costs (h, w, runs, lanes), as `costs` writes them.
+        guide: alpha (h, w), whose edges lower the large penalty.
+        first: first label of each run (h, w, runs).
+        count: labels per run.
+        small: penalty of neighbours whose labels differ by one.
+        large: penalty of those that differ by more, where alpha shows no edge.
+        total: sums (h, w, runs, lanes), int16, in units of 1 / `PARTS`, to write.
     """
     height, width, runs, lanes = cost.shape
     reach = count + 1
@@ -285,13 +303,21 @@ def _keep(paths, start, stride, runs, penalty, path):
 
 @compiled(nogil=True, cache=True)
 def winners(total, first, count, segments, hw, corner, large, claims, labels):
-    """Write the best label of each pixel of a part that begins at a corner, with its facts and position.
+    """Find the best label of each pixel of a block of alpha.
 
-    `labels` are disparity, the best label to a fraction; facts (h, w, 1 or 3): the whole label, its margin to
-    the second best (`UNRELATED` if there is none), and its cost; and positions in beta, pixels counted row by
-    row (rows * columns: not on it). `total` is in parts, the larger penalty `large` the unit of the facts.
-    `claims`, of each pixel of beta and one more, keeps the least cost with which a pixel of alpha matches it,
-    and that pixel's label: 16 bits of either. `segments` are end, along, length and cut, as of `costs`.
+    Args:
+        total: sums of costs (h, w, runs, lanes) of alpha, as `aggregate` writes them.
+        first: first label of each run (h, w, runs).
+        count: labels per run.
+        segments: end, along, length and cut of alpha's segments, as for `costs`.
+        hw: height and width of beta.
+        corner: first row and column of the block.
+        large: the large penalty, in whose units margin and cost are.
+        claims: for each pixel of beta, and one more, the least cost with which a pixel of alpha matches it
+            and that pixel's label (16 bits each); updated.
+        labels: three arrays to write, of the block: disparity, the best label to a fraction; numbers (h, w, 1
+            or 3): the whole label, its margin to the second best (`UNRELATED` if there is none), and its
+            cost; and position in beta, pixels counted row by row (height times width for none).
     """
     (end, along, length, cut), (rows, columns), (top, left) = segments, hw, corner
     disparity, facts, positions = labels
@@ -370,10 +396,13 @@ def _between(total, best, last):
 
 @compiled(nogil=True, cache=True)
 def costs_at(alpha, beta, places, out):
-    """Write the cost of alpha's pixel and beta's at each of its places: out (h, w, 1, lanes).
+    """Compute the matching cost of each pixel of alpha at explicit pixels of beta.
 
-    Places are pixels of beta counted row by row (-1: none). Lanes after the last place have no label. `alpha`
-    and `beta` are flat planes of `cost`.
+    Args:
+        alpha: flat planes of alpha, as `planes_of` computes them.
+        beta: flat planes of beta.
+        places: pixels of beta (h, w, labels), counted row by row; -1 for none, which costs `NOWHERE`.
+        out: costs (h, w, 1, lanes), uint8, to write; lanes after the last place have no label.
     """
     height, width, labels = places.shape
     for y in range(height):

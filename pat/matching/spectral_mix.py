@@ -22,7 +22,10 @@ from .likeness import UNLIKE
 
 @dataclass(frozen=True)
 class MixSettings:
-    """Settings of the combination. Brightness is 0 to 1."""
+    """Settings of the fit of bands to alpha; brightness is 0 to 1.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     equal: float = size(
         1e-4, "Share of the bands' mean variance by which the combination is drawn to equal parts"
@@ -46,16 +49,15 @@ SETTINGS = MixSettings()
 
 
 class SpectralMix(NamedTuple):
-    """The combination of C bands most similar to alpha, for each of a batch: offset + sum of weights times
-    bands.
+    """Linear combination of C bands that is most similar to alpha: offset + sum of weights times bands.
 
     Attributes:
-        weights: (B, C).
-        offset: (B).
-        slopes: (B, C), rise of each band where the combination rises by 1 from one pixel to the next; less if
-            that explains alpha badly.
-        gain: (B), 0 to 1: share of alpha's excess over the combination that is the bands' error, and not
-            another spectrum. 0 for one band, where that cannot be known.
+        weights: weight of each band (B, C).
+        offset: offset (B).
+        slopes: change of each band (B, C) where the combination changes by 1 from one pixel to the next; less
+            if that explains alpha badly.
+        gain: share (B), 0 to 1, of alpha's difference from the combination that is an error of the bands, and
+            not another spectrum; 0 for one band, where that cannot be known.
     """
 
     weights: Float[Tensor, "b c"]
@@ -76,10 +78,17 @@ class SpectralMix(NamedTuple):
         alpha: Float[Tensor, "b 1 h w"],
         weight: Float[Tensor, "b 1 h w"],
     ) -> SpectralMix:
-        """Fit the combination most similar to alpha by weighted least squares, relative to each pixel's
-        surroundings.
+        """Fit the combination most similar to alpha by weighted least squares, relative to local means.
 
-        Twice, the second time without outliers.
+        It is fitted twice, the second time without outliers.
+
+        Args:
+            bands: beta's bands at alpha's pixels.
+            alpha: alpha, no sharper than the bands.
+            weight: weight of each pixel, at least 0.
+
+        Returns:
+            The combination for each of the batch.
         """
         parts = [_mix(*tensors) for tensors in zip(bands.double(), alpha.double(), weight.double())]
         return cls(*(torch.stack(tensors) for tensors in zip(*parts)))

@@ -34,7 +34,10 @@ FULL_SIZE = SemiGlobalSettings(step=20.0, jump=80.0, margin=48)
 
 @dataclass(frozen=True)
 class SubpixelSettings:
-    """Settings of matching at full size, and to a fraction of a pixel."""
+    """Settings of matching at full size, and to a fraction of a pixel.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     run: int = size(5, "Labels in a run, of which each pixel has two")
     neighbourhood: int = size(5, "Side of the neighbourhood at half the size, pixels")
@@ -62,12 +65,14 @@ SETTINGS = SubpixelSettings()
 def matched_at_full_size(
     views: ComparedViews, segments: Segments, half: Float[Tensor, "b 1 h2 w2"]
 ) -> tuple[Float[Tensor, "b 1 h w"], Float[Tensor, "b 1 h2 w2"]]:
-    """Match to a fraction of a pixel, from the disparity at half the size.
+    """Match semi-globally at full size around the disparities at half the size, to a fraction of a pixel.
 
-    Where matching back from beta disagrees, disparity is diffused from where it agrees.
+    Where the left-right check fails, disparity is diffused from where it passes.
 
     Args:
-        half: disparity at half the size, pixels of beta.
+        views: alpha and beta at full size, equally bright and sharp.
+        segments: segments of alpha's pixels.
+        half: disparity at half the size, pixels of the full-size beta.
 
     Returns:
         Disparity in pixels of beta, and the left-right error, 0 to 1, at half the size.
@@ -117,10 +122,10 @@ def _surfaces(disparity: Plane, weight: Plane, brightness: NDArray[np.uint8], ed
 
 
 def following(inputs: Inputs, matches: Matches) -> Matches:
-    """Give the matches gradients, where images and segments have gradients.
+    """Give the matches gradients by the images and segments that require some.
 
     Returns:
-        The matches, of the same values.
+        The matches with the same values; those in other betas are unchanged.
     """
     betas, alpha = [], inputs.alpha
     for beta, one in zip(inputs.betas, matches.betas):
@@ -136,11 +141,13 @@ def following(inputs: Inputs, matches: Matches) -> Matches:
 def with_gradients(
     views: ComparedViews, segments: Segments, disparity: Float[Tensor, "b 1 h w"]
 ) -> Float[Tensor, "b 1 h w"]:
-    """Return the same disparity with gradients of the best agreement of brightness along the segments at each
-    pixel.
+    """Give a disparity the gradients of the best photometric agreement along the segments at each pixel.
 
-    By the implicit function theorem: there the least squares' step is zero, and stays so if the match moves
-    by as much as images and segments move the step.
+    By the implicit function theorem: at the best agreement the least squares' step is zero, and stays so if
+    the match moves by as much as images and segments move the step.
+
+    Returns:
+        The same disparity, pixels of beta, differentiable by images and segments.
     """
     step = _step(views, segments, disparity)
     return disparity + (step - step.detach())

@@ -25,7 +25,10 @@ Plane = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class SurfaceSettings:
-    """Settings of planes."""
+    """Settings of the fit of local planes to disparity.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     level: float = tuned(
         0.005, "Middlebury, tune half: variance of position, over reach^2, below which planes are level"
@@ -36,13 +39,13 @@ SETTINGS = SurfaceSettings()
 
 
 class Planes(NamedTuple):
-    """Planes of every second pixel.
+    """Planes fitted around every second pixel in each direction.
 
     Attributes:
         value: value at the pixel.
-        right: slope per pixel to the right.
-        down: slope per pixel downwards.
-        around: mean weight around.
+        right: slope per full-size pixel to the right.
+        down: slope per full-size pixel downwards.
+        around: mean weight of the values around.
     """
 
     value: Plane
@@ -52,9 +55,13 @@ class Planes(NamedTuple):
 
     @classmethod
     def through(cls, values: Plane, weight: Plane, guide: NDArray[np.float32], reach: float) -> Planes:
-        """Fit planes through weighted values (h, w) of every second pixel, by least squares.
+        """Fit a plane around every pixel by weighted least squares, within edges of a guide.
 
-        Values count to `reach` pixels around; a change of 1 in the guide (h, w, c) is as far.
+        Args:
+            values: values (h, w) of every second pixel.
+            weight: their weights, at least 0.
+            guide: image (h, w, c); a change of 1 in it counts as far as `reach`.
+            reach: full-size pixels to which values count.
 
         Returns:
             The planes; pixels that no value reaches have no weight around.

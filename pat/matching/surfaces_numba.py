@@ -13,10 +13,15 @@ TINY = np.finfo(np.float32).tiny
 
 @compiled(nogil=True, cache=True)
 def weighted_terms(values, weight, centre, reach, out):
-    """Write the terms of planes into out (3, h, w, 4).
+    """Compute the terms of the weighted least squares of planes z = value + right x + down y.
 
-    Weights; weights times x, y, x x, x y, y y, z, x z, y z and themselves; and 0. x and y are counted from
-    the middle in `reach` pixels, z from `centre`.
+    Args:
+        values: values z + centre (h, w).
+        weight: their weights.
+        centre: number that is subtracted from the values.
+        reach: pixels that are the unit of x and y, which are counted from the middle.
+        out: terms (3, h, w, 4) to write: weights; weights times x, y, x x, x y, y y, z, x z, y z and
+            themselves; and 0.
     """
     (height, width), centre, reach = values.shape, np.float32(centre), np.float32(reach)
     one, two, three = out
@@ -33,9 +38,17 @@ def weighted_terms(values, weight, centre, reach, out):
 
 @compiled(nogil=True, cache=True)
 def planes_through(one, two, three, centre, reach, level, out):
-    """Write planes into out (4, h, w), from smoothed `weighted_terms`.
+    """Solve for the planes, from `weighted_terms` that are summed around each pixel.
 
-    Value, slopes a pixel to the right and down, and the mean weight.
+    Args:
+        one: first four terms (h, w, 4).
+        two: next four.
+        three: last four.
+        centre: number that was subtracted from the values.
+        reach: pixels that are the unit of x and y.
+        level: variance of position, in that unit squared, below which planes are level.
+        out: planes (4, h, w) to write: value, slope per full-size pixel to the right and downwards, and mean
+            weight.
     """
     (height, width), centre, reach = one.shape[:2], np.float32(centre), np.float32(reach)
     level = np.float32(level)

@@ -51,18 +51,19 @@ AT_ONCE = 1 << 21
 def along_tangents(
     alpha: Float[Tensor, "1 1 h w"], guide: Float[Tensor, "1 1 hb wb"], field: FieldOnGrid, name: str = "beta"
 ) -> FieldOnGrid:
-    """Convert one rig's field of positions to segments through its matches in the one beta.
+    """Convert a field of positions to straight segments: the tangents of its curves at the matches.
 
-    Warns of positions that have no order. The label of each pixel is a constant; positions keep their
-    gradients.
+    The positions are matched semi-globally at half the size. Positions without an order along a curve are
+    matched pixel by pixel, with a warning. Which position is matched is a constant; its gradients are kept.
 
     Args:
         alpha: image of even sides.
         guide: beta's brightness, of even sides.
+        field: field of positions, of one rig.
         name: beta's name in the warning.
 
     Returns:
-        The field of segments.
+        The field of segments, pixels of beta.
 
     Raises:
         TypeError: for a field that gives segments for some pixels and positions for others.
@@ -117,7 +118,10 @@ class _BlockCentres:
         return [slice(*span) for span in spans(self.hw[0], self.rows)]
 
     def ordered(self) -> bool:
-        """Return True if a pixel's positions follow each other along a curve."""
+        """Return True if positions follow each other along a curve, for most of every eighth row and column.
+
+        False for fewer than three positions a pixel. A curve may turn back a few times (`SEAM`).
+        """
         locations = self.at(slice(None, None, 8), slice(None, None, 8))
         if locations.xy.shape[-2] < 3:
             return False

@@ -35,10 +35,10 @@ def luminance(
 def to_luma_chroma(
     rgb: Float[Tensor, "*b 3 h w"],
 ) -> tuple[Float[Tensor, "*b 1 h w"], Float[Tensor, "*b 2 h w"]]:
-    """Split RGB into luma and colour differences.
+    """Split sRGB values into luma and colour differences.
 
     Returns:
-        Rec. 601 luma Y, and (R - Y, B - Y), which are zero for grey.
+        Rec. 601 luma Y (one channel), and (R - Y, B - Y), not scaled, which are zero for grey.
     """
     luma = luminance(rgb)
     return luma, torch.cat([rgb[..., 0:1, :, :], rgb[..., 2:3, :, :]], -3) - luma
@@ -100,10 +100,10 @@ WANTED = 0.8
 
 
 def exposure_gain(image: Float[Tensor, "c h w"]) -> float:
-    """Gain in linear light that gives a dark or overexposed sRGB image ordinary brightness.
+    """Compute the gain that gives a dark or overexposed sRGB image ordinary brightness.
 
     Returns:
-        The factor; 1 for an image of ordinary brightness, and for one that is black.
+        Factor of linear light; 1 for an image of ordinary brightness, and for one that is black.
     """
     light = linear_from_srgb(luminance_of(image).mean(0)).flatten()
     brightest = float(light[:: max(light.numel() // 100_000, 1)].quantile(BRIGHT))

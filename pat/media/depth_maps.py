@@ -117,7 +117,9 @@ def write_points(
     """Write the pixels of known depth as a coloured point cloud (binary PLY), atomically.
 
     Args:
-        depth: metres; pixels that are not finite are left out.
+        path: file to write.
+        camera: camera of the image, on the CPU.
+        depth: metres; pixels that are not finite, or without a ray, are left out.
         image: values 0..1; grey for one channel, otherwise the first three are colours.
         along: "depth" for z along the optical axis, "distance" for the length of the ray.
 
@@ -143,10 +145,10 @@ def write_points(
 def at_distance(
     camera: Camera, x: Float[Tensor, "*n 2"], distance: Float[Tensor, "*n"]
 ) -> Float[Tensor, "*n 3"]:
-    """Compute world points of pixels at a distance along their rays.
+    """Compute the world points of pixels at a distance (metres) along their rays.
 
     Returns:
-        Points (n, 3) in metres; NaN for pixels without a ray (outside the lens model).
+        Points (*n, 3) of the world, metres; NaN for pixels without a ray (outside the lens model).
     """
     rays = world_rays(camera, x)
     return torch.where(rays.valid[..., None], rays.origin + distance[..., None] * rays.direction, torch.nan)

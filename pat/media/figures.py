@@ -74,7 +74,10 @@ def figure_file(path: Path) -> Path:
 
 
 def save_figure(figure: Figure, path: Path, *, dpi: int = 110) -> Path:
-    """Write a matplotlib figure atomically.
+    """Write a matplotlib figure atomically, in the format of the path's suffix.
+
+    Args:
+        dpi: pixels for each inch of the figure's size.
 
     Returns:
         The path.

@@ -343,12 +343,12 @@ def decoded_photograph(path: Path, flags: int, *, least: int = 1) -> NDArray | N
     """Decode an image file to 8 bits by OpenCV.
 
     Args:
-        flags: OpenCV's IMREAD flags.
+        flags: OpenCV's IMREAD flags without IMREAD_ANYDEPTH, such as IMREAD_GRAYSCALE.
         least: least pixels of a side.
 
     Returns:
-        Values, uint8, blue first; None if it is no image, has a side under `least`, or has more than
-        `MOST_PIXELS`.
+        Values (h, w) or (h, w, 3) by the flags, uint8, blue first; None if it is no image, is damaged, has a
+        side under `least`, or has more than `MOST_PIXELS`.
 
     Raises:
         OSError: if the file cannot be read.

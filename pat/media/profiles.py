@@ -35,8 +35,8 @@ def in_srgb(values: NDArray, content: bytes, label: str) -> NDArray:
         label: prefix of warnings.
 
     Returns:
-        Values in sRGB. With a warning instead, unchanged values of 16 bits, or with a profile that cannot be
-        used.
+        Values in sRGB, of the same shape and type. Values of 16 bits, and values with a profile that cannot
+        be used, are returned unchanged with a warning.
     """
     profile = _embedded(content)
     if profile is None:
@@ -83,6 +83,10 @@ def _converted(values: NDArray, profile: ImageCms.ImageCmsProfile) -> NDArray:
 
 def with_srgb_profile(content: bytes, suffix: str) -> bytes:
     """Add an sRGB profile to the bytes of an image file.
+
+    Args:
+        content: bytes of the file.
+        suffix: suffix of its name in small letters, such as ".png".
 
     Returns:
         The bytes of a PNG file in colour or a JPEG file with the profile; of other files unchanged. A grey

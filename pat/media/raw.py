@@ -28,9 +28,10 @@ def develop(
     """Develop an image to sRGB: subtract the black level, demosaic, scale light to another camera's exposure.
 
     Args:
-        image: counts over 2^bits - 1.
-        sensor: the camera that recorded it.
-        like: sensor whose scale of light is wanted; None for its own. Exposures count only if both are known.
+        image: counts over 2^bits - 1; sRGB values unless `sensor.coding` is "linear".
+        sensor: the camera that recorded it; a black level without `bits` is in counts of 16 bits.
+        like: sensor whose scale of light (exposure, gain) is wanted; None for its own. Exposures count only
+            if both are known.
 
     Returns:
         sRGB values, 3 channels for a filter mosaic; at least 0 after a black level was subtracted, above 1
@@ -115,10 +116,14 @@ def demosaiced(raw: Float[Tensor, "1 h w"], pattern: str) -> Float[Tensor, "3 h 
     which removes false-colour fringes.
 
     Args:
-        pattern: OpenCV's name of the mosaic, such as "RG".
+        raw: values of the mosaic, 0..1; others are clipped.
+        pattern: OpenCV's name of the mosaic: "BG", "GB", "RG" or "GR".
 
     Returns:
         RGB image of the same size, clipped to 0..1, without gradient.
+
+    Raises:
+        AttributeError: for another pattern.
     """
     code = getattr(cv2, f"COLOR_Bayer{pattern}2RGB_EA")
     counts = np.rint(raw[0].clamp(0, 1).cpu().numpy().astype(np.float64) * 65535).astype(np.uint16)

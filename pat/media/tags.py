@@ -36,8 +36,8 @@ class RecordedTags(NamedTuple):
     """Tags of an image file.
 
     Attributes:
-        texts: make, model and time, by number.
-        directories: EXIF's and GPS's, values by number.
+        texts: make, model and time, by the number of the tag.
+        directories: values by the number of the tag, for the directories of EXIF and GPS, by their number.
         xmp: the XMP packet; empty without.
     """
 
@@ -52,7 +52,10 @@ class RecordedTags(NamedTuple):
         return [*tags, (XMP, "B", len(packet), packet, True)] if packet else tags
 
     def write_directories(self, path: Path) -> None:
-        """Append EXIF's and GPS's directories to a little-endian TIFF file with offsets of 32 bits."""
+        """Add the directories of EXIF and GPS to a TIFF file, which is rewritten in place.
+
+        The file must be little-endian with offsets of 32 bits, as tifffile writes it; this is not checked.
+        """
         content = bytearray(path.read_bytes())
         first = int.from_bytes(content[4:8], "little")
         count = int.from_bytes(content[first : first + 2], "little")
@@ -73,7 +76,11 @@ class RecordedTags(NamedTuple):
 
 
 def recorded_tags(path: Path) -> RecordedTags | None:
-    """Read the tags of an image file; None if it has none of these, or is damaged."""
+    """Read the tags of an image file that results keep: make, model, time, EXIF, GPS and XMP.
+
+    Returns:
+        The tags; None if it has none of these, or is damaged or missing.
+    """
     try:
         with Image.open(path) as image:
             exif = image.getexif()
@@ -89,9 +96,14 @@ def recorded_tags(path: Path) -> RecordedTags | None:
 
 
 def packet_of_bands(packet: bytes, bands: Sequence[str], wavelengths: Sequence[float | None]) -> bytes:
-    """Adjust an XMP packet for an image of several bands at the pixels of the one that it is from.
+    """Adjust one camera's XMP packet for an image of several bands at that camera's pixels.
 
-    Tags of that one alone are left out (vignetting, radiometry); the camera, its pose and its flight stay.
+    Tags of its own band are left out (vignetting, radiometry); the camera, its pose and its flight stay.
+
+    Args:
+        packet: XMP packet of the camera's file.
+        bands: names of the bands.
+        wavelengths: their central wavelengths in nanometres; none are written if one is None.
 
     Returns:
         The packet; empty for a damaged one.

@@ -26,12 +26,12 @@ PREFIX = "module."
 
 
 class Authors(NamedTuple):
-    """A checkpoint of the paper's authors, converted.
+    """A checkpoint of the paper's authors, converted to this package's PAT.
 
     Attributes:
-        config: configuration of the PAT here.
-        state: weights by their names here.
-        facts: text of the file on its recipe, epoch and PSNR.
+        config: configuration of the network.
+        state: weights by the names of this package's network, float32.
+        facts: texts of the file by name: recipe, epoch and PSNR, where stated.
     """
 
     config: PATConfig
@@ -71,7 +71,7 @@ def load_authors(path: str | Path) -> PAT:
 
     Raises:
         FileNotFoundError: for a missing file.
-        ValueError: as `read_authors`.
+        ValueError: for a file that would run code, is cut short, or holds another network.
     """
     read = read_authors(path)
     network = PAT(read.config)
@@ -80,7 +80,10 @@ def load_authors(path: str | Path) -> PAT:
 
 
 def config_of(state: Mapping[str, Tensor]) -> PATConfig:
-    """Derive the configuration of the network that weights by their authors' names belong to.
+    """Derive a network's configuration from its weights, by the names that the authors gave them.
+
+    Returns:
+        The configuration, from the weights' shapes.
 
     Raises:
         ValueError: for missing weights, by name, and for sizes beyond 1 to 1024.
@@ -106,7 +109,13 @@ def config_of(state: Mapping[str, Tensor]) -> PATConfig:
 
 
 def renamed(weights: Mapping[str, Tensor], config: PATConfig) -> dict[str, Tensor]:
-    """Rename weights by their authors' names to those of a PAT of this configuration.
+    """Rename the authors' weights to the names of this package's PAT.
+
+    The columns of the fusion's convolution are reordered too: the authors have alpha last, here it is first.
+
+    Args:
+        weights: weights by the authors' names.
+        config: configuration of the network that they must fit.
 
     Returns:
         Weights by name, in float32.

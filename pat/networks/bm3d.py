@@ -29,7 +29,10 @@ from .denoiser import opponent, opponent_deviation, rgb_of_opponent
 
 @dataclass(frozen=True)
 class BM3DSettings:
-    """Settings of the filter of similar blocks (Dabov et al. 2007)."""
+    """Settings of the filter of groups of similar blocks, BM3D (Dabov et al. 2007).
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     side: int = size(8, "Side of a block, pixels")
     step: int = size(4, "Steps between blocks, pixels")
@@ -62,10 +65,11 @@ def without_noise(
 
     Args:
         network: denoiser, called with the images and the deviations.
+        recorded: noisy images, values 0..1.
         deviation: standard deviation of each value's noise.
 
     Returns:
-        Images as of `refined`.
+        The denoised images, of the same shape, not clipped, detached.
     """
     return refined(network(recorded, deviation), recorded, deviation)
 
@@ -80,10 +84,12 @@ def refined(
     Brightness is a mean of the network's and the filtered one; colour is filtered twice.
 
     Args:
+        estimate: the network's images without noise.
+        recorded: the noisy images, values 0..1.
         deviation: standard deviation of each value's white noise.
 
     Returns:
-        Images of the same shape, detached.
+        Images of the same shape, not clipped, detached.
     """
     return torch.stack([_refined(*parts) for parts in zip(estimate, recorded, deviation)])
 
@@ -125,12 +131,12 @@ def wiener_filtered(
 
 
 class Observation(NamedTuple):
-    """Another camera's recording at an image's pixels, of the same band: each (1, h, w).
+    """Another camera's recording of the same band, resampled to an image's pixels: planes (1, h, w).
 
     Attributes:
-        recorded: values.
+        recorded: recorded values.
         deviation: standard deviation of their noise.
-        grain: noise of unit deviation, white in that camera, after it is resampled.
+        grain: a sample of noise of unit deviation, white in that camera, resampled as the values were.
         confidence: confidence of the positions, 0 to 1.
     """
 
@@ -148,13 +154,15 @@ def other_camera_update(
 ) -> Float[Tensor, "1 h w"]:
     """Compute the update of an estimate without noise by another camera's recording of the same points.
 
-    Kalman's update (1960) of each group's coefficients. The estimate's error is that of Wiener's filter. The
-    blur of the other camera is estimated, and its noise has a spectrum; the less certain its positions are,
-    the less it counts.
+    Kalman's update (1960) of each group's coefficients. The estimate's error is taken to be that of Wiener's
+    filter. The blur of the other camera is estimated, as is its noise's spectrum from its grain; the less
+    certain its positions are, the less it counts.
 
     Args:
-        recorded: values from which the estimate was made.
-        deviation: standard deviation of their noise.
+        estimate: image without noise.
+        recorded: noisy image from which the estimate was made.
+        deviation: standard deviation of the noise of `recorded`.
+        other: the other camera's recording.
 
     Returns:
         Values to add to the estimate, detached.
@@ -222,11 +230,13 @@ WINDOW = np.outer(np.kaiser(SIDE, 2.0), np.kaiser(SIDE, 2.0)).astype(np.float32)
 
 @compiled(nogil=True, cache=True, fastmath=True)
 def find_alike(guide, top, alike):
-    """Fill `alike` (rows, columns, ALIKE, 2) with displacements (y, x) of the blocks most similar to each
-    one.
+    """Find the blocks most similar to each reference block, by the sum of squared differences.
 
-    Block (r, k) begins at pixel (STEP (top + r), STEP k), RADIUS pixels inside; the first one of a group is
-    itself.
+    Args:
+        guide: image (bands, h, w) in which blocks are compared, padded by RADIUS pixels.
+        top: number of the first row of reference blocks.
+        alike: displacements (y, x) to write, (rows, columns, ALIKE, 2), for reference block (r, k), which
+            begins at pixel (RADIUS + STEP (top + r), RADIUS + STEP k); it is the first of its own group.
     """
     rows, columns = alike.shape[:2]
     cells = np.zeros((rows + CELLS - 1, columns + CELLS - 1), np.float32)
@@ -262,7 +272,13 @@ def find_alike(guide, top, alike):
 
 @compiled(inline="always")
 def block_transform(blocks, spare, matrix):
-    """Multiply rows and columns of every block (SIDE^2, ALIKE) by a matrix, in place."""
+    """Transform every block B of a group to M B M^T, in place.
+
+    Args:
+        blocks: pixels of the blocks (SIDE^2, ALIKE), float32, the block's number last.
+        spare: scratch of the same shape, overwritten.
+        matrix: M (SIDE, SIDE).
+    """
     for u in range(SIDE):
         for j in range(SIDE):
             for n in range(ALIKE):
@@ -281,7 +297,11 @@ def block_transform(blocks, spare, matrix):
 
 @compiled(inline="always")
 def group_transform(blocks):
-    """Apply Hadamard's transform over the group, in place; it is its own inverse."""
+    """Apply the orthonormal Hadamard transform across a group's blocks, in place; it is its own inverse.
+
+    Args:
+        blocks: coefficients (SIDE^2, ALIKE), the block's number last.
+    """
     for i in range(SIDE * SIDE):
         width = 1
         while width < ALIKE:
@@ -329,8 +349,18 @@ def accumulate(group, counts, y0, x0, alike, window, out):
 
 @compiled(nogil=True, cache=True, fastmath=True)
 def filter_groups(image, expected, variance, top, alike, cosines, window, out):
-    """Add to `out` (2, c, rows, w), from its first row of blocks, filtered blocks with weights, and the
-    weights."""
+    """Filter groups of similar blocks by Wiener's filter, and add up the blocks and their weights.
+
+    Args:
+        image: noisy planes (c, h, w), float32, padded by RADIUS pixels.
+        expected: the same without noise, approximately.
+        variance: variance of the noise, of the same shape.
+        top: number of the first row of reference blocks.
+        alike: displacements of each group's blocks, as `find_alike` writes them.
+        cosines: orthogonal cosine transform (SIDE, SIDE).
+        window: weights of a block's pixels (SIDE, SIDE).
+        out: sums (2, c, rows, w) to add to: weighted blocks, and weights; row 0 is pixel row STEP top.
+    """
     rows, columns = alike.shape[:2]
     group = np.empty((SIDE * SIDE, ALIKE), np.float32)
     pilot = np.empty((SIDE * SIDE, ALIKE), np.float32)
@@ -360,7 +390,22 @@ def filter_groups(image, expected, variance, top, alike, cosines, window, out):
 def update_groups(
     share, spectrum, estimate, taken, variance, other, confidence, top, alike, cosines, window, out
 ):
-    """Add to `out` (2, 1, rows, w), from its first row of blocks, the weighted updates and their weights."""
+    """Compute Kalman updates of groups of similar blocks, and add up the updates and their weights.
+
+    Args:
+        share: share of each coefficient (SIDE^2) that the other camera's blur leaves.
+        spectrum: power of each coefficient of the other camera's noise of unit deviation.
+        estimate: image without noise (1, h, w), float32, padded by RADIUS pixels; as are the next four.
+        taken: the other camera's values; the estimate's where positions are not certain.
+        variance: variance of the noise from which the estimate was made.
+        other: variance of the other camera's noise.
+        confidence: confidence of the positions, 0 to 1.
+        top: number of the first row of reference blocks.
+        alike: displacements of each group's blocks, as `find_alike` writes them.
+        cosines: orthogonal cosine transform (SIDE, SIDE).
+        window: weights of a block's pixels (SIDE, SIDE).
+        out: sums (2, 1, rows, w) to add to: weighted updates, and weights; row 0 is pixel row STEP top.
+    """
     rows, columns = alike.shape[:2]
     group = np.empty((SIDE * SIDE, ALIKE), np.float32)
     pilot = np.empty((SIDE * SIDE, ALIKE), np.float32)

@@ -16,7 +16,10 @@ from ..support.settings import size
 
 @dataclass(frozen=True)
 class DenoiserSettings:
-    """Settings of the denoisers' inputs."""
+    """Settings of the denoisers' inputs.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     multiple: int = size(8, "Images are padded to multiples of this")
     scale: float = size(4.0, "So many times larger deviations are given to networks: about as values")
@@ -39,8 +42,14 @@ class DenoiserConfig:
 
 
 class Denoising(nn.Module):
-    """A network that subtracts noise, estimated in units of its standard deviation: at 0 an image stays as it
-    is."""
+    """Network that estimates noise in units of its standard deviation, and subtracts it.
+
+    Where the deviation is 0 an image stays as it is.
+
+    Args:
+        bands: number of channels of an image.
+        config: widths and depth of the U-Net.
+    """
 
     def __init__(self, bands: int, config: DenoiserConfig) -> None:
         super().__init__()
@@ -53,6 +62,7 @@ class Denoising(nn.Module):
         """Denoise images of any size.
 
         Args:
+            image: noisy images, values 0..1.
             deviation: standard deviation of each value's noise.
 
         Returns:
@@ -81,7 +91,13 @@ def rgb_of_opponent(bands: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]
 
 
 class LowLightNetwork(nn.Module):
-    """Denoisers of one band (`band`) and of a colour image (`colour`)."""
+    """Denoisers of images of one band and of three.
+
+    Attributes:
+        config: size of the networks.
+        band: denoiser of each band by itself.
+        colour: denoiser of colour images.
+    """
 
     def __init__(self, config: DenoiserConfig = DenoiserConfig()) -> None:
         super().__init__()

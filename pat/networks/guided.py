@@ -28,11 +28,11 @@ from .recall import by_example, with_less_noise
 
 
 class GuidedPAT(nn.Module):
-    """Fusion of a mono alpha with betas whose bands the image has.
+    """Fusion network that gives a mono alpha the bands of its betas, found by matching.
 
-    With `config.bands` the betas' bands, in order, are the image's: three filtered cameras, or any number in
-    RGB, beside which other betas help to find depth. With `config.bands` None the image has all bands of all
-    betas, in order, whatever their spectra; permuting betas permutes its bands.
+    With `config.bands` the image has that many bands: three filtered cameras give one each, or any number of
+    RGB cameras all three; other betas help to find depth only. With `config.bands` None the image has all
+    bands of all betas, in order, whatever their spectra; permuting betas permutes its bands.
     """
 
     multiple = 16
@@ -56,8 +56,11 @@ class GuidedPAT(nn.Module):
     def forward(self, inputs: Inputs, matches: Matches | None = None) -> FusionOutput:
         """Fuse alpha (B, 1, H, W) with the betas, by their matches.
 
+        Args:
+            matches: result of `match(inputs)`; None raises.
+
         Returns:
-            The image in the betas' bands, with position, deviation and confidence in each beta.
+            The image (B, C, H, W) in the betas' bands, with position, deviation and confidence in each beta.
 
         Raises:
             ValueError: without matches, for matches of other inputs, and for betas whose bands do not add up
@@ -107,8 +110,12 @@ class GuidedPAT(nn.Module):
 def completed(alpha: Float[Tensor, "b 1 h w"], carried: Sequence[Colours]) -> Float[Tensor, "b c h w"]:
     """Compute bands minus alpha at all pixels, from betas with different bands.
 
-    Carried values count by their weight; the rest is the mean of the nearest examples and of those by
-    attention, smoothed where weights are low.
+    Values from matches count by their weight. The rest is the mean of two fills from pixels of known colour:
+    the nearest examples, and those similar in alpha by attention. The result is smoothed where weights are
+    low.
+
+    Args:
+        carried: bands minus alpha from the matches of each beta.
 
     Returns:
         Bands minus alpha, of all betas in order.
@@ -131,8 +138,12 @@ def _joined(bands: Sequence[Tensor]) -> Tensor:
 
 
 def combined(carried: Sequence[Colours]) -> Colours:
-    """Combine several betas of the same bands to one: the mean of their colours by the odds of
-    their weights."""
+    """Combine the colours of several betas of the same bands to those of one.
+
+    Returns:
+        Means of bands, likeness and fills, weighted by the odds of each beta's weight; the largest weight.
+        For a single beta its own.
+    """
     if len(carried) == 1:
         return carried[0]
     odds = [c.weight.clamp(LEAST, 1 - LEAST).logit() for c in carried]
@@ -151,13 +162,16 @@ def combined(carried: Sequence[Colours]) -> Colours:
 def where_certain(
     residual: Float[Tensor, "b c h w"], inputs: Inputs, matches: Matches
 ) -> Float[Tensor, "b c h w"]:
-    """Replace bands minus alpha by those at the chosen positions, as far as these are certain.
+    """Replace bands minus alpha by beta's at the position chosen among candidates, as far as it is certain.
 
-    A chosen position counts fully from a pixel off the match on: matches are often wrong if alpha sees
-    another part of the spectrum.
+    A chosen position counts fully where it is a pixel or more from the match, less where it is nearer:
+    matches are often wrong if alpha sees another part of the spectrum.
+
+    Args:
+        residual: bands minus alpha.
 
     Returns:
-        Bands minus alpha; as given if no beta has all of the bands and a certainty.
+        Bands minus alpha; unchanged if no beta has all of the bands and a trained certainty.
     """
     weights, shown = [], []
     for beta, matched in zip(inputs.betas, matches.betas, strict=True):

@@ -42,7 +42,7 @@ class QueryAndKey(NamedTuple):
 
 
 class PAT(nn.Module):
-    """Features shared by all views, C3 attention to each beta, fusion by convolutions.
+    """The paper's network: features shared by all views, attention to each beta, fusion by convolutions.
 
     >>> PAT(PATConfig(betas=2, dim=8)).config.betas
     2
@@ -65,10 +65,11 @@ class PAT(nn.Module):
         self.post = PostFusion(config)
 
     def forward(self, inputs: Inputs, matches: Matches | None = None) -> FusionOutput:
-        """Fuse alpha with the betas, in the order the network was made for; matches are not used.
+        """Fuse alpha with the betas, in the order for which the network was made; matches are not used.
 
         Returns:
-            The image, enlarged by `config.scale`, with position, deviation and confidence in each beta.
+            The image (B, `config.out_channels`, s H, s W), enlarged by s = `config.scale`, with position,
+            deviation and confidence (the largest weight of attention) in each beta.
 
         Raises:
             ValueError: for another number of betas than configured, or channels that do not fit.
@@ -79,10 +80,10 @@ class PAT(nn.Module):
         """Fuse, and keep the features that attention compares in each beta.
 
         Returns:
-            The output as of `forward`, and one comparison per beta.
+            The output of `forward`, and the compared features of each beta.
 
         Raises:
-            ValueError: as `forward`.
+            ValueError: for another number of betas than configured, or channels that do not fit.
         """
         if len(inputs.betas) != self.config.betas:
             asked = f"this PAT is made for {self.config.betas} betas, got {len(inputs.betas)}"
@@ -143,7 +144,11 @@ def normalised(image: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b 1 h w"]:
 
 
 class Features(nn.Sequential):
-    """Residual-ASPP features, with the same weights for every view (paper, section 3.1)."""
+    """Residual-ASPP features, with the same weights for every view (paper, section 3.1).
+
+    Called with images of `config.in_channels` channels, and one more if `config.normalised`, it returns
+    features (b, `config.dim`, h, w).
+    """
 
     def __init__(self, config: PATConfig) -> None:
         dim, bias = config.dim, config.block_bias
@@ -159,7 +164,12 @@ class Features(nn.Sequential):
 
 
 class AttentionEngine(nn.Module):
-    """Attention from alpha's queries to keys and values of each beta (C3), over each field."""
+    """Layers that make alpha's queries and each beta's keys and values, for attention along the segments.
+
+    Args:
+        config: configuration of the network, for `betas`, `dim`, `interpolation` and whether a block has
+            biases.
+    """
 
     def __init__(self, config: PATConfig) -> None:
         super().__init__()
@@ -183,9 +193,10 @@ class AttentionEngine(nn.Module):
         Args:
             alpha_features: features (b, d, h, w).
             beta_features: features (b, d, h, w) of each beta.
+            fields: field of each beta.
 
         Returns:
-            One comparison per beta.
+            The compared features of each beta, for `Compared.attended`.
         """
         query, how = self.query(self.before(alpha_features)), self.interpolation
         scores = []
@@ -198,7 +209,14 @@ class AttentionEngine(nn.Module):
 
 
 class PostFusion(nn.Sequential):
-    """Fusion of alpha's and the attended features: 1x1 convolution, four residual blocks, pixel shuffle."""
+    """Fusion of alpha's and the attended features: 1x1 convolution, four residual blocks, pixel shuffle.
+
+    Called with features (b, (betas + 1) dim, h, w), alpha's first, it returns an image (b, out_channels,
+    scale h, scale w).
+
+    Args:
+        config: configuration of the network, for these numbers and whether layers have biases.
+    """
 
     def __init__(self, config: PATConfig) -> None:
         dim, outputs, scale = config.dim, config.out_channels, config.scale

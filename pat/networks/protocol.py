@@ -46,8 +46,11 @@ JoinsBands = Literal["no", "neighbours", "all"]
 
 @runtime_checkable
 class FusionNetwork(Protocol):
-    """Network that `fuse` can call: the bands that it makes, its use of matches, and the images that it
-    needs."""
+    """Interface of the networks that `fuse` can call.
+
+    Attributes state the bands of the image, the use of matches, and the inputs that it needs; each is
+    described beside its name.
+    """
 
     bands: int | None
     """Number of bands of its image; None for all bands of the betas."""
@@ -77,6 +80,9 @@ class FusionNetwork(Protocol):
     def __call__(self, inputs: Inputs, matches: Matches | None = None) -> FusionOutput:
         """Fuse the inputs.
 
+        Args:
+            matches: result of `match(inputs)`; None for a network without `uses_matches`.
+
         Returns:
             The image, with position, deviation and confidence in each beta.
 
@@ -88,7 +94,7 @@ class FusionNetwork(Protocol):
 
 @runtime_checkable
 class Comparing(Protocol):
-    """A network with C3 attention over its inputs' segments, which training can supervise by geometry."""
+    """Interface of a network with attention along its inputs' segments, which known geometry can train."""
 
     betas: int
     """Number of betas that it is made for: one in all bands, or several with a band each."""
@@ -97,7 +103,7 @@ class Comparing(Protocol):
         """Fuse, and keep the features that attention compares in each beta.
 
         Returns:
-            The output, and one comparison per beta.
+            The output, and the compared features of each beta.
         """
         ...
 
@@ -122,7 +128,13 @@ def fused_at_once(network: FusionNetwork, inputs: Inputs) -> FusionOutput:
 
 
 def required(matches: Matches | None, inputs: Inputs) -> Matches:
-    """Return the matches, after checking that they belong to these inputs.
+    """Check that a network that needs matches was given those of its inputs.
+
+    Args:
+        matches: matches that it was called with; None if it was called without.
+
+    Returns:
+        The matches.
 
     Raises:
         ValueError: for None, or matches of other inputs.

@@ -28,7 +28,10 @@ from ..support.settings import size, tuned
 
 @dataclass(frozen=True)
 class RecallSettings:
-    """Settings of colour by example. Pixels are those of half the size, except for `last`."""
+    """Settings of filling in colour by example; pixels are of the half-size image, except for `last`.
+
+    `pat lab settings` prints the value of each with its meaning and reason.
+    """
 
     scales: int = tuned(3, "Middlebury, tune half: sizes of what is around a pixel, radii 2, 4, 8")
     alike: float = tuned(
@@ -53,13 +56,17 @@ FIELD = Local(2 * SETTINGS.side - 1, spacing=SETTINGS.spacing)
 def by_example(
     alpha: Float[Tensor, "b 1 h w"], colour: Float[Tensor, "b c h w"], confidence: Float[Tensor, "b c h w"]
 ) -> Float[Tensor, "b c h w"]:
-    """Fill in the colour of seen pixels that look similar in alpha, smoothed together with certain colour.
+    """Fill in colour from pixels of known colour that look similar in alpha.
+
+    Filled and known colour are smoothed together, guided by alpha.
 
     Args:
-        confidence: confidence of each band's colour, 0 to 1.
+        alpha: alpha's image; both sides even.
+        colour: colour of each pixel, such as bands minus alpha.
+        confidence: confidence of each band's colour, 0 to 1; colours with 0 do not count.
 
     Returns:
-        Colour at all pixels.
+        Colour at all pixels, of the same shape.
     """
     return fitted(recalled(alpha, colour, confidence), alpha, colour, confidence)
 
@@ -67,7 +74,12 @@ def by_example(
 def with_less_noise(
     alpha: Float[Tensor, "b 1 h w"], colour: Float[Tensor, "b c h w"], confidence: Float[Tensor, "b c h w"]
 ) -> Float[Tensor, "b c h w"]:
-    """Blend colour with its mean over pixels similar in alpha, the more the less certain a pixel is.
+    """Smooth colour where it is uncertain: blend it with its mean over nearby pixels similar in alpha.
+
+    Args:
+        alpha: alpha's image.
+        colour: colour of each pixel, such as bands minus alpha.
+        confidence: confidence of each band's colour: 1 keeps it, 0 takes the mean.
 
     Returns:
         Colour of the same shape.
@@ -81,9 +93,12 @@ def recalled(
     colour: Float[Tensor, "b c h w"],
     confidence: Float[Tensor, "b c h w"],
 ) -> Float[Tensor, "b c h/2 w/2"]:
-    """Average the colour of seen pixels that look similar in alpha.
+    """Average the colour of pixels of known colour that look similar in alpha, by attention over a window.
 
-    A pixel counts as far as all bands are certain, which several betas may have.
+    Args:
+        alpha: alpha's image; both sides even.
+        colour: colour of each pixel, such as bands minus alpha.
+        confidence: confidence of each band's colour, 0 to 1; a pixel counts by the least of its bands.
 
     Returns:
         Colour at half the size.
@@ -104,11 +119,13 @@ def fitted(
     colour: Float[Tensor, "b c h w"],
     confidence: Tensor,
 ) -> Float[Tensor, "b c h w"]:
-    """Smooth filled colour together with certain colour, and enlarge it.
+    """Smooth filled colour together with confident colour, guided by alpha, and enlarge it.
 
     Args:
         filled: colour (B, C, H/2, W/2) to use where confidence is low.
-        confidence: confidence of `colour`, (B, C or 1, H, W).
+        alpha: alpha's image; both sides even.
+        colour: colour (B, C, H, W) to use where confidence is high.
+        confidence: confidence of `colour`, (B, C or 1, H, W), 0 to 1.
 
     Returns:
         Colour at full size.
@@ -127,7 +144,8 @@ def smoothed_within(
 
     Args:
         colour: colour (B, C, H, W), or at half the size.
-        confidence: confidence at the size of `colour`; None counts all alike.
+        spacings: pixels of `colour` between a window's samples, for each pass.
+        confidence: confidence at the size of `colour`, 0 to 1; None counts all alike.
 
     Returns:
         Colour of the same shape.
@@ -156,6 +174,9 @@ def surroundings(alpha: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b d h/2 w/2"
 
     They hold alpha, its brightness around each pixel and the change of that to the right and downwards, at
     each radius (a local jet, Koenderink and van Doorn 1987).
+
+    Returns:
+        Keys (B, 1 + 3 radii, H/2, W/2), in units of the settings' deviations.
     """
     half = avg_pool2d(alpha - 0.5, 2)  # for small numbers, of which float32 has more digits
     parts, (h, w) = [half / (SETTINGS.alike / 2)], half.shape[-2:]

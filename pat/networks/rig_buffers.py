@@ -16,8 +16,11 @@ from arraygeom.pixels import floating
 class RigBuffers(nn.Module):
     """Module that holds a rig, camera or pair as buffers: `.to` moves its numbers and `state_dict` has them.
 
-    Called, it returns the rig. `.half()` and `.bfloat16()` leave its numbers in float32: those hold no pixel
-    position.
+    Called, it returns the rig (or camera, or pair) with these numbers. `.half()` and `.bfloat16()` leave them
+    in float32, as half precision holds no pixel position.
+
+    Args:
+        rig: rig, camera or pair to hold.
     """
 
     def __init__(self, rig: Batched) -> None:

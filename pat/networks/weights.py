@@ -43,7 +43,7 @@ def save_weights(
     """Write a network's weights and configuration to a file, atomically.
 
     Args:
-        facts: texts (recipe, seed, figures) kept beside them in the file.
+        facts: texts by name (recipe, seed, figures) to store in the file too; None for none.
     """
     metadata = {
         "format": FORMAT,
@@ -83,6 +83,7 @@ def new_network(config: Any, start: Path | None = None) -> Network:
     """Make a network of a configuration.
 
     Args:
+        config: `PATConfig` or `GuidedPATConfig`; others raise StopIteration.
         start: weights file to start from; None for random weights.
 
     Returns:
@@ -114,6 +115,10 @@ def set_precision(network: nn.Module, precision: Precision, *, compiled: bool = 
     """Set the precision of a network's convolutions in place, and optionally compile them by torch.compile.
 
     Attention is left out, whose search segments are functions that torch.compile would break at.
+
+    Args:
+        precision: "bfloat16", or "float32", which changes nothing: bfloat16 is not undone.
+        compiled: True to compile them.
     """
     for module in network.children():
         if isinstance(module, (AttentionEngine, nn.ModuleList)):
@@ -173,8 +178,11 @@ def _is_of_pytorch(path: Path) -> bool:
 
 
 def misfit(network: nn.Module, state: Mapping[str, Tensor]) -> str:
-    """Describe the first tensor missing, too many, or of another shape than the network's; empty
-    if all fit."""
+    """Describe the first tensor of a file that does not fit a network.
+
+    Returns:
+        A phrase on a tensor that is missing, too many, or of another shape; empty if all fit.
+    """
     wanted_shapes, given_shapes = (
         {k: tuple(v.shape) for k, v in s.items()} for s in (network.state_dict(), state)
     )
@@ -190,7 +198,13 @@ def shipped() -> tuple[str, ...]:
 
 
 def find_weights(name: str | Path) -> Path:
-    """Return the path of shipped weights by name, or the path itself.
+    """Find a weights file, shipped with the package or the user's own.
+
+    Args:
+        name: name of shipped weights, such as "mono-colour", or a path.
+
+    Returns:
+        The file.
 
     Raises:
         FileNotFoundError: if neither exists.

@@ -61,7 +61,9 @@ class NoiseLevel:
         """Make the noise model of a camera that counts `electrons` at white.
 
         Args:
-            read: read noise in electrons.
+            electrons: electrons that a pixel counts at value 1.
+            read: standard deviation of the read noise in electrons.
+            added_to: "light" or "values", as for the class.
 
         Returns:
             The noise level in values 0..1.

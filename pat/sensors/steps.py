@@ -18,7 +18,10 @@ from arraygeom.pixels import HW, resize_matrix
 
 
 class Step(ABC):
-    """Base class of one step in the formation of an image."""
+    """Base class of one step in the formation of an image, such as blur or noise.
+
+    A subclass defines `apply`, and `pixel_matrix` too if it moves or resizes the pixel grid.
+    """
 
     @abstractmethod
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c2 h2 w2"]:
@@ -100,7 +103,7 @@ class Resample(Step):
         to: a factor (sizes are rounded, which changes the factor along each axis), or (height, width); not
             positive raises ValueError.
         method: "area" models a sensor with larger pixels and keeps the image's mean exactly; "bicubic" is the
-            usual antialiased resize with a = -0.5.
+            usual antialiased resize with a = -0.5, which may leave 0..1. Not checked.
     """
 
     to: float | HW
@@ -136,11 +139,11 @@ def _area_weights(old: int, new: int) -> Tensor:
 
 @dataclass(frozen=True)
 class Noise(Step):
-    """Shot and read noise on linear values.
+    """Shot and read noise on linear values; the result is not clipped.
 
     Attributes:
         full_well: electrons at value 1, more than 0; other values raise ValueError.
-        read: read noise in electrons, 0 or more.
+        read: standard deviation of the read noise in electrons, 0 or more; negative raises ValueError.
         counts: "gaussian" draws from a normal distribution of variance signal + read² and is differentiable;
             "poisson" counts electrons, which differs visibly below about ten of them, with the gradient of
             the mean.
@@ -198,14 +201,14 @@ class Quantise(Step):
 
 @dataclass(frozen=True)
 class Jitter(Step):
-    """Random gain, gamma and white balance for each image of the batch, clipped to 0..1.
+    """Random gain, gamma and white balance of sRGB values, drawn for each image of the batch.
 
-    Meant for sRGB values.
+    A value v becomes gain · channel gain · v^gamma, clipped to 0..1.
 
     Attributes:
-        gain: standard deviation of the logarithm of the gain.
-        gamma: standard deviation of the logarithm of gamma.
-        normalisation: standard deviation of the logarithm of each channel's own gain.
+        gain: standard deviation of the natural logarithm of the gain of all channels.
+        gamma: standard deviation of the natural logarithm of gamma.
+        normalisation: standard deviation of the natural logarithm of each channel's own gain.
     """
 
     gain: float = 0.05
@@ -274,9 +277,12 @@ class DegradationCase:
 
 
 def paper_cases() -> tuple[DegradationCase, ...]:
-    """Return the paper's four augmentations for two inputs, each drawn with probability 1/4.
+    """Return the paper's four degradations of an (alpha, beta) pair, for `augment`.
 
     The paper does not state the blur; here it is a box of 5 pixels.
+
+    Returns:
+        Four cases: alpha blurred; beta blurred, reduced to half the size and back, or both.
     """
     reduced = (Resample(0.5, "bicubic"), Resample(2.0, "bicubic"), Clip())
     return (
@@ -291,9 +297,9 @@ class Pairs(NamedTuple):
     """Degraded images of both cameras.
 
     Attributes:
-        alpha: alpha's images.
-        beta: beta's images.
-        case: index of each pair's case.
+        alpha: alpha's images, values 0..1.
+        beta: beta's images, values 0..1.
+        case: index of each pair's case in the list of cases.
     """
 
     alpha: Float[Tensor, "b ca ha wa"]
@@ -309,8 +315,11 @@ def augment(
 ) -> Pairs:
     """Degrade each pair of a batch by one case drawn at random, all equally likely.
 
+    Args:
+        cases: cases to draw from; their steps must keep the size and the channels of an image.
+
     Returns:
-        The degraded images; the inputs stay as they are.
+        Copies of the images, degraded, with the case of each pair.
 
     Raises:
         ValueError: naming the case, if it changes an image's shape.

@@ -23,7 +23,13 @@ ROWS = 64
 
 
 class ResidualBlock(nn.Module):
-    """Residual block: x + conv(leaky(conv(x))), both convolutions 3x3."""
+    """Residual block: x + conv(leaky(conv(x))), both convolutions 3x3.
+
+    Args:
+        dim: number of channels, in and out.
+        dilation: dilation of the first convolution.
+        bias: True for biases in both convolutions.
+    """
 
     def __init__(self, dim: int, *, dilation: int = 1, bias: bool = True) -> None:
         super().__init__()
@@ -37,8 +43,13 @@ class ResidualBlock(nn.Module):
 
 
 class ResidualASPP(nn.Module):
-    """Residual atrous pyramid: three groups of dilations 1, 4, 8, each fused by a 1x1 convolution (Wang et
-    al. 2019)."""
+    """Residual atrous pyramid: three groups of dilated 3x3 convolutions in turn, each fused by a 1x1
+    convolution and added to the input (Wang et al. 2019).
+
+    Args:
+        dim: number of channels, in and out.
+        dilations: dilations of the parallel convolutions of a group.
+    """
 
     def __init__(self, dim: int, dilations: tuple[int, ...] = (1, 4, 8)) -> None:
         super().__init__()
@@ -120,8 +131,14 @@ def enlarge(x: Float[Tensor, "b d h w"], factor: int = 2) -> Float[Tensor, "b d 
 
 
 class UNet(nn.Module):
-    """U-Net of three scales with `blocks` residual blocks at each scale, and twice as many at the
-    smallest."""
+    """U-Net of three scales, for inputs whose sides are multiples of 4.
+
+    Args:
+        inputs: number of channels of the input.
+        widths: channels at full, 1/2 and 1/4 size.
+        outputs: number of channels of the output, which has the input's size.
+        blocks: residual blocks at each scale; twice as many at the smallest.
+    """
 
     def __init__(self, inputs: int, widths: tuple[int, ...], outputs: int, *, blocks: int = 1) -> None:
         super().__init__()

@@ -83,8 +83,8 @@ class JobReport:
     Attributes:
         made: files made in this run.
         kept: files that existed before, whose tasks did not run.
-        failed: error message by the file of the task.
-        warned: files by kind of warning.
+        failed: error message by the file of the failed task.
+        warned: files whose tasks warned, by kind of warning (its class and text without numbers).
     """
 
     made: list[Path] = field(default_factory=list)
@@ -96,6 +96,10 @@ class JobReport:
         """Repeat a task's warnings in this process, once for each kind. Updates `warned`.
 
         Warnings that differ in numbers alone are one kind.
+
+        Args:
+            outcome: outcome of the task.
+            about: name of the task, put before the warning.
         """
         for warning in outcome.warnings:
             kind = re.sub(r"[\d.]+", "", f"{type(warning).__name__}: {warning}")
@@ -159,9 +163,12 @@ def run_tasks(
     """Run the tasks of a job and report what each became.
 
     Args:
-        resume: skip tasks whose file exists; otherwise such files are deleted first.
+        workers: processes to run them in; by default this one.
+        resume: True to skip tasks whose file exists; otherwise such files are deleted first.
         on_error: "stop" raises at a task's first ValueError, OSError or Warning; "skip" prints it and goes
             on.
+        title: word before the progress bar.
+        console: console for progress and messages; None for standard error.
 
     Returns:
         Files made, kept and failed, and the warnings.
@@ -205,6 +212,11 @@ def followed(
     outcomes: Iterable[T], *, title: str, total: int, done: int = 0, console: Console
 ) -> Iterator[T]:
     """Show the progress of outcomes while they are consumed: a bar on a terminal, else a line now and then.
+
+    Args:
+        title: word before the bar.
+        total: number of tasks, those done before included.
+        done: number of tasks done before.
 
     Yields:
         Each outcome, unchanged.
@@ -385,6 +397,7 @@ def attempt_on_worker(task: Task, threads: int, timeout: float | None = None) ->
     """Run `attempt` in a process that does nothing else, and keep its freed memory for later tasks.
 
     Args:
+        threads: torch's number of threads in this process.
         timeout: seconds after which the process ends itself; None for no limit.
 
     Returns:

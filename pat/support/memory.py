@@ -68,15 +68,17 @@ def keep_freed() -> None:
 
 
 def planned(limit: float | None, memory: float, *, large: bool) -> float | None:
-    """Memory limit to plan a task with, in bytes.
+    """Choose the memory limit to plan a task with.
 
     Args:
-        limit: limit that the user gave; None for no limit.
+        limit: limit that the user gave, bytes; None for no limit.
         memory: bytes that the task is expected to need.
-        large: True for a task whose freed memory would be kept on top, half as much again for 12 megapixels.
+        large: True for a large task. After `keep_freed` a process also keeps what the task has freed: half as
+            much again for 12 megapixels.
 
     Returns:
-        The smaller of both for a large task after `keep_freed`; otherwise `limit` unchanged.
+        Bytes: the smaller of both (`memory` without a limit) for a large task after `keep_freed`; otherwise
+        `limit` unchanged.
     """
     return min(memory, limit or memory) if large and _keeps else limit
 
@@ -103,8 +105,8 @@ def check_limit(pixels: int, limit: float | None = None, each: float = LEAST_BYT
     """Check, before anything is read, that a frame of so many pixels can be fused within a memory limit.
 
     Args:
-        pixels: of alpha.
-        limit: bytes; by default that of `limited`.
+        pixels: number of alpha's pixels.
+        limit: bytes; None for that of `limited`, without which any frame fits.
         each: bytes of working memory for each pixel, at least.
 
     Raises:
@@ -128,7 +130,9 @@ def limited(limit: float | None) -> Iterator[None]:
     """Context manager that states how many bytes the process may take in all, for `how_many_fit`.
 
     A thread returns freed memory to the system when the process comes near the limit. Nothing enforces it.
-    None: no limit.
+
+    Args:
+        limit: bytes; None for no limit.
     """
     before, done = _LIMIT.get(), Event()
     token = _LIMIT.set(limit)

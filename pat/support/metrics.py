@@ -58,7 +58,7 @@ def bootstrap_interval(values: Sequence[float]) -> tuple[float, float]:
     """Compute the 95 % percentile bootstrap interval of a mean (Efron & Tibshirani 1993, section 13.3).
 
     Returns:
-        Lower and upper bound, the same for the same values; (nan, nan) for fewer than two values.
+        Lower and upper bound from 10,000 resamples with a fixed seed; (nan, nan) for fewer than two values.
     """
     if len(values) < 2:
         return math.nan, math.nan

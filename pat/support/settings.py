@@ -34,9 +34,9 @@ class SettingEntry(NamedTuple):
     Attributes:
         algorithm: name of the settings' class.
         name: name of the field.
-        value: its value.
-        kind: "physics", "size" or "tuned".
-        why: reason for the value.
+        value: value of the field.
+        kind: "physics", "size" (of memory or work) or "tuned" (on data).
+        why: meaning of the field, and the source of its value.
     """
 
     algorithm: str

@@ -53,9 +53,9 @@ def about(seconds: float) -> str:
 
 @contextmanager
 def steps_shown(show: Callable[[str], None]) -> Iterator[None]:
-    """Context manager that calls `show` with one line for every step that begins in this thread.
+    """Context manager that calls `show` with a line of text for every step that these packages log.
 
-    Of nested blocks only the innermost shows.
+    Steps of other threads are not shown, and of nested blocks only the innermost shows.
     """
     loggers = [logging.getLogger(name) for name in PACKAGES]
     before = [(logger.level, logger.handlers[:]) for logger in loggers]

@@ -22,6 +22,9 @@ def write_tensors(
 ) -> None:
     """Write tensors and metadata to a safetensors file, atomically, with a digest of the tensors.
 
+    Args:
+        metadata: texts by name to store with them; None for the digest alone.
+
     Raises:
         OSError: naming the file, if writing fails, for instance on a full disk.
     """

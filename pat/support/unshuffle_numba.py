@@ -10,11 +10,12 @@ COLUMNS = 32
 
 @compiled(nogil=True, cache=True)
 def unshuffle(upper, lower, out):
-    """Rearrange 2x2 pixels into four channels, written into `out` (h, w, 4 c).
+    """Rearrange 2x2 pixels into four channels, as torch's `pixel_unshuffle` by 2 does.
 
     Args:
-        upper: the image's even rows (c, h, 2 w).
-        lower: its odd rows.
+        upper: the image's even rows (c, h, 2 w), float32.
+        lower: its odd rows, of the same shape.
+        out: array (h, w, 4 c) to write to.
     """
     channels, (height, width) = len(upper), out.shape[:2]
     for y in range(height):

@@ -84,8 +84,14 @@ CORNER = (190, 300)
 
 
 def table_of(columns: dict[str, dict[str, str]]) -> str:
-    """Format PSNR (dB) and SSIM by recording (columns) and method (lines); a dash where a method does not
-    apply."""
+    """Format a table of scores, with a column for each recording and a line for each method.
+
+    Args:
+        columns: formatted score by method, for each recording; the first recording lists all methods.
+
+    Returns:
+        The text; a dash where a method does not apply.
+    """
     methods = list(next(iter(columns.values())))
     wide = max(map(len, methods)) + 2
     lines = [" " * wide + "".join(f"{name:>18s}" for name in columns)]

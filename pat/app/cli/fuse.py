@@ -84,7 +84,10 @@ class Fuse(Around, Fusing):
         return [] if self.around is None else [KnownFile.parse(self.around).path]
 
     def frames(self, files: Files) -> Files:
-        """Check that there is one image of each camera, and return the files.
+        """Check that there is one image of each camera.
+
+        Returns:
+            The files, unchanged.
 
         Raises:
             UsageError: for several frames.
@@ -255,9 +258,11 @@ def fuse_with_progress(
     """Fuse with weights by name, showing the plan and a bar on the terminal.
 
     Args:
-        weights: name or file.
-        device: "cpu", "cuda" or "auto".
-        further: further arguments of `fuse`.
+        weights: name or file of the weights.
+        rig: the cameras.
+        images: images (c, h, w) by camera.
+        device: "cpu", "cuda" or "auto" (the GPU if there is one).
+        further: further arguments of `pat.fuse`.
 
     Returns:
         The frame, on the CPU.

@@ -53,7 +53,10 @@ class Recordings(NamedTuple):
 
 @dataclass
 class Fusing(Known):
-    """Images of an array, and how they are fused."""
+    """Base class of the commands that fuse: options on images and fusion, and the reading of both.
+
+    Fields are options of the command line, each described beside its name. A subclass defines `run`.
+    """
 
     focal: Numbers = ()
     """Without a rig: the focal length in pixels of a camera whose file does not state it."""
@@ -75,6 +78,12 @@ class Fusing(Known):
 
     def fuse_settings(self, **further: Any) -> FuseSettings:
         """Make the settings of fusion from the options.
+
+        Args:
+            further: further fields of the settings, or `noise_by_default` of `settings`.
+
+        Returns:
+            The settings.
 
         Raises:
             ValueError: for invalid options.
@@ -102,10 +111,16 @@ class Fusing(Known):
         return rig
 
     def named(self, command: str) -> tuple[tuple[str, ...], bool]:
-        """Return the images NAME=FILE of a rig's cameras, and True if there is a rig.
+        """Split the arguments into a rig and its images.
+
+        Args:
+            command: name of the command, for messages.
+
+        Returns:
+            Images NAME=FILE of the rig's cameras, and True; or no images, and False without a rig.
 
         Raises:
-            ValueError: as `named_images`, and for a format whose extra is not installed.
+            ValueError: for arguments that contradict each other, and a format whose extra is not installed.
             FileNotFoundError: for files that do not exist.
         """
         if self.kind == "exr":
@@ -116,8 +131,11 @@ class Fusing(Known):
 
     @contextmanager
     def recordings(self, image: Sequence[str], *, with_rig: bool) -> Iterator[Recordings]:
-        """Context manager that yields the images (of `named`) with the given rig or one found; it also
-        chooses weights.
+        """Context manager that yields the images with the given rig or one found, and chooses weights.
+
+        Args:
+            image: images NAME=FILE, as `named` returns them.
+            with_rig: True if a rig is given, False to find one from the images.
 
         Yields:
             The recordings; frames of videos exist within the block only.
@@ -216,8 +234,11 @@ class Fusing(Known):
             say(f"network: {self.network} (--network NAME takes others)")
 
     def healed(self, views: ViewFiles) -> Rig:
-        """Return the rig of the views, or the one corrected by their images, which is written beside the
-        results."""
+        """Compare the rig with the images, and correct it if they clearly contradict it.
+
+        Returns:
+            The rig of the views, or the corrected one, which is then written beside the results too.
+        """
         from arraygeom.io.native import write
         from arraygeom.runtime.together import write_listed
 
@@ -283,6 +304,12 @@ def files_by_camera(
 ) -> tuple[str, dict[str, list[Path]]]:
     """Find the image files of each camera of a rig.
 
+    Args:
+        rig: the rig.
+        alpha: value of --alpha; None raises.
+        paths: positional arguments, the rig's file first.
+        image: images NAME=FILE; FILE may be a folder or a pattern.
+
     Returns:
         Alpha's name, and files by camera.
 
@@ -303,10 +330,10 @@ def files_by_camera(
 
 
 def refuse_same(files: Mapping[str, Sequence[Path]]) -> None:
-    """Check that the first files of no two cameras are identical.
+    """Check that no two cameras have the same image: their first files are compared byte by byte.
 
     Raises:
-        ValueError: if they are.
+        ValueError: naming both cameras, if they have.
     """
     for (a, (first, *_)), (b, (second, *_)) in combinations(files.items(), 2):
         if first.is_file() and second.is_file() and filecmp.cmp(first, second, shallow=False):

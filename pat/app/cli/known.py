@@ -42,7 +42,13 @@ OFF_LINES = 5.0
 
 @dataclass
 class Known:
-    """An array, facts of the scene, and ways to match its images."""
+    """Base class of commands on an array's images: options on rig, depth, noise and matching.
+
+    Fields are options of the command line, each described beside its name.
+
+    Raises:
+        UsageError: for a --max-memory that is no amount of memory.
+    """
 
     given: Annotated[tuple[Path, ...], Option("RIG|IMAGE IMAGE ...", positional=True)] = ()
     """Rig file of any known format (also: --rig RIG); or, without, image, folder or video of each camera."""
@@ -84,7 +90,10 @@ class Known:
 
         Args:
             noise_by_default: True to look for noise without --noise.
-            further: further entries of the settings.
+            further: further fields of the settings.
+
+        Returns:
+            The settings.
 
         Raises:
             ValueError: for invalid options.
@@ -101,11 +110,11 @@ class Known:
 
     @contextmanager
     def judged(self) -> Iterator[None]:
-        """Context manager for work within --max-memory; exits with status 3 if the rig does not fit the
-        images.
+        """Context manager for the command's work, which is done within --max-memory.
 
         Raises:
-            SystemExit: with status 3, if it does not fit.
+            SystemExit: with status 3, if the work warned that the rig does not fit the images; with `--misfit
+                refuse` before anything is written.
         """
         from ...fusion.checks import LowConfidenceWarning, confidence_checked
         from ...support.memory import limited
@@ -131,7 +140,14 @@ class Known:
         matches: Path | None = None,
         flight: bool = False,
     ) -> ImageArray:
-        """Find the array from each camera's first image, or a flight's several, and use its levels.
+        """Find the array from each camera's first image; `match_levels` is then set as the array needs it.
+
+        Args:
+            files: image files by camera, in the order of frames.
+            weights: name of the weights; None to choose them by the bands.
+            focal: focal lengths in pixels by camera.
+            matches: file of matched points; None to match the images.
+            flight: True to use several frames of each camera, not the first alone.
 
         Returns:
             The array.
@@ -186,10 +202,13 @@ class KnownFile(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> KnownFile:
-        """Parse the option's text.
+        """Parse the option's text, and check that the file exists.
+
+        Returns:
+            The parsed value.
 
         Raises:
-            UsageError: for other text.
+            UsageError: for other text, and a missing file.
         """
         path, *parts = text.split(",")
         numbers = options.numbers_by_name(parts, "--around")
@@ -208,7 +227,11 @@ class KnownFile(NamedTuple):
 
 @dataclass
 class Around(Known):
-    """Option for known depth or matches of one frame."""
+    """Base class of commands with --around: a file of known depth or matches of one frame.
+
+    Raises:
+        UsageError: for text that is no such value, and a missing file.
+    """
 
     around: Annotated[str | None, Option("FILE", also=("--matches", "--depth-map"))] = None
     """Search around what is known: a depth map of alpha's pixels (PFM, TIFF, 16-bit PNG), or matched points
@@ -240,7 +263,17 @@ class Around(Known):
         files: Mapping[str, str | Path],
         field: ReceptiveField | None,
     ) -> tuple[Rig, ReceptiveField | Mapping[str, ReceptiveField | None] | None]:
-        """Return the rig, and the field around the known depth or matches, by beta; `field` without --around.
+        """Apply --around: restrict the search to known depth or matches.
+
+        Args:
+            images: images (c, h, w) by camera.
+            rig: rig of the images.
+            alpha: name of alpha.
+            files: image file of each camera, by whose names matches are found.
+            field: field of --field; None for the default.
+
+        Returns:
+            The rig, and the field around the known depth or matches by beta; `field` itself without --around.
 
         Raises:
             ValueError: for options that contradict each other, and files that do not suit these cameras.

@@ -75,9 +75,14 @@ def command_paths(group: Any = Pat, before: tuple[str, ...] = ()) -> Iterator[tu
 
 
 def main(arguments: list[str] | None = None, *, group: Any = Pat, prog: str = "pat") -> None:
-    """Run `pat`, or another group of commands.
+    """Run a command of `pat`, or of another group of commands.
 
-    Errors in the input are one line on standard error.
+    Errors in the input are printed as one line on standard error.
+
+    Args:
+        arguments: words after the program's name; None for those of this process.
+        group: class with `commands` by name.
+        prog: name of the program in messages.
 
     Raises:
         SystemExit: with status 2 for such errors, 130 for an interrupt, 141 for a broken pipe; others by the

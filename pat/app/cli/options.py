@@ -143,8 +143,9 @@ def writable(out: Path, *, folder: bool = False, option: str = "--out") -> Path:
     """Check that a path can be written, before the work whose result goes there.
 
     Args:
-        folder: True if a folder is wanted.
-        option: name in messages.
+        out: path of the result.
+        folder: True if a folder is wanted, False for a file.
+        option: name of the option, for messages.
 
     Returns:
         The path.
@@ -229,7 +230,11 @@ NO_IMAGE = "is no image: images end in .png, .tif, .jpg and the like"
 
 
 def load_rig_or_say_no_image(path: Path, depth: tuple[float, float] | None) -> Rig:
-    """Load the rig of the first argument as `load_rig`, with a message for a file meant as an image.
+    """Load the rig of a command's first argument; the message for another file asks if it is an image.
+
+    Args:
+        path: rig file.
+        depth: (near, far) in place of the rig's bounds, metres; None for the rig's.
 
     Returns:
         The rig.
@@ -250,6 +255,10 @@ def load_rig_or_say_no_image(path: Path, depth: tuple[float, float] | None) -> R
 
 def refuse_missing(path: Path, *, rig: bool) -> None:
     """Check that a rig file, or an image, folder or video, exists, before torch is imported to read it.
+
+    Args:
+        path: path, as the user gave it.
+        rig: True if it is to be a rig file; otherwise a pattern with *, ? or [ passes.
 
     Raises:
         FileNotFoundError: if it does not.
@@ -452,7 +461,7 @@ def working(title: str) -> Iterator[Callable[[str], None]]:
 
 @contextmanager
 def working_by_plan(title: str) -> Iterator[Callable[[Plan], None]]:
-    """Context manager as `working`, for work with a plan.
+    """Context manager during which the terminal shows a title and steps (`working`), for work with a plan.
 
     Yields:
         A function that prints the plan and adds its duration to the title.
@@ -468,7 +477,10 @@ def working_by_plan(title: str) -> Iterator[Callable[[Plan], None]]:
 
 @cache
 def say_when_compiling() -> None:
-    """Print a line, once, when kernels are about to be compiled, which takes some seconds."""
+    """Print a line on standard error once kernels are about to be compiled, which takes some seconds.
+
+    From the call on, numba's first compilation in this process is announced, later ones are not.
+    """
     from numba.core import event
 
     first = Lock()

@@ -29,8 +29,13 @@ MISSING = dataclasses.MISSING
 
 
 class UsageError(ValueError):
-    """Error for a command line that cannot be run: the option, what it expects, and what it got,
-    if anything."""
+    """Error for a command line that cannot be run.
+
+    Args:
+        option: name of the option or argument.
+        expected: description of what it expects.
+        got: value that it got; None to leave that out of the message.
+    """
 
     def __init__(self, option: str, expected: str, got: object = None) -> None:
         self.option, self.expected, self.got = option, expected, got
@@ -79,7 +84,8 @@ def parse(
     Args:
         kind: dataclass or function whose fields or parameters are the options; its docstring is the help.
         arguments: words; None for those of this process.
-        base: instance that holds the defaults, and is copied with changes.
+        prog: name of the program in the help; empty for that of this process.
+        base: instance that holds the defaults, and is copied with changes; None for the class's defaults.
         description: help text; empty for the docstring.
 
     Returns:
@@ -115,7 +121,12 @@ def parse(
 
 
 def script(kind: Callable[..., T], arguments: Sequence[str] | None = None, *, prog: str = "") -> T:
-    """Parse as `parse`, for a stand-alone script.
+    """Parse the command line of a stand-alone script, as `parse`, and end the process for a bad one.
+
+    Args:
+        kind: dataclass or function whose fields or parameters are the options.
+        arguments: words; None for those of this process.
+        prog: name of the program in the help; empty for that of this process.
 
     Returns:
         The instance, or the function's result.

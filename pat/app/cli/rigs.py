@@ -93,11 +93,11 @@ def warn_of_misfit(rig: Rig, images: Mapping[str, Tensor]) -> None:
 
 
 def matched_points(rig: Rig, alpha: str, images: Mapping[str, Tensor]) -> dict[str, tuple[Tensor, Tensor]]:
-    """Match points between alpha and each beta that shows enough of the same and that the rig relates to
-    alpha.
+    """Match points between alpha's image and each beta's.
 
     Returns:
-        Points (n, 2) of alpha and of the beta, pixels, by beta.
+        Points (n, 2) of alpha and of the beta, pixels, by beta. Betas without an image, that show too little
+        in common with alpha, or that the rig does not relate to it, are left out.
     """
     from calib.images.matches import match_cameras
     from calib.images.residuals import related
@@ -113,6 +113,11 @@ def matched_points(rig: Rig, alpha: str, images: Mapping[str, Tensor]) -> dict[s
 
 def given_matches(path: Path | None, texts: Sequence[str], images: Mapping[str, Tensor]) -> Pairs | None:
     """Read the matches of a file between the cameras' images of `--image NAME=FILE`.
+
+    Args:
+        path: file of matched points; None for none.
+        texts: values NAME=FILE of --image.
+        images: images (c, h, w) by camera, whose sizes points must fit.
 
     Returns:
         Matches by pair; None without a file.

@@ -59,7 +59,10 @@ class FuseSequence(FuseBatch):
         """Accept videos: they are sequences."""
 
     def timed(self, rig: Rig) -> Rig:
-        """Return the rig with the command line's frame rates and offsets.
+        """Set the cameras' frame rates and time offsets that the command line states.
+
+        Returns:
+            The rig.
 
         Raises:
             ValueError: for a camera that the rig lacks, and text that is no number.

@@ -136,8 +136,12 @@ def pinned(scene: ExplorerScene, alpha: str, controls: Controls) -> dict[str, An
 def moved_rig(rig: Rig, alpha: str, controls: Controls) -> Rig:
     """Apply the controls' changes to the calibrated cameras.
 
+    Args:
+        alpha: name of alpha, in whose axes steps are; uncalibrated, nothing moves.
+        controls: values of the controls: `baseline`, and `errors` by camera.
+
     Returns:
-        The rig; the same one for unchanged controls.
+        The moved rig; the same one for unchanged controls.
 
     Raises:
         ValueError: for a change that a camera's lens has not, and for unknown cameras and changes.
@@ -174,7 +178,14 @@ def moved_rig(rig: Rig, alpha: str, controls: Controls) -> Rig:
 
 
 def with_lens(name: str, camera: Camera, changes: Controls) -> LensModel | None:
-    """Return the camera's lens with values added to its numbers, by their index as text.
+    """Add values to the numbers of a camera's lens.
+
+    Args:
+        name: name of the camera, for messages.
+        changes: values by the index of the number as text; none leaves the lens.
+
+    Returns:
+        The lens; for a pinhole one of Brown-Conrady.
 
     Raises:
         ValueError: for a number that the lens has not.
@@ -198,7 +209,13 @@ def explorer_state(rig: Rig, alpha: str, controls: Controls) -> ExplorerState:
 
 
 def drawn(beta: BetaReport) -> dict[str, Any]:
-    """Convert a beta's report to plain numbers: positions in its pixels, depths in metres; or a `problem`."""
+    """Convert a beta's report to plain values for JSON.
+
+    Returns:
+        `samples` and `match` in beta's pixels, `weights`, `depths` and `depth` in metres (None where
+        unknown), and `off`, the distance of the images' match from the line, pixels; or a `problem` if no
+        sample is on the image.
+    """
     if not bool(beta.valid.any()):
         return {"problem": "no part of the segment lies in this image: the views do not overlap here"}
     best = int(beta.weight.argmax())
@@ -242,7 +259,12 @@ def number(value: float) -> float | None:
 
 
 def slider_ranges(rig: Rig) -> list[list[Any]]:
-    """List name, label, (low, high, step, value), and True for a change of one camera, of each slider."""
+    """List the sliders that suit a rig.
+
+    Returns:
+        Name, label, [low, high, step, value], and True for a change of one camera, of each; depths only with a
+        depth range, others only with calibrated cameras.
+    """
     ranges: list[list[Any]] = []
     unit = length_unit(rig)
     if rig.depth is not None:
@@ -267,7 +289,11 @@ def slider_ranges(rig: Rig) -> list[list[Any]]:
 
 
 def choices(scene: ExplorerScene, controls: Controls) -> list[list[Any]]:
-    """List name, label and options of each choice."""
+    """List the drop-down choices of the explorer: field, second field, and weights.
+
+    Returns:
+        Name, label and options of each.
+    """
     fields = [*FAMILIES, *scene.fields]
     unlisted = [name for name in (controls["field"], controls["second"]) if name not in ("none", *fields)]
     weights = [WINDOWS, *(scene.networks or [SHIPPED])]
@@ -285,7 +311,12 @@ def choices(scene: ExplorerScene, controls: Controls) -> list[list[Any]]:
 
 
 def shown_cameras(scene: ExplorerScene, alpha: str) -> list[dict[str, Any]]:
-    """Describe alpha and each beta with an image, in this order: name, size, image and unit of depth."""
+    """Describe alpha and each beta with an image, in this order, for the page.
+
+    Returns:
+        Plain values: `name`, `hw`, `src` (the image as a data URL), `alpha` (True for alpha), and `unit` of
+        depths.
+    """
     names = [alpha, *(n for n in scene.rig.betas(alpha) if n in scene.images)]
     unit = length_unit(scene.rig)
     return [
@@ -301,9 +332,9 @@ def shown_cameras(scene: ExplorerScene, alpha: str) -> list[dict[str, Any]]:
 
 
 def data_url(image: Tensor) -> str:
-    """Encode an image (c, h, w) as the URL of a PNG whose longer side is at most `WIDEST` pixels.
+    """Encode an image (c, h, w) as the data URL of a PNG whose longer side is at most `WIDEST` pixels.
 
-    Grey unless it has three bands; values are clipped to 0..1.
+    Images of other numbers of bands than three are shown as their mean; values are clipped to 0..1.
     """
     image = image if len(image) == 3 else image.mean(0, keepdim=True).expand(3, -1, -1)
     scale = min(1.0, WIDEST / max(image.shape[1:]))

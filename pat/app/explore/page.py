@@ -55,8 +55,12 @@ class Explorer:
     files: Mapping[str, str] = field(default_factory=dict)
 
     def answer(self, controls: Controls) -> dict[str, Any]:
-        """Return what is drawn for a state of the controls, or {"error": message}; raises nothing for bad
-        controls."""
+        """Compute what is drawn for a state of the controls.
+
+        Returns:
+            The values of `answers.answer`; for impossible controls {"error": message}, so that nothing is
+            raised for them.
+        """
         if self.scene is None:
             return {"error": self.error}
         try:
@@ -124,7 +128,14 @@ class Explorer:
         return with_depths(rig, explorer_state(rig, self.alpha, self.controls))
 
     def grid(self, columns: int) -> dict[str, Any]:
-        """Compute answers for a grid of alpha's pixels, by "column,row", with the grid's size."""
+        """Compute the answers for a grid of alpha's pixels, which a saved page shows.
+
+        Args:
+            columns: columns of the grid; cells are about square.
+
+        Returns:
+            Plain values: `columns`, `rows`, and `answers` by "column,row".
+        """
         if self.scene is None:
             return {"columns": 1, "rows": 1, "answers": {"0,0": {"error": self.error}}}
         h, w = self.scene.rig[self.alpha].hw
@@ -145,7 +156,12 @@ def is_pinhole(rig: Rig) -> bool:
 
 
 def geometry(rig: Rig, alpha: str) -> dict[str, Any]:
-    """Return the cameras as plain numbers, for the page's own computation."""
+    """Return the calibrated cameras as plain numbers, for the page's own computation.
+
+    Returns:
+        Name of `alpha`; `cameras` by name, each with K, R, centre (metres) and hw; `near` and `far`, at most
+        1e9 metres. The rig must have a depth range.
+    """
     cameras = {
         name: {k: getattr(camera, k).tolist() for k in ("K", "R", "centre")} | {"hw": list(camera.hw)}
         for name, camera in rig.cameras.items()
@@ -188,7 +204,17 @@ def opened(
     files: Mapping[str, str] | None = None,
     **controls: Any,
 ) -> Explorer:
-    """Make the explorer of a rig; arguments as for `explore`.
+    """Make the explorer of a rig.
+
+    Args:
+        rig: the rig.
+        images: images (C, H, W) by camera; None for a checkered room.
+        alpha: name of alpha; None for the first camera with an image.
+        x: pixel of alpha; None for the middle.
+        network: network of the paper, or its weights by name, whose attention is shown; None for correlations
+            of windows.
+        fields: further fields by name; None for none.
+        controls: initial values of the controls (`explore`).
 
     Returns:
         The explorer; problems with the arguments are its `error`.
@@ -217,11 +243,16 @@ def checked(
 ) -> tuple[Mapping[str, Tensor], str]:
     """Check rig, images and alpha of an explorer, and fill in defaults.
 
+    Args:
+        images: images by camera; None or empty for a checkered room.
+        alpha: name of alpha; None for the first camera with an image.
+
     Returns:
-        Images, and alpha's name.
+        Images by camera, and alpha's name.
 
     Raises:
-        ValueError: for what cannot be shown.
+        ValueError: for a rig of one camera, unknown names, no image of alpha or of any beta, and a rig for
+            which no room can be rendered.
     """
     if len(rig.names) < 2:
         raise ValueError("the rig has one camera: a receptive field needs two cameras or more")

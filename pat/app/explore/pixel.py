@@ -56,12 +56,12 @@ WINDOWS = "windows"
 
 @dataclass(frozen=True)
 class ExplorerState:
-    """Values of the controls.
+    """State of the explorer, from its controls.
 
     Attributes:
         alpha: name of alpha.
-        x: alpha's pixel (x, y).
-        family: name of the field; "auto" for the default.
+        x: pixel (x, y) of alpha.
+        family: name of the receptive field; "auto" for the default.
         near: near bound, metres; None for the rig's.
         far: far bound, metres; None for the rig's.
         weights: `WINDOWS`, or the name of a network.
@@ -80,11 +80,11 @@ class ExplorerState:
 
 
 class MatchOffset(NamedTuple):
-    """Best match of the images near the best sample, on the line or beside it.
+    """Best photometric match near the best sample, on the epipolar line or beside it.
 
     Attributes:
-        position: the match, pixels of beta.
-        distance: its distance from the line, pixels.
+        position: position of the match, pixels of beta.
+        distance: distance of the match from the line, pixels.
         correlation: correlation of the windows there, -1 to 1.
     """
 
@@ -94,7 +94,7 @@ class MatchOffset(NamedTuple):
 
 
 class BetaReport(NamedTuple):
-    """Samples of the pixel in one beta, and the match.
+    """Samples of alpha's pixel in one beta, with their weights and the match.
 
     Attributes:
         xy: samples, pixels of beta.
@@ -121,12 +121,12 @@ class BetaReport(NamedTuple):
 
 
 class PixelReport(NamedTuple):
-    """Reports of a pixel.
+    """Reports of one pixel of alpha in all betas.
 
     Attributes:
         betas: report by beta.
-        problems: problem by beta that has no report.
-        colour: fused colour.
+        problems: reason, in a sentence, by beta that has no report.
+        colour: fused colour, RGB or grey.
         depth: depth by all betas, metres; NaN if unknown.
     """
 
@@ -146,8 +146,8 @@ class ExplorerScene:
         fields: further fields by name.
         networks: further networks by name.
         covariance: covariance of the rig's parameters, which gives segments their bands; None for none.
-        guides: luminances for windows, by camera.
-        features: features of networks.
+        guides: luminances (1, 1, h, w) that windows are cut from, by camera.
+        features: computed features of networks.
 
     Raises:
         ValueError: for an image that does not suit its camera.
@@ -256,7 +256,10 @@ def displacement(pair: Pair, x: Float[Tensor, "1 2"]) -> float:
 
 
 def with_depths(rig: Rig, state: ExplorerState) -> Rig:
-    """Return the rig with the state's depth bounds.
+    """Replace a rig's depth bounds by those that the state has.
+
+    Returns:
+        The rig; unchanged if the state has none.
 
     Raises:
         ValueError: for only one bound where the rig has none, and near beyond far.
@@ -365,12 +368,19 @@ def match_offset(
     samples: tuple[Float[Tensor, "l 2"], Float[Tensor, " l"]],
     ends: Float[Tensor, "2 2"] | None,
 ) -> MatchOffset | None:
-    """Find the images' own match near the segment, by the correlation of windows around both pixels.
+    """Find the photometric match near the segment, by the correlation of windows around both pixels.
 
     Unlike the samples it may lie beside the line, and does if the rig is off.
 
+    Args:
+        guides: luminances of alpha and of beta.
+        pair: alpha and beta.
+        x: pixel of alpha.
+        samples: positions in beta, and their weights.
+        ends: start and end of the segment; None for other fields.
+
     Returns:
-        The match; None if nothing matches clearly.
+        The match; None without a segment, or if nothing matches clearly.
     """
     xy, weight = samples
     if ends is None or not bool((weight > 0).any()) or float((ends[1] - ends[0]).norm()) < 1e-6:
@@ -418,7 +428,18 @@ def correlations(
     x: Float[Tensor, "1 2"],
     xy: Float[Tensor, "l 2"],
 ) -> Float[Tensor, " l"]:
-    """Compute the normalised correlations (-1 to 1) of alpha's window at x with beta's at each of xy."""
+    """Compute the normalised correlations of alpha's window at a pixel with beta's at some positions.
+
+    Args:
+        alpha: luminance of alpha.
+        beta: luminance of beta.
+        pair: alpha and beta, by whose rough transfer windows are scaled and rotated.
+        x: pixel of alpha.
+        xy: positions in beta, pixels.
+
+    Returns:
+        Correlations, -1 to 1; 0 where a window is flat.
+    """
     steps = (pixel_grid((2 * RADIUS + 1, 2 * RADIUS + 1), dtype=x.dtype) - RADIUS).reshape(-1, 2)
     transformed = steps @ jacobian(pair, x).T
     alpha_features = window_features(alpha, x, steps)
@@ -457,8 +478,17 @@ def softmax(scores: Float[Tensor, " l"], valid: Bool[Tensor, " l"]) -> Float[Ten
 def depths(
     pair: Pair, x: Float[Tensor, "1 2"], xy: Float[Tensor, "l 2"], valid: Bool[Tensor, " l"]
 ) -> Float[Tensor, " l"]:
-    """Compute the depth in alpha of each sample, metres; NaN where it has none or the pair is not
-    calibrated."""
+    """Compute the depth in alpha of each sample in beta.
+
+    Args:
+        pair: alpha and beta.
+        x: pixel of alpha.
+        xy: samples, pixels of beta.
+        valid: mask of the samples in the image.
+
+    Returns:
+        Depths in metres; NaN for invalid samples, samples without depth, and pairs that are not calibrated.
+    """
     if pair.link is not None or not pair.calibrated:
         return torch.full_like(xy[:, 0], torch.nan)
     pinholes = pair.alpha.has_pinhole_view and pair.beta.has_pinhole_view

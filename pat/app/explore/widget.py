@@ -22,7 +22,13 @@ with needs("explore", "the explorer in a notebook"):
 
 
 class FieldWidget(anywidget.AnyWidget):
-    """Widget with alpha and betas side by side; `controls` come from the browser, `answer` goes to it."""
+    """Notebook widget that shows alpha and the betas side by side, with segments, samples and controls.
+
+    The browser changes `controls`; the widget then sets `answer`.
+
+    Args:
+        explorer: scene to show, or an error.
+    """
 
     _esm = MODULE
     cameras: Any = traitlets.List().tag(sync=True)
@@ -75,14 +81,15 @@ def explore(
     rig.
 
     Args:
-        images: (C, H, W) by camera; None for a checkered room.
-        alpha: its name; None for the first camera with an image.
-        x: its pixel; None for the middle.
+        rig: the rig.
+        images: images (C, H, W) by camera; None for a checkered room.
+        alpha: name of alpha; None for the first camera with an image.
+        x: pixel (x, y) of alpha; None for the middle.
         network: network of the paper, or weights such as "pat-supervised", whose attention is shown; None for
             correlations of windows.
-        fields: further fields by name, which can then be chosen.
-        covariance: covariance of the rig's parameters, as `calib` writes it: 95 % bands are drawn around
-            segments.
+        fields: further fields by name, which can then be chosen; None for none.
+        covariance: covariance of the rig's parameters, as `calib` writes it, for 95 % bands around segments;
+            None for none.
         controls: initial values of the controls: `field` and `second` (names of fields), `weights`, `near`
             and `far` (metres), `baseline` (factor), `errors` (changes by camera, such as
             {"colour": {"ry": 0.5, "cx": 3}}), `camera` (the one that sliders change), `pins`

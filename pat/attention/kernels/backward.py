@@ -16,7 +16,15 @@ from .vectors import fma, from_index, load, mul, splat, store, sub, take, total,
 
 @compiled(nogil=True, cache=True)
 def backward(call, saved, share, taps, gradients):
-    """Compute the gradients of a share of alpha's pixels, and their weighted taps; written in place."""
+    """Compute the gradients of a share of alpha's pixels, and their weighted taps; written in place.
+
+    Args:
+        call: inputs of attention (`Call`).
+        saved: results of `forward`, and gradients by them (`Saved`).
+        share: pixels of this caller (`Share`).
+        taps: `TapList` to write: beta's pixels and weights, which `scatter` adds up later.
+        gradients: `Gradients` to write, of query, points and bias.
+    """
     call, saved, share, taps, gradients = (
         pointers(call),
         pointers(saved),

@@ -53,7 +53,14 @@ def copy(array, start, n, out):
 
 @compiled
 def inner_products(x, rows, first, last, image, channels, out):
-    """out[t] = x . image[rows[t]], for first <= t < last; rows is padded to a multiple of TAP_BLOCK."""
+    """Compute inner products: out[t] = x . image[rows[t]] for first <= t < last.
+
+    Args:
+        x: vector of `channels` numbers.
+        rows: numbers of pixels, padded to a multiple of TAP_BLOCK.
+        image: pixels of `channels` numbers, one after the other.
+        out: numbers to write, up to the next multiple of LANES after `last`.
+    """
     c = 0
     for t in range(first, last, LANES):
         store(out, t, splat(zero(x)))
@@ -94,9 +101,10 @@ def _inner_products_of_rest(x, rows, first, last, image, channels, first_channel
 
 @compiled
 def weighted_sum(weights, rows, first, last, image, channels, begin, end, out):
-    """out[c] += weights[t] image[rows[t], c] for first <= t < last and the channels begin <= c < end.
+    """Add a weighted sum of pixels: out[c] += weights[t] image[rows[t], c] for begin <= c < end.
 
-    Weights and rows are padded to a multiple of TAP_BLOCK.
+    The sum is over first <= t < last. Weights and rows are padded to a multiple of TAP_BLOCK. `image` has
+    `channels` numbers a pixel.
     """
     c = begin
     while c + ROW * LANES <= end:
@@ -146,7 +154,16 @@ def block_products(pixels, counts, x, rows, image, channels, out):
 
 @compiled
 def block_sums(pixels, counts, weights, rows, image, channels, out):
-    """Compute `weighted_sum` for the pixels of a block, from 0, some taps in turn as in `block_products`."""
+    """Compute the `weighted_sum` of every pixel of a block, some taps in turn as in `block_products`.
+
+    Args:
+        pixels: number of pixels of the block.
+        counts: number of taps of each pixel.
+        weights: weights of each pixel's taps.
+        rows: beta's pixels of the taps.
+        image: beta's image, flat, `channels` numbers a pixel.
+        out: sums (channels) of each pixel to write.
+    """
     for i in range(pixels):
         fill(of(out, i), 0, channels, zero(out.first))
     for c in range(0, channels, ROW * LANES):
@@ -173,9 +190,16 @@ def scatter(taps, weights, last, x, channels, first_channel, last_channel, out):
     """Add to beta's pixels: out[row, c] += weight x[pixel, c] for all taps of the alpha pixels taps.first ..
     last.
 
-    Taps of a block are added in turn, as in `block_products`. `weights` is a column of `taps`. One caller
-    owns the channels first_channel .. last_channel, so the order of additions, and with it every bit, is the
-    same however many callers share the work.
+    Taps of a block are added in turn, as in `block_products`. One caller owns the channels from
+    `first_channel` to before `last_channel`, so the order of additions, and with it every bit, is the same
+    however many callers share the work.
+
+    Args:
+        taps: `TapList` of the pixels.
+        weights: one of its two lists of weights.
+        last: alpha pixel after the last.
+        x: gradients by alpha's pixels, flat, `channels` numbers a pixel.
+        out: sums by beta's pixels to add to, of the same form.
     """
     taps, (weights, x, out) = pointers(taps), pointers((weights, x, out))
     for first in range(0, last - taps.first, BLOCK):

@@ -38,9 +38,13 @@ def row_of(vector, n):
 
 
 class Code:
-    """Emitter of instructions.
+    """Emitter of LLVM instructions in the body of one intrinsic.
+
+    Other attributes are looked up in `builder`, LLVM's own emitter.
 
     Attributes:
+        context: numba's target context.
+        builder: llvmlite's builder.
         kinds: numba's types of the intrinsic's arguments.
         result: numba's type of its value.
     """
@@ -105,19 +109,20 @@ def _constants(lanes):
 
 
 def instruction(result):
-    """Decorator that makes an intrinsic of a function (code, *values) that emits its code.
+    """Make a decorator that turns a function into a numba intrinsic.
 
-    Arguments annotated `index` are 64-bit; those annotated `literal` are numbers at compile time.
+    The function takes a `Code` and LLVM values, and emits instructions. Arguments annotated `index` are
+    64-bit; those annotated `literal` are numbers at compile time.
 
     Args:
-        result: function from the arguments' types to the result's type.
+        result: function from the arguments' numba types to the result's type.
 
     Returns:
         The decorator.
     """
 
     def decorate(emit):
-        """numba's intrinsic of the function's name, typed by its annotations."""
+        """Make numba's intrinsic of the function `emit`, with its name, typed by its annotations."""
         _, *parameters = inspect.signature(inspect.unwrap(emit)).parameters.values()
         notes = [str(parameter.annotation) for parameter in parameters]
 

@@ -45,10 +45,16 @@ Block = namedtuple("Block", [name for name, _, _ in LAYOUT])  # type: ignore[mis
 
 
 def block_scratch(samples: int, channels: int, number: np.dtype) -> Block:
-    """Allocate the scratch of a block.
+    """Allocate the scratch memory in which a block of BLOCK alpha pixels is computed.
+
+    Args:
+        samples: samples of a pixel.
+        channels: channels of query or value, the larger number.
+        number: type of computation, float32 or float64.
 
     Returns:
-        An array (BLOCK, length) for each line of `LAYOUT`, the values of a pixel side by side.
+        An array (BLOCK, length) for each line of `LAYOUT`, the values of a pixel side by side; not
+        initialised.
     """
     lengths = {"pixel": 1, "sample": samples + LANES, "tap": 4 * samples + 2 * LANES, "channel": channels}
     ends = {"integer": 0, "number": 0}
@@ -174,11 +180,13 @@ class Saved(NamedTuple):
 
 
 class Gradients(NamedTuple):
-    """Gradients of alpha's pixels, with flags for the wanted ones. `points` and `bias` must be zero before.
+    """Flat arrays for the gradients of alpha's pixels, with flags for the wanted ones.
+
+    `points` and `bias` are added to, so they must be zero before.
 
     Attributes:
         query: gradients by the query.
-        points: gradients by the points.
+        points: gradients by the segments' ends or the positions.
         bias: gradients by the bias.
         wants_query: True if `query` is wanted.
         wants_points: True if `points` is wanted.

@@ -23,12 +23,21 @@ LOWEST = np.finfo(np.float32).min
 
 @compiled(nogil=True, cache=True, fastmath={"contract"})
 def attend_rows(query, key, value, out, logsum, bias, which, size, spacing, top):
-    """Compute `ROWS` rows, from `top` on, of one image (channels, h, w): the softmax-weighted mean of window
-    samples.
+    """Attend to windows, for up to `ROWS` rows of one image: softmax-weighted means of the values.
 
-    Written in place: `out`, the mean of the values at the samples `which` of `size` x `size` pixels,
-    `spacing` apart, with a bias for each sample; samples outside the image do not count. And `logsum` (h, w),
-    the log of the sum of exponentials, inf where no sample counts.
+    Samples outside the image do not count.
+
+    Args:
+        query: features (d, h, w) of alpha, float32.
+        key: features (d, h, w) of beta.
+        value: values (dv, h, w) of beta.
+        out: means (dv, h, w) to write; 0 where no sample counts.
+        logsum: logs of the sums of exponentials (h, w) to write; inf where no sample counts.
+        bias: score (size²) added to each sample.
+        which: samples of the window to use, numbered row by row.
+        size: samples per side of the window.
+        spacing: pixels between samples.
+        top: first row.
     """
     channels, height, width = query.shape
     scores = np.empty((len(which), -(-width // LANES) * LANES), np.float32)
@@ -89,12 +98,18 @@ def _exponentiate(rows, shape):
 
 @compiled(nogil=True, cache=True, fastmath={"contract"})
 def differentiate_rows(query, key, value, upstream, sums, gradients, wanted, bias, which, size, spacing, top):
-    """Compute `ROWS` rows of the gradients by query, key and value, from `top` on, as far as `wanted`;
-    written in place.
+    """Differentiate `attend_rows` by query, key and value, for up to `ROWS` rows.
 
-    `sums` (2, h, w) are the log of the sum of exponentials, and the inner product of `upstream`, the gradient
-    by the output, with the output. A pixel is a sample of as many pixels as it has samples: with the roles of
-    the two exchanged, gradients of keys and values are gathered, too.
+    A pixel is a sample of as many pixels as it has samples: with the roles of the two exchanged, gradients
+    of keys and values are gathered, too.
+
+    Args:
+        query: features (d, h, w) of alpha; `key`, `value`, `bias`, `which`, `size`, `spacing` and `top` are
+            those of `attend_rows`.
+        upstream: gradient (dv, h, w) by the means.
+        sums: planes (2, h, w): `logsum`, and the inner product of `upstream` with the means.
+        gradients: gradients by query, key and value to add to.
+        wanted: True for each of the three to compute.
     """
     (channels, height, width), (by_query, by_key, by_value) = query.shape, gradients
     weight, slope = np.zeros((2, -(-width // LANES) * LANES), np.float32)

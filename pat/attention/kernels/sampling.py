@@ -146,7 +146,7 @@ def _find_pixels(n, first, geometry, here):
 
 
 class Course(NamedTuple):
-    """Main direction of a pixel's samples.
+    """Main direction in beta of a pixel's samples, from the first to the last.
 
     Attributes:
         steep: True along y, False along x.
@@ -217,7 +217,14 @@ def _find_cells(n, first, geometry, here, course):
 
 @compiled
 def interpolate(by_tap, geometry, here, out):
-    """Convert numbers on taps to numbers on samples."""
+    """Interpolate numbers on taps (pixels of beta) at a pixel's samples.
+
+    Args:
+        by_tap: number of each tap.
+        geometry: `Geometry` of the call: nearest look-up or bilinear.
+        here: the pixel's part of the `Block`, after `find_samples`.
+        out: number of each sample to write, up to a multiple of LANES.
+    """
     n, m = here.sample_count[0], here.tap_count[0]
     if geometry.nearest:
         if m == n:
@@ -236,7 +243,14 @@ def interpolate(by_tap, geometry, here, out):
 
 @compiled
 def distribute(numbers, geometry, here, by_tap):
-    """Convert numbers on samples, padded with 0, to numbers on taps: the transpose of `interpolate`."""
+    """Distribute numbers on a pixel's samples to its taps: the transpose of `interpolate`.
+
+    Args:
+        numbers: number of each sample, padded with 0 to a multiple of LANES.
+        geometry: `Geometry` of the call.
+        here: the pixel's part of the `Block`, after `find_samples`.
+        by_tap: number of each tap to write, padded with 0.
+    """
     n, m = here.sample_count[0], here.tap_count[0]
     if geometry.nearest and m == n:
         for j in range(0, n, LANES):

@@ -72,9 +72,15 @@ def find_scores(p, call, here):
 
 @compiled
 def softmax(n, score, weight):
-    """Compute the weights of n scores, written in place.
+    """Compute the softmax of n scores.
 
-    Returns the log of the sum of exponentials (-inf for no samples).
+    Args:
+        n: number of scores, 0 or more.
+        score: scores, padded with -inf to a multiple of LANES.
+        weight: weights to write; left as they are if all scores are -inf.
+
+    Returns:
+        The log of the sum of exponentials; -inf if all scores are.
     """
     best = load(score, 0)
     for j in range(LANES, n, LANES):

@@ -112,7 +112,14 @@ def dot_row(code, row, array, i: index):
 
 @instruction(lambda weights, rows, t, image, channels, c, totals, n: totals)
 def fma_taps(code, weights, rows, t: index, image, channels: index, c: index, totals, n: literal):
-    """Add weights[t + k] times the row image[rows[t + k], c] to each group k of n vectors of `totals`."""
+    """Add a weighted pixel to each group of n vectors of `totals`.
+
+    Group k gets weights[t + k] times the n vectors of image[rows[t + k]] from channel c on, where `image` has
+    `channels` numbers a pixel.
+
+    Returns:
+        The row of new totals.
+    """
     vectors = code.parts(totals)
     lanes = vectors[0].type.count
     for k in range(0, len(vectors), n):
@@ -268,8 +275,12 @@ def _side_by_side(code, parts):
 
 @instruction(_nothing)
 def add_fours(code, array, starts, i: index, a, b, c, d):
-    """Add the numbers of four vectors to array[start + k], k from 0 to 3, for the `LANES` starts at an index,
-    in their order. Twos at a time: the next start touches the second two of this one."""
+    """Add the numbers of four vectors to an array, at the four places from each of `LANES` starts on.
+
+    Lane j of `a`, `b`, `c` and `d` is added to array[start], [start + 1], [start + 2] and [start + 3] of the
+    j-th start, where the starts are starts[i], starts[i + 1], ... They are taken in order, two numbers at a
+    time, as the next start may touch the second two of this one.
+    """
     fours = _transpose(code, a, b, c, d)
     for k in range(LANES):
         start = code.at(starts, code.offset(i, k))

@@ -131,7 +131,9 @@ class FieldFamily:
         """Fuse a case with this family.
 
         Args:
-            rig: rig to fuse with.
+            network: network to fuse with.
+            rig: rig to fuse with, calibrated rightly or wrongly.
+            case: scene whose images are fused.
             far: largest displacement from H x, pixels of beta.
 
         Returns:
@@ -186,9 +188,13 @@ class HorizontalDisplacement:
     def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> Segments:
         """Compute horizontal segments in beta around H x, clipped to its image.
 
+        Args:
+            pair: alpha and beta.
+            x: pixels (x, y) of alpha.
+
         Returns:
-            Segments for pixels x (n, 2) of alpha; invalid where H x is infinite or the segment misses the
-            image.
+            Segments from right to left, one for each pixel; invalid where H x is infinite or the segment
+            misses beta's image.
         """
         centre, finite = apply_homography(pair.homography, x)
         step = centre.new_tensor([self.disparity, 0.0])
@@ -197,8 +203,12 @@ class HorizontalDisplacement:
 
 
 def families() -> dict[str, FieldFamily]:
-    """Return every family by name, `calibrated` first; then wrong calibrations (rotation,
-    principal point)."""
+    """Make every family of receptive fields of the ablation.
+
+    Returns:
+        Families by name: right calibrations, `calibrated` first, then wrong ones (beta rotated, its principal
+        point displaced).
+    """
     exact = {
         "calibrated": FieldFamily(lambda disparity: None),  # the default
         "rectified, warped": FieldFamily(lambda disparity: Epipolar(), warped=True),
@@ -216,6 +226,10 @@ def families() -> dict[str, FieldFamily]:
 
 def disparity(network: FusionNetwork, pair: Pair) -> float:
     """Bound the displacement of a point from H x over the depth range.
+
+    Args:
+        network: network that beta may be resized for.
+        pair: alpha and beta.
 
     Returns:
         Pixels of beta as the network receives it (resized if it needs equal resolutions); 1 or more.
@@ -244,6 +258,7 @@ def layered_cases(
         count: number of cases.
         photos: folders of photographs; empty for those in scikit-image.
         hw: (height, width) of both images.
+        seed: seed of the scenes and the noise.
 
     Yields:
         One case at a time.
@@ -264,7 +279,7 @@ def rendered_cases(folder: Path, *, seed: int = 0) -> Iterator[AblationCase]:
     """Read cases from rendered scenes (`scene_folders`): their first camera is alpha, their second beta.
 
     Returns:
-        Iterator over the cases, with noise drawn from `seed`.
+        Iterator over the cases, read on demand, with noise drawn from `seed`.
 
     Raises:
         FileNotFoundError: for a missing folder.
@@ -295,6 +310,10 @@ def _recorded(
 def recorded(ideal: Mapping[str, Tensor], g: Generator) -> dict[str, Tensor]:
     """Simulate recording by a good camera: little noise, 8 bits.
 
+    Args:
+        ideal: images (c, h, w), sRGB in 0..1, by name.
+        g: generator of the noise.
+
     Returns:
         Images (c, h, w) in 0..1 by name.
     """
@@ -323,10 +342,17 @@ def sample_photographs(*, count: int = 12, seed: int = 0) -> PhotoBank:
 def ablate(
     network: FusionNetwork, cases: Iterable[AblationCase], chosen: Mapping[str, FieldFamily], *, out: Path
 ) -> list[AblationRow]:
-    """Run every chosen family on every case; write ablation.md, .csv and .png (crops of some cases) to `out`.
+    """Run families on cases; write ablation.md, ablation.csv and ablation.png (crops of some cases).
+
+    Args:
+        network: network to fuse with.
+        cases: scenes, read one at a time.
+        chosen: families by name.
+        out: folder for the three files.
 
     Returns:
-        One row for each family and case, baselines included.
+        One row for each case and each family or baseline ("alpha alone", "classical"); a family that fails on
+        a case has NaN there, and the reason as its note.
     """
     rows: list[AblationRow] = []
     panels: dict[str, Tensor] = {}
@@ -371,6 +397,10 @@ def _case(
 
 def point_errors(case: AblationCase, depth: Float[Tensor, "h w"]) -> tuple[float, float]:
     """Compare estimated with true depth by the projection into beta, also for points that beta does not see.
+
+    Args:
+        case: scene with alpha's true depth.
+        depth: estimated depth of alpha's pixels, metres; NaN where unknown.
 
     Returns:
         Mean error in pixels of beta where both are known, and share of pixels of known true depth with an
@@ -442,10 +472,16 @@ def _mean(values: Sequence[float]) -> float:
 
 
 def crops(case: AblationCase, images: Mapping[str, Tensor], rows: Sequence[AblationRow]) -> dict[str, Tensor]:
-    """Cut crops of a case where calibrated and rectified fields differ most.
+    """Cut crops of a case where "calibrated" is better than "rectified assumption" by most.
+
+    Args:
+        case: the scene.
+        images: fused images (3, h, w) by family or baseline.
+        rows: scores of the case, one for each family or baseline.
 
     Returns:
-        Crops (3, h, w) by title; a title has the PSNR of the whole image.
+        Crops (3, h, w) by title, the ground truth first; a title has the PSNR of the whole image. From the
+        top left corner if one of the two families has no image.
     """
     window = (slice(None), *_most_different(images, case.ground_truth))
     panels = {f"{case.name}: ground truth\nfocal ratio {case.ratio:.1f}": case.ground_truth[window]}
@@ -474,7 +510,15 @@ def _rotated(degrees: float, rig: Rig, g: Generator) -> Rig:
 
 
 def turned(rig: Rig, rotation: Float[Tensor, "3"]) -> Rig:
-    """Return the rig with beta rotated about its centre by a rotation vector (radians) in beta's axes."""
+    """Rotate beta about its centre.
+
+    Args:
+        rig: rig with cameras alpha and beta.
+        rotation: rotation vector in beta's axes, radians.
+
+    Returns:
+        The rig, all else unchanged.
+    """
     beta = rig.pair(ALPHA, BETA).cameras[1]
     turn = Pose(rotation_from_vector(rotation), torch.zeros(3).double())
     return rig.with_camera(BETA, beta.replace(cam_from_world=turn @ beta.cam_from_world))

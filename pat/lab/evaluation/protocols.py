@@ -49,6 +49,10 @@ def mono_colour_task(pair: StereoPair, rate: int) -> MonoColourTask:
     A pixel of beta is the mean of `rate` x `rate` pixels, as a sensor with larger pixels sees it. Rows and
     columns beyond the last multiple of `rate` are cut.
 
+    Args:
+        pair: pair of colour images.
+        rate: factor by which beta is smaller than alpha, 1 or more.
+
     Returns:
         The task.
 
@@ -100,7 +104,11 @@ alpha's pixels."""
 
 
 def enlarged(beta: Float[Tensor, "c hb wb"], hw: HW) -> Float[Tensor, "c h w"]:
-    """Enlarge beta to alpha's size (bicubic, clipped to 0..1), without warping."""
+    """Enlarge beta to alpha's size `hw` (bicubic, clipped to 0..1), without warping.
+
+    Returns:
+        Image (c, *hw).
+    """
     return interpolate(beta[None], hw, mode="bicubic", align_corners=False)[0].clamp(0, 1)
 
 
@@ -123,12 +131,13 @@ def rectified_fusion(
     long.
 
     Args:
+        network: network to fuse with.
         bands: True to treat each channel of beta as a camera of its own.
         settings: settings of fusion; a field in them replaces the rows.
         matcher: matcher to use instead of `match`.
 
     Returns:
-        The method.
+        The method: called with alpha, beta and `max_disparity`, it returns image and disparity.
     """
 
     def fused(alpha: Tensor, beta: Tensor, max_disparity: float) -> StereoResult:
@@ -148,11 +157,12 @@ def rectified_rig(hw: HW, betas: Mapping[str, HW], max_disparity: float) -> Rig:
     All cameras have the same field of view; the betas are together, one metre to the right of alpha.
 
     Args:
-        betas: (height, width) of each beta.
+        hw: (height, width) of alpha.
+        betas: (height, width) of each beta, by name.
         max_disparity: pixels of alpha, which sets the near bound; the far bound is infinity.
 
     Returns:
-        The rig.
+        The rig; its first camera is called "alpha".
     """
     alpha = Camera(K=intrinsics(float(hw[1]), hw), cam_from_world=Pose.identity(), hw=hw)
     right = alpha.replace(cam_from_world=Pose(alpha.R, alpha.t.new_tensor([-1.0, 0.0, 0.0])))

@@ -37,13 +37,24 @@ class Warped(NamedTuple):
     ) -> Float[Tensor, "c ha wa"]:
         """Warp an image of the canvas to alpha's pixels.
 
+        Args:
+            image: image on the rectified canvas.
+            interpolation: kind of interpolation.
+
         Returns:
             Image (c, ha, wa); beyond the canvas its border repeats.
         """
         return warped(image, self.rectification.H_alpha, self.original.alpha.hw, interpolation=interpolation)
 
     def depth_back(self, depth: Float[Tensor, "h w"]) -> Float[Tensor, "ha wa"]:
-        """Warp a depth map of the canvas to alpha: depth along alpha's axis, from the nearest pixel."""
+        """Warp a depth map of the canvas to alpha, from the nearest pixel.
+
+        Args:
+            depth: depth along the rectified camera's axis, metres.
+
+        Returns:
+            Depth (ha, wa) along alpha's axis, metres.
+        """
         level, (alpha, _) = self.rectification.pair.cameras[0], self.original.cameras
         x = apply_homography(self.rectification.H_alpha, pixel_grid(alpha.hw, dtype=torch.float64)).x
         warped = self.back(depth[None], interpolation="nearest")[0].double()
@@ -54,6 +65,10 @@ def rectified(rig: Rig, images: Mapping[str, Tensor]) -> Warped:
     """Rectify the first two cameras of a rig and their images, so that epipolar lines are rows.
 
     The canvas holds all of alpha at alpha's focal length: alpha loses only what resampling costs.
+
+    Args:
+        rig: rig of two cameras or more, with a depth range; its first camera is alpha.
+        images: images (c, h, w) of these two cameras in 0..1, by name.
 
     Returns:
         The rectified pair; images clipped to 0..1.
@@ -77,10 +92,11 @@ def whole_alpha(pair: Pair) -> Rectification:
     """Rectify a pair at alpha's focal length, onto the canvas that alpha's image fills.
 
     Returns:
-        The rectification.
+        The rectification: homographies from each image to the canvas, and the cameras there.
 
     Raises:
-        ValueError: if the baseline is too close to an optical axis.
+        ValueError: if the baseline is too close to an optical axis, or the canvas would have more than
+            `LARGEST` times alpha's pixels.
     """
     alpha, _ = pair.cameras
     rough = rectify(pair)
@@ -103,10 +119,16 @@ def whole_alpha(pair: Pair) -> Rectification:
 
 
 def warped(image: Tensor, H: Tensor, hw: HW, *, interpolation: Interpolation = "bicubic") -> Tensor:
-    """Sample an image at H x for all pixels x of an image of size `hw`; its border repeats beyond.
+    """Sample an image at H x for all pixels x of a canvas.
+
+    Args:
+        image: image (c, h, w).
+        H: homography (3, 3) from pixels of the canvas to those of the image.
+        hw: (height, width) of the canvas.
+        interpolation: kind of interpolation.
 
     Returns:
-        Image (c, *hw).
+        Image (c, *hw); the image's border repeats beyond.
     """
     x = apply_homography(H, pixel_grid(hw, dtype=torch.float64)).x
     return sample(image[None], x[None].float(), interpolation=interpolation, extended=True).values[0]

@@ -59,10 +59,19 @@ def evaluate_sets(
     *,
     out: Path,
 ) -> dict[str, list[StereoRow]]:
-    """Evaluate methods on several data sets by `evaluate_pairs`; strips of images go to `out`/set.
+    """Evaluate methods on several data sets by `evaluate_pairs`.
+
+    Args:
+        sets: pairs by data set.
+        methods: fusion methods by name.
+        rates: factors by which beta is reduced.
+        out: folder for strips of images, in a folder for each set.
 
     Returns:
         Rows by data set.
+
+    Raises:
+        ValueError: for grey pairs, and images of unequal sizes.
     """
     return {name: evaluate_pairs(pairs, methods, rates, images=out / name) for name, pairs in sets.items()}
 
@@ -78,6 +87,9 @@ def evaluate_pairs(
     """Score each method on each pair at each rate: whole frames, values clipped to 0..1, not rounded.
 
     Args:
+        pairs: stereo pairs, read one at a time.
+        methods: fusion methods by name.
+        rates: factors by which beta is reduced.
         max_disparity: pixels of alpha, the same for all pairs (the paper's: 120 / rate pixels of beta).
         images: folder for one strip of each pair and rate: beta enlarged, each method, the ground truth; None
             writes none.
@@ -112,10 +124,12 @@ def sets_markdown(
     rows: Mapping[str, Sequence[StereoRow]], *, printed: Mapping[str, PrintedScores] = {}, depth: bool = True
 ) -> str:
     """Format rows of several data sets: a table of each, the sentence of `structure_kept`, and errors of
-    depth if wanted.
+    disparity if wanted.
 
     Args:
+        rows: rows by data set; they include the methods "fusion" and "alpha".
         printed: published scores by data set, shown in a column of their own.
+        depth: True to add the errors of disparity where its truth is known.
 
     Returns:
         Markdown text.
@@ -133,6 +147,7 @@ def markdown(rows: Sequence[StereoRow], *, printed: PrintedScores = {}) -> str: 
     cells.
 
     Args:
+        rows: scores of one data set.
         printed: published scores by rate, shown as a column with a mean only.
 
     Returns:
@@ -189,8 +204,14 @@ def _depth_cell(rows: Sequence[StereoRow]) -> str:
 def structure_kept(rows: Sequence[StereoRow]) -> str:
     """Say in one line for which pairs, if any, the fusion's SSIM is below that of alpha alone.
 
+    Args:
+        rows: scores of the methods "fusion" and "alpha" on the same pairs; others are ignored.
+
     Returns:
-        A sentence. Rows need the methods "fusion" and "alpha".
+        A sentence.
+
+    Raises:
+        KeyError: for a pair with "fusion" and without "alpha".
     """
     ssim = {(row.pair, row.rate, row.method): row.ssim for row in rows}
     cases = [(pair, rate) for pair, rate, name in ssim if name == "fusion"]
@@ -210,6 +231,10 @@ def disparity_errors(
     disparity: Float[Tensor, "h w"], ground_truth: Disparity
 ) -> tuple[float | None, float | None]:
     """Compare estimated with true disparity.
+
+    Args:
+        disparity: estimate in pixels; NaN or infinite where unknown.
+        ground_truth: true disparity of the same pixels.
 
     Returns:
         Mean absolute error in pixels where both are known, and share of all known true disparities with an

@@ -17,8 +17,12 @@ T = TypeVar("T")
 def grouped(rows: Iterable[T], *names: str) -> dict[Any, list[T]]:
     """Group rows by one attribute, or by a tuple of several, in order of first appearance.
 
+    Args:
+        rows: named tuples or other objects.
+        names: names of attributes.
+
     Returns:
-        Lists of rows by value.
+        Lists of rows by the attribute's value, or by the tuple of values.
     """
     groups: dict[Any, list[T]] = {}
     for row in rows:
@@ -55,7 +59,13 @@ def markdown_row(cells: Iterable[object]) -> str:
 
 
 def write_csv(path: str | Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """Write a header and one line for each row to a CSV file, atomically, with all digits."""
+    """Write a CSV file, atomically, with all digits of numbers.
+
+    Args:
+        path: file, replaced if there is one.
+        columns: cells of the header.
+        rows: cells of each line; None is written as an empty cell.
+    """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)

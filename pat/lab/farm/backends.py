@@ -68,7 +68,10 @@ class LayeredSettings:
             raise ValueError(f"layers must be two numbers, at least 1 and in order, got {self.layers}")
 
     def images(self, rig: Rig) -> list[HW]:
-        """List the sizes (height, width) of a scene's images.
+        """List the sizes of a scene's images.
+
+        Returns:
+            (height, width) of each camera's image, in the rig's order.
 
         Raises:
             ValueError: for a rig that cannot be rendered.
@@ -78,8 +81,12 @@ class LayeredSettings:
     def renderer(self, rig: Rig, limits: CheckLimits) -> Renderer:
         """Prepare a renderer for a rig, with the photographs loaded.
 
+        Args:
+            rig: rig to render; its first camera is alpha.
+            limits: limits of the self-check.
+
         Returns:
-            The renderer.
+            A function that renders the scene of a seed into a new folder: `render(seed, out)`.
 
         Raises:
             ValueError: for a rig that cannot be rendered, and folders without images.
@@ -156,7 +163,10 @@ class BlenderSettings:
         return from_document(RenderSettings, settings, "settings")
 
     def images(self, rig: Rig) -> list[HW]:
-        """List the sizes (height, width) of a scene's images, one for each exposure.
+        """List the sizes of a scene's images, after the settings' `width`.
+
+        Returns:
+            (height, width) of each image, one for each camera and point in time.
 
         Raises:
             ValueError: for a rig that cannot be rendered, and a generator that cannot be imported.
@@ -171,8 +181,12 @@ class BlenderSettings:
     def renderer(self, rig: Rig, limits: CheckLimits) -> Renderer:
         """Prepare a renderer for a rig; imports bpy into this process.
 
+        Args:
+            rig: rig to render.
+            limits: limits of the self-check.
+
         Returns:
-            The renderer.
+            A function that renders the scene of a seed into a new folder: `render(seed, out)`.
 
         Raises:
             ValueError: if Blender is not installed, or the generator cannot be imported.
@@ -192,7 +206,7 @@ def rig_from_alpha(rig: Rig) -> RigBatch:
     """Convert a rig to a batch of one, with the first camera's frame as the world.
 
     Returns:
-        The rig; a far bound beyond `FARTHEST` times near is cut.
+        The batch; a far bound beyond `FARTHEST` times near is cut.
 
     Raises:
         ValueError: for cameras that are not calibrated or have a lens model, and for a rig without a depth

@@ -77,7 +77,7 @@ class RenderConfig:
         check: {overlap: 0.3}    # requirements of the self-check
         limits: {timeout: 300}   # seconds a scene, and how often to try
 
-    Settings of the backend that is not used are ignored.
+    Settings of the backend that is not used are ignored. `load` reads such a file.
     """
 
     rig: Path
@@ -115,7 +115,10 @@ class RenderConfig:
             raise ValueError(f"{prefix}{error}") from None
 
     def beside(self, folder: Path) -> RenderConfig:
-        """Return the configuration with its paths made absolute, relative to `folder`.
+        """Resolve the paths of the configuration relative to a folder, and check that they exist.
+
+        Returns:
+            The configuration with absolute paths.
 
         Raises:
             ValueError: for a file or folder that is missing.
@@ -142,9 +145,10 @@ class RenderConfig:
         """Prepare the renderer of the chosen backend.
 
         Returns:
-            The renderer.
+            A function that renders the scene of a seed into a new folder: `render(seed, out)`.
 
         Raises:
+            FileNotFoundError: for a missing file of the rig.
             ValueError: for a rig that cannot be rendered, or a missing library.
         """
         rig = Rig.load(self.rig)
@@ -154,6 +158,9 @@ class RenderConfig:
     def scene_bytes(self) -> float:
         """Estimate the bytes of a scene on disk: 2 for each colour and 4 for depth of a pixel, before
         compression.
+
+        Returns:
+            Bytes of all its images and its other files together.
 
         Raises:
             ValueError: for a rig that cannot be rendered.
@@ -202,7 +209,14 @@ class Shard:
         return cls(int(number), int(count))
 
     def select(self, scenes: int) -> list[int]:
-        """List the scene numbers of this part among `scenes` scenes."""
+        """List the scenes of this part of a job.
+
+        Args:
+            scenes: number of scenes of the whole job.
+
+        Returns:
+            Numbers of the part's scenes, from 0.
+        """
         return list(range(self.number - 1, scenes, self.count))
 
 
@@ -219,9 +233,13 @@ def render(
     """Render the missing ones of `scenes` scenes into folder `out`.
 
     Args:
+        config: configuration of the job.
+        scenes: number of scenes of the whole job.
+        out: folder of the job, made if missing.
         workers: processes on this machine.
         shard: part of the scenes to render.
         scheduler: address of a Dask scheduler whose workers render instead; None for this machine.
+        console: console for the progress; None for standard error.
 
     Returns:
         Report of the scenes made, kept and failed; a failed scene is skipped.
@@ -260,7 +278,7 @@ def render(
 
 
 def write_manifest(config: RenderConfig, root: Path) -> None:
-    """Write the job's manifest, or check that the existing one is the same.
+    """Write the manifest of a job into its folder `root`, or check that the existing one is of the same job.
 
     Raises:
         ValueError: if the folder holds scenes of another configuration, or of an unknown one.
@@ -293,7 +311,7 @@ def versions() -> dict[str, str]:
 
 
 def check_space(root: Path, scenes: int, scene_bytes: float) -> None:
-    """Check that the disk holds `scenes` more scenes of `scene_bytes` bytes.
+    """Check that the disk of folder `root` holds `scenes` more scenes of `scene_bytes` bytes each.
 
     Raises:
         ValueError: with how many would fit, if it does not.
@@ -310,6 +328,12 @@ def check_space(root: Path, scenes: int, scene_bytes: float) -> None:
 
 def make_scene(config_text: str, work: Path, scene: Path, index: int) -> None:
     """Render one scene from the first seed that the self-check accepts, and publish its folder.
+
+    Args:
+        config_text: the `RenderConfig` as YAML, with absolute paths.
+        work: folder for unfinished scenes, on the disk of `scene`.
+        scene: folder of the finished scene; an existing one stays.
+        index: number of the scene, from which its seeds follow.
 
     Raises:
         ValueError: if `refusals` seeds are refused.
@@ -350,7 +374,7 @@ def make_scene(config_text: str, work: Path, scene: Path, index: int) -> None:
 
 
 def scene_seed(config: RenderConfig, index: int, attempt: int) -> int:
-    """Return the seed of one attempt at a scene."""
+    """Return the seed of attempt number `attempt`, from 0, at scene number `index`."""
     return seed_for(config.seed, "scene", index, attempt)
 
 
@@ -364,7 +388,7 @@ def _ready(config_text: str) -> tuple[RenderConfig, Renderer]:
 
 
 def publish(partial: Path, final: Path) -> None:
-    """Rename a complete folder to its final name after all of it is on disk; an existing folder stays.
+    """Rename the complete folder `partial` to `final` after all of it is on disk; an existing folder stays.
 
     Raises:
         OSError: if it cannot be renamed.

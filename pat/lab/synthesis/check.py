@@ -49,6 +49,11 @@ def check_views(
 ) -> dict[str, Any]:
     """Check one frame of every camera against the other cameras and the limits.
 
+    Args:
+        rig: calibrated cameras.
+        frames: one frame of each camera, by name.
+        limits: limits to keep.
+
     Returns:
         A document for JSON: `views` and `pairs`, figures by view and by "alpha > beta" (pairs of frames of
         different times are left out), `reasons` for refusal, and `accepted`, True without any.
@@ -71,7 +76,9 @@ def view_figures(frame: RenderedFrame) -> dict[str, float]:
     """Measure brightness, texture and depths of one image.
 
     Returns:
-        Figures by name; "near" and "far" are in metres, infinite if nothing is hit.
+        Figures by name: "mean" brightness; shares, 0..1, of pixels that are "dark" or "bright", of patches
+        with "texture" and of pixels "covered" by a surface; "near" and "far" in metres, infinite if nothing
+        is hit.
     """
     finite = frame.depth.isfinite()
     depths = frame.depth[finite] if finite.any() else frame.depth.new_tensor([torch.inf])
@@ -91,6 +98,10 @@ def view_figures(frame: RenderedFrame) -> dict[str, float]:
 def texture(rgb: Float[Tensor, "3 h w"], patch: int = 8) -> Float[Tensor, ""]:
     """Compute the share of patches whose brightness deviates by more than 2 % of its mean.
 
+    Args:
+        rgb: image in linear light.
+        patch: side of a patch, pixels.
+
     Returns:
         A scalar tensor, 0..1.
     """
@@ -103,6 +114,11 @@ def texture(rgb: Float[Tensor, "3 h w"], patch: int = 8) -> Float[Tensor, ""]:
 
 def pair_figures(pair: Pair, here: RenderedFrame, there: RenderedFrame) -> dict[str, float]:
     """Measure how well alpha's depth predicts beta's view, at up to 200,000 pixels.
+
+    Args:
+        pair: alpha and beta.
+        here: alpha's frame.
+        there: beta's frame, of the same time.
 
     Returns:
         Figures by name. Shares of alpha's pixels of known depth: `inside` beta's image, `visible` there,

@@ -63,6 +63,11 @@ class _Room:
 class Setting:
     """Rig and random generator of one scene.
 
+    Args:
+        rig: rig whose calibrated cameras see the scene; without a depth range `DEPTHS` is used, and an
+            infinite far bound counts as 10 times the near one.
+        rng: random generator.
+
     Raises:
         ValueError: for a rig without a calibrated camera.
     """
@@ -85,14 +90,14 @@ class Setting:
         return self.cameras[int(self.rng.integers(len(self.cameras)))]
 
     def nearest(self, X: NDArray) -> float:
-        """Return the least depth of a point over all cameras; its distance for cameras that it is not in
-        front of."""
+        """Return the least depth in metres of a world point over all cameras; the distance instead for
+        cameras that it is not well in front of."""
         distances = np.linalg.norm(self.centres - X, axis=1)
         depths = [float(c.cam_from_world.apply(c.K.new_tensor(X)[None])[0, 2]) for c in self.cameras]
         return float(min(z if z > 0.3 * d else d for z, d in zip(depths, distances)))
 
     def ahead(self, camera: Camera, fraction: NDArray, depth: float) -> NDArray:
-        """Return the world point at a depth and at `fraction` (-1..1, across and down) of a
+        """Return the world point (3,) at a depth in metres and at `fraction` (-1..1, across and down) of a
         camera's image."""
         h, w = camera.hw
         x = camera.K.new_tensor([(w - 1) / 2 * (1 + fraction[0]), (h - 1) / 2 * (1 + fraction[1])])
@@ -104,7 +109,10 @@ def furnished(name: str, seed: int, rig: Rig, surface: Surface, moving: float) -
 
     Args:
         name: name of the generator, part of the seed.
-        surface: function that makes the textures.
+        seed: random seed.
+        rig: rig that sees the scene.
+        surface: function that makes the textures, called with the setting, a depth in metres and the kinds of
+            pattern to choose from.
         moving: seconds of motion; 0 for none.
 
     Returns:
@@ -299,7 +307,8 @@ def _material(rng: Generator, texture: Texture, pixel: float) -> Material:
 
 
 def seeded(name: str, seed: int) -> Generator:
-    """Make an independent random generator for a scene generator's name and a seed."""
+    """Make a NumPy random generator for the name of a scene generator and a seed; others are independent of
+    it."""
     return np.random.default_rng([zlib.crc32(name.encode()), seed])
 
 

@@ -28,6 +28,8 @@ def abstract(seed: int, rig: Rig, *, moving: float = 0.0) -> Scene:
     """Generate one of the paper's scenes: 10 to 20 patterned shapes in a room, within the rig's depth range.
 
     Args:
+        seed: random seed.
+        rig: rig that sees the scene.
         moving: seconds for which objects move, rotate and stretch along random paths; 0 for none.
 
     Returns:
@@ -43,6 +45,12 @@ def photographs(seed: int, rig: Rig, folder: str | Path, *, moving: float = 0.0)
     """Generate a scene like `abstract`, with the images under a folder on all surfaces.
 
     Images that are black in large parts are avoided.
+
+    Args:
+        seed: random seed.
+        rig: rig that sees the scene.
+        folder: folder of images, searched with its subfolders.
+        moving: seconds for which objects move; 0 for none.
 
     Returns:
         The scene, the same for the same seed, rig and images.
@@ -67,7 +75,7 @@ def generator_named(name: str) -> Callable[..., Scene]:
     """Look up a scene generator: "abstract", "photographs", or your own "module:function".
 
     Returns:
-        The function, called with seed, rig and `moving` seconds.
+        The function, called with seed, rig and `moving` seconds; "photographs" needs `folder` too.
 
     Raises:
         ValueError: for a name that is neither, or cannot be imported.
@@ -95,7 +103,11 @@ def _pattern(setting: Setting, depth: float, kinds: tuple[TextureKind, ...]) -> 
 
 
 def paints(rng: Generator) -> tuple[Paint, ...]:
-    """Draw two to four paints, alternately lighter and darker, of similar hues or not."""
+    """Draw the paints of a pattern, alternately lighter and darker, of similar hues or not.
+
+    Returns:
+        Two to four paints.
+    """
     hue, width, dark_first = rng.uniform(), rng.choice([0.08, 0.5]), int(rng.integers(2))
     paints = []
     for i in range(int(rng.integers(2, 5))):

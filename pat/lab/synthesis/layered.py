@@ -64,6 +64,8 @@ class LayeredScenes:
         rigs: distribution of the random rigs.
         hw: (height, width) of alpha's images.
         layers: least and greatest number of planes.
+        seed: seed of the outlines.
+        device: device of the images.
     """
 
     def __init__(
@@ -99,7 +101,9 @@ class LayeredScenes:
         and averaged by area, as a coarser sensor would.
 
         Args:
-            oversampling: further samples in a pixel along each axis.
+            rigs: rigs, alpha at the world's origin.
+            generator: random generator on the CPU.
+            oversampling: factor of further samples in a pixel along each axis.
 
         Returns:
             A batch, one scene for each rig, without gradient.
@@ -198,6 +202,10 @@ class _Front:
 
 def plane_from_camera(layers: Layers, camera: Camera) -> Float[Tensor, "b l 3 3"]:
     """Compute the homographies from pixels to the layers' planes: H (x, 1) = (u, v, 1) / z.
+
+    Args:
+        layers: layers (b, l) of a batch of scenes.
+        camera: cameras, batched (b), float64.
 
     Returns:
         H (b, l, 3, 3), float64: u, v in metres on the plane, z the depth in the camera.

@@ -59,8 +59,11 @@ def draw_layers(
     a wall; the others have outlines. In one scene in eight all lie within 5 % of one depth.
 
     Args:
+        rigs: rigs, one for each scene.
         count: least and greatest number of layers.
+        photos: textures to choose from.
         shapes: number of outlines to choose from.
+        generator: random generator on the CPU.
 
     Returns:
         The layers.

@@ -26,6 +26,11 @@ def recoloured(images: list[np.ndarray], rng: np.random.Generator, count: int) -
 
     They break the correlation of colour and luminance in photographs.
 
+    Args:
+        images: arrays (h, w, 3), uint8, RGB, to take luminance and chroma from.
+        rng: random generator.
+        count: number of textures.
+
     Returns:
         `count` arrays (256, 256, 3), uint8, RGB.
     """

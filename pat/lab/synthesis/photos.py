@@ -65,10 +65,12 @@ class PhotoBank:
         """Load all images under the folders, grey or in colour, and add 96 patterns made from `seed`.
 
         Args:
+            folders: folders, searched with their subfolders; not read if the cache exists.
             max_edge: longest side in pixels that images are reduced to.
             cache: .npz file, written on the first call and read on later ones; it is not checked against the
-                folders.
-            choose: selects images by number, to hold some out.
+                folders. None for no cache.
+            seed: seed of the patterns.
+            choose: called with an image's number, returns True to take it; to hold some out.
 
         Returns:
             The bank.
@@ -132,7 +134,10 @@ class PhotoBank:
         """Cut a square from one level of a texture, mirrored beyond its sides.
 
         Args:
-            xy: its first pixel.
+            texture: number of the texture.
+            level: level of its pyramid, 0 for the full image.
+            xy: first pixel (x, y) of the square, may lie outside.
+            side: side of the square, pixels of that level.
 
         Returns:
             Colours (3, side, side), 0..1.
@@ -179,7 +184,8 @@ def _cached(file: Path) -> list[np.ndarray]:
 
 
 def read_photographs(folders: tuple[str | Path, ...], max_edge: int) -> list[np.ndarray]:
-    """Read all images under the folders, reduced to `max_edge` pixels.
+    """Read all images under the folders, subfolders included, reduced to at most `max_edge` pixels on the
+    longest side.
 
     Returns:
         Arrays (h, w, 3), uint8, RGB; files that are no images, or have a side under 32 pixels, are skipped.

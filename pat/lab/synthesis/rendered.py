@@ -59,30 +59,47 @@ class Rendered:
 
     @cached_property
     def about(self) -> dict[str, Any]:
-        """Content of `render.json`: `settings`, `versions`, `seconds`, `frames` and `check`.
+        """Content of `render.json`: `settings`, `versions`, `seconds`, `frames` by camera (file and time of
+        each) and `check`, the outcome of `check_views`.
 
         Raises:
             OSError: if it cannot be read.
+            ValueError: if it is no JSON.
         """
         return dict(json.loads((self.folder / RENDER_FILE).read_text(encoding="utf-8")))
 
     @cached_property
     def rig(self) -> Rig:
-        """Rig as rendered, calibrated, with sizes and lenses."""
+        """Rig as rendered, calibrated, with sizes and lenses.
+
+        Raises:
+            FileNotFoundError: if the folder has no rig.yaml.
+            ValueError: for a damaged rig.yaml.
+        """
         return Rig.load(self.folder / "rig.yaml")
 
     def frames(self, camera: str) -> int:
-        """Return the number of frames of a camera."""
+        """Return the number of frames of a camera.
+
+        Raises:
+            ValueError: for an unknown camera.
+        """
         return len(self.about["frames"][self.rig.require(camera)])
 
     def frame(self, camera: str, number: int = 0) -> RenderedFrame:
         """Read one frame of a camera.
 
+        Args:
+            camera: name of the camera.
+            number: number of the frame, from 0.
+
         Returns:
             The frame, float32 (index int64).
 
         Raises:
+            ValueError: for an unknown camera.
             IndexError: for a `number` beyond its frames.
+            OSError: if a file cannot be read.
         """
         entry = self.about["frames"][self.rig.require(camera)][number]
         with np.load(self.folder / entry["file"]) as arrays:
@@ -109,7 +126,10 @@ def save_frame(path: Path, frame: RenderedFrame) -> None:
 
 
 def frame_file(rig: Rig, camera: str, number: int = 0) -> str:
-    """Return the name of a frame's file; odd characters of the camera become _, with its number in front."""
+    """Return the name of a frame's file, such as `alpha-0000.npz`.
+
+    Odd characters in the camera's name become _, and the camera's number in the rig stands in front.
+    """
     plain = re.sub(r"[^A-Za-z0-9_.+]", "_", camera)
     same = plain == camera and not camera.startswith(".")
     return f"{plain if same else f'{rig.names.index(camera):02d}_{plain}'}-{number:04d}.npz"
@@ -135,7 +155,9 @@ def depth_between(
     """Interpolate depth at positions (x, y), linearly in inverse depth, which is exact on planes.
 
     Args:
+        depth: depth of the pixels, metres; infinite where nothing is hit.
         index: object index of each pixel.
+        x: positions (x, y) in the image, pixels.
         uneven: relative deviation of inverse depth from its neighbours' mean that counts as a step or crease.
 
     Returns:

@@ -44,7 +44,10 @@ def random_rigs(rigs: RigDistribution, batch: int, hw: HW, generator: Generator)
     """Draw a batch of rigs; alpha's frame is the world.
 
     Args:
+        rigs: distribution to draw from.
+        batch: number of rigs.
         hw: (height, width) of alpha's images.
+        generator: random generator on the CPU.
 
     Returns:
         The rigs, float64 on the CPU.
@@ -118,13 +121,21 @@ def below(count: int, generator: Generator) -> int:
 
 
 def uniform(bounds: Range, shape: tuple[int, ...], generator: Generator) -> Tensor:
-    """Draw float64 values evenly between bounds."""
+    """Draw float64 values evenly between bounds (low, high).
+
+    Returns:
+        Tensor of the given shape, on the CPU.
+    """
     low, high = bounds
     return low + (high - low) * torch.rand(shape, generator=generator, dtype=torch.float64)
 
 
 def log_uniform(bounds: Range, shape: tuple[int, ...], generator: Generator) -> Tensor:
-    """Draw float64 values evenly in their logarithm between bounds."""
+    """Draw float64 values evenly in their logarithm between positive bounds (low, high).
+
+    Returns:
+        Tensor of the given shape, on the CPU.
+    """
     return uniform((math.log(bounds[0]), math.log(bounds[1])), shape, generator).exp()
 
 

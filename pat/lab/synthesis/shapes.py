@@ -70,8 +70,8 @@ def mesh(item: Object) -> Mesh:
 
 
 def inside(item: Object, point: Float[NDArray, "3"], time: float) -> bool:
-    """Return True for a world point inside a solid object at a time, or within about its relief's height of
-    it.
+    """Test whether a world point in metres is inside a solid object at a time in seconds, or within about its
+    relief's height of it.
 
     Planes, rooms and lathes have no inside: always False.
     """

@@ -46,16 +46,18 @@ def attention_loss(
     *,
     stride: int = 2,
 ) -> Tensor:
-    """Compute the mean cross-entropy over betas, on every `stride`-th row and column of alpha; nothing is
-    gathered.
+    """Compute the mean cross-entropy of the attention weights against the true positions, over all betas.
+
+    No samples of beta are gathered.
 
     Args:
         compared: features and segments of each beta.
         position: true positions (x, y) in pixels of each beta; (0, 0) where unknown.
         visible: True where that beta sees the point.
+        stride: only every `stride`-th row and column of alpha counts.
 
     Returns:
-        A scalar.
+        A scalar, with gradient.
     """
     sparse = (slice(None), slice(None, None, stride), slice(None, None, stride))
     losses = [
@@ -75,7 +77,12 @@ def _of_beta(compared: Compared, position: Tensor, visible: Tensor) -> Tensor:
 
 
 def target_of(segments: Segments, samples: int, position: Float[Tensor, "b h w 2"]) -> Target:
-    """Find the samples around true positions (x, y) on segments of `samples` positions each.
+    """Find the samples around true positions on segments.
+
+    Args:
+        segments: segments (b, h, w) of alpha's pixels.
+        samples: number of samples on each segment.
+        position: true positions (x, y), pixels of beta.
 
     Returns:
         The targets, clamped to the segment.

@@ -26,7 +26,7 @@ FACTS: Mapping[str, tuple[type, ...]] = {
     "done": (bool,),
     "recipe": (str,),
 }
-"""Facts that a checkpoint states beside its tensors, with their types."""
+"""Entries of a checkpoint beside its tensors, with their types."""
 LONGEST = 1e7
 """Minutes above which a checkpoint's time counts as damaged: 19 years."""
 
@@ -35,8 +35,9 @@ class Checkpoint(NamedTuple):
     """State of a run.
 
     Attributes:
-        tensors: tensors by name.
-        facts: step, best score so far, minutes spent, whether the run is done, and the recipe as text.
+        tensors: weights, averaged weights and optimiser's state, by name.
+        facts: "step"; "best" validation PSNR so far, dB; "minutes" spent; "done", True for a finished run;
+            and "recipe" as YAML text.
     """
 
     tensors: dict[str, Tensor]
@@ -47,6 +48,12 @@ def collect(
     network: nn.Module, optimiser: Optimizer, average: AveragedModel, facts: Mapping[str, Any]
 ) -> Checkpoint:
     """Collect the state of a run: weights, their average, and the optimiser's state.
+
+    Args:
+        network: network in training.
+        optimiser: its optimiser.
+        average: its averaged weights.
+        facts: the entries of `Checkpoint.facts`.
 
     Returns:
         The checkpoint; tensors are not copied.
@@ -94,10 +101,10 @@ def _state(tensors: Mapping[str, Tensor], optimiser: Optimizer) -> dict[int, dic
 
 
 def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> Path:
-    """Write a checkpoint atomically, and remove all but it and the previous one.
+    """Write a checkpoint into a folder atomically, and remove all but it and the previous one.
 
     Returns:
-        Its file.
+        Its file, named after the step.
 
     Raises:
         OSError: if it cannot be written, on a full disk for instance; older ones stay.

@@ -23,7 +23,11 @@ UNSEEN = ("out", "device", "save", "tensorboard", "cache")
 
 @dataclass(frozen=True)
 class RecordingConfig:
-    """Degradations of each camera's images."""
+    """Degradations of each camera's images.
+
+    Raises:
+        ValueError: for probabilities outside 0 to 1, and `miscalibrated` negative or infinite.
+    """
 
     gain: float = 0.3
     """Probability of another gain, gamma and white balance."""
@@ -52,7 +56,9 @@ class RecordingConfig:
 class TrainConfig:
     """A recipe. A step sees `groups` times `batch` scenes; there are `steps` steps, or what `minutes` allow.
 
-    Raises ValueError for inconsistent values.
+    Raises:
+        ValueError: naming the entry, for values out of range, sides of `hw` that are not multiples of 16, and
+            a share of rendered or measured scenes without their folder or the other way round.
     """
 
     photos: tuple[Path, ...] = ()
@@ -187,7 +193,7 @@ def parse_config(text: str, name: str = "config") -> TrainConfig:
     """Parse a recipe from YAML text; `name` is used in messages.
 
     Returns:
-        The recipe.
+        The recipe, with defaults for entries that the text leaves out.
 
     Raises:
         ValueError: naming the entry, for an invalid or empty recipe.
@@ -226,6 +232,10 @@ def save_config(config: TrainConfig, path: Path) -> None:
 
 def command_line(arguments: list[str], prog: str = "pat lab train") -> TrainConfig:
     """Parse `[RECIPE] [--name value ...]`: a recipe by name or file, and overrides of its values.
+
+    Args:
+        arguments: arguments behind the command's name.
+        prog: name of the command, for messages.
 
     Returns:
         The recipe.

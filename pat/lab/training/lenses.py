@@ -33,8 +33,10 @@ def through_lenses(
     """Distort images by random lenses, pass them to `recorded`, and undistort the result.
 
     Args:
+        images: images in 0..1.
         cameras: pinhole cameras, one for each image.
         recorded: simulates the recording of a batch of images.
+        g: random generator of the lenses.
         lost: largest share of height or width that the lens loses on each side.
 
     Returns:
@@ -56,9 +58,12 @@ def through_lenses(
 
 
 def lens_over(pinhole: Camera, g: Generator, lost: float = 0.0) -> Camera:
-    """Draw a random lens with as many pixels that covers a pinhole's view, except for lost borders.
+    """Draw a random lens, with as many pixels as a pinhole camera, that covers its view except for lost
+    borders.
 
     Args:
+        pinhole: pinhole camera.
+        g: random generator.
         lost: largest share of height or width to lose on each side.
 
     Returns:
@@ -83,7 +88,12 @@ def border(camera: Camera) -> Float[Tensor, "n 2"]:
 
 
 def filling(low: Float[Tensor, "2"], high: Float[Tensor, "2"], hw: tuple[int, int]) -> Float[Tensor, "3 3"]:
-    """Make the pixel map from the area between two corners to a whole image of size `hw`.
+    """Make the map of pixels from the area between two corners to a whole image.
+
+    Args:
+        low: top left corner (x, y) of the area.
+        high: bottom right corner (x, y) of the area.
+        hw: (height, width) of the image.
 
     Returns:
         Matrix (3, 3), float64.

@@ -90,6 +90,8 @@ def rate_at(config: TrainConfig, step: int, share: float) -> float:
     0.0005
 
     Args:
+        config: recipe, for `rate`, `schedule` and `warmup`.
+        step: number of the step, from 1.
         share: share of the run that is done, 1 at the end.
 
     Returns:
@@ -105,11 +107,23 @@ def rate_at(config: TrainConfig, step: int, share: float) -> float:
 class Run:
     """State of a run: network, objective, averaged weights, and sources of samples.
 
+    Args:
+        config: recipe.
+        here: this process.
+        former: checkpoint to continue from; None starts a run.
+
     Attributes:
+        network: network in training.
+        average: its averaged weights.
         together: objective whose gradients all processes share.
         groups: this process's groups of each step.
         examined: validation samples; empty except in the first process.
         watch: progress reports; None except in the first process.
+        step: steps done.
+        best: best validation PSNR so far, dB; -infinity before the first.
+
+    Raises:
+        ValueError: for data that do not suit the recipe, or a checkpoint of another network.
     """
 
     def __init__(self, config: TrainConfig, here: Process, former: Checkpoint | None) -> None:
@@ -244,8 +258,13 @@ class Run:
 
 
 def save_sample(sample: Sample, path: Path, *, facts: dict[str, str]) -> None:
-    """Write the tensors of a group: alpha, ground truth, and beta, position and visibility by number of the
-    beta.
+    """Write the tensors of a group of samples to a safetensors file: `alpha`, `ground_truth`, and `betas/0`,
+    `position/0`, `visible/0` and so on.
+
+    Args:
+        sample: group of samples.
+        path: file.
+        facts: metadata of the file, text by name.
 
     Raises:
         OSError: if writing fails.

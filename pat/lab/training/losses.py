@@ -34,6 +34,7 @@ class Objective(nn.Module):
     """Network and its loss in one module, so that DistributedDataParallel sees one forward.
 
     Args:
+        network: network in training.
         loss: name of the image loss, "psnr" or "mse".
         attention: weight of the attention loss; 0 leaves it out.
     """
@@ -48,7 +49,7 @@ class Objective(nn.Module):
         """Compute the loss of a group of samples.
 
         Returns:
-            A scalar.
+            A scalar, with gradient: the image loss plus `attention` times the attention loss.
         """
         if not self.attention:
             return self.image_loss(self.network(sample.inputs).image, sample.ground_truth)

@@ -36,6 +36,12 @@ class Process:
     def share(self, groups: int) -> list[int]:
         """List this process's groups of a step.
 
+        Args:
+            groups: number of groups of a step in all processes.
+
+        Returns:
+            Numbers of the groups, from 0.
+
         Raises:
             ValueError: if the groups cannot be distributed evenly.
         """
@@ -51,10 +57,10 @@ class Process:
         return objective if self.count == 1 else DistributedDataParallel(objective)
 
     def mean(self, number: Tensor) -> Tensor:
-        """Average a number over all processes.
+        """Average a number, a scalar tensor, over all processes.
 
         Returns:
-            The mean; with several processes `number` is overwritten by their sum.
+            The mean, a scalar tensor; with several processes `number` is overwritten by their sum.
         """
         if self.count > 1:
             distributed.all_reduce(number)

@@ -89,6 +89,10 @@ class Planned(NamedTuple):
 def plan(config: TrainConfig, seed: int) -> Iterator[Planned]:
     """Plan the scenes of each step: new ones, or one of the last `CACHED` groups again.
 
+    Args:
+        config: recipe, for its shares of kinds and `reuse`.
+        seed: random seed.
+
     Yields:
         The plan of each step, from step 0, without end.
     """
@@ -136,7 +140,15 @@ class SampleSource:
         return (group[0] for group in islice(self.steps([0]), count))
 
     def steps(self, groups: list[int], *, start: int = 0) -> Iterator[list[Sample]]:
-        """Yield the samples of the given groups, step by step, from step `start` on, without end."""
+        """Make the samples of some groups, step by step, without end.
+
+        Args:
+            groups: numbers of the groups of a step.
+            start: number of the first step, from 0.
+
+        Yields:
+            The samples of a step, one for each group.
+        """
         for step, planned in enumerate(plan(self.config, self.seed)):
             for key in [key for key in self.cache if key[0] == planned.dropped]:
                 del self.cache[key]
@@ -145,6 +157,11 @@ class SampleSource:
 
     def sample(self, planned: Planned, step: int, group: int) -> Sample:
         """Make one group of one step.
+
+        Args:
+            planned: plan of the step.
+            step: number of the step, the seed of its degradations.
+            group: number of the group.
 
         Returns:
             The samples; the scenes stay in the cache.
@@ -165,7 +182,7 @@ class SampleSource:
 
 
 def made_ahead(samples: Iterator[list[Sample]]) -> Iterator[list[Sample]]:
-    """Yield the same samples, those of the next step being made in a thread meanwhile."""
+    """Yield the same samples, while a thread makes the next step's."""
     with ThreadPoolExecutor(1) as beside:
         coming = beside.submit(next, samples)
         while True:
@@ -176,6 +193,10 @@ def made_ahead(samples: Iterator[list[Sample]]) -> Iterator[list[Sample]]:
 
 def scenes(config: TrainConfig, *, device: str = "cpu") -> tuple[SampleSource, SampleSource]:
     """Open a recipe's data, split into training and validation by photographs, scenes and pairs.
+
+    Args:
+        config: recipe.
+        device: device of the samples.
 
     Returns:
         Sources of training and of validation samples.
@@ -205,7 +226,11 @@ def source_of(
     """Make a source of a recipe's samples.
 
     Args:
+        config: recipe.
         photos: textures; None if all batches come from `folders`.
+        seed: random seed of scenes and degradations.
+        field: receptive field of all betas.
+        device: device of the samples.
         folders: windows of rendered scenes and measured pairs, by kind.
 
     Returns:
@@ -225,7 +250,10 @@ def crops(config: TrainConfig, seed: int, device: str, choose: Callable[[int], b
     """Open the recipe's rendered scenes and measured pairs.
 
     Args:
-        choose: selects items by their number.
+        config: recipe.
+        seed: seed of the order in which items are used.
+        device: device of the samples.
+        choose: called with an item's number, returns True to take it.
 
     Returns:
         Windows by kind ("rendered", "measured"); kinds without a folder are absent.
@@ -274,6 +302,8 @@ def degraded(
     """Record a scene by random cameras: alpha grey, betas in colour (one band each if there are several).
 
     Args:
+        scene: scenes with ground truth.
+        g: random generator of the degradations.
         field: receptive field of all betas.
         recording: probabilities of degradations.
 
@@ -305,10 +335,14 @@ def recorded(
     """Record images by one random camera, possibly through a lens and undistorted.
 
     Args:
+        image: images (b, c, h, w), sRGB in 0..1.
+        camera: their cameras, batched (b).
+        g: random generator.
+        recording: probabilities of degradations.
         lost: largest share that an undistorted image lacks on each side.
 
     Returns:
-        The images; `valid` is False where the lens saw nothing.
+        Images of the same shape; `valid` (b, h, w) is False where the lens saw nothing.
     """
 
     def record_here(image: Tensor) -> Tensor:
@@ -324,7 +358,7 @@ def steps(g: Generator, recording: RecordingConfig) -> list[Step]:
     """Draw the degradations of one camera: gain, blur and noise, each with its own probability, then 8 bits.
 
     Returns:
-        The steps.
+        Steps for `pat.sensors.steps.record`, in order.
     """
     steps: list[Step] = []
     if _chance(recording.gain, g):
@@ -340,7 +374,9 @@ def pair_of(scene: ArrayBatch, beta: int, g: Generator) -> Pair:
     """Make the batched pair of alpha and a beta at alpha's size, with depth bounds looser than the scenes'.
 
     Args:
+        scene: scenes with cameras.
         beta: number of the beta, from 1.
+        g: random generator of the bounds.
 
     Returns:
         The pair, float64; the far bound is infinite in half of the cases.
@@ -354,6 +390,11 @@ def pair_of(scene: ArrayBatch, beta: int, g: Generator) -> Pair:
 
 def perturbed(pair: Pair, pixels: float, g: Generator) -> Pair:
     """Rotate betas at random, so that points move by about `pixels` (root mean square on each axis).
+
+    Args:
+        pair: batched pair.
+        pixels: displacement, pixels of beta.
+        g: random generator.
 
     Returns:
         The pair; the same one for 0 pixels.
@@ -373,6 +414,7 @@ def transfer(pair: Pair, depth: Tensor, beta_depth: Tensor) -> tuple[Tensor, Ten
     """Project alpha's pixels at their true depth into beta, and test visibility by beta's depth (within 2 %).
 
     Args:
+        pair: batched pair of pinhole cameras.
         depth: depth (b, h, w) of alpha, metres; NaN where unknown.
         beta_depth: depth (b, hb, wb) of beta, of any size; NaN where unknown.
 
@@ -404,7 +446,7 @@ def alone(sample: Sample, i: int) -> Sample:
 
 
 def enlarged(image: Float[Tensor, "b c hb wb"], hw: HW) -> Float[Tensor, "b c h w"]:
-    """Enlarge images to a size (bicubic, clipped to 0..1).
+    """Enlarge images to a (height, width) (bicubic, clipped to 0..1).
 
     Returns:
         Images (b, c, *hw); the same tensor if the size is unchanged.

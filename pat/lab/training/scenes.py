@@ -52,8 +52,13 @@ class Crops:
     Args:
         roots: folders.
         hw: (height, width) of alpha in the samples.
-        resolutions: resolutions of betas, as in `RigDistribution`.
-        choose: selects items by their number.
+        resolutions: factors of betas' resolution against alpha's, to draw from.
+        seed: seed of the order in which items are used.
+        device: device of the samples.
+        choose: called with an item's number, returns True to take it.
+
+    Raises:
+        NotImplementedError: in this base class.
     """
 
     def __init__(
@@ -76,6 +81,12 @@ class Crops:
     def sample(self, batch: int, generator: Generator, *, number: int, betas: int = 1) -> ArrayBatch:
         """Draw windows from the items that are active for group `number`.
 
+        Args:
+            batch: number of windows.
+            generator: random generator on the CPU.
+            number: number of the group, which decides the active items.
+            betas: number of betas of a window.
+
         Returns:
             A batch of `batch` samples with `betas` betas.
 
@@ -85,12 +96,16 @@ class Crops:
         raise NotImplementedError
 
     def beta_sizes(self, betas: int, generator: Generator) -> list[HW]:
-        """Draw the sizes (height, width) of betas."""
+        """Draw the sizes of betas.
+
+        Returns:
+            (height, width) of each of `betas` betas.
+        """
         return [scaled(self.hw, one_of(self.resolutions, generator)) for _ in range(betas)]
 
 
 class RenderedCrops(Crops):
-    """Random windows of rendered scenes.
+    """Random windows of rendered scenes; arguments as of `Crops`.
 
     Raises:
         FileNotFoundError: for a missing folder.
@@ -112,6 +127,12 @@ class RenderedCrops(Crops):
         """Draw windows from the scenes that are active for group `number`.
 
         If a scene has fewer other cameras than betas are wanted, several betas are of the same camera.
+
+        Args:
+            batch: number of windows.
+            generator: random generator on the CPU.
+            number: number of the group, which decides the active scenes.
+            betas: number of betas of a window.
 
         Returns:
             A batch of `batch` samples with `betas` betas.
@@ -161,7 +182,12 @@ def _order(count: int, seed: int, epoch: int) -> list[int]:
 
 
 def chosen(every: list[T], choose: Callable[[int], bool], what: str) -> list[T]:
-    """Select items by their number; `what` names them in messages.
+    """Select items by their number.
+
+    Args:
+        every: all items.
+        choose: called with an item's number, returns True to take it.
+        what: name of the items in messages.
 
     Returns:
         The selected items.
@@ -179,6 +205,11 @@ def chosen(every: list[T], choose: Callable[[int], bool], what: str) -> list[T]:
 
 def large_enough(folder: Path, rig: Rig, hw: HW) -> list[str]:
     """List the cameras of a scene that can be alpha, at least as large as `hw` after undistortion.
+
+    Args:
+        folder: folder of the scene, for messages.
+        rig: its rig.
+        hw: (height, width) of alpha in the samples.
 
     Returns:
         Their names.
@@ -206,11 +237,14 @@ def beside(alpha: RenderedView, beta: RenderedView, size: HW, hw: HW, g: Generat
     depth.
 
     Args:
+        alpha: alpha's window.
+        beta: beta's whole view.
         size: (height, width) of the result.
         hw: (height, width) of alpha's window.
+        g: random generator of the depth.
 
     Returns:
-        The view.
+        Beta's window, resized to `size`, with its camera.
     """
     ratio = pixels_per_radian(beta.camera) / pixels_per_radian(alpha.camera)
     wanted = (max(round(hw[0] * ratio), 1), max(round(hw[1] * ratio), 1))
@@ -237,15 +271,15 @@ def _inside(start: float, length: int, whole: int) -> int:
 
 
 def pixels_per_radian(camera: Camera) -> float:
-    """Return the angular resolution in the middle of a camera's image."""
+    """Return the angular resolution in the middle of a camera's image, pixels for each radian."""
     return float(camera.K[:2, :2].det().abs().sqrt())
 
 
 def finite_window(view: RenderedView, top: int, left: int, size: HW, hw: HW) -> RenderedView:
-    """Cut a `window` and replace infinite depths by those at a distance of `SKY`.
+    """Cut a `window` (see its arguments) and replace infinite depths by those at a distance of `SKY` metres.
 
     Returns:
-        The view.
+        The window, with its camera.
     """
     cut = window(view, top, left, size, hw)
     rays, _ = cut.camera.rays(pixel_grid(hw, dtype=torch.float64))
@@ -258,7 +292,7 @@ def bounds(depth: Float[Tensor, "b h w"]) -> Float[Tensor, "b 2"]:
     """Compute the nearest and farthest depth of each map, NaN ignored.
 
     Returns:
-        Bounds (b, 2); both `SKY` for a map without depth.
+        Bounds (b, 2) in metres; both `SKY` for a map without depth.
     """
     unseen = depth.isnan()
     near = torch.where(unseen, SKY, depth).flatten(1).amin(1)
@@ -266,7 +300,11 @@ def bounds(depth: Float[Tensor, "b h w"]) -> Float[Tensor, "b 2"]:
 
 
 def batched(drawn: Sequence[Sequence[RenderedView]], device: str) -> ArrayBatch:
-    """Stack samples of views of the same sizes, each with alpha first.
+    """Stack samples to a batch.
+
+    Args:
+        drawn: views of each sample, alpha first; views of one place have the same size in all samples.
+        device: device of the batch.
 
     Returns:
         A batch on the device, images sRGB-encoded, alpha's frame as the world.

@@ -35,13 +35,13 @@ REDUCED = 2
 
 
 class Pictures(NamedTuple):
-    """Images and disparities of a pair, in pixels.
+    """Images and disparities of a pair.
 
     Attributes:
-        left: left image (3, h, w).
-        right: right image (3, h, w).
-        disparities: disparities (h, w) of both; 0 where unknown.
-        largest: largest disparity.
+        left: left image (3, h, w) in 0..1.
+        right: right image (3, h, w) in 0..1.
+        disparities: disparities (h, w) of both images' pixels, pixels; 0 where unknown.
+        largest: largest disparity that the files can hold, pixels.
     """
 
     left: Tensor
@@ -51,7 +51,8 @@ class Pictures(NamedTuple):
 
 
 class MeasuredPairs(Crops):
-    """Random windows of Middlebury's pairs, from the collections of 2003, 2005 and 2006.
+    """Random windows of Middlebury's pairs, from the collections of 2003, 2005 and 2006; arguments as of
+    `Crops`.
 
     Raises:
         FileNotFoundError: for a missing folder.
@@ -90,8 +91,11 @@ class MeasuredPairs(Crops):
     def read(self, pair: PairFiles) -> Pictures:
         """Read the images and disparities of a pair.
 
+        Returns:
+            Images in 0..1, and disparities in pixels.
+
         Raises:
-            ValueError: for a file that cannot be read.
+            ValueError: for a file that cannot be read, and a missing file of disparities.
         """
         left, right = (read_image(path)[0] * pair.max_disparity for path in disparity_files(pair))
         return Pictures(read_image(pair.left), read_image(pair.right), (left, right), pair.max_disparity)
@@ -100,6 +104,12 @@ class MeasuredPairs(Crops):
         """Draw windows from the pairs that are active for group `number`.
 
         Several betas are of the same camera.
+
+        Args:
+            batch: number of windows.
+            generator: random generator on the CPU.
+            number: number of the group, which decides the active pairs.
+            betas: number of betas of a window.
 
         Returns:
             A batch of `batch` samples; depth is NaN where unknown.
@@ -139,7 +149,7 @@ def disparity_files(pair: PairFiles) -> tuple[Path, Path]:
     """Find the disparity files of the left and the right image.
 
     Returns:
-        Both paths.
+        Paths of left's and of right's disparity.
 
     Raises:
         ValueError: if one is missing.
@@ -154,8 +164,15 @@ def disparity_files(pair: PairFiles) -> tuple[Path, Path]:
 
 
 def depth_of(disparity: Float[Tensor, "b h w"], width: int) -> Float[Tensor, "b h w"]:
-    """Convert disparity to depth in metres for the cameras of `assumed_cameras`; NaN where the disparity is
-    0."""
+    """Convert disparity to depth for the cameras of `assumed_cameras`.
+
+    Args:
+        disparity: disparity in pixels; 0 where unknown.
+        width: width of the image, pixels.
+
+    Returns:
+        Depth (b, h, w) in metres; NaN where the disparity is 0.
+    """
     return torch.where(disparity > 0, width / disparity, torch.nan)
 
 
@@ -176,9 +193,11 @@ def assumed_cameras(
     """Make a batch of images with cameras a metre apart, alpha first.
 
     Args:
+        images: images (b, c, h, w) in 0..1, alpha's first; the betas are the other camera, resized.
         side: 1 where alpha is left, -1 where right.
         disparity: disparity of the nearest points in pixels, which sets the near bound; the far bound is
             infinity.
+        device: device of the batch.
 
     Returns:
         The batch, without depth.

@@ -67,7 +67,15 @@ class Watch:
         self.bar.start()
 
     def step(self, step: int, loss: float, norm: float, rate: float, *, done: float) -> None:
-        """Report one step; `done` is the completed share of the run."""
+        """Report one step: to steps.csv, on the bar, and every tenth to TensorBoard.
+
+        Args:
+            step: number of the step.
+            loss: its loss.
+            norm: norm of the gradient, before clipping.
+            rate: learning rate.
+            done: completed share of the run, 0..1.
+        """
         now = time.monotonic()
         speed, self.ticked = self.scenes / (now - self.ticked), now
         self.steps.write(f"{step},{loss!r},{norm!r},{rate!r}\n")
@@ -78,7 +86,11 @@ class Watch:
                 self.board.add_scalar(name, value, step)
 
     def validated(self, facts: Mapping[str, float]) -> None:
-        """Report the figures of a validation: print, write to log.jsonl, and to TensorBoard."""
+        """Report the figures of a validation: print them, write them to log.jsonl, and to TensorBoard.
+
+        Args:
+            facts: figures by name; rounded to 4 digits.
+        """
         line = json.dumps({k: round(v, 4) for k, v in facts.items()})
         self.bar.console.print(line, highlight=False) if not self.bar.disable else print(line, flush=True)
         self.steps.flush()

@@ -39,6 +39,11 @@ class BuiltScene:
 def build(bpy: Any, scene: Scene, world: Any) -> BuiltScene:
     """Build all objects and lights of a scene in Blender.
 
+    Args:
+        bpy: Blender's module.
+        scene: scene to build.
+        world: Blender's world, for the light from all around.
+
     Returns:
         The built scene; call `show` before rendering.
 
@@ -59,7 +64,16 @@ def build(bpy: Any, scene: Scene, world: Any) -> BuiltScene:
 
 
 def colour(spectrum: Spectrum, rgb: tuple[float, float, float], nir: float) -> tuple[float, float, float]:
-    """Return the colour to render for a spectrum: near infrared in all three channels."""
+    """Choose the colour to render for a spectrum.
+
+    Args:
+        spectrum: "rgb" or "nir".
+        rgb: linear red, green and blue.
+        nir: value in near infrared.
+
+    Returns:
+        `rgb`, or `nir` in all three channels.
+    """
     return rgb if spectrum == "rgb" else (nir, nir, nir)
 
 

@@ -61,8 +61,10 @@ def use_nodes(item: Any) -> None:
 
 
 def write_layers(scene: Any) -> None:
-    """Make a scene render to one multi-layer float EXR file in one part: several fail if pixels are not
-    square (5.0)."""
+    """Set a scene of Blender, in place, to render to one multi-layer float EXR file in one part.
+
+    Files in several parts fail if pixels are not square (Blender 5.0).
+    """
     images = scene.render.image_settings
     if hasattr(images, "media_type"):
         images.media_type = "MULTI_LAYER_IMAGE"

@@ -70,6 +70,7 @@ class Lens(NamedTuple):
         extrapolated.
 
         Args:
+            depth: depth of the pinhole's pixels, metres.
             index: object index of each pixel.
 
         Returns:

@@ -13,7 +13,8 @@ class RenderSettings:
     """Settings of rendering by Blender.
 
     Attributes:
-        width: pixels of the rig's widest image, to which all are resized alike; None keeps the sizes.
+        width: width in pixels of the rig's widest image; all are resized by the same factor. None keeps the
+            sizes.
         samples: rays for each pixel.
         denoise: denoiser.
         fast_light: True for Blender's fast approximation of indirect light.

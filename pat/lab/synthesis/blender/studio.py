@@ -33,6 +33,11 @@ _SENSOR = 36.0
 class Studio:
     """Blender with one scene loaded; renders frames of any pinhole camera at any time.
 
+    Args:
+        scene: scene to render.
+        settings: settings of rendering.
+        scratch: existing folder for temporary files.
+
     Raises:
         ValueError: if Blender is not installed, or no GPU is usable for device "gpu".
     """
@@ -52,7 +57,9 @@ class Studio:
         """Render one frame.
 
         Args:
+            camera: pinhole camera; a lens model is ignored.
             time: seconds, for the objects' motion.
+            spectrum: "rgb" for colours, "nir" for near infrared.
 
         Returns:
             Channels (h, w), float32, by Blender's names: colours, depth, object index.

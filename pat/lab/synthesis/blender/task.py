@@ -53,18 +53,30 @@ class Shot(NamedTuple):
 def render(scene: Scene, rig: Rig, out: Path, *, settings: RenderSettings) -> Rendered:
     """Render a scene by `render_here` in a separate process, so that this one does not import bpy.
 
+    Args:
+        scene: scene to render.
+        rig: calibrated cameras to render.
+        out: new folder.
+        settings: settings of rendering.
+
     Returns:
         The rendered folder.
 
     Raises:
-        ValueError: as `render_here`.
+        ValueError: in one line, if `out` exists or the scene cannot be rendered.
     """
     with ProcessPoolExecutor(1, get_context("spawn")) as process:
         return process.submit(render_here, scene, rig.to("cpu"), out, settings=settings).result()
 
 
 def render_here(scene: Scene, rig: Rig, out: Path, *, settings: RenderSettings) -> Rendered:
-    """Render a scene of a rig into the new folder `out`, atomically, in this process, which imports bpy.
+    """Render a scene into a new folder, atomically, in this process, which imports bpy.
+
+    Args:
+        scene: scene to render.
+        rig: calibrated cameras to render.
+        out: new folder.
+        settings: settings of rendering.
 
     Returns:
         The rendered folder, with the outcome of the self-check in `about["check"]`; a scene that fails it is
@@ -115,7 +127,11 @@ def fitted(rig: Rig, settings: RenderSettings) -> Rig:
 
 
 def shots(rig: Rig, settings: RenderSettings) -> list[Shot]:
-    """List all frames in order: each camera from its time offset on, at its frame rate, for the duration."""
+    """List the frames to render: each camera from its time offset on, at its frame rate, for the duration.
+
+    Returns:
+        Frames by camera, then by time; at least one for each camera.
+    """
     planned = []
     for name, camera in rig.cameras.items():
         rate = camera.sensor.frame_rate or _RATE
@@ -125,7 +141,7 @@ def shots(rig: Rig, settings: RenderSettings) -> list[Shot]:
 
 
 def refuse_inside(scene: Scene, rig: Rig, planned: list[Shot]) -> None:
-    """Check that no camera is inside an object when it takes a frame.
+    """Check that no camera is inside an object when it takes one of the frames `planned`.
 
     Raises:
         ValueError: naming camera and object, if one is.
@@ -141,8 +157,13 @@ def refuse_inside(scene: Scene, rig: Rig, planned: list[Shot]) -> None:
 def take(studio: Studio, lens: Lens, shot: Shot) -> RenderedFrame:
     """Render one frame of a camera, resampled to its lens.
 
+    Args:
+        studio: Blender with the scene loaded.
+        lens: lens of the frame's camera.
+        shot: camera and time.
+
     Returns:
-        The frame.
+        The frame, with near infrared if the studio's settings ask for it.
 
     Raises:
         ValueError: if the camera sees nothing.
