@@ -28,7 +28,7 @@ from torch.nn.functional import scaled_dot_product_attention
 from torch.utils.checkpoint import checkpoint
 
 from arraygeom.camera import View
-from arraygeom.checks import check_above
+from arraygeom.checks import check_above, check_tensors
 from arraygeom.fields import Dense, Local, lazily
 from arraygeom.pair import Pair
 from arraygeom.pixels import HW, pixel_coordinates, pixel_grid
@@ -149,11 +149,14 @@ def _attend(
     measured: bool,
 ) -> tuple[Tensor, ...]:
     """Values, and if `measured` the statistics."""
-    kind = query.device.type
-    if torch.is_autocast_enabled(kind):
+    check_tensors((), query=query, key=key, value=value)
+    if not torch.compiler.is_compiling():
+        check_above(0, border=border)
+        check_above(1, whole=True, samples=samples)
+    border, kind = float(border), query.device.type
+    if kind != "meta" and torch.is_autocast_enabled(kind):
         query, key, value = (t.to(torch.get_autocast_dtype(kind)) for t in (query, key, value))
     _check(query, key, value, interpolation, backend)
-    check_above(0, border=border)
     nearest = interpolation == "nearest"
     if border > 0 and isinstance(locations, Local | Dense):
         locations = _lazily_between(query, key, locations)

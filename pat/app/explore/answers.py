@@ -262,8 +262,8 @@ def slider_ranges(rig: Rig) -> list[list[Any]]:
     """List the sliders that suit a rig.
 
     Returns:
-        Name, label, [low, high, step, value], and True for a change of one camera, of each; depths only with a
-        depth range, others only with calibrated cameras.
+        Name, label, [low, high, step, value], and True for a change of one camera, of each; depths only with
+        a depth range, others only with calibrated cameras.
     """
     ranges: list[list[Any]] = []
     unit = length_unit(rig)

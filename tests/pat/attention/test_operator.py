@@ -118,3 +118,18 @@ def test_a_soft_border_makes_the_output_continuous():
     assert float(slope) == pytest.approx(float(change), rel=1e-3)
     with pytest.raises(ValueError, match="border"):
         at(x, border=-1.0)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"query": [1.0]}, {"key": K.numpy()}, {"samples": 2.5}, {"border": "wide"}, {"border": float("nan")}],
+)
+def test_what_is_no_tensor_or_number_is_refused(change):
+    given = {"query": Q, "key": K, "value": V, "locations": segments(2, 3)} | change
+    with pytest.raises((TypeError, ValueError), match=next(iter(change))):
+        operator.attend(**given)
+
+
+def test_tensors_without_data_are_refused():
+    with pytest.raises(ValueError, match="meta"):
+        operator.attend(Q.to("meta"), K, V, segments(2, 3))
