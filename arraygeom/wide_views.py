@@ -12,7 +12,7 @@ from torch import Tensor
 from .camera import Camera, intrinsics
 from .lenses import Equirectangular
 from .pair import Pair
-from .pixels import coarse_grid, product
+from .pixels import pixel_grid, product
 from .pose import Pose, matvec, rotation_from_vector
 from .rectification import rectifying_rotations
 
@@ -42,7 +42,7 @@ def rectify_spherical(pair: Pair, *, focal: float | None = None) -> Pair:
     rotations = [product(to_columns, R) for R in rectifying_rotations(pair.beta_from_alpha)]
     scale = min(_focal(c) for c in cameras) if focal is None else focal
     angles = torch.cat([_angles(c, R) for c, R in zip(cameras, rotations)])
-    low, high = (scale * angles.amin(0)).floor(), (scale * angles.amax(0)).ceil()
+    low, high = (scale * angles.amin(0)).floor() - 1, (scale * angles.amax(0)).ceil() + 1
     w, h = (int(n) + 1 for n in (high - low).tolist())
     K = intrinsics(scale, (h, w)).to(low)
     K[:2, 2] = -low
@@ -61,8 +61,19 @@ def rectify_spherical(pair: Pair, *, focal: float | None = None) -> Pair:
 
 def _angles(camera: Camera, R: Tensor) -> Float[Tensor, "n 2"]:
     """Longitudes and latitudes of a camera's pixels, some of them, about a rotated frame."""
-    rays, valid = camera.rays(coarse_grid(camera.hw).to(camera.K))
+    rays, valid = _rays(camera)
     return Equirectangular().project(rays[valid] @ R.mT)[0]
+
+
+def _rays(camera: Camera) -> tuple[Tensor, Tensor]:
+    """Rays over a camera's image, its border's included, and which there are."""
+    h, w = camera.hw
+    steps = camera.K.new_tensor([w / (SIDE - 1), h / (SIDE - 1)])
+    return camera.rays(pixel_grid((SIDE, SIDE)).to(steps) * steps - 0.5)
+
+
+SIDE = 33
+"""Rows and columns of pixels whose rays say what a camera sees."""
 
 
 def _focal(camera: Camera) -> float:
@@ -102,7 +113,7 @@ def cube_faces(camera: Camera, *, overlap: float = 5.0) -> dict[str, Camera]:
     """
     if camera.K.ndim > 2 or not camera.central:
         raise ValueError("faces are of one camera at a time, whose rays meet in a point")
-    rays, valid = camera.rays(coarse_grid(camera.hw).to(camera.K))
+    rays, valid = _rays(camera)
     tangent, scale = math.tan(math.radians(45 + overlap)), _focal(camera)
     side = 2 * round(scale * tangent) + 1
     K, faces = intrinsics(scale, (side, side)).to(camera.K), {}
