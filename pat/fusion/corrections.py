@@ -14,9 +14,9 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
+from torch.nn.functional import avg_pool2d, max_pool2d
 
 from arraygeom import Segments
 from arraygeom.fields.grid import FieldOnGrid
@@ -57,7 +57,7 @@ class PrePassSettings:
     passes: int = size(3, "Pre-passes at most: matches are better where what was found is put right")
     matched: float = tuned(
         0.3,
-        "Share of alpha's pixels reliably matched, below which vignetting is not looked for, and less of its "
+        "Share of alpha's pixels reliably matched, below which only an exposure is fitted, and less of its "
         "variance need be explained: Middlebury's tune half has .55 at least, plain scenes .26 at most",
     )
     settled: float = size(0.25, "Pixels by which the largest displacement changes, up to which passes end")
@@ -173,7 +173,7 @@ def find_corrections(
         if rgb:
             found = _fitted(small, matches)
             response_now = found if fits else response_now._replace(explained=found.explained)
-        steps = [fit_misalignment(*m[1:]) if align else Misalignment() for m in matches]
+        steps = [fit_misalignment(*m[2:]) if align else Misalignment() for m in matches]
         moves = zip(inputs.cameras, corrections.of_betas(inputs), steps)
         by_camera = {camera: before + step for names, before, step in moves for camera in names}
         corrections = Corrections(response_now, by_camera)
@@ -215,7 +215,8 @@ def _reduced_frame(frame: FrameInputs) -> FrameInputs:
         image = padded(avg_pool2d(beta.image, factor), inputs.multiple)
         track = beta.track and track_in(beta.track, whole, 1 / factor, offset)
         small = _reduced_field(beta.field, alpha, whole, factor)
-        betas.append(Beta(image, small, track=track, cameras=beta.cameras))
+        clipped = None if beta.clipped is None else padded(max_pool2d(beta.clipped, factor), inputs.multiple)
+        betas.append(Beta(image, small, track=track, cameras=beta.cameras, clipped=clipped))
     return frame._replace(inputs=replace(inputs, alpha=alpha, betas=tuple(betas)), hw=hw)
 
 
@@ -233,11 +234,12 @@ def _reduced_field(
 class _Matches(NamedTuple):
     """Values of one beta at its matches: all (h, w) or (c, h, w), at the size of the pre-pass.
 
-    After `before` come the arguments of `fit_misalignment`. `before` are beta's own bands, blurred; `luma` is
-    that of the corrected beta, as bright and sharp as `alpha`.
+    `before` are beta's own bands, blurred, and `clipped` is where one is at its largest value. Then come the
+    arguments of `fit_misalignment`; `luma` is that of the corrected beta, as bright and sharp as `alpha`.
     """
 
     before: Float[Tensor, "c h w"]
+    clipped: Bool[Tensor, "h w"]
     alpha: Float[Tensor, "h w"]
     luma: Float[Tensor, "hb wb"]
     position: Float[Tensor, "h w 2"]
@@ -258,30 +260,29 @@ def _of_beta(alpha: Tensor, before: Beta, beta: Beta, matches: BetaMatches, hw: 
     positions, valid = matches.positions(beta.field.straight, (beta.image.shape[-2], beta.image.shape[-1]))
     where = positions[0, :h, :w]
     luma = combined_bands(beta.image)
-    sampled = sample(torch.cat([before.image, luma], 1), where.reshape(1, -1, 2).to(luma)).values
+    clipped = torch.zeros_like(luma) if before.clipped is None else before.clipped.amax(1, keepdim=True)
+    sampled = sample(torch.cat([before.image, luma, clipped], 1), where.reshape(1, -1, 2).to(luma)).values
     values = sampled.reshape(sampled.shape[1], h, w)
     unlike, margin, _ = matches.facts[0]
     reliable = (unlike < CONSISTENT) & (margin > SETTINGS.margin)
     weight = (enlarged(reliable)[:h, :w] & valid[0, :h, :w]).to(alpha)
     whole = Normalisation.from_images(alpha, luma)
     alpha_soft = whole.softened(alpha)[:, :, :h, :w]
-    measured, wanted = (moments(image, weight[None, None]) for image in (values[-1:][None], alpha_soft))
+    measured, wanted = (moments(image, weight[None, None]) for image in (values[-2:-1][None], alpha_soft))
     bright = measured.matched(luma, wanted, NORMALISATION.largest_gain)
-    soft = blurred(values[:-1][:, None], [ALIGNMENT.blur] * (len(values) - 1))[:, 0]
+    soft = blurred(values[:-2][:, None], [ALIGNMENT.blur] * (len(values) - 2))[:, 0]
     normal = normals(beta.field.straight)[0, :h, :w]
-    return _Matches(soft, alpha_soft[0, 0], bright[0, 0], where, normal.to(where), weight)
+    return _Matches(soft, values[-1] > 0.5, alpha_soft[0, 0], bright[0, 0], where, normal.to(where), weight)
 
 
 def _fitted(frame: FrameInputs, matches: list[_Matches]) -> Response:
-    """Response by all RGB betas' matches. Where few pixels match, its `explained` is raised: wrong matches
-    among few leave more of alpha unexplained, whatever alpha sees."""
+    """Response by all RGB betas' matches."""
     h, w = frame.hw
     soft = blurred(frame.inputs.alpha[:, :, :h, :w], [ALIGNMENT.blur])[0, 0]
-    colour = [(m, m.weight > 0) for m in matches if len(m.before) == 3]
+    colour = [(m, (m.weight > 0) & ~m.clipped) for m in matches if len(m.before) == 3]
     points = [of_beta.before[:, counts] for of_beta, counts in colour]
     places = [of_beta.place[counts] for of_beta, counts in colour]
     alphas = torch.cat([soft[counts] for _, counts in colour])
     matched = float(torch.stack([counts for _, counts in colour]).any(0).double().mean())
     enough = min(matched / SETTINGS.matched, 1.0)
-    found = fit(torch.cat(points, 1), alphas, torch.cat(places), vignetting=enough == 1)
-    return found._replace(explained=min(found.explained, enough) / enough if enough else 1.0)
+    return fit(torch.cat(points, 1), alphas, torch.cat(places), enough=enough)

@@ -9,9 +9,9 @@ from typing import Literal, NamedTuple
 
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import pad
+from torch.nn.functional import max_pool2d, pad
 
-from arraygeom import Curved, Moved, Pair, ReceptiveField, Widened, depth_of
+from arraygeom import Curved, Moved, Pair, ReceptiveField, Sensor, Widened, depth_of
 from arraygeom.epipolar import Depth, Track
 from arraygeom.fields import AroundDepth, AroundMatches, default_field, pinhole_track
 from arraygeom.fields.grid import BLOCK, FieldOnGrid
@@ -27,6 +27,8 @@ from .steps import FusionStep, Undo, takes_pinhole_views
 from .views import Views, check_precision, innermost
 
 LOG = logging.getLogger(__name__)
+CLIPPED = 0.995
+"""Share of the largest value from which a pixel counts as clipped: rounding, and interpolation."""
 
 
 class Placement(NamedTuple):
@@ -146,6 +148,7 @@ def frame_inputs(network: FusionNetwork, views: Views) -> FrameInputs:
             track=place.track if place.has_track else None,
             around=around,
             cameras=views.joined.get(name, (name,)),
+            clipped=clipped_in(image, views.rig[name].sensor),
         )
         betas.append(beta)
         if not on_grid.any_valid(pair.alpha.hw):
@@ -157,6 +160,16 @@ def frame_inputs(network: FusionNetwork, views: Views) -> FrameInputs:
         placements.append(place)
     inputs = Inputs(alpha, tuple(betas), m, network.beta_halo, bands=network.bands, learned=network.learned)
     return FrameInputs(inputs, placements, hw)
+
+
+def clipped_in(image: Float[Tensor, "1 c h w"], sensor: Sensor) -> Float[Tensor, "1 c h w"] | None:
+    """Compute the mask of bands at their largest value, or beside such a pixel; None if there are none.
+
+    The largest value is 1, or the image's own where exposures are stated, by which it was scaled.
+    """
+    largest = 1.0 if sensor.exposure is None else float(image.max())
+    clipped = image >= CLIPPED * largest
+    return max_pool2d(clipped.to(image), 3, 1, 1) if clipped.any() else None
 
 
 def bytes_beside(inputs: Inputs, images: Iterable[Tensor]) -> float:

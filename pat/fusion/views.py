@@ -429,14 +429,16 @@ def read_view(
 
 
 SATURATED = 0.1
-"""Share of an image's pixels at the largest value from which a warning is given."""
+"""Share of an image's pixels at the largest value, clipped, from which a warning is given."""
 
 
 def _warn_of_contradictions(image: Float[Tensor, "c h w"], sensor: Sensor, label: str) -> None:
-    """Warn of an image that is saturated, or in colour where the rig states one band."""
+    """Warn of an image that is clipped, or in colour where the rig states one band."""
     share = float((image >= 1).any(0).float().mean())
     if share > SATURATED:
-        warn(f"{label}: {share:.0%} of its pixels are saturated: they have no detail to match: expose less")
+        warn(
+            f"{label}: {share:.0%} of its pixels are clipped: little to match, and colours are guessed there"
+        )
     stated = sensor.response
     if len(image) == 3 and stated not in (None, "rgb") and is_in_colour(image):
         warn(f"{label}: is in colour, and the rig says response {stated}: give that band, or state rgb")

@@ -15,7 +15,7 @@ from torch import Tensor
 from arraygeom import Segments
 from arraygeom.runtime.chunks import chunked
 
-from ..media.colour import to_bytes
+from ..media.colour import REC601, to_bytes
 from ..support.settings import size, tuned
 from .examples import by_examples
 from .filters import LocalMoments, box_mean, numpy_of, smoothed
@@ -62,6 +62,11 @@ class ColourTransferSettings:
     lowest: float = tuned(0.1, "SYNTIM and Middlebury: the quantile that stands for the least of either")
     least_noise: float = size(
         2e-5, "Variance not worth the time to take it out: two thirds of a level of 8 bits in each band"
+    )
+    light_differs: float = tuned(
+        0.3,
+        "Middlebury, tune half, beta exposed 1.5 to 3 times: variance of light that differs between the "
+        "views over that of light beyond the largest value",
     )
     most_detail: float = size(0.2, "Differences of brightness beyond this are no detail that beta lost")
 
@@ -272,14 +277,20 @@ def matched_colours(
         1; the photometric similarity, 0 to 1, with 1 for what it cannot tell; and the statistics.
     """
     guide, normalisation = combined_bands(beta.image), matches.comparison.whole
-    bands, planes = beta.image.shape[1], torch.cat([beta.image, guide, normalisation.normalised(guide)], 1)
+    bands = beta.image.shape[1]
+    clipped = torch.zeros_like(beta.image) if beta.clipped is None else beta.clipped
+    planes = torch.cat([beta.image, guide, normalisation.normalised(guide), clipped], 1)
     sampled, valid = at_matches(planes, beta.field.straight, matches.disparity)
-    values, luma, brightness = sampled.split([bands, 1, 1], 1)
+    values, luma, brightness, clipped = sampled.split([bands, 1, 1, bands], 1)
     consistent, soft = is_consistent(matches.facts), normalisation.softened(alpha)
     statistics = statistics or MatchStatistics.from_values(
-        alpha, soft, values, luma, brightness, valid, consistent
+        alpha, soft, values, luma, brightness, valid & (clipped.amax(1, keepdim=True) < 0.5), consistent
     )
     unlike = statistics.leveled(brightness) - soft
+    if beta.clipped is not None and bands == 3 and sees_luma:
+        values, whole = with_clipped_light(values, luma, soft, clipped)
+        unlike = unlike + (whole - luma) * (1 - clipped.amin(1, keepdim=True))  # white may be of any colour
+        luma = whole
     alike = likeness(unlike) if sees_luma else torch.ones_like(unlike)
     if bands == 1:  # which may be unlike alpha
         alike = torch.lerp(torch.ones_like(alike), alike, statistics.explained.to(alike))
@@ -295,6 +306,30 @@ def matched_colours(
     else:
         matched = _detailed(values, soft, alpha) - alpha
     return torch.where(valid, matched, statistics.colour), weight, alike, statistics
+
+
+def with_clipped_light(
+    values: Float[Tensor, "b 3 h w"],
+    luma: Float[Tensor, "b 1 h w"],
+    alpha: Float[Tensor, "b 1 h w"],
+    clipped: Float[Tensor, "b 3 h w"],
+) -> tuple[Float[Tensor, "b 3 h w"], Float[Tensor, "b 1 h w"]]:
+    """Add to clipped bands the light that alpha shows and beta's luma lacks, equally to all that are clipped.
+
+    One equation for light beyond the largest value, or light that differs between the views, with normal
+    expectations of both.
+
+    Args:
+        luma: luma of the values.
+        alpha: alpha, as sharp as these.
+        clipped: 1 where a band is clipped, 0 elsewhere, and between them beside such pixels.
+
+    Returns:
+        The bands, and their luma.
+    """
+    share = (clipped * values.new_tensor(REC601)[:, None, None]).sum(1, keepdim=True)
+    beyond = (alpha - luma).clamp(min=0) * share / (share.square() + SETTINGS.light_differs)
+    return values + clipped * beyond, luma + share * beyond
 
 
 def _colours_of_bands(

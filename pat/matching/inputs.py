@@ -47,6 +47,7 @@ class Beta:
         around: True if each segment is around a known depth of its own pixel: positions along the segments of
             two pixels cannot be compared.
         cameras: names of the cameras whose bands it shows, one after another.
+        clipped: mask (B, C, H, W), 1 where a band is at its largest value; None for none.
     """
 
     image: Float[Tensor, "b c h w"]
@@ -55,6 +56,7 @@ class Beta:
     track: Callable[[Tensor], Track] | None = None
     around: bool = False
     cameras: tuple[str, ...] = ()
+    clipped: Float[Tensor, "b c h w"] | None = None
 
 
 @dataclass(frozen=True)
@@ -176,8 +178,9 @@ class Inputs:
         offset = (beta.offset[0] + x0, beta.offset[1] + y0)
         top, _, left, _ = box
         track = beta.track and track_in(beta.track, lambda x: x + x.new_tensor((left, top)), 1.0, (-x0, -y0))
-        image = beta.image[..., y0:y1, x0:x1]
-        return replace(beta, image=image, field=beta.field.cut(box, (x0, y0)), offset=offset, track=track)
+        part, field = (..., slice(y0, y1), slice(x0, x1)), beta.field.cut(box, (x0, y0))
+        image, clipped = beta.image[part], beta.clipped if beta.clipped is None else beta.clipped[part]
+        return replace(beta, image=image, field=field, offset=offset, track=track, clipped=clipped)
 
 
 def track_in(

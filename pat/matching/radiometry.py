@@ -65,12 +65,6 @@ class ResponseSettings:
         (0.08, 0.04, 0.02), "By how much the logarithms of further ones differ from that of the best, in turn"
     )
     steps: int = size(2, "How often vignetting is taken out and looked for again")
-    blocks: int = size(6, "Parts of beta's width and of its height over which evidence must agree")
-    gain: float = tuned(
-        0.25, "Middlebury, tune half: least share by which another response lowers the squared error"
-    )
-    deviations: float = physics(1.645, "Standard errors of that gain across blocks: 95 % of a normal one")
-    clipped: float = size(0.1, "Errors of brightness count as no larger: wrong matches")
     explained: float = tuned(
         0.8,
         "Share of alpha's variance that must be explained: of Middlebury's tune half at least .88 is, "
@@ -109,7 +103,12 @@ class Response(NamedTuple):
     @property
     def is_rec601(self) -> bool:
         """True if images need not be changed."""
-        return self.gain == self.gamma == 1.0 and not self.shading and self.weights.tolist() == list(REC601)
+        return self.gain == self.gamma == 1.0 and not self.shading and not self.is_unlike
+
+    @property
+    def is_unlike(self) -> bool:
+        """True if the weights are not Rec. 601's."""
+        return self.weights.tolist() != list(REC601)
 
     @property
     def explains(self) -> bool:
@@ -210,21 +209,22 @@ def fit(
     alpha: Float[Tensor, " n"],
     where: Float[Tensor, "n 2"] | None = None,
     *,
-    vignetting: bool = True,
+    enough: float = 1.0,
 ) -> Response:
     """Estimate alpha's most probable response from matched points: weights, gain, gamma and vignetting.
 
-    Each explanation is judged by its evidence, the probability of alpha under all responses that it allows
-    (MacKay 1992): an explanation that allows more must explain more. Light differs between the views as a
-    smooth function of colour and place, and with brightness (a Gaussian process, by which Kennedy and O'Hagan
-    2001 model the lack of a model).
+    Luma's weights and others each explain alpha as well as they can, judged by their evidence, the
+    probability of alpha under all responses that an explanation allows (MacKay 1992): one that allows more
+    must explain more. Light differs between the views as a smooth function of colour and place, and with
+    brightness (a Gaussian process, by which Kennedy and O'Hagan 2001 model the lack of a model).
 
     Args:
         bands: beta's bands at the points.
         alpha: alpha at the points.
         where: positions of the points in beta, in its width and height, from its middle, with which
             vignetting is estimated; None without.
-        vignetting: False to leave vignetting out.
+        enough: matched pixels as a share of those wanted, at most 1. Below 1 wrong ones among them could
+            explain anything: only an exposure is fitted, and no more of alpha than this need be explained.
 
     Returns:
         The response; Rec. 601's where there are too few points, or where no combination of bands explains
@@ -237,69 +237,18 @@ def fit(
     unclipped = (y > 0.02) & (y < 0.98) & (x > 0.01).all(0) & (x < 0.98).all(0)
     if int(unclipped.sum()) < fewest:
         return Response.rec601()
-    points = _Points(x[:, unclipped], y[unclipped], place[unclipped])
-    groups = _Groups.from_points(*points)
-    luma, any_weights = (groups.most_probable(kinds) for kinds in (LUMA, KINDS))
-    response = points.held(luma, any_weights)
-    explained = max(luma.explained, any_weights.explained)
-    if where is not None and vignetting:
-        luma, any_weights = (groups.most_probable(kinds, vignetted=True) for kinds in (LUMA, KINDS))
-        explained = max(explained, luma.explained, any_weights.explained)
-        shaded = points.held(luma, any_weights)
+    groups = _Groups.from_points(x[:, unclipped], y[unclipped], place[unclipped])
+    luma, unlike = groups.most_probable(LUMA), groups.most_probable(UNLIKE)
+    best = unlike if enough == 1 and unlike.evidence > luma.evidence else luma
+    explanations = [luma, unlike]
+    if enough == 1 and where is not None:
         # Shading may explain in part what other weights explain: it never takes them back.
-        lost = shaded.weights.tolist() == list(REC601) != response.weights.tolist()
-        if shaded.shading and not lost and points.hold(shaded, response):
-            response = shaded
-    response = response if explained >= SETTINGS.explained else Response.rec601()
+        shaded = groups.most_probable(UNLIKE if best is unlike else LUMA, vignetted=True)
+        best = shaded if shaded.evidence > best.evidence else best
+        explanations.append(shaded)
+    explained = min(max(one.response.explained for one in explanations) / enough, 1.0)
+    response = best.response if explained >= SETTINGS.explained else Response.rec601()
     return response._replace(explained=explained)
-
-
-class _Points(NamedTuple):
-    """Points that match: bands of beta, alpha, and place in beta, in its width and height from its middle."""
-
-    bands: Float[Tensor, "3 n"]
-    alpha: Float[Tensor, " n"]
-    place: Float[Tensor, "n 2"]
-
-    def held(self, luma: Response, any_weights: Response) -> Response:
-        """Return the response with any weights if it holds against that with luma's, else that, else Rec.
-        601's.
-
-        Weights that need no exposure are held against luma as recorded, not against one exposed to fit.
-        """
-        rec601 = Response.rec601()
-        exposed = luma if self.hold(luma, rec601) else rec601
-        as_recorded = any_weights.gain == any_weights.gamma == 1 and not any_weights.shading
-        simpler = rec601 if as_recorded else exposed
-        unlike = any_weights.weights.tolist() != list(REC601)
-        return any_weights if unlike and self.hold(any_weights, simpler) else exposed
-
-    def hold(self, response: Response, simpler: Response) -> bool:
-        """Return True if a response explains alpha clearly better than a simpler one, and all over the image.
-
-        Scenes of few hues, and shading that differs between the cameras, make wrong weights fit somewhat
-        better in some places: the gain must be large, and many times its standard error over blocks. For
-        points without a place the gain alone counts.
-        """
-        errors = [self._squared_errors(one) for one in (simpler, response)]
-        block = ((self.place + 0.5) * SETTINGS.blocks).long().clamp(0, SETTINGS.blocks - 1)
-        block = block[:, 1] * SETTINGS.blocks + block[:, 0]
-        count = torch.bincount(block).to(self.alpha)
-        enough = count >= SETTINGS.points_of_group
-        gains = torch.bincount(block, errors[0] - errors[1])[enough] / count[enough]
-        share = count[enough].sqrt() / count[enough].sqrt().sum()
-        mean = share @ gains
-        deviation = (share.square() @ (gains - mean).square()).sqrt()
-        enough_gain = mean >= SETTINGS.gain * errors[0].mean()
-        return bool(enough_gain & (mean >= SETTINGS.deviations * deviation) & (mean > 0))
-
-    def _squared_errors(self, response: Response) -> Float[Tensor, " n"]:
-        shades = (
-            self.bands.new_tensor(response.shading) @ _shading_terms(self.place) if response.shading else 0.0
-        )
-        even = self.bands * torch.as_tensor(shades).exp()
-        error = self.alpha - response.weights @ (response.gain * even**response.gamma)
-        return error.abs().clamp(max=SETTINGS.clipped).square()
 
 
 def _shading_terms(where: Float[Tensor, "n 2"]) -> Float[Tensor, "5 n"]:
@@ -366,14 +315,14 @@ class _Kind(NamedTuple):
         return Response(weights, gain, gamma, explained)
 
 
-KINDS = tuple(
+LUMA = tuple(_Kind(REC601, False, gain) for gain in (False, True))
+"""Luma; beta exposed as alpha, or otherwise."""
+UNLIKE = tuple(
     _Kind(weights, others, gain)
-    for weights, others in ((REC601, False), ((1 / 3, 1 / 3, 1 / 3), False), (SETTINGS.sensor, True))
+    for weights, others in (((1 / 3, 1 / 3, 1 / 3), False), (SETTINGS.sensor, True))
     for gain in (False, True)
 )
-"""Luma, a sensor without filters, or any other; beta exposed as alpha, or otherwise. The first of each is the
-usual one."""
-LUMA = tuple(kind for kind in KINDS if kind.weights == REC601)
+"""A sensor without filters, or any other; beta exposed as alpha, or otherwise."""
 
 
 class _Explanation(NamedTuple):
@@ -437,12 +386,12 @@ class _Groups(NamedTuple):
         counts, share = torch.bincount(group).to(y), weight / weights[group]
         return cls(points, share, group, means[5], level, terms, counts, variance, spread)
 
-    def most_probable(self, kinds: Sequence[_Kind], *, vignetted: bool = False) -> Response:
-        """Return the most probable response of these kinds, with vignetting or without."""
+    def most_probable(self, kinds: Sequence[_Kind], *, vignetted: bool = False) -> _Explanation:
+        """Return the most probable explanation of these kinds, with vignetting or without."""
         shading = self.y.new_zeros(len(self.terms))
         for _ in range(SETTINGS.steps if vignetted else 0):
             shading = shading + self.explained_by(shading, kinds, vignetted=True).further
-        return self.explained_by(shading, kinds, vignetted=vignetted).response
+        return self.explained_by(shading, kinds, vignetted=vignetted)
 
     def explained_by(self, shading: Tensor, kinds: Sequence[_Kind], *, vignetted: bool) -> _Explanation:
         """Return the most probable response of these kinds after this shading is removed from beta.

@@ -13,6 +13,7 @@ from pat.fusion.fuse import corrections_of
 from pat.fusion.inputs import prepared
 from pat.fusion.sequence import SequenceFusion
 from pat.fusion.views import Views
+from pat.matching.colour_transfer import with_clipped_light
 from pat.matching.epipolar_offset import Misalignment, fit_misalignment
 from pat.matching.radiometry import Response
 from pat.media.colour import luminance
@@ -214,3 +215,26 @@ def test_a_misalignment_is_recovered():
     torch.testing.assert_close(found.at(corners, (h, w)), true.at(corners, (h, w)), atol=0.1, rtol=0)
     assert fit_misalignment(texture, texture, position, normal, torch.ones(h, w)) == Misalignment()
     assert fit_misalignment(0 * alpha, texture, position, normal, torch.ones(h, w)) == Misalignment()
+
+
+def test_a_clipped_band_gets_the_light_that_alpha_shows(network, middle, monkeypatch):
+    """Beta is exposed twice as long: where one of its bands is at its largest value, alpha tells the rest."""
+    sample, images, _ = middle
+    bright = images | {BETA: (2 * images[BETA]).clamp(max=1)}
+    assert float((bright[BETA] == 1).any(0).float().mean()) > 0.2
+    aware = psnr(network, sample, bright)
+    monkeypatch.setattr("pat.fusion.inputs.clipped_in", lambda image, sensor: None)
+    assert aware > psnr(network, sample, bright) + 1
+
+
+def test_clipped_bands_share_light_and_others_keep_theirs():
+    values = torch.tensor([1.0, 1.0, 0.4])[None, :, None, None]
+    clipped = (values == 1).to(values)
+    luma, alpha = luminance(values), torch.full((1, 1, 1, 1), 0.97)
+    bands, brighter = with_clipped_light(values, luma, alpha, clipped)
+    assert bands[0, 2] == values[0, 2]
+    assert bands[0, 0] == bands[0, 1] > 1
+    assert luma < brighter < alpha
+    assert luminance(bands).item() == pytest.approx(brighter.item())
+    same, _ = with_clipped_light(values, luma, luma - 0.1, clipped)
+    assert same.equal(values)

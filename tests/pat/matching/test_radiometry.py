@@ -7,7 +7,7 @@ import torch
 
 from pat import FuseSettings, fuse
 from pat.matching import radiometry
-from pat.matching.radiometry import KINDS, SETTINGS, Response, fit, stated_response
+from pat.matching.radiometry import SETTINGS, UNLIKE, Response, fit, stated_response
 from pat.media.colour import REC601, luminance
 from pat.networks.weights import load_weights
 from pat.support.metrics import score
@@ -63,7 +63,7 @@ def test_a_sensor_without_filters_is_preferred_to_weights_that_explain_alpha_har
     alpha = light * x.mean(0) + noise
     assert fit(x, alpha).weights.tolist() == [1 / 3] * 3
     with monkeypatch.context() as patched:
-        patched.setattr(radiometry, "KINDS", [kind for kind in KINDS if kind.weights[0] != 1 / 3])
+        patched.setattr(radiometry, "UNLIKE", [kind for kind in UNLIKE if kind.weights[0] != 1 / 3])
         assert (fit(x, alpha).weights - 1 / 3).abs().max() > 0.01
     other = fit(x, combined(x[:, :, None], WEIGHTS)[0, :, 0] * light + noise).weights
     assert (other - torch.tensor(WEIGHTS)).abs().max() < 0.06
