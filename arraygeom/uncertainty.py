@@ -84,7 +84,7 @@ def triangulation_covariance(
     return _propagated(rig, covariance, points)
 
 
-class Band(NamedTuple):
+class BandWidths(NamedTuple):
     """Half-widths of the bands that hold alpha's points in beta.
 
     Attributes:
@@ -102,7 +102,7 @@ FARTHEST = 1e4
 
 def bands(
     rig: Rig, covariance: Covariance, alpha: str, beta: str, x: Real[Tensor, "n 2"], confidence: float = 0.95
-) -> Band:
+) -> BandWidths:
     """Compute the half-widths within which a calibration's error leaves a point that alpha's pixels see.
 
     Args:
@@ -139,7 +139,7 @@ def bands(
         worst = C.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True).expand_as(of_axes)
         widths.append(factor * torch.where(length > SHORTEST, of_axes, worst).clamp(min=0).sqrt())
     along, across = torch.stack(widths, -1).unbind(-2)
-    return Band(across, along)
+    return BandWidths(across, along)
 
 
 SHORTEST = 1e-3

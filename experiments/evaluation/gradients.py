@@ -31,7 +31,7 @@ UNITS = {
     "k1": ("distortion", 1.0, 0),
 }
 """Parameter of beta, unit and axis by name: degrees, tenths of the baseline, 1 % of the focal length, 1."""
-AT, STEP = 0.07, 3e-4
+AT, STEP = 0.07, 1e-3
 """Position and step of the differences, in these units; the step of k1 is ten times as large."""
 REACH = 10
 """Pixels of alpha within which a pixel of the paper's image depends on segments."""

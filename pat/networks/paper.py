@@ -106,6 +106,9 @@ class PAT(nn.Module):
 
         The fused image then changes smoothly when a rig moves, and its gradient by the rig is whole at the
         border too.
+
+        Returns:
+            The copy.
         """
         faded = copy.deepcopy(self)
         faded.engine.border = pixels
