@@ -8,7 +8,7 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --no-input -
 
 DATA ?= ../shared/data
 
-.PHONY: help env synthesis demo showcase readme pairs stages conditions certainty without-rig alignment paper-network paper-tables outside fields test test-long check format bench bench-job train notebooks docs drawings wheel fuzz mistakes kills transformations gradients
+.PHONY: help env synthesis demo showcase readme pairs stages conditions certainty without-rig alignment paper-network paper-tables outside fields formats test test-long check format bench bench-job train notebooks docs drawings wheel fuzz mistakes kills transformations gradients
 
 help:
 	@echo "make demo       fuse the sample array into out/demo"
@@ -23,6 +23,7 @@ help:
 	@echo "make paper-tables  the paper's Tables 1 and 2 by its network, into docs/reports/paper.md"
 	@echo "make outside    fuse with disparities from elsewhere, into docs/reports/outside.md"
 	@echo "make fields     every receptive field by the network pat-supervised, into docs/reports/paper.md"
+	@echo "make formats    the table of rig formats, from what their readers state, into docs/rigs.md"
 	@echo "make without-rig  fuse with rigs found from the images, against known ones, into docs/reports/without_rig.md"
 	@echo "make test       the tests"
 	@echo "make test-long  the tests, longer ones included"
@@ -82,9 +83,12 @@ without-rig: $(READY)
 	@$(BIN)/python -m docs.update_readme --document docs/reports/without_rig.md --block without-rig=out/without-rig/scores.md
 
 alignment: $(READY)
-	@$(BIN)/python -m experiments alignment --data $(DATA) --scenes middlebury motorcycle rededge sequoia nine-band \
-		--out out/alignment
+	@$(BIN)/python -m experiments alignment --data $(DATA) --out out/alignment \
+		--scenes middlebury motorcycle rededge rededge_flight sequoia nine-band
 	@$(BIN)/python -m docs.update_readme --document docs/reports/alignment.md --block alignment=out/alignment/alignment.md
+
+formats: $(READY)
+	@$(BIN)/python -m docs.formats
 
 paper-network: $(READY)
 	@$(BIN)/python -m experiments evaluate --middlebury $(DATA)/middlebury --rates 2 --half report \

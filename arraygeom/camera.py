@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
 from .batching import Batched
-from .checks import check_batches, check_hw, check_K, check_pixels, check_tensors, checking
+from .checks import check_above, check_batches, check_hw, check_K, check_pixels, check_tensors, checking
 from .distortion import Distortion
 from .kornia_models import from_kornia_model, to_kornia_model
 from .lenses.common import on_plane
@@ -308,8 +308,10 @@ class Camera(LensView):
             The scaled camera.
 
         Raises:
-            ValueError: for a lens that is not central and does not state which of its numbers are lengths.
+            ValueError: for a factor that is not positive, and a lens that is not central and does not state
+                which of its numbers are lengths.
         """
+        check_above(0, itself=False, factor=factor)
         K, lens = self.K, self.distortion
         if self.parallel:  # the image plane is in metres
             K = torch.cat([K[..., :2] / K.new_tensor([factor, factor, 1.0])[:, None], K[..., 2:]], -1)

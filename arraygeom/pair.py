@@ -35,6 +35,7 @@ class Link(Batched):
         F: fundamental matrix; 0 for cameras at one place, or whose scene is one plane or far away, so that H
             is all there is and depth has no effect.
         H: rough homography; None if unknown.
+        spread: standard deviation of points from H x, pixels of beta, where H is all there is; 0 if unknown.
 
     Raises:
         ValueError: for other shapes, NaN or infinity.
@@ -44,6 +45,7 @@ class Link(Batched):
     item_axes: ClassVar = {"F": 2, "H": 2}
     F: Float[Tensor, "*b 3 3"]
     H: Float[Tensor, "*b 3 3"] | None = None
+    spread: float = 0.0
 
     def __post_init__(self) -> None:
         if checking():
@@ -52,13 +54,16 @@ class Link(Batched):
                     check_numbers(matrix, (3, 3), name)
 
     @classmethod
-    def from_homography(cls, H: Float[Tensor, "*b 3 3"]) -> Link:
-        """Make the link of images that H alone registers."""
-        return cls(torch.zeros_like(H), H)
+    def from_homography(cls, H: Float[Tensor, "*b 3 3"], spread: float = 0.0) -> Link:
+        """Make the link of images that H alone registers, with points that are `spread` off it."""
+        return cls(torch.zeros_like(H), H, spread)
 
     def reversed(self) -> Link:
         """Return the link with alpha and beta exchanged."""
-        return Link(self.F.transpose(-1, -2), None if self.H is None else torch.linalg.inv(self.H))
+        if self.H is None:
+            return Link(self.F.transpose(-1, -2))
+        back = torch.linalg.inv(self.H)
+        return Link(self.F.transpose(-1, -2), back, self.spread and self.spread * _enlargement(back))
 
     def _text(self) -> str:
         return "F" if self.H is None else "F and H" if self.F.any() else "H"
@@ -68,7 +73,13 @@ class Link(Batched):
         A_alpha, A_beta = A_alpha.to(self.F), A_beta.to(self.F)
         back = torch.linalg.inv(A_alpha)
         F = product(product(torch.linalg.inv(A_beta).T, self.F), back)
-        return Link(F, None if self.H is None else product(product(A_beta, self.H), back))
+        H = None if self.H is None else product(product(A_beta, self.H), back)
+        return Link(F, H, self.spread and self.spread * _enlargement(A_beta))
+
+
+def _enlargement(H: Tensor) -> float:
+    """Return the factor of lengths by a homography, at the first pixel."""
+    return float((H[..., :2, :2].det().abs().sqrt() / H[..., 2, 2].abs()).mean())
 
 
 @dataclass(frozen=True, eq=False, repr=False)

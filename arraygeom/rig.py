@@ -16,7 +16,7 @@ from torch import Tensor
 
 from .batching import Batched, map_tensors
 from .camera import Camera, LensView, View, view_facts
-from .checks import check_tensors, checking, derived
+from .checks import check_above, check_tensors, checking, derived
 from .pair import Link, Pair, depth_range
 from .pixels import HW, resize_matrix, rot90_matrix, shift_matrix
 from .runtime.text import baseline_text, depth_text, length_unit
@@ -246,8 +246,10 @@ class Rig(Batched):
             The scaled rig.
 
         Raises:
-            ValueError: for a camera model that does not say which of its numbers are lengths.
+            ValueError: for a camera model that does not say which of its numbers are lengths, and for a
+                factor that is not positive.
         """
+        check_above(0, itself=False, factor=factor)
         cameras = {
             name: view.scaled(factor) if isinstance(view, Camera) else view
             for name, view in self.cameras.items()

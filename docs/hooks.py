@@ -1,14 +1,12 @@
 """What the site's pages take from elsewhere.
 
 In place of a link titled "included", alone in its line, the file or notebook it leads to; in place of the
-comments `<!-- commands -->` and `<!-- formats -->` what is made of the code. On a code host the link is a
-link.
+comment `<!-- commands -->` what is made of the code. On a code host the link is a link.
 """
 
 from __future__ import annotations
 
 import contextlib
-import inspect
 import io
 import json
 import os
@@ -25,9 +23,8 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
     markdown = re.sub(
         r'(?m)^\[[^]]*\]\((?:\.\./)+(\S+) "included"\)$', lambda found: included(found[1]), markdown
     )
-    for name, made in (("commands", commands), ("formats", formats)):
-        if f"<!-- {name} -->" in markdown:
-            markdown = markdown.replace(f"<!-- {name} -->", made())
+    if "<!-- commands -->" in markdown:
+        markdown = markdown.replace("<!-- commands -->", commands())
     return markdown
 
 
@@ -87,23 +84,3 @@ def help_of(path: tuple[str, ...]) -> str:
         main([*path, "--help"])
     text = re.sub(r"\x1b\[[0-9;]*m", "", printed.getvalue())
     return "\n".join(line.rstrip() for line in text.strip().splitlines())
-
-
-def formats() -> str:
-    """A table of the formats that are read, with the convention that each reader states."""
-    from arraygeom.io import READERS, WRITERS
-
-    rows = [
-        f"| `{n}` | {convention(r)} | {'yes' if n in WRITERS else ''} |"
-        for n, r in READERS.items()
-        if n != "native"
-    ]
-    return "\n".join(
-        ["| name | its convention, and what is done about it | written |", "|---|---|---|", *rows]
-    )
-
-
-def convention(reader: Any) -> str:
-    """What a reader's module states, as a table's cell."""
-    stated = re.search(r"^Source convention: (.+?)(\n\n|\Z)", inspect.getmodule(reader).__doc__, re.M | re.S)
-    return " ".join(stated[1].split()).replace("|", r"\|")

@@ -38,7 +38,7 @@ from calib.images.refinement import EXTRA_FREE, FREE, refine
 from experiments.evaluation.halves import of_half
 from experiments.names import refuse_unknown
 from pat import FuseSettings, align
-from pat.app.aligned_page import shown_layers
+from pat.app.aligned_page import ndvi, shown_layers
 from pat.app.from_images import array_from_images, camera_names
 from pat.fusion.align import LEAST_CONFIDENCE, SEEN, Aligned, resampled_values
 from pat.fusion.aligned_files import RecordedFiles
@@ -122,17 +122,35 @@ def evaluate_alignment(data: Path, out: Path, names: Sequence[str], *, each: Cal
     """
     refuse_unknown("no scene", names, SCENES)
     rows: list[AlignmentRow] = []
+    indices: list[str] = []
+    text = ""
     for name in names:
         for scene in SCENES[name](data):
             each(scene.name)
             aligned = aligned_scene(scene)
             rows += alignment_rows(scene, aligned)
+            indices += index_text(scene, aligned)
             layers = {} if scene.truth is not None else shown_layers(aligned, scene.recorded_rig)
             name = f"{scene.name.replace('/', '-')}.png"
             save_panels({**composites(scene, aligned), **layers}, out / name, columns=2)
-    text = alignment_markdown(rows)
-    write_text(out / "alignment.md", text)
+            text = "\n\n".join([alignment_markdown(rows), *indices])
+            write_text(out / "alignment.md", text)
     return text
+
+
+def index_text(scene: AlignmentScene, aligned: Aligned) -> list[str]:
+    """A sentence on the vegetation index of a scene with red and near infrared; none for others."""
+    index = ndvi(aligned, scene.recorded_rig)
+    if scene.recorded_rig is None or index is None:
+        return []
+    low, median, high, raw = (
+        float(np.nanquantile(values, q))
+        for values, q in ((index, 0.1), (index, 0.5), (index, 0.9), (ndvi(aligned), 0.5))
+    )
+    return [
+        f"NDVI of {scene.name}, where both bands are seen, from counts less the black level, by exposure and "
+        f"gain: {median:.2f} (median), {low:.2f} to {high:.2f} in 8 of 10 pixels; of plain counts {raw:.2f}."
+    ]
 
 
 def aligned_scene(scene: AlignmentScene, min_confidence: float = LEAST_CONFIDENCE) -> Aligned:

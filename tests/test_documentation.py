@@ -13,6 +13,7 @@ import torch
 
 from arraygeom import Camera, Pose, Rig, intrinsics
 from arraygeom.io import opencv, write_rig
+from docs import formats
 from docs.hooks import help_of, on_page_markdown
 from docs.update_readme import QUOTE, quoting
 from experiments.__main__ import Experiments
@@ -41,9 +42,10 @@ def those_with(language: str):
     return pytest.mark.parametrize("page", pages, ids=lambda p: p.stem)
 
 
-def test_rows_of_the_table_of_formats_have_its_three_cells():
-    rows = on_page_markdown("<!-- formats -->").splitlines()
-    assert {len(re.findall(r"(?<!\\)\|", row)) for row in rows} == {4}
+def test_the_table_of_formats_is_what_the_readers_state():
+    rows = formats.table().splitlines()
+    assert {len(re.findall(r"(?<!\\)\|", row)) for row in rows} == {7}
+    assert "\n".join(rows) in formats.PAGE.read_text(), "`make formats` prints it anew"
 
 
 @those_with("yaml")

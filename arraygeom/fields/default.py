@@ -14,7 +14,7 @@ from ..runtime.tracing import traced
 from .curved import Curved, ThroughLenses
 from .explicit import Dense, Local, NearestVoxels
 from .protocol import ReceptiveField
-from .straight import Epipolar, EpipolarLine, HomographyDisplacement, Rectified
+from .straight import AroundHomography, Epipolar, EpipolarLine, HomographyDisplacement, Rectified
 
 FIELDS: dict[str, type[Any]] = {
     "epipolar": Epipolar,
@@ -56,6 +56,9 @@ def named_field(name: str) -> ReceptiveField:
     return field
 
 
+NEAR, DEVIATIONS = 2.0, 4.0
+"""Displacement from H x of a pair at one place: standard deviations of points from it, and pixels at least. A
+shorter search is no choice between positions, and matches are then held for doubtful."""
 LINE_SHARE = 0.06
 """Displacement from H x along the line of a pair with a link, as a share of beta's longer side."""
 ROW_SHARE = 0.12
@@ -66,8 +69,9 @@ def default_field(pair: Pair) -> ReceptiveField:
     """Return the field that fusion uses for a pair; through lenses where a view has one.
 
     Returns:
-        `HomographyDisplacement` for a pair with a link, also if it is calibrated (a link was measured between
-        these very images), and for cameras at one place, whose segments are points. `Epipolar` for another
+        `AroundHomography` for cameras at one place, and for a pair whose link has H alone.
+        `HomographyDisplacement` for a pair with another link, also if it is calibrated (a link was measured
+        between these very images). `Epipolar` for another
         calibrated pair; called, it raises ValueError for a pair without a depth range, as a search of the
         whole line is ambiguous and must be requested (`EpipolarLine`). `Rectified` with alpha on either side
         where only sizes are known. With lenses `Curved` in place of `Epipolar`, with the bounds of
@@ -78,7 +82,9 @@ def default_field(pair: Pair) -> ReceptiveField:
 
 def straight_field(pair: Pair) -> ReceptiveField:
     """Return the `default_field` of the pair after its images are undistorted."""
-    if pair.link is not None or pair.at_one_place:
+    if pair.at_one_place:
+        return AroundHomography(max(NEAR, DEVIATIONS * (0.0 if pair.link is None else pair.link.spread)))
+    if pair.link is not None:
         return HomographyDisplacement(LINE_SHARE * max(pair.beta.hw))
     if pair.calibrated:
         return Epipolar()

@@ -160,6 +160,36 @@ class HomographyDisplacement:
         return segments_by_rows(around, pair, x)
 
 
+@dataclass(frozen=True)
+class AroundHomography:
+    """The row within +-`reach` pixels of H x, for cameras at one place: H is seldom exact to a pixel.
+
+    Attributes:
+        reach: pixels of beta, at least 0.
+    """
+
+    reach: float
+
+    def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Segments:
+        """Compute segments centred on H x, then clipped to beta's image.
+
+        Returns:
+            Segments in beta's pixels.
+
+        Raises:
+            ValueError: for a pair with lenses.
+        """
+        require_straight(pair)
+        H, step = pair.homography, torch.tensor([self.reach, 0.0])
+
+        def around(x: Tensor) -> Segments:
+            centre, placed = apply_homography(H, x)
+            piece = clip_to_image(centre + step.to(centre), centre - step.to(centre), pair.beta.hw)
+            return Segments(piece.start, piece.end, piece.valid & placed)
+
+        return segments_by_rows(around, pair, floating(x))
+
+
 def covering_displacement(pair: Pair, x: Real[Tensor, "*n 2"] | None = None) -> Float[Tensor, "*b"]:
     """Compute the displacement from H x that reaches near and far for every pixel x.
 

@@ -16,6 +16,7 @@ from typing import Any
 import torch
 
 from ..camera import Camera, LensView
+from ..checks import check_above
 from ..distortion import COEFFICIENT_COUNTS
 from ..pixels import HW
 from ..rig import Rig
@@ -30,16 +31,16 @@ from .source import RigFileError, RigFileWarning, RigSource, UnknownRigFormat, d
 
 FORMATS = (
     *("colmap", "opencv", "kalibr", "boofcv", "ros", "native", "bouguet", "matlab", "kitti-raw", "kitti"),
-    *("middlebury", "syntim", "nerfstudio", "multical", "aniposelib", "strecha", "open3d"),
-    *("metashape", "xmp", "luxonis", "mrcal", "lensboy", "realsense", "zed", "azure", "pycalib"),
+    *("middlebury", "syntim", "nerfstudio", "strecha", "open3d"),
+    *("metashape", "xmp", "luxonis", "mrcal", "lensboy", "realsense", "zed", "azure", "usual"),
 )
 """Formats, each a module, in the order in which they are tried on a file."""
 READERS: dict[str, Any] = {
     name: kitti.Raw if name == "kitti-raw" else import_module(f"{__name__}.{name}") for name in FORMATS
 }
-ANY_SCALE = ("colmap", "nerfstudio", "pycalib", "strecha")
+ANY_SCALE = ("colmap", "nerfstudio", "usual", "strecha")
 """Formats that state no unit: their lengths are metres only if the file's author scaled them so."""
-READERS["caliscope"] = READERS["aniposelib"]
+READERS |= dict.fromkeys(("aniposelib", "caliscope", "multical", "pycalib"), READERS["usual"])
 LIKELY = {
     r"Camera\d?\.fx|Camera\.type": "ORB-SLAM's settings, whose numbers are not read as a rig",
     r"T_cn_cnm1|cam_overlaps|rostopic": "Kalibr: wanted cam0, cam1, ... with intrinsics",
@@ -91,8 +92,9 @@ def read_rig(
         RigFileError: for a file that is damaged, of no known format, or with numbers that no camera has; its
             text names the file and the entry.
         FileNotFoundError: for a missing file.
-        ValueError: for an unknown format or lens model.
+        ValueError: for an unknown format or lens model, and a scale that is not positive.
     """
+    check_above(0, itself=False, scale=scale)
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such rig file")
@@ -170,7 +172,7 @@ def recognise(path: str | Path) -> str:
     if path.is_file() and not head.strip():
         raise RigFileError(path, None, "is empty")
     for name, reader in READERS.items():
-        if reader.recognises(path, head):
+        if reader.recognises(path, head) if hasattr(reader, "recognises") else re.search(reader.HEAD, head):
             return name
     likely = next((f"It may be of {name}. " for word, name in LIKELY.items() if re.search(word, head)), "")
     raise UnknownRigFormat(

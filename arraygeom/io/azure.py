@@ -4,11 +4,13 @@ Source convention: K in shares of the calibrated sensor's size, pixels with the 
 -0.5) as in the maker's own code (`k4a_calibration`); OpenCV axes; `Rt` takes points of the depth camera into
 the camera's, in metres. ModelParameters are cx cy fx fy k1..k6, the distortion's centre, p2 p1. The colour
 camera is of the whole sensor, or of the requested mode: scaled in width, as much cut off above as below.
+
+Written by: an Azure Kinect's memory and recordings: depth, and colour in any mode by --size.
+Refused: other lens models; a distortion's centre.
+Sample: hand-written: azure.json, by the maker's [code](https://github.com/microsoft/Azure-Kinect-Sensor-SDK).
 """
 
 from __future__ import annotations
-
-from pathlib import Path
 
 from ..camera import Camera
 from ..rig import Rig
@@ -18,9 +20,7 @@ NAMES = {"D0": "depth", "PV0": "color"}
 MODEL = "CALIBRATION_LensDistortionModelBrownConrady"
 
 
-def recognises(path: Path, head: str) -> bool:
-    """Return True for a text with the maker's `CalibrationInformation`."""
-    return '"CalibrationInformation"' in head
+HEAD = '"CalibrationInformation"'
 
 
 def read(source: RigSource) -> Rig:

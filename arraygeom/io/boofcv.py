@@ -4,11 +4,13 @@ Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; `ri
 right camera into the left one, so it is inverted here; the world is the left camera. Lengths are in the
 board's unit, which the file does not state: they are taken as metres (use `scale=0.001` for a board measured
 in millimetres).
+
+Written by: BoofCV: pinhole, with radial and tangential terms.
+Refused: other models; more than three radial coefficients.
+Sample: real: a Bumblebee2's stereo.yaml.
 """
 
 from __future__ import annotations
-
-from pathlib import Path
 
 from ..camera import Camera
 from ..distortion import Distortion
@@ -19,9 +21,7 @@ from .source import Entry, RigSource, pose_of
 MODELS = ("pinhole_radial_tangential", "pinhole")
 
 
-def recognises(path: Path, head: str) -> bool:
-    """Return True for a text with BoofCV's lens model, or its `rightToLeft`."""
-    return "pinhole_radial_tangential" in head or "rightToLeft" in head
+HEAD = r"pinhole_radial_tangential|rightToLeft"
 
 
 def read(source: RigSource) -> Rig:
@@ -45,12 +45,7 @@ def _camera(fields: Entry, pose: Pose) -> Camera:
         raise model.fail(f"is '{model.value}'; supported: {', '.join(MODELS)}")
     pinhole, lens = fields["pinhole"], fields.get("radial_tangential")
     K = pinhole.listed("fx", "fy", "cx", "cy").focal_and_centre(skew=pinhole.get("skew", 0.0).number())
-    return Camera(
-        K=K,
-        cam_from_world=pose,
-        hw=pinhole.sized("width", "height", K=K),
-        distortion=None if lens.value is None else _lens(lens),
-    )
+    return pinhole.camera(pose, K=K, distortion=None if lens.value is None else _lens(lens))
 
 
 def _lens(lens: Entry) -> Distortion | None:

@@ -3,6 +3,11 @@
 Source convention: pixels with the first centre at 0 (shift 0), although of MATLAB; OpenCV's lens;
 X_right = R X_left + T with R from the rotation vector `om` where it is not stated; millimetres. The world is
 the left camera. K has the skew `alpha_c` times the first focal length.
+
+Written by: Bouguet's Camera Calibration Toolbox for MATLAB, .mat of version 5 to 7.
+Refused: version 7.3.
+Sample: made by the tests in the layout of its
+[documentation](http://robots.stanford.edu/cs223b04/JeanYvesCalib/).
 """
 
 from __future__ import annotations
@@ -49,9 +54,5 @@ def _camera(fields: Entry, which: str, pose: Pose) -> Camera:
     f = f.expand(2) if len(f) == 1 else focal.numbers((2,))
     skew = fields.get(f"alpha_c{which}", 0.0).number() * float(f[0])
     K = fields.at([*f, *centre], f"fc{which}, cc{which}").focal_and_centre(skew=skew)
-    return Camera(
-        K=K,
-        cam_from_world=pose,
-        hw=fields.sized("nx", "ny", K=K),
-        distortion=fields[f"kc{which}"].brown_conrady(),
-    )
+    lens = fields[f"kc{which}"].brown_conrady()
+    return fields.camera(pose, K=K, hw=fields.sized("nx", "ny", K=K), distortion=lens)

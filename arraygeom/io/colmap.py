@@ -6,6 +6,10 @@ scalar first. The scale of a COLMAP model is arbitrary unless it was set; it is 
 Without rigs every *image* becomes a camera, named as the image is. Where the model has a rig of several
 cameras, those become the cameras, named "camera1" after their ids (or the folder of their images), and the
 world is the rig's frame.
+
+Written by: COLMAP 3 and later, text and binary, with rigs (since 3.12) or without.
+Refused: models beyond COLMAP's first eleven, RAD_TAN_THIN_PRISM_FISHEYE among them; several rigs.
+Sample: real: Lund's door, of COLMAP's ground truth; [documented](https://colmap.github.io/format.html).
 """
 
 from __future__ import annotations
@@ -203,7 +207,7 @@ def _cameras_text(source: RigSource) -> Iterator[tuple[Entry, int, str]]:
         fields = entry.value.split()
         if len(fields) < 5:
             raise entry.fail("wanted CAMERA_ID MODEL WIDTH HEIGHT PARAMS; is the file whole?")
-        yield Entry(source, fields[2:], entry.name).words(), _id(entry, fields[0]), fields[1]
+        yield Entry(source, fields[2:], entry.name), _id(entry, fields[0]), fields[1]
 
 
 def _images_text(source: RigSource) -> Iterator[Posed]:
@@ -213,7 +217,7 @@ def _images_text(source: RigSource) -> Iterator[Posed]:
         fields = entry.value.split(maxsplit=9)
         if len(fields) != 10:
             raise entry.fail("wanted IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME; is the file whole?")
-        pose = _pose(Entry(source, fields[1:8], entry.name).words())
+        pose = _pose(Entry(source, fields[1:8], entry.name))
         yield pose, _id(entry, fields[8]), fields[9].strip()
 
 

@@ -5,6 +5,10 @@ camera n-1 into camera n, so poses are chained products; metres. The world is ca
 every camera states `T_cam_imu`. `timeshift_cam_imu` (t_imu = t_cam + shift) becomes the sensor's time
 offset. Camera models pinhole (with radtan, equidistant, fov or no distortion), omni (with radtan or none),
 ds and eucm (with none). EuRoC's `sensor.yaml` has the same intrinsics; `T_BS` is camera->body, inverted.
+
+Written by: Kalibr: pinhole, omni, ds, eucm; EuRoC's sensor.yaml and their folders.
+Refused: other camera and distortion models; gaps in the chain.
+Sample: real: Hilti's five fisheyes; [documented](https://github.com/ethz-asl/kalibr/wiki/yaml-formats).
 """
 
 from __future__ import annotations
@@ -121,13 +125,9 @@ def _camera(fields: Entry, pose: Pose) -> Camera:
     first = MODELS[model.value][1]
     numbers = listed.numbers((first + 4,))
     K = fields.at(numbers[first:], "intrinsics").focal_and_centre()
-    return Camera(
-        K=K,
-        cam_from_world=pose,
-        hw=fields.sized("resolution", K=K),
-        distortion=_lens(model.value, numbers[:first].tolist(), fields),
-        sensor=Sensor(time_offset=fields.get("timeshift_cam_imu", 0.0).number()),
-    )
+    lens = _lens(model.value, numbers[:first].tolist(), fields)
+    sensor = Sensor(time_offset=fields.get("timeshift_cam_imu", 0.0).number())
+    return fields.camera(pose, K=K, distortion=lens, sensor=sensor)
 
 
 def _lens(camera: str, before: list[float], fields: Entry) -> Distortion | None:

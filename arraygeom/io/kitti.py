@@ -2,13 +2,17 @@
 
 Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; metres. P0..P3 act on points of
 rectified camera 0, so P = K [I | t] and t = K^-1 P[:, 3]; that has small y and z terms, and t_x = -baseline.
-The raw rig (S K D R T) has X_i = R X_0 + T. `calib.txt` states no image size. Cameras are named cam0..cam3.
+The raw rig (S K D R T) has X_i = R X_0 + T. The rectified file states no image size. Cameras are named
+cam0..cam3.
+
+Written by: KITTI 2012, 2015 and raw: rectified cameras, or with `kitti-raw` those before.
+Refused: files without P0 or K_00.
+Sample: real: calib_cam_to_cam.txt of 2011_09_26, the object benchmark's calibration.
 """
 
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import torch
 
@@ -21,9 +25,7 @@ ENTRIES = r"(P|S|K|D|R|T)\d?(_rect)?(_\d\d)?"
 """Pattern of the names of lines that are read; others may be dates, say."""
 
 
-def recognises(path: Path, head: str) -> bool:
-    """Return True for a text with lines of rectified cameras."""
-    return re.search(r"^(P0|P_rect_0\d):", head, re.MULTILINE) is not None
+HEAD = r"(?m)^(P0|P_rect_0\d):"
 
 
 def read(source: RigSource) -> Rig:
@@ -52,10 +54,7 @@ def _rectified(entries: Entry, name: str) -> Camera:
 class Raw:
     """Reader of the cameras before rectification, in `calib_cam_to_cam.txt`."""
 
-    @staticmethod
-    def recognises(path: Path, head: str) -> bool:
-        """Return True for a text with lines of raw cameras."""
-        return re.search(r"^K_0\d:", head, re.MULTILINE) is not None
+    HEAD = r"(?m)^K_0\d:"
 
     @staticmethod
     def read(source: RigSource) -> Rig:
@@ -73,9 +72,5 @@ class Raw:
     @staticmethod
     def _camera(entries: Entry, n: str) -> Camera:
         K = entries[f"K_{n}"].intrinsics()
-        return Camera(
-            K=K,
-            cam_from_world=pose_of(entries[f"R_{n}"], entries[f"T_{n}"]),
-            hw=entries.sized(f"S_{n}", K=K),
-            distortion=entries[f"D_{n}"].brown_conrady(),
-        )
+        pose, lens = pose_of(entries[f"R_{n}"], entries[f"T_{n}"]), entries[f"D_{n}"].brown_conrady()
+        return entries.camera(pose, K=K, hw=entries.sized(f"S_{n}", K=K), distortion=lens)

@@ -3,16 +3,18 @@
 Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes and coefficients; no pose: the
 camera is at the world's origin. A splined lens displaces pinhole points by cubic B-splines over the
 stereographic projection, whose outermost cells are beyond `fov_deg_x` and `fov_deg_y`.
+
+Written by: lensboy: opencv and pinhole_splined.
+Refused: splines of versions before 3.
+Sample: hand-written: lensboy.json.
 """
 
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import torch
 
-from ..camera import Camera
 from ..lenses import Splined
 from ..lenses.model import LensModel
 from ..lenses.splined import PINHOLE
@@ -24,9 +26,7 @@ OLDEST = 3
 """First version whose splines have this form."""
 
 
-def recognises(path: Path, head: str) -> bool:
-    """Return True for a text with lensboy's version."""
-    return '"lensboy-version"' in head
+HEAD = '"lensboy-version"'
 
 
 def read(source: RigSource) -> Rig:
@@ -36,14 +36,7 @@ def read(source: RigSource) -> Rig:
         RigFileError: for a damaged file, an unsupported lens, or splines of an older version.
     """
     fields = source.json()
-    K = fields.listed("fx", "fy", "cx", "cy").focal_and_centre()
-    camera = Camera(
-        K=K,
-        cam_from_world=Pose.identity(),
-        hw=fields.sized("image_width", "image_height", K=K),
-        distortion=_lens(fields),
-    )
-    return source.rig([(source.path.stem, camera)])
+    return source.rig([(source.path.stem, fields.camera(Pose.identity(), distortion=_lens(fields)))])
 
 
 def _lens(fields: Entry) -> LensModel | None:

@@ -3,11 +3,13 @@
 Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes and lenses; each camera's
 `extrinsics` take points of that camera into another one's (`toCameraSocket`), in centimetres; intrinsics are
 of the stated size. The world is the first camera.
+
+Written by: DepthAI, from an OAK's memory: perspective and fisheye.
+Refused: units other than centimetres, other types; cameras whose K is zeros are left out.
+Sample: real: an OAK-D's calib.json.
 """
 
 from __future__ import annotations
-
-from pathlib import Path
 
 from ..camera import Camera
 from ..pose import Pose
@@ -20,9 +22,7 @@ CENTIMETRES = 1
 SOCKETS = "ABCDEFGHIJ"
 
 
-def recognises(path: Path, head: str) -> bool:
-    """Return True for a text with the JSON's own keys."""
-    return '"cameraData"' in head or ('"boardName"' in head and '"boardRev"' in head)
+HEAD = r'(?s)"cameraData"|(?=.*"boardRev").*"boardName"'
 
 
 def read(source: RigSource) -> Rig:
@@ -90,9 +90,4 @@ def _camera(entry: Entry, pose: Pose) -> Camera:
     kind, lens = entry.get("cameraType", PERSPECTIVE), entry["distortionCoeff"]
     if kind.value not in (PERSPECTIVE, FISHEYE):
         raise kind.fail(f"is {kind.value}; perspective (0) and fisheye (1) are read")
-    return Camera(
-        K=entry["intrinsicMatrix"].intrinsics(),
-        cam_from_world=pose,
-        hw=entry.listed("width", "height").size(),
-        distortion=lens.of_model(kind),
-    )
+    return entry.camera(pose, distortion=lens.of_model(kind))

@@ -9,6 +9,11 @@ transposed one.
 Fisheyes: the struct of fisheyeIntrinsics or fisheyeParameters, a camera "camera1" (Scaramuzza's model). A
 point u, v off `DistortionCenter`, after `StretchMatrix` is undone, is seen along (u, v, a0 + a2 r^2 + a3 r^3
 + a4 r^4); a0 is the focal length here.
+
+Written by: MATLAB's Computer Vision Toolbox, names of before and since R2022b, .mat of version 5 to 7, JSON;
+fisheyes.
+Refused: objects in place of structs; version 7.3; an F that contradicts the pose.
+Sample: hand-written: matlab_old.json, matlab_new.json, matlab_fisheye.json.
 """
 
 from __future__ import annotations

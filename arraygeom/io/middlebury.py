@@ -4,23 +4,22 @@ Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; rec
 `baseline` millimetres to the right of cam0; Z = baseline f / (d + doffs), with doffs the difference of the
 principal points. Where the file states the range of disparities (vmin, vmax), the rig's depth range follows
 from it, to infinity where d + doffs may be 0 or less.
+
+Written by: Middlebury's stereo data of 2014 and 2021.
+Refused: doffs that are not the difference of the principal points.
+Sample: real: PlaytableP; [documented](https://vision.middlebury.edu/stereo/data/scenes2014/).
 """
 
 from __future__ import annotations
 
 import math
-import re
-from pathlib import Path
 
 from ..camera import Camera
 from ..pose import Pose
 from ..rig import Rig
 from .source import RigSource
 
-
-def recognises(path: Path, head: str) -> bool:
-    """Return True for a text with a line of cam0."""
-    return re.search(r"^cam0\s*=\s*\[", head, re.MULTILINE) is not None
+HEAD = r"(?m)^cam0\s*=\s*\["
 
 
 def read(source: RigSource) -> Rig:
@@ -38,9 +37,7 @@ def read(source: RigSource) -> Rig:
     doffs = entries.get("doffs", apart).number()
     if abs(doffs - apart) > 0.5:
         raise source.fail("doffs", f"is {doffs:g}, which is not the difference of the principal points")
-    hw = entries.sized("width", "height", K=Ks[0])
-    metres = baseline * 1e-3
-    first = Pose.identity()
+    hw, metres, first = entries.sized("width", "height", K=Ks[0]), baseline * 1e-3, Pose.identity()
     poses = first, Pose(first.R, first.t.new_tensor([-metres, 0.0, 0.0]))
     cameras = [Camera(K=K, cam_from_world=pose, hw=hw) for K, pose in zip(Ks, poses)]
     depth = None

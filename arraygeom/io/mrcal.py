@@ -4,6 +4,10 @@ Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; `rt
 `extrinsics`, is a rotation vector and a translation in metres that take points of the reference frame into
 the camera's. LENSMODEL_SPLINED_STEREOGRAPHIC's displacements are of stereographic points: the camera model
 `Splined`.
+
+Written by: mrcal 1 and 2: pinhole, OpenCV 4 to 12, LONLAT, splined stereographic.
+Refused: its other models: convert them with mrcal-convert-lensmodel.
+Sample: hand-written: mrcal; [documented](https://mrcal.secretsauce.net/cameramodels.html).
 """
 
 from __future__ import annotations
@@ -41,22 +45,15 @@ def read(source: RigSource) -> Rig:
     Raises:
         RigFileError: for a damaged file, or an unsupported lens model.
     """
-    files = sorted(source.path.glob(f"*{SUFFIX}")) if source.path.is_dir() else [source.path]
-    return source.rig((file.stem, _camera(source.beside(file))) for file in files)
+    return source.rig((file.path.stem, _camera(file)) for file in source.files(f"*{SUFFIX}"))
 
 
 def _camera(source: RigSource) -> Camera:
     fields = _fields(source)
-    rt = fields["rt_cam_ref" if "rt_cam_ref" in fields else "extrinsics"]
-    R, t = rt.numbers((6,)).split(3)
-    numbers = fields["intrinsics"].numbers()
-    K = fields.at(numbers[:4], "intrinsics").focal_and_centre()
-    return Camera(
-        K=K,
-        cam_from_world=pose_of(source.at(R, rt.name), source.at(t, rt.name)),
-        hw=fields.sized("imagersize", K=K),
-        distortion=_lens(fields["lensmodel"], fields["intrinsics"]),
-    )
+    rt, numbers = fields["rt_cam_ref", "extrinsics"], fields["intrinsics"]
+    R, t = (source.at(half, rt.name) for half in rt.numbers((6,)).split(3))
+    K = fields.at(numbers.numbers()[:4], "intrinsics").focal_and_centre()
+    return fields.camera(pose_of(R, t), K=K, distortion=_lens(fields["lensmodel"], numbers))
 
 
 def _lens(model: Entry, numbers: Entry) -> LensModel | None:

@@ -27,7 +27,7 @@ Units and the pixel convention stand in the file. Example:
         gain: [1.9, 1, 1.4]           # of red, green, blue; or one number
     links:                            # pairs of cameras that have only a size
       - {alpha: mono, beta: colour, F: [[...], [...], [...]], H: [[...], [...], [...]]}
-        # of cameras at one place H alone
+        # of cameras at one place H alone, and `spread`, by how many pixels points are off it
 
 A camera that is not calibrated may have a lens all the same, which says itself how many pixels count as 1 and
 where its centre is: `distortion: {model: ..., coefficients: [...], scale: 320, centre: [319.5, 199.5]}`. F
@@ -40,6 +40,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import MISSING
 from pathlib import Path
@@ -293,13 +294,16 @@ def _response(fields: Entry) -> Band | Curve:
 
 
 def _link(fields: Entry, cameras: Mapping[str, View]) -> tuple[tuple[str, str], Link]:
-    _check_keys(fields, ("alpha", "beta", "F", "H"))
+    _check_keys(fields, ("alpha", "beta", "F", "H", "spread"))
     alpha, beta = (_camera_named(fields.get(key), cameras) for key in ("alpha", "beta"))
-    H = fields.get("H")
+    H, spread = fields.get("H"), fields.get("spread", 0.0)
+    if not 0 <= spread.number() < math.inf:
+        raise spread.fail(f"is {spread.number():g}; it is 0 or more, in pixels")
     if H.value is not None and "F" not in fields:
-        return (alpha, beta), Link.from_homography(H.numbers((3, 3)))
-    link = Link(fields.get("F").numbers((3, 3)), None if H.value is None else H.numbers((3, 3)))
-    return (alpha, beta), link
+        return (alpha, beta), Link.from_homography(H.numbers((3, 3)), spread.number())
+    return (alpha, beta), Link(
+        fields.get("F").numbers((3, 3)), None if H.value is None else H.numbers((3, 3))
+    )
 
 
 def _camera_named(entry: Entry, cameras: Mapping[str, View]) -> str:
@@ -404,7 +408,7 @@ def _sensor_entry(sensor: Sensor) -> dict[str, Any]:
 def _link_entry(alpha: str, beta: str, link: Link) -> dict[str, Any]:
     H = {} if link.H is None else {"H": link.H.tolist()}
     F = {"F": link.F.tolist()} if link.F.any() or not H else {}
-    return {"alpha": alpha, "beta": beta} | F | H
+    return {"alpha": alpha, "beta": beta} | F | H | ({"spread": link.spread} if link.spread else {})
 
 
 class _Dumper(SafeDumper):

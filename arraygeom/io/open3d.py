@@ -3,21 +3,21 @@
 Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; metres; `intrinsic_matrix` and
 `extrinsic` (world->camera, 4 x 4) column by column; intrinsics alone (`intrinsic.json` of its Azure Kinect
 recorder) are a camera at the origin. Cameras are named cam0, cam1, ...
+
+Written by: Open3D: PinholeCameraParameters, PinholeCameraTrajectory, intrinsic.json.
+Refused: nothing of it.
+Sample: hand-written: open3d.json;
+[documented](https://www.open3d.org/docs/release/python_api/open3d.camera.PinholeCameraParameters.html).
 """
 
 from __future__ import annotations
-
-from pathlib import Path
 
 from ..camera import Camera
 from ..pose import Pose
 from ..rig import Rig
 from .source import Entry, RigSource
 
-
-def recognises(path: Path, head: str) -> bool:
-    """Return True for a JSON text with Open3D's classes or keys."""
-    return head.lstrip().startswith("{") and ('"PinholeCamera' in head or '"intrinsic_matrix"' in head)
+HEAD = r'(?s)\s*\{.*"(PinholeCamera|intrinsic_matrix")'
 
 
 def read(source: RigSource) -> Rig:
@@ -32,11 +32,7 @@ def read(source: RigSource) -> Rig:
 
 
 def _camera(fields: Entry) -> Camera:
-    intrinsic = fields if "intrinsic_matrix" in fields else fields["intrinsic"]
-    K = intrinsic["intrinsic_matrix"].transposed(3).intrinsics()
-    posed = intrinsic is not fields
-    return Camera(
-        K=K,
-        cam_from_world=fields["extrinsic"].transposed(4).pose_matrix() if posed else Pose.identity(),
-        hw=intrinsic.sized("width", "height", K=K),
-    )
+    posed = "intrinsic_matrix" not in fields
+    intrinsic = fields["intrinsic"] if posed else fields
+    pose = fields["extrinsic"].transposed(4).pose_matrix() if posed else Pose.identity()
+    return intrinsic.camera(pose, K=intrinsic["intrinsic_matrix"].transposed(3).intrinsics(), distortion=None)

@@ -3,6 +3,10 @@
 Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; `Extrinsic from "A" To "B"` takes
 points of A into B, in metres, the matrix row by row. The world is the depth camera, or the first stream that
 has intrinsics.
+
+Written by: `rs-enumerate-devices -c` of librealsense 2, every stream at one size.
+Refused: inverse models; modified Brown-Conrady with tangential terms.
+Sample: hand-written: realsense.txt, as the tool prints it.
 """
 
 from __future__ import annotations
@@ -10,7 +14,6 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from ..camera import Camera
 from ..distortion import Distortion
 from ..pixels import HW
 from ..pose import Pose
@@ -45,7 +48,7 @@ def read(source: RigSource) -> Rig:
     streams: dict[str, tuple[HW, Entry]] = {}
     for name, listed in INTRINSIC.findall(text):
         fields = source.at(dict(ENTRY.findall(listed)), name)
-        hw = fields.listed("Width", "Height").words().size()
+        hw = fields.listed("Width", "Height").size()
         fields.use()  # of the streams that are left out, too
         earlier = streams.get(name)
         wanted = hw == source.hw if source.hw is not None else earlier is None or hw > earlier[0]
@@ -56,7 +59,7 @@ def read(source: RigSource) -> Rig:
     poses = {(a, b): (R, t) for a, b, R, t in EXTRINSIC.findall(text)}
     first = "Depth" if "Depth" in streams else next(iter(streams))
     return source.rig(
-        (name, _camera(fields, hw, _pose(source, poses, first, name)))
+        (name, fields.camera(_pose(source, poses, first, name), hw=hw, distortion=_lens(fields)))
         for name, (hw, fields) in streams.items()
     )
 
@@ -66,15 +69,10 @@ def _pose(source: RigSource, poses: dict[tuple[str, str], tuple[str, str]], firs
         return Pose.identity()
     for a, b in ((first, name), (name, first)):
         if (a, b) in poses:
-            R, t = (source.at(text, f"Extrinsic from {a} to {b}").words() for text in poses[a, b])
+            R, t = (source.at(text, f"Extrinsic from {a} to {b}") for text in poses[a, b])
             pose = pose_of(R, t)
             return pose if a == first else pose.inverse()
     raise source.fail(name, f"has no extrinsic from or to {first}; is the file whole?")
-
-
-def _camera(fields: Entry, hw: HW, pose: Pose) -> Camera:
-    K = fields.listed("Fx", "Fy", "PPX", "PPY").words().focal_and_centre()
-    return Camera(K=K, cam_from_world=pose, hw=hw, distortion=_lens(fields))
 
 
 def _lens(fields: Entry) -> Distortion | None:
@@ -83,7 +81,7 @@ def _lens(fields: Entry) -> Distortion | None:
     The modified model applies p1 and p2 to points that are distorted already: it is read where they are 0,
     and then the same. The inverse model's polynomial undistorts.
     """
-    listed, kind = fields.get("Coeffs", "").words(), fields["Distortion"]
+    listed, kind = fields.get("Coeffs", ""), fields["Distortion"]
     c = listed.numbers()
     if not c.any():
         return None

@@ -4,6 +4,10 @@ Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; met
 K' [I | t] acts on points of the *rectified* frame, which all cameras of a stereo pair share and which is the
 world here; `rectification_matrix` takes the camera's frame into it: X_cam = R_rect^T (X_world + t). A P of
 zeros states nothing: the camera is then at the world's origin, rotated by R_rect.
+
+Written by: calibrators of ROS 1 and 2 (YAML), and `rostopic echo` or `ros2 topic echo` of CameraInfo.
+Refused: models other than plumb_bob, rational_polynomial, equidistant.
+Sample: hand-written: ros; [documented](https://docs.ros.org/en/api/sensor_msgs/html/msg/CameraInfo.html).
 """
 
 from __future__ import annotations
@@ -16,13 +20,17 @@ import torch
 from ..camera import Camera
 from ..pose import Pose
 from ..rig import Rig
-from .source import LENS_NAME, Entry, RigSource, decoded
+from .source import Entry, RigSource, decoded
 
 
 def recognises(path: Path, head: str) -> bool:
     """Return True for the text of a CameraInfo, or a folder with one."""
     if path.is_dir():
-        return any(_is_camera_info(decoded(file.read_bytes()[:4096])) for file in _yaml_files(path))
+        return any(
+            _is_camera_info(decoded(file.read_bytes()[:4096]))
+            for file in path.glob("*.y*ml")
+            if file.is_file()
+        )
     return _is_camera_info(head)
 
 
@@ -32,13 +40,8 @@ def read(source: RigSource) -> Rig:
     Raises:
         RigFileError: for a damaged file, or an unsupported lens.
     """
-    files = _yaml_files(source.path) if source.path.is_dir() else [source.path]
-    infos = [file for file in files if len(files) == 1 or _is_camera_info(decoded(file.read_bytes()))]
-    return source.rig(_camera(source.beside(file)) for file in infos)
-
-
-def _yaml_files(folder: Path) -> list[Path]:
-    return sorted(file for file in folder.iterdir() if file.suffix in {".yaml", ".yml"} and file.is_file())
+    files = source.files("*.y*ml")
+    return source.rig(_camera(f) for f in files if len(files) == 1 or _is_camera_info(decoded(f.content())))
 
 
 def _is_camera_info(text: str) -> bool:
@@ -47,25 +50,16 @@ def _is_camera_info(text: str) -> bool:
 
 
 def _camera(source: RigSource) -> tuple[str, Camera]:
-    info = source.yaml(
-        re.split(r"^---", source.text().removeprefix("---"), flags=re.M)[0]
-    )  # the first message
-    K = _numbers(info["camera_matrix", "K", "k"]).intrinsics()
-    topic = "width" if "width" in info else "image_width", "height" if "height" in info else "image_height"
-    lens = _numbers(info.find(LENS_NAME)).of_model(info["distortion_model"])
-    camera = Camera(K=K, cam_from_world=_pose(info), hw=info.sized(*topic, K=K), distortion=lens)
+    info = source.document()
+    if "distortion_model" not in info:
+        raise source.fail("distortion_model", "is missing; is this a CameraInfo?")
     frame = (info.get("header").value or {}).get("frame_id")
-    return str(info.get("camera_name").value or frame or source.path.stem), camera
-
-
-def _numbers(entry: Entry) -> Entry:
-    """Return the numbers of a file's matrix, or a message's."""
-    return entry["data"] if isinstance(entry.value, dict) else entry
+    return str(info.get("camera_name").value or frame or source.path.stem), info.camera(_pose(info))
 
 
 def _pose(info: Entry) -> Pose:
     rect_from_cam = stereo = Pose.identity()
-    R, entry = (_numbers(info.find(name)) for name in ("rectificationmatrix|r", "projectionmatrix|p"))
+    R, entry = (info.find(name) for name in ("rectificationmatrix|r", "projectionmatrix|p"))
     if R.value is not None and R.tensor().any():
         rect_from_cam = Pose(R.rotation(), stereo.t)
     if entry.value is not None:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import codecs
-import json
 import re
 import tomllib
-from collections.abc import Iterable, Mapping
+import xml.etree.ElementTree as ET
+from collections import ChainMap
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from ..distortion import BROWN_CONRADY, COEFFICIENT_COUNTS, KANNALA_BRANDT, Dist
 from ..pixels import HW, shift_matrix
 from ..pose import Pose, rotation_error, rotation_from_vector
 from ..rig import Rig
-from ..runtime.safe_yaml import load_json, load_yaml, yaml_problem
+from ..runtime.safe_yaml import DEEPEST, LARGEST_TEXT, load_json, load_yaml, text_problem
 from ..runtime.text import short
 from ..runtime.warned import warn
 
@@ -33,6 +34,15 @@ LENS_NAME = (
 )
 R_NAME, T_NAME = "(r|rot|rotation)(vector|vec|matrix|mat)?", "(t|trans|translation)(vector|vec|matrix)?"
 """Patterns of the usual names of K, R, t and of a lens's coefficients, in small letters without signs."""
+POSE_NAME = r"extrinsics?(matrix|mat)?|rt|w2c|world(to|2)cam(era)?|tcw|tcamworld|cam(era)?fromworld"
+"""Pattern of the usual names of a matrix that takes points of the world into the camera's frame."""
+PINHOLE_NAMES = tuple(
+    rf"(camera|cam)?({name})"
+    for name in ("fx|focalx", "fy|focaly", "cx|ppx|principalpointx", "cy|ppy|principalpointy")
+)
+SIZE_NAMES = tuple(rf"(image|img|im|camera|cam|frame)?({side})" for side in ("width|w", "height|h"))
+SIZE_NAME = "(image|img|imager|camera|cam|frame|sensor)?(size|resolution)"
+"""Patterns of the usual names of focal lengths and centre one by one, and of the image's size."""
 MODEL_NAMES = (
     r"(lens|distortion|dist)(model|type)",
     r"(is)?fisheye(model|lens|camera)?",
@@ -54,11 +64,15 @@ BROWN_WORDS = (
     *("rationalpolynomial", "perspective", "pinhole", "standard", "radial", "simpleradial", "simplepinhole"),
 )
 FISHEYE_WORDS = (
-    *("equidistant", "equi", "fisheye", "kannalabrandt", "kannalabrandt4", "kb4", "kb", "opencvfisheye"),
+    *("equidistant", "equi", "fisheye", "kannalabrandt", "kannalabrandt4", "kannalabrandt8"),
+    *("kb4", "kb8", "kb", "opencvfisheye"),
 )
 LENS_WORD = re.compile(
     "|".join([*BROWN_WORDS[:3], *FISHEYE_WORDS, ".*(fisheye|omni|fov|mei|eucm|sphere|division).*"])
 )
+BROWN_KEYS, FISHEYE_KEYS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), ("k1", "k2", "k3", "k4")
+LARGE_DATA = re.compile(r"\[[^\][]{300000,}\]")
+"""Pattern of data that is no camera's, such as a map of a rectification."""
 SMALL_TANGENTIAL = 0.01
 """Size above which the tangential coefficients of a lens are more likely a fisheye's third and fourth."""
 NO_MAPPING = "is not a mapping of names to values, or an empty one; is the file whole?"
@@ -194,16 +208,7 @@ class RigSource:
         Raises:
             RigFileError: for any other file.
         """
-        text = self.text()
-        try:
-            document = load_json(text)
-        except json.JSONDecodeError as error:
-            raise self.fail(
-                f"line {error.lineno}", f"is not JSON ({error.msg}); is the file whole?"
-            ) from None
-        except ValueError as error:
-            raise self.fail(None, str(error)) from None
-        return self.at(document).mapping()
+        return self._parsed("JSON", load_json, self.text())
 
     def toml(self) -> Entry:
         """Parse the file as a TOML document that is not empty.
@@ -214,11 +219,7 @@ class RigSource:
         Raises:
             RigFileError: for any other file.
         """
-        text = self.text()
-        try:
-            return self.at(tomllib.loads(text)).mapping()
-        except tomllib.TOMLDecodeError as error:
-            raise self.fail(None, f"is not TOML ({error}); is the file whole?") from None
+        return self._parsed("TOML", tomllib.loads, self.text())
 
     def yaml(self, text: str | None = None) -> Entry:
         """Parse the file as a YAML mapping that is not empty and has no repeated keys.
@@ -232,13 +233,55 @@ class RigSource:
         Raises:
             RigFileError: for any other file.
         """
+        return self._parsed("YAML", load_yaml, self.text() if text is None else text)
+
+    def xml(self) -> ET.Element:
+        """Return the root of an XML file.
+
+        Raises:
+            RigFileError: for a file that is too large, defines entities, or is no XML.
+        """
+        text = self.text(LARGEST_TEXT)
+        if "<!DOCTYPE" in text or "<!ENTITY" in text:
+            raise self.fail(None, "defines entities, which no tool for cameras writes")
         try:
-            return self.at(load_yaml(self.text() if text is None else text)).mapping()
-        except yaml.YAMLError as error:
-            line, problem = yaml_problem(error)
+            return ET.fromstring(text)
+        except ET.ParseError as error:
+            raise self.fail(f"line {error.position[0]}", "is not XML; is the file whole?") from None
+
+    def document(self) -> Entry:
+        """Return the mapping of a file in JSON, TOML, XML or YAML, OpenCV's dialects and messages included.
+
+        Of several YAML documents the first, and of OpenCV's data what is no picture or map.
+
+        Raises:
+            RigFileError: for any other file.
+        """
+        text = self.text(LARGEST_TEXT)
+        first = text.lstrip()[0]
+        if first == "{" or self.path.suffix == ".toml":
+            return self.json() if first == "{" else self.toml()
+        if first == "<":
+            return self.at(_value_of_xml(self.at(self.xml()))).mapping()
+        text = LARGE_DATA.sub("[]", re.sub(r"^%YAML.*|!!opencv[\w-]+", "", text, flags=re.M))
+        documents = re.split(r"^(?:---|\.\.\.)", text, flags=re.M)
+        return self.yaml(next(filter(str.strip, documents), ""))
+
+    def _parsed(self, kind: str, load: Callable[[str], Any], text: str) -> Entry:
+        try:
+            document = load(text)
+        except (ValueError, yaml.YAMLError) as error:
+            line, problem = text_problem(error)
             raise self.fail(
-                f"line {line}" if line else None, f"is not YAML ({problem}); is the file whole?"
+                f"line {line}" if line else None, f"is not {kind} ({problem}); is the file whole?"
             ) from None
+        return self.at(document).mapping()
+
+    def files(self, pattern: str) -> list[RigSource]:
+        """Return the files of a folder whose names match, in order; of a file itself."""
+        inside = sorted(path for path in self.path.glob(pattern) if path.is_file())
+        paths = inside if self.path.is_dir() else [self.path]
+        return [self.beside(path) for path in paths]
 
     def lines(self, separator: str, pattern: str) -> Entry:
         """Parse a text of lines "name separator numbers", such as "P0: 721 0 609 ...".
@@ -267,7 +310,7 @@ class RigSource:
                 raise self.fail(name, "has no closing bracket; is the file whole?")
             if value.startswith("["):
                 value = re.sub("[;,]", " ", value[1:-1])
-            entries[name] = self.at(value, name).words().numbers()
+            entries[name] = self.at(value, name).numbers()
         return self.at(entries)
 
     def size_unstated(self, K: Tensor | None) -> HW:
@@ -409,7 +452,7 @@ class Entry:
         Args:
             name: regular expression of such a name.
             side: camera of a stereo pair that the name must state: "1" for the left one ("left", "l", "1"),
-                "2" for the right one; "" for names that state none.
+                "2" for the right one; another end of the name; "" for names that state none.
 
         Returns:
             The entry; its value is None if no name matches.
@@ -419,13 +462,13 @@ class Entry:
         """
         ends = {"1": ("left|l", "1"), "2": ("right|r", "2")}.get(side)
         name = f"({name})"
-        one = f"({ends[0]}){name}|{name}({ends[0]}|{ends[1]})" if ends else name
+        one = f"({ends[0]}){name}|{name}({ends[0]}|{ends[1]})" if ends else name + re.escape(side)
         keys = [
             key
             for key, value in self._named().items()
             if re.fullmatch(one, plain(key))
             and value is not None
-            and not (SCALAR.fullmatch(plain(key)) and single(value))
+            and not (SCALAR.fullmatch(plain(key).removeprefix("camera")) and single(value))
         ]
         for key in keys[1:]:
             if str(self.value[key]) != str(self.value[keys[0]]):
@@ -453,13 +496,14 @@ class Entry:
                     return word
         return self.at(None, "")
 
-    def sized(self, *keys: str, K: Tensor | None) -> HW:
+    def sized(self, *keys: str, K: Tensor | None, side: str = "") -> HW:
         """Return the image size under two keys (width, height), or under one that holds both.
 
         Args:
-            keys: the two keys, or the one.
+            keys: the two keys, or the one; none for the usual names.
             K: intrinsic matrix in our pixels, for a file that states no size (`size_unstated`); None if K
                 itself depends on the size.
+            side: as of `find`, for the usual names; names without a side serve too.
 
         Returns:
             Height and width in pixels.
@@ -467,9 +511,95 @@ class Entry:
         Raises:
             RigFileError: for a size that is not positive and whole, or too large.
         """
-        if any(self.get(key).value is None for key in keys):
-            return self.source.size_unstated(K)
-        return (self[keys[0]] if len(keys) == 1 else self.listed(*keys)).size()
+        usual = (
+            [] if keys else [(names, which) for which in (side, "") for names in (SIZE_NAMES, [SIZE_NAME])]
+        )
+        choices = [[self.find(name, which) for name in names] for names, which in usual]
+        for found in choices or [[self.get(key) for key in keys]]:
+            if all(entry.value is not None for entry in found):
+                return self.joined(found).size()
+        return self.source.size_unstated(K)
+
+    def K(self, side: str = "") -> Tensor:
+        """Return the intrinsic matrix under a usual name, of one side of a pair or of none.
+
+        A matrix, or focal lengths and centre as four numbers or one by one.
+
+        Raises:
+            RigFileError: if there is none, and as `intrinsics`.
+        """
+        entry, parts = self.find(K_NAME, side), [self.find(name, side) for name in PINHOLE_NAMES]
+        if entry.value is not None:
+            return entry.focal_and_centre() if entry.numbers().numel() == 4 else entry.intrinsics()
+        if any(part.value is None for part in parts):
+            raise self.fail(f"has no matrix of intrinsics: wanted camera_matrix{side}, or fx, fy, cx, cy")
+        return self.joined(parts).focal_and_centre()
+
+    def usual_lens(self, side: str = "") -> Distortion | None:
+        """Return the lens of coefficients under a usual name, or of k1, k2, p1, p2 ... one by one.
+
+        Raises:
+            RigFileError: as `of_model`.
+        """
+        entry, word = self.find(LENS_NAME, side), self.model(side)
+        fields = entry if entry.is_table else self
+        keys = {re.sub("^cam(era)?", "", plain(key)): key for key in fields.value} if not side else {}
+        if "k1" not in keys or (entry.value is not None and not entry.is_table):
+            return entry.of_model(word)
+        said, perspective = _said(word), "k4" not in keys or "p1" in keys or "p2" in keys
+        fisheye = said in FISHEYE_WORDS or (said is None and not perspective)
+        names = FISHEYE_KEYS if fisheye else BROWN_KEYS
+        c = [fields.get(keys[name]).number() if name in keys else 0.0 for name in names]
+        listed = fields.at(c if any(c[5:]) else c[:5], ", ".join(name for name in names if name in keys))
+        if said is not None:
+            return listed.of_model(word)
+        return listed.kannala_brandt() if fisheye else listed.brown_conrady()
+
+    def camera(self, pose: Pose | None = None, *, side: str = "", **stated: Any) -> Camera:
+        """Return a camera. What is not stated is found under its usual names.
+
+        Args:
+            pose: pose in the world; None to find it.
+            side: end of the names, as of `find`.
+            stated: K, hw, distortion or sensor as of `Camera`.
+
+        Raises:
+            RigFileError: for a camera without K, or without a pose; for numbers that no camera has.
+        """
+        if "K" not in stated and (inner := self.find(K_NAME, side)).is_table:
+            self.use()
+            rest = {key: value for key, value in self.value.items() if value is not inner.value}
+            return Entry(self.source, ChainMap(inner.value, rest), self.name).camera(pose, **stated)
+        K = stated.pop("K") if "K" in stated else self.K(side)
+        hw = stated.pop("hw") if "hw" in stated else self.sized(K=K, side=side)
+        lens = stated.pop("distortion") if "distortion" in stated else self.usual_lens(side)
+        pose = self.pose(side) if pose is None else pose
+        if pose is None:
+            raise self.fail("has no R and t, from the world into the camera: state them")
+        return Camera(K=K, cam_from_world=pose, hw=hw, distortion=lens, **stated)
+
+    def pose(self, side: str = "") -> Pose | None:
+        """Return the pose by R and t, or a matrix, under usual names; None if neither is there.
+
+        Raises:
+            RigFileError: for one of R and t without the other, and as `pose_of`.
+        """
+        R, t, both = (self.find(name, side) for name in (R_NAME, T_NAME, POSE_NAME))
+        if both.value is not None and R.value is None:
+            return both.pose() if both.is_table else both.pose_matrix()
+        if (R.value is None) != (t.value is None):
+            raise self.fail(f"has {R.name or t.name} and no {'R' if R.value is None else 't'}: state both")
+        return None if R.value is None else pose_of(R, t)
+
+    @property
+    def has_K(self) -> bool:
+        """True for a mapping with a usual name of K, or of a focal length."""
+        return any(self.find(name).value is not None for name in (K_NAME, PINHOLE_NAMES[0]))
+
+    @property
+    def is_table(self) -> bool:
+        """True for a mapping of names, which is no matrix of OpenCV's or ROS'."""
+        return isinstance(self.value, Mapping) and "data" not in self.value
 
     def each(self) -> list[Entry]:
         """Return the parts of a list.
@@ -487,7 +617,12 @@ class Entry:
         Raises:
             RigFileError: if one is missing.
         """
-        return self.at([self[key].value for key in keys], ", ".join(keys))
+        return self.joined([self[key] for key in keys])
+
+    def joined(self, entries: Sequence[Entry]) -> Entry:
+        """Return entries of this mapping as one list; one alone as it is."""
+        names = ", ".join(entry.name.removeprefix(f"{self.name}.") for entry in entries)
+        return entries[0] if len(entries) == 1 else self.at([entry.value for entry in entries], names)
 
     def tensor(self, *, infinite: bool = False, also: str = "") -> Tensor:
         """Return the numbers, nested in lists or not, as a float64 tensor.
@@ -502,7 +637,12 @@ class Entry:
         Raises:
             RigFileError: for NaN, infinity unless accepted, and values that are no numbers.
         """
-        tensor = float64_of(self.value)
+        value = self.value
+        if isinstance(value, Mapping) and "data" in value:  # OpenCV's and ROS' matrices
+            value = value["data"]
+        if isinstance(value, str) or (isinstance(value, list) and any(isinstance(x, str) for x in value)):
+            value = _spaced(value)
+        tensor = float64_of(value)
         if tensor is None:
             raise self.fail(f"holds something other than numbers: {short(self.value)}{also}")
         if tensor.isnan().any() or (tensor.isinf().any() and not infinite):
@@ -527,21 +667,6 @@ class Entry:
         if shape is not None and tensor.numel() != torch.Size(shape).numel():
             raise self.fail(f"has {tensor.numel()} numbers{wanted}; is the file whole?")
         return tensor.reshape(shape or (-1,))
-
-    def words(self) -> Entry:
-        """Split a text, or several, at spaces into numbers.
-
-        Returns:
-            The entry of one list of numbers, under the same name.
-
-        Raises:
-            RigFileError: for words that are no numbers.
-        """
-        text = self.value if isinstance(self.value, str) else " ".join(self.value)
-        try:
-            return Entry(self.source, [float(word) for word in text.split()], self.name)
-        except ValueError:
-            raise self.fail(f"holds something other than numbers: {short(text)}") from None
 
     def number(self) -> float:
         """Return one finite number.
@@ -696,9 +821,7 @@ class Entry:
             RigFileError: for an unknown model, one that contradicts the user's, or a fisheye without
                 coefficients.
         """
-        said = plain(word.value) if isinstance(word.value, str) else None
-        if said is None and word.value is not None:
-            said = "fisheye" if word.value else "brown"
+        said = _said(word)
         wanted, none = self.source.lens, said in ("", "none")
         model = BROWN_CONRADY if said in BROWN_WORDS else KANNALA_BRANDT if said in FISHEYE_WORDS else wanted
         if said and not none and said not in [*BROWN_WORDS, *FISHEYE_WORDS]:
@@ -780,7 +903,7 @@ def suspicious(key: Any, value: Any) -> bool:
     if isinstance(value, Mapping):
         return bool(re.fullmatch(rf"(lens|{LENS_NAME}).?", name)) and bool(value)
     if isinstance(value, str):
-        value = [float(word) for word in re.findall(r"[-+]?\d[\d.]*(?:[eE][-+]?\d+)?", value)]
+        value = _spaced(value.replace(",", " "))
     if SCALAR.fullmatch(name):
         return value != 0 if single(value) else isinstance(value, list) and len(value) == 1 and value[0] != 0
     numbers = None if isinstance(value, bool) else float64_of(value)
@@ -805,6 +928,41 @@ def float64_of(value: Any) -> Tensor | None:
         return torch.as_tensor(value, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError):
         return None
+
+
+def _said(word: Entry) -> str | None:
+    """Return the name of a lens model in small letters, also of a flag of fisheyes; None for none."""
+    if word.value is None or isinstance(word.value, str):
+        return None if word.value is None else plain(word.value)
+    return "fisheye" if word.value else "brown"
+
+
+def _spaced(value: str | list[Any]) -> list[float] | None:
+    """Return the numbers of a text, or of several, between spaces; None for other words."""
+    words = (value if isinstance(value, str) else " ".join(map(str, value))).split()
+    try:
+        return [float(re.sub(r"^([-+]?)\.(?=[a-zA-Z])", r"\1", word)) for word in words]  # YAML's .nan
+    except ValueError:
+        return None
+
+
+def _value_of_xml(entry: Entry, depth: int = 0) -> Any:
+    """Return what OpenCV's XML holds: mappings, lists, numbers, texts."""
+    if depth > DEEPEST:
+        raise entry.source.fail(None, f"is nested more than {DEEPEST} deep")
+    parts = list(entry.value)
+    if not parts:
+        text = (entry.value.text or "").strip().strip('"')
+        numbers = _spaced(text)
+        return numbers[0] if numbers and len(numbers) == 1 else text
+    if all(part.tag == "_" for part in parts):
+        return [_value_of_xml(entry.at(part, str(i)), depth + 1) for i, part in enumerate(parts)]
+    values: dict[str, Any] = {}
+    for part in parts:
+        if part.tag in values:
+            raise entry.at(None, part.tag).fail("occurs twice; keep one")
+        values[part.tag] = _value_of_xml(entry.at(part, part.tag), depth + 1)
+    return values
 
 
 def _has_truth(value: Any) -> bool:

@@ -2,12 +2,15 @@
 
 Source convention: X_cam = R^T (X - t) in millimetres; K from u0, v0, au, av; no distortion; pixels are taken
 to have the first centre at 0 (shift 0), which the files do not say; OpenCV axes. Name either file of a pair.
+
+Written by: SYNTIM's stereo pairs (INRIA).
+Refused: nothing of it.
+Sample: real: 25 pairs.
 """
 
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 from ..camera import Camera
 from ..rig import Rig
@@ -17,9 +20,7 @@ SIDES = {"_g": "left", "_d": "right"}
 NUMBER = r"([-+]?(?:nan|inf|[\d.]+(?:[eE][-+]?\d+)?))"
 
 
-def recognises(path: Path, head: str) -> bool:
-    """Return True for a text with the format's headings."""
-    return "Intrinsic parameters:" in head and "Scale factor" in head
+HEAD = r"(?s)(?=.*Intrinsic parameters:).*Scale factor"
 
 
 def read(source: RigSource) -> Rig:
@@ -41,12 +42,12 @@ def _camera(source: RigSource) -> Camera:
     fields = source.at({name.lower(): value for name, value in stated})
     rotation, _, translation = text.partition("Rotation:")[2].partition("Translation:")
     R, t = (
-        source.at(re.findall(NUMBER, section, re.IGNORECASE), name).words()
+        source.at(re.findall(NUMBER, section, re.IGNORECASE), name)
         for section, name in ((rotation, "Rotation"), (translation, "Translation"))
     )
     R.numbers((3, 3))
     return Camera(
-        K=fields.listed("au", "av", "u0", "v0").words().focal_and_centre(),
+        K=fields.listed("au", "av", "u0", "v0").focal_and_centre(),
         cam_from_world=pose_of(R, t, metres=1e-3).inverse(),
-        hw=fields.listed("dimx", "dimy").words().size(),
+        hw=fields.listed("dimx", "dimy").size(),
     )

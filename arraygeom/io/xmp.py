@@ -11,6 +11,11 @@ C D E F takes to pixels. `RigRelatives` are degrees about x, y and z, R = Rx Ry 
 `RigTranslations` are the cameras' centres, metres. DJI's `DewarpData` is fx fy cx cy k1 k2 p1 p2 k3, with
 cx and cy counted from `CalibratedOpticalCenter`, for images whose `DewarpFlag` is not 1. All are of the
 pixels as stored: the rig is of the images as their orientation tags say.
+
+Written by: tags in images of MicaSense, Parrot Sequoia, senseFly (Pix4D's `Camera:`) and of DJI;
+`DewarpFlag`, `BlackCurrent`, `SensorGain`, bands.
+Refused: images of several captures; mirrored images; vignetting and `CalibratedHMatrix` are left out.
+Sample: real: a Sequoia's capture, two of a RedEdge.
 """
 
 from __future__ import annotations
@@ -132,7 +137,7 @@ def named_by_band(paths: Sequence[Path]) -> dict[str, Path]:
     bands = []
     for path in paths:
         tags = image_tags(path)
-        words = (tags.text(PIX4D, "BandName") or tags.text(DJI, "BandName") or "").split(",") if tags else []
+        words = tags.xmp.get("BandName", "").split(",") if tags else []
         name = "rgb" if len(words) == 3 else words[0] if len(words) == 1 else ""
         bands.append(re.sub(r"[^\w.-]+", "_", name.lower()))
     ends = [path.stem.rpartition("_")[2] for path in paths]
@@ -174,10 +179,7 @@ def rig_of_images(files: Mapping[str, Path]) -> Rig:
     rig = first.rig(cameras)
     if unrotated := [name for name, image in images.items() if image.rotation is None][1:]:
         first.warn(f"RigRelatives are not stated of {', '.join(unrotated)}: parallel axes are assumed")
-    vignetting = [
-        (image, ns, key) for image in images.values() for ns, key in image.tags.xmp if "Vignetting" in key
-    ]
-    if [image.text(key, ns) for image, ns, key in vignetting]:
+    if [image.text(key) for image in images.values() for key in image.tags.xmp if "Vignetting" in key]:
         first.warn("vignetting is stated, and not applied: values are as recorded")
     first.warn_of_unread()
     if len(cameras) > 1 and not any(bool(image.centre.any()) for image in images.values()):
@@ -192,7 +194,7 @@ class _Image(NamedTuple):
 
     source: RigSource
     tags: ImageTags
-    stated: dict[str, Entry]
+    stated: Entry
 
     @classmethod
     def from_source(cls, source: RigSource) -> _Image:
@@ -207,22 +209,19 @@ class _Image(NamedTuple):
         tags = image_tags(source.path)
         if tags is None or not _states_camera(tags):
             raise source.fail(None, "has no tags of a camera (Camera: or drone-dji): give a rig file instead")
-        xmp = tags.xmp.items()
-        names = (PIX4D, DJI, MICASENSE)
-        return cls(
-            source, tags, {ns: source.at({key: v for (one, key), v in xmp if one == ns}) for ns in names}
-        )
+        return cls(source, tags, source.at(tags.xmp))
 
-    def text(self, name: str, namespace: str = PIX4D) -> str | None:
+    def text(self, name: str) -> str | None:
         """Return an XMP tag; None if it is not stated."""
-        value = self.stated[namespace].get(name).value
-        return None if value is None else str(value)
+        value: str | None = self.stated.get(name).value
+        return value
 
-    def numbers(self, name: str, *count: int, namespace: str = PIX4D) -> Tensor | None:
+    def numbers(self, name: str, *count: int) -> Tensor | None:
         """Return the numbers of a tag, as many as `count` states; None if it is not stated."""
-        text = self.text(name, namespace)
-        words = None if text is None else self.source.at(re.sub("[,;]", " ", text), name).words()
-        return None if words is None else words.numbers(count or None)
+        text = self.text(name)
+        return (
+            None if text is None else self.stated.at(re.sub("[,;]", " ", text), name).numbers(count or None)
+        )
 
     def needed(self, name: str, count: int) -> Tensor:
         """Return the numbers of one of Pix4D's tags.
@@ -327,19 +326,15 @@ class _Image(NamedTuple):
 
     def _dji(self) -> tuple[Tensor, Distortion | None]:
         """Return K and the lens by DJI's DewarpData: fx, fy, cx, cy from the middle, k1, k2, p1, p2, k3."""
-        (h, w), text = self.tags.hw, self.text("DewarpData", DJI) or ""
+        (h, w), text = self.tags.hw, self.text("DewarpData") or ""
         dated, _, numbers = text.rpartition(";")
         if not dated:
             raise self.source.fail("DewarpData", "is not a date and nine numbers: give a rig file instead")
-        listed = self.source.at(numbers.replace(",", " "), "DewarpData").words()
+        listed = self.source.at(numbers.replace(",", " "), "DewarpData")
         fx, fy, cx, cy, *c = listed.numbers((9,)).tolist()
-        middle = [
-            (self.numbers(f"CalibratedOpticalCenter{axis}", namespace=DJI), n / 2)
-            for axis, n in (("X", w), ("Y", h))
-        ]
-        x, y = (half if stated is None else float(stated[0]) for stated, half in middle)
+        x, y = (self._one(f"CalibratedOpticalCenter{axis}", n / 2) for axis, n in (("X", w), ("Y", h)))
         K = torch.tensor([[fx, 0, x + cx], [0, fy, y + cy], [0, 0, 1]], dtype=torch.float64)
-        flag = self.numbers("DewarpFlag", 1, namespace=DJI)
+        flag = self.numbers("DewarpFlag", 1)
         if flag is None:
             self.source.warn("DewarpFlag is not stated: taken as not dewarped, with the lens of DewarpData")
         return K, None if flag is not None and flag.any() else self.source.at(c, "DewarpData").brown_conrady()
@@ -358,15 +353,15 @@ class _Image(NamedTuple):
         """Return the sensor by the tags: band, black level, exposure and gain."""
         fields = self.tags.fields
         colour = len((self.text("BandName") or "").split(",")) == 3
-        centre, width = (self._one(name) for name in ("CentralWavelength", "WavelengthFWHM"))
+        centre, width = (self._one(name, 0.0) for name in ("CentralWavelength", "WavelengthFWHM"))
         if centre and not width and not colour:
             self.source.warn(f"WavelengthFWHM is not stated: a band {USUAL_WIDTH:g} nm wide is assumed")
         response = "rgb" if colour else Band(centre, width or USUAL_WIDTH) if centre else None
-        black = fields.get(BLACK_LEVEL, self.numbers("BlackCurrent", namespace=DJI))
+        black = fields.get(BLACK_LEVEL, self.numbers("BlackCurrent"))
         if colour or self.source.path.suffix.lower() in PHOTOGRAPHS:  # developed: sRGB, no counts of light
             return Sensor(response=response)
         stated = fields.get(ISO, fields.get(ISO_SPEED))
-        gain = self.numbers("SensorGain", 1, namespace=DJI)
+        gain = self.numbers("SensorGain", 1)
         speed = float(stated[0]) if stated else 100.0 if gain is None else 100.0 * float(gain)
         missing = {"black level": black is None, "gain (ISO speed)": stated is None and gain is None}
         if any(missing.values()):
@@ -385,22 +380,19 @@ class _Image(NamedTuple):
             gain=float(speed) / 100.0,
         )
 
-    def _one(self, name: str) -> float | None:
+    def _one(self, name: str, otherwise: float) -> float:
         numbers = self.numbers(name)
-        numbers = self.numbers(name, namespace=DJI) if numbers is None else numbers
-        return None if numbers is None else float(numbers[0])
+        return otherwise if numbers is None else float(numbers[0])
 
 
 def _states_camera(tags: ImageTags | None) -> bool:
-    return tags is not None and (
-        tags.text(PIX4D, "ModelType") is not None or tags.text(DJI, "DewarpData") is not None
-    )
+    return tags is not None and bool(tags.xmp.keys() & {"ModelType", "DewarpData"})
 
 
 def _check_one_capture(images: Mapping[str, _Image]) -> None:
     """Raise RigFileError for images of several captures or of several bodies."""
     kinds = {
-        "capture": lambda tags: tags.text(PIX4D, "CaptureUUID") or tags.text(MICASENSE, "CaptureId"),
+        "capture": lambda tags: tags.xmp.get("CaptureUUID") or tags.xmp.get("CaptureId"),
         "serial number": lambda tags: tags.fields.get(SERIAL, (None,))[0],
         "time": lambda tags: tags.fields.get(TAKEN, (None,))[0],
     }
@@ -445,16 +437,13 @@ class ImageTags(NamedTuple):
     Attributes:
         hw: height and width of the stored pixels.
         fields: values of TIFF, EXIF and GPS fields by their number, as tuples; 0 for NaN.
-        xmp: XMP tags by namespace and name (lists joined by commas).
+        xmp: XMP tags by name (lists joined by commas), of the first of Pix4D's, DJI's and MicaSense's
+            namespaces that has it.
     """
 
     hw: HW
     fields: dict[int, tuple[Any, ...]]
-    xmp: dict[tuple[str, str], str]
-
-    def text(self, namespace: str, name: str) -> str | None:
-        """Return an XMP tag; None if it is not stated."""
-        return self.xmp.get((namespace, name))
+    xmp: dict[str, str]
 
 
 def image_tags(path: Path) -> ImageTags | None:
@@ -493,13 +482,13 @@ def xmp_packet(content: bytes) -> bytes:
     return b"" if b"<!DOCTYPE" in packet or b"<!ENTITY" in packet else packet
 
 
-def _xmp(content: bytes) -> dict[tuple[str, str], str]:
+def _xmp(content: bytes) -> dict[str, str]:
     """XMP tags of the namespaces above; empty if there are none, or the packet is damaged."""
     try:
         root = ET.fromstring(xmp_packet(content))
     except ET.ParseError:
         return {}
-    tags: dict[tuple[str, str], str] = {}
+    tags: dict[str, dict[str, str]] = {MICASENSE: {}, DJI: {}, PIX4D: {}}
     for described in root.iter(f"{RDF}Description"):
         parts = [(key, value) for key, value in described.attrib.items()]
         parts += [
@@ -508,7 +497,7 @@ def _xmp(content: bytes) -> dict[tuple[str, str], str]:
         ]
         for key, value in parts:
             uri, _, name = key.removeprefix("{").partition("}")
-            namespace = next((candidate for candidate in (PIX4D, DJI, MICASENSE) if candidate in uri), None)
-            if namespace and name:
-                tags[namespace, name] = value.strip()
-    return tags
+            for namespace in tags:
+                if namespace in uri and name:
+                    tags[namespace][name] = value.strip()
+    return tags[MICASENSE] | tags[DJI] | tags[PIX4D]

@@ -6,12 +6,16 @@ LEFT_DISTO and RIGHT_DISTO, fisheye ones where there is a k4 and no p1; RX, CV, 
 that takes points of the left camera into the right one. T = (-Baseline, TY, TZ), in millimetres, as its
 calibration tool (zed-opencv-calibration) writes them. World = left camera; a file with left sections alone
 is one camera, `left`.
+
+Written by: Stereolabs' factory files and zed-opencv-calibration: 4K, QHDPLUS, 2K, FHD1200, FHD, HD, SVGA,
+VGA; lenses in CAM or DISTO sections.
+Refused: no coefficients at all.
+Sample: hand-written: zed.conf, by the maker's [reader](https://github.com/stereolabs/zed-open-capture).
 """
 
 from __future__ import annotations
 
 import configparser
-from pathlib import Path
 
 from ..camera import Camera
 from ..pixels import HW
@@ -33,9 +37,7 @@ SIZES: dict[str, HW] = {
 """Height and width of one camera's image, by the name of the resolution; the largest first."""
 
 
-def recognises(path: Path, head: str) -> bool:
-    """Return True for a text with sections of the left camera."""
-    return path.is_file() and "[LEFT_CAM_" in head.upper()
+HEAD = r"(?i)\[LEFT_CAM_"
 
 
 def read(source: RigSource) -> Rig:
@@ -44,7 +46,7 @@ def read(source: RigSource) -> Rig:
     Raises:
         RigFileError: for a damaged file, no camera of a known or of the requested size, or missing numbers.
     """
-    parser = configparser.ConfigParser(interpolation=None)
+    parser = configparser.ConfigParser(interpolation=None, inline_comment_prefixes=("#", ";"))
     try:
         parser.read_string(source.text(LONGEST).replace(",", "."))  # some systems write a decimal comma
     except configparser.Error as error:
@@ -76,25 +78,16 @@ def _pose(stereo: Entry, name: str) -> Pose:
 
     Offsets may be stated for all resolutions at once.
     """
-    offsets = [stereo[f"{key}_{name}", key].words().number() for key in ("ty", "tz")]
-    t = stereo.at([-stereo["baseline"].words().number(), *offsets], "baseline, ty, tz")
-    rotation = stereo.listed(*(f"{key}_{name}" for key in ("rx", "cv", "rz"))).words()
+    offsets = [stereo[f"{key}_{name}", key].number() for key in ("ty", "tz")]
+    t = stereo.at([-stereo["baseline"].number(), *offsets], "baseline, ty, tz")
+    rotation = stereo.listed(*(f"{key}_{name}" for key in ("rx", "cv", "rz")))
     return pose_of(rotation, t, metres=1e-3)
 
 
 def _camera(fields: Entry, disto: Entry | None, hw: HW, pose: Pose) -> Camera:
     lens = disto if disto is not None and "k1" not in fields else fields
-    fisheye = "k4" in lens and "p1" not in lens
-    keys = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
     if "k1" not in lens:
         raise fields.fail(
             "has no k1, and there is no LEFT_DISTO or RIGHT_DISTO with one: state the lens, 0 for none"
         )
-    c = lens.at([lens.get(key, "0").words().number() for key in keys], ", ".join(keys))
-    c = c if fisheye or any(c.value[5:]) else lens.at(c.value[:5], c.name)
-    return Camera(
-        K=fields.listed("fx", "fy", "cx", "cy").words().focal_and_centre(),
-        cam_from_world=pose,
-        hw=hw,
-        distortion=c.kannala_brandt() if fisheye else c.brown_conrady(),
-    )
+    return fields.camera(pose, hw=hw, distortion=lens.usual_lens())

@@ -81,10 +81,12 @@ def _without_repeated_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return fields
 
 
-def yaml_problem(error: Exception) -> tuple[int | None, str]:
-    """Return the line of a YAML error (from 1; None if unknown) and its problem, for messages."""
+def text_problem(error: Exception) -> tuple[int | None, str]:
+    """Return the line of an error of YAML, JSON or TOML (from 1; None if unknown) and its problem, for
+    messages."""
     mark = getattr(error, "problem_mark", None)
-    return (mark.line + 1 if mark else None), getattr(error, "problem", None) or "not text"
+    line = mark.line + 1 if mark else getattr(error, "lineno", None)
+    return line, getattr(error, "problem", None) or getattr(error, "msg", None) or str(error) or "not text"
 
 
 def _refused(problem: str, mark: Any = None) -> yaml.YAMLError:

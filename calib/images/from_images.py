@@ -190,11 +190,12 @@ def link_of_points(rig: Rig, pair: tuple[str, str], points: PointMatches) -> tup
         ValueError: for points that no F fits, or fewer than `ENOUGH` that agree with it.
     """
     if len(points.alpha) < ENOUGH:
-        H = fit_homography(points)
-        return Link.from_homography(H), registration(H, points)
+        explained = registration(fit_homography(points), points)
+        return Link.from_homography(explained.H, explained.noise), explained
     link = fit_link(points, fit_fundamental(points), within=AGREE).link
     explained = explain(points, rig.replace(links={pair: link}).pair(*pair))
-    return link if explained.has_lines else Link.from_homography(explained.H), explained
+    spread = registration(explained.H, points).noise
+    return link if explained.has_lines else Link.from_homography(explained.H, spread), explained
 
 
 def _fundamental(

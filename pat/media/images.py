@@ -168,7 +168,7 @@ def write_image(
         image: floats (1 or 3, h, w), in 0..1.
         bits: 8 or 16: values are clipped to 0..1 and rounded; 32 (.tif and .exr only): floats as they are.
         unknown: True allows NaN and infinity in 32-bit files.
-        profile: True adds an sRGB profile to JPEG files and to PNG files in colour.
+        profile: True adds an sRGB profile to JPEG and PNG files in colour.
 
     Raises:
         ValueError: for an image of integers, another number of channels, values that are not finite, or a
@@ -187,7 +187,8 @@ def write_image(
     if path.suffix.lower() == ".exr":
         return _write_exr(path, planes, bits)
     content = _encode(path, np.ascontiguousarray(planes[::-1].transpose(1, 2, 0)), bits)
-    content = with_srgb_profile(content, path.suffix.lower()) if profile else content
+    if profile and len(planes) == 3:
+        content = with_srgb_profile(content, path.suffix.lower())
     with write_atomically(path) as temporary:
         temporary.write_bytes(content)
 

@@ -82,17 +82,16 @@ def _converted(values: NDArray, profile: ImageCms.ImageCmsProfile) -> NDArray:
 
 
 def with_srgb_profile(content: bytes, suffix: str) -> bytes:
-    """Add an sRGB profile to the bytes of an image file.
+    """Add an sRGB profile to the bytes of an image file in colour: in a grey one it is not valid.
 
     Args:
         content: bytes of the file.
         suffix: suffix of its name in small letters, such as ".png".
 
     Returns:
-        The bytes of a PNG file in colour or a JPEG file with the profile; of other files unchanged. A grey
-        JPEG gets it, too.
+        The bytes of a PNG or JPEG file with the profile; of other files unchanged.
     """
-    if suffix == ".png" and content[25] in (2, 6):
+    if suffix == ".png":
         body = b"iCCP" + b"sRGB\0\0" + zlib.compress(srgb_profile())
         chunk = struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body))
         return content[:33] + chunk + content[33:]

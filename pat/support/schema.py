@@ -83,12 +83,12 @@ def parse_yaml(text: str | bytes, name: str) -> Any:
     """
     import yaml
 
-    from arraygeom.runtime.safe_yaml import load_yaml, yaml_problem
+    from arraygeom.runtime.safe_yaml import load_yaml, text_problem
 
     try:
         return load_yaml(text if isinstance(text, str) else text.decode("utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        line, problem = yaml_problem(error)
+        line, problem = text_problem(error)
         position = f" at line {line}" if line else ""
         raise ValueError(f"{name}: not valid YAML{position}: {problem}") from None
 

@@ -37,15 +37,15 @@ PAIRS = [
     ("matlab_new.json", "matlab", ("camera1", "camera2"), {}),
     ("calib_cam_to_cam.txt", "kitti-raw", ("cam0", "cam1"), {}),
     ("transforms.json", "nerfstudio", ("a.png", "b.png"), {}),
-    ("multical.json", "multical", ("a", "b"), {}),
-    ("aniposelib.toml", "aniposelib", ("a", "b"), {}),
-    ("caliscope.toml", "aniposelib", ("cam0", "cam1"), {}),
+    ("multical.json", "usual", ("a", "b"), {}),
+    ("aniposelib.toml", "usual", ("a", "b"), {}),
+    ("caliscope.toml", "usual", ("cam0", "cam1"), {}),
     ("ros", "ros", ("a", "b"), {}),
     ("boofcv.yaml", "boofcv", ("left", "right"), {}),
     ("luxonis.json", "luxonis", ("CAM_B", "CAM_C"), {}),
     ("mrcal", "mrcal", ("a", "b"), {}),
     ("realsense.txt", "realsense", ("Depth", "Color"), {}),
-    ("pycalib.json", "pycalib", ("cam0", "cam1"), SIZE),
+    ("pycalib.json", "usual", ("cam0", "cam1"), SIZE),
 ]
 POINT = torch.tensor([-0.782, -0.22, 1.876], dtype=torch.float64)
 PIXEL_A = [319.5 - 391 / 1.876, 239.5 - 112.2 / 1.876]
@@ -78,14 +78,17 @@ def test_hand_written_pairs(file, format, names, options):
 @pytest.mark.parametrize("file", sorted({path.name for path in FIXTURES.iterdir()} - {"README.md"}))
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-16-le", "utf-16-be"])
 def test_files_are_read_behind_a_mark(file, encoding, tmp_path):
-    """Editors, and PowerShell for the output of tools, write a byte order mark."""
+    """Editors, and PowerShell for the output of tools, write a byte order mark, and Windows' line ends."""
     for old in [p for p in FIXTURES.rglob("*") if p.is_file()]:
         new = tmp_path / old.relative_to(FIXTURES)
         new.parent.mkdir(exist_ok=True)
-        new.write_bytes(("\ufeff" + old.read_text(encoding="utf-8")).encode(encoding))
+        text = "\ufeff" + old.read_text(encoding="utf-8").replace("\n", "\r\n")
+        new.write_bytes(text.encode(encoding))
     assert recognise(tmp_path / file) == recognise(FIXTURES / file)
     found, wanted = (read_rig(folder / file, hw=(720, 1280)) for folder in (tmp_path, FIXTURES))
     assert found.names == wanted.names
+    for one, other in zip(found.cameras.values(), wanted.cameras.values()):
+        assert one == other
 
 
 @pytest.mark.parametrize("file", ["opencv_mono.xml", "opencv_mono.json", "ros/right.yaml"])
@@ -418,10 +421,28 @@ def test_images_that_a_homography_registers_are_a_rig(tmp_path):
     for pair in (rig.pair("a", "b"), Rig.load(tmp_path / "again.yaml").pair("a", "b")):
         assert pair.at_one_place
         segments = default_field(pair)(pair, torch.tensor([[20.0, 20.0]]))
-        assert segments.start.tolist() == segments.end.tolist() == [[25.0, 23.0]]
+        assert (segments.start + segments.end).tolist() == [[50.0, 46.0]], "about H x"
+        assert 0 < float(segments.length) < 6, "a few pixels, as H is seldom exact"
     one = Camera(K=intrinsics(50.0, (48, 64)), cam_from_world=Pose.identity(), hw=(48, 64))
     pair = Rig({"a": one, "b": one}).pair("a", "b")
-    assert default_field(pair)(pair, torch.tensor([[20.0, 20.0]])).start.tolist() == [[20.0, 20.0]]
+    segments = default_field(pair)(pair, torch.tensor([[20.0, 20.0]]))
+    assert (segments.start + segments.end).tolist() == [[40.0, 40.0]]
+
+
+def test_the_search_about_a_homography_is_as_wide_as_its_points_are_off(tmp_path):
+    """Four standard deviations to either side, whatever pixels the images are resized to."""
+    H, size = torch.eye(3, dtype=torch.float64), View(hw=(48, 64))
+    rig = Rig({"a": size, "b": size}, links={("a", "b"): Link.from_homography(H, spread=1.5)})
+    rig.save(tmp_path / "rig.yaml")
+    for found in (rig, Rig.load(tmp_path / "rig.yaml")):
+        for pair, length in ((found.pair("a", "b"), 12), (found.resize("b", (96, 128)).pair("a", "b"), 24)):
+            segments = default_field(pair)(pair, torch.tensor([[20.0, 20.0]]))
+            assert float(segments.length) == pytest.approx(length)
+    assert rig.links["a", "b"].reversed().spread == pytest.approx(1.5)
+    assert rig.resize("b", (96, 128)).links["a", "b"].reversed().spread == pytest.approx(1.5)
+    (tmp_path / "bad.yaml").write_text((tmp_path / "rig.yaml").read_text().replace("1.5", "-1"))
+    with pytest.raises(RigFileError, match="spread"):
+        Rig.load(tmp_path / "bad.yaml")
 
 
 def test_links_name_cameras_that_are_numbers(tmp_path):

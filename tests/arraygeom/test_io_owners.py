@@ -101,6 +101,78 @@ def test_lenses_under_other_names(name, tmp_path):
     assert camera.distortion.coefficients.tolist()[:4] == C[:4]
 
 
+FISHEYE = [-0.0125, 0.0537, -0.0504, 0.0102]
+NUMBERS = dict(zip(("fx", "fy", "cx", "cy"), (700, 700, 640, 360)))
+LENS = dict(zip(("k1", "k2", "p1", "p2", "k3"), C))
+MATRIX = np.reshape(K, (3, 3)).tolist()
+POSED = {"R": np.eye(3).tolist(), "t": [0, 0, 0], "image_size": [1280, 720]}
+USUAL = {
+    "flat.json": {**NUMBERS, **LENS, "width": 1280, "height": 720},
+    "texts.json": {"K": " ".join(map(str, K)), "dist": " ".join(map(str, C)), "size": "1280 720"},
+    "nested.json": {"camera": {"intrinsics": NUMBERS, "distortion": LENS, "resolution": [1280, 720]}},
+    "list.json": {
+        "cameras": [{"name": n, "camera_matrix": MATRIX, "dist_coeffs": [C], **POSED} for n in "ab"]
+    },
+    "pair.json": {
+        **{n: {"K": MATRIX, "d": C, "w": 1280, "h": 720} for n in ("left", "right")},
+        **{"R": np.eye(3).tolist(), "T": [[-0.1], [0], [0]]},
+    },
+    "four.toml": f"[cam_1]\nintrinsics = [700, 700, 640, 360]\ndist = {C}\nresolution = [1280, 720]\n",
+    "zero.json": {
+        **{f"{name}{i}": value for i in "01" for name, value in (("K", MATRIX), ("D", C))},
+        **{"R": np.eye(3).tolist(), "T": [-0.1, 0, 0], "image_size": [1280, 720]},
+    },
+    "placed.json": {
+        "cameras": {
+            n: {
+                "intrinsics": NUMBERS,
+                "dist": C,
+                "size": [1280, 720],
+                "extrinsics": {"R": [0, 0, 0], "t": [0, 0, 1]},
+            }
+            for n in "ab"
+        }
+    },
+    "extrinsic.json": {"K": MATRIX, "distCoeffs": C, "world_to_cam": IDENTITY, "imgSize": [1280, 720]},
+    "slam.yaml": (
+        '%YAML:1.0\n---\n# Camera\nCamera.type: "PinHole"\n'
+        + "".join(f"Camera.{name}: {value}\n" for name, value in {**NUMBERS, **LENS}.items())
+        + "Camera.width: 1280\nCamera.height: 720\nCamera.fps: 20.0\n"
+    ),
+}
+
+
+@pytest.mark.parametrize("name", USUAL)
+def test_usual_names_are_read_in_any_language_and_depth(name, tmp_path):
+    """K as a matrix, four numbers or one by one; a lens as a list or one by one; a size as one or two."""
+    rig, said = read(tmp_path / name, USUAL[name])
+    for camera in rig.cameras.values():
+        assert camera.K.flatten().tolist() == K
+        assert camera.distortion.coefficients.tolist() == C
+        assert camera.hw == (720, 1280)
+    assert not said
+    assert len(rig.names) == 2 or name not in ("zero.json", "placed.json")
+    assert rig.names == {"list.json": ("a", "b"), "pair.json": ("left", "right")}.get(name, rig.names)
+    if name == "pair.json":
+        assert rig["right"].t.tolist() == [-0.1, 0, 0]
+
+
+def test_a_fisheye_by_its_numbers_names(tmp_path):
+    """Four k and no p are no lens of Brown's."""
+    document = NUMBERS | dict(zip(("k1", "k2", "k3", "k4"), FISHEYE)) | {"width": 1280, "height": 720}
+    (camera,) = read(tmp_path / "a.json", document)[0].cameras.values()
+    assert camera.distortion.model == "kannala-brandt"
+    assert camera.distortion.coefficients.tolist() == FISHEYE
+
+
+@pytest.mark.parametrize("missing", ["R", "t"])
+def test_several_cameras_without_a_place_are_refused(missing, tmp_path):
+    cameras = [{"K": MATRIX, "dist": C, **POSED} for _ in range(2)]
+    del cameras[1][missing]
+    with pytest.raises(RigFileError, match=rf"cameras\[1\]: has .* no {missing}"):
+        read(tmp_path / "a.json", {"cameras": cameras})
+
+
 UNREAD = [
     ("kalibr.yaml", "cam0:", "cam0:\n  xi: 0.9", "cam0.xi"),
     ("kalibr.yaml", "cam0:", "cam0:\n  lens_distortion: {k1: 0.1}", "lens_distortion"),
@@ -141,9 +213,6 @@ def test_unread_lenses_of_other_formats(file, tmp_path):
     text = text.replace('"image_size"', '"lens_coeffs": [1, 2], "image_size"', 1) if "json" in name else text
     _, said = read(tmp_path / name, text, hw=(370, 1240) if "kitti" in name else None)
     assert "coeffs" in said
-
-
-FISHEYE = [-0.0125, 0.0537, -0.0504, 0.0102]
 
 
 @pytest.mark.parametrize("word", ['distortion_model: "fisheye"', "fisheye: 1", 'model: "equidistant"'])
@@ -329,7 +398,7 @@ def test_zeds_lens_of_its_own_section(tmp_path):
         X, np.array([-0.001, 0.006, 0.0008]), np.array([-0.05, 0.0005, -0.0004]), K, c
     )[0][:, 0]
     np.testing.assert_allclose(rig["right"].project(torch.from_numpy(X)).x.numpy(), wanted, atol=1e-6)
-    four = ZED.replace("FHD1200", "4k")
+    four = ZED.replace("FHD1200", "4k").replace("fx = 735.4", "fx = 735.4 ; pixels")
     assert read(tmp_path / "SN1.conf", four)[0]["left"].hw == (2160, 3840)
     one = four[: four.index("[RIGHT_CAM")] + four[four.index("[LEFT_DISTO]") :]
     assert read(tmp_path / "SN1.conf", one)[0].names == ("left",)

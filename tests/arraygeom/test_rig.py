@@ -20,11 +20,12 @@ from arraygeom import (
     resize_matrix,
     rotation_from_vector,
 )
+from arraygeom.io import read_rig
 from arraygeom.lenses import RollingShutter
 from arraygeom.pose import rotation_error
 from arraygeom.runtime.text import UNSCALED
 from arraygeom.summary import summarise_pairs
-from tests.arraygeom.rigs import known_by_f, random_rig, scene_points, two_cameras
+from tests.arraygeom.rigs import known_by_f, parallel_rig, random_rig, scene_points, two_cameras
 
 EVERYTHING = ("rotation", "translation", "focal", "centre")
 
@@ -263,3 +264,13 @@ def test_what_torch_offers_of_a_tensor_a_rig_offers_too():
     depth = torch.tensor(2.0, dtype=torch.float64)
     pair = rig.pair(*rig.names)
     assert torch.equal(pair.homography_at(2.0), pair.homography_at(depth))
+
+
+@pytest.mark.parametrize("factor", [0, -1e-3, float("inf"), float("nan")])
+def test_lengths_are_scaled_by_a_positive_factor(factor, tmp_path):
+    """A rig scaled by 0 had all cameras at one place, without a word; by -1 it was mirrored."""
+    rig = parallel_rig(80.0, (48, 64), {"a": (), "b": (0.1,)}, (1.0, 50.0))
+    rig.save(tmp_path / "rig.yaml")
+    for scaled in (rig.scaled, rig["b"].scaled, lambda factor: read_rig(tmp_path / "rig.yaml", scale=factor)):
+        with pytest.raises(ValueError, match=r"factor|scale"):
+            scaled(factor)

@@ -92,6 +92,9 @@ def test_a_written_profile_is_read_by_others(suffix, tmp_path):
     if suffix == "png":
         assert torch.equal(read_image(tmp_path / "a.png"), image)
         assert cv2.imread(str(tmp_path / "a.png")) is not None
+    write_image(tmp_path / f"grey.{suffix}", image[:1], profile=True)
+    with Image.open(tmp_path / f"grey.{suffix}") as opened:
+        assert "icc_profile" not in opened.info
 
 
 def test_raw_files_name_the_extra(tmp_path, monkeypatch):
