@@ -80,7 +80,8 @@ def refine_corners(
         clear: squares from a corner's edges within which there is nothing but its own four squares.
 
     Returns:
-        Pixels, and True for corners that fit the model; the others keep `x`.
+        Pixels, and True for corners that fit the model; the others keep `x`. Fewer than `FEWEST` corners are
+        not fitted: all keep `x` and are True.
     """
     refined, good = x, np.ones(len(x), dtype=bool)
     for _ in range(PASSES):

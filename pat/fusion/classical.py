@@ -161,6 +161,10 @@ def non_local_means(image: Float[Tensor, "c h w"], deviation: float) -> Float[Te
 
     Patches of 5 x 5 pixels within 6 pixels, h = 0.8 deviations, as its documentation advises.
 
+    Args:
+        image: image, values 0..1.
+        deviation: standard deviation of the noise, in the same values.
+
     Returns:
         The image without noise, not clipped.
     """

@@ -102,7 +102,10 @@ def save_frame(
     (`write_together`).
 
     Args:
+        frame: the frame.
+        out: folder, made if missing.
         bits: 8 or 16 for sRGB values; 32 (tif, exr) for linear light as floats, not clipped.
+        kind: format of the fused image.
         view: rig of alpha alone, written to view.yaml; None for no such file.
         rig: rig of all cameras, written to found_rig.yaml; None for no such file.
         points: camera of alpha; the pixels of known depth are written to points.ply. None for no such file.

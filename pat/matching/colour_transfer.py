@@ -244,11 +244,14 @@ def transferred_bands(
 
     Args:
         alpha: alpha's image (B, 1, H, W).
+        beta: beta's image and field.
+        matches: matches in that beta.
         statistics: statistics to use; None for those of these pixels.
         sees_luma: True if alpha sees about the luma of RGB betas.
 
     Returns:
-        Bands minus alpha, weight and likeness at alpha's pixels; and the statistics.
+        Bands minus alpha, their weight and their similarity to alpha (`Colours`) at alpha's pixels; and the
+        statistics.
     """
     if matches.comparison.mix is not None:
         return _colours_of_bands(alpha, beta, matches, matches.comparison.mix, statistics)

@@ -312,7 +312,9 @@ class Convert:
         """Read and write the rig.
 
         Raises:
-            ValueError: for a size that the file contradicts, and a rig that the target format cannot hold.
+            FileNotFoundError: for a missing file.
+            ValueError: for a damaged file, a size that it contradicts or that is below 1, and a rig that the
+                target format cannot hold.
         """
         from arraygeom.io import read_rig, write_rig
         from arraygeom.lens_fit import refit_rig
@@ -356,11 +358,12 @@ class Doctor:
     """Print JSON instead of text."""
 
     def run(self) -> None:
-        """Print the diagnosis, and write the repaired rig; exits with status 4 if several repairs do as well.
+        """Print the diagnosis, and write the repaired rig to `out` if one is given.
 
         Raises:
+            FileNotFoundError: for a missing file.
             ValueError: for a rig or images that cannot be used.
-            SystemExit: with status 4, if several repairs do as well.
+            SystemExit: with status 4, if a rig is to be written and several repairs do as well.
         """
         from arraygeom.runtime.atomic import write_atomically
         from calib.images.doctor import diagnose
