@@ -13,7 +13,7 @@ DATA ?= ../shared/data
 help:
 	@echo "make demo       fuse the sample array into out/demo"
 	@echo "make showcase   fuse real images from DATA=$(DATA) into out/showcase"
-	@echo "make readme     run both and put what they print into docs/results.md and docs/reports/real_images.md"
+	@echo "make readme     run both and put what they print into docs/reports/demo.md and real_images.md"
 	@echo "make pairs      measure stereo pairs, ideal, into docs/reports/pairs.md; two minutes"
 	@echo "make stages     measure each stage of the fusion left out, on the tune half, into out/stages; ten minutes"
 	@echo "make conditions measure other responses, low light and misalignment into docs/reports/conditions.md; half an hour"
@@ -40,7 +40,7 @@ help:
 	@echo "make synthesis  adds Blender to the environment (some 400 MB), to render scenes"
 	@echo "make notebooks  run the notebooks and keep what they put out"
 	@echo "make docs       the documentation as a site, in out/site"
-	@echo "make drawings   the documentation's drawings"
+	@echo "make drawings   the documentation's drawings, and the gallery's figures"
 	@echo "make wheel      build sdist and wheels, install them into empty environments and use them there;"
 	@echo "                PYTHONS='python3.11 python3.12' ARGS=--lowest: more of them"
 	@echo "make env        only the environment, in $(VENV)"
@@ -56,8 +56,8 @@ showcase: $(READY)
 	@$(BIN)/python -m experiments showcase --data $(DATA) --out out/showcase
 
 readme: demo showcase
-	@echo "== bringing docs/results.md, docs/demo.jpg and docs/reports/real_images.md up to date"
-	@$(BIN)/python -m docs.update_readme --document docs/results.md --block demo=out/demo/demo.md \
+	@echo "== bringing docs/reports/demo.md and docs/reports/real_images.md up to date"
+	@$(BIN)/python -m docs.update_readme --document docs/reports/demo.md --block demo=out/demo/demo.md \
 		--image out/demo/demo.png docs/demo.jpg
 	@$(BIN)/python -m docs.update_readme --document docs/reports/real_images.md --block showcase=out/showcase/showcase.md
 
@@ -168,6 +168,7 @@ docs: $(READY)
 
 drawings: $(READY)
 	@$(BIN)/python docs/drawings.py
+	@$(BIN)/python -m docs.gallery
 
 wheel:
 	@$(PYTHON) tests/wheel/run.py --python $(or $(PYTHONS),$(PYTHON)) $(ARGS)

@@ -8,21 +8,16 @@ from pathlib import Path
 import torch
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
-from skimage.data import chelsea
-from torch import Generator, Tensor
+from torch import Tensor
 
 from arraygeom import (
-    Camera,
     Dense,
     Epipolar,
     EpipolarLine,
     HomographyDisplacement,
     Local,
     NearestVoxels,
-    Pose,
     Rectified,
-    Rig,
-    intrinsics,
 )
 from arraygeom.runtime.atomic import write_atomically
 from arraygeom.viz import draw_fields, draw_rig, draw_sampling_locations, show_image
@@ -30,9 +25,8 @@ from pat import FuseSettings, fuse
 from pat.app.cli.parser import script
 from pat.app.demo import as_real_cameras
 from pat.app.sample_array import ALPHA, BETA, SampleArray, load_sample
-from pat.media.colour import exposed, linear_from_srgb, luminance, srgb_from_linear, to_bytes
+from pat.media.colour import to_bytes
 from pat.media.figures import colour_depth, save_figure
-from pat.sensors import NoiseLevel
 
 OUT = Path(__file__).parent / "drawings"
 FAMILIES = {
@@ -46,42 +40,8 @@ FAMILIES = {
 }
 
 
-DARKER = 8
-"""Factor by which the mono camera of the cat has less light."""
-DISPARITY, FOCAL, BASELINE = 24, 600.0, 0.08
-"""Where the cat's photograph hangs: pixels between its images, pixels, and metres between the cameras."""
 WIDE, GAP = 902, 8
-"""Width of the fused image in README's figures, and the space between images, pixels."""
-
-
-def dark_cat() -> tuple[Rig, dict[str, Tensor]]:
-    """Return two cameras and their images of a photograph on a wall: mono in the dark, and colour.
-
-    The photograph is scikit-image's cat (CC0). It is flat: its figure shows no depth.
-    """
-    photo = torch.from_numpy(chelsea().copy()).movedim(-1, 0) / 255
-    generator, hw = Generator().manual_seed(0), (photo.shape[1], photo.shape[2])
-    dark = srgb_from_linear(luminance(linear_from_srgb(photo)) / DARKER)
-    shifted = torch.cat([photo[..., DISPARITY:], photo[..., -1:].expand(-1, -1, DISPARITY)], -1)
-    images = {
-        ALPHA: NoiseLevel.from_electrons(1000, 2.0).recorded(dark[None], generator)[0],
-        BETA: NoiseLevel.from_electrons(8000, 2.0).recorded(shifted[None], generator)[0],
-    }
-    mono = Camera(K=intrinsics(FOCAL, hw).double(), cam_from_world=Pose.identity(), hw=hw)
-    beside = Pose(mono.R, torch.tensor([-BASELINE, 0, 0]).double())
-    return Rig({ALPHA: mono, BETA: mono.replace(cam_from_world=beside)}, depth=(1, 8)), images
-
-
-def cat() -> Image.Image:
-    """Two in, one out: a cat out of the dark."""
-    rig, images = dark_cat()
-    frame = fuse(images, rig, alpha=ALPHA, settings=FuseSettings(noise="estimate"))
-    words = {
-        f"in: a mono camera with 1/{DARKER} of the light": images[ALPHA],
-        "in: a colour camera beside it": images[BETA],
-        "out: the mono camera's view, fused": exposed(frame.image, DARKER),
-    }
-    return two_in_one_out(words)
+"""Width of the fused image in figures of two in and one out, and the space between images, pixels."""
 
 
 def table() -> Image.Image:
@@ -159,14 +119,13 @@ class Drawings:
     """Draw the documentation's pictures into docs/drawings."""
 
     only: str | None = None
-    """One of cat, table, rig, segments, families."""
+    """One of table, rig, segments, families."""
 
     def run(self) -> None:
         """Write them. Raises ValueError for a name that is none."""
         array = load_sample()
         x = torch.tensor([[60.0, 60], [150, 90], [330, 210], [420, 60], [520, 320], [600, 200]])
         drawings = {
-            "cat": lambda: save(cat(), "cat.jpg"),
             "table": lambda: save(table(), "table.jpg"),
             "rig": lambda: save_figure(draw_rig(array.rig, alpha=ALPHA), OUT / "rig.png", dpi=80),
             "segments": lambda: save_figure(

@@ -6,6 +6,7 @@ comment `<!-- commands -->` what is made of the code. On a code host the link is
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import io
 import json
@@ -54,13 +55,19 @@ def cell_parts(cell: dict[str, Any]) -> list[str]:
 
 
 def shown(output: dict[str, Any]) -> str:
-    """An image, a table, or text."""
+    """An image, of the size that its notebook shows it with; a table, or text."""
     data = output.get("data", {})
-    if "text/markdown" in data:
-        return "".join(data["text/markdown"])
-    for kind in ("image/jpeg", "image/png"):
+    for kind in ("text/markdown", "text/html"):
         if kind in data:
-            return f"![](data:{kind};base64,{''.join(data[kind]).replace(chr(10), '')})"
+            return "".join(data[kind])
+    if "image/svg+xml" in data:
+        drawing = base64.b64encode("".join(data["image/svg+xml"]).encode()).decode()
+        return f'<img class="figure" alt="" src="data:image/svg+xml;base64,{drawing}">'
+    if "image/png" in data:
+        size = output["metadata"].get("image/png", {})
+        width = f' width="{size["width"]}"' if "width" in size else ""
+        image = "".join(data["image/png"]).replace("\n", "")
+        return f'<img class="figure" alt=""{width} src="data:image/png;base64,{image}">'
     text = "".join(output.get("text") or data.get("text/plain", ""))
     return f"```text\n{text.rstrip()}\n```"
 

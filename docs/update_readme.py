@@ -70,17 +70,19 @@ def quoting(page: Path) -> str:
 
     def rows(found: re.Match[str]) -> str:
         wanted, columns = found[2].split("; "), found[3].split("; ") if found[3] else None
-        tables = "\n\n".join(quoted((page.parent / found[1]).read_text(), wanted, columns))
-        if missing := [name for name in wanted if f"| {name} |" not in tables]:
+        parts = list(quoted((page.parent / found[1]).read_text(), wanted, columns))
+        if missing := [name for name in wanted if not any(f"| {name} |" in part for part in parts)]:
             raise ValueError(f"{page.name}: no row {missing[0]!r} in {found[1]}")
-        return f"{found[0].splitlines()[0]}\n\n{tables}\n\n<!-- end -->"
+        return "{}\n{}\n\n{} <!-- end -->".format(
+            found[0].splitlines()[0], "\n\n".join(parts[:-1]), parts[-1]
+        )
 
     return QUOTE.sub(rows, page.read_text())
 
 
 def quoted(report: str, wanted: Sequence[str], columns: Sequence[str] | None = None) -> Iterator[str]:
-    """Yield the tables of a report that have wanted rows and columns, cut to these, below their dates."""
-    date_line = ""
+    """Yield the tables of a report that have wanted rows and columns, cut to these; last, their date."""
+    date_line, of_chosen = "", ""
     for part in re.findall(r"^\*Printed [^*]+\*|(?:^\|.*\n?)+", report, re.M):
         if part.startswith("*"):
             date_line = part
@@ -89,10 +91,10 @@ def quoted(report: str, wanted: Sequence[str], columns: Sequence[str] | None = N
         kept = [0, *(head.index(name) for name in columns if name in head)] if columns else range(len(head))
         chosen = [row for row in rows if row[0] in wanted]
         if chosen and len(kept) > 1:
-            if date_line:
-                yield date_line
-                date_line = ""
+            of_chosen = date_line
             yield "\n".join(f"| {' | '.join(row[i] for i in kept)} |" for row in (head, rule, *chosen))
+    if of_chosen:
+        yield of_chosen
 
 
 def without_images(text: str) -> str:

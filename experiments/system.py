@@ -86,11 +86,15 @@ class ArraySystem:
         return rig
 
 
+Panels = dict[str, Tensor]
+
+
 class SystemResult(NamedTuple):
-    """The table that was written, and the files."""
+    """The table that was written, the files, and the images of the figure by title."""
 
     table: str
     written: list[Path]
+    panels: Panels
 
 
 def load_system(name: str) -> ArraySystem:
@@ -127,7 +131,7 @@ def run_system(
     save_panels(panels, out / "figure.png", columns=4)
     table = "\n".join(lines) + "\n"
     write_text(out / "scores.md", table)
-    return SystemResult(table, files_of(out))
+    return SystemResult(table, files_of(out), panels)
 
 
 def files_of(folder: Path) -> list[Path]:
@@ -164,9 +168,6 @@ def write_recording(recording: SystemRecording, rig: Rig, out: Path) -> dict[str
     for i, image in enumerate(recording.ground_truth):
         write_image(out / f"ground_truth_{i:03d}.png", image, bits=16)
     return files
-
-
-Panels = dict[str, Tensor]
 
 
 class Recorded(NamedTuple):

@@ -24,14 +24,12 @@ def execute(notebook: nbformat.NotebookNode, folder: Path) -> nbformat.NotebookN
         coalesce_streams=True,
         **patience,
     )
-    client.execute(env={**os.environ, "PYTHONPATH": str(HERE.parent)})
+    searched = os.pathsep.join(filter(None, (str(HERE.parent), os.environ.get("PYTHONPATH"))))
+    client.execute(env={**os.environ, "PYTHONPATH": searched})
     # the state of the explorer: images again, of no use without a kernel
     notebook.metadata.pop("widgets", None)
     for cell in notebook.cells:
         cell.metadata.pop("execution", None)
-        for output in cell.get("outputs", []):
-            if "image/jpeg" in output.get("data", {}):  # Pillow puts out PNG, too: ten times the size
-                output.data.pop("image/png", None)
     return notebook
 
 

@@ -31,9 +31,17 @@ ELSEWHERE = {"dask_jobqueue"}
 """Packages of which a page tells but that no extra of ours installs: their samples are not run."""
 
 
+def words_of(path: Path) -> str:
+    """The text of a page; of a notebook, its cells of words."""
+    if path.suffix != ".ipynb":
+        return path.read_text()
+    cells = json.loads(path.read_text())["cells"]
+    return "\n\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "markdown")
+
+
 def blocks(path: Path, language: str) -> list[str]:
     """Blocks of code, also those indented in lists."""
-    found = re.findall(rf"^( *)```{language}\n(.*?)^\1```$", path.read_text(), re.M | re.S)
+    found = re.findall(rf"^( *)```{language}\n(.*?)^\1```$", words_of(path), re.M | re.S)
     return [re.sub(rf"^{indent}", "", text, flags=re.M) for indent, text in found]
 
 
@@ -101,9 +109,7 @@ def test_pages_are_filled_in_on_the_site_and_are_links_on_a_code_host():
 
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda p: p.stem)
 def test_a_notebook_is_a_page_and_is_found_from_the_readme(notebook):
-    cells = json.loads(notebook.read_text())["cells"]
-    prose = "".join(line for cell in cells if cell["cell_type"] == "markdown" for line in cell["source"])
-    links = [link for link in re.findall(r"\]\(([^)]+)\)", prose) if "://" not in link]
+    links = [link for link in re.findall(r"\]\(([^)]+)\)", words_of(notebook)) if "://" not in link]
     assert [link for link in links if not (notebook.parent / link).exists()] == []
     page = ROOT / "docs" / "notebooks" / f"{notebook.stem}.md"
     assert page.read_text() == f'[{notebook.stem}](../../notebooks/{notebook.name} "included")\n'
@@ -116,7 +122,7 @@ def test_commands_in_the_pages_exist():
     known = {" ".join(path) for path in command_paths()}
     shown = {
         re.match(r"pat ((?:rig |lab data |lab weights |lab )?[a-z-]+)", line)[1]
-        for page in [*PAGES, ROOT / "README.md"]
+        for page in [*PAGES, ROOT / "README.md", *NOTEBOOKS]
         for text in [*blocks(page, "text"), *blocks(page, "")]
         for line in text.splitlines()
         if re.match(r"pat (?!help)[a-z]", line)
@@ -132,8 +138,8 @@ OF_ALL = {"--help", "--version", "--plugin"}
 def test_options_in_the_pages_exist():
     """Every option that a page shows with a `pat` command is in its --help; not a recipe's parts."""
     unknown = []
-    for page in [*PAGES, ROOT / "README.md"]:
-        shown = [*blocks(page, "text"), *blocks(page, ""), *re.findall(r"`(pat [^`]+)`", page.read_text())]
+    for page in [*PAGES, ROOT / "README.md", *NOTEBOOKS]:
+        shown = [*blocks(page, "text"), *blocks(page, ""), *re.findall(r"`(pat [^`]+)`", words_of(page))]
         for line in re.split(r"\n(?! )", "\n".join(text.replace("\\\n", " ") for text in shown)):
             words = line.split(" #")[0].split()
             paths = [p for p in command_paths() if words[:1] == ["pat"] and tuple(words[1 : 1 + len(p)]) == p]
@@ -167,7 +173,8 @@ def test_the_site_builds_without_a_warning(tmp_path):
     assert "Epipolar" in (tmp_path / "api" / "arraygeom.html").read_text()
     assert "--alpha" in (tmp_path / "api" / "commands.html").read_text()
     story = (tmp_path / "notebooks" / "1_ten_minutes.html").read_text()
-    assert 'src="data:image/jpeg;base64,' in story
+    assert 'src="data:image/png;base64,' in story
+    assert 'src="data:image/svg+xml;base64,' in story
     assert 'href="2_receptive_fields.html"' in story
 
 
@@ -199,6 +206,12 @@ def test_figures_with_units_stand_in_blocks_that_commands_fill(page):
 @pytest.mark.parametrize("page", GUIDES, ids=lambda p: p.stem)
 def test_rows_that_a_page_quotes_are_the_report_s(page):
     assert quoting(page) == page.read_text()
+
+
+def test_results_are_short_and_each_table_is_followed_by_what_it_says():
+    text = (ROOT / "docs" / "results.md").read_text()
+    assert len(text.splitlines()) <= 80
+    assert len(re.findall(r"<!-- end -->\nSo: ", text)) == text.count("<!-- end -->") > 5
 
 
 def test_pages_for_users_are_at_most_twelve_and_reports_stay_out_of_the_navigation():

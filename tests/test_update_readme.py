@@ -32,7 +32,7 @@ REPORT = f"*Printed on 2026-01-02.*\n\n{TABLE}\n| d |\n|---|\n| z |\n"
 
 
 def test_rows_and_columns_are_quoted_with_their_date():
-    date, table = quoted(REPORT, ["y"], ["c"])
+    table, date = quoted(REPORT, ["y"], ["c"])
     assert date == "*Printed on 2026-01-02.*"
     assert table == "| a | c |\n| --- | --- |\n| y | 4 |"
     assert list(quoted(REPORT, ["none"])) == []

@@ -50,12 +50,18 @@ GOOD = 1.0
 
 
 STYLE = """
+:root { color-scheme: light dark; --text: #222; --line: #ddd; --note: #8a3b00; --soft: #666 }
+@media (prefers-color-scheme: dark) {
+  :root { --text: #e6e8ea; --line: #33383e; --note: #ff9d5c; --soft: #9aa3ad }
+}
 body { font: 15px/1.45 system-ui, sans-serif; max-width: 1080px; margin: 2em auto; padding: 0 1em;
-  color: #222 }
-table { border-collapse: collapse; margin: .6em 0 1.4em; font-variant-numeric: tabular-nums }
-td, th { padding: .2em .8em .2em 0; text-align: left; vertical-align: top; border-bottom: 1px solid #ddd }
-h2 { margin-top: 2em; font-size: 1.15em } img { max-width: 100% }
-.note { color: #8a3b00 } small { color: #666 }
+  color: var(--text) }
+table { border-collapse: collapse; margin: .6em 0 1.4em; font-variant-numeric: tabular-nums; display: block;
+  overflow-x: auto }
+td, th { padding: .2em .8em .2em 0; text-align: left; vertical-align: top;
+  border-bottom: 1px solid var(--line) }
+h2 { margin-top: 2em; font-size: 1.15em } img { max-width: 100%; background: #fff }
+.note { color: var(--note) } small { color: var(--soft) }
 """
 ADEQUACY = (
     "Left, middle: standard deviation (pixels, worst direction) of the projection of points at the nearest "
@@ -121,14 +127,15 @@ def _section(title: str, text: str, figure: Figure) -> str:
     """HTML of a figure under its title and text."""
     FigureCanvasAgg(figure)
     data = BytesIO()
-    figure.savefig(data, format="png", dpi=110)
+    figure.savefig(data, format="png", dpi=150)
     image = f'<img alt="" src="data:image/png;base64,{base64.b64encode(data.getvalue()).decode()}">'
     return f"<h2>{escape(title)}</h2><p>{text}</p>{image}"
 
 
 def html_page(parts: Iterable[str], title: str, further: str = "") -> str:
     """Compose an HTML page of these parts in the report's style; `further` goes into its head."""
-    head = f'<meta charset="utf-8">{further}<title>{escape(title)}</title><style>{STYLE}</style>'
+    fit = '<meta name="viewport" content="width=device-width, initial-scale=1">'
+    head = f'<meta charset="utf-8">{fit}{further}<title>{escape(title)}</title><style>{STYLE}</style>'
     return "\n".join([f'<!DOCTYPE html>\n<html lang="en">{head}', *parts, "</html>\n"])
 
 

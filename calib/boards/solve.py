@@ -406,7 +406,7 @@ def misfit_notes(fit: Solved) -> Iterator[str]:
             listed = named([f"{m.frame} ({m.rms:.2f} px)" for m in mine], LISTED)
             yield (
                 f"{name}: frames that do not fit: {listed}, others {mine[0].typical:.2f} px: "
-                "moved, blurred or wrongly detected? See the report"
+                "moved, blurred or wrongly detected?"
             )
 
 

@@ -60,14 +60,14 @@ class Explanation(NamedTuple):
         """
         if not self.has_lines:
             return (
-                f"one homography explains {self.points - self.beyond} of {self.points} points to "
-                f"{self.noise:.2f} px (one plane, cameras at one place, or all too far): it is taken; open: "
-                "lines and depth"
+                f"one homography fits {self.points - self.beyond} of {self.points} matched points to "
+                f"{self.noise:.2f} px (a plane, cameras at one place, or a far scene), and is used; unknown: "
+                "epipolar lines and depth"
             )
-        bas_relief = "" if focal_lengths else ", and the proportions of depth without focal lengths"
+        bas_relief = "" if focal_lengths else " and, without focal lengths, the proportions of depth"
         return (
-            f"{self.beyond} of {self.points} points move along lines beyond one homography: lines are taken; "
-            f"open: scale{bas_relief}"
+            f"{self.beyond} of {self.points} matched points show depth (they lie off any one homography), so "
+            f"epipolar lines are used; unknown: scale{bas_relief}"
         )
 
 

@@ -76,8 +76,8 @@ class UncalibratedRig(NamedTuple):
         if not self.explained[a, b].has_lines:
             return explained
         return (
-            f"{explained}; held-out points {self.distance[a, b]:.2f} px from their lines, all within "
-            f"{self.fits[a, b].displacement:.0f} px of the rough map"
+            f"{explained}; held-out points lie {self.distance[a, b]:.2f} px from their lines, and all within "
+            f"{self.fits[a, b].displacement:.0f} px of a homography"
             + (", with the given focal lengths" if self.by_focal[a, b] else "")
         )
 

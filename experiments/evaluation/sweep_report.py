@@ -78,7 +78,7 @@ def curves(rows: Sequence[Row]) -> Figure:
     axes = figure.subplots(len(MEASURES), len(sweeps), squeeze=False)
     for line, measure in zip(axes, MEASURES):
         for axis, (sweep, own) in zip(line, sweeps.items()):
-            _draw(axis, own, measure)
+            draw_sweep(axis, own, measure)
             axis.set_xlabel(SWEEPS[sweep][0].replace(", ", ",\n") if sweep in SWEEPS else sweep, fontsize=8)
     handles, labels = axes[0][0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="lower center", ncols=len(labels), frameon=False)
@@ -86,8 +86,8 @@ def curves(rows: Sequence[Row]) -> Figure:
     return figure
 
 
-def _draw(axis: Axes, rows: Sequence[Row], measure: str) -> None:
-    """The curves of one sweep."""
+def draw_sweep(axis: Axes, rows: Sequence[Row], measure: str) -> None:
+    """Draw the curves of one sweep, a field each, with intervals of 95 %."""
     values = grouped(rows, "value")
     for field in grouped(rows, "field"):
         drawn = {value: _drawn(rows, field, value, measure) for value in values}

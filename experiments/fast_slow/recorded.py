@@ -55,7 +55,7 @@ def run_recorded(folder: Path, out: Path, *, weights: str, say: Callable[[str], 
     table = f"{markdown_table(['', 'flicker x 1000'], rows)}\n{note}"
     _write(out, array, frames, fused, by_themselves)
     write_text(out / "scores.md", table)
-    return SystemResult(table, files_of(out))
+    return SystemResult(table, files_of(out), {})
 
 
 def recorded_frames(folder: Path) -> dict[str, list[Tensor]]:

@@ -496,7 +496,7 @@ def _calibrated(
     first = next(iter(pairs))
     assumed = [name for name in (alpha, *pairs) if name not in focal]
     of = f" {alpha} to {first}" if len(betas) > 1 else ""
-    rough = f"; focal lengths assumed of {', '.join(assumed)}: depths are only proportional"
+    rough = f"; focal lengths of {', '.join(assumed)} are assumed: depths are right up to a factor"
     note(f"depths are multiples of the baseline{of}{rough if assumed else ''}")
     scales = {name: _relative_scale(depths[first], depths[name]) if name in depths else 1.0 for name in pairs}
     rig = joined(pairs, scales)
@@ -520,7 +520,7 @@ def _calibrated_pair(
     if pair is None:
         note(f"no depth by {name}: no poses of it and {alpha} have such lines")
         return None
-    exact = f"{pair.points} points, {pair.distance:.2f} px from their lines; refining"
+    exact = f"poses by {pair.points} points, {pair.distance:.2f} px from their epipolar lines; refining"
     rough = f"lines by F; depths are rough, by poses whose lines are {pair.distance:.2f} px off"
     note(f"{alpha} > {name}: {exact if pair.exact else rough}")
     return pair

@@ -154,7 +154,7 @@ def tiles_within(
     least = max(map(memory, tiles_of(frame.hw, 64, halo)))
     needed = SLACK * (held + max(least, matching)) / 2**20
     raise ValueError(
-        f"max_memory is {limit / 2**20:.0f} MiB; this frame and network need at least {needed:.0f} MiB"
+        f"max_memory: {limit / 2**20:.0f} MiB are too few: this frame and network need {needed:.0f} or more"
     )
 
 

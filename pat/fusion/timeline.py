@@ -43,7 +43,8 @@ class Timeline:
         for name, count in self.counts.items():
             if self.rig[name].sensor.frame_rate is None:
                 raise ValueError(
-                    f"the frame rate of '{name}' is not known: add 'frame_rate' to it in the rig"
+                    f"the frame rate of '{name}' is not known: add 'frame_rate' to it in the rig, or give "
+                    f"--frame-rate {name}=25"
                 )
             if count < 1:
                 raise ValueError(f"no frames of '{name}'")

@@ -99,7 +99,8 @@ class Views:
         names = [name for name in rig.betas(alpha) if name in images]
         if not names:
             raise ValueError(
-                f"no image of any other camera than alpha, '{alpha}': fusion needs at least one beta"
+                f"the only image is of alpha, '{alpha}': give one of another camera, too "
+                f"({', '.join(rig.betas(alpha))})"
             )
         checked = {name: checked_image(rig, images, name) for name in (alpha, *names)}
         check_exposures(rig, checked, alpha)

@@ -205,11 +205,10 @@ class Data:
 class Render:
     """Render many scenes of a rig for training: workers, retries, resuming, clusters.
 
-
     Example: pat lab render config.yaml --scenes 900 --out data/ --workers 2
 
-    The same command again renders what
-    is missing. The file has at least `rig: rig.yaml`; see `pat.lab.farm.job.RenderConfig`.
+    The same command again renders what is missing. The file has at least `rig: rig.yaml`; see
+    `pat.lab.farm.job.RenderConfig`.
     """
 
     config: Annotated[Path, Option("CONFIG", positional=True)]

@@ -141,7 +141,7 @@ def _planes(
         content = _png_of_heif(path, label, hw)
     header = image_header(content)
     if header is None:
-        raise ValueError(f"{label}: not an image that can be read: give a whole PNG, TIFF, JPEG or PNM file")
+        raise ValueError(f"{label}: is no image that can be read: give a PNG, TIFF, JPEG or PNM file")
     if content[:4] in TIFF and has_further_images(content):
         warn(f"{label}: holds several images: the first is taken; save the others as files of their own")
     applied = _applied(header, orientation, label)
@@ -277,7 +277,7 @@ def _decode(content: bytes, header: ImageHeader, label: str) -> tuple[NDArray, i
     if values is None and page is not None and page.dtype is not None and page.dtype not in DECODED:
         raise ValueError(f"{label}: has {page.dtype} values: {KINDS}")
     if values is None:
-        raise ValueError(f"{label}: not an image that can be read: give a whole PNG, TIFF or JPEG file")
+        raise ValueError(f"{label}: is damaged, or not whole: copy it again, or save it as PNG or TIFF")
     if values.shape[:2] != header.hw:
         raise ValueError(f"{label}: its header says another size than its pixels have: save it again")
     if page is not None and values.dtype == np.uint16 and header.bits < 16:

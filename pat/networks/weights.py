@@ -14,7 +14,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from ..support.blocks import in_bfloat16
-from ..support.schema import from_document
+from ..support.schema import from_document, near
 from ..support.tensor_files import DAMAGED, not_whole, undamaged, write_tensors
 from .configs import CONFIGS
 from .denoiser import DenoiserConfig, LowLightNetwork
@@ -212,7 +212,7 @@ def find_weights(name: str | Path) -> Path:
     for path in (SHIPPED / f"{name}.safetensors", Path(name)):
         if path.is_file():
             return path
-    raise FileNotFoundError(f"no weights '{name}': neither a file nor one of {', '.join(shipped())}")
+    raise FileNotFoundError(f"no weights '{name}': there is no such file{near(name, shipped())}")
 
 
 def _described(

@@ -115,8 +115,8 @@ def check_limit(pixels: int, limit: float | None = None, each: float = LEAST_BYT
     limit = limit or _LIMIT.get() or math.inf
     if (needed := SLACK * (LIBRARIES + each * pixels)) > limit:
         raise ValueError(
-            f"max_memory is {limit / 2**20:.0f} MiB; a frame of {pixels / 1e6:.1f} megapixels needs at least "
-            f"{needed / 2**20:.0f} MiB: allow more, or reduce the images"
+            f"max_memory: {limit / 2**20:.0f} MiB are too few: a frame of {pixels / 1e6:.1f} megapixels "
+            f"needs {needed / 2**20:.0f} MiB or more: allow them, or reduce the images"
         )
 
 

@@ -87,7 +87,7 @@ def test_gradients_pass_where_nodes_were_moved():
 
 
 def test_the_seam_of_a_panorama_takes_nothing_of_a_curve():
-    """Straight over the seam, with few nodes: a piece of 1 / 11 of the curve was left out."""
+    """Straight over the seam, with few nodes, every piece of the curve is kept."""
     hw = (100, 200)
     alpha = Camera(K=intrinsics(100.0, hw), cam_from_world=Pose.identity(), hw=hw)
     there = Pose.from_centre(torch.diag(number(-1, 1, -1)), number(0.2, 0.0, 0.0))

@@ -29,7 +29,7 @@ def points_ahead(camera: Camera, n: int = 50) -> torch.Tensor:
 
 
 def test_depths_that_a_ray_does_not_reach_have_no_point():
-    """They gave the point opposite, which the camera sees at another pixel or not at all."""
+    """The point opposite is none: the camera sees it at another pixel or not at all."""
     fisheye = Distortion("kannala-brandt", torch.zeros(4, dtype=torch.float64))
     c = Camera(K=intrinsics(20.0, (48, 96)), cam_from_world=Pose.identity(), hw=(48, 96), distortion=fisheye)
     x = torch.tensor([[50.0, 20.0], [95.0, 24.0]], dtype=torch.float64)  # ahead, and 136 degrees off axis

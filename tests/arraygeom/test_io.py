@@ -410,7 +410,7 @@ def test_an_image_upside_down_survives_the_native_file(tmp_path):
 
 
 def test_images_that_a_homography_registers_are_a_rig(tmp_path):
-    """A link of H alone was refused; two cameras at one place are nothing else."""
+    """A link may have H alone, as two cameras at one place do."""
     H = "H: [[1, 0, 5], [0, 1, 3], [0, 0, 1]]"
     (tmp_path / "rig.yaml").write_text(
         f"cameras: {{a: {{size: [64, 48]}}, b: {{size: [64, 48]}}}}\nlinks: [{{alpha: a, beta: b, {H}}}]\n"

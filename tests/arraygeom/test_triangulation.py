@@ -202,7 +202,7 @@ def test_two_noisy_views_are_opencvs_optimal_triangulation():
 
 
 def test_what_is_not_a_number_leaves_no_gradient():
-    """One match that is NaN, and said not to be seen, made the cameras' gradients NaN."""
+    """A match that is NaN, and said not to be seen, leaves the cameras' gradients finite."""
     cameras = array_of(3)
     _, x = seen_points(cameras)
     x[2, 0] = torch.nan

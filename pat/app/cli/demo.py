@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -74,7 +75,7 @@ class Demo:
                     save_demo_figure(panels, CORNER, folder / "demo.png")
         table = table_of(columns)
         print(table, end="")
-        write_listed(self.out / "demo.md", f"```\n{table}```\n")
+        write_listed(self.out / "demo.md", table)
         written += [self.out / "demo.png", self.out / "demo.md"]
         say(f"written: {', '.join(map(str, written))}")
 
@@ -84,7 +85,7 @@ CORNER = (190, 300)
 
 
 def table_of(columns: dict[str, dict[str, str]]) -> str:
-    """Format a table of scores, with a column for each recording and a line for each method.
+    """Format a Markdown table of scores, with a column for each recording and a line for each method.
 
     Args:
         columns: formatted score by method, for each recording; the first recording lists all methods.
@@ -93,12 +94,14 @@ def table_of(columns: dict[str, dict[str, str]]) -> str:
         The text; a dash where a method does not apply.
     """
     methods = list(next(iter(columns.values())))
-    wide = max(map(len, methods)) + 2
-    lines = [" " * wide + "".join(f"{name:>18s}" for name in columns)]
-    for method in methods:
-        scores = "".join(f"{scores_of.get(method, '-'):>18s}" for scores_of in columns.values())
-        lines.append(f"{method:{wide}s}{scores}")
-    return "\n".join([*lines, ""])
+    wide = max(map(len, methods))
+
+    def line(first: str, cells: Iterable[str]) -> str:
+        return f"| {first:{wide}s} | {' | '.join(f'{cell:>15s}' for cell in cells)} |"
+
+    rule = line("-" * wide, ["-" * 14 + ":"] * len(columns))
+    rows = [line(name, (scores.get(name, "-") for scores in columns.values())) for name in methods]
+    return "\n".join([line("PSNR, dB / SSIM", columns), rule, *rows, ""])
 
 
 @dataclass

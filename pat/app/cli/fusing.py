@@ -280,8 +280,10 @@ def named_images(paths: Sequence[Path], image: Sequence[str], command: str) -> t
     if paths and (image or is_rig_file(paths[0])):
         named = (*image, *(f"{path}" if is_named(path) else f"{path.stem}={path}" for path in paths[1:]))
         if not named:
+            options.refuse_missing(paths[0], rig=False)
             raise ValueError(
-                f"{paths[0]}: {options.NO_IMAGE}; if it is a rig, give --image NAME=FILE for each camera"
+                f"{paths[0]}: {options.NO_IMAGE}; if it is a rig, give --alpha NAME, and --image NAME=FILE "
+                "for each camera"
             )
         options.files_by_name(named)
         options.refuse_missing(paths[0], rig=True)

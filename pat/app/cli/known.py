@@ -51,7 +51,8 @@ class Known:
     """
 
     given: Annotated[tuple[Path, ...], Option("RIG|IMAGE IMAGE ...", positional=True)] = ()
-    """Rig file of any known format (also: --rig RIG); or, without, image, folder or video of each camera."""
+    """Rig file of any known format (also: --rig RIG), then images; or, without a rig, an image, a folder or a
+    video of each camera."""
     alpha: Name = None
     """The camera whose view is wanted; without a rig, by default the largest grey image."""
     image: Images = ()
@@ -59,16 +60,16 @@ class Known:
     depth: Depth = None
     """Near and far bounds in metres, instead of the rig's; far may be inf."""
     misfit: Literal["correct", "warn", "refuse"] = "correct"
-    """If the rig does not fit the images: correct how far the cameras lie off their search segments, and warn
-    where the images still do not fit; warn alone; or refuse: correct, and write nothing where they still do
-    not fit."""
+    """If matches lie beside the rig's search segments: correct moves the segments to them, and warns where
+    images still do not fit; warn only warns; refuse corrects, and writes nothing where they still do not
+    fit."""
     response: Annotated[str, Option("fit|rec601|R,G,B")] = "fit"
-    """How a mono alpha weighs red, green and blue; fit: found from matches, with gain and gamma."""
+    """Weights of red, green and blue in a mono alpha; fit finds them from matches, with gain and gamma."""
     match_levels: bool = False
-    """First bring each beta to alpha's mean and contrast (other exposures, filters)."""
+    """Bring each beta to alpha's mean and contrast before matching, for other exposures or filters."""
     noise: Annotated[tuple[str, ...], Option(NOISE, repeat=True)] = ()
-    """Low light: a camera's electrons at white and read noise in electrons, or estimate: views are denoised.
-    A frame is by default fused so where an image shows noise plainly."""
+    """Denoise in low light: a camera's electrons at white and its read noise in electrons, or estimate. By
+    default noise that shows plainly is estimated; none leaves it."""
     max_memory: Memory = None
     """Memory limit of the whole process, such as 4GiB; larger frames are done in tiles."""
 
@@ -234,11 +235,11 @@ class Around(Known):
     """
 
     around: Annotated[str | None, Option("FILE", also=("--matches", "--depth-map"))] = None
-    """Search around what is known: a depth map of alpha's pixels (PFM, TIFF, 16-bit PNG), or matched points
-    (CSV with x0,y0,x1,y1 a line, of two images in order; a COLMAP database), by which, without a rig, it is
-    found: ten of them are enough to lay one image on the other. For a depth map,
-    FILE,scale=METRES says the metres of one unit (by default 1 of floats, and .001 of whole numbers),
-    FILE,tolerance=SHARE by what share it may be off (by default .05; 0 takes it as it is)."""
+    """Search around known depths or matches only. FILE is a depth map of alpha's pixels (PFM, TIFF, 16-bit
+    PNG), or matched points: CSV with x0,y0,x1,y1 a line, of two images in order, or a COLMAP database.
+    Without a rig, matched points determine it; ten are enough to lay one image on the other. For a depth map,
+    FILE,scale=METRES is the length of one unit (by default 1 for floats, .001 for whole numbers) and
+    FILE,tolerance=SHARE its relative error (by default .05; 0 takes it as exact)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

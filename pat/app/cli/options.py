@@ -365,7 +365,7 @@ def _named_file(option: str, text: str) -> tuple[str, Path]:
         return name, Path(path)
     file = path or text
     if not Path(file).suffix:
-        raise ValueError(f"{option}: '{text}' is not NAME=FILE")
+        raise ValueError(f"{option}: expected NAME=FILE, as mono=a.png, got '{text}'")
     raise ValueError(
         f"{option} {text}: which camera is it of? Give NAME=FILE, such as {Path(file).stem}={file}"
     )
@@ -376,7 +376,8 @@ def _named_number(option: str, text: str) -> tuple[str, float]:
     with suppress(ValueError):
         if math.isfinite(value := float(number)):
             return name, value
-    raise ValueError(f"{option}: '{text}' is not NAME=NUMBER, such as mono=30")
+    example = 800 if option == "--focal" else 25
+    raise ValueError(f"{option}: expected NAME=NUMBER, as mono={example}, got '{text}'")
 
 
 def _once(option: str, pairs: Iterable[tuple[str, T]]) -> Iterator[tuple[str, T]]:

@@ -10,6 +10,7 @@ import argparse
 import ast
 import dataclasses
 import inspect
+import re
 import sys
 import textwrap
 import types
@@ -37,9 +38,10 @@ class UsageError(ValueError):
         got: value that it got; None to leave that out of the message.
     """
 
-    def __init__(self, option: str, expected: str, got: object = None) -> None:
+    def __init__(self, option: str, expected: str, got: object = None, *, text: str = "") -> None:
         self.option, self.expected, self.got = option, expected, got
-        super().__init__(f"{option}: expected {expected}" + (f", got {got}" if got is not None else ""))
+        said = f"expected {expected}" + (f", got {got}" if got is not None else "")
+        super().__init__(f"{option}: {text or said}")
 
 
 @dataclass(frozen=True)
@@ -63,12 +65,26 @@ class Option:
     repeat: bool = False
 
 
+def words_of(metavar: str | tuple[str, ...] | None) -> str:
+    """Return the values that an option wants, as its help names them."""
+    return metavar if isinstance(metavar, str) else " ".join(metavar or ())
+
+
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         option, _, said = message.removeprefix("argument ").partition(": ")
         if option.startswith("the following"):
-            option, said = said, "a value, got none"
+            option = said.partition(", ")[0]
+            raise UsageError(
+                option, "a value", text=f"is needed: {(self._entry(option).help or '').rstrip('.')}"
+            )
+        if re.match(r"expected .* arguments?$", said):
+            said = words_of(self._entry(option).metavar)
         raise UsageError(option, said.removeprefix("expected "))
+
+    def _entry(self, option: str) -> argparse.Action:
+        """Option or argument by the name that argparse gives it in messages."""
+        return next(a for a in self._actions if option in ("/".join(a.option_strings), a.metavar, a.dest))
 
 
 def parse(
@@ -142,7 +158,8 @@ def script(kind: Callable[..., T], arguments: Sequence[str] | None = None, *, pr
 
 def _unknown(word: str, options: list[str]) -> UsageError:
     if word.startswith("-"):
-        return UsageError(word.partition("=")[0], f"no such option{near(word, options)}")
+        text = f"there is no such option{near(word, options)}"
+        return UsageError(word.partition("=")[0], "another option", text=text)
     advice = ": write the option before each, as in --image a=A --image b=B" if "=" in word else ""
     return UsageError(word, f"an option before it{advice}")
 

@@ -165,7 +165,7 @@ class Explore:
     port: int = 0
     """Port on localhost; 0 takes a free one."""
     browser: bool = True
-    """Open the browser."""
+    """Print the address of the page, and open no browser."""
 
     def run(self) -> None:
         """Serve the explorer, or save its page.
@@ -304,7 +304,8 @@ class Convert:
     lens: Annotated[str | None, Option("MODEL")] = None
     """Lens model of the coefficients, as brown-conrady or kannala-brandt: for files that do not say."""
     refit: bool = False
-    """Fit lenses anew that end within their image, as at a pole: brown-conrady's k1 k2 p1 p2 k3."""
+    """Replace a lens whose model ends within the image, as at a pole, by a fitted brown-conrady lens (k1 k2
+    p1 p2 k3)."""
     write_as: Annotated[str, Option("FORMAT")] = "native"
     """Format of the target."""
 
@@ -424,7 +425,7 @@ class Refine:
     sigma: Annotated[tuple[str, ...], Option("KIND=NUMBER")] = ()
     """Standard deviation of a parameter before refinement: degrees, pixels; translation, focal relative."""
     photometric: bool = True
-    """Also minimise the fusion's own error, after that of the points."""
+    """Fit matched points alone, and not the fusion's own error after them."""
     force: bool = False
     """Write the refined rig in spite of objections."""
 
@@ -522,10 +523,10 @@ class RigFromImages:
 
 @dataclass
 class RigDiff:
-    """Say whether a rig has moved: two calibrations of it compared by the pixels and depths that they say.
+    """Compare two calibrations of a rig, in pixels and in depth: has it moved?
 
-    A motion of the whole rig is no difference. What is more than both calibrations' errors follows from the
-    covariance files that `pat calibrate` writes beside its rigs.
+    A motion of the whole rig is no difference. Whether one is larger than the calibrations' own errors is
+    judged by the covariance files that `pat calibrate` writes beside its rigs.
 
     Example: pat rig diff may.yaml october.yaml --out diff.png
     """

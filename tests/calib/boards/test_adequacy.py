@@ -192,7 +192,7 @@ def test_the_simplest_of_equal_lenses_is_advised():
 
 
 def test_a_lens_that_sees_the_board_behind_it_gives_no_pose():
-    """One line, by which the comparison of lenses leaves a model out that came out wrong."""
+    """One line says so, and the comparison of lenses leaves the model out."""
     seen = next(iter(see(Rig({"cam": TRUE}), board_poses(1), noise=0.2)["cam"].seen.values()))
     wrong = camera(60.0, (480, 640), lens=(0.0, 0.0, 0.0, 0.0), model="kannala-brandt", offset=(1e3, 0.0))
     with pytest.raises(ValueError, match="640x480"):

@@ -116,7 +116,7 @@ def test_a_few_bad_images_are_named_and_left_out(mine, without_report, capsys):
 
 def test_other_mistakes(mine, capsys):
     assert str(mine / "none") in fails(mine / "none", capsys)
-    assert "--camera: 'left'" in fails(mine, capsys, "--camera", "left")
+    assert "'left'" in fails(mine, capsys, "--camera", "left")
     assert "near <= far" in fails(mine, capsys, "--depth", "3", "1")
     assert "charuko:8x6:30mm" in fails(mine, capsys, board="charuko:8x6:30mm")
 

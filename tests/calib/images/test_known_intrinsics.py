@@ -72,7 +72,7 @@ def test_lengths_are_those_stated_of_cameras_that_match(lost, noise, monkeypatch
     ("distance", "depth", "turned"), [(25.0, 0, False), (9e3, 0, True), (25.0, 9, False)]
 )
 def test_far_scenes_need_no_baseline(distance, depth, turned):
-    """Over far ground a baseline was found in what orientations leave open, and depths with it."""
+    """Over far ground no baseline, and no depth, is read into what orientations leave open."""
     torch.manual_seed(0)
     K, hw = intrinsics(1450.0, (960, 1280)), (960, 1280)
     known = {"a": Camera(K=K, cam_from_world=Pose.identity(), hw=hw)}

@@ -62,7 +62,7 @@ def test_cameras_at_one_position_are_named():
 
 
 def test_cameras_that_are_at_one_place_are_no_misfit():
-    """Every point was called behind the cameras, and the rotation in radians."""
+    """Points without parallax are neither behind the cameras nor a sign of radians."""
     one, image = rectified_pair()["left"], rectified_images()["left"]
     rig = Rig({"left": one, "right": one.crop(0, 6, (one.hw[0], one.hw[1] - 6))})
     assert rig.pair("left", "right").at_one_place

@@ -38,7 +38,7 @@ def fused(folder, rig, out):
 
 
 def test_a_frame_heals_its_own_rig_and_says_so(material, capsys):
-    """A rig measured with a ruler gave a ghosted image of low confidence."""
+    """A rig measured with a ruler is corrected by the frame's own matches."""
     folder, ground_truth = material
     before = (folder / "rough.yaml").read_text()
     right, healed = (fused(folder, f"{name}.yaml", name) for name in ("right", "rough"))

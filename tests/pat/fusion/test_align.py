@@ -171,7 +171,7 @@ def test_values_are_samples_of_what_was_recorded(interpolation, kind):
 
 @pytest.mark.parametrize("kind", [np.int64, np.uint64, np.float32, np.bool_])
 def test_nearest_values_are_those_recorded_of_any_type(kind):
-    """Integers of 64 bits went through float64."""
+    """Integers of 64 bits keep all their bits."""
     values = np.arange(12).reshape(1, 3, 4)
     values = values % 2 == 0 if kind is np.bool_ else (np.iinfo(np.int64).max - values).astype(kind)
     positions = np.stack(np.meshgrid(np.arange(4), np.arange(3)), -1).astype(np.float32) + np.float32(0.3)

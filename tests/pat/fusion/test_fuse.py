@@ -239,7 +239,7 @@ def test_an_image_of_one_colour_is_named():
 
 
 def test_a_network_elsewhere_is_refused():
-    """It gave NaN, without a word."""
+    """Its result would be NaN."""
     rig, images = scene()
     with pytest.raises(ValueError, match="'mono' is on cpu, the network on meta: give all on one device"):
         fuse(images, rig, alpha="mono", network=network_of("PAT").to("meta"))

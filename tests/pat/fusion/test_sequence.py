@@ -152,7 +152,7 @@ def test_a_speed_that_is_none_is_refused_at_once():
 
 
 def test_an_image_that_cannot_be_read_costs_its_own_key_frame_alone():
-    """Levels are matched over those around, which it made fail too."""
+    """Levels are matched over the frames around it that can be read."""
 
     class Damaged(list):
         def __getitem__(self, i):

@@ -143,7 +143,7 @@ def test_what_is_doubtful_lies_between_matched_and_filled():
 
 
 def test_brightness_tells_of_a_match_unless_alpha_sees_something_else():
-    """Near infrared is nearly always of another brightness: colours of certain matches gave way to fills."""
+    """Near infrared is nearly always of another brightness: certain matches keep their colours there."""
     beta = torch.full((1, 3, *HW), 0.5)
     alpha = beta[:, :1].clone()
     alpha[..., 20:28] = 0.9

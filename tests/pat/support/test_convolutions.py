@@ -56,7 +56,7 @@ def test_convolutions_keep_gradients_and_precision(two_threads):
 
 
 def test_convolutions_are_torchs_own_where_its_threads_sleep(two_threads, monkeypatch):
-    """In strips they took a tenth longer at 12 megapixels."""
+    """Strips pay only where threads would spin."""
     monkeypatch.setattr(module, "_SLEEPING", True)
     monkeypatch.setattr(module, "_convolved", None)
     x, layer = torch.rand(1, 8, 300, 300), torch.nn.Conv2d(8, 8, 3, padding=1)

@@ -125,7 +125,7 @@ def test_rig_commands_take_matches(folder, capsys):
 
 @pytest.mark.parametrize("alpha", ["mono", "blind"])
 def test_matches_find_the_rig_of_images_that_do_not_match(folder, tmp_path, alpha, capsys):
-    """The rig was sought in the images alone, and refused."""
+    """Matches that are given are enough, where none can be found."""
     files = f"{folder / 'mono.png'} {folder / 'blind.png'}"
     with suppress(SystemExit):  # as confidence is low
         pat(f"align {files} --matches {folder / 'matches.csv'} --alpha {alpha} -o {tmp_path} --extras npy")
@@ -159,7 +159,7 @@ def test_a_depth_map_without_a_rig_is_refused_before_the_work(folder, tmp_path, 
 
 
 def test_matches_off_the_lines_of_the_rig_are_said(folder, capsys):
-    """Those of another image were taken without a word; here beta's rows are counted from below."""
+    """As of another image: here beta's rows are counted from below."""
     rows = np.loadtxt(folder / "matches.csv", delimiter=",")
     rows[:, 3] = H - 1 - rows[:, 3]
     np.savetxt(folder / "rows.csv", rows, delimiter=",")
@@ -194,7 +194,7 @@ def test_bad_input_is_one_line(folder, options, expected, capsys):
 
 
 def test_a_large_depth_map_in_another_unit_is_told_what_it_holds(folder, monkeypatch):
-    """Torch's quantiles are of 2^24 numbers at most: of larger maps its words were the message."""
+    """Torch's quantiles are of 2^24 numbers at most: larger maps are sampled."""
     monkeypatch.setattr("pat.media.depth_maps.read_depth", lambda *_, **__: torch.full((4097, 4097), 1e4))
     rig, large = Rig.load(folder / "rig.yaml"), folder / "large.tif"
     large.touch()

@@ -93,7 +93,6 @@ REFUSED = {
 
 @pytest.mark.parametrize("line", REFUSED)
 def test_what_the_parser_refuses_is_one_line(line, refusal):
-    """Boxes of ten lines."""
     words = line.split()
     path = " ".join(words[:2] if words[0] in ("rig", "lab") else words[:1])
     said = refusal(*words)
@@ -117,7 +116,7 @@ def test_what_the_parser_refuses_is_one_line(line, refusal):
     ],
 )
 def test_mistakes_that_need_no_torch_are_said_before_it_is_imported(line, said):
-    """They took as long as torch to be said."""
+    """A mistake in the words of a line is answered at once."""
     code = f"""
 import sys
 from pat.app.cli.main import main
@@ -174,7 +173,7 @@ runpy.run_module("pat", run_name="__main__")
 
 
 def test_threads_that_wait_sleep():
-    """Spinning, two threads took twice the core seconds beside another process; a user's setting is kept."""
+    """They leave cores to other processes; a user's setting is kept."""
     code = (
         "import os\nfrom pat.__main__ import main\ntry: main()\nfinally: print(os.environ['OMP_WAIT_POLICY'])"
     )
