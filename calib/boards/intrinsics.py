@@ -271,7 +271,7 @@ def _linear_intrinsics(view: tuple[np.ndarray, np.ndarray], hw: HW) -> np.ndarra
     7.1)."""
     X, x = view[0].astype(np.float64), view[1][:, 0].astype(np.float64)
     if len(X) < FEWEST_POINTS:
-        return np.array(intrinsics(float(max(hw)), hw))
+        return intrinsics(float(max(hw)), hw).numpy()
     scale, middle = hw[1] / 2, np.array([(hw[1] - 1) / 2, (hw[0] - 1) / 2])
     u, v = ((x - middle) / scale).T
     Xh, zero = np.column_stack([X / np.abs(X).max(), np.ones(len(X))]), np.zeros((len(X), 4))
@@ -279,7 +279,7 @@ def _linear_intrinsics(view: tuple[np.ndarray, np.ndarray], hw: HW) -> np.ndarra
     P = np.linalg.svd(A)[2][-1].reshape(3, 4)
     K = cv2.decomposeProjectionMatrix(P)[0]
     focal = scale * float(np.sqrt(abs(K[0, 0] * K[1, 1]))) / abs(K[2, 2])
-    return np.array(intrinsics(float(np.clip(focal, 0.3 * max(hw), 30 * max(hw))), hw))
+    return intrinsics(float(np.clip(focal, 0.3 * max(hw), 30 * max(hw))), hw).numpy()
 
 
 def _fisheye(views: BoardViews, board: Board) -> OpenCVSolution:
@@ -294,7 +294,7 @@ def _fisheye(views: BoardViews, board: Board) -> OpenCVSolution:
 
     solutions: list[tuple[float, OpenCVSolution]] = []
     for focal in (w / np.pi, float(w)):
-        K, none = np.array(intrinsics(focal, views.hw)), np.zeros((4, 1))
+        K, none = intrinsics(focal, views.hw).numpy(), np.zeros((4, 1))
         try:
             rms, K, c, *poses = cv2.fisheye.calibrate(points, pixels, (w, h), K, none, flags=flags)
         except cv2.error as error:

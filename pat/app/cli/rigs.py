@@ -208,6 +208,8 @@ class Explore:
 
 MOST_CAMERAS = 12
 """Number of cameras up to which `pat rig info` describes every pair."""
+MOST_ROWS = 100
+"""Number of cameras in its tables."""
 
 
 @dataclass
@@ -248,16 +250,18 @@ class Info:
         if self.json:
             document = {"cameras": [c._asdict() for c in cameras], "pairs": [p._asdict() for p in pairs]}
             return options.print_json(document)
-        print_tables(cameras, pairs, unit)
+        if len(cameras) > MOST_ROWS:
+            say(f"the first {MOST_ROWS} of {len(cameras)} cameras: --json has all")
+        print_tables(cameras[:MOST_ROWS], pairs, unit)
 
 
 def warn_of_oddities(rig: Rig) -> None:
     """Print what is odd about a rig, except for what reading its file has warned of."""
     from arraygeom.rig_check import file_oddities
 
-    warned = file_oddities(rig)
+    warned = tuple(file_oddities(rig))
     for oddity in rig.check():
-        if not any(map(oddity.endswith, warned)):
+        if not oddity.endswith(warned):
             say(f"pat: {oddity}", style="yellow")
 
 
