@@ -8,7 +8,7 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --no-input -
 
 DATA ?= ../shared/data
 
-.PHONY: help env synthesis demo showcase readme pairs stages conditions certainty without-rig alignment paper-network paper-tables outside fields formats test test-long check format bench bench-job train notebooks docs drawings wheel fuzz mistakes kills transformations
+.PHONY: help env synthesis demo showcase readme pairs stages conditions certainty without-rig alignment paper-network paper-tables outside fields formats test test-long check format bench bench-job train notebooks docs drawings wheel fuzz mistakes kills transformations gradients
 
 help:
 	@echo "make demo       fuse the sample array into out/demo"
@@ -94,6 +94,10 @@ paper-network: $(READY)
 	@$(BIN)/python -m experiments evaluate --middlebury $(DATA)/middlebury --rates 2 --half report \
 		--network tests/benchmarks/paper-2-narrow.safetensors --out out/paper-network
 	@$(BIN)/python -m docs.update_readme --document docs/reports/paper.md --block paper=out/paper-network/scores.md
+
+gradients: $(READY)
+	@$(BIN)/python -m experiments gradients --out out/gradients
+	@$(BIN)/python -m docs.update_readme --document docs/reports/gradients.md --block gradients=out/gradients/gradients.md
 
 outside: $(READY)
 	@$(BIN)/python -m experiments outside --middlebury $(DATA)/middlebury --half report --out out/outside

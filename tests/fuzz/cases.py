@@ -134,7 +134,8 @@ def rig_seeds(folder: Path) -> Iterator[Seed]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             write_rig(rig, target, format=label.partition(",")[0])
-        for file in sorted(target.iterdir()) if target.is_dir() else [target]:
+        files = sorted(target.glob("[!.]*")) if target.is_dir() else [target]
+        for file in files:
             yield Seed("rig", f"{label} (written)", file, target.is_dir())
     yield from _matlab(folder / "matlab")
     yield from _colmap_binary(folder / "colmap_binary")

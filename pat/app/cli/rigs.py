@@ -173,6 +173,8 @@ class Explore:
         Raises:
             ValueError: for a rig or images that it cannot show.
         """
+        from calib.boards.uncertainty import RigCovariance
+
         from ..explore import opened, serve
 
         if self.save is not None:
@@ -182,7 +184,19 @@ class Explore:
         if images:
             warn_of_misfit(rig, images)
         options.field_named(self.field)
-        explorer = opened(rig, images, alpha=self.alpha, network=self.network, field=self.field)
+        beside = self.rig.with_suffix(".covariance.json")
+        explorer = opened(
+            rig,
+            images,
+            alpha=self.alpha,
+            network=self.network,
+            field=self.field,
+            covariance=RigCovariance.load(beside, rig) if beside.is_file() else None,
+            files={
+                "": str(self.rig),
+                **{name: str(file) for name, file in options.files_by_name(self.image).items()},
+            },
+        )
         if explorer.error:
             raise ValueError(explorer.error)
         if self.save is None:
