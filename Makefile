@@ -8,7 +8,7 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --no-input -
 
 DATA ?= ../shared/data
 
-.PHONY: help env synthesis demo showcase readme pairs stages conditions certainty without-rig alignment paper-network paper-tables outside fields formats test test-long check format bench bench-job train notebooks docs drawings wheel fuzz mistakes kills transformations
+.PHONY: help env synthesis demo showcase readme pairs stages conditions certainty without-rig alignment paper-network paper-tables outside fields formats test test-long check format bench bench-job train notebooks docs drawings wheel fuzz mistakes kills transformations gradients
 
 help:
 	@echo "make demo       fuse the sample array into out/demo"
@@ -37,7 +37,7 @@ help:
 	@echo "make kills      end commands with SIGKILL some 100 times, continue and compare; the table of docs/reports/kills.md"
 	@echo "make transformations  torch's transformations of every operator; the table of docs/reports/transformations.md"
 	@echo "make train      train on the images at hand; ARGS=... goes to 'pat lab train'"
-	@echo "make synthesis  adds Blender to the environment (some 400 MB), to render scenes"
+	@echo "make synthesis  adds Blender (some 400 MB), to render scenes: in $(VENV)/blender, with what it needs"
 	@echo "make notebooks  run the notebooks and keep what they put out"
 	@echo "make docs       the documentation as a site, in out/site"
 	@echo "make drawings   the documentation's drawings, and the gallery's figures"
@@ -95,6 +95,10 @@ paper-network: $(READY)
 		--network tests/benchmarks/paper-2-narrow.safetensors --out out/paper-network
 	@$(BIN)/python -m docs.update_readme --document docs/reports/paper.md --block paper=out/paper-network/scores.md
 
+gradients: $(READY)
+	@$(BIN)/python -m experiments gradients --out out/gradients
+	@$(BIN)/python -m docs.update_readme --document docs/reports/gradients.md --block gradients=out/gradients/gradients.md
+
 outside: $(READY)
 	@$(BIN)/python -m experiments outside --middlebury $(DATA)/middlebury --half report --out out/outside
 	@$(BIN)/python -m docs.update_readme --document docs/reports/outside.md --block outside=out/outside/outside.md
@@ -132,8 +136,11 @@ format: $(READY)
 	@$(BIN)/ruff check --fix .
 
 synthesis: $(READY)
-	@echo "== installing Blender"
+	@echo "== installing Blender in $(VENV)/blender"
 	@$(PIP) --editable '.[dev,synthesis]'
+	@$(VENV)/blender/bin/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv --clear $(VENV)/blender
+	@$(VENV)/blender/bin/python -m pip install -qq --disable-pip-version-check --no-input --requirement blender.txt \
+		|| { rm -r $(VENV)/blender; exit 1; }
 
 bench: $(READY)
 	@$(BIN)/python -m tests.benchmarks.bench_attention

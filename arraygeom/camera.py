@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
 from .batching import Batched
-from .checks import check_above, check_batches, check_hw, check_K, checking
+from .checks import check_above, check_batches, check_hw, check_K, check_pixels, check_tensors, checking
 from .distortion import Distortion
 from .kornia_models import from_kornia_model, to_kornia_model
 from .lenses.common import on_plane
@@ -200,6 +200,7 @@ class LensView(View):
         Returns:
             Directions (z = 1 for pinholes, unit length with a lens), and True where the lens model has one.
         """
+        check_pixels(x)
         normalised = map_homogeneous(torch.linalg.inv(self.K)[..., :2, :], x)
         if self.distortion is None:
             return to_homogeneous(normalised), torch.ones_like(normalised[..., 0], dtype=torch.bool)
@@ -350,6 +351,7 @@ class Camera(LensView):
         Raises:
             ValueError: if pixels and depths, broadcast, are more than either, as (n, 2) beside (n, 1).
         """
+        check_tensors((), depth=depth)
         rays, valid = self.rays(x)
         z = rays[..., 2]
         _check_pairs(z.shape, depth.shape)

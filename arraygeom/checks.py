@@ -235,6 +235,20 @@ def check_pixels(x: Any) -> None:
         raise ValueError(f"the pixels have shape {tuple(x.shape)}; wanted (..., 2), each (x, y)")
 
 
+def check_tensors(last: tuple[int, ...], **values: Any) -> None:
+    """Check that each of the named values is a tensor whose last axes have these sizes.
+
+    Raises:
+        ValueError: for other sizes.
+        TypeError: for a value that is no tensor.
+    """
+    for name, value in values.items():
+        if not isinstance(value, Tensor):
+            raise TypeError(f"{name} is a {type(value).__name__}: give a tensor (..., {_shape(last)})")
+        if value.ndim < len(last) or tuple(value.shape[value.ndim - len(last) :]) != last:
+            raise ValueError(f"{name} has shape {tuple(value.shape)}; wanted (..., {_shape(last)})")
+
+
 def check_field(field: Any) -> None:
     """Check that a receptive field can be called and is not a class.
 

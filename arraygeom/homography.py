@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
+from .checks import check_numbers, check_tensors
 from .pixels import map_homogeneous, product, to_homogeneous
 from .robust import LocalModel, levenberg_marquardt
 from .runtime.tracing import needs_numbers, traced
@@ -114,9 +115,18 @@ def fit_homography(x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"]) -> Float[Te
         differentiable, through ten Gauss-Newton steps at the end.
 
     Raises:
-        ValueError: if there is no such homography: points on a line, or some that would be behind.
+        ValueError: for fewer points, NaN, and if there is no such homography: points on a line, or some that
+            would be behind.
+        TypeError: for points that are no tensors.
     """
+    check_tensors((2,), x=x, y=y)
+    if x.shape != y.shape or x.ndim != 2 or len(x) < 4:
+        raise ValueError(
+            f"wanted four pairs of points or more, (n, 2) each, got {tuple(x.shape)}, {tuple(y.shape)}"
+        )
     needs_numbers("the number of steps of fit_homography", x, y)
+    check_numbers(x, (2,), "x")
+    check_numbers(y, (2,), "y")
     dtype = torch.promote_types(x.dtype, y.dtype)
     x, y = x.double(), y.double()
     A, B = _normalising(x), _normalising(y)

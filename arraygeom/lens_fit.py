@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from functools import lru_cache, wraps
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -11,6 +13,9 @@ from .camera import Camera, LensView
 from .distortion import BROWN_CONRADY, Distortion
 from .pixels import coarse_grid, map_homogeneous
 from .rig import Rig
+
+T = TypeVar("T")
+V = TypeVar("V", bound=LensView)
 
 SAMPLES, ROUNDS = 160, 30
 """Points across the disc that a lens is fitted to, and rounds of reweighted fits."""
@@ -44,6 +49,32 @@ class Refit(NamedTuple):
     usual: float
 
 
+class _Lens:
+    """Key of a camera: equal for equal images, K and lenses, wherever the cameras are."""
+
+    def __init__(self, camera: Any) -> None:
+        self.camera, lens = camera, camera.distortion
+        numbers = lens.coefficients.tolist() if isinstance(lens, Distortion) else id(lens)
+        self.key = str((camera.hw, camera.K.dtype, camera.K.tolist(), getattr(lens, "model", None), numbers))
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Lens) and self.key == other.key
+
+
+def once_a_lens(function: Callable[[V], T]) -> Callable[[V], T]:
+    """Decorate a function of a camera's image, K and lens alone: cameras with equal ones share its result.
+
+    Returns:
+        The function; it remembers the last 64 results.
+    """
+    known: Callable[[_Lens], T] = lru_cache(maxsize=64)(lambda lens: function(lens.camera))
+    return wraps(function)(lambda camera: known(_Lens(camera)))
+
+
+@once_a_lens
 def coverage(camera: LensView) -> LensCoverage:
     """Measure the share of a camera's pixels with a ray, and their widest angle, on a coarse grid of pixels.
 

@@ -12,7 +12,7 @@ from jaxtyping import Float, Real
 from torch import Tensor
 
 from .batching import Batched
-from .checks import check_batches, check_numbers, check_rotation, checking, derived
+from .checks import check_batches, check_numbers, check_rotation, check_tensors, checking, derived
 from .pixels import broadcast_shapes, broadcasts, floating, product
 from .runtime.text import angle, range_text
 from .runtime.tracing import traced
@@ -145,8 +145,10 @@ class Pose(Batched):
             Points of the same shape.
 
         Raises:
-            ValueError: for points without the batch's axes.
+            ValueError: for points of other than three numbers, or without the batch's axes.
+            TypeError: for points that are no tensor.
         """
+        check_tensors((3,), points=X)
         X, batch = floating(X), self.batch_shape
         if not broadcasts(batch, X.shape[:-1]):
             raise ValueError(
@@ -217,8 +219,14 @@ def rotation_from_vector(w: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
 
     Returns:
         The rotation matrix.
+
+    Raises:
+        ValueError: for other than three numbers.
+        TypeError: for a value that is no tensor.
     """
     from kornia.geometry.conversions import axis_angle_to_rotation_matrix
+
+    check_tensors((3,), w=w)
 
     return axis_angle_to_rotation_matrix(w)
 

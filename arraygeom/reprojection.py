@@ -54,8 +54,13 @@ def reprojection_residuals(
 
     Returns:
         Residuals (v, *n, 2), pixels; zero where a point is not seen, or not valid in the camera.
+
+    Raises:
+        ValueError: for pixels of another number of views.
     """
     projected = [camera.project(X) for camera in cameras]
+    if len(x) != len(cameras):
+        raise ValueError(f"wanted pixels (views, ..., 2) of {len(cameras)} cameras, got {tuple(x.shape)}")
     used = _used(projected, x, seen)
     return torch.where(used[..., None], x - torch.stack([p.x for p in projected]), 0.0)
 

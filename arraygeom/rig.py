@@ -16,7 +16,7 @@ from torch import Tensor
 
 from .batching import Batched, map_tensors
 from .camera import Camera, LensView, View, view_facts
-from .checks import check_above, checking, derived
+from .checks import check_above, check_tensors, checking, derived
 from .pair import Link, Pair, depth_range
 from .pixels import HW, resize_matrix, rot90_matrix, shift_matrix
 from .runtime.text import baseline_text, depth_text, length_unit
@@ -291,11 +291,14 @@ class Rig(Batched):
             The rig; everything without a change is bit-identical.
 
         Raises:
-            ValueError: for an unknown name.
+            ValueError: for an unknown name, or a change of another size.
+            TypeError: for a change that is no tensor.
         """
         unknown = set(changes) - set(self._parameter_shapes())
         if unknown:
             raise ValueError(f"no such rig parameter: {', '.join(sorted(unknown))}")
+        for name, change in changes.items():
+            check_tensors((3,) if name.endswith((".rotation", ".translation")) else (), **{name: change})
         cameras = {
             name: derived(_perturbed_camera, name, camera, changes) for name, camera in self.cameras.items()
         }

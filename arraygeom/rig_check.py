@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from itertools import combinations, pairwise
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import chain, combinations, pairwise
 
 import torch
 from torch import Tensor
@@ -12,7 +12,7 @@ from .camera import Camera, LensView, View
 from .checks import derived
 from .distortion import BROWN_CONRADY, Distortion
 from .fields.default import recorded_field
-from .lens_fit import coverage
+from .lens_fit import coverage, once_a_lens
 from .pair import Pair
 from .pixels import HW, coarse_grid, map_homogeneous
 from .rig import Rig
@@ -35,6 +35,8 @@ OFF_BACK = 0.05
 """Error in pixels of projecting a pixel's ray that is tolerated: lenses in float32 err by thousandths."""
 MOST_CAMERAS = 16
 """Number of cameras above which each is compared with the next alone, as there are many pairs."""
+MOST_PAIRS = 120
+"""Number of pairs, evenly spread over the rig, whose overlap is computed: all of `MOST_CAMERAS` cameras."""
 RANK = 1e-3
 """Ratio of F's least to largest singular value above which it is not of rank two."""
 
@@ -52,7 +54,11 @@ def unit_oddity(rig: Rig) -> str | None:
     centres = [camera.centre for camera in rig.cameras.values() if isinstance(camera, Camera)]
     if len(centres) < 2 or length_unit(rig) != "m":
         return None
-    longest = float(torch.pdist(torch.stack(centres)).max())
+    places = torch.stack(centres)
+    longest, end = 0.0, places[0]
+    for _ in range(3):  # from end to end: without the distances of all pairs
+        distances = (places - end).norm(dim=-1)
+        longest, end = max(longest, float(distances.max())), places[distances.argmax()]
     if longest > LARGEST_BASELINE:
         return (
             f"has cameras {longest:.3g} m apart: is this file in millimetres? "
@@ -68,50 +74,64 @@ def unit_oddity(rig: Rig) -> str | None:
     return None
 
 
-def lens_end(name: str, camera: LensView) -> str | None:
-    """Return a sentence on the lens model of a camera called `name` that ends within the camera's image; None
-    if it covers the image.
+def lens_ends(views: Iterable[tuple[str, LensView]]) -> Iterator[str]:
+    """Yield a sentence on each lens model that ends within its image, with the names of its cameras.
 
     Camera models state themselves where they end (a pole, the rim of a fisheye's circle), which is no mistake
     unless they cover nothing.
     """
-    covered = coverage(camera)
-    stated = covered.share > 0 and not isinstance(camera.distortion, Distortion)
-    if camera.distortion is None or stated or covered.share >= COVERED:
-        return None
-    refit = ": check the coefficients"
-    if isinstance(camera.distortion, Distortion) and camera.distortion.model == BROWN_CONRADY:
-        refit = ", as at a pole or a fold of its formula; fit one without: `pat rig convert --refit`"
-    where = f"ends {covered.degrees:.1f} degrees off the axis" if covered.share else "covers nothing"
-    unused = 100 * (1 - covered.share)
-    return f"the lens model of '{name}' {where}: {unused:.0f} % of its image is not used{refit}"
+    ending: dict[tuple[str, str, str], list[str]] = {}
+    for name, camera in views:
+        covered = coverage(camera)
+        stated = covered.share > 0 and not isinstance(camera.distortion, Distortion)
+        if camera.distortion is None or stated or covered.share >= COVERED:
+            continue
+        refit = ": check the coefficients"
+        if isinstance(camera.distortion, Distortion) and camera.distortion.model == BROWN_CONRADY:
+            refit = ", as at a pole or a fold of its formula; fit one without: `pat rig convert --refit`"
+        where = f"ends {covered.degrees:.1f} degrees off the axis" if covered.share else "covers nothing"
+        ending.setdefault((where, f"{100 * (1 - covered.share):.0f}", refit), []).append(name)
+    for (where, unused, refit), names in ending.items():
+        yield f"the lens model of {_listed(names)} {where}: {unused} % of its image is not used{refit}"
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Return up to three names, and the number of the others."""
+    more = [f"{len(names) - 3} more"] * (len(names) > 3)
+    return " and ".join([", ".join(f"'{name}'" for name in names[:3]), *more])
 
 
 def file_oddities(rig: Rig) -> list[str]:
     """List the sentences that reading a rig's file warns of: its unit, and lenses that fold within their
     images."""
     views = [(name, camera) for name, camera in rig.cameras.items() if isinstance(camera, LensView)]
-    ends = [lens_end(*view) for view in views if getattr(view[1].distortion, "model", None) == BROWN_CONRADY]
-    return [sentence for sentence in (unit_oddity(rig), *ends) if sentence is not None]
+    ends = lens_ends(v for v in views if getattr(v[1].distortion, "model", None) == BROWN_CONRADY)
+    unit = unit_oddity(rig)
+    return [*([] if unit is None else [unit]), *ends]
 
 
 def _all(rig: Rig) -> Iterator[str]:
     """Sentences on units, lenses, K, overlap, positions, baselines, F."""
     if unit := unit_oddity(rig):
         yield f"the rig {unit}"
-    for name, camera in rig.cameras.items():
-        if isinstance(camera, LensView):
-            yield from _of_lens(name, camera)
+    views = {name: camera for name, camera in rig.cameras.items() if isinstance(camera, LensView)}
+    yield from lens_ends(view for view in views.items() if not _round_trip(view[1])[1])
+    for name, camera in views.items():
+        if (lens := camera.distortion) is not None and not (off := _round_trip(camera)[0]) <= OFF_BACK:
+            yield (
+                f"the model of '{name}', {lens.model}, projects the rays of its pixels up to "
+                f"{off:.3g} px off them: project and unproject are to be the inverse of one another"
+            )
         if isinstance(camera, Camera):
             yield from _of_K(name, camera)
     names = [name for name, camera in rig.cameras.items() if isinstance(camera, Camera)]
     pairs = list(combinations(names, 2)) if len(names) <= MOST_CAMERAS else list(pairwise(names))
-    small = rig
+    compared, small = pairs[:: -(-len(pairs) // MOST_PAIRS) or 1], rig
     if not rig.links:
         small = rig.replace(
-            cameras={n: camera.resize(_reduced(camera.hw)) for n, camera in rig.cameras.items()}
+            cameras={n: rig[n].resize(_reduced(rig[n].hw)) for n in dict.fromkeys(chain(*compared))}
         )
-    for one, other in [order for pair in pairs for order in (pair, pair[::-1])]:
+    for one, other in [order for pair in compared for order in (pair, pair[::-1])]:
         # a few pixels decide most pairs: through lenses all take seconds
         if not _overlap(small.pair(one, other)) and not _overlap(rig.pair(one, other)):
             near, far = map(float, rig.depth or (0, 0))
@@ -157,24 +177,16 @@ def _of_K(name: str, camera: Camera) -> Iterator[str]:
         )
 
 
-def _of_lens(name: str, camera: LensView) -> Iterator[str]:
-    """Sentences on a lens model that covers too little of its image, or whose maps are not inverse to each
-    other."""
+@once_a_lens
+def _round_trip(camera: LensView) -> tuple[float, bool]:
+    """Largest error in pixels of projecting the rays of pixels back, and whether all of them have rays."""
     if (lens := camera.distortion) is None:
-        return
+        return 0.0, True
     points = map_homogeneous(torch.linalg.inv(camera.K)[..., :2, :], _grid(camera).to(camera.K))
     directions, has_ray = lens.unproject(points)
     back, has_image = lens.project(lens.origins(points) + directions)
-    valid = has_ray & has_image
-    if not bool(valid.all()) and (ends := lens_end(name, camera)):
-        yield ends
-    off = ((back - points) @ camera.K[:2, :2].mT).norm(dim=-1)
-    off = torch.where(valid, off, 0.0)
-    if not bool((off <= OFF_BACK).all()):
-        yield (
-            f"the model of '{name}', {lens.model}, projects the rays of its pixels up to "
-            f"{float(off.max()):.3g} px off them: project and unproject are to be the inverse of one another"
-        )
+    valid, off = has_ray & has_image, ((back - points) @ camera.K[:2, :2].mT).norm(dim=-1)
+    return float(torch.where(valid, off, 0.0).max()), bool(valid.all())
 
 
 def _reduced(hw: HW) -> HW:

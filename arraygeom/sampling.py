@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import torch
 from jaxtyping import Bool, Float, Real
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
+from .checks import check_tensors
 from .pixels import HW, floating, within
 from .runtime.threads import in_parallel
 from .runtime.tracing import followed
@@ -73,8 +74,23 @@ def sample(
         in image and positions.
 
     Raises:
+        ValueError: for images or pixels of other shapes, whole numbers, or another interpolation.
+        TypeError: for values that are no tensors.
         NotImplementedError: in forward mode (jvp, jacfwd, hessian).
     """
+    check_tensors((), image=image)
+    check_tensors((2,), x=x)
+    if image.ndim != 4 or not image.numel() or not image.is_floating_point() or x.ndim < 2:
+        raise ValueError(
+            f"wanted images (B, C, H, W) of floating-point numbers and pixels (B, ..., 2), got {image.dtype} "
+            f"{tuple(image.shape)} and {tuple(x.shape)}"
+        )
+    if len(x) not in (1, len(image)):
+        raise ValueError(f"wanted pixels for 1 or {len(image)} images, got them for {len(x)}")
+    if interpolation not in get_args(Interpolation):
+        raise ValueError(
+            f"interpolation is {interpolation!r}; wanted one of {', '.join(get_args(Interpolation))}"
+        )
     batch, hw = len(image), (image.shape[-2], image.shape[-1])
     dtype = torch.promote_types(image.dtype, floating(x).dtype)
     x = floating(x).expand(batch, *x.shape[1:])

@@ -12,7 +12,7 @@ from torch import Tensor
 from .camera import Camera, LensView
 from .distortion import Distortion
 from .fields import Curved, Epipolar, sampling_locations
-from .lens_fit import coverage
+from .lens_fit import coverage, once_a_lens
 from .pair import Pair
 from .pixels import coarse_grid, pixel_grid
 from .rig import Rig
@@ -116,6 +116,7 @@ def _camera(name: str, rig: Rig) -> CameraSummary:
     return CameraSummary(name, (w, h), field_of_view(camera), focal, footprint, *of_lens)
 
 
+@once_a_lens
 def field_of_view(camera: Camera) -> tuple[float, float]:
     """Compute the angles between the rays at the middles of opposite edges, through the lens.
 

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
 from .camera import Camera
+from .checks import check_above, check_tensors
 from .epipolar import Depth, beside, depth_from_track, track
 from .lenses.common import on_plane
 from .multiview import world_rays
@@ -64,12 +65,18 @@ def triangulate(
         have it in front, and no residual is too large.
 
     Raises:
-        ValueError: for fewer than two cameras, or another number of views in `x`.
+        ValueError: for fewer than two cameras, another number of views in `x`, no deviation, or `seen` of
+            another shape.
+        TypeError: for pixels that are no tensor.
     """
     if len(cameras) != len(x) or len(cameras) < 2:
         raise ValueError(
             f"wanted pixels (views, ..., 2) of {len(cameras)} >= 2 cameras, got {tuple(x.shape)}"
         )
+    check_tensors((2,), x=x)
+    check_above(0, itself=False, deviation=deviation)
+    if seen is not None and (seen.shape != x.shape[:-1] or seen.dtype != torch.bool):
+        raise ValueError(f"seen is {seen.dtype} {tuple(seen.shape)}; wanted bools {tuple(x.shape[:-1])}")
     dtype = torch.promote_types(floating(x).dtype, cameras[0].t.dtype)
     sights, chart, p = _sighted([c.to(torch.float64) for c in cameras], x.double(), seen)
     for i in range(STEPS):

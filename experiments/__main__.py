@@ -152,6 +152,7 @@ class Experiments:
         "conditions": commands.Conditions,
         "outside": commands.Outside,
         "stages": commands.Stages,
+        "gradients": commands.Gradients,
         "certainty": commands.Certainty,
         "sweeps": commands.Sweeps,
         "fields": commands.Fields,

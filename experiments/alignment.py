@@ -34,7 +34,7 @@ from calib.boards.rig import Calibration, calibrate
 from calib.boards.target import parse_board
 from calib.images.guided_matches import ALIKE, guided_matches
 from calib.images.matches import seen_depths
-from calib.images.refinement import EXTRA_FREE, FREE, refine
+from calib.images.refinement import FREE, refine
 from experiments.evaluation.halves import of_half
 from experiments.names import refuse_unknown
 from pat import FuseSettings, align
@@ -451,7 +451,7 @@ def nine_band_scene(data: Path) -> Iterator[AlignmentScene]:
     images = {name: views[name] for name in rig.names}
     depths = [_depths_seen(rig, images, alpha, name) for name in ("Cam-3", "Cam-5")]
     bounds = min(near for near, _ in depths), max(far for _, far in depths)
-    start, free = views.developed.replace(depth=bounds), (*FREE, *EXTRA_FREE, "distortion")
+    start, free = views.developed.replace(depth=bounds), (*FREE, "distortion")
     refined = refine(start, [images], free=free, sigma={"distortion": ONE_BOARD}).rig
     yield AlignmentScene("nine-band", refined, images, RecordedFiles(rig, files), alpha, True)
 

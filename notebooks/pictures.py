@@ -10,7 +10,6 @@ import csv
 import sys
 import warnings
 from collections.abc import Mapping, Sequence
-from importlib.util import find_spec
 from io import BytesIO
 from pathlib import Path
 from tempfile import mkdtemp
@@ -148,7 +147,12 @@ def scratch() -> Path:
 
 def has_blender() -> bool:
     """Tell whether scenes can be rendered."""
-    return all(find_spec(package) for package in ("bpy", "OpenEXR"))
+    from pat.lab.synthesis.blender.environment import blender_python
+
+    try:
+        return bool(blender_python())
+    except ValueError:
+        return False
 
 
 def still_lifes(rig: Rig, out: Path, count: int) -> list[Rendered]:

@@ -22,7 +22,7 @@ from arraygeom.runtime.extras import needs
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("arraygeom", "pat", "calib")
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-EXTRAS = {"bpy", "OpenEXR", "Imath", "triton", "jupyterlab"}
+EXTRAS = {"OpenEXR", "Imath", "triton", "jupyterlab"}
 """Modules that need not be installed."""
 
 SHAPED = {

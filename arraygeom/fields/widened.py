@@ -4,17 +4,23 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Real
 from torch import Tensor
 
+from ..camera import Camera
 from ..checks import check_above, check_field
+from ..multiview import world_rays
 from ..pair import Pair
-from ..pixels import HW, floating, shift_matrix
+from ..pixels import HW, floating, pixel_grid, shift_matrix
+from ..rig import Rig
 from ..sampling import sample
-from ..segments import Positions, Segments, clip_to_image
+from ..segments import Positions, Segments, clip_to_image, sample_fractions
+from ..uncertainty import Covariance, bands
 from .curved import Curved, ThroughLenses
+from .default import default_field
 from .protocol import ReceptiveField, SamplingLocations, answered
 from .straight import Epipolar, EpipolarLine, HomographyDisplacement
 
@@ -91,6 +97,7 @@ class Widened:
         across: pixels of beta to either side, at least 0.
         along: pixels of beta at either end, at least 0.
         samples: number of positions along a segment that becomes wider, at least 1.
+        margins: more pixels, of each pixel's own, as `from_covariance` finds them; None for none.
 
     Raises:
         ValueError: for numbers below these bounds, infinity or NaN.
@@ -101,11 +108,54 @@ class Widened:
     across: float = 0.0
     along: float = 0.0
     samples: int = 96
+    margins: Margins | None = None
 
     def __post_init__(self) -> None:
         check_field(self.field)
         check_above(0, across=self.across, along=self.along)
         check_above(1, whole=True, samples=self.samples)
+
+    @classmethod
+    def from_covariance(
+        cls,
+        rig: Rig,
+        covariance: Covariance,
+        alpha: str,
+        beta: str,
+        *,
+        field: ReceptiveField | None = None,
+        confidence: float = 0.95,
+        samples: int = 96,
+    ) -> Widened:
+        """Widen a field by the uncertainty of a rig's calibration, at each pixel of alpha by its own.
+
+        Args:
+            covariance: covariance of parameters of the rig, as `calib` writes it beside the rig.
+            field: field to widen; None for the pair's `default_field`.
+            confidence: probability that the band holds the point, for normal errors.
+
+        Returns:
+            The field of this pair, also after its images are resized or undistorted.
+
+        Raises:
+            ValueError: as `arraygeom.uncertainty.bands`, and if beta sees nothing within the depth range.
+        """
+        camera, pair = rig[rig.require(alpha)], rig.pair(alpha, beta)
+        (h, w), (rows, columns) = camera.hw, GRID
+        x = pixel_grid(GRID, dtype=torch.float64) * torch.tensor(
+            [(w - 1) / (columns - 1), (h - 1) / (rows - 1)]
+        )
+        band = bands(rig, covariance, alpha, beta, x.reshape(-1, 2), confidence)
+        grid = torch.cat([band.across, band.along], -1)
+        if not bool(grid.isfinite().any()):
+            raise ValueError(
+                f"'{beta}' sees nothing that '{alpha}' sees within the depth range: check the rig"
+            )
+        most = torch.where(grid.isfinite(), grid, 0.0).amax(0)
+        grid = torch.where(grid.isfinite(), grid, most).T.reshape(1, 4, rows, columns)
+        widest = float(most[:2].max()), float(most[2:].max())
+        margins = Margins(pair.cameras[0], pair.cameras[1].K, grid, widest)
+        return cls(default_field(pair) if field is None else field, samples=samples, margins=margins)
 
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> SamplingLocations:
         """Compute the field's sampling locations, widened and on beta's image.
@@ -117,24 +167,44 @@ class Widened:
         Raises:
             ValueError: for an invalid result of the field, or whatever the field raises for this pair.
         """
-        locations = self._evaluated(pair, x)
+        across, along = self._widths(pair, x)
+        most_across, most_along = self._most
+        locations = self._evaluated(pair, x, math.ceil(most_across + most_along))
         if isinstance(locations, Segments):
-            more = self.along * direction(locations.end - locations.start)
-            longer = Segments(locations.start - more, locations.end + more, locations.valid)
-            if self.across == 0:
+            way = direction(locations.end - locations.start)
+            start, end = locations.start - along[..., :1] * way, locations.end + along[..., 1:] * way
+            longer = Segments(start, end, locations.valid)
+            if most_across == 0:
                 clipped = clip_to_image(longer.start, longer.end, pair.beta.hw)
                 return Segments(clipped.start, clipped.end, clipped.valid & locations.valid)
             locations = longer.positions(self.samples)
         else:
-            xy, along = locations.xy, self.along
-            steps = torch.linspace(-along, along, xy.shape[-2], dtype=xy.dtype, device=xy.device)
-            locations = Positions(xy + steps[:, None] * tangents(locations), locations.mask)
-        return self._band(locations, pair.beta.hw)
+            steps = _between(-along[..., :1], along[..., 1:], locations.xy)
+            locations = Positions(locations.xy + steps[..., None] * tangents(locations), locations.mask)
+        return self._band(locations, pair.beta.hw, across)
 
-    def _evaluated(self, pair: Pair, x: Tensor) -> SamplingLocations:
-        """Evaluate the field around beta's image too, as far as widening may bring it in; by sizes alone on
+    def _widths(self, pair: Pair, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Widths across and along at each pixel's start and end, (*n or none, 2)."""
+        across, along = (floating(x).new_full((2,), width) for width in (self.across, self.along))
+        if self.margins is None:
+            return across, along
+        more = self.margins.at(pair, x)
+        return across + more[..., :2], along + more[..., 2:]
+
+    @property
+    def _most(self) -> tuple[float, float]:
+        """Largest widths across and along."""
+        more = (0.0, 0.0) if self.margins is None else self.margins.most
+        return self.across + more[0], self.along + more[1]
+
+    @property
+    def rows(self) -> int:
+        """Number of rows of samples of a band."""
+        return 2 * math.ceil(self._most[0]) + 1
+
+    def _evaluated(self, pair: Pair, x: Tensor, margin: int) -> SamplingLocations:
+        """Evaluate the field around beta's image too, as far as widening may bring in; by sizes alone on
         the image."""
-        margin = math.ceil(self.across + self.along)
         if margin == 0 or not _follows_beta(self.field, pair):
             return answered(self.field, pair, x)
         h, w = pair.beta.hw
@@ -144,20 +214,54 @@ class Widened:
             return Segments(locations.start - margin, locations.end - margin, locations.valid)
         return Positions(locations.xy - margin, locations.mask)
 
-    @property
-    def rows(self) -> int:
-        """Number of rows of samples of a band."""
-        return 2 * math.ceil(self.across) + 1
-
-    def _band(self, p: Positions, hw: HW) -> Positions:
+    def _band(self, p: Positions, hw: HW, across: Tensor) -> Positions:
         tangent = tangents(p)
         left = torch.stack([tangent[..., 1], -tangent[..., 0]], -1)
-        rows = torch.linspace(self.across, -self.across, self.rows, dtype=p.xy.dtype, device=p.xy.device)
-        xy = p.xy[..., None, :, :] + rows[:, None, None] * left[..., None, :, :]
+        rows = torch.linspace(1, -1, self.rows, dtype=p.xy.dtype, device=p.xy.device)
+        steps = _between(across[..., :1], across[..., 1:], p.xy)[..., None] * left
+        xy = p.xy[..., None, :, :] + rows[:, None, None] * steps[..., None, :, :]
         xy = xy.flatten(-3, -2)
         inside = ((xy >= -0.5) & (xy <= xy.new_tensor([hw[1] - 0.5, hw[0] - 0.5]))).all(-1)
-        mask = inside & p.mask[..., None, :].expand(*p.mask.shape[:-1], self.rows, -1).flatten(-2, -1)
+        mask = inside & p.mask[..., None, :].expand(*p.mask.shape[:-1], len(rows), -1).flatten(-2, -1)
         return Positions(torch.where(mask[..., None], xy, 0.0), mask)
+
+
+GRID = 12, 16
+"""Rows and columns of alpha's pixels at which `Margins` are computed."""
+
+
+class Margins(NamedTuple):
+    """Widths of each pixel's own, interpolated between those of a grid over alpha's image.
+
+    Attributes:
+        alpha: the camera to whose pixels the grid belongs.
+        K: intrinsics of beta, of whose pixels the widths are.
+        grid: widths (1, 4, rows, columns): across and along, each at the near and the far bound.
+        most: the largest of them, across and along.
+    """
+
+    alpha: Camera
+    K: Float[Tensor, "3 3"]
+    grid: Float[Tensor, "1 4 r c"]
+    most: tuple[float, float]
+
+    def at(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Float[Tensor, "*n 4"]:
+        """Return the widths at alpha's pixels, in pixels of the pair's beta."""
+        view, beta = pair.cameras
+        x = floating(x)
+        centre, directions, _ = world_rays(view, x.to(view.K))
+        there = self.alpha.project(centre + directions).x
+        (h, w), (rows, columns) = self.alpha.hw, self.grid.shape[2:]
+        cells = there * there.new_tensor([(columns - 1) / max(w - 1, 1), (rows - 1) / max(h - 1, 1)])
+        widths = sample(self.grid.to(cells), cells.reshape(1, -1, 2), extended=True).values[0]
+        scale = (beta.K[..., :2, :2].det().abs() / self.K[:2, :2].det().abs().to(beta.K)).sqrt()
+        return (scale * widths.mT).reshape(*x.shape[:-1], 4).to(x)
+
+
+def _between(first: Tensor, last: Tensor, like: Tensor) -> Tensor:
+    """Values (*n, l) that lead evenly from first to last (*n, 1) over the positions (*n, l, 2)."""
+    share = sample_fractions(like.shape[-2], like=like) if like.shape[-2] > 1 else like.new_zeros(1)
+    return first + (last - first) * share
 
 
 def _follows_beta(field: ReceptiveField, pair: Pair) -> bool:

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
 from arraygeom import Camera, Distortion, Pose, intrinsics
 from arraygeom.lenses.central import MODELS
@@ -46,6 +47,10 @@ RAYLEIGH_MEDIAN = 1.17741
 """Median length of a vector of two independent standard normal variables."""
 OBLONG = 0.1
 """Largest relative difference between the sides of a real camera's pixels."""
+FISHEYE_FITS = 0.005
+"""Median reprojection error, as a share of the width, up to which a fisheye fits."""
+FISHEYE_FOCALS = (0.15, 0.2, 0.25, 0.32, 0.4, 0.5, 0.7, 1.0, 1.5)
+"""Focal lengths from which a fisheye's fit may start, as shares of the width: 1 / pi shows half a sphere."""
 OpenCVSolution = tuple[np.ndarray, np.ndarray, list[np.ndarray], list[np.ndarray]]
 """K, distortion coefficients, rotations, translations."""
 
@@ -173,20 +178,27 @@ def near_homography(detection: Detection, board: Board) -> Detection:
 def _solved(name: str, views: BoardViews, board: Board, lens: Lens) -> tuple[Camera, dict[FrameKey, Pose]]:
     """OpenCV's camera, and `cam_from_board` by moment. Raises ValueError if it finds none."""
     model, count = LENSES[lens]
-    pinhole = model in ("brown-conrady", "none")
+    if model not in ("brown-conrady", "none"):
+        camera, poses = _fisheye(views, board)
+        return camera if model == "kannala-brandt" else _with_model(camera, model), poses
     try:
-        K, coefficients, rotations, translations = (
-            _pinhole(views, board, count) if pinhole else _fisheye(views, board)
-        )
-    except cv2.error as error:
-        wrong = f"{name}: OpenCV finds no camera that fits these boards ({error.err})"
-        raise ValueError(f"{wrong}: do all show the same board?") from None
-    initial = model if pinhole else "kannala-brandt"
-    distortion = Distortion(initial, torch.tensor(coefficients)) if count else None
-    camera = Camera(K=torch.tensor(K), cam_from_world=Pose.identity(), hw=views.hw, distortion=distortion)
-    if not pinhole and model != "kannala-brandt":
-        camera = _with_model(camera, model)
-    return camera, {key: _pose(r, t) for key, r, t in zip(views.seen, rotations, translations)}
+        K, coefficients, rotations, translations = _pinhole(views, board, count)
+        distortion = Distortion(model, torch.tensor(coefficients)) if count else None
+        camera = Camera(K=torch.tensor(K), cam_from_world=Pose.identity(), hw=views.hw, distortion=distortion)
+        return camera, {key: _pose(r, t) for key, r, t in zip(views.seen, rotations, translations)}
+    except (cv2.error, ValueError):  # none is found, or one with NaN
+        raise ValueError(_advice(name, views, board)) from None
+
+
+def _advice(name: str, views: BoardViews, board: Board) -> str:
+    """Sentence on boards that no pinhole camera fits: whether a fisheye does."""
+    camera, poses = _fisheye(views, board)
+    errors = [_projection_errors(camera, poses[key], d, board.points) for key, d in views.seen.items()]
+    off = float(np.median(np.concatenate(errors)))
+    wrong = f"{name}: no pinhole camera fits these boards"
+    if off < FISHEYE_FITS * views.hw[1]:
+        return f"{wrong}, and a fisheye does to {off:.2g} px: give --lens kannala-brandt"
+    return f"{wrong}, nor does a fisheye (to {off:.0f} px): do all images show the same board?"
 
 
 def _with_model(camera: Camera, model: str) -> Camera:
@@ -219,21 +231,40 @@ def board_pose(camera: Camera, detection: Detection, board: Board) -> Pose:
     Raises:
         ValueError: if fewer than four points are in front of the camera, as by a lens far from the true one.
     """
-    directions, valid = camera.rays(torch.from_numpy(detection.x))
-    rays = directions.numpy()
-    usable = valid.numpy() & (rays[:, 2] > 0.05 * np.linalg.norm(rays, axis=1))
+    rays, valid = _unit_rays(camera, detection)
+    try:
+        return _pose_of_rays(board, detection.ids[valid], rays[valid])
+    except ValueError as error:
+        raise ValueError(f"{error} of {camera}: check its lens and focal length") from None
+
+
+def _unit_rays(
+    camera: Camera, detection: Detection
+) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
+    """Rays of length 1 through a camera's points, and a mask of those that its lens model has."""
+    rays, valid = camera.rays(torch.from_numpy(detection.x))
+    return (rays / rays.norm(dim=-1, keepdim=True)).numpy(), valid.numpy()
+
+
+def _pose_of_rays(board: Board, ids: Int[np.ndarray, " n"], rays: Float[np.ndarray, "n 3"]) -> Pose:
+    """`cam_from_board` by the rays of its points, relative to their mean: a fisheye sees boards beside it."""
+    ahead, usable = np.eye(3), np.zeros(0, dtype=bool)
+    if len(rays):
+        ahead = Rotation.align_vectors([0.0, 0.0, 1.0], rays.mean(0))[0].as_matrix()
+        rays = rays @ ahead.T
+        usable = rays[:, 2] > 0.05
     if usable.sum() < 4:
         raise ValueError(
-            f"only {usable.sum()} of {len(usable)} points of a board are in front of {camera}: "
-            "a pose needs four; check its lens and focal length"
+            f"only {usable.sum()} points of a board (a pose needs four) have rays through the lens"
         )
     flat = rays[usable, :2] / rays[usable, 2:]
-    points = board.points[detection.ids[usable]]
+    points = board.points[ids[usable]]
     method = cv2.SOLVEPNP_IPPE if board.flat else cv2.SOLVEPNP_SQPNP
     first = points * (1, 1, 0) if board.flat else points
     _, r, t = cv2.solvePnP(first, flat, np.eye(3), np.zeros(4), flags=method)
     _, r, t = cv2.solvePnP(points, flat, np.eye(3), np.zeros(4), r, t, True, cv2.SOLVEPNP_ITERATIVE)
-    return _pose(r, t)
+    turned, back = _pose(r, t), torch.from_numpy(ahead.T)
+    return Pose(back @ turned.R, back @ turned.t)
 
 
 def _pinhole(views: BoardViews, board: Board, count: int) -> OpenCVSolution:
@@ -271,7 +302,7 @@ def _linear_intrinsics(view: tuple[np.ndarray, np.ndarray], hw: HW) -> np.ndarra
     7.1)."""
     X, x = view[0].astype(np.float64), view[1][:, 0].astype(np.float64)
     if len(X) < FEWEST_POINTS:
-        return np.array(intrinsics(float(max(hw)), hw))
+        return intrinsics(float(max(hw)), hw).numpy()
     scale, middle = hw[1] / 2, np.array([(hw[1] - 1) / 2, (hw[0] - 1) / 2])
     u, v = ((x - middle) / scale).T
     Xh, zero = np.column_stack([X / np.abs(X).max(), np.ones(len(X))]), np.zeros((len(X), 4))
@@ -279,31 +310,43 @@ def _linear_intrinsics(view: tuple[np.ndarray, np.ndarray], hw: HW) -> np.ndarra
     P = np.linalg.svd(A)[2][-1].reshape(3, 4)
     K = cv2.decomposeProjectionMatrix(P)[0]
     focal = scale * float(np.sqrt(abs(K[0, 0] * K[1, 1]))) / abs(K[2, 2])
-    return np.array(intrinsics(float(np.clip(focal, 0.3 * max(hw), 30 * max(hw))), hw))
+    return intrinsics(float(np.clip(focal, 0.3 * max(hw), 30 * max(hw))), hw).numpy()
 
 
-def _fisheye(views: BoardViews, board: Board) -> OpenCVSolution:
-    """Fit from the focal length of half a sphere and from that of a narrow view; the better fit is kept."""
-    if not board.flat:
-        raise ValueError("fisheyes need a flat board to start from: points in space give pinhole cameras")
-    points = [board.points[d.ids][:, None] for d in views.seen.values()]
-    pixels = [d.x[:, None] for d in views.seen.values()]
-    h, w = views.hw
-    flags = cv2.fisheye.CALIB_RECOMPUTE_EXTRINSIC | cv2.fisheye.CALIB_FIX_SKEW
-    flags |= cv2.fisheye.CALIB_USE_INTRINSIC_GUESS
+def _fisheye(views: BoardViews, board: Board) -> tuple[Camera, dict[FrameKey, Pose]]:
+    """Fit the focal length and two terms of Kannala and Brandt's model, each board's pose by its own rays.
 
-    solutions: list[tuple[float, OpenCVSolution]] = []
-    for focal in (w / np.pi, float(w)):
-        K, none = np.array(intrinsics(focal, views.hw)), np.zeros((4, 1))
+    From the best of `FISHEYE_FOCALS`; the principal point is in the middle.
+    """
+
+    def changed(values: np.ndarray) -> Camera:
+        lens = Distortion("kannala-brandt", torch.tensor([*values[1:], 0, 0], dtype=torch.float64))
+        K = intrinsics(float(np.exp(values[0])), views.hw)
+        return Camera(K=K, cam_from_world=Pose.identity(), hw=views.hw, distortion=lens)
+
+    detections = list(views.seen.values())
+    ends = np.cumsum([len(d.ids) for d in detections])[:-1]
+    every = Detection(np.concatenate([d.ids for d in detections]), np.concatenate([d.x for d in detections]))
+
+    def placed(camera: Camera) -> list[Pose]:
+        rays, valid = _unit_rays(camera, every)
+        parts = zip(np.split(every.ids, ends), np.split(rays, ends), np.split(valid, ends))
+        return [_pose_of_rays(board, ids[seen], directions[seen]) for ids, directions, seen in parts]
+
+    def off(values: np.ndarray) -> np.ndarray:
+        camera, points = changed(values), torch.from_numpy(board.points)
         try:
-            rms, K, c, *poses = cv2.fisheye.calibrate(points, pixels, (w, h), K, none, flags=flags)
-        except cv2.error as error:
-            failed = error
-        else:
-            solutions.append((rms, (K, c.reshape(-1), list(poses[0]), list(poses[1]))))
-    if not solutions:
-        raise failed
-    return min(solutions, key=lambda one: one[0])[1]
+            X = torch.cat([pose.apply(points[d.ids]) for pose, d in zip(placed(camera), detections)])
+        except (ValueError, cv2.error):
+            return np.full(len(every.ids), float(max(views.hw)))
+        errors = np.linalg.norm(camera.project_local(X).x.numpy() - every.x, axis=-1)
+        return np.nan_to_num(errors, nan=np.inf).clip(max=max(views.hw))
+
+    tried = [np.array([np.log(share * views.hw[1]), 0, 0]) for share in FISHEYE_FOCALS]
+    first = min(tried, key=lambda values: float(np.median(off(values))))
+    found = least_squares(off, first, loss="soft_l1", diff_step=1e-4, x_scale=(0.01, 0.01, 0.01), max_nfev=6)
+    camera = changed(found.x)
+    return camera, dict(zip(views.seen, placed(camera)))
 
 
 def _pose(r: np.ndarray, t: np.ndarray) -> Pose:

@@ -5,7 +5,7 @@ Gauss-Newton with Marquardt's damping (Triggs et al. 2000).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -60,6 +60,8 @@ MISFIT = 1.8
 CONSPICUOUS = 1.8
 """and ratio to the camera's noise, which it must exceed too."""
 SYNCHRONISED = "taken at the same moments, with matching numbers, not mirrored, with a stiff board"
+MOVED = 2.0
+"""Ratio of an image's joint residuals to those of its camera alone above which it contradicts the others."""
 INCONSISTENT, REJECTED = 3.0, 20.0
 """Ratios of joint to single RMS above which a camera is inconsistent with the others, or refused."""
 LISTED = 5
@@ -432,12 +434,17 @@ def solve_together(initial: InitialRig, board: Board, singles: Mapping[str, Solv
     if len(singles) == 1:
         return next(iter(singles.values()))
     rms = {name: single.problem.rms() for name, single in singles.items()}
-    solved = solve(initial, board)
-    while wrong := _wrong_images(solved, rms):
-        initial = _without(initial, wrong)
-        solved = solve(initial, board)
-    if not (doubts := _inconsistent_cameras(solved, rms)):
-        return solved
+    given, first = initial, solve(initial, board)
+    for limit in (
+        _moved_from,
+        _refused_from,
+    ):  # if boards move in all frames, only images far off are left out
+        initial, solved = given, first
+        while wrong := _wrong_images(solved, singles, limit):
+            initial = _without(initial, wrong)
+            solved = solve(initial, board)
+        if not (doubts := _inconsistent_cameras(solved, rms)):
+            return solved
     priors = {name: _as_prior(name, single) for name, single in singles.items()}
     free = {name: prior.information.diagonal() > 0 for name, prior in priors.items()}
     for name, mask in free.items():
@@ -449,11 +456,18 @@ def solve_together(initial: InitialRig, board: Board, singles: Mapping[str, Solv
     return replace(adjusted, notes=tuple(notes), views=initial.views, left_out=initial.left_out)
 
 
-def _wrong_images(solved: Solved, single_rms: Mapping[str, float]) -> list[tuple[str, FrameKey]]:
-    """Images that contradict the others, one for each moment; none if they are too many of one camera's."""
+def _wrong_images(
+    solved: Solved, singles: Mapping[str, Solved], limit: Callable[[float], float]
+) -> list[tuple[str, FrameKey]]:
+    """Images that fit their own camera and contradict the others, as of a board that moved between exposures.
+
+    One for each moment; none if they are too many of one camera's.
+    """
     reasons = dict[FrameKey, str]()
+    alone = {name: frame_rms(single.problem)[name] for name, single in singles.items()}
     for misfit in misfits(solved):
-        if misfit.rms > _refused_from(single_rms[misfit.camera]):
+        others = sum(misfit.frame in views.seen for views in solved.views.values()) > 1
+        if others and misfit.rms > limit(alone[misfit.camera].get(misfit.frame, misfit.rms)):
             reasons.setdefault(misfit.frame, misfit.camera)
     counts = {name: len(v.seen) for name, v in solved.views.items()}
     many = many_wrong(list(reasons.values()), [name for name, _ in solved.left_out], counts)
@@ -483,6 +497,11 @@ def many_wrong(wrong: Sequence[str], before: Sequence[str], counts: Mapping[str,
     return any(
         wrong.count(n) + before.count(n) > MANY_WRONG * (counts[n] + before.count(n)) for n in set(wrong)
     )
+
+
+def _moved_from(single_rms: float) -> float:
+    """Joint reprojection error (RMS, pixels) above which an image contradicts other cameras' images."""
+    return MOVED * single_rms
 
 
 def _refused_from(single_rms: float) -> float:

@@ -24,6 +24,7 @@ from arraygeom.pixels import HW
 from arraygeom.runtime.atomic import write_text
 from arraygeom.runtime.safe_yaml import load_json
 from arraygeom.sensor import Sensor
+from arraygeom.uncertainty import position_covariance
 
 from .board import Board
 from .bundle import (
@@ -130,7 +131,7 @@ def beta_covariance(
 ) -> Float[np.ndarray, "n 2 2"]:
     """Propagate a rig's covariance to the positions in beta of alpha's pixels at a depth.
 
-    To first order: the point moves in alpha's plane of that depth so that alpha's pixel is unchanged.
+    To first order, of points at a depth in alpha, by `arraygeom.uncertainty.position_covariance`.
 
     Args:
         depth: metres.
@@ -139,18 +140,8 @@ def beta_covariance(
         Covariances (n, 2, 2) in pixels² of beta; NaN where alpha's lens has no ray or beta does not see the
         point.
     """
-    a, b = rig.pair(alpha, beta).cameras
-    X = a.unproject(torch.from_numpy(x), torch.full((len(x),), depth, dtype=torch.float64))
-    usable = (X.isfinite().all(-1) & b.project(X.nan_to_num(1.0)).valid).numpy()
-    at_points = np.full((len(x), 2, 2), np.nan)
-    if usable.any():
-        J_a, J_b = (camera_jacobian(camera, X.numpy()[usable]) for camera in (a, b))
-        across = J_b[..., 3:6] @ (b.R @ a.R.T).numpy()[:, :2]
-        change = J_b @ covariance.selection(beta, b) - across @ np.linalg.solve(
-            J_a[..., 3:5], J_a @ covariance.selection(alpha, a)
-        )
-        at_points[usable] = change @ covariance.matrix @ change.swapaxes(-1, -2)
-    return at_points
+    found = position_covariance(rig, covariance, alpha, beta, torch.from_numpy(x), depth)
+    return found.numpy()
 
 
 def baseline_deviation(rig: Mapping[str, Camera], a: str, b: str, covariance: RigCovariance) -> float:

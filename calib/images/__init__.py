@@ -1,7 +1,7 @@
 """Rigs and ordinary images: diagnosis, refinement and uncalibrated rigs, by points matched between cameras.
 
 `matches` and `patch_matching` match points; `residuals` measures them; `hypotheses`, `evidence` and `doctor`
-find the usual mistakes; `parameters`, `least_squares`, `depth_change`, `lenses`, `photometric` and
+find the usual mistakes; `parameters`, `least_squares`, `depth_change`, `lenses` and
 `refinement` improve a rig; `from_images` makes a rig from images alone; `rig_check` tests whether a rig fits
 images at all.
 """

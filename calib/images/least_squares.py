@@ -71,19 +71,15 @@ class Solution(NamedTuple):
         z: the free parameters.
         active: mask of the observable ones; the others are 0.
         covariance: posterior covariance of the free parameters, the prior's for fixed ones.
-        directions: columns of which z is a combination; along others the images do not determine it.
         full: most probable free and considered parameters without that restriction.
-        gained: variance of depth that the changes remove, relative to depth squared.
-        known: relative standard deviation of depth that would be left with the full solution.
+        depth: relative change of depth that the points' lines suggest; None where depth does not count.
     """
 
     z: Float[Tensor, " n"]
     active: Bool[Tensor, " n"]
     covariance: Float[Tensor, "n n"]
-    directions: Float[Tensor, "n m"]
     full: Float[Tensor, " k"]
-    gained: float = 0.0
-    known: float = 0.0
+    depth: float | None = None
 
 
 def solve(residuals: Residuals, count: int, considered: int = 0) -> Solution:
@@ -98,7 +94,7 @@ def solve(residuals: Residuals, count: int, considered: int = 0) -> Solution:
         considered: number of further parameters that are uncertain, but not changed.
 
     Returns:
-        The solution; its `directions` span the observable parameters.
+        The solution.
     """
     total = count + considered
     active = torch.ones(total, dtype=torch.bool)
@@ -111,8 +107,7 @@ def solve(residuals: Residuals, count: int, considered: int = 0) -> Solution:
         observable = covariance.diagonal().sqrt() <= LARGEST_POSTERIOR
         observable[count:] = True
         if bool((observable == active).all()):
-            root = torch.linalg.cholesky(covariance[:count, :count])[:, active[:count]]
-            return Solution(z[:count], active[:count], covariance[:count, :count], root, z)
+            return Solution(z[:count], active[:count], covariance[:count, :count], z)
         active = active & observable
 
 
@@ -120,8 +115,7 @@ def shifts_left_out(
     residuals: Residuals,
     z: Float[Tensor, " k"],
     parts: Int[Tensor, " m"],
-    kept: Bool[Tensor, " k"] | None = None,
-) -> Float[Tensor, "g n"]:
+) -> Float[Tensor, "g k"]:
     """Compute changes of parameters when one of the `PARTS` x `PARTS` parts of the image is left out.
 
     To first order, from the most probable z on.
@@ -130,13 +124,11 @@ def shifts_left_out(
         residuals: function of the parameters.
         z: most probable parameters, in prior deviations.
         parts: number of the part in which each residual is.
-        kept: mask of the parameters that may change; None for all.
 
     Returns:
         One row per part, in prior deviations.
     """
     r, J = jacobian(residuals, z)
-    J = J if kept is None else J[:, kept]
     weight = _weight(r)
     information = normal_equations(J.T, r, weight)[0] + torch.eye(J.shape[1], dtype=J.dtype)
     changes = []

@@ -27,17 +27,6 @@ def with_lenses(rig: Rig) -> Rig:
     return rig
 
 
-def with_distortion(rig: Rig) -> Rig:
-    """Return the rig with a lens without distortion for those of its calibrated cameras that have none.
-
-    The rig itself if every calibrated camera has one.
-    """
-    for name, view in rig.cameras.items():
-        if isinstance(view, Camera) and view.distortion is None:
-            rig = rig.with_camera(name, view.replace(distortion=_no_distortion()))
-    return rig
-
-
 def _no_distortion() -> Distortion:
     return Distortion("brown-conrady", torch.zeros(TERMS, dtype=torch.float64))
 

@@ -49,20 +49,6 @@ class LineStatistics(NamedTuple):
         return f"{self.median:.2f} px"
 
 
-class PhotometricResult(NamedTuple):
-    """Result of the minimisation of the photometric error.
-
-    Attributes:
-        before: mean absolute error on held-out pixels before.
-        after: the same after.
-        accepted: True if the result was used.
-    """
-
-    before: float
-    after: float
-    accepted: bool
-
-
 @dataclass(frozen=True)
 class Refinement:
     """Result of a refinement.
@@ -75,8 +61,6 @@ class Refinement:
         held_out: statistics of the held-out points, before and after.
         depth: change of depth; None for uncalibrated rigs and too few points of observable depth.
         objections: reasons not to accept the result, in words.
-        kept: parameters in combinations that would change depth without being determined.
-        photometric: result of the photometric stage; None if it was not run.
     """
 
     rig: Rig
@@ -86,8 +70,6 @@ class Refinement:
     held_out: tuple[LineStatistics, LineStatistics]
     depth: DepthChange | None = None
     objections: tuple[str, ...] = ()
-    kept: tuple[str, ...] = ()
-    photometric: PhotometricResult | None = None
 
     def as_text(self) -> str:
         """Return the changes, the distances of held-out points and the change of depth as lines of text."""
@@ -95,20 +77,11 @@ class Refinement:
         verdict = "accepted all the same" if self.accepted else "not accepted"
         lines = [
             f"held-out points ({original.points}) lie {original} from their lines before, {refined} after",
-            "" if self.depth is None else str(self.depth),
+            "" if self.depth is None else f"{'lines mended, ' * self.accepted}{self.depth}",
             *(f"{verdict}: {objection}" for objection in self.objections),
             *(f"changed: {change}" for change in self.changes),
             describe_lenses(self.rig) if self.accepted else "the rig is unchanged",
         ]
         if self.unobservable:
             lines.append(f"fixed, as these images do not determine them: {', '.join(self.unobservable)}")
-        if self.kept:
-            why = "as they would change depth without the images determining it"
-            lines.append(f"kept, {why}: combinations of {', '.join(self.kept)}")
-        if self.photometric is not None:
-            before, after, accepted = self.photometric
-            verdict = "accepted" if accepted else "not accepted"
-            lines.append(
-                f"photometric error on held-out pixels: {before:.4f} before, {after:.4f} after: {verdict}"
-            )
         return "\n".join(filter(None, lines))

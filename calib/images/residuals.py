@@ -397,12 +397,6 @@ def _joined(frames: Sequence[Pairs]) -> dict[tuple[str, str], PointMatches]:
     }
 
 
-def held_out_pixels(error: Tensor) -> Tensor:
-    """Return a mask of the held-out pixels of a grid: one square of 4 x 4 in `HELD_OUT`."""
-    rows, columns = (torch.arange(n) // 4 for n in error.shape)
-    return (columns + 2 * rows[:, None]) % HELD_OUT == 0
-
-
 def image_parts(rig: Rig, pairs: Pairs) -> Int[Tensor, " n"]:
     """Return which of `PARTS` x `PARTS` parts of alpha's image each point is in, the pairs one after the
     other."""

@@ -11,6 +11,7 @@ from arraygeom.runtime.atomic import write_text
 from experiments.names import refuse_unknown
 from pat.app.cli.options import NetworkName, Out, progress, say, writable
 from pat.app.cli.parser import Option
+from pat.app.sample_array import load_sample
 from pat.fusion.fuse import FuseSettings
 from pat.lab import commands as research
 from pat.lab.data.pairs import StereoPair, middlebury_pairs
@@ -19,11 +20,12 @@ from pat.lab.evaluation.ablation import sample_photographs
 from pat.lab.evaluation.tables import write_csv
 from pat.matching.certainty import fitted_network
 from pat.media.figures import save_panels
-from pat.networks.protocol import Comparing
+from pat.networks.paper import PAT
+from pat.networks.protocol import Comparing, FusionNetwork
 from pat.networks.weights import Network, load_weights
 from pat.support.tensor_files import write_tensors
 
-from . import certainty, conditions, fields, paper, stages, sweeps
+from . import certainty, conditions, fields, gradients, paper, stages, sweeps
 from .halves import of_half
 from .outside import evaluate_outside, outside_markdown
 from .sweep_report import write_report
@@ -236,6 +238,34 @@ class OnScenes:
         """Print the table."""
         print((self.out / "ablation.md").read_text(encoding="utf-8"), end="")
         say(f"written: {self.out / 'ablation.md'}, and its figures and numbers beside it")
+
+
+@dataclass
+class Gradients:
+    """Measure which gradients of a fused image by a rig's numbers are true, and what a rig is recovered to.
+
+    On the sample array; against differences, by network, parameter and region.
+    """
+
+    networks: tuple[str, ...] = ("pat-supervised", "mono-colour", "classical")
+    """Networks to compare, by name."""
+    out: Out = Path("out/gradients")
+    """Folder for gradients.md."""
+
+    def run(self) -> None:
+        """Write and print the tables. Raises FileNotFoundError for unknown weights."""
+        writable(self.out, folder=True)
+        chosen: dict[str, FusionNetwork] = {}
+        for name in self.networks:
+            network = load_weights(name)
+            if isinstance(network, PAT):
+                chosen[f"{name}, border {gradients.BORDER:g}"] = network.with_border(gradients.BORDER)
+            chosen[name] = network
+        sample, paper = load_sample(), load_weights("pat-supervised")
+        assert isinstance(paper, PAT)
+        rows = gradients.gradient_rows(chosen, gradients.cropped(sample), tuple(gradients.UNITS))
+        found = gradients.recovered_markdown(paper, sample)
+        finished(self.out / "gradients.md", f"{gradients.gradients_markdown(rows)}\n{found}")
 
 
 @dataclass

@@ -7,7 +7,7 @@ gradient.
 
 Gradients reach query, key, value, bias and the geometry. Which samples count is a constant in the graph: a
 sample that enters or leaves beta's image when a rig moves has no gradient, which is part of the truth near
-its border. A `value` that falls to 0 towards beta's border makes the output continuous there. With `nearest`
+its border. With `border` samples fade there, the output is continuous, and its gradient whole. With `nearest`
 the value and the peak have no gradient by the geometry (they are constant almost everywhere); position and
 spread do, as weighted means of the positions.
 """
@@ -28,9 +28,10 @@ from torch.nn.functional import scaled_dot_product_attention
 from torch.utils.checkpoint import checkpoint
 
 from arraygeom.camera import View
+from arraygeom.checks import check_above, check_tensors
 from arraygeom.fields import Dense, Local, lazily
 from arraygeom.pair import Pair
-from arraygeom.pixels import pixel_coordinates
+from arraygeom.pixels import HW, pixel_coordinates, pixel_grid
 from arraygeom.runtime.chunks import chunked
 from arraygeom.runtime.tracing import needs_numbers, transformations
 from arraygeom.segments import Positions, Segments
@@ -62,6 +63,7 @@ def attend(
     samples: int | None = None,
     interpolation: Interpolation = "bilinear",
     bias: Tensor | None = None,
+    border: float = 0.0,
     backend: Backend = "auto",
 ) -> Float[Tensor, "b dv ha wa"]:
     """Compute for each alpha pixel the values at its samples in beta, weighted by softmax(query . key).
@@ -82,6 +84,8 @@ def attend(
         samples: how many samples a segment has. None: one for each beta pixel of the longest valid one.
         interpolation: `bilinear` (differentiable in the geometry) or `nearest` (the paper's).
         bias: added to the scores; anything that broadcasts to (B, Ha, Wa, L); None for none.
+        border: pixels from beta's border within which weights and values fall smoothly to 0, so that nothing
+            jumps when a sample enters or leaves the image. Takes one number of memory for each sample.
         backend: `reference` (plain torch, differentiable any number of times and in forward mode), `cpu`,
             `triton`, `local` (windows alone, see `LOCAL_SERVES`; its output is channels-first in memory), or
             `auto`: `local` where that serves, or the compiled one of the tensors' device, with forward-mode
@@ -98,7 +102,8 @@ def attend(
         RuntimeError: an explicit backend that cannot serve.
         NotImplementedError: derivatives that an explicit backend does not have.
     """
-    return _attend(query, key, value, locations, samples, interpolation, bias, backend, measured=False)[0]
+    given = query, key, value, locations, samples, interpolation, bias, border, backend
+    return _attend(*given, measured=False)[0]
 
 
 def attend_with_statistics(
@@ -110,6 +115,7 @@ def attend_with_statistics(
     samples: int | None = None,
     interpolation: Interpolation = "bilinear",
     bias: Tensor | None = None,
+    border: float = 0.0,
     backend: Backend = "auto",
 ) -> Attended:
     """Compute `attend` together with statistics of its weights; arguments as there.
@@ -125,9 +131,8 @@ def attend_with_statistics(
         RuntimeError: as `attend`.
         NotImplementedError: as `attend`.
     """
-    return Attended(
-        *_attend(query, key, value, locations, samples, interpolation, bias, backend, measured=True)
-    )
+    given = query, key, value, locations, samples, interpolation, bias, border, backend
+    return Attended(*_attend(*given, measured=True))
 
 
 def _attend(
@@ -138,16 +143,23 @@ def _attend(
     samples: int | None,
     interpolation: Interpolation,
     bias: Tensor | None,
+    border: float,
     backend: Backend,
     *,
     measured: bool,
 ) -> tuple[Tensor, ...]:
     """Values, and if `measured` the statistics."""
-    kind = query.device.type
-    if torch.is_autocast_enabled(kind):
+    check_tensors((), query=query, key=key, value=value)
+    if not torch.compiler.is_compiling():
+        check_above(0, border=border)
+        check_above(1, whole=True, samples=samples)
+    border, kind = float(border), query.device.type
+    if kind != "meta" and torch.is_autocast_enabled(kind):
         query, key, value = (t.to(torch.get_autocast_dtype(kind)) for t in (query, key, value))
     _check(query, key, value, interpolation, backend)
     nearest = interpolation == "nearest"
+    if border > 0 and isinstance(locations, Local | Dense):
+        locations = _lazily_between(query, key, locations)
     if isinstance(locations, Dense) and backend == "auto" and samples is None and not measured:
         return (_attend_dense(query, key, value, locations.stride, bias),)
     if isinstance(locations, Local | Dense):
@@ -161,6 +173,11 @@ def _attend(
 
     def run(q: Tensor, k: Tensor, v: Tensor, locations: Locations, bias: Tensor | None) -> tuple[Tensor, ...]:
         form = sample_positions(locations, q, samples)
+        if border > 0:
+            seen = _visibility(form.positions(), (k.shape[2], k.shape[3]), border)
+            faded = seen.clamp(min=LEAST_VISIBLE).log()
+            bias = faded if bias is None else bias + faded
+            v = v * _visibility(pixel_grid((k.shape[2], k.shape[3])).to(v), (k.shape[2], k.shape[3]), border)
         attended = _run(
             AttentionInputs(q, k, v, form, _bias(bias, q, form.samples), nearest), backend, measured
         )
@@ -194,6 +211,17 @@ def _check(query: Tensor, key: Tensor, value: Tensor, interpolation: str, backen
         raise ValueError(f"interpolation must be 'bilinear' or 'nearest', got {interpolation!r}")
     if backend not in get_args(Backend):
         raise ValueError(f"backend must be one of {', '.join(get_args(Backend))}, got {backend!r}")
+
+
+LEAST_VISIBLE = 1e-9
+"""Factor of the weight of a sample on the border's centres."""
+
+
+def _visibility(xy: Tensor, hw: HW, border: float) -> Tensor:
+    """Factor (*n) of weights at positions (*n, 2): 0 on the border's centres, 1 from `border` pixels on."""
+    inside = torch.minimum(xy, xy.new_tensor([hw[1] - 1, hw[0] - 1]) - xy)
+    share = (inside / border).clamp(0, 1)
+    return (share * share * (3 - 2 * share)).prod(-1)
 
 
 def _local_serves(query: Tensor, key: Tensor, value: Tensor, field: Local, bias: Tensor | None) -> bool:

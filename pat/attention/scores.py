@@ -35,6 +35,7 @@ class Compared(NamedTuple):
         locations: segments, or a function that returns locations.
         samples: samples of each segment.
         interpolation: "bilinear" or "nearest".
+        border: pixels within which samples fade towards beta's border.
     """
 
     query: Tensor
@@ -43,6 +44,7 @@ class Compared(NamedTuple):
     locations: Segments | Callable[[Tensor], Locations]
     samples: int
     interpolation: Interpolation
+    border: float = 0.0
 
     def attended(self) -> Attended:
         """Compute C3 attention with its statistics."""
@@ -50,6 +52,7 @@ class Compared(NamedTuple):
             *(self.query, self.key, self.value, self.locations),
             samples=self.samples,
             interpolation=self.interpolation,
+            border=self.border,
         )
 
     @property
@@ -89,7 +92,7 @@ def log_sum(compared: Compared) -> Float[Tensor, "b ha wa"]:
     Raises:
         ValueError: for explicit positions.
     """
-    query, key, value, _, _, interpolation = compared
+    query, key, value, _, _, interpolation, _ = compared
     positions = sample_positions(compared.segments, query, compared.samples)
     nearest = interpolation == "nearest"
     if torch_op.wants_gradient(positions.points):
@@ -103,7 +106,7 @@ def mean_score(compared: Compared) -> Float[Tensor, "b ha wa"]:
     Returns:
         Scores (b, ha, wa), differentiable; 0 where no sample counts.
     """
-    query, key, _, locations, samples, interpolation = compared
+    query, key, _, locations, samples, interpolation, _ = compared
     nothing = torch.zeros_like(query), torch.zeros_like(key)
     even = attend(*nothing, key, locations, samples=samples, interpolation=interpolation)
     return (query * even).sum(1)
@@ -119,7 +122,7 @@ def peak_position(compared: Compared) -> Float[Tensor, "b 2 ha wa"]:
         Positions (x, y) in beta's pixels, (b, 2, ha, wa), float32, without gradient; 0 where no sample
         counts.
     """
-    query, key, _, locations, samples, interpolation = compared
+    query, key, _, locations, samples, interpolation, _ = compared
     sharp = query.float() * SHARPENED
     arguments = sharp, key.float(), key[:, :1].float(), locations
     return attend_with_statistics(*arguments, samples=samples, interpolation=interpolation).position

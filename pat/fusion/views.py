@@ -155,7 +155,7 @@ def check_dense(views: Views, limit: float | None) -> None:
         ValueError: for a `Dense` field of a beta that takes more.
     """
     has = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") if os.name == "posix" else math.inf
-    most, (h, w) = limit or has, views.rig[views.alpha].hw
+    most, (h, w) = min(limit or math.inf, has), views.rig[views.alpha].hw
     for name in views.betas:
         field, beta = innermost(views.fields.get(name)), views.rig[name].hw
         if isinstance(field, Dense) and (needed := dense_bytes((h, w), beta, field.stride)) > most:

@@ -6,6 +6,7 @@ colours in the order red, green, blue.
 
 from __future__ import annotations
 
+import io
 import struct
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -15,6 +16,7 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
+import tifffile
 import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
@@ -59,7 +61,6 @@ GREY_WITH_ALPHA = 4
 MOST_PIXELS = 2**28
 """Pixels above which an image is read only if its size is expected: some 3 GiB in colour."""
 
-_DEFLATED = [cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_ADOBE_DEFLATE]
 _HEIF = tuple(b"ftyp" + brand for brand in (b"heic", b"heix", b"mif1", b"msf1", b"heim", b"heis"))
 
 
@@ -463,9 +464,15 @@ def _encode(path: Path, colours: NDArray, bits: int) -> bytes:
     tiff = suffix in (".tif", ".tiff")
     if bits == 32 and not tiff:
         raise ValueError(f"{path}: 32-bit floats need a name that ends in .tif")
+    values = _quantised(colours, bits)
+    if tiff:  # OpenCV's have predictors and compressions that depend on its version, and not all read them
+        file = io.BytesIO()
+        kind = "rgb" if values.shape[2] == 3 else "minisblack"
+        rows = values[..., ::-1] if values.shape[2] == 3 else values[..., 0]
+        tifffile.imwrite(file, rows, photometric=kind, compression="zlib", predictor=bits < 32, metadata=None)
+        return file.getvalue()
     try:
-        # OpenCV writes float colours as LogLuv else, of 3 digits, and LZW, which tifffile cannot read.
-        succeeded, content = cv2.imencode(suffix, _quantised(colours, bits), _DEFLATED if tiff else [])
+        succeeded, content = cv2.imencode(suffix, values)
     except cv2.error:
         succeeded = False
     if not succeeded:

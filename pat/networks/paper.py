@@ -6,6 +6,7 @@ configuration is the paper's; variants are configuration.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -100,6 +101,19 @@ class PAT(nn.Module):
         position, deviation, confidence = (list(tensors) for tensors in list(zip(*attended))[1:])
         return FusionOutput(image, position, deviation, confidence), compared
 
+    def with_border(self, pixels: float) -> PAT:
+        """Copy the network, with attention that fades within so many pixels of beta's border.
+
+        The fused image then changes smoothly when a rig moves, and its gradient by the rig is whole at the
+        border too.
+
+        Returns:
+            The copy.
+        """
+        faded = copy.deepcopy(self)
+        faded.engine.border = pixels
+        return faded
+
     def query_and_key(self, image: Float[Tensor, "b c h w"], beta: int = 0) -> QueryAndKey:
         """Compute an image's query as alpha's, and its key as that of the `beta`-th beta.
 
@@ -164,6 +178,7 @@ class AttentionEngine(nn.Module):
         super().__init__()
         betas, dim = config.betas, config.dim
         self.interpolation, self.values_after_block = config.interpolation, config.values_after_block
+        self.border = 0.0
         self.before = ResidualBlock(dim, bias=config.block_bias)
         self.query = nn.Conv2d(dim, dim, 1)
         self.key = nn.ModuleList(nn.Conv2d(dim, dim, 1) for _ in range(betas))
@@ -192,7 +207,7 @@ class AttentionEngine(nn.Module):
             after = self.before(f)
             value = to_value(after if self.values_after_block else f)
             locations = field.at if field.pixels is None else field.pixels.to(query)
-            scores.append(Compared(query, to_key(after), value, locations, field.samples, how))
+            scores.append(Compared(query, to_key(after), value, locations, field.samples, how, self.border))
         return scores
 
 

@@ -4,6 +4,8 @@ import re
 
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
 from arraygeom import (
     Camera,
@@ -24,7 +26,7 @@ from arraygeom.io import read_rig
 from arraygeom.lenses import RollingShutter
 from arraygeom.pose import rotation_error
 from arraygeom.runtime.text import UNSCALED
-from arraygeom.summary import summarise_pairs
+from arraygeom.summary import summarise_cameras, summarise_pairs
 from tests.arraygeom.rigs import known_by_f, parallel_rig, random_rig, scene_points, two_cameras
 
 EVERYTHING = ("rotation", "translation", "focal", "centre")
@@ -175,6 +177,42 @@ def test_overlap_of_large_images_through_lenses_is_checked_by_few_pixels(monkeyp
     odd = Rig({"a": cameras[0], "b": cameras[1]}).check()
     assert sum("sees nothing" in sentence for sentence in odd) == 2 * turned
     assert turned or sum(asked) < 10_000
+
+
+class Numbers(TorchDispatchMode):
+    """Counts the numbers that torch's operators return."""
+
+    count = 0
+
+    def __torch_dispatch__(self, function, types, arguments=(), named=None):
+        result = function(*arguments, **(named or {}))
+        self.count += sum(x.numel() for x in tree_leaves(result) if isinstance(x, torch.Tensor))
+        return result
+
+
+def test_a_rig_of_many_cameras_is_described_in_proportion_to_their_number():
+    """Twenty thousand took minutes and the distances of all pairs: each one's lens was looked at anew."""
+    lens = torch.tensor([-0.1, 0.01, 0, 0]).double()
+
+    def numbers(count: int) -> int:
+        cameras = {
+            f"c{i}": Camera(
+                K=intrinsics(900.0, (800, 1000)),
+                cam_from_world=Pose.from_centre(
+                    torch.eye(3).double(), torch.tensor([0.01 * i, 0, 0]).double()
+                ),
+                hw=(800, 1000),
+                distortion=Distortion("brown-conrady", lens.clone()),
+            )
+            for i in range(count)
+        }
+        with Numbers() as counted:
+            Rig(cameras).check()
+            summarise_cameras(Rig(cameras))
+        return counted.count
+
+    few, more = numbers(300), numbers(1200)
+    assert more < 1.5 * few
 
 
 @pytest.mark.parametrize(("t", "depth"), [(1e-3, (50, 100)), (60, (1, 2)), (1e-6, (1, 2))])

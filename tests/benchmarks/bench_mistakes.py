@@ -280,7 +280,7 @@ def what_is_said(change: Change, folder: Path) -> tuple[int, str]:
 
 def main(only: str = "", out: Path | None = None) -> None:
     """Print the table of all mistakes, or of those with a word in their name; `out` is a page for it."""
-    rows, silent = [head("what is wrong | status | what is said")], 0
+    rows, silent = [head("what is wrong | status | what is said", align="lrl")], 0
     for name, change in MISTAKES.items():
         if only not in name:
             continue

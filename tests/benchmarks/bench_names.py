@@ -20,6 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from arraygeom import Camera, Distortion, Pose, Rig, rotation_from_vector
@@ -86,6 +87,35 @@ def shifted(d: float) -> Callable[[Camera], Camera]:
     return change
 
 
+def rescaled(focal: float, centre: float) -> Callable[[Camera], Camera]:
+    """K with its focal lengths, and its principal point from the corner of the first pixel, times factors."""
+
+    def change(c: Camera) -> Camera:
+        K = c.K.clone()
+        K[:2, :2] *= focal
+        K[:2, 2] = (K[:2, 2] + 0.5) * centre - 0.5
+        return c.replace(K=K)
+
+    return change
+
+
+def cropped(c: Camera) -> Camera:
+    """The camera of an image that lost a fifth of its width and height at the left and the top."""
+    K = c.K.clone()
+    K[:2, 2] += K.new_tensor([0.2 * c.hw[1], 0.2 * c.hw[0]])
+    return c.replace(K=K)
+
+
+def reordered_angles(R: Tensor, t: Tensor) -> Pose:
+    angles = Rotation.from_matrix(R.numpy()).as_euler("XYZ")
+    return Pose(torch.from_numpy(Rotation.from_euler("ZYX", angles[::-1]).as_matrix()), t)
+
+
+def left_handed(R: Tensor, t: Tensor) -> Pose:
+    S = torch.diag(torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64))
+    return Pose(S @ R @ S, S @ t)
+
+
 def negated(c: Camera) -> Camera:
     assert c.distortion is not None
     return c.replace(distortion=Distortion(c.distortion.model, -c.distortion.coefficients))
@@ -138,6 +168,18 @@ MISTAKES = {
     "xyzw as wxyz": Mistake("order of quaternions", posed(lambda R, t: reordered(Pose(R, t), (1, 2, 3, 0)))),
     "degrees": Mistake("degrees and radians", posed(lambda R, t: Pose(turned(R, 180 / math.pi), t))),
     "radians": Mistake("degrees and radians", posed(lambda R, t: Pose(turned(R, math.pi / 180), t))),
+    "K half": Mistake("resized", on(rescaled(0.5, 0.5))),
+    "focal half": Mistake("resized", on(rescaled(0.5, 1.0))),
+    "centre half": Mistake("resized", on(rescaled(1.0, 0.5))),
+    "centre half, one": Mistake("resized", on(rescaled(1.0, 0.5), both=False)),
+    "zoomed, one": Mistake("focal length", on(rescaled(1 / 1.3, 1.0), both=False)),
+    "cropped, one": Mistake("cropped", on(cropped, both=False)),
+    "millimetres": Mistake("focal length", on(rescaled(0.0066, 1.0))),
+    "order of angles": Mistake("order of angles", posed(reordered_angles)),
+    "frame of t": Mistake("frame of t", posed(lambda R, t: Pose(R, R.T @ t))),
+    "NeRF": Mistake("OpenGL axes", posed(lambda R, t: Pose(R, t).inverse() @ Pose(OPENGL, 0 * t))),
+    "left-handed": Mistake("left-handed", posed(left_handed)),
+    "x of t": Mistake("sign of t", posed(lambda R, t: Pose(R, t * t.new_tensor([-1.0, 1.0, 1.0])))),
     "depth range": Mistake(
         "depth range", lambda rig, g: rig.replace(depth=tuple(6 * float(d) for d in rig.depth))
     ),

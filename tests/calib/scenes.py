@@ -5,9 +5,7 @@ import numpy as np
 import torch
 
 from arraygeom import Camera, Distortion, Pose, Rig, intrinsics, rotation_from_vector
-from calib.images.least_squares import Solution
 from calib.images.matches import PointMatches
-from calib.images.refinement import RefinementProblem
 from tests.arraygeom.rigs import parallel_rig
 
 HW = (240, 320)
@@ -47,13 +45,6 @@ def unlike_pair(*, lens: bool = False) -> Rig:
 def rectified_pair() -> Rig:
     """Two equal cameras side by side."""
     return parallel_rig(300.0, HW, {"left": (), "right": (0.2,)}, (1.5, 8.0))
-
-
-def uninformed(fit: RefinementProblem) -> Solution:
-    """The prior of a fit as a solution: no change, give or take a standard deviation."""
-    n = sum(len(parameter.sigma) for parameter in fit.parameters)
-    z, covariance = torch.zeros(n, dtype=torch.float64), torch.eye(n, dtype=torch.float64)
-    return Solution(z, torch.ones(n, dtype=torch.bool), covariance, covariance, z)
 
 
 def seen_points(

@@ -1,7 +1,5 @@
 """Real and rendered images of rigs: what the benchmarks measure at length."""
 
-from importlib.util import find_spec
-
 import numpy as np
 import pytest
 import torch
@@ -18,6 +16,7 @@ from tests.calib.board_scenes import errors_of, pose_errors
 from tests.calib.real import bumblebee, syntim
 from tests.calib.rendered import BOARD, photograph
 from tests.calib.simulated import worse
+from tests.pat.lab.synthesis.scenes import needs_blender
 
 
 @pytest.mark.slow
@@ -68,8 +67,7 @@ def test_real_rigs_return(shared_data, source):
 @pytest.mark.slow
 def test_rendered_photographs_of_four_cameras(tmp_path):
     """Twelve boards, found, fitted and compared with the rig that took them (ten minutes of one core)."""
-    if find_spec("bpy") is None:
-        pytest.skip("rendering needs `make synthesis`")
+    needs_blender()
     photograph(tmp_path)
     true = Rig.load(tmp_path / "true.yaml")
     views = collect_folder(tmp_path, parse_board(BOARD)).views

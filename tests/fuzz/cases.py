@@ -34,6 +34,7 @@ from pat.networks.weights import load_weights, save_weights
 from tests.arraygeom.test_damaged_files import matlab_pair
 
 from .mutations import mutated
+from .pieces import pixels_damaged
 
 FIXTURES = Path(__file__).parents[1] / "arraygeom" / "fixtures"
 
@@ -69,6 +70,9 @@ def damaged(seed: Seed, number: int, folder: Path) -> Path:
     """A copy of a seed's file (with its folder, where files belong together) with damage of this number."""
     source = random.Random(f"{seed.kind} {seed.format} {seed.file.name} {number}")
     path, read = placed(seed, folder / "case")
+    if seed.kind == "pixels":
+        path.write_bytes(pixels_damaged(source, seed.file.read_bytes(), seed.file.suffix))
+        return read
     binary = seed.file.suffix in (".bin", ".mat", ".safetensors", ".npz") or seed.kind in ("image", "video")
     if source.random() < NO_FILE:
         path.unlink()
@@ -130,7 +134,8 @@ def rig_seeds(folder: Path) -> Iterator[Seed]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             write_rig(rig, target, format=label.partition(",")[0])
-        for file in sorted(target.iterdir()) if target.is_dir() else [target]:
+        files = sorted(target.glob("[!.]*")) if target.is_dir() else [target]
+        for file in files:
             yield Seed("rig", f"{label} (written)", file, target.is_dir())
     yield from _matlab(folder / "matlab")
     yield from _colmap_binary(folder / "colmap_binary")
@@ -278,6 +283,54 @@ def with_photos(folder: Path) -> None:
             raise
 
 
+# Pixels -----------------------------------------------------------------------------------------------------
+
+
+UNDAMAGED: dict[str, torch.Tensor] = {}
+"""The pixels of good files, by their names."""
+COMPRESSIONS: dict[str, dict[str, Any]] = {
+    "png.png": {},
+    "jpeg baseline.jpg": {"quality": 90},
+    "jpeg optimised.jpg": {"quality": 90, "optimize": True},
+    "jpeg progressive.jpg": {"quality": 90, "progressive": True},
+    "tiff deflate.tif": {"compression": "tiff_adobe_deflate"},
+    "tiff LZW.tif": {"compression": "tiff_lzw"},
+    "tiff PackBits.tif": {"compression": "packbits"},
+    "tiff JPEG.tif": {"compression": "jpeg"},
+    "webp lossy.webp": {"quality": 90},
+    "webp lossless.webp": {"lossless": True},
+}
+"""Formats of compressed pixels, with Pillow's options."""
+UNKNOWABLE = ("jpeg baseline", "jpeg optimised", "tiff JPEG", "tiff PackBits", "webp lossy", "webp lossless")
+"""Formats in which nearly all bytes are a code of some pixels, and no checksum says of which."""
+
+
+def pixel_seeds(folder: Path) -> Iterator[Seed]:
+    """Images of each compression, smooth ones with a little noise."""
+    folder.mkdir(parents=True, exist_ok=True)
+    rng = np.random.default_rng(0)
+    values = cv2.resize(rng.integers(0, 256, (12, 16, 3), dtype=np.uint8), (320, 240)).astype(int)
+    values = (values + rng.integers(0, 8, values.shape)).clip(0, 255).astype(np.uint8)
+    for name, options in COMPRESSIONS.items():
+        file = folder / name.replace(" ", "_")
+        Image.fromarray(values).save(file, **options)
+        UNDAMAGED[file.name] = read_image(file)
+        yield Seed("pixels", name.partition(".")[0], file)
+
+
+def same_pixels(path: Path, _: random.Random) -> str:
+    """A damaged file is refused, or read as the good one; else it is a fault."""
+    try:
+        image = read_image(path)
+    except ValueError as error:
+        return refused(error, path)
+    right = UNDAMAGED[path.name]
+    if image.shape != right.shape:
+        return f"read as {tuple(image.shape)}"
+    wrong = float(((image - right).abs().amax(0) > 1 / 64).double().mean())
+    return "read" if torch.equal(image, right) else f"read with {wrong:.1%} of the pixels wrong"
+
+
 # Videos -----------------------------------------------------------------------------------------------------
 
 
@@ -357,6 +410,7 @@ def faults_of_covariance(found: RigCovariance) -> str:
 KINDS: dict[str, tuple[Callable[[Path], Iterator[Seed]], Check, int]] = {
     "rig": (rig_seeds, convert_and_inspect, 5000),
     "image": (image_seeds, read_and_write, 1000),
+    "pixels": (pixel_seeds, same_pixels, 1000),
     "video": (video_seeds, answered(read_video, faults_of_video), 100),
     "weights": (weight_seeds, answered(load_weights), 200),
     "checkpoint": (checkpoint_seeds, use_checkpoint, 150),

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import random
 import struct
 import zlib
 from collections.abc import Callable
 from functools import partial
+
+import tifffile
 
 Span = tuple[int, int]
 
@@ -60,6 +63,51 @@ def _tiff(content: bytes) -> list[Span]:
     except struct.error:
         return []
     return [(start + 2 + 12 * i, start + 14 + 12 * i) for i in range(min(count, 100))]
+
+
+def pixels_damaged(source: random.Random, content: bytes, suffix: str) -> bytes:
+    """The file with four bytes of its compressed pixels changed; checksums of PNG are made anew."""
+    spans = COMPRESSED[suffix](content)
+    changed = bytearray(content)
+    for first, last in source.choices(spans, [last - first for first, last in spans], k=4):
+        changed[source.randrange(first, last)] ^= source.randrange(1, 256)
+    return _with_checksums(bytes(changed)) if suffix == ".png" else bytes(changed)
+
+
+def _idat(content: bytes) -> list[Span]:
+    return [(a + 8, b - 4) for a, b in PIECES[".png"](content) if content[a + 4 : a + 8] == b"IDAT"]
+
+
+def _scan(content: bytes) -> list[Span]:
+    """The coded pixels of a JPEG file's scans, after the header of each."""
+    spans, start = [], content.find(b"\xff\xda")
+    while start >= 0:
+        first = start + 2 + struct.unpack_from(">H", content, start + 2)[0]
+        start = content.find(b"\xff\xda", first)
+        last = content.rfind(b"\xff\xc4", first, start) if start >= 0 else len(content) - 2
+        spans.append((first, last if last > first else start))
+    return spans
+
+
+def _strips(content: bytes) -> list[Span]:
+    with tifffile.TiffFile(io.BytesIO(content)) as file:
+        page = file.pages.first
+        return [(a, a + b) for a, b in zip(page.dataoffsets, page.databytecounts)]
+
+
+def _frames(content: bytes) -> list[Span]:
+    """The coded pixels of a WebP file, after the head of their chunk."""
+    chunks = [(a, b) for a, b in PIECES[".webp"](content) if content[a : a + 3] == b"VP8"]
+    return [(a + 18, b) for a, b in chunks]
+
+
+COMPRESSED: dict[str, Callable[[bytes], list[Span]]] = {
+    ".png": _idat,
+    ".jpg": _scan,
+    ".tif": _strips,
+    ".webp": _frames,
+}
+"""Where a file's compressed pixels are, by suffix."""
 
 
 PIECES: dict[str, Callable[[bytes], list[Span]]] = {

@@ -6,7 +6,6 @@ import json
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
 
 import cv2
@@ -17,6 +16,7 @@ from safetensors import safe_open
 from arraygeom.io import read_rig
 from calib.boards.simulation import photograph
 from calib.boards.target import parse_board
+from pat.lab.synthesis.blender.environment import blender_python
 from pat.lab.training.checkpoints import newest_checkpoint, read_checkpoint
 from pat.lab.training.config import save_config
 from pat.media.images import write_image
@@ -69,15 +69,37 @@ def frame_job(folder: Path) -> Job:
     return Job("fuse", arguments(0), files_of, whole("fused.png"), former=arguments(1))
 
 
-def batch_job(folder: Path, *more: str, name: str = "batch") -> Job:
-    """Return a job of several frames, each with its own files. Earlier ones are kept."""
+def alignment_job(folder: Path) -> Job:
+    """Aligned images of one frame, over those of another one."""
+
+    def arguments(i: int) -> Arguments:
+        images = _images(folder, f"fast_{i}.png", "slow_0.png")
+        return lambda out: [
+            *_fuse(folder, "align")[:-4],
+            *images,
+            "--out",
+            str(out),
+            "--extras",
+            "npy,separate",
+        ]
+
+    return Job("alignment", arguments(0), files_of, whole("aligned.tif"), former=arguments(1))
+
+
+def batch_job(folder: Path, *more: str, name: str = "batch", frames: int = FRAMES) -> Job:
+    """Return a job of several frames, each with its own files. Earlier ones are kept.
+
+    Those of the former command have other colours.
+    """
 
     further = more or ("--threads", "1")
 
-    def arguments(out: Path) -> list[str]:
-        return [*_fuse(folder, "batch"), *_images(folder, "", "many"), "--out", str(out), *further]
+    def arguments(beta: str) -> Arguments:
+        images = _images(folder, f"fast_[0-{frames - 1}].png", f"{beta}/[0-{frames - 1}].png")
+        return lambda out: [*_fuse(folder, "batch"), *images, "--out", str(out), *further]
 
-    return Job(name, arguments, _frames_of, _frames_mixed, again=("--resume",), kept=_times)
+    job = Job(name, arguments("many"), _frames_of, _frames_mixed, again=("--resume",), kept=_times)
+    return job if frames == FRAMES else job._replace(former=arguments("darker"))
 
 
 def sequence_job(folder: Path) -> Job:
@@ -101,6 +123,7 @@ def _fuse(folder: Path, command: str = "fuse") -> list[str]:
                 write_image(folder / "fusion" / name / f"{name}_{i}.png", image)
         for i in range(FRAMES):
             write_image(folder / "fusion" / "many" / f"{i}.png", frames["slow"][0])
+            write_image(folder / "fusion" / "darker" / f"{i}.png", 0.8 * frames["slow"][0])
         moving.rig(0.003).save(folder / "fusion" / "rig.yaml")
     made = folder / "fusion"
     weights = str(made / "tiny.safetensors")
@@ -109,7 +132,7 @@ def _fuse(folder: Path, command: str = "fuse") -> list[str]:
 
 def _images(folder: Path, fast: str, slow: str) -> list[str]:
     made = folder / "fusion"
-    beta = made / "many" if slow == "many" else made / "slow" / slow
+    beta = made / slow if slow.startswith(("many", "darker")) else made / "slow" / slow
     return ["--image", f"fast={made / 'fast' / fast}", "--image", f"slow={beta}"]
 
 
@@ -233,7 +256,9 @@ def all_jobs(folder: Path) -> Iterator[Job]:
     yield training_job(folder)
     yield calibration_job(folder)
     yield rendering_job(folder)
-    if find_spec("bpy"):
-        yield rendering_job(folder, "blender", scenes=3)
+    try:
+        blender_python()
+    except ValueError as error:
+        print(f"rendering by Blender is left out: {error}", file=sys.stderr)
     else:
-        print("rendering by Blender is left out: pip install '.[synthesis]'", file=sys.stderr)
+        yield rendering_job(folder, "blender", scenes=3)

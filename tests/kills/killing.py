@@ -64,11 +64,20 @@ class Killed(NamedTuple):
     faults: list[str]
 
 
-def started(arguments: list[str], log: Path, announced: Path | None = None) -> int:
-    """`pat` with arguments in a forked process of its own group; writes are long where they are announced."""
+def started(
+    arguments: list[str],
+    log: Path,
+    announced: Path | None = None,
+    before: Callable[[], object] = lambda: None,
+) -> int:
+    """`pat` with arguments in a forked process of its own group; writes are long where they are announced.
+
+    `before` is called in the process first.
+    """
 
     def act() -> int:
         os.setsid()
+        before()
         signal.signal(signal.SIGXFSZ, signal.SIG_DFL)
         if announced is not None:
             folders = [str(Path(sitecustomize.__file__).parent), str(ROOT)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -13,6 +14,7 @@ from arraygeom import Distortion, Pose
 from arraygeom.fields import covering_displacement
 from pat.attention import attend, attend_with_statistics
 from tests.arraygeom.rigs import random_rig
+from tests.arraygeom.test_camera_models import MODELS, camera
 
 
 class Operator(NamedTuple):
@@ -157,10 +159,27 @@ FIELDS = {
 }
 ATTENTION = {
     **{f"attend, by {of}": attention(attend, of) for of in ("query", "key", "value", "geometry")},
+    "attend, border": attention(partial(attend, border=0.5), "geometry"),
     "attend_with_statistics": attention(measured, "query"),
     'attend, backend="cpu"': attention(cpu, "query"),
 }
-OPERATORS = {**GEOMETRY, **FIELDS, **ATTENTION}
+
+
+def of_model(name: str) -> dict[str, Operator]:
+    """Projection, rays and the curve of a camera model, as beta."""
+    beta = camera(name, beta=True)
+    pair = ag.Pair(camera("own"), beta, RIG.depth)
+    ahead = POINTS.reshape(-1, 3) @ beta.R + beta.centre
+    return {
+        f"project, {name}": Operator(lambda x: beta.project(x.reshape(-1, 3)).x, ahead.flatten()),
+        f"unproject, {name}": Operator(lambda x: beta.unproject(pixels(x), 1 + x[::2] / 50), SHOWN),
+        f"Curved, {name}": Operator(lambda x: ends(ag.Curved(5, nodes=8)(pair, pixels(x))), SHOWN),
+    }
+
+
+SHOWN = vector(60.2, 44.7, 71.4, 53.1)
+MODEL_OPERATORS = {key: operator for name in MODELS for key, operator in of_model(name).items()}
+OPERATORS = {**GEOMETRY, **FIELDS, **ATTENTION, **MODEL_OPERATORS}
 
 
 def _of_plane(pose: Pose) -> Tensor:

@@ -6,14 +6,14 @@ import sys
 import pytest
 import torch
 
-from tests.transformations.operators import ATTENTION, OPERATORS
+from tests.transformations.operators import ATTENTION, FIELDS, GEOMETRY, OPERATORS
 from tests.transformations.run import CHECKS, verdict
 
 REFUSED = {"sample", "Moved", "fit_homography", "rectify", "approximated", 'attend, backend="cpu"'}
 """Operators of which some transformations are refused."""
 
 
-@pytest.mark.parametrize("operator", [name for name in OPERATORS if name not in ATTENTION])
+@pytest.mark.parametrize("operator", [*GEOMETRY, *FIELDS])
 @pytest.mark.parametrize("transformation", ["grad", "jvp", "vmap", "jacfwd", "autocast"])
 def test_geometry(operator, transformation):
     found = verdict(operator, transformation)

@@ -173,6 +173,8 @@ class Explore:
         Raises:
             ValueError: for a rig or images that it cannot show.
         """
+        from calib.boards.uncertainty import RigCovariance
+
         from ..explore import opened, serve
 
         if self.save is not None:
@@ -182,7 +184,19 @@ class Explore:
         if images:
             warn_of_misfit(rig, images)
         options.field_named(self.field)
-        explorer = opened(rig, images, alpha=self.alpha, network=self.network, field=self.field)
+        beside = self.rig.with_suffix(".covariance.json")
+        explorer = opened(
+            rig,
+            images,
+            alpha=self.alpha,
+            network=self.network,
+            field=self.field,
+            covariance=RigCovariance.load(beside, rig) if beside.is_file() else None,
+            files={
+                "": str(self.rig),
+                **{name: str(file) for name, file in options.files_by_name(self.image).items()},
+            },
+        )
         if explorer.error:
             raise ValueError(explorer.error)
         if self.save is None:
@@ -194,6 +208,8 @@ class Explore:
 
 MOST_CAMERAS = 12
 """Number of cameras up to which `pat rig info` describes every pair."""
+MOST_ROWS = 100
+"""Number of cameras in its tables."""
 
 
 @dataclass
@@ -234,16 +250,18 @@ class Info:
         if self.json:
             document = {"cameras": [c._asdict() for c in cameras], "pairs": [p._asdict() for p in pairs]}
             return options.print_json(document)
-        print_tables(cameras, pairs, unit)
+        if len(cameras) > MOST_ROWS:
+            say(f"the first {MOST_ROWS} of {len(cameras)} cameras: --json has all")
+        print_tables(cameras[:MOST_ROWS], pairs, unit)
 
 
 def warn_of_oddities(rig: Rig) -> None:
     """Print what is odd about a rig, except for what reading its file has warned of."""
     from arraygeom.rig_check import file_oddities
 
-    warned = file_oddities(rig)
+    warned = tuple(file_oddities(rig))
     for oddity in rig.check():
-        if not any(map(oddity.endswith, warned)):
+        if not oddity.endswith(warned):
             say(f"pat: {oddity}", style="yellow")
 
 
@@ -384,17 +402,16 @@ class Doctor:
 
 REFUSED = 4
 """Exit status of a refused refinement of a rig that does not fit."""
-NEARER = 4.0
-"""Factor by which points come nearer to their lines in that case."""
+BADLY = 1.0
+"""Median distance of held-out points from their lines, pixels, above which a rig does not fit."""
 
 
 @dataclass
 class Refine:
-    """Refine a rig by ordinary images of its cameras: matched points first, then the fusion's own error.
+    """Refine a rig by points matched between ordinary images of its cameras.
 
     No rig is written unless held-out points come nearer to their epipolar lines, the changes agree with their
-    standard deviations, and depth does not become less certain. What happens to depth is printed and written
-    into the file.
+    standard deviations, and depth changes by 1.5 per cent at most, as matched points do not determine it.
 
     Example: pat rig refine rig.yaml --image mono=a.png --image colour=b.png --out better.yaml
     """
@@ -405,13 +422,11 @@ class Refine:
     out: Out
     """Rig file to write."""
     matches: MatchesFile = None
-    free: tuple[str, ...] = ("rotation", "centre")
+    free: tuple[str, ...] = ("rotation", "translation", "focal", "centre")
     """Free parameters: rotation, translation, focal, centre (principal_point), distortion; or
-    CAMERA.rotation. By default, focal and translation too if that brings held-out points nearer."""
+    CAMERA.rotation."""
     sigma: Annotated[tuple[str, ...], Option("KIND=NUMBER")] = ()
     """Standard deviation of a parameter before refinement: degrees, pixels; translation, focal relative."""
-    photometric: bool = True
-    """Fit matched points alone, and not the fusion's own error after them."""
     force: bool = False
     """Write the refined rig in spite of objections."""
 
@@ -425,8 +440,6 @@ class Refine:
         from arraygeom.io.native import write
         from arraygeom.runtime.atomic import write_text
         from calib.images.refinement import refine
-
-        from ...attention import attend_with_statistics
 
         options.writable(self.out)
         rig = load_rig(self.rig)
@@ -445,7 +458,6 @@ class Refine:
                 matches=None if matches is None else [matches],
                 free=[kind for text in self.free for kind in text.split(",")],
                 sigma={kind: math.radians(s) if kind == "rotation" else s for kind, s in deviations.items()},
-                attend=attend_with_statistics if self.photometric else None,
                 force=self.force,
             )
         print(refined.as_text())
@@ -456,14 +468,15 @@ class Refine:
         say(f"written: {self.out}")
 
     def _refused(self, refined: Refinement) -> None:
-        """Say why no rig is written, and what to do; exits if points come far nearer."""
-        force = ": --force writes it all the same" if refined.objections else ""
-        if not refined.held_out[1].median < refined.held_out[0].median / NEARER:
-            return say(f"no rig written{force}")
+        """Say why no rig is written, and what to do; exits if the given rig does not fit."""
+        off = refined.held_out[0].median
+        force = "--force follows the lines, whatever that does to depth" if refined.objections else ""
+        if not off > BADLY:
+            return say(f"no rig written: {force}".rstrip(": "))
         first = {text.partition("=")[0]: text.partition("=")[2] for text in self.image[::-1]}
         say(
-            "no rig written, though points come far nearer to their lines: --force writes it all the "
-            f"same; or fuse without a rig: `pat fuse {' '.join(first.values())}`",
+            f"no rig written, though points lie {off:.1f} px from their lines: {force}; or fuse without a "
+            f"rig: `pat fuse {' '.join(first.values())}`",
             style="yellow",
         )
         sys.exit(REFUSED)

@@ -14,11 +14,14 @@ from torch.nn.functional import interpolate
 
 from arraygeom import Camera, Distortion, Pose, Rig, rotation_from_vector
 from arraygeom.io.native import write as rig_text
+from arraygeom.lenses.model import LensModel
 from arraygeom.runtime.text import length_unit
 
 from ...media.colour import to_bytes
 from .pixel import FAMILIES, WINDOWS, BetaReport, ExplorerScene, ExplorerState, image_pixel, inspect_pixel
 
+ALL = "all betas"
+"""The `camera` whose sliders change all betas alike."""
 Controls = dict[str, Any]
 """Values of the controls, see `DEFAULTS`, and x, alpha's pixel."""
 DEFAULTS: Controls = {
@@ -28,19 +31,35 @@ DEFAULTS: Controls = {
     "near": None,
     "far": None,
     "baseline": 1.0,
-    "rotation": 0.0,
-    "focal": 1.0,
-    "lens": 0.0,
-    "moved": {},
+    "camera": ALL,
+    "errors": {},
+    "pins": [],
     "clicked": None,
 }
 """Controls of an unchanged rig.
 
-baseline and focal are factors, rotation is in degrees about the betas' y axes, lens is added to their k1,
-`moved` are steps (right, forward) in alpha's axes by beta, metres; near and far are metres. `clicked` is a
-beta and a pixel of it, whose match becomes alpha's pixel.
+baseline is a factor of all betas' distance from alpha; `errors` are changes of cameras by name (`ALL`: of all
+betas), each by the names of `ERRORS`; `camera` is the one that the sliders change; near and far are metres.
+`pins` are pixels of alpha that stay drawn. `clicked` is a beta and a pixel of it, whose match becomes alpha's
+pixel.
 """
-WIDEST = 640
+ERRORS: dict[str, tuple[str, float, float, float, float]] = {
+    "rx": ("rotation x (degrees)", -3.0, 3.0, 0.01, 0.0),
+    "ry": ("rotation y (degrees)", -3.0, 3.0, 0.01, 0.0),
+    "rz": ("rotation z (degrees)", -3.0, 3.0, 0.01, 0.0),
+    "right": ("right ({unit})", -1.0, 1.0, 0.005, 0.0),
+    "down": ("down ({unit})", -1.0, 1.0, 0.005, 0.0),
+    "forward": ("forward ({unit})", -1.0, 1.0, 0.005, 0.0),
+    "cx": ("principal point x (px)", -20.0, 20.0, 0.1, 0.0),
+    "cy": ("principal point y (px)", -20.0, 20.0, 0.1, 0.0),
+    "focal": ("focal length (times)", 0.8, 1.25, 0.005, 1.0),
+}
+"""Label, least, most, step and usual value of each change of a camera.
+
+Rotations are about its own axes, steps along those of alpha (in longest baselines), pixels are
+added, the focal length is multiplied. "lens0", "lens1", ... are added to the numbers of the lens.
+"""
+WIDEST = 1280
 """Pixels of the longer side of a displayed image."""
 FARTHEST = 1000.0
 """Metres at which an infinite far bound is displayed until it is changed."""
@@ -52,8 +71,8 @@ def answer(scene: ExplorerScene, alpha: str, controls: Controls) -> dict[str, An
     """Compute what is drawn for a state of the controls.
 
     Returns:
-        Pixel `x`, `depth`, `betas` with samples, weights and match (or a `problem`), and the rig's `top`
-        view, as plain values for JSON.
+        Pixel `x`, `depth`, `betas` with samples, weights and match (or a `problem`), `pins`, and the rig's
+        `top` view, as plain values for JSON.
 
     Raises:
         ValueError: or TypeError, AttributeError, KeyError, for impossible controls.
@@ -72,7 +91,9 @@ def answer(scene: ExplorerScene, alpha: str, controls: Controls) -> dict[str, An
         for name, beta in betas.items():
             problem = other.problems.get(name)
             beta["second"] = {"problem": problem} if problem else drawn(other.betas[name])
+    pins = [pinned(scene, alpha, {**controls, "x": x}) for x in controls["pins"]]
     return {
+        "pins": pins,
         "x": list(image_pixel(controls["x"][0], controls["x"][1], scene.rig[alpha].hw)),
         "depth": number(report.depth),
         "betas": betas,
@@ -102,68 +123,82 @@ def clicked(scene: ExplorerScene, alpha: str, controls: Controls) -> tuple[Contr
     return {**controls, "x": report["match"]}, report["samples"]
 
 
+def pinned(scene: ExplorerScene, alpha: str, controls: Controls) -> dict[str, Any]:
+    """Compute samples and match in each beta of a pixel that stays drawn."""
+    report = inspect_pixel(scene, explorer_state(scene.rig, alpha, controls))
+    shown = {name: drawn(beta) for name, beta in report.betas.items()}
+    found = {
+        name: {k: beta[k] for k in ("samples", "match")} for name, beta in shown.items() if "match" in beta
+    }
+    return {"x": list(image_pixel(controls["x"][0], controls["x"][1], scene.rig[alpha].hw)), "betas": found}
+
+
 def moved_rig(rig: Rig, alpha: str, controls: Controls) -> Rig:
-    """Move every calibrated beta as the controls say: position, rotation, focal length and lens.
+    """Apply the controls' changes to the calibrated cameras.
 
     Args:
-        alpha: name of alpha, which stays, as do its axes for positions; uncalibrated, nothing moves.
-        controls: values of the controls (`explore`): baseline and focal length as factors, rotation about the
-            beta's y axis in degrees, k1 to add, and shifts (right, forward) in metres by beta.
+        alpha: name of alpha, in whose axes steps are; uncalibrated, nothing moves.
+        controls: values of the controls: `baseline`, and `errors` by camera.
 
     Returns:
         The moved rig; the same one for unchanged controls.
 
     Raises:
-        ValueError: for a lens without k1, if that is changed.
+        ValueError: for a change that a camera's lens has not, and for unknown cameras and changes.
     """
-    alpha_view, cameras = rig[alpha], dict(rig.cameras)
-    if all(controls[name] == DEFAULTS[name] for name in ("baseline", "rotation", "focal", "lens", "moved")):
+    alpha_view, cameras, errors = rig[alpha], dict(rig.cameras), controls["errors"]
+    known = {*rig.names, ALL}
+    if unknown := {*errors} - known or {
+        k for e in errors.values() for k in e if k not in ERRORS and k[:4] != "lens"
+    }:
+        raise ValueError(f"errors: no camera or change is called {', '.join(map(repr, sorted(unknown)))}")
+    same = all(v == (1 if k == "focal" else 0) for e in errors.values() for k, v in e.items())
+    if (same and controls["baseline"] == 1) or not isinstance(alpha_view, Camera):
         return rig
-    turned = torch.tensor([0.0, math.radians(controls["rotation"]), 0.0], dtype=torch.float64)
-    for name in rig.betas(alpha):
-        beta = rig[name]
-        if not (isinstance(beta, Camera) and isinstance(alpha_view, Camera)):
+    for name, camera in rig.cameras.items():
+        if not isinstance(camera, Camera):
             continue
-        right, forward = controls["moved"].get(name, (0.0, 0.0))
-        step = alpha_view.R.T @ alpha_view.R.new_tensor([right, 0.0, forward])
-        centre = alpha_view.centre + controls["baseline"] * (beta.centre - alpha_view.centre) + step
-        K = torch.cat([beta.K[:2, :2] * controls["focal"], beta.K[:2, 2:]], 1)
-        cameras[name] = beta.replace(
-            K=torch.cat([K, beta.K[2:]]),
-            cam_from_world=Pose.from_centre(rotation_from_vector(turned).to(beta.R) @ beta.R, centre),
-            distortion=with_k1(beta, controls["lens"]),
+        given = [errors.get(name, {}), *([] if name == alpha else [errors.get(ALL, {})])]
+        change = {key: sum(e.get(key, 0.0) for e in given) for key in {*ERRORS, *given[0], *given[-1]}}
+        step = alpha_view.R.T @ alpha_view.R.new_tensor([change[key] for key in ("right", "down", "forward")])
+        centre = alpha_view.centre + controls["baseline"] * (camera.centre - alpha_view.centre) + step
+        turn = camera.R.new_tensor([math.radians(change[key]) for key in ("rx", "ry", "rz")])
+        focal = math.prod(e.get("focal", 1.0) for e in given)
+        K = camera.K.clone()
+        K[:2, :2] *= focal
+        K[:2, 2] += K.new_tensor([change["cx"], change["cy"]])
+        cameras[name] = camera.replace(
+            K=K,
+            cam_from_world=Pose.from_centre(rotation_from_vector(turn) @ camera.R, centre),
+            distortion=with_lens(
+                name, camera, {k[4:]: v for k, v in change.items() if k[:4] == "lens" and v}
+            ),
         )
     return rig.replace(cameras=cameras)
 
 
-def with_k1(camera: Camera, k1: float) -> Any:
-    """Add a number to the first radial coefficient of a camera's lens.
+def with_lens(name: str, camera: Camera, changes: Controls) -> LensModel | None:
+    """Add values to the numbers of a camera's lens.
 
     Args:
-        k1: number to add; 0 leaves the lens.
+        name: name of the camera, for messages.
+        changes: values by the index of the number as text; none leaves the lens.
 
     Returns:
         The lens; for a pinhole one of Brown-Conrady.
 
     Raises:
-        ValueError: for a lens without k1.
+        ValueError: for a number that the lens has not.
     """
-    lens = camera.distortion
-    if k1 == 0:
-        return lens
-    if lens is None:
-        return Distortion("brown-conrady", camera.K.new_tensor([k1, 0, 0, 0]))
-    if not has_k1(camera):
-        raise ValueError("the lens slider changes k1, which this lens has not: set it back to 0")
-    change = torch.zeros_like(lens.coefficients)
-    change[..., 0] = k1
-    return lens.replace(coefficients=lens.coefficients + change)
-
-
-def has_k1(camera: Camera) -> bool:
-    """Return True if the lens slider can change the camera."""
-    lens = camera.distortion
-    return lens is None or (isinstance(lens, Distortion) and lens.model == "brown-conrady")
+    if not changes:
+        return camera.distortion
+    lens = camera.distortion or Distortion("brown-conrady", camera.K.new_zeros(4))
+    numbers = lens.coefficients.clone()
+    for index, value in changes.items():
+        if not (index.isdecimal() and int(index) < numbers.numel()):
+            raise ValueError(f"'{name}' has no lens number {index}: set it back to 0")
+        numbers[int(index)] += value
+    return lens.with_coefficients(numbers)
 
 
 def explorer_state(rig: Rig, alpha: str, controls: Controls) -> ExplorerState:
@@ -191,6 +226,7 @@ def drawn(beta: BetaReport) -> dict[str, Any]:
         "match": rounded(beta.xy[best]),
         "depth": number(float(beta.depth[best])),
         "off": None if beta.offset is None else round(beta.offset.distance, 2),
+        "band": None if beta.band is None else rounded(beta.band),
     }
 
 
@@ -226,22 +262,29 @@ def slider_ranges(rig: Rig) -> list[list[Any]]:
     """List the sliders that suit a rig.
 
     Returns:
-        Name, label and [low, high, step, value] of each; depths only with a depth range, others only with
-        calibrated cameras.
+        Name, label, [low, high, step, value], and True for a change of one camera, of each; depths only with
+        a depth range, others only with calibrated cameras.
     """
     ranges: list[list[Any]] = []
+    unit = length_unit(rig)
     if rig.depth is not None:
-        unit = length_unit(rig)
         near, far = (min(float(d), FARTHEST) for d in rig.depth)
-        ranges.append(["near", f"near ({unit})", [near / 4, far, (far - near / 4) / 500, near]])
-        ranges.append(["far", f"far ({unit})", [near, 4 * far, (4 * far - near) / 500, far]])
+        ranges.append(["near", f"near ({unit})", [near / 4, far, (far - near / 4) / 500, near], False])
+        ranges.append(["far", f"far ({unit})", [near, 4 * far, (4 * far - near) / 500, far], False])
     cameras = [camera for camera in rig.cameras.values() if isinstance(camera, Camera)]
-    if cameras:
-        ranges.append(["baseline", "baseline (times)", [0.1, 4.0, 0.05, 1.0]])
-        ranges.append(["rotation", "rotation (degrees)", [-3.0, 3.0, 0.05, 0.0]])
-        ranges.append(["focal", "focal length (times)", [0.8, 1.25, 0.005, 1.0]])
-    if cameras and all(map(has_k1, cameras)):
-        ranges.append(["lens", "lens (k1)", [-0.3, 0.3, 0.01, 0.0]])
+    if not cameras:
+        return ranges
+    ranges.append(["baseline", "baseline (times)", [0.1, 4.0, 0.05, 1.0], False])
+    longest = max(float((camera.centre - cameras[0].centre).norm()) for camera in cameras) or 1.0
+    for name, (label, low, high, step, usual) in ERRORS.items():
+        size = longest if "{unit}" in label else 1.0
+        steps = [size * low, size * high, size * step, usual]
+        ranges.append([name, label.format(unit=unit), steps, True])
+    lenses = [camera.distortion.coefficients for camera in cameras if camera.distortion is not None]
+    largest = max(lenses, key=lambda numbers: numbers.numel(), default=torch.zeros(1))
+    for i, value in enumerate(largest.flatten().tolist()):
+        reach = max(0.3, 0.5 * abs(value)) if i == 0 else max(0.05, 0.5 * abs(value))
+        ranges.append([f"lens{i}", f"lens number {i + 1}", [-reach, reach, reach / 100, 0.0], True])
     return ranges
 
 
@@ -259,6 +302,11 @@ def choices(scene: ExplorerScene, controls: Controls) -> list[list[Any]]:
         ["field", "field", [*fields, *unlisted]],
         ["second", "compared with", ["none", *fields, *unlisted]],
         ["weights", "weights by", weights],
+        [
+            "camera",
+            "sliders change",
+            [ALL, *(n for n, v in scene.rig.cameras.items() if isinstance(v, Camera))],
+        ],
     ]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +15,20 @@ from torch import Tensor
 
 from arraygeom import Camera, ReceptiveField, Rig, pixel_grid
 from arraygeom.runtime.atomic import write_text
+from arraygeom.uncertainty import Covariance
 
 from ...networks.paper import PAT
-from .answers import DEFAULTS, Controls, answer, choices, shown_cameras, slider_ranges
-from .pixel import WINDOWS, ExplorerScene, shipped_attention
+from .answers import (
+    DEFAULTS,
+    Controls,
+    answer,
+    choices,
+    explorer_state,
+    moved_rig,
+    shown_cameras,
+    slider_ranges,
+)
+from .pixel import WINDOWS, ExplorerScene, shipped_attention, with_depths
 
 MODULE, PINHOLE = (Path(__file__).with_name(name) for name in ("widget.js", "pinhole.js"))
 GRID = 24
@@ -34,12 +44,15 @@ class Explorer:
         alpha: name of alpha.
         controls: initial controls.
         error: message; empty if there is a scene.
+        files: files of the rig ("") and of the images by camera, for the code that makes the view; empty if
+            unknown.
     """
 
     scene: ExplorerScene | None
     alpha: str
     controls: Controls
     error: str = ""
+    files: Mapping[str, str] = field(default_factory=dict)
 
     def answer(self, controls: Controls) -> dict[str, Any]:
         """Compute what is drawn for a state of the controls.
@@ -56,9 +69,9 @@ class Explorer:
                     raise ValueError(
                         f"{name}: {controls[name]!r:.80} was not given when the explorer was started"
                     )
-            return answer(self.scene, self.alpha, controls)
+            return {**answer(self.scene, self.alpha, controls), "asked": controls.get("asked")}
         except (ValueError, TypeError, AttributeError, LookupError, ArithmeticError, RuntimeError) as error:
-            return {"error": str(error)}
+            return {"error": str(error), "asked": controls.get("asked")}
 
     def values(self) -> dict[str, Any]:
         """Return the widget's initial values, as plain values for JSON."""
@@ -69,6 +82,7 @@ class Explorer:
             "choices": [] if scene is None else choices(scene, self.controls),
             "controls": self.controls,
             "defaults": DEFAULTS,
+            "files": dict(self.files),
             "answer": self.answer(self.controls),
         }
 
@@ -84,9 +98,11 @@ class Explorer:
         Raises:
             OSError: if writing fails.
         """
-        values = {**self.values(), "choices": []}
+        values = self.values()
+        all_choices, values["choices"] = values["choices"], []
         if self.scene is not None and is_pinhole(self.scene.rig) and self.usual:
-            values["ranges"] = [entry for entry in values["ranges"] if entry[0] != "lens"]
+            values["ranges"] = [entry for entry in values["ranges"] if not entry[0].startswith("lens")]
+            values["choices"] = [choice for choice in all_choices if choice[0] == "camera"]
             asks = f"asksPinholes({json.dumps(geometry(self.scene.rig, self.alpha))})"
         else:
             values["ranges"] = []
@@ -95,8 +111,21 @@ class Explorer:
 
     @property
     def usual(self) -> bool:
-        """True if field, weights and lens are those that a page can compute."""
-        return all(self.controls[name] == DEFAULTS[name] for name in ("field", "second", "weights", "lens"))
+        """True if field, weights and lenses are those that a page can compute."""
+        lenses = [key for errors in self.controls["errors"].values() for key in errors if key[:4] == "lens"]
+        return not lenses and all(self.controls[n] == DEFAULTS[n] for n in ("field", "second", "weights"))
+
+    @property
+    def rig(self) -> Rig:
+        """The rig as the controls have changed it.
+
+        Raises:
+            ValueError: if there is none, or for impossible controls.
+        """
+        if self.scene is None:
+            raise ValueError(self.error)
+        rig = moved_rig(self.scene.rig, self.alpha, self.controls)
+        return with_depths(rig, explorer_state(rig, self.alpha, self.controls))
 
     def grid(self, columns: int) -> dict[str, Any]:
         """Compute the answers for a grid of alpha's pixels, which a saved page shows.
@@ -171,6 +200,8 @@ def opened(
     x: tuple[float, float] | None = None,
     network: PAT | str | None = None,
     fields: Mapping[str, ReceptiveField] | None = None,
+    covariance: Covariance | None = None,
+    files: Mapping[str, str] | None = None,
     **controls: Any,
 ) -> Explorer:
     """Make the explorer of a rig.
@@ -199,12 +230,12 @@ def opened(
         if isinstance(network, str):
             shipped_attention(network)  # refuses others
         images, alpha = checked(rig, images, alpha)
-        scene = ExplorerScene(rig, images, fields or {}, networks)
+        scene = ExplorerScene(rig, images, fields or {}, networks, covariance)
     except (ValueError, TypeError, FileNotFoundError) as error:
         return Explorer(None, "", {**DEFAULTS, "x": [0, 0]}, str(error))
     h, w = rig[alpha].hw
     controls = {**DEFAULTS, "weights": weights, **controls, "x": list(x or (w // 2, h // 2))}
-    return Explorer(scene, alpha, controls)
+    return Explorer(scene, alpha, controls, files=files or {})
 
 
 def checked(

@@ -6,7 +6,8 @@ function modelOf(values, ask) {
   async function answer() {
     if (busy) { again = true; return; }
     busy = true;
-    try { values.answer = await ask(values.controls, values); } catch (error) { values.answer = { error: String(error) }; }
+    const { asked } = values.controls;
+    try { values.answer = { ...await ask(values.controls, values), asked }; } catch (error) { values.answer = { error: String(error), asked }; }
     busy = false;
     drawAgain();
     if (again) { again = false; answer(); }
@@ -76,15 +77,23 @@ function asksPinholes(rig) {
     const length = Math.sqrt(dot(centred, centred));
     return length > FLAT ? centred.map((f) => f / length) : centred.map(() => 0);
   }
-  function moved(controls) {
-    const own = rig.cameras[rig.alpha], angle = controls.rotation * Math.PI / 180, found = {};
-    const turn = [[Math.cos(angle), 0, Math.sin(angle)], [0, 1, 0], [-Math.sin(angle), 0, Math.cos(angle)]];
+  const turned = (degrees) => { // Rodrigues
+    const angle = Math.hypot(...degrees) * Math.PI / 180;
+    if (!angle) return [[1, 0, 0], [0, 1, 0], [0, 0, 1]];
+    const [x, y, z] = degrees.map((v) => v * Math.PI / 180 / angle), c = Math.cos(angle), s = Math.sin(angle), d = 1 - c;
+    return [[c + x * x * d, x * y * d - z * s, x * z * d + y * s], [y * x * d + z * s, c + y * y * d, y * z * d - x * s],
+      [z * x * d - y * s, z * y * d + x * s, c + z * z * d]];
+  };
+  function moved({ errors, baseline }) {
+    const own = rig.cameras[rig.alpha], found = {};
     for (const [name, camera] of Object.entries(rig.cameras)) {
-      if (name === rig.alpha) { found[name] = camera; continue; }
-      const [right, forward] = controls.moved[name] ?? [0, 0], step = times(transposed(own.R), [right, 0, forward]);
-      const centre = own.centre.map((c, i) => c + controls.baseline * (camera.centre[i] - c) + step[i]);
-      const K = camera.K.map((row, i) => row.map((v, j) => (i < 2 && j < 2 ? v * controls.focal : v)));
-      found[name] = { ...camera, K, R: product(turn, camera.R), centre };
+      const given = [errors[name] ?? {}, ...(name === rig.alpha ? [] : [errors["all betas"] ?? {}])];
+      const sums = (...keys) => keys.map((key) => given.reduce((sum, one) => sum + (one[key] ?? 0), 0));
+      const focal = given.reduce((all, one) => all * (one.focal ?? 1), 1);
+      const step = times(transposed(own.R), sums("right", "down", "forward")), shift = sums("cx", "cy");
+      const centre = own.centre.map((c, i) => c + baseline * (camera.centre[i] - c) + step[i]);
+      const K = camera.K.map((row, i) => row.map((v, j) => (i < 2 ? (j < 2 ? v * focal : v + shift[i]) : v)));
+      found[name] = { ...camera, K, R: product(turned(sums("rx", "ry", "rz")), camera.R), centre };
     }
     return found;
   }
@@ -157,10 +166,15 @@ function asksPinholes(rig) {
     let [sum, inverse] = [0, 0];
     for (const { problem, weights, depths: known, peak } of Object.values(betas))
       if (!problem) weights.forEach((w, i) => { if (known[i] != null) { sum += peak * w; inverse += peak * w / known[i]; } });
+    const pins = [];
+    for (const at of controls.pins) {
+      const there = await inspect(cameras, shown, rig.alpha, inside(at, own.hw), depths);
+      pins.push({ x: inside(at, own.hw), betas: Object.fromEntries(Object.entries(there).filter(([, one]) => !one.problem)) });
+    }
     const top = Object.entries(cameras).map(([name, { centre, R }]) => {
       const at = times(own.R, centre.map((c, i) => c - own.centre[i])), ahead = times(own.R, R[2]);
       return { name, at: [at[0], at[2]], ahead: [ahead[0], ahead[2]] };
     });
-    return { x, depth: inverse > 0 ? Number((sum / inverse).toPrecision(4)) : null, betas, backwards, top, rig: "" };
+    return { x, depth: inverse > 0 ? Number((sum / inverse).toPrecision(4)) : null, betas, pins, backwards, top, rig: "" };
   };
 }

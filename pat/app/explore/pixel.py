@@ -40,7 +40,9 @@ from arraygeom.fields import covering_displacement
 from arraygeom.fields.default import FIELDS, LINE_SHARE, named_field, recorded_field
 from arraygeom.fields.protocol import sampling_locations
 from arraygeom.fields.ray_depth import ray_depth, rough_transfer
+from arraygeom.fields.widened import direction
 from arraygeom.pixels import HW
+from arraygeom.uncertainty import Covariance, bands
 
 from ...fusion.steps import hw_at_alphas_resolution, of_size
 from ...fusion.views import checked_image
@@ -103,6 +105,8 @@ class BetaReport(NamedTuple):
         value: weighted mean of beta's image.
         peak: largest weight.
         offset: best match of the images; None without a segment or a clear match.
+        band: corners of the band that holds the match by the calibration's uncertainty, pixels of beta; None
+            without a covariance or a segment.
     """
 
     xy: Float[Tensor, "l 2"]
@@ -113,6 +117,7 @@ class BetaReport(NamedTuple):
     value: Float[Tensor, " c"]
     peak: float
     offset: MatchOffset | None = None
+    band: Float[Tensor, "4 2"] | None = None
 
 
 class PixelReport(NamedTuple):
@@ -140,6 +145,7 @@ class ExplorerScene:
         images: images (c, h, w) by camera.
         fields: further fields by name.
         networks: further networks by name.
+        covariance: covariance of the rig's parameters, which gives segments their bands; None for none.
         guides: luminances (1, 1, h, w) that windows are cut from, by camera.
         features: computed features of networks.
 
@@ -151,6 +157,7 @@ class ExplorerScene:
     images: Mapping[str, Tensor]
     fields: Mapping[str, ReceptiveField] = field(default_factory=dict)
     networks: Mapping[str, PAT] = field(default_factory=dict)
+    covariance: Covariance | None = None
     guides: dict[str, Tensor] = field(default_factory=dict)
     features: dict[tuple[str, str, str | None], tuple[HW, QueryAndKey]] = field(default_factory=dict)
 
@@ -283,7 +290,8 @@ def inspect_pixel(scene: ExplorerScene, state: ExplorerState) -> PixelReport:
             problems[name] = "no image given"
             continue
         try:
-            betas[name] = beta_report(scene, rig.pair(state.alpha, name), name, state)
+            report = beta_report(scene, rig.pair(state.alpha, name), name, state)
+            betas[name] = report._replace(band=band_corners(scene, rig, name, state, report.ends))
         except (ValueError, FileNotFoundError) as error:
             problems[name] = str(error)
         except Exception as error:  # of a field of one's own
@@ -326,6 +334,21 @@ def beta_report(scene: ExplorerScene, pair: Pair, name: str, state: ExplorerStat
     depth, ends = depths(pair, x, xy, valid), ends_of(locations)
     offset = match_offset((scene.guides[state.alpha], scene.guides[name]), pair, x, (xy, weight), ends)
     return BetaReport(xy, valid, ends, weight, depth, value, float(weight.max()), offset)
+
+
+def band_corners(
+    scene: ExplorerScene, rig: Rig, name: str, state: ExplorerState, ends: Float[Tensor, "2 2"] | None
+) -> Float[Tensor, "4 2"] | None:
+    """Return the corners of the 95 % band around a segment; None without one, or without a covariance."""
+    if scene.covariance is None or ends is None:
+        return None
+    band = bands(rig, scene.covariance, state.alpha, name, pixel_of(state))
+    along = direction(ends[1] - ends[0])
+    left = torch.stack([along[1], -along[0]])
+    start, end = ends[0] - band.along[0, 0] * along, ends[1] + band.along[0, 1] * along
+    one, two = band.across[0, 0] * left, band.across[0, 1] * left
+    corners = torch.stack([start + one, end + two, end - two, start - one])
+    return corners if bool(corners.isfinite().all()) else None
 
 
 ACROSS, STEP = 8, 0.25

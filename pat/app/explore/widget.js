@@ -1,9 +1,10 @@
 const STYLE = `
 .pat { font: 13px system-ui, sans-serif; color: light-dark(#1c2127, #e8eaed); background: light-dark(#fff, #1d2125);
   --line: light-dark(#cfd5dc, #434a52); --soft: light-dark(#5d6670, #a5aeb8); padding: 10px; color-scheme: light dark }
-.pat .views { display: flex; flex-wrap: wrap; gap: 10px } .pat figure { flex: 1 1 300px; margin: 0; max-width: 640px }
+.pat .views { display: flex; flex-wrap: wrap; gap: 10px } .pat figure { flex: 1 1 340px; margin: 0; min-width: 0 }
 .pat canvas { width: 100%; display: block; border-radius: 4px } .pat figcaption { min-height: 2.8em; margin-top: 4px }
-.pat .profile { height: 56px; border-radius: 0; margin-top: 4px } .pat .top { width: 240px; height: 180px }
+.pat .sign { visibility: hidden; color: var(--soft) } .pat.busy .sign { visibility: visible; transition: visibility 0s .15s }
+.pat .zoom { height: 150px; border-radius: 0; margin-top: 4px } .pat .profile { height: 56px; border-radius: 0; margin-top: 4px } .pat .top { width: 240px; height: 180px }
 .pat .top { border: 1px solid var(--line); touch-action: none } .pat canvas[data-camera] { cursor: crosshair }
 .pat .below, .pat .controls, .pat .buttons { display: flex; flex-wrap: wrap; gap: 12px; align-items: start }
 .pat .below { margin-top: 6px } .pat .controls { flex: 1 1 300px } .pat .buttons { flex-basis: 100% }
@@ -11,7 +12,8 @@ const STYLE = `
 .pat select, .pat button { font: inherit; color: inherit; background: light-dark(#f3f5f7, #2a2f35);
   border: 1px solid var(--line); border-radius: 5px; padding: 3px 8px } .pat button { cursor: pointer }
 .pat button:disabled { opacity: .4 } .pat :focus-visible { outline: 2px solid #0a84ff; outline-offset: 1px } .pat kbd { font: inherit; opacity: .6 }`;
-const FIRST = "#e69f00", SECOND = "#cc79a7", MATCH = "#00bfff", BACK = "#ff6d3a";
+const FIRST = "#e69f00", SECOND = "#cc79a7", MATCH = "#00bfff", BACK = "#ff6d3a", BAND = "#ffffff";
+const PINS = ["#f0e442", "#009e73", "#d55e00", "#56b4e9", "#ff8fd0", "#b8e986"];
 const depthText = (d, unit) => (d == null ? "no depth" : `depth ${d} ${unit}`);
 const make = (tag, properties = {}, ...children) => {
   const made = Object.assign(document.createElement(tag), properties);
@@ -33,30 +35,35 @@ function write(context, text) {
 }
 
 // What is drawn over an image, once for the canvas and once for the SVG: lines, dots and crosses in its pixels.
-function marks(camera, answer) {
-  const found = [], beta = answer.betas?.[camera.name], radius = camera.hw[1] / 50;
+function marks(camera, answer, unit = camera.hw[1] / 400) {
+  const found = [], beta = answer.betas?.[camera.name], radius = 8 * unit;
   const cross = ([x, y], colour) => [[1, 0], [-1, 0], [0, 1], [0, -1]].forEach(([u, v]) => found.push(
     { line: [0.4 * radius, radius].map((r) => [x + r * u, y + r * v]), colour }));
   const field = (report, colour) => {
     if (!report || report.problem) return;
-    const top = Math.max(...report.weights), unit = camera.hw[1] / 400;
+    const top = Math.max(...report.weights);
     found.push({ line: report.samples, colour });
     report.samples.forEach((at, i) => found.push({ dot: at, radius: unit * (0.6 + 4 * report.weights[i] / top), colour }));
   };
+  (answer.pins ?? []).forEach((pin, i) => {
+    const colour = PINS[i % PINS.length], there = camera.alpha ? { match: pin.x } : pin.betas[camera.name];
+    if (there?.samples) found.push({ line: there.samples, colour });
+    if (there) cross(there.match, colour);
+  });
   if (camera.alpha) {
     if (answer.backwards?.length) found.push({ line: answer.backwards, colour: BACK });
     if (answer.x) cross(answer.x, MATCH);
     return found;
   }
+  if (beta?.band) found.push({ line: [...beta.band, beta.band[0]], colour: BAND });
   field(beta?.second, SECOND);
   field(beta, FIRST);
   if (beta?.match) cross(beta.match, MATCH);
   return found;
 }
 
-function drawMarks(context, camera, answer) {
-  const unit = camera.hw[1] / 400;
-  for (const { line, dot, radius, colour } of marks(camera, answer)) {
+function drawMarks(context, camera, answer, unit = camera.hw[1] / 400) {
+  for (const { line, dot, radius, colour } of marks(camera, answer, unit)) {
     context.strokeStyle = context.fillStyle = colour;
     context.beginPath();
     if (line) {
@@ -70,6 +77,39 @@ function drawMarks(context, camera, answer) {
       context.globalAlpha = 1;
     }
   }
+}
+
+// Part of an image around a point, `wide` of its pixels across a box (left, width) of a canvas, with what is drawn over it.
+function drawPart(context, { camera, image }, answer, [x, y], wide, left, width) {
+  if (!image.complete || !image.naturalWidth) return;
+  const high = wide * context.canvas.height / width, [h, w] = camera.hw;
+  const across = image.naturalWidth / w, down = image.naturalHeight / h, from = [x - wide / 2, y - high / 2];
+  context.save();
+  context.beginPath();
+  context.rect(left, 0, width, context.canvas.height);
+  context.clip();
+  context.imageSmoothingEnabled = false;
+  context.translate(left, 0);
+  context.scale(width / wide, width / wide);
+  context.translate(-from[0], -from[1]);
+  context.drawImage(image, -0.5, -0.5, w, h);
+  drawMarks(context, camera, answer, 2.5 * wide / width);
+  context.restore();
+}
+
+const PATCH = 25; // pixels of alpha
+
+// Alpha's patch and the match's side by side, then the segment enlarged.
+function drawZoom(canvas, alpha, part, answer) {
+  const context = canvas.getContext("2d"), width = (canvas.width = 2 * canvas.clientWidth || 600), beta = answer.betas?.[part.camera.name];
+  const height = (canvas.height = 300), side = Math.min(height, width / 4);
+  if (answer.error || !beta || beta.problem) return;
+  drawPart(context, alpha, answer, answer.x, PATCH, 0, side);
+  drawPart(context, part, answer, beta.match, PATCH, side + 6, side);
+  const points = [...beta.samples, ...(beta.band ?? [])], rest = width - 2 * side - 12;
+  const [low, high] = [Math.min, Math.max].map((f) => [0, 1].map((i) => f(...points.map((p) => p[i]))));
+  const wide = 1.15 * Math.max(PATCH, high[0] - low[0], (high[1] - low[1]) * rest / height);
+  drawPart(context, part, answer, low.map((v, i) => (v + high[i]) / 2), wide, 2 * side + 12, rest);
 }
 
 // Weights along the segment from one end to the other, the highest being 1.
@@ -98,19 +138,23 @@ function drawProfile(canvas, beta, unit) {
 
 function betaText(beta, unit) {
   if (beta.problem) return beta.problem;
-  const off = beta.off == null ? "" : `, ${beta.off} px off the line`;
+  const side = beta.band && Math.hypot(...beta.band[0].map((v, i) => v - beta.band[3][i])) / 2;
+  const off = (beta.off == null ? "" : `, ${beta.off} px off the line`) + (side ? `, band ±${side.toFixed(2)} px` : "");
   const second = beta.second && (beta.second.problem ?? `${beta.second.samples.length} samples`);
   return `match (${beta.match.map((v) => v.toFixed(1)).join(", ")}), ${depthText(beta.depth, unit)}, ` +
     `${beta.samples.length} samples${off}` + (second ? `; compared: ${second}` : "");
 }
 
-// Python that makes the same view.
-function code(cameras, controls, defaults, x) {
+// Python that makes the same view, from the files if they are known.
+function code(cameras, controls, defaults, x, files) {
   const python = (v) => (v === null ? "None" : typeof v === "number" ? String(Number(v.toPrecision(6))) : JSON.stringify(v));
   const kept = Object.keys(defaults).filter((n) => n !== "clicked" && python(controls[n]) !== python(defaults[n]));
   const changes = kept.map((n) => `, ${n}=${python(controls[n])}`).join("");
-  const alpha = cameras.find((camera) => camera.alpha).name;
-  return `explore(rig, images, alpha=${python(alpha)}, x=(${x.map((v) => Math.round(v)).join(", ")})${changes})`;
+  const alpha = cameras.find((camera) => camera.alpha).name, names = Object.keys(files).filter((name) => name);
+  const images = names.map((name) => `${python(name)}: read_view(rig, ${python(name)}, ${python(files[name])})`).join(", ");
+  const head = files[""] ? `from arraygeom import Rig\nfrom pat.app.explore import explore\nfrom pat.fusion.views import read_view\n\n` +
+    `rig = Rig.load(${python(files[""])})\nimages = ${names.length ? `{${images}}` : "None"}\n` : "from pat.app.explore import explore\n\n";
+  return `${head}explore(rig, images, alpha=${python(alpha)}, x=(${x.map((v) => Math.round(v)).join(", ")})${changes})`;
 }
 
 function svg(cameras, answer) {
@@ -168,14 +212,15 @@ function topView(canvas, model, change) {
   canvas.addEventListener("pointerdown", (event) => {
     const [x, y] = at(event), near = ([a, b]) => Math.hypot(a - x, b - y) < 30;
     const camera = (model.get("answer").top ?? []).find((one) => !isAlpha(one) && near(place(one.at)));
-    held = camera && { name: camera.name, from: [x, y], before: model.get("controls").moved[camera.name] ?? [0, 0] };
+    held = camera && { name: camera.name, from: [x, y], before: model.get("controls").errors[camera.name] ?? {} };
     if (held) canvas.setPointerCapture(event.pointerId);
   });
   canvas.addEventListener("pointermove", (event) => {
     if (!held) return;
     const [x, y] = at(event);
-    const step = [held.before[0] + (x - held.from[0]) / scale, held.before[1] - (y - held.from[1]) / scale];
-    change({ moved: { ...model.get("controls").moved, [held.name]: step.map((v) => Number(v.toFixed(4))) } });
+    const step = { right: (x - held.from[0]) / scale, forward: (held.from[1] - y) / scale }, mine = { ...held.before };
+    for (const [key, v] of Object.entries(step)) mine[key] = Number(((mine[key] ?? 0) + v).toFixed(4));
+    change({ errors: { ...model.get("controls").errors, [held.name]: mine } });
   });
   canvas.addEventListener("pointerup", () => { held = null; draw(); });
   return draw;
@@ -184,10 +229,16 @@ function topView(canvas, model, change) {
 function render({ model, el }) {
   const views = make("div", { className: "views" }), bar = make("div", { className: "controls" });
   const root = make("div", { className: "pat", tabIndex: 0 }, make("style", { textContent: STYLE }), views);
+  let asked = 0;
   const first = model.get("controls");
   let waiting = null;
   const change = (part) => { // at most once a frame; alpha's pixel is that of the last answer if a beta was clicked
-    if (!waiting) requestAnimationFrame(() => { model.set("controls", waiting); model.save_changes(); waiting = null; });
+    if (!waiting) requestAnimationFrame(() => {
+      model.set("controls", { ...waiting, asked: ++asked });
+      model.save_changes();
+      waiting = null;
+      root.classList.add("busy");
+    });
     const now = waiting ?? model.get("controls");
     waiting = { ...now, ...(now.clicked && model.get("answer").x ? { x: model.get("answer").x } : {}), clicked: null, ...part };
   };
@@ -195,8 +246,9 @@ function render({ model, el }) {
   const parts = cameras.map((camera) => {
     const { name, hw, src, alpha } = camera, canvas = make("canvas", { width: hw[1], height: hw[0] });
     const caption = make("figcaption"), profile = make("canvas", { className: "profile" }), image = new Image();
+    const zoom = make("canvas", { className: "zoom", title: "alpha's patch, the match's, the segment" });
     canvas.dataset.camera = name;
-    views.append(make("figure", {}, canvas, ...(alpha || !src ? [] : [profile]), caption));
+    views.append(make("figure", {}, canvas, ...(alpha || !src ? [] : [zoom, profile]), caption));
     const pixel = (event) => [
       (event.offsetX / canvas.clientWidth) * hw[1] - 0.5, (event.offsetY / canvas.clientHeight) * hw[0] - 0.5];
     let held = false;
@@ -208,13 +260,14 @@ function render({ model, el }) {
     if (alpha) canvas.addEventListener("pointermove", (event) => { if (!held) change({ x: pixel(event) }); });
     image.onload = () => draw();
     image.src = src;
-    return { camera, canvas, caption, profile, image };
+    return { camera, canvas, caption, profile, zoom, image };
   });
   const top = make("canvas", { className: "top", title: "from above: drag a camera" });
   const drawTop = topView(top, model, change);
   function draw() {
     const answer = model.get("answer");
-    for (const { camera, canvas, caption, profile, image } of parts) {
+    for (const part of parts) {
+      const { camera, canvas, caption, profile, zoom, image } = part;
       const context = canvas.getContext("2d"), { name, alpha, unit } = camera;
       context.setTransform(1, 0, 0, 1, 0, 0);
       context.clearRect(0, 0, canvas.width, canvas.height);
@@ -224,6 +277,7 @@ function render({ model, el }) {
       context.translate(0.5, 0.5); // the centre of the first pixel is (0, 0)
       if (!answer.error) drawMarks(context, camera, answer);
       if (!alpha) drawProfile(profile, beta, unit);
+      if (!alpha && parts[0].camera.alpha) drawZoom(zoom, parts[0], part, answer);
       const text = answer.error ?? (alpha ? `pixel (${answer.x}), ${depthText(answer.depth, unit)}` : betaText(beta, unit));
       caption.textContent = `${name}${alpha ? " (alpha)" : ""}: ${text}`;
     }
@@ -236,25 +290,34 @@ function render({ model, el }) {
     bar.append(make("label", {}, text, select));
     return { show: (controls) => { select.value = controls[name]; }, input: select, name };
   });
-  for (const [name, text, [min, max, step, usual]] of model.get("ranges")) {
+  const value = (controls, name, each) => (each ? controls.errors[controls.camera]?.[name] : controls[name]);
+  for (const [name, text, [min, max, step, usual], each] of model.get("ranges")) { // `each`: of the chosen camera
     const input = make("input", { type: "range", min, max, step }), label = make("span");
-    const show = (controls) => {
-      input.value = controls[name] ?? usual;
-      label.textContent = `${text}: ${Number((controls[name] ?? usual).toPrecision(3))}`;
-    };
-    input.addEventListener("input", () => { change({ [name]: Number(input.value) }); show({ [name]: Number(input.value) }); });
+    const tell = (v) => { label.textContent = `${text}: ${Number(v.toPrecision(3))}`; };
+    const show = (controls) => { input.value = value(controls, name, each) ?? usual; tell(value(controls, name, each) ?? usual); };
+    input.addEventListener("input", () => {
+      const now = Number(input.value), { errors, camera } = waiting ?? model.get("controls");
+      change(each ? { errors: { ...errors, [camera]: { ...errors[camera], [name]: now } } } : { [name]: now });
+      tell(now);
+    });
     bar.append(make("label", {}, label, input));
     show(first);
     inputs.push({ show, input, name });
   }
+  inputs.find(({ name }) => name === "camera")?.input.addEventListener("change", (event) => {
+    const now = { ...model.get("controls"), camera: event.target.value };
+    inputs.forEach(({ show }) => show(now));
+  });
   for (const { input, name } of inputs) input.dataset.control = name;
   const acts = {
     c: ["copy code", async (button) => {
-      const text = code(cameras, model.get("controls"), model.get("defaults"), model.get("answer").x ?? first.x);
+      const text = code(cameras, model.get("controls"), model.get("defaults"), model.get("answer").x ?? first.x, model.get("files"));
       try { await navigator.clipboard.writeText(text); button.textContent = "copied"; } catch { button.textContent = text; }
     }],
     s: ["save as SVG", () => download("fields.svg", svg(cameras, model.get("answer")), "image/svg+xml")],
     g: ["save the moved rig", () => download("rig_moved.yaml", model.get("answer").rig, "text/yaml")],
+    p: ["pin the pixel", () => change({ pins: [...model.get("controls").pins, model.get("answer").x ?? first.x] })],
+    u: ["unpin all", () => change({ pins: [] })],
     r: ["reset", () => {
       const usual = { ...model.get("defaults"), ...first, x: model.get("answer").x ?? first.x };
       change(usual);
@@ -273,7 +336,7 @@ function render({ model, el }) {
     button.addEventListener("click", () => act(button));
     return button;
   });
-  bar.append(make("div", { className: "buttons" }, ...buttons, make("kbd", { textContent: "arrows move the pixel" })));
+  bar.append(make("div", { className: "buttons" }, ...buttons, make("kbd", { textContent: "arrows move the pixel" }), make("span", { className: "sign", textContent: "computing" })));
   root.addEventListener("keydown", (event) => {
     if (event.target.matches("input, select") || event.ctrlKey || event.metaKey || event.altKey) return;
     const step = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
@@ -287,7 +350,12 @@ function render({ model, el }) {
   root.append(make("div", { className: "below" }, top, bar));
   el.append(root);
   const showRig = () => { buttons[2].disabled = !model.get("answer").rig; };
-  model.on("change:answer", () => { draw(); showRig(); });
+  model.on("change:answer", () => {
+    draw();
+    showRig();
+    if ((model.get("answer").asked ?? asked) === asked) root.classList.remove("busy");
+  });
+  new ResizeObserver(() => draw()).observe(views);
   draw();
   showRig();
 }

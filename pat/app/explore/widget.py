@@ -11,6 +11,7 @@ from torch import Tensor
 
 from arraygeom import ReceptiveField, Rig
 from arraygeom.runtime.extras import needs
+from arraygeom.uncertainty import Covariance
 
 from ...networks.paper import PAT
 from .page import GRID, MODULE, Explorer, opened
@@ -34,6 +35,7 @@ class FieldWidget(anywidget.AnyWidget):
     ranges: Any = traitlets.List().tag(sync=True)
     choices: Any = traitlets.List().tag(sync=True)
     defaults = traitlets.Dict().tag(sync=True)
+    files = traitlets.Dict().tag(sync=True)
     controls = traitlets.Dict().tag(sync=True)
     answer = traitlets.Dict().tag(sync=True)
 
@@ -44,6 +46,16 @@ class FieldWidget(anywidget.AnyWidget):
 
     def __repr__(self) -> str:
         return "the explorer, which a kernel answers: run this cell"
+
+    @property
+    def rig(self) -> Rig:
+        """The rig as the controls have changed it, for the next cell.
+
+        Raises:
+            ValueError: if there is none, or for impossible controls.
+        """
+        self.explorer.controls = self.controls
+        return self.explorer.rig
 
     def save(self, path: str | Path, columns: int = GRID) -> None:
         """Write a page of one file that needs no kernel; see `Explorer.save`."""
@@ -62,6 +74,7 @@ def explore(
     x: tuple[float, float] | None = None,
     network: PAT | str | None = None,
     fields: Mapping[str, ReceptiveField] | None = None,
+    covariance: Covariance | None = None,
     **controls: Any,
 ) -> FieldWidget:
     """Show the receptive fields of a rig in a cell of a notebook: point at a pixel of alpha, and move the
@@ -75,14 +88,21 @@ def explore(
         network: network of the paper, or weights such as "pat-supervised", whose attention is shown; None for
             correlations of windows.
         fields: further fields by name, which can then be chosen; None for none.
+        covariance: covariance of the rig's parameters, as `calib` writes it, for 95 % bands around segments;
+            None for none.
         controls: initial values of the controls: `field` and `second` (names of fields), `weights`, `near`
-            and `far` (metres), `baseline` and `focal` (factors), `rotation` (degrees), `lens` (added to k1),
-            `moved` (metres).
+            and `far` (metres), `baseline` (factor), `errors` (changes by camera, such as
+            {"colour": {"ry": 0.5, "cx": 3}}), `camera` (the one that sliders change), `pins`
+            (pixels of alpha that stay drawn).
 
     Returns:
-        The widget; problems with the input are shown in it.
+        The widget; problems with the input are shown in it. Its `rig` is the rig as changed.
 
     Raises:
         TypeError: for an unknown argument.
     """
-    return FieldWidget(opened(rig, images, alpha=alpha, x=x, network=network, fields=fields, **controls))
+    return FieldWidget(
+        opened(
+            rig, images, alpha=alpha, x=x, network=network, fields=fields, covariance=covariance, **controls
+        )
+    )

@@ -17,10 +17,11 @@ from arraygeom.batching import stack
 from arraygeom.camera import Camera
 from arraygeom.pixels import HW
 from arraygeom.rig import Rig
-from pat.lab.synthesis.blender import compat
+from pat.lab.synthesis.blender.environment import blender_python
 from pat.lab.synthesis.blender.lens import lens_for
 from pat.lab.synthesis.blender.settings import PRESETS, RenderSettings
-from pat.lab.synthesis.blender.task import fitted, render_here, shots
+from pat.lab.synthesis.blender.task import fitted, shots
+from pat.lab.synthesis.blender.task import render as render_scene
 from pat.lab.synthesis.check import CheckLimits, check_views
 from pat.lab.synthesis.generators import generator_named
 from pat.lab.synthesis.layered import LayeredScenes
@@ -179,7 +180,7 @@ class BlenderSettings:
         return [rig[shot.camera].hw for shot in shots(rig, settings)]
 
     def renderer(self, rig: Rig, limits: CheckLimits) -> Renderer:
-        """Prepare a renderer for a rig; imports bpy into this process.
+        """Prepare a renderer for a rig.
 
         Args:
             rig: rig to render.
@@ -191,13 +192,13 @@ class BlenderSettings:
         Raises:
             ValueError: if Blender is not installed, or the generator cannot be imported.
         """
-        compat.load()
+        blender_python()
         generator, settings = generator_named(self.generator), replace(self.render_settings(), limits=limits)
         further = {} if self.photos is None else {"folder": self.photos}
 
         def render(seed: int, out: Path) -> None:
             scene = generator(seed, rig, moving=settings.duration, **further)
-            render_here(scene, rig, out, settings=settings)
+            render_scene(scene, rig, out, settings=settings)
 
         return render
 

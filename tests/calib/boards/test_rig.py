@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from arraygeom import Pose, Rig
+from arraygeom import Pose, Rig, rotation_from_vector
+from calib.boards import intrinsics
 from calib.boards.adequacy import coverage
 from calib.boards.detect import BoardViews, Detection
 from calib.boards.poses import symmetry_poses
@@ -199,6 +200,59 @@ def test_boards_that_move_between_the_exposures_do_not_distort_the_lenses(pair):
         change = abs(float(result.rig["colour"].K[i, i] - alone.problem.cameras["colour"].K[i, i]))
         assert change < alone.deviations[f"colour.focal.{i}"]
     assert len(set(result.fit.problem.sigma.values())) == 1
+
+
+def test_boards_that_moved_in_a_few_frames_are_left_out(pair, found):
+    """By some pixels: each image fits its own camera, and the two contradict each other."""
+    rig, boards, views = pair
+    moved = Pose(boards.R, boards.t + tensor(0.004, 0.003, 0))
+    off = see(rig, moved, noise=0.1)["colour"].seen
+    seen = views["colour"].seen
+    keys = [key for key in seen if key in off and key in views["mono"].seen][1:6:2]
+    result = calibrate(with_seen(views, "colour", {**seen, **{key: off[key] for key in keys}}), BOARD)
+    assert {key for _, key in result.fit.left_out} == set(keys)
+    assert result.rms < 1.2 * found.rms
+    assert all(any(str(key) in note for note in result.notes) for key in keys)
+
+
+def fisheye_views(seed, *, focal=200.0, widest=80.0, count=14):
+    """Boards all over a fisheye's image, many of them beside the camera."""
+    g, points = np.random.default_rng(seed), torch.from_numpy(CHESS.points - CHESS.points.mean(0))
+    fisheye = camera(focal, (480, 640), lens=(0.02, -0.01, 0.002, 0.0), model="kannala-brandt")
+    seen = {}
+    while len(seen) < count:
+        azimuth, angle = g.uniform(0, 2 * np.pi), np.radians(widest) * np.sqrt(g.uniform())
+        sideways = tensor(np.cos(azimuth), np.sin(azimuth), 0)
+        direction = np.sin(angle) * sideways + np.cos(angle) * tensor(0, 0, 1)
+        axis = torch.linalg.cross(tensor(0, 0, 1), sideways)
+        R = rotation_from_vector(angle * axis) @ rotation_from_vector(
+            torch.from_numpy(g.normal(0, (0.4, 0.4, 0.3)))
+        )
+        x, _, valid = fisheye.project_local(points @ R.T + g.uniform(0.3, 0.8) * direction)
+        inside = (valid & fisheye.contains(x)).numpy()
+        if inside.sum() > 20:
+            noisy = x.numpy() + g.normal(0, 0.1, x.shape)
+            seen[len(seen)] = Detection(np.flatnonzero(inside), noisy[inside])
+    return {"cam": BoardViews(fisheye.hw, seen)}
+
+
+@pytest.mark.parametrize(("seed", "widest"), [(0, 80.0), (2, 80.0), (1, 95.0)])
+def test_fisheyes_with_boards_beside_the_camera(seed, widest):
+    """OpenCV's own start ends in an assertion of its, or tens of pixels off."""
+    views = fisheye_views(seed, widest=widest)
+    found = calibrate(views, CHESS, lens="kannala-brandt")
+    assert found.rms == pytest.approx(0.1 * 2**0.5, rel=0.15)
+    assert len(found.views["cam"].seen) == len(views["cam"].seen)
+    assert float(found.rig["cam"].K[0, 0]) == pytest.approx(200, abs=0.5)
+
+
+def test_a_fisheye_taken_for_a_pinhole_is_named(monkeypatch):
+    def failing(*_):
+        raise ValueError("t holds NaN or infinity")
+
+    monkeypatch.setattr(intrinsics, "_pinhole", failing)
+    with pytest.raises(ValueError, match=r"cam.*--lens kannala-brandt"):
+        calibrate(fisheye_views(1), CHESS)
 
 
 def test_one_image_is_too_few(pair):

@@ -8,15 +8,13 @@ import torch
 
 from arraygeom import Camera, Distortion, Link, Rig, View
 from arraygeom.runtime.text import UNSCALED
-from calib.images.depth_change import DepthChange, relative_change
+from calib.images.depth_change import relative_change
 from calib.images.hypotheses import swap
 from calib.images.matches import PointMatches, image_sizes, match_cameras
 from calib.images.parameters import apply_change, free_parameters
-from calib.images.photometric import PhotometricImage, photometric_errors
-from calib.images.refinement import RefinementProblem, jacobian, polish, refine, refine_matches, solve
+from calib.images.refinement import FREE, RefinementProblem, jacobian, refine, refine_matches, solve
 from calib.images.residuals import epipolar_residuals, median_off, sampson_of_pairs
 from pat.app.cli.main import main
-from pat.attention import attend_with_statistics
 from pat.media.images import write_image
 from tests.benchmarks.bench_drift import DRIFTS, drifted, with_lens_mistake
 from tests.benchmarks.bench_drift import error as depth_error
@@ -27,7 +25,6 @@ from tests.calib.scenes import (
     rectified_pair,
     seen_points,
     texture,
-    uninformed,
     unlike_pair,
     vector,
 )
@@ -70,27 +67,7 @@ def test_depth_that_points_do_not_determine_stays():
     assert found.depth.change < 0.02
     before, after = (depth_error(r, rig, points) for r in (bad, found.rig))
     assert after < before + 0.01
-    assert "depth changes by" in found.as_text()
-    assert found.kept
-
-
-def test_what_is_kept_is_named_alike_by_any_basis():
-    """A name for each combination, whichever of them span what is kept."""
-    _, bad = small_drift()
-    problem = RefinementProblem.from_frames(bad, ["rotation", "centre", "focal"], frames=[seen_points(bad)])
-    solution, g = problem.solve_freely(), torch.Generator().manual_seed(0)
-    root = torch.linalg.cholesky(solution.covariance[solution.active][:, solution.active])
-    basis = torch.linalg.qr(torch.randn(root.shape, generator=g, dtype=torch.float64)).Q[:, 4:]
-    names = []
-    for turn in (
-        torch.eye(basis.shape[1]).double(),
-        torch.randn(2 * basis.shape[1:], generator=g, dtype=torch.float64),
-    ):
-        directions = torch.zeros(problem.count, basis.shape[1], dtype=torch.float64)
-        directions[solution.active] = root @ basis @ torch.linalg.qr(turn).Q
-        names.append(problem.report(solution._replace(directions=directions), force=True).kept)
-    assert names[0] == names[1]
-    assert len(set(names[0])) == 4
+    assert "lines mended, depth not determined" in found.as_text()
 
 
 @pytest.mark.parametrize("field", ["narrow", "wide"])
@@ -99,10 +76,9 @@ def test_a_wrong_focal_length_does_not_ruin_depth(field):
     points = simulated_matches(rig, field, np.random.default_rng(8))
     bad = rig.perturbed({"c1.focal": 0.02 * rig["c1"].K[:2, :2].diagonal()})
     found = refine_matches(bad, [points])
-    assert found.accepted
     before, after = (depth_error(r, rig, points) for r in (bad, found.rig))
-    assert after < before
-    assert found.held_out[1].median < 0.25
+    assert after < before + 0.01
+    assert found.held_out[1].median < 0.25 * found.held_out[0].median
 
 
 def test_swapped_cameras_are_not_accepted():
@@ -134,7 +110,9 @@ def test_a_prior_binds():
     rig = simulated_rig("wide", 2, np.random.default_rng(11))
     bad = rig.perturbed({"c1.rotation": vector(0.03, 0, 0)})
     points = simulated_matches(rig, "wide", np.random.default_rng(12))
-    found = refine_matches(bad, [points], sigma={"rotation": math.radians(0.1), "centre": 1.0})
+    sigma = {"rotation": math.radians(0.1), "centre": 1.0}
+    problem = RefinementProblem.from_frames(bad, ["rotation", "centre"], frames=[points], sigma=sigma)
+    found = problem.report(problem.solve(near_depth=False))
     assert not found.accepted
     assert any("standard deviations" in text and "sigma" in text for text in found.objections)
 
@@ -192,7 +170,7 @@ def test_a_refusal_says_what_else_to_free():
     """A rotation that stands in for a shift of the principal point is refused with that hint."""
     rig = unlike_pair()
     bad, points = rig.perturbed({"second.centre": vector(0, 8, 0)[:2]}), seen_points(rig, count=200)
-    for free, advice in ((["rotation"], "free "), (["rotation", "centre"], "")):
+    for free, advice in ((["rotation"], "free "), (FREE, "")):
         problem = RefinementProblem.from_frames(bad, free, frames=[points])
         solution = problem.solve()
         refused = problem.report(solution._replace(z=torch.zeros_like(solution.z))).objections[0]
@@ -307,65 +285,6 @@ def test_a_fundamental_matrix_is_refined():
     assert median_off(found.rig, seen_points(rig, noise=0.0, seed=1)) < 0.1
 
 
-def test_photometric_error_is_least_for_the_true_rig():
-    rig, images = rectified_pair(), rectified_images()
-    rig = rig.replace(depth=(2.5, 6.5))
-    views = {name: PhotometricImage.from_image(image) for name, image in images.items()}
-
-    def error(pixels):
-        moved = rig.perturbed({"right.centre": vector(0, pixels)})
-        left, seen = photometric_errors(moved, views, ("left", "right"), attend_with_statistics)
-        return float(left[seen].abs().mean())
-
-    errors = {p: error(p) for p in (-2.0, -1.0, 0.0, 1.0, 2.0)}
-    assert min(errors, key=errors.get) == 0.0
-    change = torch.zeros(2, dtype=torch.float64, requires_grad=True)
-    left, _ = photometric_errors(
-        rig.perturbed({"right.centre": change + vector(0, 0.7)}),
-        views,
-        ("left", "right"),
-        attend_with_statistics,
-    )
-    (slope,) = torch.autograd.grad(left.square().sum(), change)
-    assert slope[1] > 0
-
-
-def test_photometric_error_refines_a_rig():
-    rig, images = rectified_pair(), rectified_images()
-    bad = rig.perturbed({"right.rotation": vector(0.004, 0, 0.002)})
-    found = refine(bad, [images], free=["rotation"], attend=attend_with_statistics)
-    assert found.accepted
-    assert found.photometric is not None
-    assert "photometric error on held-out pixels" in found.as_text()
-    assert median_off(found.rig, seen_points(rig, noise=0.0)) < 0.1
-
-
-@pytest.mark.parametrize("bands", [2, 4])
-def test_photometric_error_refines_a_rig_of_many_bands(bands):
-    rig, images = rectified_pair(), {n: x.mean(0, keepdim=True) for n, x in rectified_images().items()}
-    bad = rig.perturbed({"right.rotation": vector(0.004, 0, 0.002)})
-    one, many = (
-        refine(bad, [frame], free=["rotation"], attend=attend_with_statistics)
-        for frame in (images, {name: image.repeat(bands, 1, 1) for name, image in images.items()})
-    )
-    assert many.photometric is not None
-    assert torch.allclose(many.rig["right"].R, one.rig["right"].R, atol=1e-6)
-
-
-def test_photometric_error_alone_refines_a_rig():
-    """No point is used: the gradient through attention's segments moves the rig."""
-    rig, images = rectified_pair().replace(depth=(2.5, 6.5)), rectified_images()
-    bad = rig.perturbed({"right.rotation": vector(0.004, 0, 0.002)})
-    fit = RefinementProblem.from_frames(bad, ["right.rotation"], frames=[match_cameras(images)])
-    ground_truth = seen_points(rig, near=3.0, far=5.5, noise=0.0)
-    before = median_off(fit.rig, ground_truth)
-    found, errors = polish(fit, uninformed(fit), [images], attend_with_statistics)
-    assert before > 1
-    assert median_off(fit.after(found.z), ground_truth) < 0.3 * before
-    assert errors.accepted
-    assert errors.after < errors.before
-
-
 def test_bad_input_is_one_clear_line():
     rig, images = rectified_pair(), rectified_images()
     with pytest.raises(ValueError):
@@ -417,9 +336,9 @@ def test_command_line(tmp_path, capsys, refusal):
         write_image(tmp_path / f"{name}.png", image)
     rig.perturbed({"right.rotation": vector(0.004, 0, 0.002)}).save(tmp_path / "rig.yaml")
     command = ["rig", "refine", str(tmp_path / "rig.yaml"), *files, "--free", "rotation"]
-    main([*command, "--no-photometric", "--out", str(tmp_path / "better.yaml")])
+    main([*command, "--out", str(tmp_path / "better.yaml")])
     assert "changed: right.rotation" in capsys.readouterr().out
-    assert "# depth changes by" in (tmp_path / "better.yaml").read_text()
+    assert "# lines mended" in (tmp_path / "better.yaml").read_text()
     better = Rig.load(tmp_path / "better.yaml")
     assert isinstance(better["right"], Camera)
     assert better["right"].hw == HW
@@ -439,7 +358,7 @@ def test_depth_that_is_lost_counts_as_changed():
 
 
 def test_poses_do_not_stand_in_for_lenses():
-    """Wrong lenses are not explained by other poses, which would change depth."""
+    """Lines that wrong lenses bend change depth by one per cent at most."""
     g = np.random.default_rng([0, 2, 4])
     rig = simulated_rig("wide", 2, g)
     matches = simulated_matches(rig, "wide", g)
@@ -448,10 +367,7 @@ def test_poses_do_not_stand_in_for_lenses():
         cameras={name: camera.replace(distortion=lens) for name, camera in rig.cameras.items()}
     )
     found = refine_matches(bent, [matches])
-    assert not found.accepted
-    assert ["other lenses" in objection for objection in found.objections] == [True]
-    turned = rig.perturbed({"c1.rotation": torch.tensor([0.003, 0.003, 0.003], dtype=torch.float64)})
-    assert refine_matches(turned, [matches]).accepted
+    assert depth_error(found.rig, rig, matches) < depth_error(bent, rig, matches) + 0.01
 
 
 @pytest.mark.parametrize(
@@ -459,12 +375,14 @@ def test_poses_do_not_stand_in_for_lenses():
     [
         pytest.param("SmRub", "k1 +.05", 0, marks=pytest.mark.slow),
         ("SmRub", "centre 5 px", 1),
+        pytest.param("thing01", "k1 +.05", 0, marks=pytest.mark.slow),
         ("Poly", "rotation 1", 1),
     ],
 )
 def test_depth_does_not_change_for_nothing(shared_data, name, kind, seed):
-    """Changes of depth by many times its deviation's fall are refused."""
-    (pair,) = syntim(shared_data, (name,))
+    """Poses that fit the lines of `thing01` best would change depth by 16 per cent, from 2.5 to 14 off."""
+    pairs = bumblebee(shared_data, (name,)) if name == "thing01" else syntim(shared_data, (name,))
+    (pair,) = (pair for pair in pairs if name in pair.name)
     matches = match_cameras(pair.images)
     rig = Rig({name: pair.rig[name] for name in pair.images})
     lens = kind.startswith("k1")
@@ -476,22 +394,3 @@ def test_depth_does_not_change_for_nothing(shared_data, name, kind, seed):
     assert bad is not None
     found = refine_matches(bad, [matches])
     assert depth_error(found.rig, rig, matches) < depth_error(bad, rig, matches) + 0.01
-
-
-@pytest.mark.parametrize(("known", "doubtful"), [(0.02, False), (0.1, True)])
-def test_depth_may_change_far_where_it_is_known(known, doubtful):
-    """Here by six times its deviation's fall, as in the next test."""
-    assert DepthChange(change=0.178, before=0.44, after=0.4389, known=known).doubtful == doubtful
-
-
-@pytest.mark.slow
-def test_depth_changes_far_where_it_is_known(shared_data):
-    """A real pair's second camera turned by a degree: depth changes by six times its deviation's fall."""
-    (pair,) = (pair for pair in bumblebee(shared_data, ("chair01",)) if pair.name.endswith("chair01"))
-    matches = match_cameras(pair.images)
-    rig = Rig({name: pair.rig[name] for name in pair.images})
-    found = refine_matches(
-        drifted(rig, "rotation 1", np.random.default_rng([1, DRIFTS.index("rotation 1")])), [matches]
-    )
-    assert found.accepted
-    assert depth_error(found.rig, rig, matches) < 0.02

@@ -94,7 +94,7 @@ def test_a_refusal_of_refine_has_a_status_of_its_own_and_says_what_to_do(materia
     folder, _ = material
     files = images(folder, "mono", "colour")
     with pytest.raises(SystemExit) as stop:
-        pat(f"rig refine {folder / 'rough.yaml'} {files} --no-photometric -o {folder / 'x.yaml'}")
+        pat(f"rig refine {folder / 'rough.yaml'} {files} -o {folder / 'x.yaml'}")
     assert stop.value.code == 4
     said = " ".join(capsys.readouterr().err.split())
     assert f"or fuse without a rig: `pat fuse {folder / 'colour.png'} {folder / 'mono.png'}`" in said

@@ -135,7 +135,7 @@ def test_winners_are_those_of_their_slow_twin(views, runs, count, spread):
             wanted[claimed] = min(wanted[claimed], int(its) << 16 | int(label))
         allowed = on if on.any() else np.arange(len(on)) == 0
         allowed = allowed | bool(cut[y, x])
-        best = int(np.where(allowed, sums[y, x], 2**15).argmin())
+        best = int(np.where(allowed, sums[y, x].astype(int), 2**15).argmin())
         rest = sums[y, x][allowed & (np.abs(labels[y, x] - labels[y, x, best]) > 1)]
         assert positions[y, x] == at[best]
         assert facts[y, x, 0] == labels[y, x, best]

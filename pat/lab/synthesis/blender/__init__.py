@@ -1,10 +1,9 @@
 """Scenes rendered by Blender (Cycles), for any calibrated rig.
 
-bpy is imported when a scene is rendered: by `render` in a separate process, by `render_here` in this one (for
-a farm's workers).
+Blender runs as a process of its own, in a Python environment of its own (`environment`), for each scene.
 """
 
 from .settings import RenderSettings
-from .task import render, render_here
+from .task import render
 
-__all__ = ["RenderSettings", "render", "render_here"]
+__all__ = ["RenderSettings", "render"]

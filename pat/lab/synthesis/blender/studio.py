@@ -1,13 +1,13 @@
-"""Rendering of a built scene: set the camera, render, read the passes."""
+"""Rendering of a scene by Blender, which runs as a process of its own in its own environment."""
 
 from __future__ import annotations
 
-import os
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+import json
+import subprocess
+from collections.abc import Mapping
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -18,9 +18,10 @@ from torch import Tensor
 
 from arraygeom.camera import Camera
 
+from ....support.schema import to_document
 from ..scene import Motion, Scene
-from . import compat
-from .build import BuiltScene, Spectrum, build
+from ..shapes import mesh
+from .environment import blender_python
 from .settings import RenderSettings
 
 NOTHING = 1e9
@@ -28,6 +29,7 @@ NOTHING = 1e9
 
 _FLIP = np.diag([1.0, -1.0, -1.0])
 _SENSOR = 36.0
+_SERVE = "import sys; sys.path.append(sys.argv[1]); from child.serve import serve; serve()"
 
 
 class Studio:
@@ -38,22 +40,30 @@ class Studio:
         settings: settings of rendering.
         scratch: existing folder for temporary files.
 
+    Attributes:
+        version: Blender's version.
+
     Raises:
         ValueError: if Blender is not installed, or no GPU is usable for device "gpu".
+        BrokenProcessPool: if its process dies.
     """
 
     def __init__(self, scene: Scene, settings: RenderSettings, scratch: Path):
-        self.scene, self.settings, self.scratch = scene, settings, scratch
-        self.bpy = compat.load()
-        self.blender = compat.new_scene(self.bpy)
-        self.camera = self.bpy.data.objects.new("camera", self.bpy.data.cameras.new("camera"))
-        self.blender.collection.objects.link(self.camera)
-        self.blender.camera = self.camera
-        self.stage: BuiltScene = build(self.bpy, scene, self.blender.world)
-        with quietly():  # naming a denoiser looks for GPUs, and complains of their absence
-            self._quality()
+        self.scene, self.settings, self.path = scene, settings, scratch / "layers.exr"
+        command = [blender_python(), "-I", "-B", "-c", _SERVE, str(Path(__file__).parent)]
+        self.errors, pipe = scratch / "errors.txt", subprocess.PIPE
+        with self.errors.open("w") as errors:
+            self.process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=errors, text=True)
+        shapes = [mesh(thing)._asdict() for thing in scene.objects]
+        meshes = [{name: values.tolist() for name, values in shape.items()} for shape in shapes]
+        entries = to_document(scene, defaults=True), to_document(settings, defaults=True)
+        try:
+            self.version = self._ask(scene=entries[0], settings=entries[1], meshes=meshes)["version"]
+        except BaseException:
+            self.close()
+            raise
 
-    def channels(self, camera: Camera, time: float, spectrum: Spectrum) -> dict[str, Tensor]:
+    def channels(self, camera: Camera, time: float, spectrum: Literal["rgb", "nir"]) -> dict[str, Tensor]:
         """Render one frame.
 
         Args:
@@ -64,80 +74,62 @@ class Studio:
         Returns:
             Channels (h, w), float32, by Blender's names: colours, depth, object index.
         """
-        for item, thing in zip(self.stage.objects, self.scene.objects):
-            _place(item, thing.motion, time)
-        self.blender.frame_set(1)
-        self._aim(camera)
-        self.stage.show(spectrum)
-        path = self.scratch / "layers.exr"
-        self.blender.render.filepath = str(path)
-        with quietly():
-            self.bpy.ops.render.render(write_still=True)
-        channels = read_layers(path)
-        path.unlink()
+        places = [_place(thing.motion, time) for thing in self.scene.objects]
+        self._ask(places=places, spectrum=spectrum, path=str(self.path), **_aim(camera))
+        channels = read_layers(self.path)
+        self.path.unlink()
         return channels
 
     def close(self) -> None:
-        """Drop Blender's persistent data; until then one of its threads keeps half a core busy."""
-        self.blender.render.use_persistent_data = False
+        """End Blender's process."""
+        self.process.kill()
+        self.process.communicate()
 
-    # Settings --------------------------------------------------------------------------------------------
+    def _ask(self, **request: Any) -> dict[str, str]:
+        """Send a request. Raises ValueError with Blender's own sentence, BrokenProcessPool if it dies."""
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        try:
+            self.process.stdin.write(json.dumps(request) + "\n")
+            self.process.stdin.flush()
+        except BrokenPipeError:
+            pass
+        answer = self.process.stdout.readline()
+        if not answer:
+            status = f"Blender's process died with status {self.process.wait()}"
+            last = self.errors.read_text().splitlines()[-1:]
+            raise BrokenProcessPool(": ".join([status, *last]))
+        answered: dict[str, str] = json.loads(answer)
+        if "error" in answered:
+            raise ValueError(answered["error"])
+        return answered
 
-    def _quality(self) -> None:
-        s, render, cycles = self.settings, self.blender.render, self.blender.cycles
-        render.engine = "CYCLES"
-        cycles.device = "GPU" if s.device != "cpu" and self._gpu() else "CPU"
-        cycles.samples, cycles.use_adaptive_sampling, cycles.seed = s.samples, False, self.scene.seed % 2**31
-        cycles.use_denoising = s.denoise != "none"
-        cycles.denoiser = "OPENIMAGEDENOISE"
-        cycles.denoising_input_passes = "RGB_ALBEDO_NORMAL"
-        cycles.denoising_quality = "HIGH" if s.denoise == "accurate" else "FAST"
-        cycles.denoising_prefilter = "ACCURATE" if s.denoise == "accurate" else "FAST"
-        self._light_paths()
-        render.use_persistent_data = True
-        render.dither_intensity = 0
-        render.threads_mode = "FIXED" if s.threads else "AUTO"
-        render.threads = s.threads or 1
-        layer = self.blender.view_layers[0]
-        layer.use_pass_z = layer.use_pass_object_index = True
-        compat.write_layers(self.blender)
 
-    def _light_paths(self) -> None:
-        s, cycles = self.settings, self.blender.cycles
-        glass = any(thing.material.transmission for thing in self.scene.objects)
-        cycles.max_bounces = max(s.bounces, 6 if glass else 0)
-        cycles.diffuse_bounces = cycles.glossy_bounces = s.bounces
-        cycles.transmission_bounces = 6 if glass else 0
-        cycles.caustics_reflective = cycles.caustics_refractive = False
-        cycles.sample_clamp_indirect = 5
-        cycles.use_light_tree = len(self.scene.lights) > 4
-        cycles.use_fast_gi = s.fast_light
-        cycles.fast_gi_method = "REPLACE"
-        cycles.ao_bounces_render = 1
-        self.blender.world.light_settings.distance = 0.15 * self.scene.depth[1]
-
-    def _gpu(self) -> bool:
-        gpu = compat.use_gpu(self.bpy)
-        if not gpu and self.settings.device == "gpu":
-            raise ValueError("no GPU that Cycles can use was found: take device 'cpu' or 'auto'")
-        return gpu
-
-    # One image -----------------------------------------------------------------------------------------
-
-    def _aim(self, camera: Camera) -> None:
-        """Set Blender's camera, with a sensor 36 units wide for any camera: Blender refuses less
-        than 1 mm."""
-        data, render = self.camera.data, self.blender.render
-        (h, w), K = camera.hw, camera.K
-        fx, fy = float(K[0, 0]), float(K[1, 1])
-        render.resolution_x, render.resolution_y, render.resolution_percentage = w, h, 100
-        render.pixel_aspect_x, render.pixel_aspect_y = max(1.0, fy / fx), max(1.0, fx / fy)
-        data.sensor_fit, data.sensor_width, data.lens = "HORIZONTAL", _SENSOR, fx * _SENSOR / w
-        aspect = render.pixel_aspect_y / render.pixel_aspect_x
-        data.shift_x = (w / 2 - 0.5 - float(K[0, 2])) / w
-        data.shift_y = (float(K[1, 2]) + 0.5 - h / 2) * aspect / w
-        data.clip_start, data.clip_end = 1e-3, 1e5
-        self.camera.matrix_world = _blender_pose(camera).T.tolist()
+def _aim(camera: Camera) -> dict[str, Any]:
+    """Settings of Blender's image, camera and pose, with a sensor 36 units wide for any camera: Blender
+    refuses less than 1 mm."""
+    (h, w), K = camera.hw, camera.K
+    fx, fy = float(K[0, 0]), float(K[1, 1])
+    across, down = max(1.0, fy / fx), max(1.0, fx / fy)
+    return {
+        "image": {
+            "resolution_x": w,
+            "resolution_y": h,
+            "resolution_percentage": 100,
+            "pixel_aspect_x": across,
+            "pixel_aspect_y": down,
+        },
+        "camera": {
+            "sensor_fit": "HORIZONTAL",
+            "sensor_width": _SENSOR,
+            "lens": fx * _SENSOR / w,
+            "shift_x": (w / 2 - 0.5 - float(K[0, 2])) / w,
+            "shift_y": (float(K[1, 2]) + 0.5 - h / 2) * (down / across) / w,
+            "clip_start": 1e-3,
+            "clip_end": 1e5,
+        },
+        "pose": {"matrix_world": _blender_pose(camera).T.tolist()},
+    }
 
 
 def read_layers(path: Path) -> dict[str, Tensor]:
@@ -145,14 +137,9 @@ def read_layers(path: Path) -> dict[str, Tensor]:
 
     Returns:
         Channels (h, w), float32, by `Pass.Channel`.
-
-    Raises:
-        ValueError: if OpenEXR is not installed.
     """
-    try:
-        import OpenEXR
-    except ImportError:
-        raise ValueError(f"rendering needs OpenEXR to read what Blender writes: {compat.INSTALL}") from None
+    import OpenEXR
+
     layers: dict[str, Tensor] = {}
     with OpenEXR.File(str(path), separate_channels=True) as file:
         for layer in file.parts:
@@ -160,20 +147,6 @@ def read_layers(path: Path) -> dict[str, Tensor]:
                 short = name.split(".", 1)[1] if name.count(".") > 1 else name
                 layers[short] = torch.from_numpy(np.array(channel.pixels, dtype=np.float32))
     return layers
-
-
-@contextmanager
-def quietly() -> Iterator[None]:
-    """Context manager that suppresses Blender's output, which bypasses Python's standard output."""
-    sys.stdout.flush()
-    former, sink = os.dup(1), os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(sink, 1)
-        yield
-    finally:
-        os.dup2(former, 1)
-        os.close(former)
-        os.close(sink)
 
 
 def _blender_pose(camera: Camera) -> Float[NDArray, "4 4"]:
@@ -184,9 +157,17 @@ def _blender_pose(camera: Camera) -> Float[NDArray, "4 4"]:
     return M
 
 
-def _place(item: Any, motion: Motion, time: float) -> None:
+def _place(motion: Motion, time: float) -> tuple[list[float], list[float], list[float]]:
+    """Location, quaternion (w, x, y, z) and scale of an object at a time."""
     R, position, extent = motion.at(time)
     x, y, z, w = Rotation.from_matrix(R).as_quat()
-    item.location = position.tolist()
-    item.rotation_quaternion = [w, x, y, z]
-    item.scale = (extent / np.asarray(motion.keys[0].extent)).tolist()
+    return position.tolist(), [w, x, y, z], (extent / np.asarray(motion.keys[0].extent)).tolist()
+
+
+def index_name(channels: Mapping[str, Any]) -> str:
+    """Return the name of the object-index channel among those of a file.
+
+    Raises:
+        StopIteration: if there is none.
+    """
+    return next(name for name in ("Object Index.X", "IndexOB.X") if name in channels)

@@ -1,4 +1,4 @@
-"""Rendering of one scene in this process."""
+"""Rendering of one scene."""
 
 from __future__ import annotations
 
@@ -8,10 +8,8 @@ import shutil
 import tempfile
 import time
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing, contextmanager
 from importlib.metadata import version
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 from uuid import uuid4
@@ -26,10 +24,9 @@ from ..check import check_views
 from ..rendered import RENDER_FILE, Rendered, RenderedFrame, frame_file, save_frame
 from ..scene import Scene
 from ..shapes import inside
-from . import compat
 from .lens import Lens, lens_for
 from .settings import RenderSettings
-from .studio import NOTHING, Studio
+from .studio import NOTHING, Studio, index_name
 
 _RATE = 30.0
 _SHARED_MEMORY = Path("/dev/shm")
@@ -51,26 +48,7 @@ class Shot(NamedTuple):
 
 
 def render(scene: Scene, rig: Rig, out: Path, *, settings: RenderSettings) -> Rendered:
-    """Render a scene by `render_here` in a separate process, so that this one does not import bpy.
-
-    Args:
-        scene: scene to render.
-        rig: calibrated cameras to render.
-        out: new folder.
-        settings: settings of rendering.
-
-    Returns:
-        The rendered folder.
-
-    Raises:
-        ValueError: in one line, if `out` exists or the scene cannot be rendered.
-    """
-    with ProcessPoolExecutor(1, get_context("spawn")) as process:
-        return process.submit(render_here, scene, rig.to("cpu"), out, settings=settings).result()
-
-
-def render_here(scene: Scene, rig: Rig, out: Path, *, settings: RenderSettings) -> Rendered:
-    """Render a scene into a new folder, atomically, in this process, which imports bpy.
+    """Render a scene of a rig into the new folder `out`, atomically.
 
     Args:
         scene: scene to render.
@@ -85,11 +63,12 @@ def render_here(scene: Scene, rig: Rig, out: Path, *, settings: RenderSettings) 
     Raises:
         ValueError: in one line, if `out` exists or the scene cannot be rendered (skew, a camera inside an
             object, a missing library).
+        BrokenProcessPool: if Blender's process dies.
     """
     out = Path(out)
     if out.exists():
         raise ValueError(f"{out} exists: give a new folder, or remove it first")
-    rig, started = fitted(rig, settings), time.monotonic()
+    rig, started = fitted(rig.to("cpu"), settings), time.monotonic()
     lenses = {name: lens_for(camera, name) for name, camera in rig.cameras.items()}
     planned = shots(rig, settings)
     refuse_inside(scene, rig, planned)
@@ -106,7 +85,7 @@ def render_here(scene: Scene, rig: Rig, out: Path, *, settings: RenderSettings) 
         scene.save(folder / "scene.yaml")
         about = {
             "settings": to_document(settings),
-            "versions": {"blender": studio.bpy.app.version_string, "pat": version("arraygeom-pat")},
+            "versions": {"blender": studio.version, "pat": version("arraygeom-pat")},
             "seconds": round(time.monotonic() - started, 3),
             "frames": files,
             "check": check_views(rig, first, settings.limits),
@@ -169,7 +148,7 @@ def take(studio: Studio, lens: Lens, shot: Shot) -> RenderedFrame:
         ValueError: if the camera sees nothing.
     """
     rendered = studio.channels(lens.pinhole, shot.time, "rgb")
-    index = rendered[compat.index_name(rendered)].round().int()
+    index = rendered[index_name(rendered)].round().int()
     depth = torch.where(rendered["Depth.Z"] < NOTHING, rendered["Depth.Z"], torch.inf)
     if not (index > 0).any():
         raise ValueError(f"camera '{shot.camera}' sees nothing at {shot.time:g} s: rotate it or move it")

@@ -120,7 +120,7 @@ def test_rig_commands_take_matches(folder, capsys):
     pat(f"rig start {given} -o {folder / 'started.yaml'}")
     assert "points" in capsys.readouterr().out
     assert Rig.load(folder / "started.yaml").links
-    pat(f"rig refine {folder / 'rig.yaml'} {given} -o {folder / 'refined.yaml'} --no-photometric")
+    pat(f"rig refine {folder / 'rig.yaml'} {given} -o {folder / 'refined.yaml'}")
 
 
 @pytest.mark.parametrize("alpha", ["mono", "blind"])

@@ -1,5 +1,6 @@
 """The explorer's server: for this machine's own names only, ports that are checked, a quiet end."""
 
+import json
 import os
 import re
 import signal
@@ -42,14 +43,56 @@ def status(port, path, data=None, **headers) -> int:
         return error.code
 
 
-def another_user(ask) -> bool:
-    """Return True if a process of another user of this machine is refused all that it asks for."""
+def another_user(ask) -> list:
+    """Return what a process of another user of this machine, "nobody", is answered."""
+    source, sink = os.pipe()
     child = os.fork()
     if not child:
-        os.setgid(65534)
-        os.setuid(65534)
-        os._exit(0 if all(answer == 404 for answer in ask()) else 1)
-    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+        try:
+            os.setgroups([])
+            os.setgid(65534)
+            os.setuid(65534)
+            answers = ask()
+        except BaseException as error:  # else this process would go on with the tests
+            answers = [repr(error)]
+        os.write(sink, json.dumps(answers).encode())
+        os._exit(0)
+    os.close(sink)
+    with open(source) as answers:
+        os.waitpid(child, 0)
+        return json.load(answers)
+
+
+@pytest.mark.skipif(sys.platform != "linux" or os.geteuid() != 0, reason="only root becomes another user")
+def test_another_user_of_the_machine_is_refused(server):
+    """Whoever is told the address may look; others can neither guess it nor read it off the process."""
+    process, port, page = server
+    own, token = f"localhost:{port}", page.strip("/")
+
+    def read(path) -> str:
+        try:
+            return Path(path).read_bytes().decode(errors="replace")
+        except PermissionError:
+            return "not permitted"
+
+    def ask() -> list:
+        guessed = [f"/{'a' * len(token)}/", f"/{token[:-1]}/", f"/{token[:-1]}%00/", "/", "/answer"]
+        refused = [status(port, path, data, Host=own) for path in guessed for data in (None, b"{}")]
+        about = [read(f"/proc/{process.pid}/{name}") for name in ("cmdline", "environ", "maps", "mem")]
+        foreign = [status(port, page, Host=host) for host in ("evil.example", f"evil.example:{port}")]
+        foreign.append(status(port, f"{page}answer", b"{}", Host=own, Origin="http://evil.example"))
+        return [refused, about, foreign, status(port, page, Host=own)]
+
+    assert status(port, "/", Host=own) == 404  # and all modules are there: others cannot read root's
+    answers = another_user(ask)
+    assert len(answers) == 4, answers
+    refused, about, foreign, told = answers
+    assert {*refused} == {404}
+    assert "explore" in about[0]
+    assert token not in "".join(about)
+    assert {*about[1:]} == {"not permitted"}
+    assert {*foreign} == {403}
+    assert told == 200
 
 
 def test_the_browser_is_not_told_the_token_where_others_see_it(monkeypatch):
@@ -106,8 +149,6 @@ def test_foreign_hosts_are_refused_whatever_their_origin_and_ctrl_c_is_quiet(ser
     assert status(port, answer, deep, Host=own) in (200, 400)
     for path in ("/", "/answer", "/elsewhere", page[:-2] + "/", f"{page}../"):
         assert status(port, path, Host=own) == status(port, path, b"{}", Host=own) == 404
-    if os.geteuid() == 0 and sys.platform == "linux":
-        assert another_user(lambda: [status(port, "/", Host=own), status(port, "/answer", b"{}", Host=own)])
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=300)
     assert process.returncode == 0

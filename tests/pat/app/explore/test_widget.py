@@ -6,6 +6,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 import torch
@@ -49,16 +50,59 @@ def test_controls_move_the_samples():
     first = view.answer["betas"]["b"]["samples"][0]
     wider = change(view, baseline=2.0)["betas"]["b"]["samples"][0]
     assert first[0] - wider[0] == pytest.approx(9.0, abs=0.02)  # f b / near = 90 * 0.1 / 1
-    rotated = change(view, baseline=1.0, rotation=1.0)["betas"]["b"]["samples"][0]
+    rotated = change(view, baseline=1.0, errors={"all betas": {"ry": 1.0}})["betas"]["b"]["samples"][0]
     assert abs(rotated[0] - first[0]) > 1
     assert "rotation" in view.answer["rig"]
+
+
+def test_an_error_of_one_camera_moves_that_camera_alone():
+    rig = parallel_rig(90.0, (80, 120), {"a": (0.0,), "b": (0.1,), "c": (-0.1,)}, (1.0, 8.0))
+    view = explore(rig)
+    before = view.answer["betas"]
+    for name, value in (("rx", 0.5), ("rz", 3.0), ("down", 0.05), ("cx", 4.0), ("cy", 4.0), ("lens0", 0.3)):
+        after = change(view, errors={"b": {name: value}}, x=[20, 15])["betas"]
+        usual = change(view, errors={}, x=[20, 15])["betas"]
+        assert after["c"] == usual["c"]
+        assert after["b"]["samples"] != usual["b"]["samples"]
+    assert change(view, errors={"b": {"cx": 4.0}}, x=[60, 40])["betas"]["c"] == before["c"]
+    shifted = view.answer["betas"]["b"]["samples"][0][0] - before["b"]["samples"][0][0]
+    assert shifted == pytest.approx(4.0, abs=0.02)
+    assert float(view.rig["b"].K[0, 2] - rig["b"].K[0, 2]) == 4.0
+    for wrong in ({"nobody": {}}, {"b": {"yaw": 1.0}}, {"b": {"lens7": 1.0}}):
+        assert "error" in change(view, errors=wrong)
+
+
+def test_every_number_of_a_cameras_model_is_changed():
+    lens = Distortion("kannala-brandt", torch.tensor([0.01, 0, 0, 0], dtype=torch.float64))
+    rig = small_rig()
+    view = explore(rig.with_camera("b", rig["b"].replace(distortion=lens)), errors={"b": {"lens3": 0.02}})
+    assert [name for name, *_ in view.ranges][-4:] == ["lens0", "lens1", "lens2", "lens3"]
+    assert view.rig["b"].distortion.coefficients.tolist() == [0.01, 0, 0, 0.02]
+
+
+def test_pinned_pixels_stay_and_a_covariance_draws_a_band():
+    rig = small_rig()
+    view = explore(
+        rig, pins=[[30, 20], [90, 60]], covariance=Stated(("b.rotation.0",), torch.tensor([[1e-4]]))
+    )
+    first, second = view.answer["pins"]
+    assert first["x"] == [30, 20]
+    assert second["betas"]["b"]["samples"] == change(view, x=[90, 60])["betas"]["b"]["samples"]
+    assert change(view, x=[5, 5])["pins"] == [first, second]
+    band = torch.tensor(view.answer["betas"]["b"]["band"])
+    assert float((band[0] - band[3]).norm()) / 2 == pytest.approx(1.96 * 0.01 * 90, rel=0.2)
+
+
+class Stated(NamedTuple):
+    names: tuple[str, ...]
+    matrix: torch.Tensor
 
 
 def test_depths_of_unknown_scale_are_not_metres():
     """Both the sliders and the captions said m."""
     for name, unit in (("", "m"), (UNSCALED, "baselines")):
         view = explore(small_rig().replace(name=name))
-        assert [text for _, text, _ in view.ranges][:2] == [f"near ({unit})", f"far ({unit})"]
+        assert [text for _, text, *_ in view.ranges][:2] == [f"near ({unit})", f"far ({unit})"]
         assert {camera["unit"] for camera in view.cameras} == {unit}
 
 
@@ -71,7 +115,7 @@ def test_what_is_wrong_is_said_in_the_picture():
     assert "nobody" in explore(small_rig(), alpha="nobody").answer["error"]
     assert "nothing" in explore(small_rig(), network="nothing").answer["error"]
     assert "infinity" in explore(small_rig(), x=(float("inf"), 0)).answer["error"]
-    assert "error" in explore(small_rig(), moved=0.1).answer
+    assert "error" in explore(small_rig(), errors=0.1).answer
     problem = explore(small_rig(), weights="nothing").answer["betas"]["b"]["problem"]
     assert problem.startswith("no weights 'nothing'")
     for image in (torch.rand(80, 120), torch.ones(3, 80, 120, dtype=torch.uint8)):
@@ -185,6 +229,7 @@ def point(driver, camera, x, y, hw=(80, 120)):
 
 def drag(driver, element, start, step):
     """From a point of it, which is seen from its centre."""
+    driver.execute_script("arguments[0].scrollIntoView({ block: 'center' })", element)
     held = webdriver.ActionChains(driver).move_to_element_with_offset(element, *start).click_and_hold()
     held.move_by_offset(*step).release().perform()
 
@@ -193,6 +238,12 @@ def slide(driver, name, value):
     script = """const input = document.querySelector(`input[data-control=${arguments[0]}]`);
         input.value = arguments[1]; input.dispatchEvent(new Event('input'));"""
     driver.execute_script(script, name, value)
+
+
+def choose(driver, camera):
+    script = """const select = document.querySelector('select[data-control=camera]');
+        select.value = arguments[0]; select.dispatchEvent(new Event('change'));"""
+    driver.execute_script(script, camera)
 
 
 def resources(driver):
@@ -204,9 +255,24 @@ def test_the_saved_page_gives_the_numbers_of_the_kernel(driver, tmp_path):
     rig = small_rig(baseline=0.5)
     view = explore(rig)
     open_saved(driver, view, tmp_path)
-    for name, value in (("rotation", 1.0), ("baseline", 1.2), ("focal", 1.1), ("near", 0.9)):
+    errors: dict[str, dict[str, float]] = {"all betas": {}, "a": {}, "b": {}}
+    changes = [
+        *(
+            ("all betas", name, v)
+            for name, v in (("ry", 1.0), ("baseline", 1.2), ("focal", 1.1), ("near", 0.901))
+        ),
+        *(
+            ("b", name, v)
+            for name, v in (("rx", -0.5), ("rz", 2.0), ("down", 0.02), ("cx", 3.0), ("cy", -2.0))
+        ),
+        ("a", "forward", 0.05),
+    ]
+    for camera, name, value in changes:
+        choose(driver, camera)
         slide(driver, name, value)
-        change(view, **{name: value})
+        known = name in ("baseline", "near")
+        errors[camera] |= {} if known else {name: value}
+        change(view, errors={**errors}, **({name: value} if known else {}))
         for x, y in ((70, 30), (61, 52)):
             point(driver, "a", x, y)
             until(driver, lambda told, x=x, y=y: f"pixel ({x},{y})" in told[0])

@@ -1,7 +1,6 @@
 """Whole jobs with the layered backend: `pat lab render`."""
 
 import errno
-import importlib.util
 import json
 import os
 import shutil
@@ -22,6 +21,7 @@ from pat.lab.farm.backends import LayeredSettings, rig_from_alpha
 from pat.lab.farm.job import RenderConfig, Shard, check_space, publish, render, scene_seed, write_manifest
 from pat.lab.synthesis.rendered import Rendered
 from pat.support.jobs import JobError
+from tests.pat.lab.synthesis.scenes import needs_blender
 
 ROOT = Path(__file__).parents[4]
 RIG = """
@@ -109,8 +109,8 @@ def test_a_job_is_rendered_killed_and_resumed(config, tmp_path, capfd):
 @pytest.mark.slow
 @pytest.mark.parametrize("backend", ["layered", "blender"])
 def test_shards_and_dask_make_the_same(config, tmp_path, backend):
-    if backend == "blender" and importlib.util.find_spec("bpy") is None:
-        pytest.skip("Blender is not installed: pip install '.[synthesis]'")
+    if backend == "blender":
+        needs_blender()
     from distributed import LocalCluster
 
     write(config, backend=backend, blender={"settings": {"width": 96, "samples": 2}})
@@ -279,7 +279,7 @@ def test_seeds_are_of_the_scene_and_the_attempt_alone(config):
 
 @pytest.mark.parametrize("backend", ["layered", "blender"])
 def test_no_renderer_is_made_for_a_rig_it_cannot_render(backend, config, tmp_path, monkeypatch):
-    monkeypatch.setattr("pat.lab.farm.backends.compat.load", lambda: None)
+    monkeypatch.setattr("pat.lab.farm.backends.blender_python", lambda: "")
     (tmp_path / "rig.yaml").write_text("cameras: {mono: {size: [96, 64]}}")
     write(config, backend=backend)
     with pytest.raises(ValueError, match="camera 'mono' is not calibrated"):

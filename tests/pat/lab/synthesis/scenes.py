@@ -1,14 +1,24 @@
 """Small scenes and rigs that several test files use."""
 
+import pytest
 import torch
 
 from arraygeom.camera import Camera, intrinsics
 from arraygeom.distortion import BROWN_CONRADY, Distortion
 from arraygeom.pose import Pose, rotation_from_vector
 from arraygeom.rig import Rig
+from pat.lab.synthesis.blender.environment import blender_python
 from pat.lab.synthesis.scene import Key, Light, Material, Motion, Object, Paint, Relief, Scene, Texture, Vec3
 
 LENS = Distortion(BROWN_CONRADY, torch.tensor([-0.3, 0.08, 0.001, -0.002], dtype=torch.float64))
+
+
+def needs_blender() -> None:
+    """Skip a test where Blender is not installed."""
+    try:
+        blender_python()
+    except ValueError as error:
+        pytest.skip(str(error))
 
 
 def posed(rotation: Vec3 = (0, 0, 0), centre: Vec3 = (0, 0, 0)) -> Pose:

@@ -1,14 +1,17 @@
 """Every way in which rendering can be refused is one line, and no crash of Blender reaches the caller."""
 
 import importlib
+import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import torch
 
 from arraygeom.camera import Camera, intrinsics
 from arraygeom.rig import Rig
-from pat.lab.synthesis.blender import RenderSettings, compat, render, render_here, task
+from pat.lab.synthesis.blender import RenderSettings, environment, render, task
+from pat.lab.synthesis.blender.child import compat
 from pat.lab.synthesis.blender.settings import PRESETS
 from tests.pat.lab.synthesis.scenes import posed, room_scene, unlike_cameras
 
@@ -26,11 +29,11 @@ def without(monkeypatch, error: Exception) -> None:
 def test_skew_is_refused_before_blender_starts(tmp_path):
     skewed = RIG["oblong"].replace(K=RIG["oblong"].K + torch.tensor([[0, 0.5, 0], [0, 0, 0], [0, 0, 0]]))
     with pytest.raises(ValueError, match=r"'oblong' .*skew"):
-        render_here(room_scene(), RIG.with_camera("oblong", skewed), tmp_path / "x", settings=SETTINGS)
+        render(room_scene(), RIG.with_camera("oblong", skewed), tmp_path / "x", settings=SETTINGS)
     assert "bpy" not in sys.modules
 
 
-def test_errors_of_a_process_of_its_own_come_back_as_they_are(tmp_path):
+def test_a_folder_that_exists_is_refused(tmp_path):
     (tmp_path / "x").mkdir()
     with pytest.raises(ValueError, match="exists"):
         render(room_scene(), RIG, tmp_path / "x", settings=SETTINGS)
@@ -43,14 +46,23 @@ def test_a_camera_inside_an_object_is_refused():
         task.refuse_inside(room_scene(), rig, task.shots(rig, SETTINGS))
 
 
-def test_another_version_of_python_is_refused(monkeypatch):
-    without(monkeypatch, ModuleNotFoundError("No module named 'bpy'", name="bpy"))
-    monkeypatch.setattr(sys, "version_info", (3, 12, 1))
-    with pytest.raises(ValueError, match=r"3.11 .*3.13 .*3.12$"):
-        compat.load()
-    monkeypatch.setattr(sys, "version_info", (3, 11, 2))
-    with pytest.raises(ValueError, match=r"pip install bpy, .*'\.\[synthesis\]'$"):
-        compat.load()
+@pytest.mark.parametrize("missing", ["OpenEXR", "bpy"])
+def test_what_is_missing_is_named_with_what_installs_it(missing, monkeypatch, tmp_path):
+    monkeypatch.setattr(environment, "FOLDER", tmp_path)
+    monkeypatch.setattr(environment, "find_spec", lambda name: name if name not in (missing, "bpy") else None)
+    with pytest.raises(ValueError, match=rf"pip install .*{missing}"):
+        environment.blender_python()
+    (tmp_path / "bin").mkdir()
+    (tmp_path / "bin" / "python").touch()
+    if missing == "bpy":
+        assert environment.blender_python() == str(tmp_path / "bin" / "python")
+
+
+def test_the_childs_code_needs_nothing_of_the_rest():
+    code = "import sys; sys.path.append(sys.argv[1]); import child.serve; print(*sys.modules)"
+    command = [sys.executable, "-I", "-c", code, str(Path(environment.__file__).parent)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert not {"pat", "arraygeom", "torch", "scipy"} & set(done.stdout.split())
 
 
 def test_missing_libraries_are_named_with_the_packages_that_bring_them(monkeypatch):

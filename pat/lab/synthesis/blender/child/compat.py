@@ -3,17 +3,10 @@
 from __future__ import annotations
 
 import importlib
-import sys
-from collections.abc import Mapping
 from typing import Any
-
-from arraygeom.runtime.extras import install_line
 
 LIBRARIES = "libx11-6 libxrender1 libxfixes3 libxi6 libxkbcommon0 libsm6 libgl1"
 """Debian packages that `import bpy` needs (Cycles needs no more)."""
-
-PYTHONS = "Python 3.11 (bpy 4.5 and 5.0) or 3.13 (5.1 and newer)"
-INSTALL = install_line("bpy", "synthesis")
 
 
 def load() -> Any:
@@ -28,12 +21,7 @@ def load() -> Any:
     try:
         return importlib.import_module("bpy")
     except ModuleNotFoundError as error:
-        if error.name != "bpy":
-            raise ValueError(f"Blender needs the Python package {error.name}: {INSTALL}") from None
-        text, (major, minor, *_) = "rendering needs Blender as a Python module", sys.version_info
-        if (major, minor) in ((3, 11), (3, 13)):
-            raise ValueError(f"{text}: {INSTALL}") from None
-        raise ValueError(f"{text}, which exists for {PYTHONS}; this is {major}.{minor}") from None
+        raise ValueError(f"Blender's environment has no {error.name}: make it again") from None
     except ImportError as error:
         library = str(error).partition(":")[0]
         raise ValueError(
@@ -79,15 +67,6 @@ def factor(node: Any) -> Any:
     """Return the single-valued output of a texture node: 'Factor', 'Fac' before 5.0, or its first."""
     outputs = node.outputs
     return outputs.get("Factor") or outputs.get("Fac") or outputs[0]
-
-
-def index_name(channels: Mapping[str, Any]) -> str:
-    """Return the name of the object-index channel among those of a file.
-
-    Raises:
-        StopIteration: if there is none.
-    """
-    return next(name for name in ("Object Index.X", "IndexOB.X") if name in channels)
 
 
 def use_gpu(bpy: Any) -> bool:

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from ..scene import Light, Object, Paint, Scene, Texture, TextureKind, World
-from ..shapes import mesh
 from . import compat
 
 Spectrum = Literal["rgb", "nir"]
+Part = Any
+"""A part of a `pat.lab.synthesis.scene.Scene`, under the same names."""
 
 _STEPS = {"voronoi", "brick", "checker"}
 
@@ -36,8 +36,8 @@ class BuiltScene:
             paint(spectrum)
 
 
-def build(bpy: Any, scene: Scene, world: Any) -> BuiltScene:
-    """Build all objects and lights of a scene in Blender.
+def build(bpy: Any, scene: Part, meshes: Sequence[Part], world: Any) -> BuiltScene:
+    """Build all objects and lights of a scene in Blender; `meshes` are the objects' shapes.
 
     Args:
         bpy: Blender's module.
@@ -51,8 +51,8 @@ def build(bpy: Any, scene: Scene, world: Any) -> BuiltScene:
         ValueError: for a texture whose image file is missing.
     """
     stage = BuiltScene([], [])
-    for i, thing in enumerate(scene.objects):
-        item = _object(bpy, thing)
+    for i, (thing, surface) in enumerate(zip(scene.objects, meshes)):
+        item = _object(bpy, thing, surface)
         item.pass_index = i + 1
         item.data.materials.append(_material(bpy, thing, stage))
         stage.objects.append(item)
@@ -77,15 +77,14 @@ def colour(spectrum: Spectrum, rgb: tuple[float, float, float], nir: float) -> t
     return rgb if spectrum == "rgb" else (nir, nir, nir)
 
 
-def _set_colour(item: Any, name: str, spectrum: Spectrum, shown: Paint | World) -> None:
+def _set_colour(item: Any, name: str, spectrum: Spectrum, shown: Part) -> None:
     setattr(item, name, (*colour(spectrum, shown.rgb, shown.nir), 1.0))
 
 
-def _object(bpy: Any, thing: Object) -> Any:
-    surface = mesh(thing)
+def _object(bpy: Any, thing: Part, surface: Part) -> Any:
     data = bpy.data.meshes.new(thing.name)
-    faces = [f[:3] if f[2] == f[3] else f for f in surface.faces.tolist()]
-    data.from_pydata(surface.vertices.tolist(), [], faces)
+    faces = [f[:3] if f[2] == f[3] else f for f in surface.faces]
+    data.from_pydata(surface.vertices, [], faces)
     uv = np.concatenate([c[: len(f)] for f, c in zip(faces, surface.uv)])
     data.uv_layers.new(name="UVMap").data.foreach_set("uv", uv.astype(np.float32).ravel())
     data.polygons.foreach_set("use_smooth", np.ones(len(faces), dtype=bool))
@@ -99,7 +98,7 @@ def _object(bpy: Any, thing: Object) -> Any:
 _SIZES = {"area": "size", "sun": "angle", "point": "shadow_soft_size"}
 
 
-def _light(bpy: Any, light: Light, stage: BuiltScene) -> None:
+def _light(bpy: Any, light: Part, stage: BuiltScene) -> None:
     data = bpy.data.lights.new(light.kind, light.kind.upper())
     data.energy = light.power
     setattr(data, _SIZES[light.kind], light.size)
@@ -162,7 +161,7 @@ class _Nodes:
         return node
 
 
-def _material(bpy: Any, thing: Object, stage: BuiltScene) -> Any:
+def _material(bpy: Any, thing: Part, stage: BuiltScene) -> Any:
     material = thing.material
     made = bpy.data.materials.new(thing.name)
     compat.use_nodes(made)
@@ -189,7 +188,7 @@ def _material(bpy: Any, thing: Object, stage: BuiltScene) -> Any:
     return made
 
 
-def _texture(bpy: Any, nodes: _Nodes, texture: Texture, stage: BuiltScene) -> tuple[Any, Any]:
+def _texture(bpy: Any, nodes: _Nodes, texture: Part, stage: BuiltScene) -> tuple[Any, Any]:
     """Outputs of colour and of bump height (None for images)."""
     if texture.kind == "image":
         return _image(bpy, nodes, texture, stage), None
@@ -201,7 +200,7 @@ def _texture(bpy: Any, nodes: _Nodes, texture: Texture, stage: BuiltScene) -> tu
     return _grained(nodes, texture, ramp.outputs[0]), height
 
 
-def _set_ramp(ramp: Any, texture: Texture) -> None:
+def _set_ramp(ramp: Any, texture: Part) -> None:
     """Place one stop for each paint; stepped patterns stay stepped."""
     stepped = texture.kind in _STEPS
     ramp.interpolation = "CONSTANT" if stepped else "LINEAR"
@@ -214,18 +213,18 @@ def _set_ramp(ramp: Any, texture: Texture) -> None:
         ramp.elements.new(stop)
 
 
-def _paint_ramp(ramp: Any, paints: tuple[Paint, ...], spectrum: Spectrum) -> None:
+def _paint_ramp(ramp: Any, paints: Sequence[Part], spectrum: Spectrum) -> None:
     for stop, paint in zip(ramp.elements, paints):
         _set_colour(stop, "color", spectrum, paint)
 
 
-def _coordinates(nodes: _Nodes, texture: Texture, source: str = "Object", scale: float = 1.0) -> Any:
+def _coordinates(nodes: _Nodes, texture: Part, source: str = "Object", scale: float = 1.0) -> Any:
     """Texture coordinates, of the object or along its surface, times the scale, shifted."""
     where = nodes.new("TexCoord").outputs[source]
     return nodes.vector("MULTIPLY_ADD", where, (scale * texture.scale,) * 3, texture.offset)
 
 
-def _grained(nodes: _Nodes, texture: Texture, paint: Any) -> Any:
+def _grained(nodes: _Nodes, texture: Part, paint: Any) -> Any:
     if not texture.grain:
         return paint
     noise = nodes.texture("Noise", _coordinates(nodes, texture, scale=4.0), Scale=1.0, Detail=3.0)
@@ -236,8 +235,8 @@ def _grained(nodes: _Nodes, texture: Texture, paint: Any) -> Any:
     return node.outputs[0]
 
 
-def _pattern(kind: str, **inputs: float) -> Callable[[_Nodes, Texture], Any]:
-    def make(nodes: _Nodes, texture: Texture) -> Any:
+def _pattern(kind: str, **inputs: float) -> Callable[[_Nodes, Part], Any]:
+    def make(nodes: _Nodes, texture: Part) -> Any:
         node = nodes.texture(kind, _coordinates(nodes, texture), **inputs)
         if "Distortion" in node.inputs and texture.distortion:
             node.inputs["Distortion"].default_value = texture.distortion
@@ -246,26 +245,26 @@ def _pattern(kind: str, **inputs: float) -> Callable[[_Nodes, Texture], Any]:
     return make
 
 
-def _voronoi(nodes: _Nodes, texture: Texture) -> Any:
+def _voronoi(nodes: _Nodes, texture: Part) -> Any:
     node = nodes.texture("Voronoi", _coordinates(nodes, texture), Scale=1.0)
     split = nodes.new("SeparateXYZ")
     nodes.give(split.inputs[0], node.outputs["Color"])
     return split.outputs[0]
 
 
-def _brick(nodes: _Nodes, texture: Texture) -> Any:
+def _brick(nodes: _Nodes, texture: Part) -> Any:
     greys = {"Color1": (0.0, 0.0, 0.0, 1.0), "Color2": (0.7, 0.7, 0.7, 1.0), "Mortar": (1.0, 1.0, 1.0, 1.0)}
     node = nodes.texture("Brick", _coordinates(nodes, texture, "UV"), **greys, Scale=0.5)
     return node.outputs["Color"]
 
 
-def _plain(nodes: _Nodes, texture: Texture) -> Any:
+def _plain(nodes: _Nodes, texture: Part) -> Any:
     node = nodes.new("Value")
     node.outputs[0].default_value = 0.0
     return node.outputs[0]
 
 
-_PATTERNS: dict[TextureKind, Callable[[_Nodes, Texture], Any]] = {
+_PATTERNS: dict[str, Callable[[_Nodes, Part], Any]] = {
     "plain": _plain,
     "voronoi": _voronoi,
     "magic": _pattern("Magic", Scale=1.0),
@@ -276,7 +275,7 @@ _PATTERNS: dict[TextureKind, Callable[[_Nodes, Texture], Any]] = {
 }
 
 
-def _image(bpy: Any, nodes: _Nodes, texture: Texture, stage: BuiltScene) -> Any:
+def _image(bpy: Any, nodes: _Nodes, texture: Part, stage: BuiltScene) -> Any:
     file = Path(texture.image)
     if not file.is_file():
         raise ValueError(f"{texture.image or 'a texture without a file'}: no such image for a texture")
