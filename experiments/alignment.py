@@ -32,7 +32,7 @@ from calib.boards.detect import collect_folder
 from calib.boards.poses import StartDeviations
 from calib.boards.rig import Calibration, calibrate
 from calib.boards.target import parse_board
-from calib.images.guided_matches import ALIKE, guided_matches
+from calib.images.guided_matches import LEAST_SIMILARITY, guided_matches
 from calib.images.matches import seen_depths
 from calib.images.refinement import FREE, refine
 from experiments.evaluation.halves import of_half
@@ -173,7 +173,8 @@ def alignment_rows(scene: AlignmentScene, aligned: Aligned) -> list[AlignmentRow
     reach = PATCH + SEARCH
     corners = corners[((corners >= reach) & (corners < np.array([w, h]) - reach)).all(1)]
     straight, pinhole = without_lenses(scene.rig, scene.images)
-    truth, visible = scene.truth, np.ones((h, w), bool)
+    truth = scene.truth
+    visible: NDArray[np.bool_] = np.ones((h, w), bool)
     if truth is not None:
         expected = pixel_grid((h, w)).numpy().copy()
         expected[..., 0] -= truth.value.numpy()
@@ -258,7 +259,7 @@ def local_offsets(
     offsets, like = zip(*(_best_match(alpha, beta, pixel) for pixel in x)) if len(x) else ([], [])
     best = np.reshape(offsets, (len(x), len(PARTS), 2))
     agree = np.linalg.norm(best[:, 1:] - best[:, :1], axis=-1).max(1) <= HALF_PIXEL
-    return np.linalg.norm(best[:, 0], axis=-1), agree & (np.array(like) >= ALIKE)
+    return np.linalg.norm(best[:, 0], axis=-1), agree & (np.array(like) >= LEAST_SIMILARITY)
 
 
 def _best_match(

@@ -235,7 +235,7 @@ def _lens(entry: Entry) -> LensModel | None:
     if name is not None and name not in COEFFICIENT_COUNTS:
         raise entry["model"].fail(
             f"is '{name}', not one of {', '.join([*COEFFICIENT_COUNTS, *CAMERA_MODELS])}: "
-            "import the module that defines a model of your own first"
+            "import the module that defines a model of your own first (commands of pat: --plugin MODULE)"
         )
     _check_keys(entry, ("model", "coefficients"))
     return _made(entry, Distortion, str(name), entry.get("coefficients").numbers())

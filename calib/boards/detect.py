@@ -359,7 +359,7 @@ def _plausible(detection: Detection, board: Board) -> bool:
         return False
     flat = cv2.perspectiveTransform(p[:, None], H)[:, 0]
     basis = monomials((p - p.mean(0)) / np.abs(p - p.mean(0)).max(0), 3 if len(p) >= 30 else 1)
-    distort = np.linalg.lstsq(basis, detection.x - flat, rcond=None)[0]
+    distort = np.linalg.pinv(basis) @ (detection.x - flat)
     left = np.linalg.norm(detection.x - flat - basis @ distort, axis=-1)
     return bool(np.median(left) < LARGEST_MISFIT * np.median(apart(flat)) and np.isfinite(left).all())
 

@@ -248,11 +248,11 @@ def _unit_rays(
 
 def _pose_of_rays(board: Board, ids: Int[np.ndarray, " n"], rays: Float[np.ndarray, "n 3"]) -> Pose:
     """`cam_from_board` by the rays of its points, relative to their mean: a fisheye sees boards beside it."""
-    ahead, usable = np.eye(3), np.zeros(0, dtype=bool)
+    ahead = np.eye(3)
     if len(rays):
         ahead = Rotation.align_vectors([0.0, 0.0, 1.0], rays.mean(0))[0].as_matrix()
         rays = rays @ ahead.T
-        usable = rays[:, 2] > 0.05
+    usable = rays[:, 2] > 0.05
     if usable.sum() < 4:
         raise ValueError(
             f"only {usable.sum()} points of a board (a pose needs four) have rays through the lens"

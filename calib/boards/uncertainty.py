@@ -182,7 +182,7 @@ def intrinsics_of(fit: Solved, name: str) -> Intrinsics:
     of_rig = rig_covariance(fit) or RigCovariance((), np.zeros((0, 0)))
     mine = of_rig.selection(name, camera)
     mine[:6] = 0  # the pose
-    free = mine.any(1)
+    free = np.asarray(mine.any(1))
     covariance = mine[free] @ of_rig.matrix @ mine[free].T
     return Intrinsics(camera, covariance, free, fit.problem.sigma[name], points)
 

@@ -106,7 +106,8 @@ def window_of(path: Path, rng: np.random.Generator) -> Image:
     image = cv2.resize(image, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
     y, x = (int(rng.integers(0, a - b + 1)) for a, b in zip(image.shape[:2], HW))
     image = image[y : y + HW[0], x : x + HW[1]]
-    return (image[:, ::-1] if rng.random() < 0.5 else image).astype(np.float32) / 255
+    image = (image[:, ::-1] if rng.random() < 0.5 else image).astype(np.float32)
+    return image / np.float32(255)
 
 
 def _with_objects(image: Image, texture: Image, rng: np.random.Generator) -> Image:

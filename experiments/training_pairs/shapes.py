@@ -38,9 +38,9 @@ def shape_pair(pair: StereoPair, photos: Sequence[Path], seed: int) -> StereoPai
     rng = np.random.default_rng(seed)
     which, disparity = _window(*_surfaces(pair.disparity), rng)
     disparity = _moved(disparity, which, rng)
-    pictures = [window_of(photos[rng.integers(len(photos))], rng) for _ in range(rng.integers(1, 5))]
+    pictures = [window_of(photos[int(rng.integers(len(photos)))], rng) for _ in range(rng.integers(1, 5))]
     textures = np.stack([_texture(pictures[rng.integers(len(pictures))], rng) for _ in disparity])
-    hidden = window_of(photos[rng.integers(len(photos))], rng)
+    hidden = window_of(photos[int(rng.integers(len(photos)))], rng)
     shares = np.stack(
         [cv2.GaussianBlur((which == i).astype(np.float32), (3, 3), 0.55) for i in range(len(disparity))]
     )
@@ -126,7 +126,7 @@ def _texture(picture: Image, rng: np.random.Generator) -> Image:
     """A photograph moved, mirrored, lighter or darker; a quarter of them hardly textured."""
     if rng.random() < 0.6:
         picture = np.roll(picture, rng.integers(0, 200, 2), (0, 1))[:, :: rng.choice([1, -1])]
-    picture = picture * rng.uniform(0.6, 1.25) + rng.normal(0, 0.03, 3)
+    picture = picture * np.float32(rng.uniform(0.6, 1.25)) + rng.normal(0, 0.03, 3).astype(np.float32)
     if rng.random() < 0.25:
         mean = picture.mean((0, 1))
         smooth = cv2.GaussianBlur(picture, (0, 0), 8) - mean
@@ -151,7 +151,7 @@ def seen_from_right(which: NDArray, disparity: NDArray, textures: NDArray, hidde
     column = np.floor((x - near + 0.5) * GRID).astype(int)
     on = (column >= 0) & (column < w * GRID)
     order = np.argsort(near[on], kind="stable")
-    drawn = np.full(h * w * GRID, -1)
+    drawn: NDArray[np.int64] = np.full(h * w * GRID, -1)
     drawn[(row * w * GRID + column)[on][order]] = np.flatnonzero(on)[order]
     drawn = drawn.reshape(h, w * GRID)
     last_drawn = np.maximum.accumulate(np.where(drawn >= 0, np.arange(w * GRID), -1), 1)

@@ -124,7 +124,7 @@ def fit_misalignment(
     arrays = (t.detach().cpu().float().numpy() for t in (alpha, beta, position, normal, weight))
     views = _Windows.from_arrays(*arrays)
     height, width = alpha.shape
-    coefficients = np.zeros(3)
+    coefficients: NDArray[np.float64] = np.zeros(3)
     for _ in range(SETTINGS.steps):
         step = views.step(coefficients)
         if step is None:

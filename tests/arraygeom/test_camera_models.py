@@ -296,6 +296,14 @@ def test_a_file_that_lacks_a_number_of_its_model_says_which(tmp_path):
         Rig.load(tmp_path / "rig.yaml")
 
 
+def test_a_file_of_a_model_that_is_not_imported_says_how_to_import_it(tmp_path):
+    rig("port", "port").save(tmp_path / "rig.yaml")
+    text = (tmp_path / "rig.yaml").read_text()
+    (tmp_path / "rig.yaml").write_text(text.replace("flat-port", "of-my-own"))
+    with pytest.raises(ValueError, match="is 'of-my-own', not one of .*--plugin MODULE"):
+        Rig.load(tmp_path / "rig.yaml")
+
+
 @pytest.mark.parametrize("factor", [1000.0, 1e-3])
 def test_another_unit_changes_no_pixel(factor):
     """Lengths of models scale with the rig: velocities, distances, parallel rays."""
