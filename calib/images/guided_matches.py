@@ -92,7 +92,7 @@ def _best_match(
         return None
     searched = beta[first[1] - PATCH : last[1] + PATCH + 1, first[0] - PATCH : last[0] + PATCH + 1]
     similarity = np.nan_to_num(cv2.matchTemplate(searched, patch, cv2.TM_CCOEFF_NORMED)) ** 2
-    similarity = similarity * (valid[first[1] : last[1] + 1, first[0] : last[0] + 1] > 0)
+    similarity = similarity.astype(np.float32) * (valid[first[1] : last[1] + 1, first[0] : last[0] + 1] > 0)
     v, u = np.unravel_index(similarity.argmax(), similarity.shape)
     best = similarity[v, u]
     if best < LEAST_SIMILARITY or not (0 < u < similarity.shape[1] - 1 and 0 < v < similarity.shape[0] - 1):
