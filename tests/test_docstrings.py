@@ -5,7 +5,7 @@ import re
 from collections import defaultdict
 from collections.abc import Iterator
 from functools import cache
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -136,12 +136,24 @@ def arguments(node: ast.FunctionDef) -> set[str]:
 
 
 def fields(node: ast.ClassDef) -> set[str]:
-    """Return the names of a class's fields, and of the attributes that its methods use."""
+    """Return the names of a class's fields and its bases', and of the attributes that its methods use."""
+    bases = [base for one in node.bases for base in classes().get(ast.unparse(one), ())]
     stated = [one.target for one in node.body if isinstance(one, ast.AnnAssign)]
     used = [
         one for one in ast.walk(node) if isinstance(one, ast.Attribute) and ast.unparse(one.value) == "self"
     ]
-    return {one.id for one in stated if isinstance(one, ast.Name)} | {one.attr for one in used}
+    own = {one.id for one in stated if isinstance(one, ast.Name)} | {one.attr for one in used}
+    return own.union(*map(fields, bases))
+
+
+@cache
+def classes() -> dict[str, list[ast.ClassDef]]:
+    """Return the public classes of all rooms by name."""
+    found: dict[str, list[ast.ClassDef]] = {}
+    for each in chain(*rooms().values()):
+        if isinstance(each.node, ast.ClassDef):
+            found.setdefault(each.node.name, []).append(each.node)
+    return found
 
 
 REVISED = sorted(set(rooms()) - set(UNREVISED))

@@ -300,7 +300,7 @@ def test_a_file_of_a_model_that_is_not_imported_says_how_to_import_it(tmp_path):
     rig("port", "port").save(tmp_path / "rig.yaml")
     text = (tmp_path / "rig.yaml").read_text()
     (tmp_path / "rig.yaml").write_text(text.replace("flat-port", "of-my-own"))
-    with pytest.raises(ValueError, match="is 'of-my-own', not one of .*--plugin MODULE"):
+    with pytest.raises(ValueError, match=r"is 'of-my-own', not one of .*--plugin MODULE"):
         Rig.load(tmp_path / "rig.yaml")
 
 

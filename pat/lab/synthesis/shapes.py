@@ -70,8 +70,8 @@ def mesh(item: Object) -> Mesh:
 
 
 def inside(item: Object, point: Float[NDArray, "3"], time: float) -> bool:
-    """Test whether a world point in metres is inside a solid object at a time in seconds, or within about its
-    relief's height of it.
+    """Return True if a world point, in metres, is inside a solid object at a time, in seconds, or about as
+    near to it as its relief is high.
 
     Planes, rooms and lathes have no inside: always False.
     """
