@@ -611,7 +611,9 @@ def typical_prior(camera: Camera) -> CameraPrior:
     deviation[8:10] = CENTRE_DEVIATION * w
     mean = np.zeros(len(deviation))
     mean[8:10] = (w - 1) / 2, (h - 1) / 2
-    mean[10:] = () if camera.distortion is None else pinhole_coefficients(camera.distortion)
+    mean[10:] = (
+        () if camera.distortion is None else np.array(pinhole_coefficients(camera.distortion).tolist())
+    )
     information = np.diag(deviation**-2.0)
     information[:8, :8] = 0.0
     information[6:8, 6:8] = np.array([[1, -1], [-1, 1]]) / (ASPECT_DEVIATION * _mean_focal(camera)) ** 2

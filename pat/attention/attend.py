@@ -385,15 +385,15 @@ def _attend_by_rows(
     x, y = pixel_coordinates((query.shape[2], query.shape[3]), dtype=accumulated(query), device=query.device)
 
     def at(x: Tensor, y: Tensor, kind: Any = None) -> Any:
-        answer = locations(torch.stack([x, y], -1).reshape(-1, 2))
-        if not isinstance(answer, kind or Locations):
+        here = locations(torch.stack([x, y], -1).reshape(-1, 2))
+        if not isinstance(here, kind or Locations):
             wanted = "Segments or Positions, of one kind for all pixels"
-            raise TypeError(f"locations must return {wanted}, got {type(answer)}")
-        return answer
+            raise TypeError(f"locations must return {wanted}, got {type(here)}")
+        return here
 
     def segments(x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
-        spans, rows = at(x, y, Segments), x.shape[-2:]
-        return spans.start.unflatten(-2, rows), spans.end.unflatten(-2, rows), spans.valid.unflatten(-1, rows)
+        here, rows = at(x, y, Segments), x.shape[-2:]
+        return here.start.unflatten(-2, rows), here.end.unflatten(-2, rows), here.valid.unflatten(-1, rows)
 
     def attended(q: Tensor, x: Tensor, y: Tensor, *bias_rows: Tensor) -> tuple[Tensor, ...]:
         positions = at(x, y, Positions)

@@ -167,13 +167,13 @@ def backward(
     taps = _tap_list(b * ha * wa, call)
     step = len(taps.tap_count)
     for first in range(0, b * ha * wa, step):
-        last, part = min(first + step, b * ha * wa), taps._replace(first=first)
+        last, here = min(first + step, b * ha * wa), taps._replace(first=first)
         shares = _shares(first, last, call)
         in_parallel(
-            [partial(kernels.backward, call, forward_results, share, part, gradients) for share in shares]
+            [partial(kernels.backward, call, forward_results, share, here, gradients) for share in shares]
         )
-        for_keys = _channel_tasks(part, part.key_weight, last, call.query, d, key_out)
-        for_values = _channel_tasks(part, part.value_weight, last, upstream, call.value_channels, value_out)
+        for_keys = _channel_tasks(here, here.key_weight, last, call.query, d, key_out)
+        for_values = _channel_tasks(here, here.value_weight, last, upstream, call.value_channels, value_out)
         in_parallel([*for_keys, *for_values])
     images = (
         (out.to(like.dtype).permute(0, 3, 1, 2) if want else like.new_empty(0))

@@ -110,10 +110,10 @@ class _AttendLocal(torch.autograd.Function):
         if torch.is_grad_enabled():
             asked = [t for t, want in zip(inputs, wanted) if want]
             of_asked = iter(torch.autograd.grad(ctx.again(*inputs), asked, upstream, create_graph=True))
-            grads = [next(of_asked) if want else None for want in wanted]
+            found = [next(of_asked) if want else None for want in wanted]
         else:
-            grads = compiled("cpu").backward_local(inputs, ctx.field, bias, (out, logsum), upstream, wanted)
-        return *(g if want else None for g, want in zip(grads, wanted)), None, None, None
+            found = compiled("cpu").backward_local(inputs, ctx.field, bias, (out, logsum), upstream, wanted)
+        return *(g if want else None for g, want in zip(found, wanted)), None, None, None
 
 
 def compiled(backend: str) -> ModuleType:
@@ -130,8 +130,8 @@ def compiled(backend: str) -> ModuleType:
 @torch.library.custom_op(
     "pat::attend", mutates_args=(), schema=f"({INPUTS}, {OPTIONS}) -> (Tensor, Tensor, Tensor, Tensor)"
 )
-def _attend(*args: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    tensors, (*form, measured, backend, _) = args[:6], args[6:]
+def _attend(*given: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    tensors, (*form, measured, backend, _) = given[:6], given[6:]
     return compiled(backend).forward(_inputs(tensors, form), measured)
 
 
@@ -154,8 +154,8 @@ def _(query, key, value, points, mask, bias, samples, straight, nearest, measure
 def _(info, in_dims, *inputs):
     """One call for each element of the axis: the kernels have a batch axis, but of images of one rig."""
     axes = zip(inputs, in_dims)
-    args = [[t if axis is None else t.select(axis, i) for i in range(info.batch_size)] for t, axis in axes]
-    outputs = [torch.stack(parts) for parts in zip(*(_attend(*call) for call in zip(*args)))]
+    given = [[t if axis is None else t.select(axis, i) for i in range(info.batch_size)] for t, axis in axes]
+    outputs = [torch.stack(parts) for parts in zip(*(_attend(*one) for one in zip(*given)))]
     return tuple(outputs), (0,) * len(outputs)
 
 
@@ -164,9 +164,9 @@ def _(info, in_dims, *inputs):
     mutates_args=(),
     schema=f"({INPUTS}, {SAVED}, {OPTIONS}, bool[] wanted) -> (Tensor, Tensor, Tensor, Tensor, Tensor)",
 )
-def _attend_backward(*args: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    tensors, saved, cotangents = args[:6], args[6:10], args[10:12]
-    *form, _, backend, _, wanted = args[12:]
+def _attend_backward(*given: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    tensors, saved, cotangents = given[:6], given[6:10], given[10:12]
+    *form, _, backend, _, wanted = given[12:]
     return compiled(backend).backward(_inputs(tensors, form), saved, cotangents, wanted)
 
 
@@ -225,8 +225,8 @@ def _differentiate_again(ctx, *cotangents):
     with torch.enable_grad():
         out = reference.attend(_inputs(saved[:6], form))
         outputs = [out.value, _side_by_side(out)] if measured else [out.value]
-        cotangents = upstream[: len(outputs)]
-        first = torch.autograd.grad(outputs, inputs, cotangents, create_graph=True, materialize_grads=True)
+        given = upstream[: len(outputs)]
+        first = torch.autograd.grad(outputs, inputs, given, create_graph=True, materialize_grads=True)
         leaves = [t for t in (query, key, value, points, bias, *upstream) if t is not None]
         first, cotangents = zip(*[(f, c) for f, c in zip(first, cotangents) if f.requires_grad])
         second = iter(torch.autograd.grad(first, leaves, cotangents, allow_unused=True, create_graph=higher))

@@ -48,20 +48,20 @@ def _backward_block(first, pixels, call, saved, block, taps, gradients):
     block = replaced(block, Taps(from_pixel(taps.tap_count, slot), from_pixel(taps.rows, slot)))
     key_weight, value_weight = from_pixel(taps.key_weight, slot), from_pixel(taps.value_weight, slot)
     for i in range(pixels):
-        p, work = first + i, pixel_of(block, i)
-        copy(call.query, p * d, d, work.query)
-        copy(saved.value_upstream, p * dv, dv, work.upstream)
-        work.tap_count[0] = 0
+        p, here = first + i, pixel_of(block, i)
+        copy(call.query, p * d, d, here.query)
+        copy(saved.value_upstream, p * dv, dv, here.upstream)
+        here.tap_count[0] = 0
         if saved.logsum[p] > -np.inf:
-            find_samples(p, call.geometry, work)
+            find_samples(p, call.geometry, here)
     block_products(pixels, block.tap_count, block.query, block.rows, call.key, d, block.by_key)
     block_products(pixels, block.tap_count, block.upstream, block.rows, call.value, dv, block.by_value)
     for i in range(pixels):
-        work = pixel_of(block, i)
-        if work.tap_count[0] > 0:
-            _backward_pixel(first + i, call, saved, work, gradients)
-            distribute(work.weight, call.geometry, work, of(value_weight, i))
-            distribute(work.score_slope, call.geometry, work, of(key_weight, i))
+        here = pixel_of(block, i)
+        if here.tap_count[0] > 0:
+            _backward_pixel(first + i, call, saved, here, gradients)
+            distribute(here.weight, call.geometry, here, of(value_weight, i))
+            distribute(here.score_slope, call.geometry, here, of(key_weight, i))
     if gradients.wants_query:
         block_sums(pixels, block.tap_count, key_weight, block.rows, call.key, d, block.query)
         for i in range(pixels):
@@ -69,24 +69,24 @@ def _backward_block(first, pixels, call, saved, block, taps, gradients):
 
 
 @compiled
-def _backward_pixel(p, call, saved, work, gradients):
+def _backward_pixel(p, call, saved, here, gradients):
     """Recompute the weights of pixel p, and the gradients by weights, scores, points and bias."""
-    n, samples = work.sample_count[0], call.geometry.samples
+    n, samples = here.sample_count[0], call.geometry.samples
     statistics = from_index(saved.statistics, saved.step * p)
     upstream = from_index(saved.statistics_upstream, saved.step * p)
-    find_scores(p, call, work)
-    exponentiate(n, work.score, work.weight, saved.logsum[p])
-    interpolate(work.by_value, call.geometry, work, work.slope)
-    _score_gradient(n, work, statistics, upstream)
+    find_scores(p, call, here)
+    exponentiate(n, here.score, here.weight, saved.logsum[p])
+    interpolate(here.by_value, call.geometry, here, here.slope)
+    _score_gradient(n, here, statistics, upstream)
     if gradients.wants_points:
-        _position_gradient(p, n, call.geometry, work, statistics, upstream, gradients.points)
+        _position_gradient(p, n, call.geometry, here, statistics, upstream, gradients.points)
     if gradients.wants_bias:
         for j in range(n):
-            gradients.bias[p * samples + work.index[j]] = work.score_slope[j]
+            gradients.bias[p * samples + here.index[j]] = here.score_slope[j]
 
 
 @compiled
-def _score_gradient(n, work, statistics, upstream):
+def _score_gradient(n, here, statistics, upstream):
     """Convert gradients by the weights to gradients by the scores.
 
     `slope` holds the gradients by the values' weights.
@@ -97,40 +97,40 @@ def _score_gradient(n, work, statistics, upstream):
     pull = HALF * gspread / spread if spread > 0 else nothing
     if gx != 0 or gy != 0 or pull != 0:
         for j in range(n):
-            away = (work.x[j] - x) ** 2 + (work.y[j] - y) ** 2
-            work.slope[j] += gx * work.x[j] + gy * work.y[j] + pull * away
+            away = (here.x[j] - x) ** 2 + (here.y[j] - y) ** 2
+            here.slope[j] += gx * here.x[j] + gy * here.y[j] + pull * away
     if upstream[3] != 0:
         best = 0
         for j in range(1, n):
-            best = j if work.weight[j] > work.weight[best] else best
-        work.slope[best] += upstream[3]
-    fill(work.slope, n, n + LANES, nothing)
+            best = j if here.weight[j] > here.weight[best] else best
+        here.slope[best] += upstream[3]
+    fill(here.slope, n, n + LANES, nothing)
     mean = splat(nothing)
     for j in range(0, n, LANES):
-        mean = fma(load(work.weight, j), load(work.slope, j), mean)
+        mean = fma(load(here.weight, j), load(here.slope, j), mean)
     mean = splat(total(mean))
     for j in range(0, n, LANES):
-        store(work.score_slope, j, mul(load(work.weight, j), sub(load(work.slope, j), mean)))
+        store(here.score_slope, j, mul(load(here.weight, j), sub(load(here.slope, j), mean)))
 
 
 @compiled
-def _position_gradient(p, n, geometry, work, statistics, upstream, out):
+def _position_gradient(p, n, geometry, here, statistics, upstream, out):
     """Gradients by the positions of the samples, and by the points that define them."""
     nothing = zero(upstream)
     centre_x, centre_y, spread = statistics[0], statistics[1], statistics[2]
     gx, gy, gspread = upstream[0], upstream[1], upstream[2]
     pull = gspread / spread if spread > 0 else nothing
     x0 = y0 = x1 = y1 = nothing
-    course = course_of(n, work)
+    course = course_of(n, here)
     for j in range(n):
-        x, y, w = work.x[j], work.y[j], work.weight[j]
+        x, y, w = here.x[j], here.y[j], here.weight[j]
         dx, dy = w * (gx + pull * (x - centre_x)), w * (gy + pull * (y - centre_y))
         if not geometry.nearest:
-            kx, ky = interpolation_slopes(j, course, work, work.by_key)
-            vx, vy = interpolation_slopes(j, course, work, work.by_value)
-            dx += work.score_slope[j] * kx + w * vx if (x >= nothing) & (x <= geometry.last_x) else nothing
-            dy += work.score_slope[j] * ky + w * vy if (y >= nothing) & (y <= geometry.last_y) else nothing
-        i = work.index[j]
+            kx, ky = interpolation_slopes(j, course, here, here.by_key)
+            vx, vy = interpolation_slopes(j, course, here, here.by_value)
+            dx += here.score_slope[j] * kx + w * vx if (x >= nothing) & (x <= geometry.last_x) else nothing
+            dy += here.score_slope[j] * ky + w * vy if (y >= nothing) & (y <= geometry.last_y) else nothing
+        i = here.index[j]
         if geometry.straight:
             u = geometry.fractions[i]
             x1, y1 = x1 + u * dx, y1 + u * dy

@@ -35,74 +35,74 @@ def _forward_block(first, pixels, call, block, outputs):
     """Process a block of alpha's pixels."""
     d, dv = call.channels, call.value_channels
     for i in range(pixels):
-        work = pixel_of(block, i)
-        copy(call.query, (first + i) * d, d, work.query)
-        find_samples(first + i, call.geometry, work)
+        here = pixel_of(block, i)
+        copy(call.query, (first + i) * d, d, here.query)
+        find_samples(first + i, call.geometry, here)
     block_products(pixels, block.tap_count, block.query, block.rows, call.key, d, block.by_key)
     for i in range(pixels):
-        p, work = first + i, pixel_of(block, i)
-        outputs.logsum[p] = _find_weights(p, call, outputs.measured, work)
+        p, here = first + i, pixel_of(block, i)
+        outputs.logsum[p] = _find_weights(p, call, outputs.measured, here)
         if outputs.measured:
-            _find_statistics(work, from_index(outputs.statistics, 4 * p))
+            _find_statistics(here, from_index(outputs.statistics, 4 * p))
     block_sums(pixels, block.tap_count, block.by_key, block.rows, call.value, dv, block.query)
     for i in range(pixels):
         copy(of(block.query, i), 0, dv, from_index(outputs.value, (first + i) * dv))
 
 
 @compiled
-def _find_weights(p, call, measured, work):
+def _find_weights(p, call, measured, here):
     """Convert the inner products of pixel p's taps to their weights, in place.
 
     Returns the log of the sum of exponentials.
     """
-    n = work.sample_count[0]
-    logsum = zero(work.by_key) - np.float32(np.inf)
-    if call.geometry.nearest and n == work.tap_count[0] and n > 0:
-        return _find_tap_weights(p, n, call, measured, work)
+    n = here.sample_count[0]
+    logsum = zero(here.by_key) - np.float32(np.inf)
+    if call.geometry.nearest and n == here.tap_count[0] and n > 0:
+        return _find_tap_weights(p, n, call, measured, here)
     if n > 0:
-        find_scores(p, call, work)
-        logsum = softmax(n, work.score, work.weight)
+        find_scores(p, call, here)
+        logsum = softmax(n, here.score, here.weight)
     if logsum == -np.inf:
-        work.tap_count[0] = 0
+        here.tap_count[0] = 0
     else:
-        distribute(work.weight, call.geometry, work, work.by_key)
+        distribute(here.weight, call.geometry, here, here.by_key)
     return logsum
 
 
 @compiled
-def _find_tap_weights(p, n, call, measured, work):
+def _find_tap_weights(p, n, call, measured, here):
     """Compute `_find_weights` where each sample has its own tap, without going to samples and back."""
-    by_tap = work.by_key
+    by_tap = here.by_key
     if call.biased:
         for j in range(n):
-            by_tap[j] += call.bias[p * call.geometry.samples + work.index[j]]
+            by_tap[j] += call.bias[p * call.geometry.samples + here.index[j]]
     fill(by_tap, n, n + LANES, zero(by_tap) - np.float32(np.inf))
     logsum = softmax(n, by_tap, by_tap)
     if logsum == -np.inf:
-        work.tap_count[0] = 0
+        here.tap_count[0] = 0
     elif measured:
-        copy(by_tap, 0, n + LANES, work.weight)
+        copy(by_tap, 0, n + LANES, here.weight)
     return logsum
 
 
 @compiled
-def _find_statistics(work, statistics):
+def _find_statistics(here, statistics):
     """Write expected position, spread and largest of the weights (padded with 0); all 0 without taps."""
-    nothing = zero(work.x)
-    if work.tap_count[0] == 0:
+    nothing = zero(here.x)
+    if here.tap_count[0] == 0:
         fill(statistics, 0, 4, nothing)
         return
-    n = work.sample_count[0]
+    n = here.sample_count[0]
     x = y = squared = peak = splat(nothing)
     for j in range(0, n, LANES):
-        w = load(work.weight, j)
-        x = fma(w, load(work.x, j), x)
-        y = fma(w, load(work.y, j), y)
+        w = load(here.weight, j)
+        x = fma(w, load(here.x, j), x)
+        y = fma(w, load(here.y, j), y)
     statistics[0], statistics[1] = total(x), total(y)
     x, y = splat(statistics[0]), splat(statistics[1])
     for j in range(0, n, LANES):
-        w = load(work.weight, j)
-        dx, dy = sub(load(work.x, j), x), sub(load(work.y, j), y)
+        w = load(here.weight, j)
+        dx, dy = sub(load(here.x, j), x), sub(load(here.y, j), y)
         squared = fma(w, fma(dx, dx, mul(dy, dy)), squared)
         peak = maximum(w, peak)
     spread = math.sqrt(total(squared))

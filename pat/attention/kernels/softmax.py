@@ -60,14 +60,14 @@ def _exponentials32(x):
 
 
 @compiled
-def find_scores(p, call, work):
+def find_scores(p, call, here):
     """Compute the scores of pixel p's samples, padded with -inf; written in place."""
-    n = work.sample_count[0]
-    interpolate(work.by_key, call.geometry, work, work.score)
+    n = here.sample_count[0]
+    interpolate(here.by_key, call.geometry, here, here.score)
     if call.biased:
         for j in range(n):
-            work.score[j] += call.bias[p * call.geometry.samples + work.index[j]]
-    fill(work.score, n, n + LANES, zero(work.score) - np.float32(np.inf))
+            here.score[j] += call.bias[p * call.geometry.samples + here.index[j]]
+    fill(here.score, n, n + LANES, zero(here.score) - np.float32(np.inf))
 
 
 @compiled

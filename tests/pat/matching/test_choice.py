@@ -153,7 +153,7 @@ def turned(inputs, k):
     alpha, other = (image.rot90(k, (-2, -1)) for image in (inputs.alpha, beta.image))
     pair = rig.pair("mono", "colour")
     field = FieldOnGrid.from_field(default_field(pair), pair, hw=alpha.shape[-2:], blocks=True)
-    return replace(inputs, alpha=alpha, betas=(replace(beta, image=other, field=field),))
+    return replace(inputs, alpha=alpha, betas=(replace(beta, image=other, field=field, clipped=None),))
 
 
 def test_quarter_turns_bring_near_ends_to_the_left():
