@@ -196,7 +196,7 @@ class RayCurve(NamedTuple):
         last: end towards far, in beta's frame.
         valid: mask of the pixels whose ray beta may see.
         beta: the camera whose image holds the curve.
-        wide: True if fractions are even in angle, as in all cameras that are not central.
+        wide: True if fractions are even in angle, as in cameras that are not central, parallel rays apart.
         inverse: inverse depths (or distances) in alpha of both ends (*n), 1 / metres.
     """
 

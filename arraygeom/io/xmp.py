@@ -90,7 +90,7 @@ def capture_of(path: Path) -> list[Path]:
     Its images lie in one folder, and their names differ only after the last "_".
 
     Returns:
-        Files, sorted, `path` included; those whose tags state no camera are left out. For a name without "_"
+        Files, sorted, `path` as any other; those whose tags state no camera are left out. For a name without "_"
         `path` alone.
     """
     stem = path.stem.rpartition("_")[0]

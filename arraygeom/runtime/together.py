@@ -150,7 +150,7 @@ def recover(folder: Path, group: str | None = None) -> None:
 
 
 def sweep(folder: Path, stem: str | None = None) -> None:
-    """Run `recover`, and remove temporary files and folders of killed processes, safetensors' too.
+    """Run `recover`, and remove temporary files and folders by their names, a running writer's too.
 
     Args:
         stem: file stem or group to restrict this to; None for all.

@@ -186,7 +186,7 @@ class Probe(NamedTuple):
         A small part comes first, as loops may have to be compiled.
 
         Returns:
-            The measured cost.
+            The measured cost: seconds and bytes for a pixel of alpha.
         """
         side = min(max(math.sqrt(math.prod(frame.hw) * PROBED), PROBE[0]), PROBE[1])
         for n in (PROBE[0], int(side)):

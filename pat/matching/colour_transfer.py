@@ -319,8 +319,8 @@ def with_clipped_light(
 ) -> tuple[Float[Tensor, "b 3 h w"], Float[Tensor, "b 1 h w"]]:
     """Add to clipped bands the light that alpha shows and beta's luma lacks, equally to all that are clipped.
 
-    One equation for light beyond the largest value, or light that differs between the views, with normal
-    expectations of both.
+    Alpha's excess over luma, where positive, is explained by light beyond the largest value and by light that
+    differs between the views, each by its expected variance: a ridge regression of one number at each pixel.
 
     Args:
         luma: luma of the values.
