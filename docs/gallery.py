@@ -149,7 +149,7 @@ WORDS = {
 WITHOUT_RIG = {"table": "pat/app/sample"}
 """Pairs whose rig is found, and the folders of their images."""
 OPTIONS = {"cat": "--noise estimate --exposure auto"}
-"""What a pair's line states beside images."""
+"""Options in a pair's line, beside its images."""
 
 
 def images_of(name: str) -> list[Path]:

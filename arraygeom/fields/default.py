@@ -57,7 +57,7 @@ def named_field(name: str) -> ReceptiveField:
 
 
 NEAR, DEVIATIONS = 2.0, 4.0
-"""Displacement from H x of a pair at one place: standard deviations of points from it, and pixels at least. A
+"""Displacement from H x of a pair at one place: pixels at least, and standard deviations of points from it. A
 shorter search is no choice between positions, and matches are then held for doubtful."""
 LINE_SHARE = 0.06
 """Displacement from H x along the line of a pair with a link, as a share of beta's longer side."""

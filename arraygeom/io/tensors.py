@@ -19,7 +19,7 @@ FLIP = {"opengl": (1.0, -1.0, -1.0), "pytorch3d": (-1.0, -1.0, 1.0)}
 
 
 class GSplatCamera(NamedTuple):
-    """What `gsplat.rasterization` takes, with the height and width beside it.
+    """Cameras as arguments of `gsplat.rasterization`, with height and width beside them.
 
     Attributes:
         viewmats: camera from world, axes as ours.

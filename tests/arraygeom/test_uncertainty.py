@@ -62,7 +62,7 @@ def test_positions_scatter_as_stated(rig):
 
 
 def test_points_scatter_as_stated(rig):
-    """By a small covariance: in first order depth scatters by a percent."""
+    """The covariance is small: deviations hold to first order."""
     covariance = stated(rig)._replace(matrix=0.03 * stated(rig).matrix)
     X = torch.tensor([[0.1, 0.0, 3.0], [-0.2, 0.1, 4.0]], dtype=torch.float64)
     x = torch.stack([camera.project(X).x for camera in rig.cameras.values()])

@@ -203,7 +203,7 @@ def test_boards_that_move_between_the_exposures_do_not_distort_the_lenses(pair):
 
 
 def test_boards_that_moved_in_a_few_frames_are_left_out(pair, found):
-    """By some pixels: each image fits its own camera, and the two contradict each other."""
+    """Each image fits its own camera, and the two contradict each other by some pixels."""
     rig, boards, views = pair
     moved = Pose(boards.R, boards.t + tensor(0.004, 0.003, 0))
     off = see(rig, moved, noise=0.1)["colour"].seen

@@ -133,7 +133,7 @@ def test_the_same_is_found_again():
 
 
 def test_fills_of_a_batch_are_of_each_image():
-    """By example, and for any bands by the regression on brightness."""
+    """Examples of one image serve no other; nor does the regression on brightness for any bands."""
     alpha, colour = (torch.from_numpy(x.copy()) for x in bands_of_brightness())
     weight = torch.from_numpy(hidden(colour.numpy())[1])[None, None].repeat(2, 1, 1, 1)
     both = torch.stack([colour, -colour]), torch.stack([alpha, 1 - alpha])[:, None], weight

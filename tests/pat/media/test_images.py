@@ -470,7 +470,7 @@ def test_comments_bigtiff_and_damaged_orientation(tmp_path):
 @pytest.mark.parametrize("channels", [1, 3])
 @pytest.mark.parametrize("bits", [8, 16, 32])
 def test_tiffs_are_read_by_all_without_further_codecs(bits, channels, tmp_path):
-    """As some versions of OpenCV write them (LZW, a predictor of floats) tifffile alone refuses them."""
+    """No LZW with a predictor of floats, which some versions of OpenCV write and tifffile refuses."""
     image = torch.rand(channels, 12, 17)
     write_image(tmp_path / "a.tif", image, bits=bits)
     scale = 1 if bits == 32 else 2**bits - 1

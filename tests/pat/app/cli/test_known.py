@@ -159,7 +159,7 @@ def test_a_depth_map_without_a_rig_is_refused_before_the_work(folder, tmp_path, 
 
 
 def test_matches_off_the_lines_of_the_rig_are_said(folder, capsys):
-    """As of another image: here beta's rows are counted from below."""
+    """Beta's rows are counted from below, as for another image."""
     rows = np.loadtxt(folder / "matches.csv", delimiter=",")
     rows[:, 3] = H - 1 - rows[:, 3]
     np.savetxt(folder / "rows.csv", rows, delimiter=",")
