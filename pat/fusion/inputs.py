@@ -165,9 +165,11 @@ def frame_inputs(network: FusionNetwork, views: Views) -> FrameInputs:
 def clipped_in(image: Float[Tensor, "1 c h w"], sensor: Sensor) -> Float[Tensor, "1 c h w"] | None:
     """Compute the mask of bands at their largest value, or beside such a pixel; None if there are none.
 
-    The largest value is 1, or the image's own where exposures are stated, by which it was scaled.
+    The largest value is 1; the image's own if that is more, or if its exposure is stated, which scaled it.
     """
-    largest = 1.0 if sensor.exposure is None else float(image.max())
+    largest = float(image.max())
+    if sensor.exposure is None:
+        largest = max(largest, 1.0)
     clipped = image >= CLIPPED * largest
     return max_pool2d(clipped.to(image), 3, 1, 1) if clipped.any() else None
 

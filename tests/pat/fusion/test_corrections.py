@@ -6,11 +6,12 @@ from dataclasses import replace
 import pytest
 import torch
 
+from arraygeom import Sensor
 from pat import FuseSettings, fuse
 from pat.fusion import corrections
 from pat.fusion.corrections import Corrections, find_corrections
 from pat.fusion.fuse import corrections_of
-from pat.fusion.inputs import prepared
+from pat.fusion.inputs import clipped_in, prepared
 from pat.fusion.sequence import SequenceFusion
 from pat.fusion.views import Views
 from pat.matching.colour_transfer import with_clipped_light
@@ -225,6 +226,17 @@ def test_a_clipped_band_gets_the_light_that_alpha_shows(network, middle, monkeyp
     aware = psnr(network, sample, bright)
     monkeypatch.setattr("pat.fusion.inputs.clipped_in", lambda image, sensor: None)
     assert aware > psnr(network, sample, bright) + 1
+
+
+@pytest.mark.parametrize(
+    ("most", "exposure", "expected"), [(1.0, None, True), (0.5, None, False), (0.5, 0.01, True), (3.0, None, False)]
+)
+def test_a_band_is_clipped_at_the_largest_value_that_it_can_have(most, exposure, expected):
+    """That is 1; the image's own where its exposure scaled it; and highlights above 1 leave 1 unclipped."""
+    image = torch.full((1, 3, 8, 9), 0.2)
+    image[0, 0, 4, 4], image[0, 1, 0, 0] = min(most, 1.0), most
+    clipped = clipped_in(image, Sensor(exposure=exposure))
+    assert (clipped is not None and bool(clipped[0, 0, 4, 4])) is expected
 
 
 def test_clipped_bands_share_light_and_others_keep_theirs():
