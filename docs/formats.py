@@ -40,7 +40,7 @@ def table() -> str:
 
 
 def stated(doc: str, label: str) -> str:
-    """Return the text after a label in a docstring, as a table's cell. Raises ValueError without the label."""
+    """Return the text after a label in a docstring, as a table's cell. Raises ValueError without one."""
     found = re.search(rf"^{label}: (.+?)(?=\n\n|\nWritten by: |\nRefused: |\nSample: |\Z)", doc, re.M | re.S)
     if found is None:
         raise ValueError(f"a reader's module has no '{label}:': {doc.splitlines()[0]}")

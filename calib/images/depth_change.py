@@ -24,8 +24,8 @@ from .residuals import FEW, match_depths, share
 DEPTH_KEPT = 0.003
 """Relative standard deviation of depth, as given, as evidence."""
 SMALL = 0.015
-"""Change of depth, relative, up to which depth counts as kept. No rig for tuning whose depth changed by less
-got worse by more than 0.4 per cent."""
+"""Change of depth, relative, up to which depth counts as kept: rotations of .2 degrees change it by nearly as
+much on the rigs for tuning."""
 BEYOND = 1.5
 """Factor of depth beyond the rig's depth range at which a point counts as outside."""
 

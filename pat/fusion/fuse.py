@@ -305,11 +305,7 @@ def corrections_of(
     Raises:
         ValueError: for images that do not fit the rig or the network, and views that do not overlap.
     """
-    views = Views.of(rig, images, alpha=alpha, depth=settings.depth, field=settings.field)
-    views, _ = denoised_views(views, settings.noise)
-    check_bands(views, network.bands)
-    inputs, _ = prepared(network, views, steps_for(network, normalise=settings.match_levels))
-    return find_corrections(network, inputs, settings.response, align=settings.align is not False)
+    return ready_frame(images, rig, alpha, network, settings, explain=None, announce=None).corrections
 
 
 def _given(kind: type[T], value: T) -> T:

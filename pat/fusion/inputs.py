@@ -167,6 +167,7 @@ def clipped_in(image: Float[Tensor, "1 c h w"], sensor: Sensor) -> Float[Tensor,
 
     The largest value is 1; the image's own if that is more, or if its exposure is stated, which scaled it.
     """
+    image = image.detach()
     largest = float(image.max())
     if sensor.exposure is None:
         largest = max(largest, 1.0)

@@ -242,8 +242,7 @@ def fit(
     best = unlike if enough == 1 and unlike.evidence > luma.evidence else luma
     explanations = [luma, unlike]
     if enough == 1 and where is not None:
-        # Shading may explain in part what other weights explain: it never takes them back.
-        shaded = groups.most_probable(UNLIKE if best is unlike else LUMA, vignetted=True)
+        shaded = groups.most_probable(LUMA + UNLIKE, vignetted=True)
         best = shaded if shaded.evidence > best.evidence else best
         explanations.append(shaded)
     explained = min(max(one.response.explained for one in explanations) / enough, 1.0)

@@ -8,7 +8,7 @@ import torch
 
 from arraygeom import Camera, Distortion, Link, Rig, View
 from arraygeom.runtime.text import UNSCALED
-from calib.images.depth_change import relative_change
+from calib.images.depth_change import SMALL, relative_change
 from calib.images.hypotheses import swap
 from calib.images.matches import PointMatches, image_sizes, match_cameras
 from calib.images.parameters import apply_change, free_parameters
@@ -68,6 +68,17 @@ def test_depth_that_points_do_not_determine_stays():
     before, after = (depth_error(r, rig, points) for r in (bad, found.rig))
     assert after < before + 0.01
     assert "lines mended, depth not determined" in found.as_text()
+
+
+def test_a_change_of_depth_that_points_do_not_determine_is_refused():
+    rig = simulated_rig("wide", 2, np.random.default_rng(7))
+    points = simulated_matches(rig, "wide", np.random.default_rng(8))
+    bad = rig.perturbed({"c1.focal": 0.02 * rig["c1"].K[:2, :2].diagonal()})
+    found = refine_matches(bad, [points])
+    assert found.depth.change > SMALL
+    assert not found.accepted
+    assert any("depth would change" in objection for objection in found.objections)
+    assert refine_matches(bad, [points], force=True).accepted
 
 
 @pytest.mark.parametrize("field", ["narrow", "wide"])

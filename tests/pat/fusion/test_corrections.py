@@ -228,8 +228,18 @@ def test_a_clipped_band_gets_the_light_that_alpha_shows(network, middle, monkeyp
     assert aware > psnr(network, sample, bright) + 1
 
 
+def test_clipped_points_say_nothing_of_the_response(network, middle):
+    sample, images, _ = middle
+    bright = images | {BETA: (3 * images[BETA]).clamp(max=1)}
+    found = corrections_of(bright, sample.rig, alpha=ALPHA, network=network).response
+    assert found.gain == pytest.approx(1 / 3, abs=0.03)
+    assert found.gamma == pytest.approx(1.0, abs=0.05)
+    assert not found.is_unlike
+
+
 @pytest.mark.parametrize(
-    ("most", "exposure", "expected"), [(1.0, None, True), (0.5, None, False), (0.5, 0.01, True), (3.0, None, False)]
+    ("most", "exposure", "expected"),
+    [(1.0, None, True), (0.5, None, False), (0.5, 0.01, True), (3.0, None, False)],
 )
 def test_a_band_is_clipped_at_the_largest_value_that_it_can_have(most, exposure, expected):
     """That is 1; the image's own where its exposure scaled it; and highlights above 1 leave 1 unclipped."""

@@ -47,6 +47,21 @@ def test_a_response_is_recovered_from_colourful_points(weights, gamma):
     assert found.is_rec601 is False
 
 
+def test_where_few_points_match_only_an_exposure_is_fitted():
+    g = torch.Generator().manual_seed(0)
+    x = torch.rand(3, 4000, generator=g) * 0.8 + 0.1
+    where = torch.rand(4000, 2, generator=g) - 0.5
+    fall = torch.exp(-1.2 * where.square().sum(1))
+    for weights, light in ((WEIGHTS, 0.8), (REC601, 0.8 * fall)):
+        alpha = light * (torch.tensor(weights)[:, None] * x).sum(0)
+        all_found, exposure = (fit(x, alpha, where, enough=enough) for enough in (1.0, 0.9))
+        assert all_found.is_unlike is (weights == WEIGHTS)
+        assert bool(all_found.shading) is (weights == REC601)
+        assert not exposure.is_unlike
+        assert not exposure.shading
+        assert exposure.gain < 0.9
+
+
 def test_grey_points_leave_rec601():
     g = torch.Generator().manual_seed(0)
     grey = torch.rand(4000, generator=g) * 0.9 + 0.05
