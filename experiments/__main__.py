@@ -156,6 +156,7 @@ class Experiments:
         "certainty": commands.Certainty,
         "sweeps": commands.Sweeps,
         "fields": commands.Fields,
+        "trained-fields": commands.TrainedFields,
         "record": Record,
     }
 

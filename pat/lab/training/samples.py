@@ -304,7 +304,8 @@ def degraded(
     Args:
         scene: scenes with ground truth.
         g: random generator of the degradations.
-        field: receptive field of all betas.
+        field: receptive field of all betas; one with a method `of_depth` is asked for that of alpha's true
+            depth, (b, h, w) in metres: an upper bound.
         recording: probabilities of degradations.
 
     Returns:
@@ -321,7 +322,8 @@ def degraded(
         if two_views and _chance(recording.paper, g):
             alpha, betas[0], _ = augment(alpha, betas[0], paper_cases(), g)
         pair = pair_of(scene, i, g)
-        on_grid.append(FieldOnGrid.from_field(field, perturbed(pair, recording.miscalibrated, g)))
+        known = getattr(field, "of_depth", lambda depth: field)(scene.depth[0])
+        on_grid.append(FieldOnGrid.from_field(known, perturbed(pair, recording.miscalibrated, g)))
         where, seen = transfer(pair, scene.depth[0], scene.depth[i].masked_fill(~beta.valid, torch.nan))
         position.append(where)
         visible.append(seen)
