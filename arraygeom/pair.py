@@ -226,14 +226,15 @@ class Pair(Batched):
             H (*b, 3, 3), scaled so that its third coordinate is positive in front of both cameras.
 
         Raises:
-            ValueError: unless both cameras are calibrated and central.
+            ValueError: unless both cameras are calibrated and central, and for depths that are not positive.
         """
         alpha, beta = self._central("homography")
+        depth = torch.as_tensor(depth).to(alpha.K)
+        if checking() and not depth.is_meta and not bool((depth > 0).all()):
+            raise ValueError(f"a plane at a depth of {_shown(depth)} has no homography: give metres above 0")
         normal = alpha.K.new_tensor([0.0, 0.0, 1.0])
         pose = self.beta_from_alpha
-        return plane_homography(
-            alpha.K, beta.K, pose.R, pose.t, normal=normal, d=-torch.as_tensor(depth).to(alpha.K)
-        )
+        return plane_homography(alpha.K, beta.K, pose.R, pose.t, normal=normal, d=-depth)
 
     def _central(self, what: str) -> tuple[Camera, Camera]:
         """Both cameras. Raises ValueError if the rays of one do not meet in a point."""

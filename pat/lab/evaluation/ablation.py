@@ -77,8 +77,7 @@ RIGS = RigDistribution(
     rotation=3.0,
     decentring=0.05,
 )
-"""Rig distribution of the layered scenes: beta's focal length is 1/3 to 1 of alpha's, at equal
-image sizes."""
+"""Rigs of the layered scenes: beta's focal length is 1/3 to 1 of alpha's, at equal image sizes."""
 DENSE_LIMIT = 2**31
 """Bytes of explicit positions above which the dense field is omitted."""
 RATIOS = (1.0, 1.5, 2.0)
