@@ -13,7 +13,7 @@ import operator
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import partial, wraps
+from functools import cache, partial, wraps
 from numbers import Integral, Real
 from types import FunctionType, UnionType
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -227,19 +227,6 @@ def check_bounds(near: Any, far: Any) -> None:
         raise ValueError(f"near is {near:g} m and far {far:g} m: exchange them")
 
 
-def check_pixels(x: Any) -> None:
-    """Check that x are pixels (\\*n, 2).
-
-    Raises:
-        ValueError: for another shape.
-        TypeError: for a value that is no tensor.
-    """
-    if not isinstance(x, Tensor):
-        raise TypeError(f"the pixels are a {type(x).__name__}: give a tensor of (x, y)")
-    if x.ndim < 1 or x.shape[-1] != 2:
-        raise ValueError(f"the pixels have shape {tuple(x.shape)}; wanted (..., 2), each (x, y)")
-
-
 def check_tensors(last: tuple[int, ...], **values: Any) -> None:
     """Check that each of the named values is a tensor whose last axes have these sizes.
 
@@ -281,26 +268,23 @@ def checked(function: Callable[..., T]) -> Callable[..., T]:
     Returns:
         The function, which raises TypeError or ValueError before it does anything.
     """
-    inner = inspect.unwrap(function)
-    kinds = [p.kind for p in inspect.signature(inner).parameters.values()]
-    names = list(inspect.signature(inner).parameters)[: kinds.count(inspect.Parameter.POSITIONAL_OR_KEYWORD)]
-    refusals: dict[str, Callable[[str, Any], Exception | None]] = {}
-    looked_up: list[bool] = []
 
     @wraps(function)
     def call(*args: Any, **kwargs: Any) -> T:
         if checking():
-            if not looked_up:
-                looked_up.append(True)
-                refusals.update(_refusals(inner))
-            given = {**dict(zip(names, args)), **kwargs}
-            for name, value in given.items():
-                if name in refusals and (error := refusals[name](name, value)):
-                    raise error
-            _check_devices(given)
+            _check_arguments(function, args, kwargs)
         return function(*args, **kwargs)
 
     return call
+
+
+def _check_arguments(function: Callable[..., Any], args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> None:
+    names, refusals = _refusals(function)
+    given = {**dict(zip(names, args)), **kwargs}
+    for name, value in given.items():
+        if name in refusals and (error := refusals[name](name, value)):
+            raise error
+    _check_devices(given)
 
 
 def check_methods(cls: type) -> None:
@@ -320,20 +304,25 @@ def _check_devices(given: Mapping[str, Any]) -> None:
         raise ValueError(f"{listed}: give all on one device")
 
 
-def _refusals(function: Callable[..., Any]) -> dict[str, Callable[[str, Any], Exception | None]]:
-    """Functions that say what is wrong with an argument, by its name, for those that can be checked."""
+@cache
+def _refusals(
+    function: Callable[..., Any],
+) -> tuple[list[str], dict[str, Callable[[str, Any], Exception | None]]]:
+    """Names of a function's positional arguments, and functions that say what is wrong with an argument."""
+    function = inspect.unwrap(function)
+    parameters = inspect.signature(function).parameters
+    names = [name for name, p in parameters.items() if p.kind == inspect.Parameter.POSITIONAL_OR_KEYWORD]
     try:
         hints = get_type_hints(function)
     except NameError:  # of another package, imported for type checkers alone
-        return {}
-    hints.pop("return", None)
+        return names, {}
     made = {}
     for name, hint in hints.items():
         hint = getattr(hint, "__bound__", None) or hint
         kinds = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
-        if all(map(_is_checked, kinds)):
+        if name != "return" and all(map(_is_checked, kinds)):
             made[name] = partial(_refusal, kinds)
-    return made
+    return names, made
 
 
 def _is_checked(kind: Any) -> bool:

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
-from .checks import check_numbers, check_tensors
+from .checks import check_numbers
 from .pixels import map_homogeneous, product, to_homogeneous
 from .robust import LocalModel, levenberg_marquardt
 from .runtime.tracing import needs_numbers, traced
@@ -119,7 +119,6 @@ def fit_homography(x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"]) -> Float[Te
             would be behind.
         TypeError: for points that are no tensors.
     """
-    check_tensors((2,), x=x, y=y)
     if x.shape != y.shape or x.ndim != 2 or len(x) < 4:
         raise ValueError(
             f"wanted four pairs of points or more, (n, 2) each, got {tuple(x.shape)}, {tuple(y.shape)}"

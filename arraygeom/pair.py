@@ -206,10 +206,6 @@ class Pair(Batched):
             return self.homography_at(torch.tensor(torch.inf, dtype=torch.float64))
         return resize_matrix(self.alpha.hw, self.beta.hw)
 
-    def resize_beta(self, hw: HW) -> Pair:
-        """Return the pair whose beta records images of another size."""
-        return self.transform_beta(resize_matrix(self.beta.hw, hw), hw)
-
     def transform_beta(self, A: Float[Tensor, "3 3"], hw: HW) -> Pair:
         """Return the pair in which beta's pixels are x' ~ A x and its image's size is `hw`."""
         eye = torch.eye(3, dtype=A.dtype)

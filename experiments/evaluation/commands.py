@@ -330,7 +330,7 @@ class TrainedFields:
     """Folders of photographs: the textures of layered scenes."""
     seeds: tuple[int, ...] = (0, 1)
     """Seeds of weights, scenes and noise."""
-    steps: int = 600
+    steps: int = 500
     """Steps of each training."""
     batches: int = 32
     """Batches of unseen scenes that each is scored on."""

@@ -389,7 +389,7 @@ def answer(use: Callable[[], Any]) -> str:
             made = use()
         except (TypeError, ValueError, Warning) as error:
             last = traceback.extract_tb(error.__traceback__)[-1].filename
-            if "arraygeom" not in Path(last).parts[:-1]:
+            if "tests" in Path(last).parts or "arraygeom" not in Path(last).parts:
                 raise
             return f"{type(error).__name__}: {error}"
     return " ".join(made.check()[:1]) if isinstance(made, Rig) else ""
