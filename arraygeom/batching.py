@@ -159,9 +159,6 @@ def stack(items: Sequence[T]) -> T:
     Everything but tensors must be equal in all (sizes, lens models, names of a rig's cameras), except for
     names and sensors, which are the first item's.
 
-    Returns:
-        The batch.
-
     Raises:
         ValueError: for no items, and items that differ in kind, shapes or anything else.
     """

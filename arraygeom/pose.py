@@ -75,9 +75,6 @@ class Pose(Batched):
             target: world coordinates, metres.
             down: direction in the world; None for (0, 1, 0). For a world with z upwards it is (0, 0, -1).
 
-        Returns:
-            The pose.
-
         Raises:
             ValueError: if down is along the axis, or the target at the centre.
         """
@@ -142,7 +139,7 @@ class Pose(Batched):
         """Transform points (*n, 3) to R X + t. With batched poses (*b), points are (*b, ..., 3).
 
         Returns:
-            Points of the same shape.
+            Points, whose leading axes of length 1 become the batch's.
 
         Raises:
             ValueError: for points of other than three numbers, or without the batch's axes.

@@ -122,9 +122,6 @@ class MatchStatistics(NamedTuple):
             brightness: that combination, normalised to alpha's brightness.
             valid: mask of the matches that are on beta.
             consistent: 1 where a match passes the left-right check, else 0.
-
-        Returns:
-            The statistics.
         """
         both = valid * consistent
         count = both.sum((-2, -1), keepdim=True) + 1

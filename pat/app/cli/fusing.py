@@ -82,9 +82,6 @@ class Fusing(Known):
         Args:
             further: further fields of the settings, or `noise_by_default` of `settings`.
 
-        Returns:
-            The settings.
-
         Raises:
             ValueError: for invalid options.
         """

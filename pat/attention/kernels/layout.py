@@ -146,12 +146,12 @@ class Share(NamedTuple):
 
 
 class Outputs(NamedTuple):
-    """Outputs of forward.
+    """Outputs of forward, to write: flat arrays, alpha's pixels image by image and row by row.
 
     Attributes:
-        value: weighted values.
-        statistics: four per pixel, if `measured`.
-        logsum: logarithms of the sums of exponentials.
+        value: weighted values, channels last.
+        statistics: x, y, spread and peak of each pixel, if `measured`.
+        logsum: logarithm of each pixel's sum of exponentials.
         measured: True if statistics are wanted.
     """
 
@@ -162,7 +162,7 @@ class Outputs(NamedTuple):
 
 
 class Saved(NamedTuple):
-    """Results of forward, and gradients by its outputs.
+    """Results of forward, and gradients by its outputs: flat arrays in the order of `Outputs`.
 
     Attributes:
         statistics: statistics of forward; those of pixel p start at `step` p.
