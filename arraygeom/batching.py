@@ -114,7 +114,7 @@ class Batched:
         return map_tensors(self, lambda t, axes: t.pin_memory())
 
     def requires_grad_(self: T, requires_grad: bool = True) -> T:
-        """Let autograd record operations on its numbers, or not, in place.
+        """Let autograd record operations on its numbers, or not (`requires_grad` False), in place.
 
         Returns:
             Itself.

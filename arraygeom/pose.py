@@ -242,7 +242,7 @@ def in_float64(function: Callable[..., Tensor], *tensors: Tensor) -> Tensor:
     Matrices are expanded to common batch axes.
 
     Returns:
-        The result in the matrices' own type, float32 at least.
+        The function's result, in the widest type of the matrices, float32 at least.
     """
     batch = broadcast_shapes(*(t.shape[:-2] for t in tensors))
     dtype = torch.promote_types(torch.float32, reduce(torch.promote_types, (t.dtype for t in tensors)))

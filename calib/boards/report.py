@@ -82,6 +82,7 @@ def report_html(
     """Compose the HTML report of a calibration: verdict, notes, accuracy, coverage, residuals, uncertainty.
 
     Args:
+        title: heading of the page.
         notes: sentences at the top; "No advice." without any.
         detected: all detections by camera; with `photos`, the images that fit worst are drawn. None to draw
             none.

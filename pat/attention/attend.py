@@ -260,6 +260,8 @@ def sample_positions(locations: Locations, query: Tensor, samples: int | None) -
     """Convert Segments or Positions to the one form that backends take, in their precision.
 
     Args:
+        locations: segments (ha, wa) or (b, ha, wa), or positions with one more axis.
+        query: features (b, d, ha, wa), for their sizes, device and precision.
         samples: samples of each segment; None for one on each beta pixel of the longest segment.
 
     Returns:

@@ -178,7 +178,7 @@ def _is_of_pytorch(path: Path) -> bool:
 
 
 def misfit(network: nn.Module, state: Mapping[str, Tensor]) -> str:
-    """Describe the first tensor of a file that does not fit a network.
+    """Describe the first tensor of a file's `state` that does not fit a network.
 
     Returns:
         A phrase on a tensor that is missing, too many, or of another shape; empty if all fit.

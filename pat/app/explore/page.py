@@ -214,6 +214,8 @@ def opened(
         network: network of the paper, or its weights by name, whose attention is shown; None for correlations
             of windows.
         fields: further fields by name; None for none.
+        covariance: covariance of the rig's parameters, for bands; None for none.
+        files: files of the rig and the images, as for `Explorer`; None if unknown.
         controls: initial values of the controls (`explore`).
 
     Returns:
