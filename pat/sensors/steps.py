@@ -20,7 +20,8 @@ from arraygeom.pixels import HW, resize_matrix
 class Step(ABC):
     """Base class of one step in the formation of an image, such as blur or noise.
 
-    A subclass defines `apply`, and `pixel_matrix` too if it moves or resizes the pixel grid.
+    A subclass defines `apply(image, generator)` of images (b, c, h, w), and `pixel_matrix` too if it moves or
+    resizes the pixel grid.
     """
 
     @abstractmethod

@@ -58,8 +58,8 @@ class Explorer:
         """Compute what is drawn for a state of the controls.
 
         Returns:
-            The values of `answers.answer`; for impossible controls {"error": message}, so that nothing is
-            raised for them.
+            The values of `answers.answer`, or for impossible controls `error`, a message; and the control
+            `asked` as it was given.
         """
         if self.scene is None:
             return {"error": self.error}
