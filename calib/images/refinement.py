@@ -311,7 +311,7 @@ class RefinementProblem:
         it.
 
         Args:
-            force: accept it in spite of objections.
+            force: accept it in spite of objections, unless nothing moved.
 
         Returns:
             The refinement; its rig is the given one unless accepted.
