@@ -76,11 +76,7 @@ def once_a_lens(function: Callable[[V], T]) -> Callable[[V], T]:
 
 @once_a_lens
 def coverage(camera: LensView) -> LensCoverage:
-    """Measure the share of a camera's pixels with a ray, and their widest angle, on a coarse grid of pixels.
-
-    Returns:
-        The coverage.
-    """
+    """Measure the share of a camera's pixels with a ray, and their widest angle, on a coarse grid."""
     with torch.no_grad():
         grid = coarse_grid(camera.hw, max(8, max(camera.hw) // 128)).to(camera.K)
         if camera.distortion is None:

@@ -129,7 +129,7 @@ class _SafeLoader(_Base):  # type: ignore[misc]
     """YAML loader in which a repeated key is an error."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """Check for repeated keys, then build the mapping as the parent does."""
+        """Build the mapping as the parent does, after a check: a repeated key raises yaml.YAMLError."""
         lines: dict[Any, int] = {}
         for key_node, _ in node.value:
             if key_node.tag == "tag:yaml.org,2002:merge":
