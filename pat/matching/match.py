@@ -55,15 +55,12 @@ def match(inputs: Inputs, choice: Choice | None = None) -> Matches:
         raise ValueError(f"alpha has {w}x{h} pixels to match: pad both sides to whole multiples of {FINE}")
     if not inputs.learned:
         return transferred(inputs, located(inputs))
-    matches = in_each_beta(inputs)
-    if inputs.can_agree:
-        with torch.no_grad():
-            matches = with_certainty(chosen(inputs, matches, choice))
+    with torch.no_grad():
+        matches = with_certainty(chosen(inputs, in_each_beta(inputs), choice))
+        if inputs.can_agree:
             matches = with_likeliest_colours(inputs, matches, with_certainty(agreed(inputs, matches)))
     if torch.is_grad_enabled():
         matches = following(inputs, matches)
-    if not inputs.can_agree:
-        matches = with_certainty(chosen(inputs, matches, choice))
     return transferred(inputs, matches)
 
 
@@ -148,9 +145,6 @@ def coarse_mix(
             pixels of the whole beta.
         blocks: segments (B or 1, h / 2 factor, w / 2 factor) of blocks of twice the side.
         factor: whole number by which both images are reduced.
-
-    Returns:
-        The combination.
     """
     coarse_alpha, bands = avg_pool2d(alpha, factor), avg_pool2d(beta, factor)
     comparison = Comparison.from_images(coarse_alpha, bands, SpectralMix.equal(bands))
