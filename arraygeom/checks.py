@@ -318,7 +318,7 @@ def _refusals(
         hints = get_type_hints(function)
     except NameError:  # of another package, imported for type checkers alone
         return names, {}
-    made = {}
+    made: dict[str, Callable[[str, Any], Exception | None]] = {}
     for name, hint in hints.items():
         hint = getattr(hint, "__bound__", None) or hint
         kinds = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)

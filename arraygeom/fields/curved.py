@@ -23,7 +23,7 @@ from ..pair import Pair
 from ..pixels import HW, floating, map_homogeneous, product, within
 from ..runtime.chunks import spans
 from ..runtime.threads import in_parallel
-from ..runtime.tracing import traced
+from ..runtime.tracing import needs_numbers, traced
 from ..segments import Positions, Segments, fractions_on_image, sample_fractions
 from ..undistortion import pinhole_view
 from .protocol import PIECE, ReceptiveField, answered, compilable
@@ -252,6 +252,8 @@ class RayCurve(NamedTuple):
         valid = ahead & visible.valid
         if beta.central:
             return cls.between(points, near_end, far_end, valid, beta, wide)
+        if torch.compiler.is_compiling():  # loops within loops, which it would write out
+            needs_numbers("the part of a ray that a camera shows whose rays do not meet in a point", x)
         remote = REMOTE / beside(pose.t.norm(dim=-1) + near.to(x.dtype), x.ndim - 1)
         near_end, far_end = (torch.maximum(v, remote) for v in (near_end, far_end))
         whole = cls.between(points, near_end, far_end, valid, beta, wide)
