@@ -225,10 +225,9 @@ def composites(scene: AlignmentScene, aligned: Aligned) -> dict[str, Float[Tenso
     images: list[list[NDArray[Any]]] = [[], []]
     for name in names:
         values, view = np.asarray(scene.recorded[name]), aligned[name]
-        rigid = by_homography(scene, name, straight, pinhole)
         by_plane, by_scene = (
             resampled_values(values, plane, "bilinear")[0] * (0.95 / np.percentile(values[0], 99))
-            for plane in (rigid, np.nan_to_num(view.positions))
+            for plane in (by_homography(scene, name, straight, pinhole), np.nan_to_num(view.positions))
         )
         images[0].append(by_plane)
         images[1].append(np.where(view.valid, by_scene, 1.0))

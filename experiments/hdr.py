@@ -51,8 +51,7 @@ def merged(frame: Frame, rig: Rig, images: Mapping[str, Float[Tensor, "_ _ _"]],
 def _at_alpha(frame: Frame, rig: Rig, image: Tensor, alpha: str, name: str) -> Float[Tensor, "h w"]:
     """Linear light of a beta at alpha's pixels, by depth; NaN where it is not known or outside the image."""
     a, b = rig.pair(alpha, name).cameras
-    X = a.to(torch.float32).unproject(pixel_grid(a.hw), frame.depth)
-    x, _, valid = b.to(torch.float32).project(X)
+    x, _, valid = b.to(torch.float32).project(a.to(torch.float32).unproject(pixel_grid(a.hw), frame.depth))
     sampled = sample(linear_from_srgb(image)[None], torch.where(valid[..., None], x, -1e3)[None])
     return torch.where(valid & sampled.valid[0], sampled.values[0, 0], torch.nan)
 

@@ -120,13 +120,10 @@ class Spectral(Step):
         """One channel, or three for "rgb"."""
         channels = image.shape[1]
         if channels not in (3, 4):
-            raise ValueError(
-                f"a spectral response needs an image in RGB or RGB + NIR, got {channels} channels"
-            )
+            raise ValueError(f"a spectral response needs RGB or RGB + NIR, got {channels} channels")
         if self.response == "rgb":
             return image[:, :3]
-        weights = image.new_tensor(self._weights(channels))
-        return (image * weights[:, None, None]).sum(1, keepdim=True)
+        return (image * image.new_tensor(self._weights(channels))[:, None, None]).sum(1, keepdim=True)
 
     def _weights(self, channels: int) -> tuple[float, ...]:
         if self.response == "luminance":
@@ -185,9 +182,7 @@ def curve_weights(curve: Curve, channels: int = 3) -> tuple[float, ...]:
     gaussians = [(-0.5 * ((wavelength - c) / s) ** 2).exp() / s for c, s in CHANNELS[:channels]]
     overlaps = [float(torch.trapezoid(response * g, wavelength)) for g in gaussians]
     if sum(overlaps) < 1e-6:
-        raise ValueError(
-            "the response curve collects no light of the image's channels: check its wavelengths, in nm"
-        )
+        raise ValueError("the response curve collects no light of the image: check its wavelengths, in nm")
     return _shares(overlaps)
 
 
@@ -289,9 +284,7 @@ def read_chain(value: Any, where: str = "chain") -> tuple[Step, ...]:
     (DecodeSRGB(), Noise(full_well=8000.0, read=3.0, counts='gaussian'), Quantise(bits=12))
     """
     if not isinstance(value, list):
-        raise ValueError(
-            f"{where}: wanted a list of steps, such as [decode-srgb, {{noise: {{full_well: 8000}}}}]"
-        )
+        raise ValueError(f"{where}: wanted a list of steps, as [decode-srgb, {{noise: {{full_well: 8000}}}}]")
     return tuple(_step(entry, f"{where}[{i}]") for i, entry in enumerate(value))
 
 

@@ -95,8 +95,7 @@ def _pairs(network: FusionNetwork, data: Path, out: Path, rates: Sequence[int]) 
     methods = {name: BASELINES[name] for name in ("alpha", "classical")}
     methods["fusion"] = rectified_fusion(network)
     sets = {name: of_half(DATA_SETS[name](data / name), "report") for name in PAIRS}
-    rows = evaluate_sets(sets, methods, rates, out=out / "pairs")
-    return PAIRS_TEXT + sets_markdown(rows, depth=False)
+    return PAIRS_TEXT + sets_markdown(evaluate_sets(sets, methods, rates, out=out / "pairs"), depth=False)
 
 
 class SyntimScene(NamedTuple):
@@ -157,13 +156,12 @@ class FastSlowArray(NamedTuple):
 
 
 def _fast_and_slow(network: FusionNetwork, array: FastSlowArray, out: Path) -> str:
-    field = HomographyDisplacement(array.displacement)
     frame = fuse(
         array.images,
         array.rig,
         alpha=FAST,
         network=network,
-        settings=FuseSettings(field=field, match_levels=True),
+        settings=FuseSettings(field=HomographyDisplacement(array.displacement), match_levels=True),
     )
     shown = {"alpha: the fast camera": array.images[FAST]}
     shown |= {f"beta: {name}": array.images[name] for name in SLOW}
@@ -205,9 +203,7 @@ def published_matrices(file: Path) -> dict[str, Float[Tensor, "3 3"]]:
             for name, key in SLOW.items()
         }
     except (KeyError, TypeError, json.JSONDecodeError) as error:
-        raise ValueError(
-            f"{file}: wanted 3x3 matrices {', '.join(SLOW.values())} under 'pillow' ({error!r})"
-        ) from None
+        raise ValueError(f"{file}: no matrices {', '.join(SLOW.values())} of 'pillow' ({error!r})") from None
 
 
 def transformed(array: FastSlowArray) -> Float[Tensor, "3 h w"]:

@@ -63,9 +63,7 @@ class Pairs(research.StereoSets):
         """All of them. Raises ValueError if there is none."""
         every = [pair for pairs in self.sets().values() for pair in pairs]
         if not every:
-            raise ValueError(
-                f"--half {self.half}: no pair belongs to that half: give more pairs, or the other half"
-            )
+            raise ValueError(f"--half {self.half}: no pair belongs to it: give more, or the other half")
         return every
 
 
@@ -97,8 +95,7 @@ class Evaluate(Pairs, research.Evaluate):
         field = paper.AuthorsRows() if self.as_authors else None
         if self.as_authors:
             sets = {name: map(paper.halved, pairs) for name, pairs in sets.items()}
-        settings = FuseSettings(field=field)
-        fusion = protocols.rectified_fusion(network, bands=bands, settings=settings)
+        fusion = protocols.rectified_fusion(network, bands=bands, settings=FuseSettings(field=field))
         methods = {**protocols.BASELINES, "fusion": fusion, **compared}
         rows = stereo.evaluate_sets(sets, methods, self.rates, out=self.out)
         text = stereo.sets_markdown(rows, printed=paper.PRINTED[self.protocol])
@@ -159,8 +156,7 @@ class Outside(Pairs):
     def run(self) -> None:
         """Write and print the table. Raises ValueError for no images, and for none with a true disparity."""
         pairs = with_truth([pair for pair in self.pairs() if pair.disparity is not None], self.half)
-        shown = progress("evaluating")(pairs, len(pairs))
-        rows = evaluate_outside(shown, load_weights(self.network))
+        rows = evaluate_outside(progress("evaluating")(pairs, len(pairs)), load_weights(self.network))
         finished(self.out / "outside.md", outside_markdown(rows))
 
 
@@ -197,8 +193,7 @@ class Certainty(Pairs):
                 judged_pixels, lambda one: certainty.Stated.by(fitted_network(), one.numbers)
             )
         certainty.save_reliability(held, self.out / "reliability.png")
-        text = certainty.held_markdown(held)
-        finished(self.out / "certainty.md", text, ", and reliability.png beside it")
+        finished(self.out / "certainty.md", certainty.held_markdown(held), ", and reliability.png beside it")
 
 
 @dataclass
@@ -221,10 +216,7 @@ class OnScenes:
         writable(self.out, folder=True)
         network: Network = load_weights(self.network)
         if not isinstance(network, Comparing):
-            raise ValueError(
-                f"--network {self.network}: "
-                "this network matches without attention, too: `pat lab ablate` takes it"
-            )
+            raise ValueError(f"--network {self.network}: it matches without attention: `pat lab ablate`")
         if network.betas not in (1, 3):
             wanted = "give some for one beta in colour, or for three with a band each"
             raise ValueError(f"--network {self.network}: they are for {network.betas} betas: {wanted}")
@@ -288,8 +280,7 @@ class Sweeps(OnScenes):
         chosen = self.chosen(sweeps.FIELDS)
         rigs = list(sweeps.points(self.sweeps or tuple(sweeps.SWEEPS), hw=self.hw))
         shown = progress("ablating")(rigs, len(rigs))
-        rows = sweeps.ablate(network, shown, chosen, scenes=self.scenes)
-        write_report(rows, self.out)
+        write_report(sweeps.ablate(network, shown, chosen, scenes=self.scenes), self.out)
         self.say_written()
 
 

@@ -72,8 +72,7 @@ class Condition:
     def recorded(self, pair: StereoPair) -> MonoColourTask:
         """The pair under this condition; what is drawn at random depends on the pair's name alone."""
         g = Generator().manual_seed(int(hashlib.sha256(pair.name.encode()).hexdigest()[:8], 16))
-        moved = replace(pair, right=self.right(pair.right))
-        task = mono_colour_task(moved, self.rate)
+        task = mono_colour_task(replace(pair, right=self.right(pair.right)), self.rate)
         alpha, beta = task.alpha, self.beta(task.beta)
         if self.alpha != "luma":
             alpha = luminance(task.ground_truth, _random_weights(g) if self.alpha == "random" else self.alpha)
@@ -98,10 +97,8 @@ def _moved(rows: float = 0.0, degrees: float = 0.0) -> Callable[[Tensor], Tensor
             torch.arange(h) - (h - 1) / 2 - rows, torch.arange(w) - (w - 1) / 2, indexing="ij"
         )
         columns = (c * x + s * y + (w - 1) / 2).clamp(0, w - 1)
-        lines = (c * y - s * x + (h - 1) / 2).clamp(0, h - 1)
-        where = torch.stack([columns, lines], -1).reshape(1, -1, 2)
-        sampled = sample(image[None], where, interpolation="bicubic").values
-        return sampled.reshape(image.shape).clamp(0, 1)
+        where = torch.stack([columns, (c * y - s * x + (h - 1) / 2).clamp(0, h - 1)], -1).reshape(1, -1, 2)
+        return sample(image[None], where, interpolation="bicubic").values.reshape(image.shape).clamp(0, 1)
 
     return moved
 

@@ -78,8 +78,7 @@ def cropped(sample: SampleArray) -> SampleArray:
     rig = sample.rig.crop(ALPHA, top, left, (h, w)).crop(BETA, beta_top, beta_left, (bh, bw))
     window = (..., slice(top, top + h), slice(left, left + w))
     of_beta = sample.images[BETA][:, beta_top : beta_top + bh, beta_left : beta_left + bw]
-    images = {ALPHA: sample.images[ALPHA][window], BETA: of_beta}
-    return SampleArray(rig, images, sample.ground_truth[window])
+    return SampleArray(rig, {ALPHA: sample.images[ALPHA][window], BETA: of_beta}, sample.ground_truth[window])
 
 
 def regions(rig: Rig) -> dict[str, Tensor]:
@@ -158,8 +157,7 @@ def found_rig(
 
     def loss() -> Tensor:
         optimiser.zero_grad()
-        changes = {name: WRONG[name] * share for name, share in zip(names, left)}
-        pair = moved(rig, changes).pair(ALPHA, BETA)
+        pair = moved(rig, {name: WRONG[name] * share for name, share in zip(names, left)}).pair(ALPHA, BETA)
         value = -mean_score(pair, query, key, x)
         value.backward()
         return value
@@ -174,8 +172,7 @@ def mean_score(pair: Pair, query: Tensor, key: Tensor, x: Tensor) -> Tensor:
     field = Curved(96, nodes=16) if pair.has_lens else Epipolar()
     locations = sampling_locations(field, pair, x)
     samples = 96 if isinstance(locations, Segments) else None
-    gathered = attend(query, key, key, locations, samples=samples, border=4.0)
-    return (query * gathered).sum(1).mean()
+    return (query * attend(query, key, key, locations, samples=samples, border=4.0)).sum(1).mean()
 
 
 WRONG = {

@@ -40,8 +40,7 @@ def run_recorded(folder: Path, out: Path, *, weights: str, say: Callable[[str], 
     rig, frames = array.rig, recorded_frames(folder)
     for name, rate in RATES.items():
         rig = with_sensor(rig, name, frame_rate=rate)
-    field = HomographyDisplacement(array.displacement)
-    settings = FuseSettings(field=field, match_levels=True)
+    settings = FuseSettings(field=HomographyDisplacement(array.displacement), match_levels=True)
     job = SequenceFusion(load_weights(weights), rig, frames, FAST, settings=settings)
     keys = [str(FAST_FRAMES[key.alpha]) for key in job.timeline.key_frames()]
     say(f"fusing key frames {', '.join(keys)}, then all")
@@ -84,5 +83,4 @@ def _write(
     detail |= {f"frame {n} alone": f.image[:, rows, columns] for n, f in zip(FAST_FRAMES, by_themselves)}
     detail |= {"confidence, 144 alone": by_themselves[3].confidence[None, rows, columns]}
     save_panels(detail, out / "details.png", columns=4)
-    whole = {"alpha, 144": frames[FAST][3], "fused, 144": fused[3].image}
-    save_panels(whole, out / "figure.png", columns=2)
+    save_panels({"alpha, 144": frames[FAST][3], "fused, 144": fused[3].image}, out / "figure.png", columns=2)

@@ -166,8 +166,7 @@ def _plant(rng: Generator) -> Iterator[Object]:
         tip = rotation.apply([0, -1, 0])
         green = (0.05 + 0.05 * float(rng.uniform()), 0.20 + 0.12 * float(rng.uniform()), 0.035)
         paints = tuple(paint(*(factor * c for c in green), nir=0.55) for factor in (1.0, 1.35))
-        veins = Texture(kind="noise", paints=paints, scale=60.0)
-        leaf = Material(texture=veins, roughness=0.4, specular=0.4)
+        leaf = Material(texture=Texture(kind="noise", paints=paints, scale=60.0), roughness=0.4, specular=0.4)
         middle = np.array([x, -0.13, z]) + tip * length / 2
         blade = ball(f"leaf{i}", vec(middle), (0.035 + 0.02 * float(rng.uniform()), length, 0.004), leaf)
         key = replace(blade.motion.keys[0], rotation=vec(rotation.as_rotvec()))
@@ -245,6 +244,5 @@ def _lamp() -> Iterator[Object]:
         profile(0, 300, 8, 300, 8, 30, 30, 20, 80, 12, 80, 0),
         BRASS,
     )
-    rim = profile(72, 200, 74, 200, 140, 2, 142, 0, 138, 2)
-    yield lathed("shade", (x, -0.33, z), rim, shade)
+    yield lathed("shade", (x, -0.33, z), profile(72, 200, 74, 200, 140, 2, 142, 0, 138, 2), shade)
     yield ball("bulb", (x, -0.36, z), (0.05, 0.06, 0.05), bulb)

@@ -114,9 +114,7 @@ class Batch:
             raise ValueError(f"no image of alpha, '{self.alpha}'")
         if not self.sequence and len({len(files) for files in self.files.values()}) > 1:
             counts = ", ".join(f"{len(files)} of '{name}'" for name, files in self.files.items())
-            raise ValueError(
-                f"frames need as many images of each camera, got {counts}; or is it for `pat sequence`?"
-            )
+            raise ValueError(f"frames need as many images of each camera, got {counts}")
 
     @cached_property
     def names(self) -> list[str]:
@@ -319,7 +317,6 @@ class Batch:
             with confidence_checked(strict=self.strict):
                 frame = self._frame(i)
             view = view_of(self.rig, self.alpha, bits=self.bits, bands=len(frame.image))
-            bands = band_names(frame, self._betas) or self._propagated_bands(frame)
             save_frame(
                 frame,
                 self.out,
@@ -327,7 +324,7 @@ class Batch:
                 kind=self.kind,
                 view=view,
                 name=self.names[i],
-                bands=bands,
+                bands=(band_names(frame, self._betas) or self._propagated_bands(frame)),
                 about={"inputs": inputs or self.inputs(i)},
             )
 
@@ -367,9 +364,7 @@ def _plain(value: object) -> object:
     kind = type(value).__name__
     if FIELD_CLASSES.get(kind) is not type(value):
         supported = ", ".join(FIELD_CLASSES)
-        raise ValueError(
-            f"a batch's field is written to a file, which {value!r} cannot be: give one of {supported}"
-        )
+        raise ValueError(f"a batch cannot write {value!r} to its file: give one of {supported}")
     return {"kind": kind, **vars(value)}
 
 
@@ -433,9 +428,7 @@ def find_images(text: str | Path, *, name: str = "") -> list[Path]:
     path = Path(text)
     label = f"{name}: " if name else ""
     if path.suffix.lower() in VIDEO_SUFFIXES:
-        raise ValueError(
-            f"{label}{path}: is a video, which only `pat fuse` without a rig reads: save its frames"
-        )
+        raise ValueError(f"{label}{path}: is a video, which needs `pat fuse` without a rig: save its frames")
     if path.is_dir():
         files = _images_in(path)
     elif path.exists():
@@ -451,9 +444,7 @@ def find_images(text: str | Path, *, name: str = "") -> list[Path]:
     for file in files:
         if (other := frames.setdefault(file.stem, file)) != file:
             pattern = file.with_name(f"*{file.suffix}")
-            raise ValueError(
-                f"{label}{other} and {file.name} are one frame: give a pattern, such as '{pattern}'"
-            )
+            raise ValueError(f"{label}{other} and {file.name} are one frame: give a pattern, as '{pattern}'")
     return files
 
 

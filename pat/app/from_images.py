@@ -128,9 +128,7 @@ def array_from_images(
         range_of(name, image)
     for name, length in focal.items():
         if name not in sources or not 0 < length < math.inf:
-            raise ValueError(
-                f"focal {name}={length:g}: no camera of {', '.join(sources)}, or not positive: mend it"
-            )
+            raise ValueError(f"focal {name}={length:g}: no camera of {', '.join(sources)}, or not positive")
     notes: list[str] = []
 
     def note(line: str) -> None:
@@ -199,9 +197,7 @@ def by_camera(sources: ImageSources) -> Mapping[str, str | Path | Tensor]:
         for source in sources:
             if not isinstance(source, str | Path):
                 got = type(source).__name__
-                raise TypeError(
-                    f"an image is a {got} without a name: give files, or {{NAME: tensor}} by camera"
-                )
+                raise TypeError(f"an image is a {got} without a name: give files, or {{NAME: tensor}}")
         sources = camera_names([Path(path) for path in sources])
     if len(sources) < 2:
         raise ValueError(f"an array has two images or more, got {len(sources)}")

@@ -81,8 +81,7 @@ class Evaluate(StereoSets):
         from .evaluation import protocols, stereo
 
         sets = self.sets()
-        network = load_weights(self.network)
-        methods = {**protocols.BASELINES, "fusion": protocols.rectified_fusion(network)}
+        methods = {**protocols.BASELINES, "fusion": protocols.rectified_fusion(load_weights(self.network))}
         rows = stereo.evaluate_sets(sets, methods, self.rates, out=self.out)
         self.write(rows, stereo.sets_markdown(rows))
 

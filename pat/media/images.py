@@ -396,9 +396,7 @@ def _counts(planes: NDArray, label: str, bits: int | None, white: int) -> NDArra
     """Scale integers to 0..1. Raises ValueError for values beyond the stated bits."""
     stored, largest = max(white.bit_length(), 8), int(planes.max())
     if bits and bits > stored:
-        raise ValueError(
-            f"{label}: has {stored} bits a value, the rig says {bits}: correct 'bits', or give the raw file"
-        )
+        raise ValueError(f"{label}: has {stored} bits a value, the rig says {bits}: correct 'bits'")
     if largest > white:
         raise ValueError(f"{label}: has values up to {largest}, its header says {white}: save it again")
     few = 0 < largest < 2**12 or HIGHLIGHTS <= largest < 2**14

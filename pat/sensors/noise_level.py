@@ -195,6 +195,5 @@ def _fitted(
     from scipy.optimize import nnls  # here, as it takes long to import
 
     (shot, read), _ = nnls(design.numpy(), np.ones(len(value)))
-    predicted = design @ torch.tensor([shot, read]).to(design)
-    error = float(predicted.clamp(min=1e-6).log().square().mean())
+    error = float((design @ torch.tensor([shot, read]).to(design)).clamp(min=1e-6).log().square().mean())
     return NoiseLevel(float(shot), math.sqrt(read), added_to), error

@@ -355,7 +355,5 @@ def _same_size(image: Tensor, steps: Sequence[Step], generator: Generator, name:
     degraded = record(image, steps, generator)
     if degraded.shape != image.shape:
         old, new = tuple(image.shape[1:]), tuple(degraded.shape[1:])
-        raise ValueError(
-            f'case "{name}" changes {old} to {new}; the cases of a batch must keep the size: add a Resample'
-        )
+        raise ValueError(f'case "{name}" changes {old} to {new}, and a batch has one size: add a Resample')
     return degraded

@@ -340,8 +340,7 @@ def _around_matches(
     from arraygeom.io.point_matches import read_matches
 
     fields = dict.fromkeys(rig.betas(alpha), field)
-    matches = read_matches(path, files, {name: rig[name].hw for name in files})
-    for names, points in matches.items():
+    for names, points in read_matches(path, files, {name: rig[name].hw for name in files}).items():
         if alpha not in names:
             continue
         (a, b) = (names, points) if names[0] == alpha else (names[::-1], points[::-1])

@@ -305,8 +305,7 @@ def field_docs(kind: Any) -> dict[str, str]:
         if parent is object:
             continue
         (body,) = ast.parse(textwrap.dedent(inspect.getsource(parent))).body
-        statements = typing.cast(ast.ClassDef, body).body
-        for field, text in pairwise(statements):
+        for field, text in pairwise(typing.cast(ast.ClassDef, body).body):
             if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
                 docs[ast.unparse(field.target)] = str(getattr(text.value, "value", ""))
     return docs

@@ -271,8 +271,7 @@ def print_tables(cameras: Sequence[CameraSummary], pairs: Sequence[PairSummary],
     from rich.table import Table
 
     fine, baseline = ("mm", "baseline m") if unit == "m" else (f"{unit}/1000", "baseline")
-    footprint = f"{fine} a pixel, near - far"
-    of_cameras = Table("camera", "pixels", "focal px", "view deg", footprint, box=None)
+    of_cameras = Table("camera", "pixels", "focal px", "view deg", f"{fine} a pixel, near - far", box=None)
     of_lenses = Table("camera", "lens", "covers", "coefficients", box=None)
     for c in cameras:
         further = _two(c.focal), _two(c.field_of_view, " x "), _two(c.footprint, " - ")
@@ -447,9 +446,7 @@ class Refine:
         options.say_when_compiling()
         frames = options.read_frames(rig, self.image)
         if self.matches is not None and len(frames) > 1:
-            raise ValueError(
-                f"--matches needs a single frame, and {len(frames)} are given: give one image of each camera"
-            )
+            raise ValueError(f"--matches needs one frame, got {len(frames)}: give one image of each camera")
         matches = given_matches(self.matches, self.image, frames[0])
         with options.working("matching features and refining"):
             refined = refine(
@@ -560,9 +557,7 @@ class RigDiff:
         a, b = load_rig(self.first), load_rig(self.second)
         depth = self.depth or (a.depth or b.depth)
         if depth is None:
-            raise ValueError(
-                "--depth: neither rig states the depths it is used between: give NEAR FAR, metres"
-            )
+            raise ValueError("--depth: neither rig states a depth range: give NEAR FAR, metres")
         near, far = (float(bound) for bound in depth)
         beside = [path.with_suffix(".covariance.json") for path in (self.first, self.second)]
         covariances = [

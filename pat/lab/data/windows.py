@@ -176,8 +176,7 @@ def reduced_depth(depth: Float[Tensor, "n h w"], hw: HW) -> Float[Tensor, "n h2 
     old = (depth.shape[-2], depth.shape[-1])
     if old == hw:
         return depth
-    back = resize_matrix(hw, old)
-    x = map_homogeneous(back[:2], pixel_grid(hw, dtype=torch.float64)).to(depth)[None]
+    x = map_homogeneous(resize_matrix(hw, old)[:2], pixel_grid(hw, dtype=torch.float64)).to(depth)[None]
     between = 1 / sample(1 / depth[:, None], x).values[:, 0]
     nearest = sample(depth[:, None], x, interpolation="nearest").values[:, 0]
     even = (between / nearest - 1).abs() < 0.01

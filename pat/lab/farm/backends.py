@@ -217,9 +217,7 @@ def rig_from_alpha(rig: Rig) -> RigBatch:
         if not isinstance(camera, Camera):
             raise ValueError(f"camera '{name}' is not calibrated: rendering needs its K, R and t")
         if camera.distortion is not None:
-            raise ValueError(
-                f"camera '{name}' has a lens model, layered scenes have none: use Blender, or omit it"
-            )
+            raise ValueError(f"camera '{name}' has a lens, layered scenes have none: use Blender, or omit it")
     if rig.depth is None:
         raise ValueError("the rig has no depth range: add `depth: [near, far]` in metres to its file")
     near, far = (float(d) for d in rig.depth)

@@ -108,8 +108,7 @@ def texture(rgb: Float[Tensor, "3 h w"], patch: int = 8) -> Float[Tensor, ""]:
     grey = rgb.mean(0)[None, None].clamp(0, 1)
     mean = avg_pool2d(grey, min(patch, *rgb.shape[1:]))
     square = avg_pool2d(grey**2, min(patch, *rgb.shape[1:]))
-    deviation = (square - mean**2).clamp(min=0).sqrt()
-    return (deviation > 0.02 * mean.clamp(min=0.01)).float().mean()
+    return ((square - mean**2).clamp(min=0).sqrt() > 0.02 * mean.clamp(min=0.01)).float().mean()
 
 
 def pair_figures(pair: Pair, here: RenderedFrame, there: RenderedFrame) -> dict[str, float]:

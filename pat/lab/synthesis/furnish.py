@@ -196,8 +196,7 @@ def _lights(setting: Setting, room: _Room) -> tuple[Light, ...]:
     """Two to four lamps beside and above the cameras, perhaps a sun; of similar brightness together in all
     scenes."""
     rng = setting.rng
-    count = int(rng.integers(2, 5))
-    shares = rng.dirichlet(np.full(count, 3.0)) * _IRRADIANCE * rng.uniform(0.8, 1.2)
+    shares = rng.dirichlet(np.full(int(rng.integers(2, 5)), 3.0)) * _IRRADIANCE * rng.uniform(0.8, 1.2)
     target = room.at(np.array([0.0, 0.0, 0.2]))
     lights = [_lamp(setting, room, target, float(share)) for share in shares]
     if rng.uniform() < 0.6:

@@ -227,5 +227,4 @@ def _steps(distance: Tensor) -> Tensor:
 
 
 def _oversampling(alpha: Camera, camera: Camera) -> int:
-    ratio = float((alpha.K[:, 0, 0] / camera.K[:, 0, 0]).median())
-    return min(max(round(ratio), 1), _MAX_OVERSAMPLING)
+    return min(max(round(float((alpha.K[:, 0, 0] / camera.K[:, 0, 0]).median())), 1), _MAX_OVERSAMPLING)

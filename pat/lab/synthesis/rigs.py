@@ -156,5 +156,4 @@ def _rotation_towards(direction: Tensor, old: Tensor) -> Tensor:
     a, b = (v / v.norm(dim=-1, keepdim=True) for v in (direction, old))
     axis = torch.linalg.cross(a, b)
     sine = axis.norm(dim=-1, keepdim=True)
-    angle = torch.atan2(sine, (a * b).sum(-1, keepdim=True))
-    return axis * angle / sine.clamp(min=1e-12)
+    return axis * torch.atan2(sine, (a * b).sum(-1, keepdim=True)) / sine.clamp(min=1e-12)

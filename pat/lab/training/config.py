@@ -158,9 +158,7 @@ class TrainConfig:
             share, folders = getattr(self, name), getattr(self, f"{name}_from")
             if bool(share) != bool(folders):
                 given = "there is no folder" if share else f"{folders[0]} is given"
-                raise ValueError(
-                    f"{name} is {share:g} and {given}: give both `{name}` and `{name}_from`, or neither"
-                )
+                raise ValueError(f"{name} is {share:g} and {given}: give `{name}` and `{name}_from`")
         total = self.rendered + self.measured
         if total > 1:
             raise ValueError(f"rendered and measured are shares of the batches, {total:g} in all")
@@ -183,9 +181,7 @@ def load_config(name: str | Path) -> TrainConfig:
     """
     path = next((p for p in (RECIPES / f"{name}.yaml", Path(name)) if p.is_file()), None)
     if path is None:
-        raise FileNotFoundError(
-            f"no recipe '{name}' (it is a file or a name of the package){near(name, recipes())}"
-        )
+        raise FileNotFoundError(f"no recipe '{name}' (a file, or a shipped name){near(name, recipes())}")
     return parse_config(path.read_text(encoding="utf-8"), str(path))
 
 
@@ -201,9 +197,7 @@ def parse_config(text: str, name: str = "config") -> TrainConfig:
     values = parse_yaml(text, name)
     try:
         if not values:
-            raise ValueError(
-                f"the recipe is empty: write entries (name: value), or take {', '.join(recipes())}"
-            )
+            raise ValueError(f"the recipe is empty: write entries, or take {', '.join(recipes())}")
         if not isinstance(values, Mapping):
             raise ValueError(f"wanted entries (name: value), got {values!r}")
         return from_document(TrainConfig, values)
@@ -226,8 +220,7 @@ def save_config(config: TrainConfig, path: Path) -> None:
     """Write a recipe to a YAML file, atomically."""
     from arraygeom.runtime.atomic import write_text
 
-    text = config_text(config)
-    write_text(path, text)
+    write_text(path, config_text(config))
 
 
 def command_line(arguments: list[str], prog: str = "pat lab train") -> TrainConfig:

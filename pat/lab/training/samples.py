@@ -176,8 +176,7 @@ class SampleSource:
     def _made(self, planned: Planned, g: Generator) -> ArrayBatch:
         if planned.kind in self.folders:
             crops = self.folders[planned.kind]
-            betas = self.config.network.betas
-            return crops.sample(self.config.batch, g, number=planned.scenes, betas=betas)
+            return crops.sample(self.config.batch, g, number=planned.scenes, betas=self.config.network.betas)
         return self.layered[planned.kind].sample(self.config.batch, g)
 
 
@@ -205,8 +204,7 @@ def scenes(config: TrainConfig, *, device: str = "cpu") -> tuple[SampleSource, S
         ValueError: for no photographs, or too few to hold some out, and other data that cannot be used.
     """
     field, n = named_field(config.field), config.held_out
-    layered = config.rendered + config.measured < 1
-    bank, unseen = photographs(config) if layered else (None, None)
+    bank, unseen = photographs(config) if config.rendered + config.measured < 1 else (None, None)
 
     def source(photos: PhotoBank | None, seed: int, choose: Callable[[int], bool]) -> SampleSource:
         return source_of(config, photos, seed, field, device, crops(config, seed, device, choose))

@@ -197,9 +197,7 @@ def chosen(every: list[T], choose: Callable[[int], bool], what: str) -> list[T]:
     """
     items = [item for i, item in enumerate(every) if choose(i)]
     if not items:
-        raise ValueError(
-            f"{what}: {len(every)} are too few to learn from some and to hold others out: give more"
-        )
+        raise ValueError(f"{what}: {len(every)} are too few to learn from and to hold out: give more")
     return items
 
 
@@ -220,15 +218,11 @@ def large_enough(folder: Path, rig: Rig, hw: HW) -> list[str]:
     sizes = {name: pinhole_of(c).hw for name, c in rig.cameras.items() if isinstance(c, Camera)}
     count = len(rig.names)
     if len(sizes) < max(count, 2):
-        raise ValueError(
-            f"{folder}: has {len(sizes)} calibrated cameras of {count}: all must be, two at least"
-        )
+        raise ValueError(f"{folder}: {len(sizes)} of {count} cameras are calibrated: all must be, and two")
     names = [name for name, size in sizes.items() if size[0] >= hw[0] and size[1] >= hw[1]]
     if not names:
         listed = ", ".join(f"{name} {w}x{h}" for name, (h, w) in sizes.items())
-        raise ValueError(
-            f"{folder}: no image is as large as the samples, {hw[1]}x{hw[0]} ({listed}): lower `hw`"
-        )
+        raise ValueError(f"{folder}: no image is as large as samples, {hw[1]}x{hw[0]} ({listed}): lower `hw`")
     return names
 
 

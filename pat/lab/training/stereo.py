@@ -83,9 +83,7 @@ class MeasuredPairs(Crops):
             raise ValueError(f"{pair.left} is grey: pairs to train on must be in colour")
         h, w = self.hw
         if left[0] < h or left[1] < w:
-            raise ValueError(
-                f"{pair.left} is {_described(left)}, smaller than the samples, {w}x{h}: lower `hw`"
-            )
+            raise ValueError(f"{pair.left} is {_described(left)}, less than samples of {w}x{h}: lower `hw`")
         disparity_files(pair)
 
     def read(self, pair: PairFiles) -> Pictures:
@@ -158,9 +156,7 @@ def disparity_files(pair: PairFiles) -> tuple[Path, Path]:
         left, right = (pair.left.with_name(name) for name in names)
         if left.is_file() and right.is_file():
             return left, right
-    raise ValueError(
-        f"{pair.left.parent}: wanted the true disparity of both images beside them, disp1.png and disp5.png"
-    )
+    raise ValueError(f"{pair.left.parent}: the true disparities are missing, disp1.png and disp5.png")
 
 
 def depth_of(disparity: Float[Tensor, "b h w"], width: int) -> Float[Tensor, "b h w"]:
@@ -222,9 +218,7 @@ def _header(file: Path) -> tuple[int, int, int]:
         with Image.open(file) as image:
             return image.height, image.width, 1 if image.mode[0] in "1LIF" else 3
     except (OSError, UnidentifiedImageError):
-        raise ValueError(
-            f"{file}: not an image that can be read: give a whole PNG, TIFF or JPEG file"
-        ) from None
+        raise ValueError(f"{file}: not an image that can be read: give a PNG, TIFF or JPEG") from None
 
 
 def _described(header: tuple[int, int, int]) -> str:

@@ -163,8 +163,7 @@ def _wide(camera: Camera, upright: Camera, name: str) -> Lens:
     if w * h > _MOST_PIXELS:
         raise ValueError(f"camera '{name}': its lens needs an image of {w}x{h} pixels: crop the camera")
     K = torch.tensor([[f, 0, -float(low[0])], [0, f, -float(low[1])], [0, 0, 1]], dtype=torch.float64)
-    x = map_homogeneous(K[:2], plane)
-    return Lens(upright.replace(K=K, hw=(h, w)), x, valid)
+    return Lens(upright.replace(K=K, hw=(h, w)), map_homogeneous(K[:2], plane), valid)
 
 
 def _finest(plane: Float[Tensor, "h w 2"], valid: Bool[Tensor, "h w"]) -> Float[Tensor, ""]:

@@ -272,10 +272,8 @@ def test_what_is_wrong_with_scenes(broken, tmp_path):
     said = partial(refused, RenderedCrops)
     (tmp_path / "empty").mkdir()
     assert "holds no rendered scene" in said(tmp_path / "empty")
-    assert "000000: no image is as large as the samples, 256x128 (mono 128x96, wide 112x80" in said(
-        broken, (128, 256)
-    )
-    assert "4 are too few to learn from some and to hold others out" in said(broken, choose=lambda i: i > 10)
+    assert "256x128 (mono 128x96, wide 112x80" in said(broken, (128, 256))
+    assert "4 are too few" in said(broken, choose=lambda i: i > 10)
     scene = broken / "scenes" / "000002"
     rig = Rig.load(scene / "rig.yaml")
     frames = Rendered(scene).about["frames"]
@@ -290,7 +288,7 @@ def test_what_is_wrong_with_scenes(broken, tmp_path):
     (scene / "render.json").unlink()
     assert "000002: is not a whole scene (no render.json)" in said(broken)
     rig.replace(cameras={"mono": rig["mono"]}).save(broken / "scenes" / "000000" / "rig.yaml")
-    assert "has 1 calibrated cameras of 1: all must be, two at least" in said(broken / "scenes" / "000000")
+    assert "1 of 1 cameras" in said(broken / "scenes" / "000000")
 
 
 # Stereo pairs ----------------------------------------------------------------------------------------------

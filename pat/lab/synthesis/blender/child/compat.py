@@ -24,9 +24,7 @@ def load() -> Any:
         raise ValueError(f"Blender's environment has no {error.name}: make it again") from None
     except ImportError as error:
         library = str(error).partition(":")[0]
-        raise ValueError(
-            f"Blender needs system libraries ({library} is missing): apt-get install -y {LIBRARIES}"
-        ) from None
+        raise ValueError(f"Blender needs {library} of the system: apt-get install -y {LIBRARIES}") from None
 
 
 def new_scene(bpy: Any) -> Any:
