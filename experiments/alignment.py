@@ -356,9 +356,7 @@ def alignment_markdown(rows: Sequence[AlignmentRow]) -> str:
     lines, pairs = [], [row for row in rows if "/" in row.scene]
     for name in dict.fromkeys(row.beta for row in pairs):
         mine = [row for row in pairs if row.beta == name]
-        means: dict[str, Any] = {
-            n: float(np.mean([getattr(row, n) for row in mine])) for n in (*SHARES, *MEDIANS)
-        }
+        means: dict[str, Any] = {n: np.mean([getattr(row, n) for row in mine]) for n in (*SHARES, *MEDIANS)}
         scene, off = f"{len(mine)} pairs", max(row.off for row in mine)
         lines.append(_line(mine[0]._replace(scene=scene, off=off, **means)))
     lines += [_line(row) for row in rows if row not in pairs]

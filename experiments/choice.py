@@ -80,9 +80,8 @@ class Kept(NamedTuple):
     def rows(self, top: int, count: int) -> Kept:
         """Some of all rows; the blurs are the same."""
         half = slice(top // FINE, (top + count) // FINE)
-        cut = {
-            n: getattr(self, n)[:, top : top + count] for n in ("alpha", "beta", "disparity", "truth", "seen")
-        }
+        names = ("alpha", "beta", "disparity", "truth", "seen")
+        cut = {n: getattr(self, n)[:, top : top + count] for n in names}
         return Kept(**cut, facts=self.facts[:, half], blurs=self.blurs)
 
     def upside_down(self) -> Kept:

@@ -41,9 +41,8 @@ def merged(frame: Frame, rig: Rig, images: Mapping[str, Float[Tensor, "_ _ _"]],
     weight = torch.where(noise.isfinite(), frame.confidence / noise, 0.0)
     measured_weight = torch.where(measured < WHITE, 1 / (measured + READ_NOISE), 0.0)
     total = weight + measured_weight
-    light = torch.where(
-        total > 0, (weight * predicted + measured_weight * measured) / total.clamp(min=1e-12), measured
-    )
+    mean = (weight * predicted + measured_weight * measured) / total.clamp(min=1e-12)
+    light = torch.where(total > 0, mean, measured)
     light = torch.where((measured >= WHITE) & noise.isfinite(), torch.maximum(predicted, measured), light)
     return frame._replace(image=frame.image + srgb_from_linear(light[None]) - images[alpha])
 

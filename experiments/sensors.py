@@ -297,9 +297,8 @@ def read_chains(value: Any, where: str = "sensors") -> dict[str, tuple[Step, ...
 
 def _step(entry: Any, where: str) -> Step:
     """One step of a chain. Raises ValueError naming the entry."""
-    name, options = (
-        next(iter(entry.items())) if isinstance(entry, Mapping) and len(entry) == 1 else (entry, {})
-    )
+    single = isinstance(entry, Mapping) and len(entry) == 1
+    name, options = next(iter(entry.items())) if single else (entry, {})
     if not isinstance(name, str):
         raise ValueError(f"{where}: is {entry!r}; wanted a step's name, or one name with its options")
     if name not in STEPS:

@@ -105,10 +105,7 @@ class Reliability(NamedTuple):
 
 
 def judged(
-    network: FusionNetwork,
-    pairs: Iterable[StereoPair],
-    conditions: Sequence[str],
-    choices: Sequence[Path],
+    network: FusionNetwork, pairs: Iterable[StereoPair], conditions: Sequence[str], choices: Sequence[Path]
 ) -> Iterator[Judged]:
     """Every pair with true disparity under every condition, fused as `fuse` does.
 

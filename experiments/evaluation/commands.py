@@ -182,16 +182,14 @@ class Certainty(Pairs):
         writable(self.out, folder=True)
         pairs = self.pairs()
         shown = progress("fusing")(pairs, len(pairs))
-        judged_pixels = with_truth(
+        judged = with_truth(
             list(certainty.judged(load_weights(self.network), shown, names, self.choices)), self.half
         )
         if self.fit:
-            write_tensors(self.fit, certainty.widened(judged_pixels).state_dict())
-            held = certainty.held(judged_pixels, certainty.by_thirds(judged_pixels))
+            write_tensors(self.fit, certainty.widened(judged).state_dict())
+            held = certainty.held(judged, certainty.by_thirds(judged))
         else:
-            held = certainty.held(
-                judged_pixels, lambda one: certainty.Stated.by(fitted_network(), one.numbers)
-            )
+            held = certainty.held(judged, lambda one: certainty.Stated.by(fitted_network(), one.numbers))
         certainty.save_reliability(held, self.out / "reliability.png")
         finished(self.out / "certainty.md", certainty.held_markdown(held), ", and reliability.png beside it")
 

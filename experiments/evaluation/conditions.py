@@ -239,11 +239,8 @@ def _row(
 ) -> ConditionRow:
     image, truth = result.image.clamp(0, 1), task.ground_truth
     error = (image - truth).square().mean(0)
-    psnr = {
-        n: -10 * math.log10(max(float(error[region].mean()), 1e-12))
-        for n, region in regions.items()
-        if region.any()
-    }
+    means = {n: float(error[region].mean()) for n, region in regions.items() if region.any()}
+    psnr = {n: -10 * math.log10(max(mean, 1e-12)) for n, mean in means.items()}
     depth = depth_errors(result.disparity, task.disparity, regions)
     return ConditionRow(pair, condition, method, score(image, truth).ssim, psnr, *depth)
 
@@ -313,9 +310,8 @@ def _depth(rows: Sequence[ConditionRow]) -> str:
         name = "OpenCV's SGBM" if method == "classical" else method
         rate = f"x{CONDITIONS[condition].rate}"
         lines.append([rate, name, f"{np.mean(errors):.2f} px", *(f"{share:.1f} %" for share in shares)])
-    return markdown_table(
-        ["beta", "", "end-point error", "within 1 px, of all", "of those that beta sees"], lines
-    )
+    columns = ["beta", "", "end-point error", "within 1 px, of all", "of those that beta sees"]
+    return markdown_table(columns, lines)
 
 
 Curves = Mapping[str, list[tuple[float, float]]]
@@ -344,9 +340,7 @@ def save_condition_curves(rows: Sequence[ConditionRow], path: Path) -> None:
         "electrons at white": {50: "50 electrons", 200: "200 electrons", 1000: "1000 electrons"},
         "rows off (px)": {0: "ideal", 1: "rows off 1 px", 3: "rows off 3 px"},
     }
-    plots = {
-        title: _curve(rows, points) for title, points in axes.items() if set(points.values()) <= conditions
-    }
+    plots = {title: _curve(rows, named) for title, named in axes.items() if set(named.values()) <= conditions}
     if plots:
         save_curves(plots, path, ylabel="PSNR (dB)")
 

@@ -44,9 +44,8 @@ def moved(rig: Rig, changes: dict[str, Tensor]) -> Rig:
     camera, steps = rig.cameras[BETA], dict[str, Tensor]()
     assert isinstance(camera, Camera)
     if "k1" in changes and camera.distortion is None:
-        rig = rig.with_camera(
-            BETA, camera.replace(distortion=Distortion("brown-conrady", camera.t.new_zeros(4)))
-        )
+        lens = Distortion("brown-conrady", camera.t.new_zeros(4))
+        rig = rig.with_camera(BETA, camera.replace(distortion=lens))
     sizes = {"translation": camera.t.norm(), "focal": camera.K[0, 0]}
     lengths = {"rotation": 3, "translation": 3, "focal": 2, "distortion": 4}
     for name, value in changes.items():
@@ -126,9 +125,8 @@ def gradient_rows(
             step = 10 * STEP if name == "k1" else STEP
             ends = (errors(network, name, by.detach() + by_step) for by_step in (step, -step))
             for region, slope, after, before in zip(masks, slopes, *ends):
-                rows.append(
-                    GradientRow(title, name, region, float(slope), float(after - before) / (2 * step))
-                )
+                difference = float(after - before) / (2 * step)
+                rows.append(GradientRow(title, name, region, float(slope), difference))
     return rows
 
 
@@ -198,9 +196,8 @@ def gradients_markdown(rows: Sequence[GradientRow]) -> str:
             f"{row.gradient:.3g} | {row.difference:.3g} | {100 * row.off:.1f} %" for row in mine.values()
         )
         lines.append([network, parameter, *" | ".join(cells).split(" | ")])
-    columns = [
-        f"{region}, {part}" for region in ("interior", "border") for part in ("gradient", "difference", "off")
-    ]
+    parts = ("gradient", "difference", "off")
+    columns = [f"{region}, {part}" for region in ("interior", "border") for part in parts]
     return markdown_table(["network", "parameter", *columns], lines)
 
 

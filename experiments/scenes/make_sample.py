@@ -48,9 +48,8 @@ def main(out: Path = SAMPLE, seed: int = 2, samples: int = 64) -> None:
     settings = RenderSettings(samples=samples, denoise="accurate", fast_light=False, bounces=4)
     with TemporaryDirectory() as folder:
         rendered = render(still_life(seed, rig), rig, Path(folder) / "scene", settings=settings)
-        ground_truth, beta_image = (
-            srgb_from_linear(rendered.frame(name).rgb[None]).clamp(0, 1) for name in (ALPHA, BETA)
-        )
+        lights = (rendered.frame(name).rgb[None] for name in (ALPHA, BETA))
+        ground_truth, beta_image = (srgb_from_linear(light).clamp(0, 1) for light in lights)
     mono = record(luminance(ground_truth), [Noise(8000, 3), Clip(), Quantise(8)], generator)
     colour = record(beta_image, [Noise(4000, 3), Clip(), Quantise(8)], generator)
     out.mkdir(parents=True, exist_ok=True)

@@ -52,12 +52,9 @@ def _under_the_table() -> Iterator[Object]:
         knob = (x + (0.22 if i % 2 == 0 else -0.22), 0.42, SHELF - 0.03)
         yield ball(f"knob{i}", knob, (0.03, 0.03, 0.03), BRASS)
     top = -1.145
-    yield box(
-        "carton", (-0.75, top - 0.13, SHELF + 0.15), (0.42, 0.26, 0.26), plain(0.36, 0.24, 0.13, grain=0.1)
-    )
-    yield box(
-        "case", (0.1, top - 0.07, SHELF + 0.15), (0.5, 0.14, 0.24), plain(0.05, 0.12, 0.11, grain=0.1), yaw=4
-    )
+    card, leather = plain(0.36, 0.24, 0.13, grain=0.1), plain(0.05, 0.12, 0.11, grain=0.1)
+    yield box("carton", (-0.75, top - 0.13, SHELF + 0.15), (0.42, 0.26, 0.26), card)
+    yield box("case", (0.1, top - 0.07, SHELF + 0.15), (0.5, 0.14, 0.24), leather, yaw=4)
     urn = profile(50, 340, 60, 340, 50, 300, 120, 220, 130, 140, 70, 0, 0, 0)
     yield lathed("urn", (0.82, top, SHELF + 0.15), urn, plain(0.50, 0.20, 0.08, roughness=0.3))
 
@@ -92,9 +89,8 @@ def _floor_lamp() -> Iterator[Object]:
 def _pictures() -> Iterator[Object]:
     sea = ((0.03, 0.10, 0.22), (0.55, 0.60, 0.62), (0.20, 0.33, 0.40), (0.62, 0.42, 0.22))
     field = ((0.45, 0.33, 0.06), (0.10, 0.20, 0.05), (0.55, 0.48, 0.35), (0.30, 0.07, 0.04))
-    for i, (x, y, w, h, paints) in enumerate(
-        ((-2.2, -1.15, 0.95, 0.7, sea), (-1.55, -0.75, 0.4, 0.5, field))
-    ):
+    pictures = (-2.2, -1.15, 0.95, 0.7, sea), (-1.55, -0.75, 0.4, 0.5, field)
+    for i, (x, y, w, h, paints) in enumerate(pictures):
         yield box(f"frame{i}", (x, y, WALL - 0.01), (w, h, 0.03), WALNUT)
         yield box(f"mount{i}", (x, y, WALL - 0.013), (w - 0.07, h - 0.07, 0.03), _WHITE)
         colours = tuple(paint(*rgb) for rgb in paints)
@@ -115,7 +111,6 @@ def _window() -> Iterator[Object]:
     for side in (-1, 1):
         for i in range(5):
             fold = profile(55, 2300, 55, 0, 0, 0)
-            yield lathed(
-                f"curtain{side}{i}", (side * (0.56 + 0.085 * i), 1.6, -0.09 - 0.02 * (i % 2)), fold, linen
-            )
+            foot = (side * (0.56 + 0.085 * i), 1.6, -0.09 - 0.02 * (i % 2))
+            yield lathed(f"curtain{side}{i}", foot, fold, linen)
     yield box("rail", (0, -0.72, -0.1), (2.1, 0.025, 0.025), BRASS)

@@ -138,18 +138,15 @@ def _book(rng: Generator, name: str, x: float, floor: float, wh: tuple[float, fl
     width, height = wh
     z = SHELF + 0.05 + float(rng.uniform(0, 0.03)) + 0.09
     colour = tuple(float(c * rng.uniform(0.7, 1.3)) for c in _CLOTHBOUND[int(rng.integers(len(_CLOTHBOUND)))])
-    yield box(
-        name, (x, floor - height / 2, z), (width, height, 0.18), plain(*colour, roughness=0.6, grain=0.15)
-    )
+    cover = plain(*colour, roughness=0.6, grain=0.15)
+    yield box(name, (x, floor - height / 2, z), (width, height, 0.18), cover)
     bright = sum(colour) > 0.6
     label = plain(*((0.08, 0.05, 0.04) if bright else (0.62, 0.47, 0.20)), roughness=0.4)
-    for fraction in sorted(
-        rng.choice([0.12, 0.2, 0.35, 0.6, 0.8, 0.88], int(rng.integers(1, 4)), replace=False)
-    ):
+    places = rng.choice([0.12, 0.2, 0.35, 0.6, 0.8, 0.88], int(rng.integers(1, 4)), replace=False)
+    for fraction in sorted(places):
         position = (x, floor - height * (1 - float(fraction)), z - 0.0005)
-        yield box(
-            f"{name}.{fraction}", position, (width * 0.99, float(rng.uniform(0.004, 0.022)), 0.18), label
-        )
+        extent = (width * 0.99, float(rng.uniform(0.004, 0.022)), 0.18)
+        yield box(f"{name}.{fraction}", position, extent, label)
 
 
 def _plant(rng: Generator) -> Iterator[Object]:
@@ -175,14 +172,12 @@ def _plant(rng: Generator) -> Iterator[Object]:
 
 def _pottery() -> Iterator[Object]:
     glaze = {"roughness": 0.12, "specular": 0.6}
-    blue, white, red = (
-        plain(*c, **glaze) for c in ((0.02, 0.09, 0.33), (0.72, 0.70, 0.64), (0.45, 0.03, 0.02))
-    )
+    colours = (0.02, 0.09, 0.33), (0.72, 0.70, 0.64), (0.45, 0.03, 0.02)
+    blue, white, red = (plain(*colour, **glaze) for colour in colours)
     vase = profile(22, 330, 30, 335, 32, 330, 24, 300, 24, 260, 75, 190, 85, 130)
     yield lathed("vase", (-0.24, 0, 0.52), [*vase, *profile(50, 20, 50, 0, 0, 0)], blue)
-    bands = Texture(
-        kind="wave", paints=(paint(0.72, 0.66, 0.5), paint(0.5, 0.2, 0.07)), scale=60.0, distortion=0.6
-    )
+    clays = (paint(0.72, 0.66, 0.5), paint(0.5, 0.2, 0.07))
+    bands = Texture(kind="wave", paints=clays, scale=60.0, distortion=0.6)
     jar = profile(0, 235, 16, 235, 20, 220, 12, 205, 60, 190, 66, 180, 66, 170)
     jar += profile(90, 150, 100, 90, 70, 5, 70, 0, 0, 0)
     yield lathed("jar", (0.26, 0, 0.6), jar, Material(texture=bands, roughness=0.25, specular=0.5))
@@ -233,16 +228,10 @@ def _throw(duration: float) -> list[tuple[float, Vec3]]:
 
 
 def _lamp() -> Iterator[Object]:
-    shade = Material(
-        texture=Texture(paints=(paint(0.85, 0.62, 0.36),)), roughness=0.9, specular=0.1, emission=0.62
-    )
+    linen = Texture(paints=(paint(0.85, 0.62, 0.36),))
+    shade = Material(texture=linen, roughness=0.9, specular=0.1, emission=0.62)
     bulb = Material(texture=Texture(paints=(Paint(LAMPLIGHT, 1.0),)), emission=BULB)
     x, z = 0.62, 0.42
-    yield lathed(
-        "lamp",
-        (x, 0, z),
-        profile(0, 300, 8, 300, 8, 30, 30, 20, 80, 12, 80, 0),
-        BRASS,
-    )
+    yield lathed("lamp", (x, 0, z), profile(0, 300, 8, 300, 8, 30, 30, 20, 80, 12, 80, 0), BRASS)
     yield lathed("shade", (x, -0.33, z), profile(72, 200, 74, 200, 140, 2, 142, 0, 138, 2), shade)
     yield ball("bulb", (x, -0.36, z), (0.05, 0.06, 0.05), bulb)

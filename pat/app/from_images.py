@@ -233,9 +233,7 @@ def camera_names(paths: Sequence[Path]) -> dict[str, Path]:
     return {f"camera{i}": path for i, path in enumerate(paths, 1)}
 
 
-def frames_of_videos(
-    videos: Mapping[str, Path], folder: Path
-) -> tuple[dict[str, list[Path]], dict[str, float]]:
+def video_frames(videos: Mapping[str, Path], folder: Path) -> tuple[dict[str, list[Path]], dict[str, float]]:
     """Write the frames of videos as image files into a folder.
 
     Files get their video's modification time, by which a resumed job recognises them.
@@ -418,9 +416,7 @@ def found_rig(
     known = lengths.keys() & {alpha, *betas}
     observed = {} if known else _observed_focal_lengths(uncalibrated, alpha, with_lines)
     for name, (length, deviation) in observed.items():
-        note(
-            f"{name}: focal length {length / factors[name]:.0f} pixels +- {deviation:.0%}, by matched points"
-        )
+        note(f"{name}: focal length {length / factors[name]:.0f} px +- {deviation:.0%}, by matched points")
     lengths |= {name: length for name, (length, _) in observed.items()}
     rig = _calibrated(uncalibrated, reduced, alpha, betas, lengths, bands, note, by_pair is None)
     if rig.name == UNSCALED and known != {alpha, *betas}:
@@ -440,9 +436,8 @@ def _observed_focal_lengths(
     for name in betas:
         LOG.info("looking for the focal length of %s and %s", alpha, name)
         views = {n: uncalibrated.rig[n] for n in (alpha, name)}
-        fits.append(
-            common_focal_length(views, uncalibrated.rig.links[alpha, name], uncalibrated.matches[alpha, name])
-        )
+        link, matches = uncalibrated.rig.links[alpha, name], uncalibrated.matches[alpha, name]
+        fits.append(common_focal_length(views, link, matches))
     best = min((fit for fit in fits if fit is not None), key=lambda fit: fit.deviation, default=None)
     if best is None:
         return {}
@@ -600,9 +595,7 @@ def _chosen_alpha(images: Images, alpha: str | None, note: Say) -> str:
         why = "the only grey image"
     elif sum(images[name].shape[-2:] == (h, w) for name in grey or images) > 1:
         why = "the first of images of one size"
-    note(
-        f"alpha, whose view and detail the result has: {chosen} ({w}x{h}, {why}; --alpha NAME takes another)"
-    )
+    note(f"alpha, whose view and detail the result has: {chosen} ({w}x{h}, {why}; --alpha takes another)")
     return chosen
 
 

@@ -167,9 +167,8 @@ def _attend(*given: Any, measured: bool) -> tuple[Tensor, ...]:
             faded = seen.clamp(min=LEAST_VISIBLE).log()
             bias = faded if bias is None else bias + faded
             v = v * _visibility(pixel_grid((k.shape[2], k.shape[3])).to(v), (k.shape[2], k.shape[3]), border)
-        attended = _run(
-            AttentionInputs(q, k, v, form, _bias(bias, q, form.samples), nearest), backend, measured
-        )
+        inputs = AttentionInputs(q, k, v, form, _bias(bias, q, form.samples), nearest)
+        attended = _run(inputs, backend, measured)
         return attended if measured else attended[:1]
 
     if not callable(locations):
@@ -315,9 +314,8 @@ def _missing(*tensors: Tensor | None) -> str:
     if torch.compiler.is_compiling():
         return ""
     under_way = transformations()
-    if "Jvp" in under_way or any(
-        t is not None and forward_ad.unpack_dual(t).tangent is not None for t in tensors
-    ):
+    tangents = (forward_ad.unpack_dual(t).tangent for t in tensors if t is not None)
+    if "Jvp" in under_way or any(tangent is not None for tangent in tangents):
         return "forward mode"
     return "gradients by torch.func (by torch.autograd it has)" if "Grad" in under_way else ""
 

@@ -143,7 +143,7 @@ def backward(
     upstream = _flat(channels_last(cotangents[0].to(counted)))
     measured = saved[0], cotangents[1].to(counted).contiguous()
     statistics, statistics_upstream = (t if t.numel() else t.new_zeros(4) for t in measured)
-    forward_results = kernels.Saved(
+    results = kernels.Saved(
         statistics=_flat(statistics),
         logsum=_flat(saved[1]),
         value_upstream=upstream,
@@ -169,9 +169,7 @@ def backward(
     for first in range(0, b * ha * wa, step):
         last, here = min(first + step, b * ha * wa), taps._replace(first=first)
         shares = _shares(first, last, call)
-        in_parallel(
-            [partial(kernels.backward, call, forward_results, share, here, gradients) for share in shares]
-        )
+        in_parallel([partial(kernels.backward, call, results, share, here, gradients) for share in shares])
         for_keys = _channel_tasks(here, here.key_weight, last, call.query, d, key_out)
         for_values = _channel_tasks(here, here.value_weight, last, upstream, call.value_channels, value_out)
         in_parallel([*for_keys, *for_values])

@@ -157,9 +157,7 @@ class Ablate:
 
         if self.scenes < 1:
             raise ValueError(f"--scenes: {self.scenes}: give at least 1")
-        layered = [
-            name for name in ("photos", "scenes", "hw") if getattr(self, name) != getattr(Ablate, name)
-        ]
+        layered = [n for n in ("photos", "scenes", "hw") if getattr(self, n) != getattr(Ablate, n)]
         if self.rendered is not None and layered:
             raise ValueError(f"--{', --'.join(layered)}: of layered scenes: leave out with --rendered")
         writable(self.out, folder=True)

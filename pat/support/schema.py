@@ -10,6 +10,7 @@ import math
 import types
 import typing
 from collections.abc import Iterable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -25,17 +26,14 @@ def to_document(value: Any, *, defaults: bool = False) -> Any:
     Returns:
         The document, ready for YAML or JSON.
     """
+    plain = partial(to_document, defaults=defaults)
     if dataclasses.is_dataclass(value):
         entries = {f: getattr(value, f.name) for f in dataclasses.fields(value)}
-        return {
-            f.name: to_document(v, defaults=defaults)
-            for f, v in entries.items()
-            if defaults or v != _default(f)
-        }
+        return {f.name: plain(v) for f, v in entries.items() if defaults or v != _default(f)}
     if isinstance(value, tuple | list):
-        return [to_document(v, defaults=defaults) for v in value]
+        return [plain(v) for v in value]
     if isinstance(value, dict):
-        return {k: to_document(v, defaults=defaults) for k, v in value.items()}
+        return {k: plain(v) for k, v in value.items()}
     return str(value) if isinstance(value, Path) else value
 
 

@@ -53,7 +53,7 @@ class Fuse(Around, Fusing):
     """Folder for fused.png, confidence.png, depth.tif, depth_16.png (16 bits; 0 is unknown), depth.png,
     depth_nearest.tif and depth_farthest.tif (the true depth is between them in 9 of 10 pixels; not by
     assumed focal lengths), index.html (a page that shows them) and view.yaml (the rig of the fused view)."""
-    exposure: Annotated[Literal["auto", "keep"] | None, Option("{auto,keep}")] = None
+    exposure: Literal["auto", "keep"] | None = None
     """Brightness of the fused image: auto makes a dark or overexposed one as bright as a photograph; keep
     leaves it as alpha has it. By default auto without a rig, else keep."""
     extras: Annotated[str, Option("NAME[,NAME]")] = "page"
@@ -232,12 +232,7 @@ def no_depth(rig: Rig, alpha: str) -> str:
 
 
 def fuse_with_progress(
-    weights: str,
-    rig: Rig,
-    images: Mapping[str, Tensor],
-    *,
-    device: str = "cpu",
-    **further: Any,
+    weights: str, rig: Rig, images: Mapping[str, Tensor], *, device: str = "cpu", **further: Any
 ) -> Frame:
     """Fuse with weights by name, showing the plan and a bar on the terminal.
 

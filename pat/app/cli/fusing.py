@@ -167,7 +167,7 @@ class Fusing(Known):
         """Images with the rig found from the first ones; frames of videos go to a folder."""
         from ...support.locks import folder_lock
         from ..batch import find_images
-        from ..from_images import camera_names, frames_of_videos
+        from ..from_images import camera_names, video_frames
 
         if self.depth:
             raise UsageError("--depth", "a rig: give one with --rig RIG")
@@ -187,7 +187,7 @@ class Fusing(Known):
         if videos:
             if not self.takes_videos:
                 raise UsageError(f"{videos[0]}", "images; `pat sequence` takes videos")
-            files, rates = frames_of_videos(cameras, folder)
+            files, rates = video_frames(cameras, folder)
         else:
             files = {name: find_images(path) for name, path in cameras.items()}
             refuse_same(files)

@@ -344,14 +344,12 @@ def _around_matches(
         if alpha not in names:
             continue
         (a, b) = (names, points) if names[0] == alpha else (names[::-1], points[::-1])
-        alpha_view, beta_view = rig[a[0]], rig[a[1]]
-        assert isinstance(alpha_view, LensView)
+        view, beta_view = rig[a[0]], rig[a[1]]
+        assert isinstance(view, LensView)
         assert isinstance(beta_view, LensView)
         if rig.pair(*a).calibrated:
             _check_matches(path, a, rig.pair(*a), *b)
-        fields[a[1]] = AroundMatches.from_points(
-            *b, alpha_view.hw, views=(alpha_view, beta_view), field=field
-        )
+        fields[a[1]] = AroundMatches.from_points(*b, view.hw, views=(view, beta_view), field=field)
     return fields
 
 

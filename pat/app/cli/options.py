@@ -10,7 +10,7 @@ import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from tempfile import TemporaryFile
 from threading import Lock
@@ -35,10 +35,7 @@ WEIGHT_NAMES = tuple(sorted(path.stem for path in SHIPPED.glob("*.safetensors"))
 
 FIELD_NAMES = ("epipolar", "line", "homography", "rectified", "nearest", "local", "dense", "curved")
 """Keys of `arraygeom.fields.FIELDS`, whose import takes torch."""
-FIELD_HELP = (
-    f"Receptive field in the other cameras: {', '.join(FIELD_NAMES)}, or MODULE:OBJECT for your own; "
-)
-FIELD_HELP += "auto takes what the rig allows."
+FIELD_HELP = f"Receptive field: auto (as the rig allows), {', '.join(FIELD_NAMES)}, or MODULE:OBJECT."
 FieldName = Annotated[str, Option("NAME", FIELD_HELP)]
 
 
@@ -146,9 +143,8 @@ def writable(out: Path, *, folder: bool = False, option: str = "--out") -> Path:
         ValueError: for a folder where a file is wanted, a file in the way, or no permission.
     """
     if out.exists() and out.is_dir() != folder:
-        raise ValueError(
-            f"{option}: {out} is a {'folder: name a file in it' if out.is_dir() else 'file: name a folder'}"
-        )
+        kind = "folder: name a file in it" if out.is_dir() else "file: name a folder"
+        raise ValueError(f"{option}: {out} is a {kind}")
     above = out if out.exists() else next(p for p in out.absolute().parents if p.exists())
     if above != out and not above.is_dir():
         raise ValueError(f"{option}: {above} is a file, so {out} cannot be made: give another path")
@@ -424,11 +420,9 @@ def working(title: str) -> Iterator[Callable[[str], None]]:
 
     from ...support.steps import steps_shown
 
-    title_column, step_column = (
-        TextColumn(text, markup=False) for text in ("{task.description}", "{task.fields[step]}")
-    )
+    text = partial(TextColumn, markup=False)
     title = printable(title)
-    columns = SpinnerColumn(), title_column, TimeElapsedColumn(), step_column
+    columns = SpinnerColumn(), text("{task.description}"), TimeElapsedColumn(), text("{task.fields[step]}")
     terminal, printed = console().is_terminal, time.monotonic()
     with Progress(*columns, console=console(), transient=True, disable=not terminal) as bar:
         task = bar.add_task(title, total=None, step="")

@@ -75,9 +75,8 @@ class _Parser(argparse.ArgumentParser):
         option, _, said = message.removeprefix("argument ").partition(": ")
         if option.startswith("the following"):
             option = said.partition(", ")[0]
-            raise UsageError(
-                option, "a value", text=f"is needed: {(self._entry(option).help or '').rstrip('.')}"
-            )
+            text = f"is needed: {(self._entry(option).help or '').rstrip('.')}"
+            raise UsageError(option, "a value", text=text)
         if re.match(r"expected .* arguments?$", said):
             said = words_of(self._entry(option).metavar)
         raise UsageError(option, said.removeprefix("expected "))

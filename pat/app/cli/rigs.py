@@ -13,18 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from . import options
 from .known import MatchesFile
-from .options import (
-    Depth,
-    FieldName,
-    Images,
-    MaybeOut,
-    Name,
-    Numbers,
-    Out,
-    RigFile,
-    load_rig,
-    say,
-)
+from .options import Depth, FieldName, Images, MaybeOut, Name, Numbers, Out, RigFile, load_rig, say
 from .parser import Option
 
 if TYPE_CHECKING:
@@ -560,9 +549,7 @@ class RigDiff:
             raise ValueError("--depth: neither rig states a depth range: give NEAR FAR, metres")
         near, far = (float(bound) for bound in depth)
         beside = [path.with_suffix(".covariance.json") for path in (self.first, self.second)]
-        covariances = [
-            RigCovariance.load(path, rig) if path.is_file() else None for path, rig in zip(beside, (a, b))
-        ]
+        covariances = [RigCovariance.load(p, rig) if p.is_file() else None for p, rig in zip(beside, (a, b))]
         difference = rig_difference(a, b, covariances=(covariances[0], covariances[1]), depth=(near, far))
         for path, covariance in zip(beside, covariances):
             if covariance is None and any(covariances):

@@ -221,9 +221,8 @@ def rig_from_alpha(rig: Rig) -> RigBatch:
     if rig.depth is None:
         raise ValueError("the rig has no depth range: add `depth: [near, far]` in metres to its file")
     near, far = (float(d) for d in rig.depth)
-    far = min(far, FARTHEST * near)
+
     cameras = [c.to(torch.float64) for c in rig.cameras.values() if isinstance(c, Camera)]
     relative = [stack([in_frame_of(cameras[0], c)]) for c in cameras]
-    return RigBatch(
-        relative, torch.tensor([near], dtype=torch.float64), torch.tensor([far], dtype=torch.float64)
-    )
+    bounds = (torch.tensor([d], dtype=torch.float64) for d in (near, min(far, FARTHEST * near)))
+    return RigBatch(relative, *bounds)

@@ -66,9 +66,8 @@ def check_views(
     for name in sorted({a for a, _ in together}):
         overlap = max(pairs[f"{a} > {b}"]["visible"] for a, b in together if a == name)
         if overlap < limits.overlap:
-            reasons.append(
-                f"{name}: the other cameras see {overlap:.0%} of what it sees (at least {limits.overlap:.0%})"
-            )
+            least = f"at least {limits.overlap:.0%}"
+            reasons.append(f"{name}: the other cameras see {overlap:.0%} of what it sees ({least})")
     return {"accepted": not reasons, "reasons": reasons, "views": views, "pairs": pairs}
 
 

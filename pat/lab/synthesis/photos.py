@@ -124,9 +124,7 @@ class PhotoBank:
         low = self._bilinear(index, half_pixel * scale - 0.5)
         return torch.lerp(low, self._bilinear(index + 1, half_pixel * (0.5 * scale) - 0.5), weight)
 
-    def window(
-        self, texture: int, level: int, xy: tuple[int, int], side: int
-    ) -> Float[Tensor, "3 side side"]:
+    def window(self, texture: int, level: int, xy: tuple[int, int], side: int) -> Float[Tensor, "3 n n"]:
         """Cut a square from one level of a texture, mirrored beyond its sides.
 
         Args:

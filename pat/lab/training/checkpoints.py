@@ -154,18 +154,15 @@ def read_checkpoint(path: Path) -> Checkpoint | None:
 
 
 def _are_facts(facts: object) -> bool:
-    if not isinstance(facts, dict) or not all(
-        type(facts.get(name)) in kinds for name, kinds in FACTS.items()
-    ):
+    if not isinstance(facts, dict) or any(type(facts.get(n)) not in kinds for n, kinds in FACTS.items()):
         return False
     return facts["step"] >= 0 and 0 <= facts["minutes"] < LONGEST and not math.isnan(facts["best"])
 
 
 def _files(folder: Path) -> list[Path]:
     """Checkpoint files, newest first."""
-    return sorted(
-        (p for p in folder.glob("step-*.safetensors") if re.fullmatch(r"step-\d+", p.stem)), reverse=True
-    )
+    files = [p for p in folder.glob("step-*.safetensors") if re.fullmatch(r"step-\d+", p.stem)]
+    return sorted(files, reverse=True)
 
 
 def _no_room(folder: Path, step: int, tensors: Mapping[str, Tensor], error: Exception) -> str:

@@ -50,9 +50,7 @@ def through_lenses(
         for p, pinhole, lens in zip(images.cpu(), pinholes, lenses)
     ]
     captured = recorded(torch.cat(distorted).clamp(0, 1).to(images.device)).cpu()
-    back = [
-        resampled(p, lens, pinhole, extended=True) for p, lens, pinhole in zip(captured, lenses, pinholes)
-    ]
+    back = [resampled(p, lens, view, extended=True) for p, lens, view in zip(captured, lenses, pinholes)]
     values, valid = (torch.cat(parts) for parts in zip(*back))
     return Sampled(values.clamp(min=0).to(images), valid.to(images.device))
 

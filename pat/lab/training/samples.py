@@ -402,10 +402,8 @@ def perturbed(pair: Pair, pixels: float, g: Generator) -> Pair:
     alpha, beta = pair.cameras
     drawn = torch.randn(len(beta.K), 3, generator=g, dtype=torch.float64).to(beta.K)
     rotation = rotation_from_vector(drawn * pixels / beta.K[:, :1, 0])
-    moved: Camera = beta.replace(
-        cam_from_world=Pose(rotation, torch.zeros_like(beta.t)) @ beta.cam_from_world
-    )
-    return Pair(alpha, moved, pair.depth)
+    turned = Pose(rotation, torch.zeros_like(beta.t)) @ beta.cam_from_world
+    return Pair(alpha, beta.replace(cam_from_world=turned), pair.depth)
 
 
 def transfer(pair: Pair, depth: Tensor, beta_depth: Tensor) -> tuple[Tensor, Tensor]:

@@ -119,9 +119,7 @@ class RenderedCrops(Crops):
         rigs = [scene_rig(folder) for folder in self.folders]
         self.names = [rig.names for rig in rigs]
         self.alphas = [large_enough(folder, rig, self.hw) for folder, rig in zip(self.folders, rigs)]
-        self._view = lru_cache(3 * ACTIVE)(
-            lambda scene, name: undistorted(read_view(self.folders[scene], name))
-        )
+        self._view = lru_cache(3 * ACTIVE)(lambda i, name: undistorted(read_view(self.folders[i], name)))
 
     def sample(self, batch: int, generator: Generator, *, number: int, betas: int = 1) -> ArrayBatch:
         """Draw windows from the scenes that are active for group `number`.
@@ -248,11 +246,8 @@ def beside(alpha: RenderedView, beta: RenderedView, size: HW, hw: HW, g: Generat
     depth = middle.new_tensor(1 / (share / near + (1 - share) / far))
     projected = beta.camera.project(alpha.camera.unproject(middle, depth))
     shift = DECENTRED * (2 * torch.rand(2, generator=g, dtype=torch.float64) - 1)
-    centre = (
-        projected.x
-        if bool(projected.valid)
-        else middle.new_tensor([beta.camera.hw[1] / 2, beta.camera.hw[0] / 2])
-    )
+    centre = middle.new_tensor([beta.camera.hw[1] / 2, beta.camera.hw[0] / 2])
+    centre = projected.x if bool(projected.valid) else centre
     x, y = (centre + shift * middle.new_tensor([wanted[1], wanted[0]])).tolist()
     top, left = (_inside(c - n / 2, n, whole) for c, n, whole in zip((y, x), wanted, beta.camera.hw))
     return finite_window(beta, top, left, wanted, size)
@@ -277,9 +272,8 @@ def finite_window(view: RenderedView, top: int, left: int, size: HW, hw: HW) -> 
     """
     cut = window(view, top, left, size, hw)
     rays, _ = cut.camera.rays(pixel_grid(hw, dtype=torch.float64))
-    return cut._replace(
-        depth=torch.where(cut.depth.isposinf(), (SKY / rays.norm(dim=-1)).to(cut.depth), cut.depth)
-    )
+    depth = torch.where(cut.depth.isposinf(), (SKY / rays.norm(dim=-1)).to(cut.depth), cut.depth)
+    return cut._replace(depth=depth)
 
 
 def bounds(depth: Float[Tensor, "b h w"]) -> Float[Tensor, "b 2"]:

@@ -201,9 +201,8 @@ def assumed_cameras(
     batch, _, h, w = images[0].shape
     K = intrinsics(float(w), (h, w)).expand(batch, 3, 3)
     t = torch.zeros(batch, 3, dtype=torch.float64)
-    alpha = Camera(
-        K=K, cam_from_world=Pose(torch.eye(3, dtype=torch.float64).expand(batch, 3, 3), t), hw=(h, w)
-    )
+    pose = Pose(torch.eye(3, dtype=torch.float64).expand(batch, 3, 3), t)
+    alpha = Camera(K=K, cam_from_world=pose, hw=(h, w))
     beta = alpha.replace(cam_from_world=Pose(alpha.R, torch.stack([-side, t[:, 1], t[:, 2]], -1)))
     betas = [beta.resize((p.shape[-2], p.shape[-1])) for p in images[1:]]
     cameras = [camera.to(device, torch.float32) for camera in (alpha, *betas)]

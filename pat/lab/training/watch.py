@@ -140,9 +140,8 @@ def _row(network: FusionNetwork, sample: Sample) -> Tensor:
 
 def _keep_lines(path: Path, step: int, step_of: Any, *, header: str = "") -> None:
     """Remove the lines of steps after `step`, and an incomplete last line."""
-    lines = (
-        path.read_text(encoding="utf-8").splitlines(keepends=True)[bool(header) :] if path.is_file() else []
-    )
+    text = path.read_text(encoding="utf-8") if path.is_file() else ""
+    lines = text.splitlines(keepends=True)[bool(header) :]
     earlier = [line for line in lines if line.endswith("\n") and step_of(line) <= step]
     write_text(path, header + "".join(earlier))
 

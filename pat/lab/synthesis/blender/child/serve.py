@@ -20,9 +20,7 @@ def serve() -> None:
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # Blender prints there, past Python
     threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
-    requests = (
-        json.loads(line, object_hook=lambda entries: SimpleNamespace(**entries)) for line in sys.stdin
-    )
+    requests = (json.loads(line, object_hook=lambda it: SimpleNamespace(**it)) for line in sys.stdin)
     for answer in _answers(requests):
         answers.write(json.dumps(answer) + "\n")
         answers.flush()
