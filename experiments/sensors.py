@@ -281,7 +281,7 @@ def read_chain(value: Any, where: str = "chain") -> tuple[Step, ...]:
     """The steps of a list as YAML has it. Raises ValueError naming the entry (`where`), the nearest name.
 
     >>> read_chain(["decode-srgb", {"noise": {"full_well": 8000, "read": 3}}, {"quantise": 12}])
-    (DecodeSRGB(), Noise(full_well=8000.0, read=3.0, counts='gaussian'), Quantise(bits=12))
+    (DecodeSRGB(), Noise(full_well=8000.0, read=3.0), Quantise(bits=12))
     """
     if not isinstance(value, list):
         raise ValueError(f"{where}: wanted a list of steps, as [decode-srgb, {{noise: {{full_well: 8000}}}}]")

@@ -27,19 +27,10 @@ from arraygeom import Rig, ThroughLenses, Widened
 from arraygeom.fields import FIELDS
 from arraygeom.io.native import read_text as rig_of_text
 from arraygeom.io.native import write as rig_text
+from arraygeom.runtime import together
 from arraygeom.runtime.atomic import write_text
 from arraygeom.runtime.safe_yaml import dump_yaml, load_yaml
 from arraygeom.runtime.threads import in_parallel
-from arraygeom.runtime.together import (
-    LISTS,
-    digest,
-    list_file,
-    read_about,
-    retire,
-    sweep,
-    write_listed,
-    write_together,
-)
 
 from ..fusion.checks import confidence_checked
 from ..fusion.frame import Frame
@@ -61,7 +52,7 @@ from ..support.memory import limited
 from ..support.tensor_files import read_tensors, write_tensors
 
 SETTINGS, VIDEO = "settings.yaml", "fused.mp4"
-KEYS, PLAN = f"{LISTS}/keys", "plan.json"
+KEYS, PLAN = f"{together.LISTS}/keys", "plan.json"
 
 PLAN_FORMAT = "pat-batch 1"
 _network = lru_cache(maxsize=2)(load_weights)
@@ -125,13 +116,13 @@ class Batch:
     @cached_property
     def dependencies(self) -> str:
         """Everything that the results depend on, as YAML text."""
-        digest = hashlib.sha256(find_weights(self.weights).read_bytes()).hexdigest()
+        stamp = hashlib.sha256(find_weights(self.weights).read_bytes()).hexdigest()
         entries = json.loads(self.to_json())
         files = entries.pop("files")
         for name in ("format", "out", "strict"):
             del entries[name]
         del entries["settings"]["max_memory"]
-        entries["weights"] = f"{self.weights} (SHA-256 {digest[:16]})"
+        entries["weights"] = f"{self.weights} (SHA-256 {stamp[:16]})"
         if self.sequence:
             entries["frames"] = {name: len(paths) for name, paths in files.items()}
         return dump_yaml(entries)
@@ -139,22 +130,22 @@ class Batch:
     @cached_property
     def _of_sequence(self) -> str:
         """Digest of settings and all images of a sequence; empty for independent frames."""
-        files = {name: list(map(digest, paths)) for name, paths in self.files.items()}
+        files = {name: list(map(together.digest, paths)) for name, paths in self.files.items()}
         return _digest([self.dependencies, files]) if self.sequence else ""
 
     def inputs(self, i: int) -> str:
         """Return a digest of the settings and the images that frame `i` depends on: all images in
         a sequence."""
-        own = {name: digest(files[i]) for name, files in self.files.items() if not self.sequence}
+        own = {name: together.digest(files[i]) for name, files in self.files.items() if not self.sequence}
         return self._of_sequence or _digest([self.dependencies, own])
 
     def list_file(self, i: int) -> Path:
         """Return the path of a frame's list of files, which exists once the frame is complete."""
-        return list_file(self.out, fused_group(self.names[i]))
+        return together.list_file(self.out, fused_group(self.names[i]))
 
     def _is_made(self, i: int) -> bool:
         """True if a frame is complete and made from these images and settings."""
-        about = read_about(self.out, fused_group(self.names[i]))
+        about = together.read_about(self.out, fused_group(self.names[i]))
         return about is not None and about.get("inputs") == self.inputs(i)
 
     def fused_file(self, i: int) -> Path:
@@ -209,7 +200,7 @@ class Batch:
             report = run_tasks(tasks, title="frames", **{**how, "resume": True})
             if video is not None and (report.made or report.kept):
                 made = [self.fused_file(i) for i in many if self.list_file(i).exists()]
-                with write_together(self.out, group=VIDEO, last=VIDEO) as folder:
+                with together.write_together(self.out, group=VIDEO, last=VIDEO) as folder:
                     write_video(folder / VIDEO, (read_image(p) for p in made), rate=video)
             if not report.failed:
                 shutil.rmtree(self.out / KEYS)
@@ -228,7 +219,7 @@ class Batch:
                 "give the same ones, or another --out"
             )
         vars(self).pop("_of_sequence", None)  # files may have changed since another run
-        sweep(self.out)
+        together.sweep(self.out)
         refuse_to_replace(self.out, self.names)
         same = [partial(self._is_made, i) for i in range(len(self.names))]
         made = in_parallel(same) if resume else [False] * len(same)
@@ -237,10 +228,10 @@ class Batch:
             shutil.rmtree(self.out / KEYS, ignore_errors=True)
         for name, kept in zip(self.names, made):
             if not kept:
-                retire(self.out, fused_group(name))
-        sweep(self.out / KEYS)
+                together.retire(self.out, fused_group(name))
+        together.sweep(self.out / KEYS)
         write_text(before, self._of_sequence)
-        write_listed(file, text)
+        together.write_listed(file, text)
         write_text(self.out / KEYS / PLAN, self.to_json())
 
     def to_json(self) -> str:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from . import options
 from .known import MatchesFile
-from .options import Depth, FieldName, Images, MaybeOut, Name, Numbers, Out, RigFile, load_rig, say
+from .options import Depth, FieldName, Images, MaybeOut, Name, Numbers, Out, RigFile, say
 from .parser import Option
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ class Show:
 
         options.writable(self.out, folder=True)
         refuse_others(self.out, ["rig.png", "fields.png", "matches.png"], group="show")
-        rig = load_rig(self.rig)
+        rig = options.load_rig(self.rig)
         alpha = rig.require(self.alpha or rig.names[0])
         images = options.read_images(rig, self.image)
         warn_of_misfit(rig, images)
@@ -168,7 +168,7 @@ class Explore:
 
         if self.save is not None:
             options.writable(self.save, option="--save")
-        rig = load_rig(self.rig)
+        rig = options.load_rig(self.rig)
         images = options.read_images(rig, self.image) if self.image else None
         if images:
             warn_of_misfit(rig, images)
@@ -223,7 +223,7 @@ class Info:
         from arraygeom.runtime.text import length_unit
         from arraygeom.summary import summarise_cameras, summarise_pairs
 
-        rig = load_rig(self.rig, self.depth)
+        rig = options.load_rig(self.rig, self.depth)
         if rig.name:
             say(rig.name)
         warn_of_oddities(rig)
@@ -363,7 +363,7 @@ class Doctor:
 
         if self.out is not None:
             options.writable(self.out)
-        rig = load_rig(self.rig)
+        rig = options.load_rig(self.rig)
         with options.working("matching features and trying mistakes"):
             images = options.read_images(rig, self.image, sized=False)
             diagnosis = diagnose(rig, images, given_matches(self.matches, self.image, images))
@@ -430,7 +430,7 @@ class Refine:
         from calib.images.refinement import refine
 
         options.writable(self.out)
-        rig = load_rig(self.rig)
+        rig = options.load_rig(self.rig)
         deviations = options.numbers_by_name(self.sigma, "--sigma")
         options.say_when_compiling()
         frames = options.read_frames(rig, self.image)
@@ -543,7 +543,7 @@ class RigDiff:
             figure_file(options.writable(self.out))
         if self.matches is not None and not self.image:
             raise ValueError("--matches needs --image: give the images of the cameras, NAME=FILE for each")
-        a, b = load_rig(self.first), load_rig(self.second)
+        a, b = options.load_rig(self.first), options.load_rig(self.second)
         depth = self.depth or (a.depth or b.depth)
         if depth is None:
             raise ValueError("--depth: neither rig states a depth range: give NEAR FAR, metres")

@@ -161,9 +161,7 @@ def _chosen(frame: RenderedFrame, most: int) -> tuple[Tensor, Tensor, Tensor]:
     return grid[finite][::step], frame.depth[finite][::step].double(), frame.index[finite][::step]
 
 
-def _compared(
-    here: RenderedFrame, x: Float[Tensor, "n 2"], there: RenderedFrame, target: Float[Tensor, "n 2"]
-) -> tuple[Tensor, Tensor]:
+def _compared(here: RenderedFrame, x: Tensor, there: RenderedFrame, target: Tensor) -> tuple[Tensor, Tensor]:
     """Median difference of colours, and the shift of one image against the other that explains most of it."""
     slopes = torch.cat(torch.gradient(here.rgb, dim=(-1, -2)))[None]
     mine, dx, dy = sample(torch.cat([here.rgb[None], slopes], 1).double(), x[None]).values[0].split(3)

@@ -19,15 +19,8 @@ from arraygeom.batching import stack
 from arraygeom.camera import Camera
 from arraygeom.pixels import HW, pixel_grid
 from arraygeom.rig import Rig
-from pat.lab.data.windows import (
-    RenderedView,
-    pinhole_of,
-    read_view,
-    scene_folders,
-    scene_rig,
-    undistorted,
-    window,
-)
+from pat.lab.data import windows
+from pat.lab.data.windows import RenderedView
 from pat.lab.synthesis.layered import ArrayBatch
 from pat.lab.synthesis.rigs import below, in_frame_of, one_of, scaled
 from pat.media.colour import srgb_image
@@ -114,12 +107,12 @@ class RenderedCrops(Crops):
     """
 
     def _find(self, roots: Sequence[Path], choose: Callable[[int], bool]) -> None:
-        folders = [folder for root in roots for folder in scene_folders(root)]
+        folders = [folder for root in roots for folder in windows.scene_folders(root)]
         self.folders = chosen(folders, choose, f"rendered scenes of {', '.join(map(str, roots))}")
-        rigs = [scene_rig(folder) for folder in self.folders]
+        rigs = [windows.scene_rig(folder) for folder in self.folders]
         self.names = [rig.names for rig in rigs]
         self.alphas = [large_enough(folder, rig, self.hw) for folder, rig in zip(self.folders, rigs)]
-        self._view = lru_cache(3 * ACTIVE)(lambda i, name: undistorted(read_view(self.folders[i], name)))
+        self._view = lru_cache(3 * ACTIVE)(self._read)
 
     def sample(self, batch: int, generator: Generator, *, number: int, betas: int = 1) -> ArrayBatch:
         """Draw windows from the scenes that are active for group `number`.
@@ -143,6 +136,9 @@ class RenderedCrops(Crops):
         with torch.no_grad():
             drawn = [self._windows(one_of(scenes, generator), sizes, generator) for _ in range(batch)]
         return batched(drawn, self.device)
+
+    def _read(self, scene: int, name: str) -> RenderedView:
+        return windows.undistorted(windows.read_view(self.folders[scene], name))
 
     def _windows(self, scene: int, sizes: list[HW], g: Generator) -> list[RenderedView]:
         """Alpha's window and one of each beta."""
@@ -213,7 +209,7 @@ def large_enough(folder: Path, rig: Rig, hw: HW) -> list[str]:
     Raises:
         ValueError: if none is large enough, a camera is not calibrated, or there is only one.
     """
-    sizes = {name: pinhole_of(c).hw for name, c in rig.cameras.items() if isinstance(c, Camera)}
+    sizes = {name: windows.pinhole_of(c).hw for name, c in rig.cameras.items() if isinstance(c, Camera)}
     count = len(rig.names)
     if len(sizes) < max(count, 2):
         raise ValueError(f"{folder}: {len(sizes)} of {count} cameras are calibrated: all must be, and two")
@@ -270,7 +266,7 @@ def finite_window(view: RenderedView, top: int, left: int, size: HW, hw: HW) -> 
     Returns:
         The window, with its camera.
     """
-    cut = window(view, top, left, size, hw)
+    cut = windows.window(view, top, left, size, hw)
     rays, _ = cut.camera.rays(pixel_grid(hw, dtype=torch.float64))
     depth = torch.where(cut.depth.isposinf(), (SKY / rays.norm(dim=-1)).to(cut.depth), cut.depth)
     return cut._replace(depth=depth)
