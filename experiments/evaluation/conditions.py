@@ -222,27 +222,22 @@ def evaluate_conditions(
             regions = regions_of(task)
             if condition == CONDITIONS["ideal"]:
                 bound = StereoResult(chroma_bound(task, condition.rate))
-                rows.append(_row(pair.name, name, "bound of beta's resolution", bound, task, regions))
+                rows.append(_row((pair.name, name, "bound of beta's resolution"), bound, task, regions))
             for method, run in methods_of(network, condition.noise).items():
                 result = run(task.alpha, task.beta, PAPER_DISPARITY)
-                rows.append(_row(pair.name, name, method, result, task, regions))
+                rows.append(_row((pair.name, name, method), result, task, regions))
     return rows
 
 
 def _row(
-    pair: str,
-    condition: str,
-    method: str,
-    result: StereoResult,
-    task: MonoColourTask,
-    regions: Mapping[str, Tensor],
+    names: tuple[str, str, str], result: StereoResult, task: MonoColourTask, regions: Mapping[str, Tensor]
 ) -> ConditionRow:
     image, truth = result.image.clamp(0, 1), task.ground_truth
     error = (image - truth).square().mean(0)
     means = {n: float(error[region].mean()) for n, region in regions.items() if region.any()}
     psnr = {n: -10 * math.log10(max(mean, 1e-12)) for n, mean in means.items()}
     depth = depth_errors(result.disparity, task.disparity, regions)
-    return ConditionRow(pair, condition, method, score(image, truth).ssim, psnr, *depth)
+    return ConditionRow(*names, score(image, truth).ssim, psnr, *depth)
 
 
 def depth_errors(

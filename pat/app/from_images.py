@@ -138,17 +138,11 @@ def array_from_images(
     tagged = None if images else _tagged_rig(files, note)
     if tagged is not None and focal:
         raise ValueError("focal: the images' tags state the focal lengths: leave it out")
-    for name in files:
-        images[name] = read_image(files[name], name=name)
-    sizes = image_sizes(images)
-    by_pair = (
-        None
-        if matches is None
-        else {
-            pair: PointMatches(*points)
-            for pair, points in read_matches(matches, {n: files.get(n, n) for n in sources}, sizes).items()
-        }
-    )
+    images |= {name: read_image(file, name=name) for name, file in files.items()}
+    by_pair: Pairs | None = None
+    if matches is not None:
+        given = read_matches(matches, {n: files.get(n, n) for n in sources}, image_sizes(images))
+        by_pair = {pair: PointMatches(*points) for pair, points in given.items()}
     images = {name: _textured(f"{name}: {files.get(name, 'the image')}", images[name]) for name in sources}
     alpha = _chosen_alpha(images, alpha, note)
     if tagged is not None:

@@ -143,27 +143,16 @@ def backward(
     upstream = _flat(channels_last(cotangents[0].to(counted)))
     measured = saved[0], cotangents[1].to(counted).contiguous()
     statistics, statistics_upstream = (t if t.numel() else t.new_zeros(4) for t in measured)
-    results = kernels.Saved(
-        statistics=_flat(statistics),
-        logsum=_flat(saved[1]),
-        value_upstream=upstream,
-        statistics_upstream=_flat(statistics_upstream),
-        step=4 if saved[0].numel() else 0,
-    )
+    step = 4 if saved[0].numel() else 0
+    results = kernels.Saved(_flat(statistics), _flat(saved[1]), upstream, _flat(statistics_upstream), step)
     query_out, key_out, value_out = (
         _new(*((b, *t.shape[2:], t.shape[1]) if want else (0,)), dtype=counted).zero_()
         for t, want in zip((query, key, value), wanted)
     )
     points_out = query.new_zeros((b, *positions.points.shape[1:]) if wanted[3] else 0, dtype=counted)
     bias_out = query.new_zeros((b, ha, wa, positions.samples) if wanted[4] else 0, dtype=counted)
-    gradients = kernels.Gradients(
-        _flat(query_out),
-        _flat(points_out),
-        _flat(bias_out),
-        wants_query=wanted[0],
-        wants_points=wanted[3],
-        wants_bias=wanted[4],
-    )
+    outputs = _flat(query_out), _flat(points_out), _flat(bias_out)
+    gradients = kernels.Gradients(*outputs, wanted[0], wanted[3], wanted[4])
     taps = _tap_list(b * ha * wa, call)
     step = len(taps.tap_count)
     for first in range(0, b * ha * wa, step):

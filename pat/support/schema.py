@@ -219,6 +219,27 @@ def _below(entry: str, key: object) -> str:
     return f"{entry}.{key}" if entry else str(key)
 
 
+def check_fields(config: Any, names: str, least: float, most: float = math.inf, above: bool = False) -> None:
+    """Check that numbers of a dataclass are in a range.
+
+    Args:
+        config: instance of the dataclass.
+        names: names of the fields, with spaces between.
+        least: lower bound.
+        most: upper bound.
+        above: True to exclude `least`.
+
+    Raises:
+        ValueError: naming the first field that is outside, or NaN.
+    """
+    for name in names.split():
+        value = getattr(config, name)
+        if not least <= value <= most or (above and value == least):
+            wanted = f"{'more than' if above else 'at least'} {least:g}"
+            wanted = wanted if most == math.inf else f"from {least:g} to {most:g}"
+            raise ValueError(f"{name} must be {wanted}, got {value:g}")
+
+
 def near(name: object, choices: Iterable[object]) -> str:
     """Return the ending of a message about an unknown name: the most similar choice, or all choices.
 

@@ -31,7 +31,7 @@ from pat.lab.synthesis.rendered import RENDER_FILE, RenderedFrame, frame_file, s
 from pat.lab.synthesis.rig_distribution import RigDistribution
 from pat.lab.synthesis.rigs import RigBatch, in_frame_of
 from pat.media.colour import linear_from_srgb
-from pat.support.schema import from_document
+from pat.support.schema import check_fields, from_document
 
 FARTHEST = 50.0
 """Multiple of the near bound at which layered scenes end for rigs that see to infinity."""
@@ -62,9 +62,8 @@ class LayeredSettings:
     oversampling: int = 2
 
     def __post_init__(self) -> None:
-        for name, least in (("edge", 32), ("oversampling", 1)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
+        check_fields(self, "edge", 32)
+        check_fields(self, "oversampling", 1)
         if not 1 <= self.layers[0] <= self.layers[1]:
             raise ValueError(f"layers must be two numbers, at least 1 and in order, got {self.layers}")
 
