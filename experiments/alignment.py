@@ -155,14 +155,9 @@ def index_text(scene: AlignmentScene, aligned: Aligned) -> list[str]:
 
 def aligned_scene(scene: AlignmentScene, min_confidence: float = LEAST_CONFIDENCE) -> Aligned:
     """Its bands at the pixels of alpha."""
-    return align(
-        scene.images,
-        scene.rig,
-        alpha=scene.alpha,
-        settings=FuseSettings(match_levels=scene.match_levels),
-        recorded=scene.recorded,
-        min_confidence=min_confidence,
-    )
+    settings = FuseSettings(match_levels=scene.match_levels)
+    how: dict[str, Any] = {"recorded": scene.recorded, "min_confidence": min_confidence}
+    return align(scene.images, scene.rig, alpha=scene.alpha, settings=settings, **how)
 
 
 def alignment_rows(scene: AlignmentScene, aligned: Aligned) -> list[AlignmentRow]:

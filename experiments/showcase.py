@@ -152,13 +152,8 @@ class FastSlowArray(NamedTuple):
 
 
 def _fast_and_slow(network: FusionNetwork, array: FastSlowArray, out: Path) -> str:
-    frame = fuse(
-        array.images,
-        array.rig,
-        alpha=FAST,
-        network=network,
-        settings=FuseSettings(field=HomographyDisplacement(array.displacement), match_levels=True),
-    )
+    settings = FuseSettings(field=HomographyDisplacement(array.displacement), match_levels=True)
+    frame = fuse(array.images, array.rig, alpha=FAST, network=network, settings=settings)
     shown = {"alpha: the fast camera": array.images[FAST]}
     shown |= {f"beta: {name}": array.images[name] for name in SLOW}
     shown |= {"betas by the rough homography alone": transformed(array), "fusion": frame.image}

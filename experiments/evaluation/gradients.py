@@ -20,15 +20,10 @@ from pat.lab.evaluation.tables import markdown_table
 from pat.networks.paper import PAT
 from pat.networks.protocol import FusionNetwork
 
-UNITS = {
-    "rotation x": ("rotation", math.radians(1), 0),
-    "rotation y": ("rotation", math.radians(1), 1),
-    "rotation z": ("rotation", math.radians(1), 2),
-    "translation x": ("translation", 0.1, 0),
-    "translation y": ("translation", 0.1, 1),
-    "translation z": ("translation", 0.1, 2),
-    "focal length": ("focal", 0.01, None),
-    "k1": ("distortion", 1.0, 0),
+UNITS: dict[str, tuple[str, float, int | None]] = {
+    **{f"rotation {axis}": ("rotation", math.radians(1), i) for i, axis in enumerate("xyz")},
+    **{f"translation {axis}": ("translation", 0.1, i) for i, axis in enumerate("xyz")},
+    **{"focal length": ("focal", 0.01, None), "k1": ("distortion", 1.0, 0)},
 }
 """Parameter of beta, unit and axis by name: degrees, tenths of the baseline, 1 % of the focal length, 1."""
 AT, STEP = 0.07, 1e-3
@@ -173,15 +168,8 @@ def mean_score(pair: Pair, query: Tensor, key: Tensor, x: Tensor) -> Tensor:
     return (query * attend(query, key, key, locations, samples=samples, border=4.0)).sum(1).mean()
 
 
-WRONG = {
-    "rotation x": 0.3,
-    "rotation y": 0.3,
-    "rotation z": 0.3,
-    "translation y": 0.5,
-    "translation z": 0.5,
-    "focal length": 1.0,
-    "k1": 0.03,
-}
+WRONG = dict.fromkeys(("rotation x", "rotation y", "rotation z"), 0.3)
+WRONG |= {"translation y": 0.5, "translation z": 0.5, "focal length": 1.0, "k1": 0.03}
 """Units by which each parameter is wrong at first: translations turn the baseline by 3 degrees."""
 RECOVERED = [*((name,) for name in WRONG), ("rotation x", "rotation y", "rotation z"), tuple(WRONG)]
 """Sets of parameters that are wrong together."""

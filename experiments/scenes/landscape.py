@@ -61,12 +61,8 @@ def _leafy(dark: Vec3, light: Vec3, scale: float, kind: TextureKind = "noise") -
 _GRASS = _leafy((0.06, 0.14, 0.025), (0.13, 0.24, 0.05), 3.0)
 _BARK = plain(0.13, 0.09, 0.06, roughness=0.95, specular=0.05, grain=0.3)
 _WHITE = plain(0.74, 0.72, 0.68, roughness=0.6)
-_STONE = Material(
-    texture=Texture(
-        kind="noise", paints=(paint(0.34, 0.30, 0.25, nir=0.4), paint(0.45, 0.40, 0.34, nir=0.45)), scale=9
-    ),
-    roughness=0.95,
-)
+_GREYS = (paint(0.34, 0.30, 0.25, nir=0.4), paint(0.45, 0.40, 0.34, nir=0.45))
+_STONE = Material(texture=Texture(kind="noise", paints=_GREYS, scale=9), roughness=0.95)
 
 
 def _ground(rng: Generator) -> Iterator[Object]:

@@ -29,12 +29,8 @@ def sample_cameras() -> dict[str, Camera]:
     mono = Camera(
         K=intrinsics(820.0, HW), cam_from_world=Pose.identity(), hw=HW, sensor=Sensor(response="mono")
     )
-    colour = Camera(
-        K=intrinsics((460.0, 460.0), (360, 560), (284.0, 172.0)),
-        cam_from_world=Pose.from_centre(rotation, centre),
-        hw=(360, 560),
-        sensor=Sensor(response="rgb"),
-    )
+    K, pose = intrinsics((460.0, 460.0), (360, 560), (284.0, 172.0)), Pose.from_centre(rotation, centre)
+    colour = Camera(K=K, cam_from_world=pose, hw=(360, 560), sensor=Sensor(response="rgb"))
     return {ALPHA: mono, BETA: colour}
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from pat.lab.synthesis.scene import Material, Object, Paint, Texture, Vec3
+from pat.lab.synthesis.scene import Material, Object, Paint, Texture, TextureKind, Vec3
 
 from .props import ball, box, lathed, moved, paint, plain, profile, wood
 
@@ -24,7 +24,7 @@ def furniture() -> Iterator[Object]:
     """The table's legs, a cupboard under the shelf, rug, armchair, chair, lamp, pictures and window."""
     yield from _under_the_table()
     yield box("skirting", (0, FLOOR - 0.07, WALL - 0.005), (8, 0.14, 0.02), _WHITE)
-    rug = _pattern("wave", (0.30, 0.045, 0.035), (0.42, 0.30, 0.17), 7.0, distortion=3.0)
+    rug = pattern("wave", (0.30, 0.045, 0.035), (0.42, 0.30, 0.17), 7.0, distortion=3.0)
     yield box("rug", (-0.25, FLOOR - 0.004, 0.0), (3.5, 0.008, 2.1), rug, yaw=-2)
     yield from moved(_armchair(), "armchair", (-2.25, FLOOR, 0.45), yaw=-38)
     yield from moved(_chair(), "chair", (1.75, FLOOR, -0.15), yaw=62)
@@ -33,9 +33,10 @@ def furniture() -> Iterator[Object]:
     yield from moved(_window(), "window", (2.45, -1.0, WALL - 0.03))
 
 
-def _pattern(kind: str, first: Vec3, second: Vec3, scale: float, *, distortion: float = 0.0) -> Material:
+def pattern(kind: TextureKind, first: Vec3, second: Vec3, scale: float, **further: float) -> Material:
+    """A matt material of two colours, of a pattern, its scale, and `distortion` and `grain`."""
     paints = (paint(*first), paint(*second))
-    texture = Texture(kind=kind, paints=paints, scale=scale, distortion=distortion, grain=0.15)  # type: ignore[arg-type]
+    texture = Texture(kind=kind, paints=paints, scale=scale, **{"grain": 0.15, **further})
     return Material(texture=texture, roughness=0.95, specular=0.05)
 
 
@@ -60,14 +61,14 @@ def _under_the_table() -> Iterator[Object]:
 
 
 def _armchair() -> Iterator[Object]:
-    cloth = _pattern("noise", (0.045, 0.13, 0.14), (0.07, 0.18, 0.19), 130.0)
+    cloth = pattern("noise", (0.045, 0.13, 0.14), (0.07, 0.18, 0.19), 130.0)
     yield box("base", (0, -0.23, 0), (0.78, 0.2, 0.72), cloth)
     yield box("back", (0, -0.55, 0.33), (0.78, 0.7, 0.15), cloth)
     yield ball("seat", (0, -0.37, -0.04), (0.6, 0.22, 0.72), cloth)
     for side in (-1, 1):
         yield box(f"arm{side}", (0.36 * side, -0.4, -0.01), (0.13, 0.38, 0.72), cloth)
         yield lathed(f"foot{side}", (0.32 * side, 0, -0.3), profile(30, 140, 15, 0, 0, 0), WALNUT)
-    checks = _pattern("checker", (0.7, 0.42, 0.04), (0.6, 0.5, 0.3), 9.0)
+    checks = pattern("checker", (0.7, 0.42, 0.04), (0.6, 0.5, 0.3), 9.0)
     yield ball("cushion", (0.03, -0.6, 0.2), (0.44, 0.4, 0.16), checks)
 
 

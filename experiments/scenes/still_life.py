@@ -20,7 +20,7 @@ from pat.lab.synthesis.furnish import seeded, vec
 from pat.lab.synthesis.scene import Key, Light, Material, Motion, Object, Paint, Scene, Texture, Vec3, World
 
 from .props import arranged, ball, box, first_camera, lathed, moved, on_path, paint, plain, profile
-from .room import BRASS, FLOOR, OAK, SHELF, WALNUT, furniture
+from .room import BRASS, FLOOR, OAK, SHELF, WALNUT, furniture, pattern
 
 VIEW = 1.4
 """Metres of the still life that the first camera's image is wide."""
@@ -72,20 +72,8 @@ _LIGHTS = (
 # Surfaces ---------------------------------------------------------------------------------------------------
 
 
-_PLASTER = Material(
-    texture=Texture(
-        kind="noise", paints=(paint(0.40, 0.43, 0.36), paint(0.47, 0.50, 0.42)), scale=7.0, grain=0.05
-    ),
-    roughness=0.95,
-    specular=0.05,
-)
-_CLOTH = Material(
-    texture=Texture(
-        kind="checker", paints=(paint(0.62, 0.58, 0.50), paint(0.16, 0.25, 0.38)), scale=26.0, grain=0.1
-    ),
-    roughness=0.95,
-    specular=0.05,
-)
+_PLASTER = pattern("noise", (0.40, 0.43, 0.36), (0.47, 0.50, 0.42), 7.0, grain=0.05)
+_CLOTH = pattern("checker", (0.62, 0.58, 0.50), (0.16, 0.25, 0.38), 26.0, grain=0.1)
 
 # What is in the room ----------------------------------------------------------------------------------------
 

@@ -230,13 +230,9 @@ def _tap_list(pixels: int, call: kernels.Call) -> kernels.TapList:
     geometry = call.geometry
     stride = (geometry.samples * (1 if geometry.nearest else 4) // kernels.LANES + 2) * kernels.LANES
     pixels = min(pixels, max(64, SCRATCH_TAPS // stride))
-    return kernels.TapList(
-        first=0,
-        tap_count=np.empty((pixels, 1), np.int32),
-        rows=np.empty((pixels, stride), np.int32),
-        key_weight=np.empty((pixels, stride), geometry.fractions.dtype),
-        value_weight=np.empty((pixels, stride), geometry.fractions.dtype),
-    )
+    counts, rows = np.empty((pixels, 1), np.int32), np.empty((pixels, stride), np.int32)
+    weights = (np.empty((pixels, stride), geometry.fractions.dtype) for _ in range(2))
+    return kernels.TapList(0, counts, rows, *weights)
 
 
 def _channel_tasks(

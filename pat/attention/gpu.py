@@ -76,11 +76,9 @@ def backward(
         for t in (saved[0], cotangents[1].to(counted))
     )
     fixed = torch.are_deterministic_algorithms_enabled()
-    scales = (
-        _scales(query, key, value, upstream, statistics_upstream)
-        if fixed
-        else query.new_ones(2, dtype=counted)
-    )
+    scales = query.new_ones(2, dtype=counted)
+    if fixed:
+        scales = _scales(query, key, value, upstream, statistics_upstream)
     sums = torch.int64 if fixed else counted
     images = [t.new_zeros(b, *t.shape[2:], t.shape[1], dtype=sums) for t in (key, value)]
     query_out = query.new_empty(b, ha, wa, query.shape[1])
@@ -98,13 +96,8 @@ def backward(
     if fixed:
         images = [(t.double() / s.double()).to(counted) for t, s in zip(images, scales)]
     key_out, value_out = (t.to(query.dtype).permute(0, 3, 1, 2) for t in images)
-    gradients = (
-        query_out.permute(0, 3, 1, 2),
-        key_out,
-        value_out,
-        points_out.sum_to_size(positions.points.shape),
-        bias_out,
-    )
+    points_out = points_out.sum_to_size(positions.points.shape)
+    gradients = query_out.permute(0, 3, 1, 2), key_out, value_out, points_out, bias_out
     return tuple(t if want else t.new_empty(0) for t, want in zip(gradients, wanted))
 
 

@@ -349,7 +349,7 @@ class Import:
         say(f"written: {self.out} (PAT for {what})")
 
 
-class WeightsCommands:
+class Weights:
     """Convert weights of other programs."""
 
     commands: ClassVar[Mapping[str, Any]] = {"import": Import}

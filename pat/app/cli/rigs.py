@@ -174,6 +174,7 @@ class Explore:
             warn_of_misfit(rig, images)
         options.field_named(self.field)
         beside = self.rig.with_suffix(".covariance.json")
+        files = {"": self.rig, **options.files_by_name(self.image)}
         explorer = opened(
             rig,
             images,
@@ -181,10 +182,7 @@ class Explore:
             network=self.network,
             field=self.field,
             covariance=RigCovariance.load(beside, rig) if beside.is_file() else None,
-            files={
-                "": str(self.rig),
-                **{name: str(file) for name, file in options.files_by_name(self.image).items()},
-            },
+            files={name: str(file) for name, file in files.items()},
         )
         if explorer.error:
             raise ValueError(explorer.error)

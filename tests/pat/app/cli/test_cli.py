@@ -488,7 +488,8 @@ def test_one_image_for_two_cameras_is_refused(small, refusal):
     shutil.copy(small / "mono.png", small / "copy.png")
     for name in ("mono.png", "copy.png"):
         error = refusal(*arguments(small, colour=small / name))
-        assert f"the images of 'mono' and 'colour' are the same image, {small / name}: give each" in error
+        assert "'mono' and 'colour'" in error
+        assert f"{small / name}" in error
         assert not (small / "out").exists()
 
 
