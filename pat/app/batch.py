@@ -422,10 +422,7 @@ def find_images(text: str | Path, *, name: str = "") -> list[Path]:
         raise ValueError(f"{label}{path}: is a video, which needs `pat fuse` without a rig: save its frames")
     if path.is_dir():
         files = _images_in(path)
-    elif path.exists():
-        files = [path]
-    else:
-        files = [p for p in path.parent.glob(path.name) if p.is_file()]
+    files = [path] if path.exists() else [p for p in path.parent.glob(path.name) if p.is_file()]
     files = sorted((p for p in files if p == path or not p.name.startswith(".")), key=_natural)
     if not files:
         below = [str(p) for p in sorted(path.iterdir()) if _images_in(p)] if path.is_dir() else []

@@ -121,9 +121,7 @@ def lens_for(camera: View, name: str) -> Lens:
         raise ValueError(f"camera '{name}' is batched {tuple(camera.K.shape[:-2])}: render one rig at a time")
     camera = camera.to(dtype=torch.float64, device="cpu")
     upright = _upright(camera, name)
-    if camera.distortion is None:
-        return Lens(upright, None, None)
-    return _wide(camera, upright, name)
+    return Lens(upright, None, None) if camera.distortion is None else _wide(camera, upright, name)
 
 
 def _upright(camera: Camera, name: str) -> Camera:
