@@ -83,7 +83,7 @@ class MeasuredPairs(Crops):
             raise ValueError(f"{pair.left} is grey: pairs to train on must be in colour")
         h, w = self.hw
         if left[0] < h or left[1] < w:
-            raise ValueError(f"{pair.left} is {_described(left)}, less than samples of {w}x{h}: lower `hw`")
+            raise ValueError(f"{pair.left} is {_described(left)}, below samples of {w}x{h}: lower `hw`")
         disparity_files(pair)
 
     def read(self, pair: PairFiles) -> Pictures:
