@@ -33,10 +33,12 @@ def furniture() -> Iterator[Object]:
     yield from moved(_window(), "window", (2.45, -1.0, WALL - 0.03))
 
 
-def pattern(kind: TextureKind, first: Vec3, second: Vec3, scale: float, **further: float) -> Material:
-    """A matt material of two colours, of a pattern, its scale, and `distortion` and `grain`."""
+def pattern(
+    kind: TextureKind, first: Vec3, second: Vec3, scale: float, distortion: float = 0.0, grain: float = 0.15
+) -> Material:
+    """A matt material of two colours."""
     paints = (paint(*first), paint(*second))
-    texture = Texture(kind=kind, paints=paints, scale=scale, **{"grain": 0.15, **further})
+    texture = Texture(kind=kind, paints=paints, scale=scale, distortion=distortion, grain=grain)
     return Material(texture=texture, roughness=0.95, specular=0.05)
 
 

@@ -23,8 +23,7 @@ CURVE = 65
 SMOOTHED = 7
 """Side in pixels of the window over which the signal is averaged."""
 SIDE, GROUPS, FEWEST = 12, 16, 40
-"""Blocks for the estimate: their side in pixels, number of groups of about equal value, least blocks in a
-group."""
+"""Blocks for the estimate: their side in pixels, groups of about equal value, least blocks in a group."""
 SMOOTHEST, SHARE = 0.05, 0.677
 """Quantile of a group's variances that stands for noise alone, and its ratio to the variance of white noise
 (measured on 40,000 blocks of it)."""

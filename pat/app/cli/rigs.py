@@ -36,8 +36,7 @@ class Show:
     """Images to draw on, if wanted; with two or more, points are matched in them."""
     out: Out = Path("out/show")
     """Folder for rig.png (cameras in space; if calibrated), fields.png (search segments of some pixels) and,
-    with images, matches.png (patches around points matched in the images, and how far they lie from their
-    lines)."""
+    with images, matches.png (patches around matched points, and how far they lie from their lines)."""
 
     def run(self) -> None:
         """Write the drawings, and warn of a rig that does not fit the images.
@@ -294,8 +293,7 @@ class Convert:
     lens: Annotated[str | None, Option("MODEL")] = None
     """Lens model of the coefficients, as brown-conrady or kannala-brandt: for files that do not say."""
     refit: bool = False
-    """Replace a lens whose model ends within the image, as at a pole, by a fitted brown-conrady lens (k1 k2
-    p1 p2 k3)."""
+    """Replace a lens whose model ends within the image by a fitted brown-conrady lens (k1 k2 p1 p2 k3)."""
     write_as: Annotated[str, Option("FORMAT")] = "native"
     """Format of the target."""
 
@@ -342,9 +340,8 @@ class Doctor:
     """An image of each of two or more cameras."""
     matches: MatchesFile = None
     out: MaybeOut = None
-    """Rig file to write if a mistake is found: the repaired rig. A former file is kept as
-    NAME.old. Exit status 4, and nothing is written, if several mistakes with different repairs explain the
-    images as well."""
+    """Rig file to write if a mistake is found: the repaired rig. A former file is kept as NAME.old. Exit status
+    4, and nothing is written, if several mistakes with different repairs explain the images as well."""
     json: bool = False
     """Print JSON instead of text."""
 
@@ -409,8 +406,7 @@ class Refine:
     """Rig file to write."""
     matches: MatchesFile = None
     free: tuple[str, ...] = ("rotation", "translation", "focal", "centre")
-    """Free parameters: rotation, translation, focal, centre (principal_point), distortion; or
-    CAMERA.rotation."""
+    """Free parameters: rotation, translation, focal, centre (principal_point), distortion; CAMERA.KIND."""
     sigma: Annotated[tuple[str, ...], Option("KIND=NUMBER")] = ()
     """Standard deviation of a parameter before refinement: degrees, pixels; translation, focal relative."""
     force: bool = False

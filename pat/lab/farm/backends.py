@@ -38,8 +38,7 @@ FARTHEST = 50.0
 
 
 Renderer = Callable[[int, Path], None]
-"""Function of a seed and a folder that renders and checks a scene into that folder, which it makes. Raises
-ValueError."""
+"""Function of a seed and a folder that makes the folder, and renders and checks a scene into it."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -43,5 +43,4 @@ PRESETS: dict[str, dict[str, Any]] = {
     "fast": {"width": 512},
     "paper": {"width": 2048, "samples": 32, "denoise": "accurate", "fast_light": False, "bounces": 4},
 }
-"""Presets by name, as differences from the defaults: 512 pixels wide, or as the paper's 2048 at higher
-quality."""
+"""Presets by name, beside the defaults: 512 pixels wide, or as the paper's 2048 at higher quality."""
