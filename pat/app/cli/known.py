@@ -60,8 +60,8 @@ class Known:
     depth: Depth = None
     """Near and far bounds in metres, instead of the rig's; far may be inf."""
     misfit: Literal["correct", "warn", "refuse"] = "correct"
-    """If matches lie beside the rig's search segments: correct moves these to them, and warns where images still
-    do not fit; warn only warns; refuse corrects, and writes nothing where they still do not fit."""
+    """If matches lie beside the rig's search segments: correct moves these, and warns where images still do
+    not fit; warn only warns; refuse corrects, and writes nothing where they still do not fit."""
     response: Annotated[str, Option("fit|rec601|R,G,B")] = "fit"
     """Weights of red, green and blue in a mono alpha; fit finds them from matches, with gain and gamma."""
     match_levels: bool = False

@@ -340,7 +340,7 @@ class Doctor:
     """An image of each of two or more cameras."""
     matches: MatchesFile = None
     out: MaybeOut = None
-    """Rig file to write if a mistake is found: the repaired rig. A former file is kept as NAME.old. Exit status
+    """The repaired rig to write if a mistake is found. A former file is kept as NAME.old. Exit status
     4, and nothing is written, if several mistakes with different repairs explain the images as well."""
     json: bool = False
     """Print JSON instead of text."""
