@@ -10,6 +10,7 @@ import math
 import types
 import typing
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -187,12 +188,13 @@ def _read_plain(kind: Any, value: Any, entry: str) -> Any:
     the entry."""
     if kind is Any:
         return value
+    if kind in (int, float) and isinstance(value, str):
+        with suppress(ValueError):
+            value = float(value)
     if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
         if math.isnan(value):
             raise ValueError(f"{entry}: is NaN; wanted a number")
         return float(value)
-    if kind in (int, float) and isinstance(value, str) and _is_number(value):
-        value = float(value)
     if kind is int and isinstance(value, float) and value.is_integer():
         value = int(value)
     if kind is int and isinstance(value, int) and abs(value) >= 2**63:
