@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 from skimage.data import stereo_motorcycle
 from torch import Tensor
 
-from arraygeom import Camera, Pose, Rig, apply_homography, intrinsics, sample
-from arraygeom.pixels import pixel_grid
+from arraygeom import Camera, Pose, Rig, apply_homography, intrinsics, pixel_grid, sample
 from arraygeom.runtime.atomic import write_text
 from arraygeom.undistortion import pixels_between, recorded_pixels
 from calib.boards.detect import collect_folder

@@ -30,10 +30,7 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from arraygeom.pixels import pixel_grid
-from arraygeom.rig import Rig
-from arraygeom.sampling import sample
-from arraygeom.sensor import Band, Curve, Sensor
+from arraygeom import Band, Curve, Rig, Sensor, pixel_grid, sample
 from pat.lab.data.windows import read_view, scene_rig
 from pat.lab.synthesis.rendered import Rendered
 from pat.media.colour import REC601, linear_from_srgb, srgb_from_linear

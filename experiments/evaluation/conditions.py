@@ -19,8 +19,7 @@ from jaxtyping import Bool, Float
 from torch import Generator, Tensor
 from torch.nn.functional import interpolate
 
-from arraygeom import Rectified
-from arraygeom.sampling import sample
+from arraygeom import Rectified, sample
 from arraygeom.viz import new_figure
 from pat import FuseSettings
 from pat.fusion.classical import classical_fusion, denoised_knowing, raw_disparity

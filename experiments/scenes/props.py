@@ -12,9 +12,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from arraygeom.camera import Camera
-from arraygeom.pose import Pose
-from arraygeom.rig import Rig
+from arraygeom import Camera, Pose, Rig
 from pat.lab.synthesis.furnish import DEPTHS, vec
 from pat.lab.synthesis.scene import Key, Light, Material, Motion, Object, Paint, Scene, Texture, Vec3, World
 

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
-from arraygeom.camera import Camera
-from arraygeom.rig import Rig
+from arraygeom import Camera, Rig
 from pat.lab.synthesis.furnish import seeded, vec
 from pat.lab.synthesis.scene import Key, Light, Material, Motion, Object, Paint, Scene, Texture, Vec3, World
 

@@ -27,14 +27,11 @@ from torch.autograd import forward_ad
 from torch.nn.functional import scaled_dot_product_attention
 from torch.utils.checkpoint import checkpoint
 
-from arraygeom.camera import View
+from arraygeom import Dense, Local, Pair, Positions, Segments, View, lazily, pixel_grid
 from arraygeom.checks import check_above, check_tensors
-from arraygeom.fields import Dense, Local, lazily
-from arraygeom.pair import Pair
-from arraygeom.pixels import HW, pixel_coordinates, pixel_grid
+from arraygeom.pixels import HW, pixel_coordinates
 from arraygeom.runtime.chunks import chunked
 from arraygeom.runtime.tracing import needs_numbers, transformations
-from arraygeom.segments import Positions, Segments
 from pat.attention import reference, torch_op
 from pat.attention.reference import Attended, AttentionInputs, SamplePositions, accumulated
 

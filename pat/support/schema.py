@@ -209,14 +209,6 @@ def _read_plain(kind: Any, value: Any, entry: str) -> Any:
 _PLAIN = {float: "a number", int: "a whole number", str: "text", bool: "true or false", Path: "a path"}
 
 
-def _is_number(text: str) -> bool:
-    """True for text that is a number, also inf, which YAML reads as text."""
-    try:
-        return not math.isnan(float(text))
-    except ValueError:
-        return False
-
-
 def _below(entry: str, key: object) -> str:
     return f"{entry}.{key}" if entry else str(key)
 

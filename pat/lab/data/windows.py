@@ -13,11 +13,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from arraygeom.camera import Camera
-from arraygeom.pixels import HW, map_homogeneous, pixel_grid, resize_matrix
-from arraygeom.rig import Rig
-from arraygeom.sampling import sample
-from arraygeom.undistortion import pinhole_view, resampled
+from arraygeom import Camera, Rig, pinhole_view, pixel_grid, resampled, resize_matrix, sample
+from arraygeom.pixels import HW, map_homogeneous
 from pat.lab.synthesis.rendered import RENDER_FILE, Rendered, is_rendered
 
 AGAIN = "remove it and run 'pat lab render' again"

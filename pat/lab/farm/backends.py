@@ -13,10 +13,8 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from arraygeom.batching import stack
-from arraygeom.camera import Camera
+from arraygeom import Camera, Rig, stack
 from arraygeom.pixels import HW
-from arraygeom.rig import Rig
 from pat.lab.synthesis.blender.environment import blender_python
 from pat.lab.synthesis.blender.lens import lens_for
 from pat.lab.synthesis.blender.settings import PRESETS, RenderSettings

@@ -12,10 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from arraygeom.pair import Pair
-from arraygeom.pixels import pixel_grid
-from arraygeom.rig import Rig
-from arraygeom.sampling import sample
+from arraygeom import Pair, Rig, pixel_grid, sample
 
 from .rendered import RenderedFrame, depth_between
 

@@ -13,9 +13,8 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from arraygeom.camera import Camera
+from arraygeom import Camera, Rig
 from arraygeom.pixels import coarse_grid
-from arraygeom.rig import Rig
 
 from .scene import (
     Key,

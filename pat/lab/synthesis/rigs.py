@@ -11,9 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from arraygeom.camera import Camera
+from arraygeom import Camera, Pose, rotation_from_vector
 from arraygeom.pixels import HW
-from arraygeom.pose import Pose, rotation_from_vector
 
 from .rig_distribution import Range, RigDistribution
 

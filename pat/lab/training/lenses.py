@@ -8,11 +8,9 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from arraygeom.camera import Camera
-from arraygeom.distortion import BROWN_CONRADY, Distortion
-from arraygeom.pixels import pixel_grid
+from arraygeom import Camera, Distortion, pixel_grid, resampled
+from arraygeom.distortion import BROWN_CONRADY
 from arraygeom.sampling import Sampled
-from arraygeom.undistortion import resampled
 
 STRONGEST = 0.3
 """Largest |k1| of a random lens."""

@@ -15,10 +15,8 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from arraygeom.batching import stack
-from arraygeom.camera import Camera
-from arraygeom.pixels import HW, pixel_grid
-from arraygeom.rig import Rig
+from arraygeom import Camera, Rig, pixel_grid, stack
+from arraygeom.pixels import HW
 from pat.lab.data import windows
 from pat.lab.data.windows import RenderedView
 from pat.lab.synthesis.layered import ArrayBatch

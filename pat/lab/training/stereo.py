@@ -17,9 +17,8 @@ from jaxtyping import Float
 from PIL import Image, UnidentifiedImageError
 from torch import Generator, Tensor
 
-from arraygeom.camera import Camera, intrinsics
+from arraygeom import Camera, Pose, intrinsics
 from arraygeom.pixels import HW
-from arraygeom.pose import Pose
 from pat.lab.data.pairs import PairFiles, pair_files
 from pat.lab.data.windows import reduced
 from pat.lab.synthesis.layered import ArrayBatch

@@ -11,10 +11,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import map_coordinates
 from torch import Tensor
 
-from arraygeom.camera import Camera, View
-from arraygeom.pixels import map_homogeneous, pixel_grid
-from arraygeom.pose import Pose
-from arraygeom.sampling import sample
+from arraygeom import Camera, Pose, View, pixel_grid, sample
+from arraygeom.pixels import map_homogeneous
 
 from ..rendered import depth_between
 
