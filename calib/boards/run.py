@@ -152,7 +152,7 @@ class Session:
         """Detect the board in new images; unreadable ones are tried again later.
 
         Returns:
-            True if there were any.
+            True if one could be read.
         """
         fresh = [
             (name, key) for name, moments in photos.items() for key in moments if (name, key) not in self.seen

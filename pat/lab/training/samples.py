@@ -222,7 +222,7 @@ def source_of(
         photos: textures of layered scenes; None if all batches come from the recipe's folders.
         seed: random seed of scenes, degradations and the order in which items are used.
         device: device of the samples.
-        choose: called with the number of a rendered scene or pair, returns True to take it.
+        choose: called with an item's number, returns True to take it.
 
     Returns:
         The source.
