@@ -6,7 +6,7 @@ import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -96,7 +96,7 @@ def draw_sweep(axis: Axes, rows: Sequence[Row], measure: str) -> None:
         means = np.array([np.mean(drawn[value]) for value in measured])
         bounds = np.array([bootstrap_interval(drawn[value]) for value in measured]).reshape(-1, 2)
         spread = np.abs(np.nan_to_num(bounds.T - means)) if len(measured) else None
-        style = {"marker": "o", "markersize": 3, "capsize": 2, "linewidth": 1}
+        style: dict[str, Any] = {"marker": "o", "markersize": 3, "capsize": 2, "linewidth": 1}
         axis.errorbar(measured, means, yerr=spread, label=field, **style)
     axis.set_ylabel(MEASURES[measure][0], fontsize=8)
     axis.tick_params(labelsize=8)

@@ -312,7 +312,7 @@ class Batch:
                 kind=self.kind,
                 view=view,
                 name=self.names[i],
-                bands=(band_names(frame, self._betas) or self._propagated_bands(frame)),
+                bands=band_names(frame, self._betas) or self._propagated_bands(frame),
                 about={"inputs": inputs or self.inputs(i)},
             )
 
@@ -419,7 +419,8 @@ def find_images(text: str | Path, *, name: str = "") -> list[Path]:
         raise ValueError(f"{label}{path}: is a video, which needs `pat fuse` without a rig: save its frames")
     if path.is_dir():
         files = _images_in(path)
-    files = [path] if path.exists() else [p for p in path.parent.glob(path.name) if p.is_file()]
+    else:
+        files = [path] if path.exists() else [p for p in path.parent.glob(path.name) if p.is_file()]
     files = sorted((p for p in files if p == path or not p.name.startswith(".")), key=_natural)
     if not files:
         below = [str(p) for p in sorted(path.iterdir()) if _images_in(p)] if path.is_dir() else []

@@ -408,7 +408,7 @@ def test_settings_reach_the_fusion_of_frames_and_of_sequences(material, tmp_path
 
 
 def test_a_field_that_is_a_function_is_refused_before_anything_is_fused(material, tmp_path):
-    with pytest.raises(ValueError, match="a batch's field is written to a file"):
+    with pytest.raises(ValueError, match="Rectified"):
         batch(material, tmp_path / "out", field=lambda pair, x: None).run()
 
 
