@@ -19,7 +19,6 @@ from pat.lab.evaluation import protocols, stereo
 from pat.lab.evaluation.ablation import sample_photographs
 from pat.lab.evaluation.tables import write_csv
 from pat.matching.certainty import fitted_network
-from pat.media.figures import save_panels
 from pat.networks.paper import PAT
 from pat.networks.protocol import Comparing, FusionNetwork
 from pat.networks.weights import Network, load_weights
@@ -290,7 +289,7 @@ class Fields(OnScenes):
     """Folder of Middlebury's pairs with true disparity; those of the report half."""
 
     def run(self) -> None:
-        """Write ablation.md, .csv, peaks.png (attention's maxima in three pictures); print the table."""
+        """Write ablation.md and .csv; print the table."""
         network = self.comparing(fields.fields_of(1.0))
         cases = list(fields.layered_cases(sample_photographs(), self.scenes))
         if self.middlebury is not None:
@@ -299,9 +298,6 @@ class Fields(OnScenes):
                 cases += fields.rectified_cases(pairs, linked=linked)
         shown = progress("fusing")(cases, len(cases))
         rows = fields.evaluate_fields(network, shown, fields=lambda most: self.chosen(fields.fields_of(most)))
-        looked_at = [case for case in cases if case.kind != "F alone"]
-        panels = fields.drawn_peaks(network, looked_at[:: -(-len(looked_at) // 3)])
-        save_panels(panels, self.out / "peaks.png", columns=4)
         write_text(self.out / "ablation.md", fields.fields_markdown(rows))
         write_csv(self.out / "ablation.csv", fields.FieldRow._fields, rows)
         self.say_written()
