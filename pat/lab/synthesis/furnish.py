@@ -251,10 +251,9 @@ def _object(
 
 def _crowded(centre: NDArray, radius: float, others: list[Object]) -> bool:
     """True if much of the object would be inside another one."""
-    for key in (other.motion.keys[0] for other in others):
-        if np.linalg.norm(centre - key.position) < 0.5 * (radius + np.linalg.norm(key.extent) / 2):
-            return True
-    return False
+    keys = [other.motion.keys[0] for other in others]
+    radii = [0.5 * (radius + np.linalg.norm(key.extent) / 2) for key in keys]
+    return any(np.linalg.norm(centre - key.position) < reach for key, reach in zip(keys, radii))
 
 
 def _extent(rng: Generator, shape: Shape, radius: float) -> NDArray:
