@@ -234,9 +234,8 @@ def disparity(network: FusionNetwork, pair: Pair) -> float:
         Pixels of beta as the network receives it (resized if it needs equal resolutions); 1 or more.
     """
     if pair.has_lens:
-        segments = Curved(bounds=natural_bounds(pair))(
-            pair, coarse_grid(pair.alpha.hw).reshape(-1, 2).double()
-        )
+        grid = coarse_grid(pair.alpha.hw).reshape(-1, 2).double()
+        segments = Curved(bounds=natural_bounds(pair))(pair, grid)
         reached = (segments.xy - segments.xy[:, :1]).norm(dim=-1)[segments.mask & segments.mask[:, :1]]
         return float(reached.amax()) if len(reached) else 1.0
     scale = resolution_ratio(pair)
@@ -245,11 +244,7 @@ def disparity(network: FusionNetwork, pair: Pair) -> float:
 
 
 def layered_cases(
-    count: int,
-    *,
-    photos: Sequence[Path] = (),
-    hw: HW = (240, 320),
-    seed: int = 0,
+    count: int, *, photos: Sequence[Path] = (), hw: HW = (240, 320), seed: int = 0
 ) -> Iterator[AblationCase]:
     """Render cases from layered photographs, with some noise.
 
