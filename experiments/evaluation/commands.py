@@ -19,6 +19,7 @@ from pat.lab.evaluation import protocols, stereo
 from pat.lab.evaluation.ablation import sample_photographs
 from pat.lab.evaluation.tables import write_csv
 from pat.matching.certainty import fitted_network
+from pat.media.figures import save_panels
 from pat.networks.paper import PAT
 from pat.networks.protocol import Comparing, FusionNetwork
 from pat.networks.weights import Network, load_weights

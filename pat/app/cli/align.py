@@ -49,11 +49,7 @@ class Align(Around):
 
     out: Out = Path("out")
     """Folder for aligned.tif (all bands, with names and wavelengths), NAME_visibility.png (255 seen, 128
-<<<<<<< HEAD
-    occluded, 0 beyond the edge), NAME_confidence.png, NAME_positions.npy, depth.tif, visibility.txt, page."""
-=======
     occluded, 0 outside), NAME_confidence.png, NAME_positions.npy, depth.tif, visibility.txt, index.html."""
->>>>>>> main
     interpolation: Literal["nearest", "bilinear", "cubic"] = "bilinear"
     """Interpolation between recorded values; nearest keeps them."""
     confidence: float = 0.5
