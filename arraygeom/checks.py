@@ -313,7 +313,7 @@ def _refusals(
     """Names of a function's positional arguments, and functions that say what is wrong with an argument."""
     function = inspect.unwrap(function)
     parameters = inspect.signature(function).parameters
-    names = [name for name, p in parameters.items() if p.kind == inspect.Parameter.POSITIONAL_OR_KEYWORD]
+    names = [name for name, p in parameters.items() if p.kind == p.POSITIONAL_OR_KEYWORD]
     try:
         hints = get_type_hints(function)
     except NameError:  # of another package, imported for type checkers alone
