@@ -361,13 +361,14 @@ class Camera(LensView):
         return torch.where(valid[..., None], X, torch.nan)
 
     def to_kornia(self) -> PinholeCamera | CameraModel:
-        """Convert to kornia: a `PinholeCamera`, batched (B, 4, 4), or with a lens a `CameraModel`.
+        """Convert to kornia: a `PinholeCamera`, batched (B, 4, 4), or a `CameraModel` with a distorting lens.
 
         Kornia's camera models (`kornia.sensors.camera`) have no pose: keep `cam_from_world`. Pixels and axes
         agree. `PinholeCamera.scale` moves the principal point differently: `resize` first.
 
         Raises:
-            ValueError: for a lens that kornia does not have.
+            ValueError: for a lens, or prism or tilt terms, that kornia does not have, and with a lens for a K
+                that is skewed or rotated.
         """
         from kornia.geometry.camera import PinholeCamera
 

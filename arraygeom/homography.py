@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
-from .checks import check_numbers
+from .checks import check_numbers, check_tensors
 from .pixels import map_homogeneous, product, to_homogeneous
 from .robust import LocalModel, levenberg_marquardt
 from .runtime.tracing import needs_numbers, traced
@@ -115,10 +115,11 @@ def fit_homography(x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"]) -> Float[Te
         differentiable, through ten Gauss-Newton steps at the end.
 
     Raises:
-        ValueError: for fewer points, NaN, and if there is no such homography: points on a line, or some that
-            would be behind.
+        ValueError: for fewer points, NaN, and if there is no such homography, as some points would be behind.
+            Points on a line are not told: any of many homographies comes back.
         TypeError: for points that are no tensors.
     """
+    check_tensors((2,), x=x, y=y)
     if x.shape != y.shape or x.ndim != 2 or len(x) < 4:
         raise ValueError(
             f"wanted four pairs of points or more, (n, 2) each, got {tuple(x.shape)}, {tuple(y.shape)}"

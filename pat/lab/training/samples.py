@@ -118,6 +118,9 @@ def plan(config: TrainConfig, seed: int) -> Iterator[Planned]:
 class SampleSource:
     """Samples by number of the step; calling it with a count yields the first group of that many steps.
 
+    A group is one process's share of a step: a `Sample`. Each call begins at step 0, and yields the same for
+    the same seed.
+
     Attributes:
         config: recipe.
         layered: layered scenes by kind of their rigs.
