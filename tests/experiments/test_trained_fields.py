@@ -49,7 +49,7 @@ def test_segments_elsewhere_are_those_of_other_pixels():
 
 
 def test_the_true_position_is_known_in_training():
-    source = source_of(replace(RECIPE, hw=(32, 48)), sample_photographs(count=1), 0, TruePosition())
+    source = source_of(replace(RECIPE, hw=(32, 48)), sample_photographs(count=1), 0)
     scene = source.layered["general"].sample(2, torch.Generator().manual_seed(0))
     made = degraded(scene, torch.Generator().manual_seed(0), field=TruePosition(), recording=RECIPE.recording)
     segments, seen = made.fields[0].straight, made.visible[0]

@@ -196,13 +196,13 @@ def test_what_is_not_what_it_should_be_is_refused_in_a_line():
         "response is 'fit', 'rec601' or three weights; got 'luma'",
         "noise is 'estimate', 'auto' or a NoiseLevel of each camera; got 0.1: give {NAME",
         "noise is 'estimate', 'auto' or a NoiseLevel of each camera; got {'mono': 200}: give {NAME",
-        "an image is a Tensor without a name: give files, or {NAME: tensor} by camera",
-        "an image is a Tensor without a name: give files, or {NAME: tensor} by camera",
+        "an image is a Tensor without a name",
+        "an image is a Tensor without a name",
         "network is a Linear",
         "settings are a dict",
         "wanted Corrections, got a dict",
         "wanted Matches, got a int",
-        "the rig has no camera '0'",
+        "name is a int",
         "x.png: the image to write is uint8: give floats in 0..1",
     )
     lines = done.stdout.splitlines()
