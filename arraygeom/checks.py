@@ -335,7 +335,7 @@ def _is_checked(kind: Any) -> bool:
 
 
 def _refusal(kinds: Sequence[Any], name: str, value: Any) -> Exception | None:
-    """What is wrong with a value that should be of one of these kinds; None for nothing."""
+    """Return the error for a value that should be of one of these kinds; None for a value that is."""
     if value is None and type(None) in kinds:
         return None
     errors = [_fault(kind, name, value) for kind in kinds if kind is not type(None)]

@@ -221,6 +221,20 @@ def test_a_rig_of_many_cameras_is_described_in_seconds(own_lenses, monkeypatch):
     assert more < 1.5 * few
 
 
+def test_some_of_many_different_lenses_are_looked_at(monkeypatch):
+    monkeypatch.setattr(rig_check, "MOST_LENSES", 10)
+    looked, fold = [], Distortion("brown-conrady", torch.tensor([-0.6, 0, 0, 0]).double())
+    coverage = rig_check.coverage
+    monkeypatch.setattr(rig_check, "coverage", lambda camera: looked.append(camera) or coverage(camera))
+    cameras = {
+        f"c{i}": Camera(K=intrinsics(90.0 + i, (80, 100)), cam_from_world=Pose.identity(), hw=(80, 100))
+        for i in range(40)
+    }
+    rig = Rig({name: camera.replace(distortion=fold) for name, camera in cameras.items()})
+    assert any("lens model" in sentence for sentence in rig_check.file_oddities(rig))
+    assert len(looked) == 10
+
+
 def test_a_rig_under_water_without_a_depth_range_is_checked():
     """Nothing is known of what such cameras see of each other: no complaint, and no error."""
     one = partial(torch.tensor, dtype=torch.float64)

@@ -334,8 +334,21 @@ def test_a_field_of_ones_own_is_fused_like_the_one_that_it_calls():
     assert all(torch.equal(a.nan_to_num(), b.nan_to_num()) for a, b in zip(known[:4], own[:4]))
 
 
+def middle_third(pair, x):
+    """Segments in the middle of beta's image, whatever its size."""
+    h, w = pair.beta.hw
+    ends = (x.new_tensor([share * w, h / 2]).expand_as(x) for share in (1 / 3, 2 / 3))
+    return Segments(*ends, torch.ones(x.shape[:-1], dtype=torch.bool))
+
+
 @pytest.mark.parametrize(
-    ("field", "cropped"), [(Epipolar(), True), (Local(), True), (Rectified(20, alpha_is="either"), False)]
+    ("field", "cropped"),
+    [
+        (Epipolar(), True),
+        (Local(), True),
+        (Rectified(20, alpha_is="either"), False),
+        (middle_third, False),
+    ],
 )
 def test_a_beta_is_cropped_if_its_field_says_the_same_of_the_crop(field, cropped):
     rig, images = scene(beta_hw=(300, 440), beta_focal=100.0)
