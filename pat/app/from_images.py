@@ -35,9 +35,9 @@ from calib.images.self_calibration import RefinedPair, joined, refined_by_depth,
 from ..fusion.dense_matches import MatchedDepth, matched_depth
 from ..fusion.steps import without_lenses
 from ..fusion.views import is_in_colour, range_of, read_view
-from ..media.headers import focal_length
 from ..media.images import ImageSources, read_image, write_image
 from ..media.raw import developed_rig
+from ..media.tags import focal_length
 from ..media.video import read_video
 from ..networks.weights import load_weights
 

@@ -7,9 +7,7 @@ colours in the order red, green, blue.
 from __future__ import annotations
 
 import io
-import struct
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
@@ -22,13 +20,14 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from arraygeom.pixels import HW
 from arraygeom.runtime import image_bytes
 from arraygeom.runtime.atomic import write_atomically
 from arraygeom.runtime.chunks import ROWS, spans
 from arraygeom.runtime.extras import install_line
+from arraygeom.runtime.image_bytes import ImageHeader, image_header
 from arraygeom.runtime.warned import warn
 
-from .headers import HW, ImageHeader, image_header
 from .profiles import in_srgb, with_srgb_profile
 from .suffixes import RAW_SUFFIXES
 
@@ -130,15 +129,25 @@ def _planes(
     header = image_header(content)
     if header is None:
         raise ValueError(f"{label}: is no image that can be read: give a PNG, TIFF, JPEG or PNM file")
-    if content[:4] in image_bytes.TIFF and image_bytes.has_further_images(content):
+    if header.several:
         warn(f"{label}: holds several images: the first is taken; save the others as files of their own")
     applied = _applied(header, orientation, label)
     _check_header(header.upright if applied > 1 else header.hw, hw, label)
-    values, white = _decode(content, header, label)
-    values = _opaque(_upright(values, applied), content, label, white)
+    if (page := header.page) is not None:
+        bands, grey = page.samplesperpixel, page.photometric in image_bytes.GREY_TIFF
+        if bands not in (1, 3, 4) or (bands == 4 and grey):
+            raise ValueError(f"{label}: has {bands} channels: {CHANNELS}")
+    values = image_bytes.stored_values(content, header)
+    if values is None and page is not None and page.dtype is not None and page.dtype not in DECODED:
+        raise ValueError(f"{label}: has {page.dtype} values: {KINDS}")
+    if values is None:
+        raise ValueError(f"{label}: is damaged, or not whole: copy it again, or save it as PNG or TIFF")
+    if values.shape[:2] != header.hw:
+        raise ValueError(f"{label}: its header says another size than its pixels have: save it again")
+    values = _opaque(_upright(values, applied), content, label, header.white)
     if orientation == "apply":
         values = in_srgb(values, content, label)
-    return (values[None] if values.ndim == 2 else values[..., ::-1].transpose(2, 0, 1)), white
+    return (values[None] if values.ndim == 2 else values[..., ::-1].transpose(2, 0, 1)), header.white
 
 
 def write_image(
@@ -253,82 +262,6 @@ def _upright(values: NDArray, orientation: int) -> NDArray:
     return values[rows, columns]
 
 
-def _decode(content: bytes, header: ImageHeader, label: str) -> tuple[NDArray, int]:
-    """Decode values as stored; with the largest possible value where a TIFF or PNM file states it, else 0.
-
-    OpenCV shifts TIFF values of fewer than 16 bits up, and scales 8-bit values of text PNM files to 255.
-    """
-    values = decoded(_without_orientation(content, header))
-    page = image_bytes.first_tiff_page(content) if content[:4] in image_bytes.TIFF else None
-    if page is not None:
-        values = _as_tiff_states(values, page, content, label)
-    if values is None and page is not None and page.dtype is not None and page.dtype not in DECODED:
-        raise ValueError(f"{label}: has {page.dtype} values: {KINDS}")
-    if values is None:
-        raise ValueError(f"{label}: is damaged, or not whole: copy it again, or save it as PNG or TIFF")
-    if values.shape[:2] != header.hw:
-        raise ValueError(f"{label}: its header says another size than its pixels have: save it again")
-    if page is not None and values.dtype == np.uint16 and header.bits < 16:
-        return values >> (16 - header.bits), 2**header.bits - 1
-    if content[:2] in image_bytes.PNM_OF_TEXT and values.dtype == np.uint8:
-        values = ((values.astype(np.uint16) * header.white + 254) // 255).astype(np.uint8)
-    return values, header.white
-
-
-def _as_tiff_states(values: NDArray | None, page: Any, content: bytes, label: str) -> NDArray | None:
-    """Correct OpenCV's reading of a TIFF file by the file's tags.
-
-    OpenCV returns the first of several bands that are no colours; beyond 8 bits it mixes planes and takes
-    white for black.
-    """
-    bands, grey = page.samplesperpixel, page.photometric in (image_bytes.MINISWHITE, image_bytes.MINISBLACK)
-    if bands not in (1, 3, 4) or (bands == 4 and grey):
-        raise ValueError(f"{label}: has {bands} channels: {CHANNELS}")
-    if values is None:
-        return None
-    deep = values.dtype != np.uint8
-    if bands > 1 and (grey or (deep and page.planarconfig == image_bytes.SEPARATE)):
-        colours = image_bytes.tiff_colours(content)
-        return None if colours is None else colours[..., [2, 1, 0, 3][:bands]]
-    inverted = page.photometric == image_bytes.MINISWHITE and values.dtype == np.uint16
-    return 65535 - values if inverted else values
-
-
-def _without_orientation(content: bytes, header: ImageHeader) -> bytes:
-    """Bytes of a TIFF file with orientation 1: OpenCV always applies the tag in TIFF files."""
-    if header.tag is None or header.orientation == 1:
-        return content
-    place, form = header.tag
-    changed = bytearray(content)
-    struct.pack_into(form, changed, place, 1)
-    return bytes(changed)
-
-
-def _log_level(level: int) -> int:
-    """Set OpenCV's log level and return the former one. OpenCV 5 has the function in another module."""
-    logging = cv2 if hasattr(cv2, "setLogLevel") else getattr(cv2.utils, "logging")  # noqa: B009
-    return int(logging.setLogLevel(level))
-
-
-def decoded(content: bytes, flags: int = cv2.IMREAD_UNCHANGED) -> NDArray | None:
-    """Decode an image file's bytes by OpenCV without its messages.
-
-    Returns:
-        Values (h, w) or (h, w, channels), blue first, type as stored; None for a damaged file.
-    """
-    if content[:2] == image_bytes.JPEG and flags == cv2.IMREAD_UNCHANGED:
-        with suppress(Exception):  # damaged, which `decodable` says
-            if (colours := image_bytes.jpeg_colours(content)) is not None:
-                return colours[..., 0] if colours.shape[2] == 1 else colours[..., ::-1]
-    level, checked = _log_level(0), image_bytes.decodable(content)
-    try:
-        return None if checked is None else cv2.imdecode(np.frombuffer(checked, np.uint8), flags)
-    except cv2.error:
-        return None
-    finally:
-        _log_level(level)
-
-
 def decoded_photograph(path: Path, flags: int, *, least: int = 1) -> NDArray | None:
     """Decode an image file to 8 bits by OpenCV.
 
@@ -347,8 +280,9 @@ def decoded_photograph(path: Path, flags: int, *, least: int = 1) -> NDArray | N
     header = image_header(content)
     if header is None or min(header.hw) < least or header.hw[0] * header.hw[1] > MOST_PIXELS:
         return None
-    values = decoded(content, flags | (cv2.IMREAD_ANYDEPTH if header.white else 0))
-    if values is None or not header.white:
+    pnm = header.white and header.page is None
+    values = image_bytes.decoded(content, flags | (cv2.IMREAD_ANYDEPTH if pnm else 0))
+    if values is None or not pnm:
         return values
     full = 255 if content[:2] in image_bytes.PNM_OF_TEXT and values.dtype == np.uint8 else header.white
     return np.rint(np.minimum(values / full, 1) * 255).astype(np.uint8)
