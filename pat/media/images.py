@@ -7,7 +7,11 @@ colours in the order red, green, blue.
 from __future__ import annotations
 
 import io
+import struct
+import warnings
+import zlib
 from collections.abc import Mapping, Sequence
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
@@ -18,8 +22,10 @@ import tifffile
 import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
+from PIL import Image, ImageCms
 from torch import Tensor
 
+from arraygeom import Sensor
 from arraygeom.pixels import HW
 from arraygeom.runtime import image_bytes
 from arraygeom.runtime.atomic import write_atomically
@@ -28,7 +34,6 @@ from arraygeom.runtime.extras import install_line
 from arraygeom.runtime.image_bytes import ImageHeader, image_header
 from arraygeom.runtime.warned import warn
 
-from .profiles import in_srgb, with_srgb_profile
 from .suffixes import RAW_SUFFIXES
 
 FEW_BITS = (8, 10, 12, 14)
@@ -47,6 +52,8 @@ GREY_WITH_ALPHA = 4
 MOST_PIXELS = 2**28
 """Pixels above which an image is read only if its size is expected: some 3 GiB in colour."""
 
+_JPEG_PART = 65_000
+"""Bytes of a colour profile that fit in one segment of a JPEG file."""
 _HEIF = tuple(b"ftyp" + brand for brand in (b"heic", b"heix", b"mif1", b"msf1", b"heim", b"heis"))
 
 
@@ -148,6 +155,16 @@ def _planes(
     if orientation == "apply":
         values = in_srgb(values, content, label)
     return (values[None] if values.ndim == 2 else values[..., ::-1].transpose(2, 0, 1)), header.white
+
+
+def recorded_bands(values: Any, sensor: Sensor) -> Any:
+    """Reduce three equal bands to one for a camera that the rig declares grey.
+
+    Returns:
+        Values (1, h, w) in that case; otherwise `values` unchanged.
+    """
+    grey = len(values) == 3 and sensor.response not in (None, "rgb")
+    return values[:1] if grey and all((values[0] == band).all() for band in values[1:]) else values
 
 
 def write_image(
@@ -415,3 +432,85 @@ def _quantised(colours: NDArray, bits: int) -> NDArray:
         rows = np.clip(colours[first:last], 0, 1).astype(np.float64)
         counts[first:last] = np.rint(rows * (2**bits - 1))
     return counts
+
+
+@cache
+def srgb_profile() -> bytes:
+    """Return the bytes of an ICC profile of sRGB, with a fixed date (bytes 24 to 35) so that files are
+    reproducible."""
+    made = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    return made[:24] + struct.pack(">6H", 2000, 1, 1, 0, 0, 0) + made[36:]
+
+
+def in_srgb(values: NDArray, content: bytes, label: str) -> NDArray:
+    """Convert decoded values to sRGB if their file has another colour profile.
+
+    Args:
+        values: (h, w) or (h, w, 3) with blue first.
+        content: bytes of the image file.
+        label: prefix of warnings.
+
+    Returns:
+        Values in sRGB, of the same shape and type. Values of 16 bits, and values with a profile that cannot
+        be used, are returned unchanged with a warning.
+    """
+    profile = _embedded(content)
+    if profile is None:
+        return values
+    try:
+        opened = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        name = ImageCms.getProfileDescription(opened).strip()
+        if "srgb" in name.lower() and "linear" not in name.lower():
+            return values
+        if values.dtype != np.uint8:
+            warn(f"{label}: colour profile '{name}' is ignored, as values have 16 bits: save it in sRGB")
+            return values
+        converted = _converted(values, opened)
+    except (ImageCms.PyCMSError, OSError, ValueError) as error:
+        warn(f"{label}: its colour profile cannot be used ({error}): save it in sRGB")
+        return values
+    warn(f"{label}: converted from colour profile '{name}' to sRGB")
+    return converted
+
+
+def _embedded(content: bytes) -> bytes | None:
+    """ICC profile in an image file; None without one."""
+    if not any(mark in content for mark in (b"iCCP", b"ICC_PROFILE", b"ICCP", b"acsp")):
+        return None
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with Image.open(io.BytesIO(content)) as image:
+                return image.info.get("icc_profile")
+    except (OSError, SyntaxError, ValueError, TypeError, struct.error, Image.DecompressionBombError):
+        return None
+
+
+def _converted(values: NDArray, profile: ImageCms.ImageCmsProfile) -> NDArray:
+    grey = values.ndim == 2
+    image = Image.fromarray(values if grey else np.ascontiguousarray(values[..., ::-1]))
+    srgb = ImageCms.createProfile("sRGB")
+    intent = ImageCms.Intent.RELATIVE_COLORIMETRIC
+    colours = np.asarray(ImageCms.profileToProfile(image, profile, srgb, intent, outputMode="RGB"))
+    return colours[..., 1].copy() if grey else colours[..., ::-1]
+
+
+def with_srgb_profile(content: bytes, suffix: str) -> bytes:
+    """Add an sRGB profile to the bytes of an image file in colour: in a grey one it is not valid.
+
+    Args:
+        content: bytes of the file.
+        suffix: suffix of its name in small letters, such as ".png".
+
+    Returns:
+        The bytes of a PNG or JPEG file with the profile; of other files unchanged.
+    """
+    if suffix == ".png":
+        body = b"iCCP" + b"sRGB\0\0" + zlib.compress(srgb_profile())
+        chunk = struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body))
+        return content[:33] + chunk + content[33:]
+    if suffix in (".jpg", ".jpeg"):
+        segment = b"ICC_PROFILE\0\1\1" + srgb_profile()
+        assert len(segment) < _JPEG_PART
+        return content[:2] + b"\xff\xe2" + struct.pack(">H", len(segment) + 2) + segment + content[2:]
+    return content

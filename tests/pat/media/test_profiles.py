@@ -12,8 +12,7 @@ import torch
 from PIL import Image, ImageCms
 
 from pat.media.colour import srgb_from_linear
-from pat.media.images import read_image, write_image
-from pat.media.profiles import srgb_profile
+from pat.media.images import read_image, srgb_profile, write_image
 
 COLOURS = np.random.default_rng(0).integers(20, 236, (8, 9, 3), np.uint8)
 
