@@ -388,7 +388,7 @@ class Camera(LensView):
         """Convert a camera of kornia.
 
         Args:
-            batched: True keeps a batch of one as a batch.
+            batched: True keeps a batch of one as a batch; a `CameraModel` keeps its axes as they are.
             cam_from_world: pose for a `CameraModel`, which has none; None for the identity.
 
         Raises:
@@ -449,6 +449,7 @@ def intrinsics(
 
     Raises:
         ValueError: for more than two numbers.
+        TypeError: for values that are no numbers.
     """
     fx, fy = _two(focal, "focal")
     cx, cy = _two(((hw[1] - 1) / 2, (hw[0] - 1) / 2) if centre is None else centre, "centre")

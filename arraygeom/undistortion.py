@@ -27,7 +27,8 @@ def pinhole_view(camera: AnyLensView) -> AnyLensView:
     """Make the pinhole camera that covers an image with a lens, up to `WIDEST` off axis.
 
     Position, orientation and K stay except for the principal point: pixels in the middle keep their size.
-    Links follow by `rig.transformed(name, view.K @ camera.K^-1, view.hw)`.
+    Rays that do not meet in a point are taken to. Links follow by `rig.transformed(name, view.K @
+    camera.K^-1, view.hw)`.
 
     Returns:
         The camera without its lens, usually of another size.

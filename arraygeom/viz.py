@@ -261,14 +261,16 @@ def draw_matches(
 ) -> Figure:
     """Draw patches around points matched between alpha and each beta, with the lines that the rig gives.
 
-    Above, alpha's patch, 18 pixels to either side of the point; below, beta's around the match, with the line
-    of alpha's point and the distance in pixels. Matches lie on their lines only if the rig is right.
+    Seven matches of each beta at most are drawn, spread over the image. Above, alpha's patch, 18 pixels to
+    either side of the point; below, beta's around the match, with the line of alpha's point and the distance
+    in pixels. Matches lie on their lines only if the rig is right.
 
     Args:
-        matches: points (x, y) of alpha and of the beta, by beta.
+        matches: points (x, y) of alpha and of the beta, by beta, in pixels as recorded.
 
     Raises:
         ImportError: without matplotlib.
+        ValueError: if neither calibration nor F is known.
     """
     count, half = 7, 18
     figure = new_figure(figsize=(1.55 * count, 3.7 * len(matches)), layout="constrained")

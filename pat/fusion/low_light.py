@@ -183,6 +183,8 @@ class LowLight:
 def denoised_views(views: Views, noise: Noise | None) -> tuple[Views, LowLight]:
     """Denoise the views that have noticeable noise.
 
+    Warns if the noise stated for a camera is far more than its image shows.
+
     Args:
         noise: noise level by camera, "estimate" to estimate each, "auto" to do so only if an image shows
             noise plainly; None for no denoising.

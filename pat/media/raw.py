@@ -117,7 +117,7 @@ def demosaiced(raw: Float[Tensor, "1 h w"], pattern: str) -> Float[Tensor, "3 h 
 
     Args:
         raw: values of the mosaic, 0..1; others are clipped.
-        pattern: OpenCV's name of the mosaic: "BG", "GB", "RG" or "GR".
+        pattern: colours of the first two pixels of the first row, then of the second, such as "RGGB".
 
     Returns:
         RGB image of the same size, clipped to 0..1, without gradient.
