@@ -39,6 +39,8 @@ def simulate_photos(
 ) -> Pose:
     """Render photographs of a board in `count` random poses, into `folder`/CAMERA/000.png and so on.
 
+    Grey images of 8 bits; folders are made, and files of these names replaced.
+
     Args:
         count: number of poses, and of images of each camera.
         noise: standard deviation of the noise, in grey values of 255.

@@ -370,6 +370,8 @@ def write_board(board: str, out: Path, *, paper: str | None = None) -> Path:
 
     Raises:
         ValueError: for another suffix, text that is no board, and a board that does not fit on the sheet.
+        FileNotFoundError: for a missing target file.
+        OSError: if the file cannot be written.
     """
     if out.suffix.lower() not in (".pdf", ".svg"):
         raise ValueError(f"{out}: a board is written as .pdf or .svg, which keep its true size")

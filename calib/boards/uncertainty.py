@@ -284,6 +284,9 @@ def jackknife(problem: BundleProblem) -> Jackknife:
     A plain jackknife's deviations are too large by 15 to 40 % with a dozen boards that determine all
     parameters between them; Bell and McCaffrey's (2002) correction removes that.
 
+    Returns:
+        Covariances of the cameras' free parameters and of the boards' shapes, and the shapes after a step.
+
     Raises:
         numpy.linalg.LinAlgError: if parameters are not observable.
     """

@@ -18,7 +18,11 @@ TERMS = 4
 
 
 def with_lenses(rig: Rig) -> Rig:
-    """Return the rig with a lens without distortion for those linked views that have no lens."""
+    """Return the rig with a lens without distortion for those linked views that have no lens.
+
+    Their lens is a `brown-conrady` of zeros, the focal length half the longer side; the same rig if none
+    lacks one.
+    """
     for name in dict.fromkeys(name for pair in rig.links for name in pair):
         if not isinstance(view := rig[name], LensView):
             K = intrinsics(max(view.hw) / 2, view.hw)

@@ -359,6 +359,8 @@ def split(
     """Split points into those to use and those to hold out: whole frames if several, else squares of alpha's
     image.
 
+    Of several frames the last are held out: one in `HELD_OUT`, rounded down, and at least one.
+
     Returns:
         Matches to use and to hold out, by pair of names.
 

@@ -108,6 +108,9 @@ def self_calibrated(
 
     Returns:
         The pair, with the depth range of the points; None for points that no poses explain.
+
+    Raises:
+        ValueError: for points that are all in one spot.
     """
     alpha, beta = views
     lenses = {
