@@ -115,7 +115,7 @@ class Batch:
 
     @cached_property
     def dependencies(self) -> str:
-        """Everything that the results depend on, as YAML text."""
+        """Everything but the images that the results depend on, as YAML text."""
         stamp = hashlib.sha256(find_weights(self.weights).read_bytes()).hexdigest()
         entries = json.loads(self.to_json())
         files = entries.pop("files")
@@ -300,6 +300,7 @@ class Batch:
 
         Raises:
             ValueError: if it cannot be fused.
+            OSError: if a file cannot be read or written.
         """
         with limited(self.settings.limit):
             with confidence_checked(strict=self.strict):
@@ -407,11 +408,12 @@ def find_images(text: str | Path, *, name: str = "") -> list[Path]:
         name: name of the camera, for messages.
 
     Returns:
-        Files in natural order, numbers in names counting as such.
+        Files in natural order, numbers in names counting as such; of a folder those with the suffix of an
+        image. Hidden ones are left out; a single file may have any other suffix than a video's.
 
     Raises:
         FileNotFoundError: if there is none.
-        ValueError: for a video, and two files of one name.
+        ValueError: for a video, and two files whose names differ in the suffix alone.
     """
     path = Path(text)
     label = f"{name}: " if name else ""

@@ -112,10 +112,14 @@ def array_from_images(
         further: files of other captures by camera, used too where tags state cameras without parallax.
         say: function that is called with a line of text for each finding.
 
+    Returns:
+        The array: alpha, and the betas that show enough of what alpha shows.
+
     Raises:
-        ValueError: in one line, for fewer than two images, an image of one colour, images that do not show
-            the same things, and a focal length of an unknown camera.
-        FileNotFoundError: for a missing file.
+        ValueError: in one line, for fewer than two images, tensors that are no image in 0..1, an image of one
+            colour, images that do not show the same things, and a focal length that is not positive, of an
+            unknown camera, or beside tags that state it.
+        FileNotFoundError: for a missing file, and unknown weights.
         TypeError: for an image without a name that is no file.
     """
     sources, focal = by_camera(sources), focal or {}
@@ -546,7 +550,11 @@ def _moved(pairs: Pairs, maps: Mapping[str, Tensor]) -> dict[tuple[str, str], Po
 
 
 def resized_rig(rig: Rig, images: Images) -> Rig:
-    """Return the rig with its cameras resized to the images' sizes."""
+    """Return the rig with its cameras resized to the images' sizes.
+
+    Returns:
+        The rig; `images` must have all of its cameras.
+    """
     for name in rig.names:
         rig = rig.resize(name, (int(images[name].shape[-2]), int(images[name].shape[-1])))
     return rig

@@ -161,6 +161,9 @@ def writable(out: Path, *, folder: bool = False, option: str = "--out") -> Path:
 def device_of(name: str) -> str:
     """Resolve a device's name.
 
+    Args:
+        name: "cpu", "cuda", or "auto" for a GPU if there is one.
+
     Returns:
         "cpu" or "cuda".
 

@@ -145,7 +145,7 @@ def middlebury_pairs(root: str | Path) -> Iterator[StereoPair]:
 
     Raises:
         FileNotFoundError: for a missing folder.
-        ValueError: for a folder without a pair.
+        ValueError: for a folder without a pair; and while they are read, for an image that cannot be.
     """
     root = _folder(root)
     return (_middlebury_pair(root, *scene) for scene in _some(_middlebury_scenes(root), root))
@@ -161,7 +161,7 @@ def folder_pairs(root: str | Path) -> Iterator[StereoPair]:
 
     Raises:
         FileNotFoundError: for a missing folder.
-        ValueError: for a folder without a pair.
+        ValueError: for a folder without a pair; and while they are read, for an image that cannot be.
     """
     root = _folder(root)
     return (

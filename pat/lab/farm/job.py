@@ -326,14 +326,14 @@ def make_scene(config_text: str, work: Path, scene: Path, index: int) -> None:
     """Render one scene from the first seed that the self-check accepts, and publish its folder.
 
     Args:
-        config_text: the `RenderConfig` as YAML, with absolute paths.
+        config_text: the `RenderConfig` as JSON, with absolute paths.
         work: folder for unfinished scenes, on the disk of `scene`.
         scene: folder of the finished scene; an existing one stays.
         index: number of the scene, from which its seeds follow.
 
     Raises:
         ValueError: if `refusals` seeds are refused.
-        JobError: if no scene can be made, such as on a full disk.
+        JobError: if no scene can be made: a full disk, or a configuration that cannot be used.
     """
     config, render_scene = _ready(config_text)
     reason = ""

@@ -183,7 +183,10 @@ class SampleSource:
 
 
 def made_ahead(samples: Iterator[list[Sample]]) -> Iterator[list[Sample]]:
-    """Yield the same samples, while a thread makes the next step's."""
+    """Yield the same samples, while a thread makes the next step's.
+
+    `samples` must be without end.
+    """
     with ThreadPoolExecutor(1) as beside:
         coming = beside.submit(next, samples)
         while True:
