@@ -201,6 +201,9 @@ class LensView(View):
         Returns:
             Directions (z = 1 for pinholes, unit length with a `Distortion`, any length by other models), and
             True where the lens model has one; elsewhere the direction means nothing.
+
+        Raises:
+            ValueError: for points without the axes of a batch of cameras.
         """
         normalised = map_homogeneous(torch.linalg.inv(self.K)[..., :2, :], x)
         if self.distortion is None:

@@ -35,6 +35,7 @@ def pinhole_view(camera: AnyLensView) -> AnyLensView:
 
     Raises:
         ValueError: for a batch of cameras, and an image without a pixel inside its lens's range.
+        NotImplementedError: within `torch.func.vmap`.
     """
     needs_numbers("the size of a pinhole view", camera.K)
     if camera.K.ndim > 2:

@@ -331,6 +331,7 @@ def approximated(pair: Pair) -> Pair:
     Raises:
         ValueError: for uncalibrated or batched pairs, lenses, no depth range, and where beta sees nothing
             between the bounds.
+        NotImplementedError: within `torch.func.vmap`.
     """
     alpha, _ = pair.cameras
     if alpha.K.ndim > 2:

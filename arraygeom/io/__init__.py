@@ -146,6 +146,7 @@ def write_rig(rig: Rig, path: str | Path, *, format: str = "native") -> None:
     Raises:
         ValueError: for an unknown format, a rig that the format cannot hold, and a batch.
         FileExistsError: for a folder with files of these names that nothing here wrote.
+        OSError: if it cannot be written.
     """
     if format not in WRITERS:
         raise ValueError(f"cannot write rig format '{format}' (known: {', '.join(WRITERS)})")

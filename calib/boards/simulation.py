@@ -52,6 +52,7 @@ def simulate_photos(
     Raises:
         ValueError: for a rig without calibrated cameras, cameras that nowhere see a board together, a `count`
             below 1, and a negative `noise`.
+        OSError: if files cannot be written.
     """
     if not 0 <= noise < math.inf:
         raise ValueError(f"noise is a standard deviation in grey values, 0 or more; got {noise:g}")

@@ -119,6 +119,9 @@ def log_depths(
     Returns:
         A function of z that returns a list of one tensor, the logarithms of the depths in alpha,
         differentiable in z; None for fewer than `FEW` points.
+
+    Raises:
+        ValueError: for pairs with neither cameras nor F.
     """
     observable = ~torch.stack([observed_depths(rig, pairs) for rig in rigs]).isnan().any(0)
     if int(observable.sum()) < FEW:

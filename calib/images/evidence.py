@@ -111,6 +111,9 @@ def fit_statistics(
     Returns:
         Statistics by hypothesis; a mask of the inliers among all points of all pairs; and the standard
         deviation of their distances, pixels, at least `LEAST_NOISE`.
+
+    Raises:
+        ValueError: for pairs with neither cameras nor F.
     """
     observed = observations([hypothesis.rig for hypothesis in tried], pairs)
     inliers, floor = _inliers(tried, observed.off, pairs)
@@ -157,6 +160,9 @@ def observations(rigs: Sequence[Rig], pairs: Pairs) -> PointObservations:
 
     Returns:
         Distances, depths and masks, detached: one row a rig, the pairs' points one after the other.
+
+    Raises:
+        ValueError: for pairs with neither cameras nor F.
     """
     parts = [_observations([rig.pair(*names) for rig in rigs], matches) for names, matches in pairs.items()]
     return PointObservations(*(torch.cat(tensors, 1) for tensors in zip(*parts)))

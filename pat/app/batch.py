@@ -115,7 +115,11 @@ class Batch:
 
     @cached_property
     def dependencies(self) -> str:
-        """Everything but the images that the results depend on, as YAML text."""
+        """Everything but the images that the results depend on, as YAML text.
+
+        Raises:
+            FileNotFoundError: for unknown weights.
+        """
         stamp = hashlib.sha256(find_weights(self.weights).read_bytes()).hexdigest()
         entries = json.loads(self.to_json())
         files = entries.pop("files")
@@ -179,6 +183,7 @@ class Batch:
                 rate.
             ImportError: for a video without the extra `video`.
             FileExistsError: for files in the way that no run wrote.
+            OSError: if files cannot be written, on a full disk for instance.
         """
         if video is not None:
             check_video(video)

@@ -295,6 +295,9 @@ def fused_in_tiles(
 
     Returns:
         The whole frame, in the form of one tile. A stored tile that is damaged is fused again.
+
+    Raises:
+        OSError: if a finished tile cannot be written to `store`.
     """
 
     def make(tile: Tile) -> FusedTile:

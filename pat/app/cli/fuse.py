@@ -69,6 +69,8 @@ class Fuse(Around, Fusing):
         Raises:
             UsageError: for invalid options.
             ValueError: for images or a rig that cannot be used.
+            FileNotFoundError: for a missing file, and unknown weights.
+            SystemExit: as `judged`.
         """
         extras = self._extras = {*self.extras.split(",")}
         if unknown := extras - {*EXTRAS}:
@@ -254,6 +256,7 @@ def fuse_with_progress(
 
     Raises:
         ValueError: as `fuse`, and for a GPU that is not available.
+        FileNotFoundError: for unknown weights.
     """
     from ...networks.weights import load_weights
     from ..front import fuse

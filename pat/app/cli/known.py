@@ -150,6 +150,7 @@ class Known:
 
         Raises:
             ValueError: for images that cannot be used, and a memory limit that their size exceeds.
+            FileNotFoundError: for a missing file, and unknown weights.
         """
         from ...media.headers import image_header
         from ...support.memory import check_limit

@@ -44,6 +44,7 @@ class Show:
         Raises:
             ValueError: for a rig or images that cannot be used.
             FileExistsError: for files in the way that no run wrote.
+            FileNotFoundError: for a missing file.
         """
         from arraygeom import Camera
         from arraygeom.runtime.together import refuse_others, write_together
@@ -160,6 +161,7 @@ class Explore:
 
         Raises:
             ValueError: for a rig or images that it cannot show.
+            FileNotFoundError: for a missing file.
         """
         from calib.boards.uncertainty import RigCovariance
 
@@ -215,6 +217,7 @@ class Info:
 
         Raises:
             ValueError: for a file that is no rig, and an unknown alpha.
+            FileNotFoundError: for a missing file.
         """
         from arraygeom.io import ANY_SCALE, recognise
         from arraygeom.runtime.text import length_unit
@@ -419,6 +422,8 @@ class Refine:
 
         Raises:
             ValueError: for a rig, images or options that cannot be used.
+            FileNotFoundError: for a missing file.
+            SystemExit: with status 4, as above.
         """
         from arraygeom.io.native import write
         from arraygeom.runtime.atomic import write_text
@@ -484,6 +489,7 @@ class RigFromImages:
 
         Raises:
             ValueError: for images with too little in common.
+            FileNotFoundError: for a missing file.
         """
         from arraygeom.runtime.text import OPEN
         from calib.images.from_images import rig_from_images
@@ -528,6 +534,7 @@ class RigDiff:
 
         Raises:
             ValueError: for rigs of other cameras, no depth range, and options that contradict each other.
+            FileNotFoundError: for a missing file.
         """
         from calib.boards.rig_diff import draw_difference, rig_difference
         from calib.boards.uncertainty import RigCovariance

@@ -232,6 +232,9 @@ def disparity(network: FusionNetwork, pair: Pair) -> float:
 
     Returns:
         Pixels of beta as the network receives it (resized if it needs equal resolutions); 1 or more.
+
+    Raises:
+        ValueError: for a pair that is not calibrated or has no depth range.
     """
     if pair.has_lens:
         grid = coarse_grid(pair.alpha.hw).reshape(-1, 2).double()

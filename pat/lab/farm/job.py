@@ -163,6 +163,7 @@ class RenderConfig:
 
         Raises:
             ValueError: for a rig that cannot be rendered.
+            FileNotFoundError: for a missing file of the rig.
         """
         return sum(10.0 * h * w for h, w in self.settings.images(Rig.load(self.rig))) + 20_000
 
@@ -244,6 +245,7 @@ def render(
         ValueError: for what cannot be rendered, scenes or workers below 1, more scenes than the disk holds,
             or a folder in use or of another configuration.
         JobError: if the job cannot go on, such as on a full disk.
+        ImportError: for a `scheduler` without the package of Dask.
     """
     if scenes < 1 or workers < 1:
         raise ValueError(f"give at least one scene and one worker, got --scenes {scenes} --workers {workers}")

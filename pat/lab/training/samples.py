@@ -207,6 +207,7 @@ def scenes(config: TrainConfig, *, device: str = "cpu") -> tuple[SampleSource, S
 
     Raises:
         ValueError: for no photographs, or too few to hold some out, and other data that cannot be used.
+        FileNotFoundError: for a missing folder.
     """
     n, layered = config.held_out, config.rendered + config.measured < 1
     bank, unseen = photographs(config) if layered else (None, None)
@@ -235,6 +236,7 @@ def source_of(
 
     Raises:
         ValueError: for folders that cannot be used.
+        FileNotFoundError: for a missing folder.
     """
     rectified, general = config.rectified_rigs, config.general_rigs
     how: dict[str, Any] = {"hw": config.hw, "seed": seed, "device": device}
