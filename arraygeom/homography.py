@@ -89,7 +89,7 @@ def fit_similarity(x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"]) -> Float[Te
     Umeyama 1991 in two dimensions, in closed form: as complex numbers y = a x + b.
 
     Returns:
-        Matrix (3, 3), differentiable.
+        Matrix (3, 3) of the points' type, differentiable.
 
     Raises:
         ValueError: if all points of x coincide.

@@ -132,7 +132,9 @@ def depth_outline(rig: Rig, cameras: Mapping[str, Camera], alpha: str | None) ->
 
 
 def image_border(hw: HW) -> Float[Tensor, "n 2"]:
-    """Return points around the image's area, from its first corner back to it, 16 on each side, in pixels."""
+    """Return float64 points around the image's area, from its first corner back to it, 16 on each side, in
+    pixels.
+    """
     h, w = hw
     corners = torch.tensor([[0.0, 0], [w, 0], [w, h], [0, h], [0, 0]], dtype=torch.float64) - 0.5
     steps = torch.arange(16, dtype=torch.float64)[:, None] / 16

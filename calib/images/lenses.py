@@ -56,7 +56,7 @@ def describe_lenses(rig: Rig) -> str:
 
 
 def largest_distortion(view: LensView) -> Float[Tensor, ""]:
-    """Compute the largest distortion of a lens beyond that of the nearest homography, pixels."""
+    """Compute the largest distortion of a lens beyond that of the nearest homography, pixels (float64)."""
     x = coarse_grid(view.hw).reshape(-1, 2)
     undistorted, valid = view.to(torch.float64).undistort(x)
     x, undistorted = x[valid], undistorted[valid]

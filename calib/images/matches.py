@@ -381,7 +381,7 @@ def depths_near_lines(pair: Pair, matches: PointMatches, *, within: float) -> Fl
     front.
 
     Returns:
-        Depths in the rig's unit (metres), of these points alone; points too far for their depth to be known
+        Depths in the rig's unit, float64, of these points alone; points too far for their depth to be known
         are left out.
 
     Raises:
@@ -455,7 +455,7 @@ def fit_homography(matches: PointMatches) -> Float[Tensor, "3 3"]:
     """Fit H to a few points, as near to a similarity as they allow; wrong ones among them count little.
 
     Returns:
-        H with beta ~ H alpha.
+        H with beta ~ H alpha, float64, without gradient.
 
     Raises:
         ValueError: for fewer than `FEWEST` points, points in one spot, and points that no similarity fits.

@@ -60,7 +60,7 @@ class FreeParameter:
 
     @cached_property
     def root(self) -> Float[Tensor, "k k"]:
-        """Lower triangular root of the prior covariance: the change is root z."""
+        """Lower triangular root of the prior covariance, float64: the change is root z."""
         eye = torch.eye(len(self.sigma), dtype=torch.float64)
         correlation = torch.where(eye > 0, eye, self.correlation)
         return self.sigma[:, None] * torch.linalg.cholesky(correlation)

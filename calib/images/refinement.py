@@ -388,8 +388,8 @@ def systematic_columns(rig: Rig, pairs: Pairs) -> Float[Tensor, "m s"]:
     """Compute derivatives of all Sampson distances by the distortion that lens models leave uncorrected.
 
     Returns:
-        One row a point, four columns a camera, in pixels per prior deviation (`SYSTEMATIC`); 0 for pairs
-        known by F.
+        One row a point, four columns a camera, float64 without gradient, in pixels per prior deviation
+        (`SYSTEMATIC`); 0 for pairs known by F.
     """
     names = [name for name in cameras_of(rig, pairs) if isinstance(rig[name], Camera)]
     columns = {name: slice(4 * i, 4 * i + 4) for i, name in enumerate(names)}

@@ -182,7 +182,8 @@ def systematic_modes(pair: Pair, matches: PointMatches) -> tuple[Float[Tensor, "
     fifth order, and decentred along x and along y.
 
     Returns:
-        Four columns for alpha and four for beta, one row a match; 0 where a pixel has no ray.
+        Four columns for alpha and four for beta, one row a match, without gradient; 0 where a pixel has no
+        ray.
 
     Raises:
         ValueError: for a pair with neither cameras nor F.
@@ -221,7 +222,8 @@ def lines_basis(pair: Pair, matches: PointMatches) -> Float[Tensor, "n 8"]:
     For calibrated pairs the matrix is E, between rays.
 
     Returns:
-        Pixels per unit of each degree of freedom, one row a match; 0 where a pixel has no ray.
+        Pixels per unit of each degree of freedom, one row a match, without gradient; 0 where a pixel has no
+        ray.
 
     Raises:
         ValueError: for a pair with neither cameras nor F.

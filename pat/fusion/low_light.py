@@ -350,7 +350,7 @@ def brightness_change(
         matched: positions of alpha's pixels in each beta, x and y, with their confidence.
 
     Returns:
-        Values to add to each band, (1, H, W).
+        Values to add to each band, (1, H, W), without gradient.
     """
 
     def changed(estimate: Tensor, *planes: Tensor) -> Tensor:
@@ -377,7 +377,7 @@ def colours_averaged(
         matched: positions of alpha's pixels in each beta, x and y, with their confidence.
 
     Returns:
-        The image with the same luma; unchanged without noise in the betas.
+        The image with the same luma, without gradient; unchanged without noise in the betas.
     """
     beta, confidence = warped(betas, matched)
     deviation = float(beta.deviation.mean())
