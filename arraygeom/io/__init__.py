@@ -97,7 +97,7 @@ def read_rig(
     check_above(0, itself=False, scale=scale)
     path = Path(path)
     if not path.exists():
-        raise FileNotFoundError(f"{path}: no such rig file")
+        raise FileNotFoundError(f"{path}: no such rig file: check the path")
     if not (path.is_file() or path.is_dir()):
         raise RigFileError(path, None, "is neither a file nor a folder")
     format = recognise(path) if format is None else format

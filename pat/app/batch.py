@@ -102,7 +102,7 @@ class Batch:
         for name in self.files:
             self.rig.require(name)
         if self.alpha not in self.files:
-            raise ValueError(f"no image of alpha, '{self.alpha}'")
+            raise ValueError(f"no image of alpha, '{self.alpha}', only of {', '.join(self.files)}")
         if not self.sequence and len({len(files) for files in self.files.values()}) > 1:
             counts = ", ".join(f"{len(files)} of '{name}'" for name, files in self.files.items())
             raise ValueError(f"frames need as many images of each camera, got {counts}")
@@ -423,7 +423,7 @@ def find_images(text: str | Path, *, name: str = "") -> list[Path]:
     path = Path(text)
     label = f"{name}: " if name else ""
     if path.suffix.lower() in VIDEO_SUFFIXES:
-        raise ValueError(f"{label}{path}: is a video, which needs `pat fuse` without a rig: save its frames")
+        raise ValueError(f"{label}{path}: is a video, for `pat sequence` without a rig: save its frames")
     if path.is_dir():
         files = _images_in(path)
     else:

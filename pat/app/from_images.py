@@ -129,7 +129,9 @@ def array_from_images(
         range_of(name, image)
     for name, length in focal.items():
         if name not in sources or not 0 < length < math.inf:
-            raise ValueError(f"focal {name}={length:g}: no camera of {', '.join(sources)}, or not positive")
+            raise ValueError(
+                f"focal: '{name}={length:g}' is of no camera ({', '.join(sources)}), or not positive"
+            )
     notes: list[str] = []
 
     def note(line: str) -> None:
@@ -253,7 +255,7 @@ def video_frames(videos: Mapping[str, Path], folder: Path) -> tuple[dict[str, li
             write_image(files[name][-1], image)
             os.utime(files[name][-1], ns=(path.stat().st_mtime_ns,) * 2)
         if not files[name]:
-            raise ValueError(f"{path}: a video without frames")
+            raise ValueError(f"{path}: holds no frames: is the video whole?")
     return files, rates
 
 

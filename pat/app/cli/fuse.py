@@ -95,7 +95,9 @@ class Fuse(Around, Fusing):
         """
         if several := [name for name, paths in files.items() if len(paths) > 1]:
             count = len(files[several[0]])
-            raise UsageError(several[0], "one image; `pat batch` fuses many", f"{count} images")
+            raise UsageError(
+                several[0], "one image; `pat batch` or `pat sequence` fuses many", f"{count} images"
+            )
         return files
 
     def _fuse(self, frame: Recordings) -> None:
@@ -110,7 +112,7 @@ class Fuse(Around, Fusing):
 
         alpha, found, begin = frame.alpha, frame.found, time.monotonic()
         if "points" in self._extras and not isinstance(frame.rig[alpha], Camera):
-            raise UsageError("--extras points", "a calibrated alpha, and its camera has F alone")
+            raise UsageError("--extras points", "a calibrated alpha, and it has F alone: leave it out")
         with folder_lock(self.out):
             sweep(self.out)
             refuse_to_replace(self.out)

@@ -314,7 +314,7 @@ class Convert:
 
         hw = None if self.size is None else (self.size[1], self.size[0])
         if hw is not None and min(hw) < 1:
-            raise ValueError("--size: wanted width and height in pixels")
+            raise ValueError(f"--size: wanted width and height in pixels, got {hw[1]} {hw[0]}")
         rig = read_rig(self.source, format=self.read_as, hw=hw, lens=self.lens)
         if hw is not None and all(view.hw != hw for view in rig.cameras.values()):
             h, w = rig[rig.names[0]].hw
