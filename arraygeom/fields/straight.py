@@ -67,7 +67,7 @@ class Epipolar:
             Near and far, in the rig's unit.
 
         Raises:
-            ValueError: if neither states one.
+            ValueError: if neither states one, or near is beyond far.
         """
         if self.near is not None and self.far is not None:
             return depth_range(self.near, self.far)

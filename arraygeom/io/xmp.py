@@ -460,6 +460,7 @@ def image_tags(path: Path) -> ImageTags | None:
 
     Raises:
         OSError: for a file that cannot be opened.
+        ImportError: without Pillow, for a file with XMP.
     """
     xmp = _xmp(path.read_bytes())
     if not xmp:

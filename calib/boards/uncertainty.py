@@ -338,6 +338,9 @@ def with_disagreement(solved: Solved, board: Board, *, unchecked: bool = False) 
 
     Returns:
         The solution with that covariance, the factor in `raised`, and notes.
+
+    Raises:
+        numpy.linalg.LinAlgError: if parameters are not observable by the frames.
     """
     problem, covariance, notes = solved.problem, solved.covariance, list[str]()
     raised, frames = 1.0, len(problem.frames)

@@ -240,7 +240,7 @@ def lines_basis(pair: Pair, matches: PointMatches) -> Float[Tensor, "n 8"]:
 
 
 def related(rig: Rig, pairs: Pairs) -> dict[tuple[str, str], PointMatches]:
-    """Select those of the pairs that the rig relates: calibrated ones and those with an F.
+    """Select those of the pairs that the rig relates: calibrated ones and those with a link.
 
     Returns:
         Matches by pair of names.

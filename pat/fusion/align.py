@@ -189,6 +189,7 @@ def align_frame(
     Raises:
         ValueError: as `pat.align`; for a network that uses no matches, and recorded values that are missing,
             no numbers, or of another size.
+        TypeError: for what `matcher` returns if that is no `Matches`.
     """
     rule = _ViewRule(interpolation, min_confidence, fill)
     rig = with_pixels(rig)

@@ -410,7 +410,7 @@ def summarise(root: Path) -> str:
 
     Raises:
         FileNotFoundError: for a missing folder.
-        ValueError: for a folder without scenes.
+        ValueError: for a folder without scenes, with an incomplete one, or whose first rig cannot be read.
     """
     from statistics import median
 
