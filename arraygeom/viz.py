@@ -119,7 +119,8 @@ def depth_outline(rig: Rig, cameras: Mapping[str, Camera], alpha: str | None) ->
         alpha: name of alpha; None for the first camera.
 
     Returns:
-        Arrays (n, 3) of world points; empty without a depth range, or for bounds too far away.
+        Arrays (n, 3) of world points; empty without a depth range. A bound beyond 6 times the rig's extent is
+        left out.
     """
     if rig.depth is None:
         return []
