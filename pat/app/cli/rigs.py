@@ -163,8 +163,6 @@ class Explore:
             ValueError: for a rig or images that it cannot show.
             FileNotFoundError: for a missing file.
         """
-        from calib.boards.uncertainty import RigCovariance
-
         from ..explore import opened, serve
 
         if self.save is not None:
@@ -174,7 +172,11 @@ class Explore:
         if images:
             warn_of_misfit(rig, images)
         options.field_named(self.field)
-        beside = self.rig.with_suffix(".covariance.json")
+        beside, covariance = self.rig.with_suffix(".covariance.json"), None
+        if beside.is_file():
+            from calib.boards.uncertainty import RigCovariance  # imports matplotlib
+
+            covariance = RigCovariance.load(beside, rig)
         files = {"": self.rig, **options.files_by_name(self.image)}
         explorer = opened(
             rig,
@@ -182,7 +184,7 @@ class Explore:
             alpha=self.alpha,
             network=self.network,
             field=self.field,
-            covariance=RigCovariance.load(beside, rig) if beside.is_file() else None,
+            covariance=covariance,
             files={name: str(file) for name, file in files.items()},
         )
         if explorer.error:
