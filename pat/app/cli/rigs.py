@@ -172,8 +172,8 @@ class Explore:
         if images:
             warn_of_misfit(rig, images)
         options.field_named(self.field)
-        beside, covariance = self.rig.with_suffix(".covariance.json"), None
-        if beside.is_file():
+        covariance = None
+        if (beside := self.rig.with_suffix(".covariance.json")).is_file():
             from calib.boards.uncertainty import RigCovariance  # imports matplotlib
 
             covariance = RigCovariance.load(beside, rig)
