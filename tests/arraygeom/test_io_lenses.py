@@ -109,7 +109,7 @@ def test_zeds_rows_are_those_that_the_makers_code_makes():
     K = [np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]) for fx, fy, cx, cy in ZED_K]
     cv2 = pytest.importorskip("cv2")
     R, t = cv2.Rodrigues(np.array([0.0024, 0.007, -0.0021]))[0], np.array([-119.905, 0.5, -2.5])
-    R1, R2, P1, P2 = cv2.stereoRectify(K[0], ZED_C[0], K[1], ZED_C[1], (1280, 720), R, t)[:4]
+    R1, R2, P1, P2 = cv2.stereoRectify(K[0], ZED_C[0], K[1], ZED_C[1], (1280, 720), R, t[:, None])[:4]
     rows = [
         cv2.undistortPoints(pixels(rig, name, POINTS)[:, None], *camera)[:, 0, 1]
         for name, camera in (

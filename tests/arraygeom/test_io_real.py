@@ -178,7 +178,7 @@ def chessboard(path: Path) -> torch.Tensor | None:
     if not found:
         return None
     stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-4)
-    return tensor(cv2.cornerSubPix(grey, corners, (5, 5), (-1, -1), stop)[:, 0])
+    return tensor(cv2.cornerSubPix(grey, corners, (5, 5), (-1, -1), stop).reshape(-1, 2))
 
 
 def test_kalibr_fisheyes(shared_data):

@@ -40,7 +40,7 @@ def test_rotations_are_opencvs(seed):
     w, h = 64, 48
     zero = np.zeros(5)
     R1, R2, P1, P2, *_ = cv2.stereoRectify(
-        pair.alpha.K.numpy(), zero, pair.beta.K.numpy(), zero, (w, h), pose.R.numpy(), pose.t.numpy()
+        pair.alpha.K.numpy(), zero, pair.beta.K.numpy(), zero, (w, h), pose.R.numpy(), pose.t.numpy()[:, None]
     )
     done = rectify(pair, K=torch.from_numpy(P1[:, :3].copy()), hw=(h, w))
     np.testing.assert_allclose(done.R_alpha.numpy(), R1, atol=1e-9)
