@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import json
 import math
 from typing import Any
 
@@ -12,13 +13,26 @@ from PIL import Image
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from arraygeom import Camera, Distortion, Pose, Rig, rotation_from_vector
+from arraygeom import Camera, Distortion, Pair, Pose, Rig, rotation_from_vector
 from arraygeom.io.native import write as rig_text
 from arraygeom.lenses.model import LensModel
+from arraygeom.pixels import HW
 from arraygeom.runtime.text import length_unit
 
 from ...media.colour import to_bytes
-from .pixel import FAMILIES, WINDOWS, BetaReport, ExplorerScene, ExplorerState, image_pixel, inspect_pixel
+from .pixel import (
+    FAMILIES,
+    WINDOWS,
+    BetaReport,
+    ExplorerScene,
+    ExplorerState,
+    PixelReport,
+    beta_report,
+    image_pixel,
+    inspect_pixel,
+    pixel_of,
+    with_depths,
+)
 
 ALL = "all betas"
 """The `camera` whose sliders change all betas alike."""
@@ -31,6 +45,7 @@ DEFAULTS: Controls = {
     "near": None,
     "far": None,
     "baseline": 1.0,
+    "map": "none",
     "camera": ALL,
     "errors": {},
     "pins": [],
@@ -40,8 +55,8 @@ DEFAULTS: Controls = {
 
 baseline is a factor of all betas' distance from alpha; `errors` are changes of cameras by name (`ALL`: of all
 betas), each by the names of `ERRORS`; `camera` is the one that the sliders change; near and far are metres.
-`pins` are pixels of alpha that stay drawn. `clicked` is a beta and a pixel of it, whose match becomes alpha's
-pixel.
+`map` is one of `MAPS`; `pins` are pixels of alpha that stay drawn; `clicked` is a beta and a pixel of it,
+whose match becomes alpha's pixel.
 """
 ERRORS: dict[str, tuple[str, float, float, float, float]] = {
     "rx": ("rotation x (degrees)", -3.0, 3.0, 0.01, 0.0),
@@ -59,6 +74,12 @@ ERRORS: dict[str, tuple[str, float, float, float, float]] = {
 Rotations are about its own axes, steps along those of alpha (in longest baselines), pixels are
 added, the focal length is multiplied. "lens0", "lens1", ... are added to the numbers of the lens.
 """
+MAPS = ("none", "length, px", "betas that see it", "depth range seen", "entropy of weights")
+"""Maps of the whole image: length from the first sample to the last, pixels of beta; number of betas with a
+sample; share of the depth range, in inverse depth, at which beta sees the point; entropy of the weights, 1 if
+all are alike. All but the number are means over the betas."""
+GRID = 24
+"""Columns of alpha's pixels for which maps, and the answers of a saved page that cannot compute, are made."""
 WIDEST = 1280
 """Pixels of the longer side of a displayed image."""
 FARTHEST = 1000.0
@@ -85,6 +106,8 @@ def answer(scene: ExplorerScene, alpha: str, controls: Controls) -> dict[str, An
     report = inspect_pixel(scene, explorer_state(scene.rig, alpha, controls))
     betas: dict[str, Any] = {name: {"problem": text} for name, text in report.problems.items()}
     betas |= {name: drawn(beta) for name, beta in report.betas.items()}
+    for name, beta in betas.items():
+        beta["epipole"] = epipole(scene.rig, alpha, name)
     if controls["second"] != "none":
         second = {**controls, "field": controls["second"]}
         other = inspect_pixel(scene, explorer_state(scene.rig, alpha, second))
@@ -98,7 +121,8 @@ def answer(scene: ExplorerScene, alpha: str, controls: Controls) -> dict[str, An
         "depth": number(report.depth),
         "betas": betas,
         "backwards": backwards,
-        "top": top_view(scene.rig, alpha),
+        "top": top_view(scene.rig, alpha, report),
+        "map": whole_map(scene, alpha, controls),
         "rig": "" if scene.rig is rig else rig_text(scene.rig),
     }
 
@@ -228,12 +252,21 @@ def drawn(beta: BetaReport) -> dict[str, Any]:
     }
 
 
-def top_view(rig: Rig, alpha: str) -> list[dict[str, Any]]:
-    """List the cameras from above, in alpha's axes: each centre (right, forward) and viewing direction,
-    metres.
+def epipole(rig: Rig, alpha: str, beta: str) -> list[float] | None:
+    """Return the position in beta of alpha's centre; None where beta does not see it."""
+    a, b = rig[alpha], rig[beta]
+    if not (isinstance(a, Camera) and isinstance(b, Camera) and a.central):
+        return None
+    seen = b.project(a.centre)
+    return rounded(seen.x) if bool(seen.valid & seen.x.isfinite().all()) else None
+
+
+def top_view(rig: Rig, alpha: str, report: PixelReport) -> list[dict[str, Any]]:
+    """List the cameras from above, in alpha's axes (right, forward).
 
     Returns:
-        Plain values; empty if alpha is not calibrated.
+        Plain values of each camera: `at`, its centre in metres, `ahead`, its viewing direction, and `ray`, to
+        alpha's pixel or to the match (None without one); empty if alpha is not calibrated.
     """
     alpha_view = rig[alpha]
     if not isinstance(alpha_view, Camera):
@@ -241,9 +274,79 @@ def top_view(rig: Rig, alpha: str) -> list[dict[str, Any]]:
     shown = []
     for name, camera in rig.cameras.items():
         if isinstance(camera, Camera):
-            centre, ahead = alpha_view.R @ (camera.centre - alpha_view.centre), alpha_view.R @ camera.R[2]
-            shown.append({"name": name, "at": rounded(centre[[0, 2]], 5), "ahead": rounded(ahead[[0, 2]], 4)})
+            centre, axes = alpha_view.R @ (camera.centre - alpha_view.centre), alpha_view.R @ camera.R.T
+            beta = report.betas.get(name)
+            x = report.x if name == alpha else None if beta is None else beta.xy[int(beta.weight.argmax())]
+            ray, valid = (axes[:, 2], False) if x is None else camera.rays(x.to(axes))
+            shown.append(
+                {
+                    "name": name,
+                    "at": rounded(centre[[0, 2]], 5),
+                    "ahead": rounded(axes[[0, 2], 2], 4),
+                    "ray": rounded((axes @ (ray / ray.norm()))[[0, 2]], 4) if valid else None,
+                }
+            )
     return shown
+
+
+def grid_pixels(hw: HW, columns: int) -> tuple[int, list[list[float]]]:
+    """Return the number of rows of about square cells over an image, and the cells' middles, row by row."""
+    h, w = hw
+    rows = max(1, round(columns * h / w))
+    xs, ys = ([(i + 0.5) * side / n - 0.5 for i in range(n)] for side, n in ((w, columns), (h, rows)))
+    return rows, [[x, y] for y in ys for x in xs]
+
+
+def whole_map(scene: ExplorerScene, alpha: str, controls: Controls) -> dict[str, Any] | None:
+    """Compute the map that the controls choose, on a grid of alpha's pixels; kept until they change.
+
+    Returns:
+        Plain values: `columns`, `rows`, and `values` row by row (None where there is none); None for no map.
+    """
+    which = MAPS.index(controls["map"])
+    kept = {k: controls[k] for k in ("map", "field", "weights", "near", "far", "baseline", "errors")}
+    key = json.dumps(kept, sort_keys=True)
+    if which and key not in scene.maps:
+        rows, pixels = grid_pixels(scene.rig[alpha].hw, GRID)
+        states = [explorer_state(scene.rig, alpha, {**controls, "x": x}) for x in pixels]
+        rig = with_depths(scene.rig, states[0])
+        pairs = {name: rig.pair(alpha, name) for name in rig.betas(alpha) if name in scene.images}
+        values = []
+        for state in states:
+            found = [_mapped(scene, pair, name, state, which) for name, pair in pairs.items()]
+            known = [v for v in found if v is not None]
+            values.append(number(sum(known) / (1 if which == 2 else len(known))) if known else None)
+        scene.maps.clear()
+        scene.maps[key] = {"columns": GRID, "rows": rows, "values": values}
+    return scene.maps[key] if which else None
+
+
+def _mapped(scene: ExplorerScene, pair: Pair, name: str, state: ExplorerState, which: int) -> float | None:
+    """Value in one beta of the map with a number in `MAPS`; None without one."""
+    if which == 3:
+        if not (pair.calibrated and pair.link is None and pair.depth is not None):
+            return None
+        near, far = (float(d) for d in pair.depth)
+        depth = 1 / torch.linspace(1 / near, 1 / far, DEPTHS, dtype=torch.float64).clamp(min=1e-9)
+        alpha, beta = pair.cameras
+        seen = beta.project(alpha.unproject(pixel_of(state).expand(DEPTHS, 2), depth))
+        return float((seen.valid & beta.contains(seen.x)).double().mean())
+    try:
+        report = beta_report(scene, pair, name, state)
+    except (ValueError, FileNotFoundError):
+        return None
+    weight, n = report.weight[report.valid], int(report.valid.sum())
+    if which == 2:
+        return float(n > 0)
+    if not n:
+        return None
+    if which == 1:
+        return float((report.xy[report.valid][-1] - report.xy[report.valid][0]).norm())
+    return float(torch.special.entr(weight).sum()) / math.log(n) if n > 1 else 0.0
+
+
+DEPTHS = 33
+"""Depths at which it is asked whether a beta sees a point, evenly spaced in inverse depth."""
 
 
 def rounded(values: Tensor, digits: int = 2) -> list[Any]:
@@ -299,6 +402,7 @@ def choices(scene: ExplorerScene, controls: Controls) -> list[list[Any]]:
         ["field", "field", [*fields, *unlisted]],
         ["second", "compared with", ["none", *fields, *unlisted]],
         ["weights", "weights by", weights],
+        ["map", "over alpha", list(MAPS)],
         [
             "camera",
             "sliders change",

@@ -14,7 +14,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -102,7 +102,6 @@ class BetaReport(NamedTuple):
         ends: start and end of a segment; None for other fields.
         weight: weight of each sample, summing to 1.
         depth: depth of each sample, metres; NaN where it has none.
-        value: weighted mean of beta's image.
         peak: largest weight.
         offset: best match of the images; None without a segment or a clear match.
         band: corners of the band that holds the match by the calibration's uncertainty, pixels of beta; None
@@ -114,7 +113,6 @@ class BetaReport(NamedTuple):
     ends: Float[Tensor, "2 2"] | None
     weight: Float[Tensor, " l"]
     depth: Float[Tensor, " l"]
-    value: Float[Tensor, " c"]
     peak: float
     offset: MatchOffset | None = None
     band: Float[Tensor, "4 2"] | None = None
@@ -124,15 +122,15 @@ class PixelReport(NamedTuple):
     """Reports of one pixel of alpha in all betas.
 
     Attributes:
+        x: the pixel.
         betas: report by beta.
         problems: reason, in a sentence, by beta that has no report.
-        colour: fused colour, RGB or grey.
         depth: depth by all betas, metres; NaN if unknown.
     """
 
+    x: Float[Tensor, "2"]
     betas: dict[str, BetaReport]
     problems: dict[str, str]
-    colour: Float[Tensor, " c"]
     depth: float
 
 
@@ -146,6 +144,7 @@ class ExplorerScene:
         fields: further fields by name.
         networks: further networks by name.
         covariance: covariance of the rig's parameters, which gives segments their bands; None for none.
+        maps: maps of the whole image, by the controls that gave them.
         guides: luminances (1, 1, h, w) that windows are cut from, by camera.
         features: computed features of networks.
 
@@ -158,6 +157,7 @@ class ExplorerScene:
     fields: Mapping[str, ReceptiveField] = field(default_factory=dict)
     networks: Mapping[str, PAT] = field(default_factory=dict)
     covariance: Covariance | None = None
+    maps: dict[str, Any] = field(default_factory=dict)
     guides: dict[str, Tensor] = field(default_factory=dict)
     features: dict[tuple[str, str, str | None], tuple[HW, QueryAndKey]] = field(default_factory=dict)
 
@@ -287,13 +287,19 @@ def inspect_pixel(scene: ExplorerScene, state: ExplorerState) -> PixelReport:
             problems[name] = "no image given"
             continue
         try:
-            report = beta_report(scene, rig.pair(state.alpha, name), name, state)
-            betas[name] = report._replace(band=band_corners(scene, rig, name, state, report.ends))
+            pair = rig.pair(state.alpha, name)
+            report = beta_report(scene, pair, name, state)
+            guides = scene.guides[state.alpha], scene.guides[name]
+            betas[name] = report._replace(
+                offset=match_offset(guides, pair, pixel_of(state), (report.xy, report.weight), report.ends),
+                band=band_corners(scene, rig, name, state, report.ends),
+            )
         except (ValueError, FileNotFoundError) as error:
             problems[name] = str(error)
         except Exception as error:  # of a field of one's own
             problems[name] = f"the field '{state.family}' failed: {type(error).__name__}: {error}"
-    return PixelReport(betas, problems, fused_colour(scene, betas, state), joint_depth(betas))
+    x = pixel_of(state)[0]
+    return PixelReport(x, betas, problems, joint_depth(betas))
 
 
 def pixel_of(state: ExplorerState) -> Float[Tensor, "1 2"]:
@@ -324,10 +330,8 @@ def beta_report(scene: ExplorerScene, pair: Pair, name: str, state: ExplorerStat
         larger = xy.new_tensor([key.shape[-1] / pair.beta.hw[1], key.shape[-2] / pair.beta.hw[0]])
         scores = (query.T @ sampled(key, (xy + 0.5) * larger - 0.5))[0]
     weight = softmax(scores, valid)
-    value = sampled(scene.images[name][None], xy) @ weight
     depth, ends = depths(pair, x, xy, valid), ends_of(locations)
-    offset = match_offset((scene.guides[state.alpha], scene.guides[name]), pair, x, (xy, weight), ends)
-    return BetaReport(xy, valid, ends, weight, depth, value, float(weight.max()), offset)
+    return BetaReport(xy, valid, ends, weight, depth, float(weight.max()))
 
 
 def band_corners(
@@ -505,24 +509,6 @@ def sampled(
 ) -> Float[Tensor, " c *l"]:
     """Sample an image at positions, in their precision, without copying it."""
     return sample(image, x[None].to(image), extended=extended).values[0].to(x)
-
-
-def fused_colour(
-    scene: ExplorerScene, betas: Mapping[str, BetaReport], state: ExplorerState
-) -> Float[Tensor, " c"]:
-    """Combine alpha's luminance with the colour differences of the betas in colour, each weighted by its
-    peak.
-
-    Returns:
-        RGB; alpha's luminance alone without such betas.
-    """
-    alpha_value = sampled(scene.guides[state.alpha], pixel_of(state))[:, 0]
-    coloured = [s for s in betas.values() if len(s.value) == 3 and s.peak > 0]
-    if not coloured:
-        return alpha_value
-    weights = sum(s.peak for s in coloured)
-    differences = [s.value - luminance(s.value[:, None, None]).reshape(1) for s in coloured]
-    return alpha_value + sum((s.peak / weights) * difference for s, difference in zip(coloured, differences))
 
 
 def image_pixel(x: float, y: float, hw: HW) -> tuple[float, float]:
