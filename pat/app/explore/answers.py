@@ -247,7 +247,7 @@ def drawn(beta: BetaReport) -> dict[str, Any]:
         "depths": [number(float(d)) for d in beta.depth[beta.valid]],
         "match": rounded(beta.xy[best]),
         "depth": number(float(beta.depth[best])),
-        "off": None if beta.offset is None else round(beta.offset.distance, 2),
+        "off": None if beta.offset is None else round(beta.offset, 2),
         "band": None if beta.band is None else rounded(beta.band),
     }
 

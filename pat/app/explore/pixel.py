@@ -79,20 +79,6 @@ class ExplorerState:
         return dataclasses.replace(self, **changes)  # type: ignore[arg-type]
 
 
-class MatchOffset(NamedTuple):
-    """Best photometric match near the best sample, on the epipolar line or beside it.
-
-    Attributes:
-        position: position of the match, pixels of beta.
-        distance: distance of the match from the line, pixels.
-        correlation: correlation of the windows there, -1 to 1.
-    """
-
-    position: Float[Tensor, "2"]
-    distance: float
-    correlation: float
-
-
 class BetaReport(NamedTuple):
     """Samples of alpha's pixel in one beta, with their weights and the match.
 
@@ -102,8 +88,7 @@ class BetaReport(NamedTuple):
         ends: start and end of a segment; None for other fields.
         weight: weight of each sample, summing to 1.
         depth: depth of each sample, metres; NaN where it has none.
-        peak: largest weight.
-        offset: best match of the images; None without a segment or a clear match.
+        offset: distance of the images' own match from the line, pixels; None without a segment or a match.
         band: corners of the band that holds the match by the calibration's uncertainty, pixels of beta; None
             without a covariance or a segment.
     """
@@ -113,8 +98,7 @@ class BetaReport(NamedTuple):
     ends: Float[Tensor, "2 2"] | None
     weight: Float[Tensor, " l"]
     depth: Float[Tensor, " l"]
-    peak: float
-    offset: MatchOffset | None = None
+    offset: float | None = None
     band: Float[Tensor, "4 2"] | None = None
 
 
@@ -331,7 +315,7 @@ def beta_report(scene: ExplorerScene, pair: Pair, name: str, state: ExplorerStat
         scores = (query.T @ sampled(key, (xy + 0.5) * larger - 0.5))[0]
     weight = softmax(scores, valid)
     depth, ends = depths(pair, x, xy, valid), ends_of(locations)
-    return BetaReport(xy, valid, ends, weight, depth, float(weight.max()))
+    return BetaReport(xy, valid, ends, weight, depth)
 
 
 def band_corners(
@@ -365,10 +349,10 @@ def match_offset(
     x: Float[Tensor, "1 2"],
     samples: tuple[Float[Tensor, "l 2"], Float[Tensor, " l"]],
     ends: Float[Tensor, "2 2"] | None,
-) -> MatchOffset | None:
-    """Find the photometric match near the segment, by the correlation of windows around both pixels.
+) -> float | None:
+    """Find how far beside the line the images' own match lies, by the correlation of windows around both pixels.
 
-    Unlike the samples it may lie beside the line, and does if the rig is off.
+    It lies on the line unless the rig is off.
 
     Args:
         guides: luminances of alpha and of beta.
@@ -378,7 +362,7 @@ def match_offset(
         ends: start and end of the segment; None for other fields.
 
     Returns:
-        The match; None without a segment, or if nothing matches clearly.
+        Its distance, pixels; None without a segment, or if nothing matches clearly.
     """
     xy, weight = samples
     if ends is None or not bool((weight > 0).any()) or float((ends[1] - ends[0]).norm()) < 1e-6:
@@ -394,16 +378,16 @@ def match_offset(
         scores = correlations(*guides, pair, x, points)
         return points[scores.argmax()], float(scores.max())
 
-    on_line, line_score = best(best(line)[0] + fine * along)
+    line_score = best(best(line)[0] + fine * along)[1]
     beside = best(line[:, None] + torch.arange(-ACROSS, ACROSS + 1).to(xy)[:, None] * across)[0]
     beside, beside_score = best(beside + fine[:, None] * across + fine * along)
     distance = abs(float((beside - ends[0]) @ across))
     if max(line_score, beside_score) < CLEAR:
         return None
     if beside_score < line_score + BETTER:
-        return MatchOffset(on_line, 0.0, line_score)
+        return 0.0
     # at the edge it would be better beyond
-    return MatchOffset(beside, distance, beside_score) if distance < ACROSS else None
+    return distance if distance < ACROSS else None
 
 
 def ends_of(locations: Segments | Positions) -> Float[Tensor, "2 2"] | None:
@@ -499,8 +483,9 @@ def joint_depth(betas: Mapping[str, BetaReport]) -> float:
     inverse, total = 0.0, 0.0
     for beta in betas.values():
         has_depth = beta.depth.isfinite()
-        inverse += beta.peak * float((beta.weight[has_depth] / beta.depth[has_depth]).sum())
-        total += beta.peak * float(beta.weight[has_depth].sum())
+        weight = beta.weight.max() * beta.weight[has_depth]
+        inverse += float((weight / beta.depth[has_depth]).sum())
+        total += float(weight.sum())
     return total / inverse if inverse > 0 else math.nan
 
 
