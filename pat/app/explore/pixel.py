@@ -350,7 +350,7 @@ def match_offset(
     samples: tuple[Float[Tensor, "l 2"], Float[Tensor, " l"]],
     ends: Float[Tensor, "2 2"] | None,
 ) -> float | None:
-    """Find how far beside the line the images' own match lies, by the correlation of windows around both pixels.
+    """Find how far beside the line the images' own match lies, by correlating windows around both pixels.
 
     It lies on the line unless the rig is off.
 
