@@ -152,17 +152,17 @@ function asksPinholes(rig) {
   }
   // The maps of answers.py, kept until what they depend on changes.
   let kept = {};
-  const entropy = (weights) => (weights.length < 2 ? 0 : -weights.reduce((sum, p) => sum + (p && p * Math.log(p)), 0) / Math.log(weights.length));
   const MAPS = {
     "length, px": ({ samples: s }) => Math.hypot(...s[0].map((v, i) => v - s.at(-1)[i])),
     "betas that see it": () => 1,
-    "entropy of weights": ({ weights }) => entropy(weights),
+    "entropy of weights": ({ weights: w }) => (w.length < 2 ? 0 : -w.reduce((sum, p) => sum + (p && p * Math.log(p)), 0) / Math.log(w.length)),
   };
   async function mapOf({ map, errors, baseline }, cameras, shown, depths) {
     const key = JSON.stringify([map, errors, baseline, depths]), [h, w] = cameras[rig.alpha].hw;
     if (map === "none" || kept.key === key) return map === "none" ? null : kept.map;
     const columns = 24, rows = Math.max(1, Math.round(columns * h / w)), values = [];
     for (let i = 0; i < columns * rows; i++) {
+      if (i % columns === 0) await new Promise((go) => setTimeout(go)); // lets the page draw
       const x = [((i % columns) + 0.5) * w / columns - 0.5, (Math.floor(i / columns) + 0.5) * h / rows - 0.5].map(Math.round);
       let found;
       if (map === "depth range seen") found = shown.filter(({ name }) => name !== rig.alpha).map(({ name, hw }) => {
