@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import reduce
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from jaxtyping import Float, Real
@@ -132,7 +132,8 @@ class Pose(Batched):
         Raises:
             ValueError: for a pose in the plane (`Se2`).
         """
-        return cls.from_matrix(getattr(pose, "pose", pose).matrix())
+        given: Any = getattr(pose, "pose", pose)
+        return cls.from_matrix(given.matrix())
 
     def to_kornia(self) -> Se3:
         """Convert to kornia's `Se3`, which stores a quaternion: R comes back except for rounding.
