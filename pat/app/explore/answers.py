@@ -6,14 +6,16 @@ import base64
 import io
 import json
 import math
+from contextlib import suppress
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from arraygeom import Camera, Distortion, Pair, Pose, Rig, rotation_from_vector
+from arraygeom import Camera, Distortion, Pair, Pose, Rig, Segments, rotation_from_vector
 from arraygeom.io.native import write as rig_text
 from arraygeom.lenses.model import LensModel
 from arraygeom.pixels import HW
@@ -30,6 +32,7 @@ from .pixel import (
     beta_report,
     image_pixel,
     inspect_pixel,
+    located,
     pixel_of,
     with_depths,
 )
@@ -75,7 +78,7 @@ Rotations are about its own axes, steps along those of alpha (in longest baselin
 added, the focal length is multiplied. "lens0", "lens1", ... are added to the numbers of the lens.
 """
 MAPS = ("none", "length, px", "betas that see it", "depth range seen", "entropy of weights")
-"""Maps of the whole image: length from the first sample to the last, pixels of beta; number of betas with a
+"""Maps of the whole image: length of the segment or curve, pixels of beta; number of betas with a
 sample; share of the depth range, in inverse depth, at which beta sees the point; entropy of the weights, 1 if
 all are alike. All but the number are means over the betas."""
 GRID = 24
@@ -310,39 +313,43 @@ def whole_map(scene: ExplorerScene, alpha: str, controls: Controls) -> dict[str,
         rows, pixels = grid_pixels(scene.rig[alpha].hw, GRID)
         states = [explorer_state(scene.rig, alpha, {**controls, "x": x}) for x in pixels]
         rig = with_depths(scene.rig, states[0])
-        pairs = {name: rig.pair(alpha, name) for name in rig.betas(alpha) if name in scene.images}
-        values = []
-        for state in states:
-            found = [_mapped(scene, pair, name, state, which) for name, pair in pairs.items()]
-            known = [v for v in found if v is not None]
-            values.append(number(sum(known) / (1 if which == 2 else len(known))) if known else None)
+        found = []
+        for name in (n for n in rig.betas(alpha) if n in scene.images):
+            with suppress(Exception):  # the reason is said in its picture
+                found.append(_mapped(scene, rig.pair(alpha, name), name, states, which))
+        values = torch.stack(found) if found else torch.full((1, len(states)), torch.nan)
+        values = values.nansum(0) if which == 2 else values.nanmean(0)
         scene.maps.clear()
-        scene.maps[key] = {"columns": GRID, "rows": rows, "values": values}
+        scene.maps[key] = {"columns": GRID, "rows": rows, "values": [number(v) for v in values.tolist()]}
     return scene.maps[key] if which else None
 
 
-def _mapped(scene: ExplorerScene, pair: Pair, name: str, state: ExplorerState, which: int) -> float | None:
-    """Value in one beta of the map with a number in `MAPS`; None without one."""
+def _mapped(
+    scene: ExplorerScene, pair: Pair, name: str, states: list[ExplorerState], which: int
+) -> Float[Tensor, " n"]:
+    """Values of the map with a number in `MAPS` in one beta; NaN where there is none."""
+    if which == 4:
+        return torch.tensor([_entropy(beta_report(scene, pair, name, state)) for state in states]).double()
+    x = torch.cat([pixel_of(state) for state in states])
     if which == 3:
-        if not (pair.calibrated and pair.link is None and pair.depth is not None):
-            return None
-        near, far = (float(d) for d in pair.depth)
-        depth = 1 / torch.linspace(1 / near, 1 / far, DEPTHS, dtype=torch.float64).clamp(min=1e-9)
+        near, far = (float(d) for d in pair.depth_range)
         alpha, beta = pair.cameras
-        seen = beta.project(alpha.unproject(pixel_of(state).expand(DEPTHS, 2), depth))
-        return float((seen.valid & beta.contains(seen.x)).double().mean())
-    try:
-        report = beta_report(scene, pair, name, state)
-    except (ValueError, FileNotFoundError):
-        return None
-    weight, n = report.weight[report.valid], int(report.valid.sum())
-    if which == 2:
-        return float(n > 0)
-    if not n:
-        return None
-    if which == 1:
-        return float((report.xy[report.valid][-1] - report.xy[report.valid][0]).norm())
-    return float(torch.special.entr(weight).sum()) / math.log(n) if n > 1 else 0.0
+        depth = 1 / torch.linspace(1 / near, 1 / far, DEPTHS, dtype=torch.float64).clamp(min=1e-9)
+        seen = beta.project(alpha.unproject(x, depth[:, None].expand(-1, len(x))))
+        return (seen.valid & beta.contains(seen.x)).double().mean(0)
+    locations = located(scene, pair, states[0].family, x)
+    if isinstance(locations, Segments):
+        seen, length = locations.valid, locations.length
+    else:
+        here, steps = locations.mask, locations.xy.diff(dim=-2).norm(dim=-1)
+        seen, length = here.any(-1), torch.where(here[:, 1:] & here[:, :-1], steps, 0.0).sum(-1)
+    return seen.double() if which == 2 else torch.where(seen, length, torch.nan).double()
+
+
+def _entropy(report: BetaReport) -> float:
+    """Entropy of the weights as a share of the largest; NaN without samples."""
+    count = int(report.valid.sum())
+    return float(torch.special.entr(report.weight).sum()) / math.log(max(count, 2)) if count else math.nan
 
 
 DEPTHS = 33

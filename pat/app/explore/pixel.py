@@ -217,19 +217,19 @@ FAMILIES = ("auto", *FIELDS)
 """Names of the fields: `auto` is the default of `pat fuse`. A state takes MODULE:OBJECT, too."""
 
 
-def chosen_field(pair: Pair, family: str, x: Float[Tensor, "1 2"]) -> ReceptiveField:
-    """Make the field of a family for a pixel.
+def located(scene: ExplorerScene, pair: Pair, family: str, x: Float[Tensor, "n 2"]) -> Segments | Positions:
+    """Evaluate the field of a family, the scene's own or by name, at pixels of alpha.
 
     Raises:
-        ValueError: for an unknown family.
+        ValueError: for an unknown family, and if the field does not suit the pair.
     """
-    if family in SIZED:
-        return SIZED[family](pair, x)
-    return recorded_field(pair) if family == "auto" else named_field(family)
+    field = scene.fields.get(family) or (SIZED[family](pair, x) if family in SIZED else None)
+    field = field or (recorded_field(pair) if family == "auto" else named_field(family))
+    return sampling_locations(field, pair, x)
 
 
-def displacement(pair: Pair, x: Float[Tensor, "1 2"]) -> float:
-    """Return the displacement from H x that covers the depth range at a pixel, or else a share of beta's
+def displacement(pair: Pair, x: Float[Tensor, "n 2"]) -> float:
+    """Return the displacement from H x that covers the depth range at pixels, or else a share of beta's
     longer side; pixels."""
     if pair.link is None and pair.calibrated and pair.depth is not None:
         return max(1.0, float(covering_displacement(pair, x)))
@@ -298,8 +298,7 @@ def beta_report(scene: ExplorerScene, pair: Pair, name: str, state: ExplorerStat
         ValueError: if the field does not suit the pair.
     """
     x = pixel_of(state)
-    field = scene.fields.get(state.family) or chosen_field(pair, state.family, x)
-    locations = sampling_locations(field, pair, x)
+    locations = located(scene, pair, state.family, x)
     if isinstance(locations, Segments):  # about one sample a pixel of beta
         longest = float(torch.where(locations.valid, locations.length, 0.0).max())
         samples = locations.positions(math.ceil(longest) + 1)

@@ -82,7 +82,8 @@ function drawMap(context, [h, w], { columns, rows, values }) {
 function mapText({ columns, rows, values }, name, [x, y], [h, w]) {
   const known = values.filter((v) => v != null), at = Math.floor((y + 0.5) / h * rows) * columns + Math.floor((x + 0.5) / w * columns);
   if (!known.length) return `; ${name}: none`;
-  return `; ${name}: ${Math.min(...known)} to ${Math.max(...known)}, here ${values[at] ?? "none"}`;
+  const [low, high, here] = [Math.min(...known), Math.max(...known), values[at]].map((v) => (v == null ? "none" : Number(v.toFixed(2))));
+  return `; ${name}: ${low} to ${high}, here ${here}`;
 }
 
 function drawMarks(context, camera, answer, unit = camera.hw[1] / 400) {
@@ -330,7 +331,7 @@ function render({ model, el }) {
     const tell = (v) => { label.textContent = `${text}: ${Number(v.toPrecision(3))}`; };
     const show = (controls) => { input.value = value(controls, name, each) ?? usual; tell(value(controls, name, each) ?? usual); };
     input.addEventListener("input", () => {
-      const now = Number(input.value), { errors, camera } = waiting ?? model.get("controls");
+      const now = Number(Number(input.value).toPrecision(6)), { errors, camera } = waiting ?? model.get("controls");
       change(each ? { errors: { ...errors, [camera]: { ...errors[camera], [name]: now } } } : { [name]: now });
       tell(now);
     });
