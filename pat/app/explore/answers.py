@@ -57,9 +57,9 @@ DEFAULTS: Controls = {
 """Controls of an unchanged rig.
 
 baseline is a factor of all betas' distance from alpha; `errors` are changes of cameras by name (`ALL`: of all
-betas), each by the names of `ERRORS`; `camera` is the one that the sliders change; near and far are metres.
-`map` is one of `MAPS`; `pins` are pixels of alpha that stay drawn; `clicked` is a beta and a pixel of it,
-whose match becomes alpha's pixel.
+betas), each by the names of `ERRORS`; `camera` is the one that the sliders change; near and far are in the
+rig's unit. `map` is one of `MAPS`; `pins` are pixels of alpha that stay drawn; `clicked` is a beta and one
+of its pixels, whose match becomes alpha's pixel.
 """
 ERRORS: dict[str, tuple[str, float, float, float, float]] = {
     "rx": ("rotation x (degrees)", -3.0, 3.0, 0.01, 0.0),
@@ -237,9 +237,9 @@ def drawn(beta: BetaReport) -> dict[str, Any]:
     """Convert a beta's report to plain values for JSON.
 
     Returns:
-        `samples` and `match` in beta's pixels, `weights`, `depths` and `depth` in metres (None where
-        unknown), and `off`, the distance of the images' match from the line, pixels; or a `problem` if no
-        sample is on the image.
+        `samples` and `match` in beta's pixels, `weights`, `depths` and `depth` in the rig's unit (None where
+        unknown), `off`, the distance of the images' match from the line, pixels, and `band`, its corners in
+        beta's pixels (both None where there is none); or a `problem` if no sample is on the image.
     """
     if not bool(beta.valid.any()):
         return {"problem": "no part of the segment lies in this image: the views do not overlap here"}
@@ -265,10 +265,10 @@ def epipole(rig: Rig, alpha: str, beta: str) -> list[float] | None:
 
 
 def top_view(rig: Rig, alpha: str, report: PixelReport) -> list[dict[str, Any]]:
-    """List the cameras from above, in alpha's axes (right, forward).
+    """List the cameras from above, in alpha's axes (right, forward), in the rig's unit.
 
     Returns:
-        Plain values of each camera: `at`, its centre in metres, `ahead`, its viewing direction, and `ray`, to
+        Plain values of each camera: `at`, its centre, `ahead`, its viewing direction, and `ray`, to
         alpha's pixel or to the match (None without one); empty if alpha is not calibrated.
     """
     alpha_view = rig[alpha]

@@ -62,8 +62,8 @@ class ExplorerState:
         alpha: name of alpha.
         x: pixel (x, y) of alpha.
         family: name of the receptive field; "auto" for the default.
-        near: near bound, metres; None for the rig's.
-        far: far bound, metres; None for the rig's.
+        near: near bound, in the rig's unit; None for the rig's.
+        far: far bound, in the rig's unit; None for the rig's.
         weights: `WINDOWS`, or the name of a network.
     """
 
@@ -87,7 +87,7 @@ class BetaReport(NamedTuple):
         valid: True for samples in the image.
         ends: start and end of a segment; None for other fields.
         weight: weight of each sample, summing to 1.
-        depth: depth of each sample, metres; NaN where it has none.
+        depth: depth of each sample in alpha, in the rig's unit; NaN where it has none.
         offset: distance of the images' own match from the line, pixels; None without a segment or a match.
         band: corners of the band that holds the match by the calibration's uncertainty, pixels of beta; None
             without a covariance or a segment.
@@ -109,7 +109,7 @@ class PixelReport(NamedTuple):
         x: the pixel.
         betas: report by beta.
         problems: reason, in a sentence, by beta that has no report.
-        depth: depth by all betas, metres; NaN if unknown.
+        depth: depth by all betas, in the rig's unit; NaN if unknown.
     """
 
     x: Float[Tensor, "2"]
@@ -467,7 +467,8 @@ def depths(
         valid: mask of the samples in the image.
 
     Returns:
-        Depths in metres; NaN for invalid samples, samples without depth, and pairs that are not calibrated.
+        Depths in the rig's unit; NaN for invalid samples, samples without depth, and pairs that are not
+        calibrated.
     """
     if pair.link is not None or not pair.calibrated:
         return torch.full_like(xy[:, 0], torch.nan)
@@ -477,8 +478,9 @@ def depths(
 
 
 def joint_depth(betas: Mapping[str, BetaReport]) -> float:
-    """Return the inverse of the weighted mean inverse depth of all betas, metres; NaN if no sample has a
-    depth."""
+    """Return the inverse of the weighted mean inverse depth of all betas, in the rig's unit; NaN if no sample
+    has a depth.
+    """
     inverse, total = 0.0, 0.0
     for beta in betas.values():
         has_depth = beta.depth.isfinite()
