@@ -335,8 +335,8 @@ def _mapped(
         near, far = (float(d) for d in pair.depth_range)
         alpha, beta = pair.cameras
         depth = 1 / torch.linspace(1 / near, 1 / far, DEPTHS, dtype=torch.float64).clamp(min=1e-9)
-        seen = beta.project(alpha.unproject(x, depth[:, None].expand(-1, len(x))))
-        return (seen.valid & beta.contains(seen.x)).double().mean(0)
+        there = beta.project(alpha.unproject(x, depth[:, None].expand(-1, len(x))))
+        return (there.valid & beta.contains(there.x)).double().mean(0)
     locations = located(scene, pair, states[0].family, x)
     if isinstance(locations, Segments):
         seen, length = locations.valid, locations.length
