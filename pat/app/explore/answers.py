@@ -335,7 +335,8 @@ def _mapped(
         near, far = (float(d) for d in pair.depth_range)
         alpha, beta = pair.cameras
         depth = 1 / torch.linspace(1 / near, 1 / far, DEPTHS, dtype=torch.float64).clamp(min=1e-9)
-        there = beta.project(alpha.unproject(x, depth[:, None].expand(-1, len(x))))
+        points = alpha.unproject(x.expand(DEPTHS, -1, -1), depth[:, None].expand(-1, len(x)))
+        there = beta.project(points)
         return (there.valid & beta.contains(there.x)).double().mean(0)
     locations = located(scene, pair, states[0].family, x)
     if isinstance(locations, Segments):
