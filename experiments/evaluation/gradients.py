@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from numpy.polynomial.legendre import leggauss
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
@@ -29,8 +28,6 @@ UNITS: dict[str, tuple[str, float, int | None]] = {
 """Parameter of beta, unit and axis by name: degrees, tenths of the baseline, 1 % of the focal length, 1."""
 AT, STEP = 0.07, 1e-3
 """Position and step of the differences, in these units; the step of k1 is ten times as large."""
-NODES = 5
-"""Points within the step over which gradients are averaged, as a difference is the mean between its ends."""
 REACH = 10
 """Pixels of alpha within which a pixel of the paper's image depends on segments."""
 BORDER = 8.0
@@ -99,10 +96,7 @@ def regions(rig: Rig) -> dict[str, Tensor]:
 def gradient_rows(
     networks: dict[str, FusionNetwork], sample: SampleArray, parameters: Sequence[str]
 ) -> list[GradientRow]:
-    """Compare gradients of `fuse(differentiable=True)` with differences: by network, parameter and region.
-
-    Gradients are averaged over the step of the difference.
-    """
+    """Compare gradients of `fuse(differentiable=True)` with differences: by network, parameter and region."""
     rows, masks = [], regions(sample.rig)
     settings = FuseSettings(align=False, response="rec601")
 
@@ -118,14 +112,13 @@ def gradient_rows(
 
     for title, network in networks.items():
         for name in parameters:
+            by = torch.tensor(AT, dtype=torch.float64, requires_grad=True)
+            slopes = [
+                torch.autograd.grad(error, by, retain_graph=True)[0]
+                for error in errors(network, name, by, differentiable=True)
+            ]
             step = 10 * STEP if name == "k1" else STEP
-            slopes = torch.zeros(len(masks), dtype=torch.float64)
-            for node, weight in zip(*leggauss(NODES)):
-                by = torch.tensor(AT + step * node, dtype=torch.float64, requires_grad=True)
-                found = errors(network, name, by, differentiable=True)
-                each = [torch.autograd.grad(error, by, retain_graph=True)[0] for error in found]
-                slopes += weight / 2 * torch.stack(each)
-            ends = (errors(network, name, torch.tensor(AT + s, dtype=torch.float64)) for s in (step, -step))
+            ends = (errors(network, name, by.detach() + by_step) for by_step in (step, -step))
             for region, slope, after, before in zip(masks, slopes, *ends):
                 difference = float(after - before) / (2 * step)
                 rows.append(GradientRow(title, name, region, float(slope), difference))
