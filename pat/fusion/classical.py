@@ -17,7 +17,6 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from arraygeom import Camera, Pair, Rig
@@ -26,6 +25,7 @@ from ..matching.filters import filled
 from ..media.colour import from_luma_chroma, luminance, luminance_of, to_bytes
 from ..media.figures import reduced
 from ..sensors import NoiseLevel
+from ..support.neighbours import nearest_points
 from .frame import Frame
 from .steps import undistort
 from .views import Views
@@ -406,7 +406,7 @@ def _by_examples(values: Image, seen: NDArray[np.bool_], mono: Image) -> Image:
     sources[::2, ::2] = seen[::2, ::2]
     if sources.sum() < EXAMPLES or not asked.any():
         return out
-    distance, index = cKDTree(features[sources]).query(features[asked], k=EXAMPLES)
+    index, distance = nearest_points(features[sources], features[asked], EXAMPLES)
     weight = np.exp(-np.square(distance / (distance[:, :1] + 0.15)))
     out[:, asked] = (values[:, sources][:, index] * weight).sum(-1) / weight.sum(-1)
     return out
