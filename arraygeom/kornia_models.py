@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera, StereoCamera
     from kornia.sensors.camera import CameraModel
 
-    from .pair import Pair
-
 BROWN_TERMS = 8
 """Number of kornia's Brown-Conrady coefficients: k1 k2 p1 p2 k3 k4 k5 k6."""
 
@@ -145,26 +143,3 @@ def to_pinhole_batch(cameras: Mapping[str, PinholeCamera]) -> PinholeCamera:
 
     parts = [(c.intrinsics, c.extrinsics, c.height, c.width) for c in cameras.values()]
     return PinholeCamera(*map(torch.cat, zip(*parts)))
-
-
-def to_stereo_camera(pair: Pair) -> StereoCamera:
-    """Convert a rectified pair, alpha on the left, as `arraygeom.rectify` makes it (`.pair`).
-
-    Raises:
-        ValueError: for a pair that is not rectified, or whose beta is not to the right of alpha.
-    """
-    from kornia.geometry.camera import StereoCamera
-
-    alpha, beta = pair.cameras
-    pose, K = pair.beta_from_alpha, alpha.K.reshape(-1, 3, 3)
-    t = pose.t.reshape(-1, 3)
-    turned, other = (pose.R - torch.eye(3).to(pose.R)).abs().max(), (beta.K - alpha.K).abs().max()
-    aside = (t[:, 1:].abs().amax(-1) > -ROUNDED * t[:, 0]).any()
-    if pair.has_lens or bool(aside | (turned > ROUNDED) | (other > ROUNDED * K.max())):
-        raise ValueError("kornia's StereoCamera is a rectified pair, beta on the right: rectify(pair).pair")
-    right = K[..., :1] * t[:, :1, None]
-    return StereoCamera(torch.cat([K, torch.zeros_like(right)], -1), torch.cat([K, right], -1))
-
-
-ROUNDED = 1e-5
-"""Difference of two numbers, relative, that rounding in float32 explains."""

@@ -22,7 +22,8 @@ from arraygeom import (
     sampling_locations,
     stack,
 )
-from arraygeom.kornia_models import to_pinhole_batch, to_stereo_camera
+from arraygeom.kornia_models import to_pinhole_batch
+from arraygeom.rectification import to_stereo_camera
 from tests.arraygeom.rigs import random_rig, scene_points
 
 F64 = torch.float64
