@@ -13,14 +13,17 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
+from jaxtyping import Float
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.tri import Triangulation
+from torch import Tensor
 
 from arraygeom import Camera, Rig
 from arraygeom.distortion import term
 from arraygeom.runtime.text import angle
+from arraygeom.uncertainty import triangulation_covariance
 from arraygeom.viz import COLOURS, draw_rig, show_image
 
 from .adequacy import CELLS, Coverage, coverages
@@ -31,6 +34,7 @@ from .rig import Calibration
 from .solve import frame_rms, misfits
 from .uncertainty import (
     GRID,
+    RigCovariance,
     baseline_deviation,
     beta_covariance,
     grid_points,
@@ -78,6 +82,7 @@ def report_html(
     notes: Sequence[str] = (),
     detected: Mapping[str, BoardViews] | None = None,
     photos: Photos | None = None,
+    further: str = "",
 ) -> str:
     """Compose the HTML report of a calibration: verdict, notes, accuracy, coverage, residuals, uncertainty.
 
@@ -86,6 +91,7 @@ def report_html(
         detected: all detections by camera; with `photos`, the images that fit worst are drawn. None to draw
             none.
         photos: images by camera and moment; None to draw none.
+        further: HTML for the page's head.
 
     Returns:
         The page as HTML, figures embedded.
@@ -120,7 +126,7 @@ def report_html(
         )
         drawn = draw_uncertainty(calibration, (near, far))
         parts.append(_section("Uncertainty of predicted positions", text, drawn))
-    return html_page(parts, title)
+    return html_page(parts, title, further)
 
 
 def _section(title: str, text: str, figure: Figure) -> str:
@@ -197,23 +203,36 @@ def verdict(calibration: Calibration) -> str:
             f"Not good enough to fuse: points of held-out frames lie {off:.2f} px off their lines; check "
             "that images of one moment have the same number, and the lens model."
         )
-    deviations: dict[float, float] = {}
-    for depth in np.geomspace(*_depths(covers.values()), 5):
-        x, _ = grid_points(calibration.rig[alpha], depth)
+    off_position, off_depth = {}, {}
+    for depth in np.geomspace(*_depths(covers.values()), 5).tolist():
+        x, X = grid_points(calibration.rig[alpha], depth)
         by_beta = (beta_covariance(calibration.rig, covariance, alpha, beta, x, depth) for beta in betas)
         usable = [pixels[np.isfinite(pixels).all((1, 2))] for pixels in by_beta]
         medians = [float(np.median(worst_deviation(pixels))) for pixels in usable if len(pixels)]
         if medians:
-            deviations[float(depth)] = max(medians)
-    good = [depth for depth, deviation in deviations.items() if deviation < GOOD]
+            off_position[depth] = max(medians)
+            off_depth[depth] = _depth_deviation(calibration.rig, covariance, torch.from_numpy(X)) / depth
+    good = [depth for depth, deviation in off_position.items() if deviation < GOOD]
     if not good:
-        least = min(deviations.values(), default=math.nan)
+        least = min(off_position.values(), default=math.nan)
         return f"Not good enough to fuse: predicted positions deviate by {least:.2g} px; take more images."
-    most = max(deviations[depth] for depth in good)
+    most, share = (max(deviations[depth] for depth in good) for deviations in (off_position, off_depth))
     return (
         f"Good enough to fuse at {min(good):.3g} to {max(good):.3g} m, where the boards were: predicted "
-        f"positions deviate by {most:.2g} px at most (standard deviation, median over the image)."
+        f"positions deviate by {most:.2g} px at most, and depth by {share:.1%} by this calibration (standard "
+        "deviations, medians over the image)."
     )
+
+
+def _depth_deviation(rig: Rig, covariance: RigCovariance, X: Float[Tensor, "n 3"]) -> float:
+    """Median standard deviation along the first camera's axis of points that it and others see, metres."""
+    projected = [(camera, camera.project(X)) for camera in rig.cameras.values()]
+    seen = torch.stack([at.valid & camera.contains(at.x) for camera, at in projected])
+    seen &= seen[0] & (seen.sum(0) > 1)
+    x = torch.stack([at.x for _, at in projected]).nan_to_num()
+    of_point = triangulation_covariance(rig, covariance, x[:, seen[0]], seen=seen[:, seen[0]])
+    axis = rig[rig.names[0]].R[2]
+    return float((axis @ of_point @ axis).sqrt().nanmedian())
 
 
 def _depths(covers: Iterable[Coverage]) -> tuple[float, float]:

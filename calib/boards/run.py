@@ -2,39 +2,32 @@
 
 from __future__ import annotations
 
-import base64
 import glob
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from html import escape
 from pathlib import Path
 from typing import Literal, NamedTuple
-
-import cv2
-import numpy as np
 
 from arraygeom import Rig
 from arraygeom.pair import depth_range
 from arraygeom.runtime.atomic import write_text
 from arraygeom.runtime.together import refuse_others, sweep, write_together
 
-from .adequacy import coverage_advice, coverages, next_views, point_counts
+from .adequacy import coverage_advice
 from .board import Board
-from .detect import BoardViews, DetectedImage, Detection, Progress, board_views, collect_folder, detected
+from .detect import DetectedImage, Progress, board_views, collect_folder, detected
 from .intrinsics import Lens
-from .photos import FrameKey, Grey, Photos, find_photos
+from .photos import FrameKey, Photos, find_photos
 from .poses import StartDeviations
 from .report import by_cameras, html_page, report_html, summary, verdict
-from .rig import Calibration, calibrate
+from .rig import calibrate
 from .target import parse_boards
-from .uncertainty import intrinsics_of, rig_covariance
+from .uncertainty import rig_covariance
 from .validation import compare_lenses
 
-WIDTH = 420
-"""Width of the images shown, pixels."""
-COLOURS = (60, 60, 230), (80, 200, 80)
-"""Colours (blue, green, red) of cells without and with points."""
+REFRESH = '<meta http-equiv="refresh" content="2">'
+"""HTML that loads a page again every two seconds."""
 
 
 class CalibrationOutput(NamedTuple):
@@ -128,72 +121,6 @@ def calibrate_photos(
 # While images are taken -------------------------------------------------------------------------------------
 
 
-@dataclass
-class Session:
-    """State of a live calibration, repeated while images arrive in a folder.
-
-    Attributes:
-        board: the board.
-        lens: lens model of all cameras.
-        seen: size and detections of each image, by camera and moment.
-        calibration: last calibration; None if it failed.
-        problem: reason why there is no calibration; empty if there is one.
-        photos: images by camera and moment.
-    """
-
-    board: Board
-    lens: Lens = "brown-conrady"
-    seen: dict[tuple[str, FrameKey], DetectedImage] = field(default_factory=dict)
-    calibration: Calibration | None = None
-    problem: str = "waiting for images"
-    photos: Photos = field(default_factory=dict)
-
-    def detect(self, photos: Photos) -> bool:
-        """Detect the board in new images; unreadable ones are tried again later.
-
-        Returns:
-            True if there were any.
-        """
-        fresh = [
-            (name, key) for name, moments in photos.items() for key in moments if (name, key) not in self.seen
-        ]
-        for name, key in fresh:
-            try:
-                self.seen[name, key] = detected(photos[name][key], key, self.board)
-            except ValueError as error:  # still being written: it is tried again
-                self.problem = str(error)
-        self.photos = photos
-        return any(image in self.seen for image in fresh)
-
-    def views(self) -> dict[str, BoardViews]:
-        """Combine the detections of all cameras that have images.
-
-        Returns:
-            Detections by camera.
-
-        Raises:
-            ValueError: if a camera's images differ in size.
-        """
-        images = {name: self.images(name) for name in self.photos}
-        return {
-            name: board_views(name, self.photos[name], detections)
-            for name, detections in images.items()
-            if detections
-        }
-
-    def images(self, name: str) -> dict[FrameKey, DetectedImage]:
-        """Return a camera's detections by moment, in order of arrival."""
-        moments = self.photos[name]
-        return {key: detection for (n, key), detection in self.seen.items() if n == name and key in moments}
-
-    def calibrate(self) -> None:
-        """Calibrate with all detections; sets `calibration`, or `problem` if that fails."""
-        try:
-            self.calibration, self.problem = calibrate(self.views(), self.board, lens=self.lens), ""
-        except ValueError as error:
-            self.calibration, self.problem = None, str(error)
-
-
 def watch(
     folder: Path,
     board: Board,
@@ -203,10 +130,11 @@ def watch(
     lens: Lens = "brown-conrady",
     interval: float = 1.0,
     finished: Callable[[], bool] = lambda: False,
-) -> Session:
+) -> dict[tuple[str, FrameKey], DetectedImage]:
     """Calibrate again and write a page whenever images arrive in a folder, until `finished` or Ctrl-C.
 
-    The page shows detections, coverage, current uncertainty, and the view that would help most.
+    The page is the calibration's report, with what is missing and the views that would help most; before
+    there is one, it says where the board was found and what is wrong.
 
     Args:
         page: HTML file to write.
@@ -216,97 +144,62 @@ def watch(
         finished: function that returns True to stop.
 
     Returns:
-        The final state.
+        Size and detections of each image, by camera and moment.
 
     Raises:
         OSError: if the page cannot be written, or the folder is missing.
     """
-    session, problem = Session(board, lens), ""
-    write_text(page, _page(session))
-    while not finished():
-        before = problem
+    seen: dict[tuple[str, FrameKey], DetectedImage] = {}
+    shown: tuple[int, str] | None = None
+    photos: Photos = {}
+    problem = "waiting for images"
+    while True:
+        if (state := (len(seen), problem)) != shown:
+            shown = state
+            found = {
+                name: {key: seen[name, key] for key in moments if (name, key) in seen}
+                for name, moments in photos.items()
+            }
+            notes = [
+                f"{name}: the board is in {sum(bool(boards) for _, boards in images.values())} of "
+                f"{len(images)} images"
+                for name, images in found.items()
+            ]
+            write_text(page, _page([*notes, problem]))  # at once, before the calibration
+            if found and not problem:
+                write_text(page, _calibrated_page(found, photos, board, lens, notes))
+        if finished():
+            return seen
+        time.sleep(interval)
         try:
             photos, problem = find_photos(folder, patterns=patterns), ""
         except ValueError as error:
             photos, problem = {}, str(error)
-        if fresh := session.detect(photos):
-            write_text(page, _page(session))  # at once, with the advice of before
-        if fresh or problem != before:
-            if problem:
-                session.problem = problem
-            else:
-                session.calibrate()
-            write_text(page, _page(session))
-        time.sleep(interval)
-    return session
+        for name, key in [(name, key) for name, moments in photos.items() for key in moments]:
+            if (name, key) not in seen:
+                try:
+                    seen[name, key] = detected(photos[name][key], key, board)
+                except ValueError as error:  # still being written: it is tried again
+                    problem = str(error)
 
 
-def _page(session: Session) -> str:
-    calibration, notes = session.calibration, [session.problem]
-    parts = [f"<h1>{len(session.seen)} images</h1>"]
-    if calibration is not None and not session.problem:
-        parts.append(f"<p>Reprojection error {calibration.rms:.3f} px, {len(calibration.frames)} frames.</p>")
-        notes = list(calibration.notes)
-    parts += [_note(note) for note in notes]
-    parts += [_camera(session, name) for name in session.photos]
-    return html_page(parts, "Calibration", '<meta http-equiv="refresh" content="2">')
+def _page(notes: Iterable[str]) -> str:
+    parts = [f'<p class="note">{escape(note)}</p>' for note in filter(None, notes)]
+    return html_page(["<h1>Calibration</h1>", *parts], "Calibration", REFRESH)
 
 
-def _note(text: str) -> str:
-    return f'<p class="note">{escape(text)}</p>'
-
-
-def _camera(session: Session, name: str) -> str:
-    """HTML of one camera: detections, advice, the last image, coverage."""
-    images = session.images(name)
-    count = sum(bool(boards) for _, boards in images.values())
-    parts = [f"<h2>{escape(name)}: the board is in {count} of {len(images)} images</h2>"]
-    if session.calibration is not None and name in session.calibration.views:
-        parts.append(_advice(session.calibration, name))
-    if images:
-        last = list(images)[-1]
-        shown = _drawn(session.photos[name][last].read(), images[last][1])
-        parts.append(f"<table><tr><td>{_picture(shown)}<br>the last: {escape(str(last))}</td>")
-        cells = _picture(_coverage(images.values()))
-        parts.append(f"<td>{cells}<br>where points were (red: nowhere)</td></tr></table>")
-    return "".join(parts)
-
-
-def _advice(calibration: Calibration, name: str) -> str:
-    """HTML of a camera's focal length, the view that would help most, and missing coverage."""
-    deviation = calibration.deviations().get(f"{name}.focal.0")
-    stated = f" ± {deviation:.2g}" if deviation else ""
-    parts = [f"<p>Focal length {float(calibration.rig[name].K[0, 0]):.1f} px{stated}.</p>"]
-    covered = coverages(calibration)[name]
-    intrinsics = intrinsics_of(calibration.fit, name)
-    if len(intrinsics.covariance):
-        parts += [
-            f"<p><b>Next: {escape(best.text)}</b> (uncertainty of projection {best.before:.2g} px, "
-            f"with it {best.after:.2g}).</p>"
-            for best in next_views(intrinsics, calibration.board, float(np.mean(covered.depths)), count=1)
-        ]
-    return "".join([*parts, *map(_note, covered.missing)])
-
-
-def _drawn(grey: Grey, boards: Mapping[FrameKey, Detection]) -> np.ndarray:
-    """Image with its detected points."""
-    scale = WIDTH / grey.shape[1]
-    small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    small = cv2.cvtColor(small, cv2.COLOR_GRAY2BGR)
-    for detection in boards.values():
-        for x, y in (detection.x + 0.5) * scale - 0.5:
-            cv2.circle(small, (round(float(x)), round(float(y))), 2, COLOURS[1], -1)
-    return small
-
-
-def _coverage(images: Collection[DetectedImage]) -> np.ndarray:
-    """Image of the cells with and without points."""
-    h, w = next(hw for hw, _ in images)
-    counts = point_counts([d.x for _, boards in images for d in boards.values()], (h, w))
-    cells = np.where((counts > 0)[..., None], COLOURS[1], COLOURS[0]).astype(np.uint8)
-    return cv2.resize(cells, (WIDTH, round(WIDTH * h / w)), interpolation=cv2.INTER_NEAREST)
-
-
-def _picture(image: np.ndarray) -> str:
-    data = base64.b64encode(cv2.imencode(".jpg", image)[1].tobytes()).decode()
-    return f'<img alt="" src="data:image/jpeg;base64,{data}">'
+def _calibrated_page(
+    found: Mapping[str, Mapping[FrameKey, DetectedImage]],
+    photos: Photos,
+    board: Board,
+    lens: Lens,
+    notes: Sequence[str],
+) -> str:
+    """Report of a calibration with all detections; a page that says why there is none yet."""
+    try:
+        views = {name: board_views(name, photos[name], images) for name, images in found.items() if images}
+        calibration = calibrate(views, board, lens=lens)
+    except ValueError as error:
+        return _page([*notes, str(error)])
+    notes = by_cameras([*notes, *calibration.notes, *coverage_advice(calibration)])
+    return report_html(calibration, notes=notes, further=REFRESH)

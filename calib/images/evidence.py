@@ -249,12 +249,15 @@ class DriftEvidence:
     clipped: float
 
     @classmethod
-    def from_points(cls, rig: Rig, pairs: Pairs, used: Bool[Tensor, " n"], noise: float) -> DriftEvidence:
+    def from_points(
+        cls, rig: Rig, pairs: Pairs, used: Bool[Tensor, " n"], noise: float, prior: float = 0.0
+    ) -> DriftEvidence:
         """Fit the drift of a rig to some of its matched points.
 
         Args:
             used: mask of the points to use, among all points of all pairs.
             noise: standard deviation of the points' distances, pixels.
+            prior: -2 log probability of the rig without any points.
 
         Returns:
             The rig's drift with its evidence.
@@ -268,7 +271,8 @@ class DriftEvidence:
         r, J = jacobian(distances, z)
         B = systematic_columns(rig, pairs) / noise
         wrong_side = _rotation_to_plausible_depth(rig, pairs)
-        fixed = {scale: RARE * math.log1p(scale**2) + (wrong_side / scale) ** 2 for scale in SCALES}
+        rare = {scale: RARE * math.log1p(scale**2) for scale in SCALES}
+        fixed = {scale: prior + rare[scale] + (wrong_side / scale) ** 2 for scale in SCALES}
 
         def cost_of(scale: float) -> float:
             explained, volume, _ = _drift(r[used], J[used], B[used], scale)

@@ -1,5 +1,6 @@
 """From detections to a rig: ground truth within its uncertainty, and a message for every unusable set."""
 
+import re
 from dataclasses import replace
 from functools import cache
 
@@ -7,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from arraygeom import Pose, Rig, rotation_from_vector
+from arraygeom import Pose, Rig, rotation_from_vector, triangulate
 from calib.boards import intrinsics
 from calib.boards.adequacy import coverage
 from calib.boards.detect import BoardViews, Detection
@@ -77,6 +78,18 @@ def test_the_covariance_says_how_far_predictions_are_off(pair, found):
     squared = np.einsum("ni,nij,nj->n", difference, np.linalg.inv(spread), difference)
     assert squared.max() < 20
     assert 0.01 < np.sqrt(spread[:, 0, 0]).mean() < 1.0
+
+
+def test_the_verdict_says_how_far_depth_is_off(pair, found):
+    """Points of the true rig at the largest depth of the verdict, triangulated by the calibration."""
+    rig, text = pair[0], verdict(found)
+    far, stated = (float(re.search(p, text)[1]) for p in (r"to ([\d.]+) m", r"depth by ([\d.]+)%"))
+    x = torch.tensor([[x, y] for x in range(200, 800, 100) for y in range(150, 600, 100)]).double()
+    y = rig["colour"].project(rig["mono"].unproject(x, torch.full((len(x),), far).double())).x
+    depth = triangulate([found.rig[name] for name in ("mono", "colour")], torch.stack([x, y])).X[:, 2]
+    off = 100 * float((depth / far - 1).abs().median())
+    assert 0.1 * off < stated
+    assert off < 3 * stated
 
 
 def test_held_out_frames_are_no_worse(found):
