@@ -114,7 +114,7 @@ class Batched:
         return map_tensors(self, lambda t, axes: t.pin_memory())
 
     def requires_grad_(self: T, requires_grad: bool = True) -> T:
-        """Let autograd record operations on its numbers, or not, in place.
+        """Let autograd record operations on its numbers, or not (`requires_grad` False), in place.
 
         Returns:
             Itself.
@@ -158,9 +158,6 @@ def stack(items: Sequence[T]) -> T:
 
     Everything but tensors must be equal in all (sizes, lens models, names of a rig's cameras), except for
     names and sensors, which are the first item's.
-
-    Returns:
-        The batch.
 
     Raises:
         ValueError: for no items, and items that differ in kind, shapes or anything else.

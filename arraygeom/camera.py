@@ -43,7 +43,7 @@ class Projected(NamedTuple):
     """Projection of points into an image.
 
     Attributes:
-        x: pixels (x, y).
+        x: pixels (x, y); without meaning where not `valid`.
         depth: z in the camera's frame, metres.
         valid: True for points that the model sees: in front of a pinhole, within a lens model's range; the
             image's borders are not considered.
@@ -198,7 +198,8 @@ class LensView(View):
         """Compute the rays of pixels in the camera's frame.
 
         Returns:
-            Directions (z = 1 for pinholes, unit length with a lens), and True where the lens model has one.
+            Directions (z = 1 for pinholes, unit length with a `Distortion`, any length by other models), and
+            True where the lens model has one; elsewhere the direction means nothing.
         """
         check_pixels(x)
         normalised = map_homogeneous(torch.linalg.inv(self.K)[..., :2, :], x)
@@ -302,10 +303,7 @@ class Camera(LensView):
             check_batches("K, lens and cam_from_world", *shapes)
 
     def scaled(self, factor: float) -> Camera:
-        """Multiply all lengths of the camera by a positive factor, as for another unit.
-
-        Returns:
-            The scaled camera.
+        """Return the camera with all lengths multiplied by a positive factor, as for another unit.
 
         Raises:
             ValueError: for a factor that is not positive, and a lens that is not central and does not state
@@ -369,9 +367,6 @@ class Camera(LensView):
         Kornia's camera models (`kornia.sensors.camera`) have no pose: keep `cam_from_world`. Pixels and axes
         agree. `PinholeCamera.scale` moves the principal point differently: `resize` first.
 
-        Returns:
-            Kornia's camera.
-
         Raises:
             ValueError: for a lens that kornia does not have.
         """
@@ -395,9 +390,6 @@ class Camera(LensView):
         Args:
             batched: True keeps a batch of one as a batch.
             cam_from_world: pose for a `CameraModel`, which has none; None for the identity.
-
-        Returns:
-            The camera.
 
         Raises:
             ValueError: if the images of a batch differ in size.

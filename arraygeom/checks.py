@@ -92,6 +92,8 @@ def check_numbers(value: Any, shape: tuple[int, ...], what: str) -> Tensor:
 def check_origin(near: Tensor, *translations: Tensor, unit: str) -> None:
     """Check that float32 translations (\\*b, 3) are not visibly rounded for a scene at `near` (\\*b).
 
+    `unit` names their unit of length in the message.
+
     Raises:
         ValueError: if they are.
     """

@@ -145,9 +145,6 @@ def track(
         K_beta: beta's K.
         beta_from_alpha: pose of alpha's frame in beta's.
         x: pixels of alpha.
-
-    Returns:
-        The track.
     """
     a = map_homogeneous(infinite_homography(K_alpha, K_beta, beta_from_alpha.R), x)
     b = matvec(K_beta, beta_from_alpha.t).to(a.dtype)

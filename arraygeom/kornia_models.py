@@ -30,9 +30,6 @@ def to_kornia_model(K: Float[Tensor, "*b 3 3"], hw: HW, lens: LensModel | None) 
         hw: height and width of the image.
         lens: the lens; None for a pinhole.
 
-    Returns:
-        The model.
-
     Raises:
         ValueError: for a skewed or rotated K, and lenses that kornia does not have.
     """

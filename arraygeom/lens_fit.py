@@ -49,7 +49,7 @@ class Refit(NamedTuple):
     usual: float
 
 
-class _Lens:
+class LensKey:
     """Key of a camera: equal for equal images, K and lenses, wherever the cameras are."""
 
     def __init__(self, camera: Any) -> None:
@@ -61,26 +61,22 @@ class _Lens:
         return hash(self.key)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Lens) and self.key == other.key
+        return isinstance(other, LensKey) and self.key == other.key
 
 
 def once_a_lens(function: Callable[[V], T]) -> Callable[[V], T]:
     """Decorate a function of a camera's image, K and lens alone: cameras with equal ones share its result.
 
     Returns:
-        The function; it remembers the last 64 results.
+        The function; it remembers the last 256 results.
     """
-    known: Callable[[_Lens], T] = lru_cache(maxsize=64)(lambda lens: function(lens.camera))
-    return wraps(function)(lambda camera: known(_Lens(camera)))
+    known: Callable[[LensKey], T] = lru_cache(maxsize=256)(lambda lens: function(lens.camera))
+    return wraps(function)(lambda camera: known(LensKey(camera)))
 
 
 @once_a_lens
 def coverage(camera: LensView) -> LensCoverage:
-    """Measure the share of a camera's pixels with a ray, and their widest angle, on a coarse grid of pixels.
-
-    Returns:
-        The coverage.
-    """
+    """Measure the share of a camera's pixels with a ray, and their widest angle, on a coarse grid."""
     with torch.no_grad():
         grid = coarse_grid(camera.hw, max(8, max(camera.hw) // 128)).to(camera.K)
         if camera.distortion is None:

@@ -47,9 +47,6 @@ def world_rays(camera: Camera, x: Real[Tensor, "*n 2"] | None = None) -> WorldRa
 
     Args:
         x: pixels; None for all of the image, (*b, H, W).
-
-    Returns:
-        The rays.
     """
     batch = camera.batch_shape
     if x is None:
@@ -139,7 +136,7 @@ class ConsistentDepth(NamedTuple):
     """Depth map confirmed by other views.
 
     Attributes:
-        depth: mean depth of the agreeing views, metres; 0 where not valid.
+        depth: mean of alpha's depth and that of the agreeing views, metres; 0 where not valid.
         views: number of agreeing other views.
         valid: True where enough views agree.
     """

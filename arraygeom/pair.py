@@ -220,10 +220,11 @@ class Pair(Batched):
         """Compute the homography from alpha's to beta's pixels of the plane z = depth in alpha's frame.
 
         Args:
-            depth: metres; may be infinite.
+            depth: metres (*d), which broadcast with the pair's batch axes; may be infinite.
 
         Returns:
-            H (*b, 3, 3), scaled so that its third coordinate is positive in front of both cameras.
+            H (*b, 3, 3), of batch and depths broadcast, scaled so that its third coordinate is positive
+            in front of both cameras.
 
         Raises:
             ValueError: unless both cameras are calibrated and central.

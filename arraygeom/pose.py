@@ -75,9 +75,6 @@ class Pose(Batched):
             target: world coordinates, metres.
             down: direction in the world; None for (0, 1, 0). For a world with z upwards it is (0, 0, -1).
 
-        Returns:
-            The pose.
-
         Raises:
             ValueError: if down is along the axis, or the target at the centre.
         """
@@ -142,7 +139,7 @@ class Pose(Batched):
         """Transform points (*n, 3) to R X + t. With batched poses (*b), points are (*b, ..., 3).
 
         Returns:
-            Points of the same shape.
+            Points, whose leading axes of length 1 become the batch's.
 
         Raises:
             ValueError: for points of other than three numbers, or without the batch's axes.
@@ -245,7 +242,7 @@ def in_float64(function: Callable[..., Tensor], *tensors: Tensor) -> Tensor:
     Matrices are expanded to common batch axes.
 
     Returns:
-        The result in the matrices' own type, float32 at least.
+        The function's result, in the widest type of the matrices, float32 at least.
     """
     batch = broadcast_shapes(*(t.shape[:-2] for t in tensors))
     dtype = torch.promote_types(torch.float32, reduce(torch.promote_types, (t.dtype for t in tensors)))

@@ -92,9 +92,6 @@ class Rig(Batched):
             batched: True keeps batches of one as batches.
             fields: further fields of the rig, such as `depth`.
 
-        Returns:
-            The rig.
-
         Raises:
             ValueError: for batches of unequal length.
             TypeError: for other cameras than kornia's pinholes by name.
@@ -240,10 +237,7 @@ class Rig(Batched):
         return self.with_camera(name, self[name].transformed(A, hw)).replace(links=links)
 
     def scaled(self, factor: float) -> Rig:
-        """Multiply all lengths (of cameras and depth range) by a positive factor, as for another unit.
-
-        Returns:
-            The scaled rig.
+        """Return the rig with all lengths (cameras, depth range) multiplied by a factor, as for another unit.
 
         Raises:
             ValueError: for a camera model that does not say which of its numbers are lengths, and for a
@@ -319,9 +313,6 @@ class Rig(Batched):
     @classmethod
     def load(cls, path: str | Path) -> Rig:
         """Read a rig file of any format that `arraygeom.io` knows.
-
-        Returns:
-            The rig.
 
         Raises:
             arraygeom.io.RigFileError: for a file that cannot be used.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain, combinations, pairwise
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -12,11 +13,13 @@ from .camera import Camera, LensView, View
 from .checks import derived
 from .distortion import BROWN_CONRADY, Distortion
 from .fields.default import recorded_field
-from .lens_fit import coverage, once_a_lens
+from .lens_fit import LensKey, coverage, once_a_lens
 from .pair import Pair
 from .pixels import HW, coarse_grid, map_homogeneous
 from .rig import Rig
 from .runtime.text import length_unit
+
+T = TypeVar("T")
 
 SMALLEST_BASELINE, LARGEST_BASELINE = 1e-4, 50.0
 """Bounds of a baseline in metres: outside, a mistaken unit is more likely than a camera array."""
@@ -37,6 +40,8 @@ MOST_CAMERAS = 16
 """Number of cameras above which each is compared with the next alone, as there are many pairs."""
 MOST_PAIRS = 120
 """Number of pairs, evenly spread over the rig, whose overlap is computed: all of `MOST_CAMERAS` cameras."""
+MOST_LENSES = 120
+"""Number of different lenses, evenly spread over the rig, that are checked."""
 RANK = 1e-3
 """Ratio of F's least to largest singular value above which it is not of rank two."""
 
@@ -74,23 +79,38 @@ def unit_oddity(rig: Rig) -> str | None:
     return None
 
 
-def lens_ends(views: Iterable[tuple[str, LensView]]) -> Iterator[str]:
+def _lenses(rig: Rig) -> list[tuple[list[str], LensView]]:
+    """Different lenses, `MOST_LENSES` at most: for each the names of its cameras, and one of these."""
+    groups: dict[LensKey, list[str]] = {}
+    for name, camera in rig.cameras.items():
+        if isinstance(camera, LensView) and camera.distortion is not None:
+            groups.setdefault(LensKey(camera), []).append(name)
+    lenses = [(names, rig[names[0]]) for names in groups.values()]
+    return _spread(lenses, MOST_LENSES)
+
+
+def _spread(items: Sequence[T], most: int) -> list[T]:
+    """At most so many of the items, evenly spread."""
+    return list(items[:: -(-len(items) // most) or 1])
+
+
+def lens_ends(lenses: Iterable[tuple[Sequence[str], LensView]]) -> Iterator[str]:
     """Yield a sentence on each lens model that ends within its image, with the names of its cameras.
 
     Camera models state themselves where they end (a pole, the rim of a fisheye's circle), which is no mistake
     unless they cover nothing.
     """
     ending: dict[tuple[str, str, str], list[str]] = {}
-    for name, camera in views:
+    for names, camera in lenses:
         covered = coverage(camera)
         stated = covered.share > 0 and not isinstance(camera.distortion, Distortion)
-        if camera.distortion is None or stated or covered.share >= COVERED:
+        if stated or covered.share >= COVERED:
             continue
         refit = ": check the coefficients"
         if isinstance(camera.distortion, Distortion) and camera.distortion.model == BROWN_CONRADY:
             refit = ", as at a pole or a fold of its formula; fit one without: `pat rig convert --refit`"
         where = f"ends {covered.degrees:.1f} degrees off the axis" if covered.share else "covers nothing"
-        ending.setdefault((where, f"{100 * (1 - covered.share):.0f}", refit), []).append(name)
+        ending.setdefault((where, f"{100 * (1 - covered.share):.0f}", refit), []).extend(names)
     for (where, unused, refit), names in ending.items():
         yield f"the lens model of {_listed(names)} {where}: {unused} % of its image is not used{refit}"
 
@@ -104,8 +124,9 @@ def _listed(names: Sequence[str]) -> str:
 def file_oddities(rig: Rig) -> list[str]:
     """List the sentences that reading a rig's file warns of: its unit, and lenses that fold within their
     images."""
-    views = [(name, camera) for name, camera in rig.cameras.items() if isinstance(camera, LensView)]
-    ends = lens_ends(v for v in views if getattr(v[1].distortion, "model", None) == BROWN_CONRADY)
+    ends = lens_ends(
+        one for one in _lenses(rig) if getattr(one[1].distortion, "model", None) == BROWN_CONRADY
+    )
     unit = unit_oddity(rig)
     return [*([] if unit is None else [unit]), *ends]
 
@@ -114,19 +135,19 @@ def _all(rig: Rig) -> Iterator[str]:
     """Sentences on units, lenses, K, overlap, positions, baselines, F."""
     if unit := unit_oddity(rig):
         yield f"the rig {unit}"
-    views = {name: camera for name, camera in rig.cameras.items() if isinstance(camera, LensView)}
-    yield from lens_ends(view for view in views.items() if not _round_trip(view[1])[1])
-    for name, camera in views.items():
+    lenses = _lenses(rig)
+    yield from lens_ends(one for one in lenses if not _round_trip(one[1])[1])
+    for names, camera in lenses:
         if (lens := camera.distortion) is not None and not (off := _round_trip(camera)[0]) <= OFF_BACK:
             yield (
-                f"the model of '{name}', {lens.model}, projects the rays of its pixels up to "
-                f"{off:.3g} px off them: project and unproject are to be the inverse of one another"
+                f"the model of {_listed(names)}, {lens.model}, projects the rays of its pixels "
+                f"up to {off:.3g} px off them: project and unproject are to be the inverse of one another"
             )
-        if isinstance(camera, Camera):
-            yield from _of_K(name, camera)
     names = [name for name, camera in rig.cameras.items() if isinstance(camera, Camera)]
+    for name in names:
+        yield from _of_K(name, rig[name])
     pairs = list(combinations(names, 2)) if len(names) <= MOST_CAMERAS else list(pairwise(names))
-    compared, small = pairs[:: -(-len(pairs) // MOST_PAIRS) or 1], rig
+    compared, small = _spread(pairs, MOST_PAIRS), rig
     if not rig.links:
         small = rig.replace(
             cameras={n: rig[n].resize(_reduced(rig[n].hw)) for n in dict.fromkeys(chain(*compared))}
@@ -180,8 +201,8 @@ def _of_K(name: str, camera: Camera) -> Iterator[str]:
 @once_a_lens
 def _round_trip(camera: LensView) -> tuple[float, bool]:
     """Largest error in pixels of projecting the rays of pixels back, and whether all of them have rays."""
-    if (lens := camera.distortion) is None:
-        return 0.0, True
+    lens = camera.distortion
+    assert lens is not None
     points = map_homogeneous(torch.linalg.inv(camera.K)[..., :2, :], _grid(camera).to(camera.K))
     directions, has_ray = lens.unproject(points)
     back, has_image = lens.project(lens.origins(points) + directions)

@@ -114,7 +114,7 @@ def solve_in_plane(
         steps: largest number of steps.
 
     Returns:
-        The points; where there is no solution, those with the nearest images that were found.
+        The points (*n, 2); where there is no solution, those with the nearest images that were found.
     """
     xy = start
     value, jacobian = f(xy)

@@ -167,7 +167,7 @@ FLAT = 1e-6
 
 def sample_fractions(samples: int, *, like: Tensor) -> Float[Tensor, " l"]:
     """Return the positions of a segment's samples as fractions: l / (L - 1) for l = 0 .. L - 1; 0.5 for a
-    single one.
+    single one. They have the type and device of `like`.
 
     Raises:
         ValueError: for fewer than 1 sample.

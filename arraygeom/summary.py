@@ -77,9 +77,9 @@ MOST_PIXELS = 1 << 18
 """Largest number of alpha's pixels for which segments are computed; a sixteenth of them through lenses."""
 
 
-def summarise_cameras(rig: Rig) -> list[CameraSummary]:
-    """Summarise each camera, in the rig's order."""
-    return [_camera(name, rig) for name in rig.names]
+def summarise_cameras(rig: Rig, most: int | None = None) -> list[CameraSummary]:
+    """Summarise each camera, in the rig's order; the first ones alone if `most` says how many."""
+    return [_camera(name, rig) for name in rig.names[:most]]
 
 
 def summarise_pairs(rig: Rig, alpha: str | None = None) -> list[PairSummary]:

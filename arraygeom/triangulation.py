@@ -25,7 +25,7 @@ class Triangulated(NamedTuple):
 
     Attributes:
         X: world points (*n, 3), metres; 0 where not valid.
-        covariance: covariance (*n, 3, 3) of the points, m².
+        covariance: covariance (*n, 3, 3) of the points, m²; without meaning where not valid.
         valid: True for usable points.
         residual: largest distance between a match and the point's image over the views that count, pixels.
     """

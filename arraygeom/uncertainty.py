@@ -106,6 +106,7 @@ def bands(
     """Compute the half-widths within which a calibration's error leaves a point that alpha's pixels see.
 
     Args:
+        covariance: covariance of parameters of the rig.
         x: pixels of alpha.
         confidence: probability that the point is within them, in each direction by itself, for normal errors.
 

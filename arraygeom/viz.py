@@ -48,9 +48,6 @@ def draw_rig(rig: Rig, *, alpha: str | None = None) -> Figure:
         alpha: camera whose depth range is drawn; None for the first calibrated one. Bounds that would dwarf
             the rig (beyond 6 times its extent, or infinite) are left out.
 
-    Returns:
-        The figure.
-
     Raises:
         ValueError: if no camera is calibrated.
         ImportError: without matplotlib.
@@ -178,11 +175,8 @@ def draw_fields(
     Segments are lines with a dot at their near end, positions are dots.
 
     Args:
-        field: field of all betas, or fields by name; None for `recorded_field`.
+        field: field of all betas, or fields by name; None, or no field of a beta, for `recorded_field`.
         images: images (H, W), (H, W, 3) or (3, H, W) by camera; None for empty frames.
-
-    Returns:
-        The figure.
 
     Raises:
         ValueError: for an unknown camera.
@@ -273,9 +267,6 @@ def draw_matches(
     Args:
         matches: points (x, y) of alpha and of the beta, by beta.
 
-    Returns:
-        The figure.
-
     Raises:
         ImportError: without matplotlib.
     """
@@ -340,9 +331,6 @@ def draw_residuals(
         x_beta: matches in beta, undistorted pixels.
         image: beta's image.
 
-    Returns:
-        The figure.
-
     Raises:
         ValueError: if neither calibration nor F is known.
         ImportError: without matplotlib.
@@ -381,9 +369,6 @@ def draw_residuals(
 
 def new_figure(**options: Any) -> Figure:
     """Make a matplotlib figure outside pyplot.
-
-    Returns:
-        The figure.
 
     Raises:
         ImportError: without matplotlib.

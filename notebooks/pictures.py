@@ -37,21 +37,23 @@ from pat.lab.synthesis.check import CheckLimits
 from pat.lab.synthesis.rendered import Rendered
 from pat.media.colour import exposed, srgb_image
 from pat.media.figures import colour_depth as depth_picture
-from pat.media.figures import draw_panels
+from pat.media.figures import GAP, draw_panels
 from pat.media.images import write_image
 from pat.support.metrics import score
 
 __all__ = ["depth_picture", "exposed"]
 
-SHOWN = 880
-"""Width on the page of a picture that has more pixels than that."""
+SHOWN, STORED = 700, 900
+"""Width of a picture on the page, and the most pixels across that are kept of it."""
 
 sys.path.append(str(Path(__file__).parents[1]))
 
 
 def panels(images: Mapping[str, Float[Tensor, "_ _ _"]], columns: int = 2) -> Image.Image:
-    """Draw images side by side, with their names above them."""
-    return draw_panels(images, columns=columns, width=12)
+    """Draw images side by side, with their names above them, at whole multiples of their own size."""
+    own, most = next(iter(images.values())).shape[-1], STORED // columns - GAP
+    across = own * (most // own) if own <= most else most
+    return draw_panels(images, columns=columns, width=columns * (across + GAP) / 110)
 
 
 def curves(x: str, y: str, **lines: tuple[Sequence[float], Sequence[float]]) -> Figure:
@@ -76,7 +78,7 @@ def locations(
     """
     figure = Figure(figsize=(5.2, 3.4), layout="constrained")
     axes = figure.subplots()
-    show_image(axes, pair.beta.hw, image.mean(0, keepdim=True) * 0.5 + 0.5)
+    show_image(axes, pair.beta.hw, image.mean(0, keepdim=True) * 0.35 + 0.65)
     for field in fields:
         draw_sampling_locations(axes, field, pair, x)
     if window:
@@ -210,23 +212,31 @@ def svg(figure: Figure) -> str | None:
 
 
 def png(figure: Figure) -> tuple[bytes, dict[str, int]] | None:
-    """Return a figure with images as PNG of twice the pixels that it is shown with; None for a drawing."""
+    """Return a figure with images as PNG, shown at 90 pixels to the inch; None for a drawing."""
     if is_drawing(figure):
         return None
-    return as_png(Image.open(BytesIO(print_figure(figure, "png", dpi=180, base64=False))), 0.5)
+    image = Image.open(BytesIO(print_figure(figure, "png", dpi=144, base64=False)))
+    return as_png(image, round(image.width * 90 / 144), Image.Dither.NONE)
 
 
-def as_png(image: Image.Image, shrink: float = 1.0) -> tuple[bytes, dict[str, int]]:
-    """Return an image as PNG of 256 colours, chosen for it and dithered, and the size it is shown with.
+def frame_png(frame: Frame) -> tuple[bytes, dict[str, int]]:
+    """Return a frame's own picture as `as_png` does."""
+    image = Image.open(BytesIO(frame._repr_png_()))
+    return as_png(image.resize((STORED, round(image.height * STORED / image.width))))
+
+
+def as_png(
+    image: Image.Image, width: int = SHOWN, dither: Image.Dither = Image.Dither.FLOYDSTEINBERG
+) -> tuple[bytes, dict[str, int]]:
+    """Return an image as PNG of 256 colours, chosen for it, and the size it is shown with, `width` across.
 
     Colours are spread over all that occur, so that a small thing keeps its own: a third of a full PNG's size.
     """
-    shrink = min(shrink, SHOWN / image.width)
     file = BytesIO()
     full = image.convert("RGB")
     palette = full.quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=5)
-    full.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG).save(file, "PNG", optimize=True)
-    return file.getvalue(), {"width": round(image.width * shrink), "height": round(image.height * shrink)}
+    full.quantize(palette=palette, dither=dither).save(file, "PNG", optimize=True)
+    return file.getvalue(), {"width": width, "height": round(image.height * width / image.width)}
 
 
 def say(message: Warning | str, *_: object) -> None:
@@ -240,4 +250,5 @@ if (shell := get_ipython()) is not None:
     formatters["image/svg+xml"].for_type(Figure, svg)
     formatters["image/png"].for_type(Figure, png)
     formatters["image/png"].for_type(Image.Image, as_png)
+    formatters["image/png"].for_type(Frame, frame_png)
     formatters["image/jpeg"].for_type(Image.Image, lambda image: None)

@@ -462,7 +462,7 @@ class LensNumbers(NamedTuple):
 
     Attributes:
         model: 0 for a pinhole, else a number of `COMPILED_LENSES`.
-        c: 14 coefficients, padded with zeros.
+        c: coefficients (14), padded with zeros.
         limit: squared limit of the lens model's domain (`Distortion.squared_limit`); 0 for a pinhole.
         K: intrinsics (3, 3).
         wide: True if fractions are even in angle.

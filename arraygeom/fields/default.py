@@ -70,12 +70,11 @@ def default_field(pair: Pair) -> ReceptiveField:
 
     Returns:
         `AroundHomography` for cameras at one place, and for a pair whose link has H alone.
-        `HomographyDisplacement` for a pair with another link, also if it is calibrated (a link was measured
-        between these very images). `Epipolar` for another
-        calibrated pair; called, it raises ValueError for a pair without a depth range, as a search of the
-        whole line is ambiguous and must be requested (`EpipolarLine`). `Rectified` with alpha on either side
-        where only sizes are known. With lenses `Curved` in place of `Epipolar`, with the bounds of
-        `natural_bounds`, and `ThroughLenses` of any other.
+        `HomographyDisplacement` for a pair with another link, calibrated or not (a link was measured between
+        these very images). `Epipolar` for another calibrated pair; called, it raises ValueError without a
+        depth range: a search of the whole line must be requested (`EpipolarLine`). `Rectified` with alpha on
+        either side where only sizes are known. With lenses `Curved` in place of `Epipolar`, with
+        the bounds of `natural_bounds`, and `ThroughLenses` of any other.
     """
     return _through_lenses(straight_field(pair), pair)
 

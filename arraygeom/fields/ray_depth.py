@@ -105,7 +105,7 @@ def rough_transfer(pair: Pair, x: Real[Tensor, "n 2"]) -> TransformedPoints:
     """Map pixels of alpha roughly to beta: by the pair's homography, or the middle of other cameras' curves.
 
     Returns:
-        Positions in beta's pixels, detached, with their validity.
+        Positions in beta's pixels, detached, with their validity; 0 where not valid.
 
     Raises:
         ValueError: for a pair that is not calibrated or has no depth range, where curves are needed.

@@ -165,7 +165,7 @@ class AroundHomography:
     """The row within +-`reach` pixels of H x, for cameras at one place: H is seldom exact to a pixel.
 
     Attributes:
-        reach: pixels of beta, at least 0.
+        reach: pixels of beta, at least 0, which is not checked.
     """
 
     reach: float

@@ -96,9 +96,6 @@ def read_text(text: str, path: str | Path) -> Rig:
         text: content of the file, YAML.
         path: name of the file in errors; nothing is read from it.
 
-    Returns:
-        The rig.
-
     Raises:
         RigFileError: for a damaged text; its message names the file, the entry and what to do.
     """

@@ -347,9 +347,6 @@ class RigSource:
             cameras: names and cameras, in the rig's order.
             fields: further fields of the rig, such as `depth`.
 
-        Returns:
-            The rig.
-
         Raises:
             RigFileError: for no camera, or a name that occurs twice.
         """
@@ -793,9 +790,6 @@ class Entry:
 
     def kannala_brandt(self) -> Distortion:
         """Return a Kannala-Brandt fisheye from one to four coefficients, zero-padded to four.
-
-        Returns:
-            The lens.
 
         Raises:
             RigFileError: for another number of them.

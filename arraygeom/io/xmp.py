@@ -350,7 +350,7 @@ class _Image(NamedTuple):
         return K
 
     def sensor(self) -> Sensor:
-        """Return the sensor by the tags: band, black level, exposure and gain."""
+        """Return the sensor by the tags: band; of raw bands also black level, exposure and gain."""
         fields = self.tags.fields
         colour = len((self.text("BandName") or "").split(",")) == 3
         centre, width = (self._one(name, 0.0) for name in ("CentralWavelength", "WavelengthFWHM"))

@@ -43,7 +43,8 @@ class LensModel(Batched):
         """Project points in the camera's frame (*n, 3).
 
         Returns:
-            Points of the image plane (*n, 2), which `Camera.K` takes to pixels, and True where seen.
+            Points of the image plane (*n, 2), which `Camera.K` takes to pixels, and True where seen; others
+        mean nothing. A batch of lenses (*b) takes points (*b, ..., 3).
 
         Raises:
             NotImplementedError: in this base class.
@@ -56,7 +57,7 @@ class LensModel(Batched):
         """Compute the directions of points of the image plane (*n, 2).
 
         Returns:
-            Directions (*n, 3) of any length, and True where there is one.
+            Directions (*n, 3) of any length, and True where there is one; others mean nothing.
 
         Raises:
             NotImplementedError: in this base class.

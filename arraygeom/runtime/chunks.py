@@ -111,7 +111,9 @@ def assembled(
     """Assemble tensors of a frame (h, w) from the inner parts of its tiles' results.
 
     Args:
+        lengths: lengths of the whole frame along `axes`.
         parts: tiles with one or several tensors each, as large as the outer box or smaller by a whole factor.
+        axes: axes of the tensors that the tiles cut.
 
     Returns:
         A tensor if the parts are tensors, else a tuple; the result of a tile that is the whole frame is

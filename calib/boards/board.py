@@ -133,7 +133,7 @@ class MarkedBoard(Board):
 
 @dataclass(frozen=True)
 class Chessboard(Board):
-    """Chessboard of `columns` x `rows` inner corners."""
+    """Chessboard of `columns` x `rows` inner corners, squares `spacing` metres wide."""
 
     def __str__(self) -> str:
         return f"chessboard:{self.columns}x{self.rows}:{millimetres(self.spacing)}"
@@ -148,6 +148,8 @@ class Chessboard(Board):
 @dataclass(frozen=True)
 class Charuco(MarkedBoard):
     """Chessboard with markers in its white squares; `columns` x `rows` counts inner corners.
+
+    Fields begin with those of `Board` (`spacing` is a square's side) and `MarkedBoard`.
 
     Attributes:
         marker: side of a marker, metres.
@@ -188,8 +190,8 @@ class Charuco(MarkedBoard):
 class AprilGrid(MarkedBoard):
     """Kalibr's grid of AprilTags. Its points are the corners of all tags, four each.
 
-    Tags are numbered row by row from below. `columns` and `rows` count points, two for each tag; `spacing` is
-    twice the gap between two tags, metres.
+    Fields begin with those of `Board` and `MarkedBoard`. Tags are numbered row by row from below. `columns`
+    and `rows` count points, two for each tag; `spacing` is twice the gap between two tags, metres.
 
     Attributes:
         tag: side of a tag, metres.
@@ -240,6 +242,8 @@ class AprilGrid(MarkedBoard):
 class Boards(Board):
     """Several boards in view at once, each with its own pose; their points form one list.
 
+    `columns`, `rows` and `spacing` are the first board's.
+
     Attributes:
         boards: the single boards.
     """
@@ -263,7 +267,9 @@ class Boards(Board):
 
 @dataclass(frozen=True)
 class Circles(Board):
-    """Grid of black circles on white; in an asymmetric grid every other row is shifted by half a spacing.
+    """Grid of black circles on white, `columns` x `rows`.
+
+    In an asymmetric one circles of a row are 2 `spacing` apart, and every other row is shifted by one.
 
     Attributes:
         asymmetric: True for OpenCV's asymmetric grid.
@@ -301,7 +307,7 @@ class Circles(Board):
 
 @dataclass(frozen=True)
 class KnownPoints(MarkedBoard):
-    """Points at surveyed positions: centres or corners of markers.
+    """Points at surveyed positions: centres or corners of markers. `columns` is their number, `rows` 1.
 
     Attributes:
         file: file that they were read from.

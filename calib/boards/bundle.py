@@ -381,10 +381,10 @@ class NormalEquations:
         return S[:c, :c] - S[:c, c:] @ np.linalg.solve(S[c:, c:], S[c:, :c])
 
     def reduced(self, damping: float) -> tuple[Array, Array, Array]:
-        """Eliminate the boards.
+        """Eliminate the boards, after diagonals are multiplied by 1 + `damping`.
 
         Returns:
-            The Schur complement, W B^-1, and B^-1.
+            The Schur complement (c, c), W B^-1 (b, c, 6), and B^-1 (b, 6, 6).
         """
         eye = np.eye(POSE)
         inverse = np.linalg.inv(self.B * (1 + damping * eye) + 1e-12 * eye)

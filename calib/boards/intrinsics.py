@@ -109,7 +109,7 @@ def without_bad_images(views: BoardViews, initial: CalibratedViews, board: Board
         initial: camera and board poses that were estimated from them.
 
     Returns:
-        The detections in the remaining images: those below 2 pixels, or ten times the median error.
+        The detections in the images whose error (RMS) is below 2 pixels or ten times the median, the larger.
     """
     rms = {}
     for key, pose in initial.poses.items():

@@ -87,6 +87,7 @@ def report_html(
     """Compose the HTML report of a calibration: verdict, notes, accuracy, coverage, residuals, uncertainty.
 
     Args:
+        title: heading of the page.
         notes: sentences at the top; "No advice." without any.
         detected: all detections by camera; with `photos`, the images that fit worst are drawn. None to draw
             none.
@@ -249,9 +250,6 @@ def camera_table(calibration: Calibration, covers: Mapping[str, Coverage]) -> st
 
     Args:
         covers: coverage by camera.
-
-    Returns:
-        HTML.
     """
     rows = []
     for name, camera in calibration.fit.problem.cameras.items():
@@ -330,11 +328,7 @@ def _table(rows: Sequence[Mapping[str, str]]) -> str:
 
 
 def draw_scene(calibration: Calibration) -> Figure:
-    """Draw the rig alone, and the rig with the boards from above.
-
-    Returns:
-        The figure.
-    """
+    """Draw the rig alone, and the rig with the boards from above."""
     figure = draw_rig(Rig({escaped(n): c for n, c in calibration.rig.cameras.items()}))
     figure.set_size_inches(10.4, 4.6)
     axes: Any = figure.axes[0]
@@ -361,11 +355,7 @@ def draw_scene(calibration: Calibration) -> Figure:
 
 
 def draw_by_image(calibration: Calibration) -> Figure:
-    """Plot the root mean square residual of every image of every camera, by frame.
-
-    Returns:
-        The figure.
-    """
+    """Plot the root mean square residual of every image of every camera, by frame."""
     frames = calibration.frames
     figure = Figure(figsize=(10.4, 2.8), layout="constrained")
     axes = figure.subplots()
@@ -388,9 +378,6 @@ def draw_camera(calibration: Calibration, name: str, covered: Coverage) -> Figur
     Args:
         name: name of the camera.
         covered: coverage of its image; cells without points are red.
-
-    Returns:
-        The figure.
     """
     observed, r = calibration.fit.problem.seen[name], calibration.fit.problem.residuals[name]
     hw = calibration.views[name].hw
@@ -515,9 +502,6 @@ def draw_images(
         chosen: camera and moment of each image, at least one.
         detected: all detections by camera.
         photos: images by camera and moment.
-
-    Returns:
-        The figure.
     """
     columns = min(3, len(chosen))
     rows = -(-len(chosen) // columns)

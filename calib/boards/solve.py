@@ -299,9 +299,6 @@ def noise(problem: BundleProblem, parameters: int) -> dict[str, float]:
 
     Args:
         parameters: number of fitted parameters, by which degrees of freedom are reduced.
-
-    Returns:
-        Noise by camera.
     """
     residuals = problem.residuals
     numbers = 2 * sum(len(r) for r in residuals.values())

@@ -93,9 +93,6 @@ BELOW = 14.0
 def parse_board(text: str) -> Board:
     """Parse the text of a board, such as ``charuco:8x6:30mm``, or read a target file; see the module.
 
-    Returns:
-        The board.
-
     Raises:
         ValueError: for text or a file that is no board.
         FileNotFoundError: for a missing file.

@@ -85,9 +85,6 @@ class RigCovariance:
             path: JSON file.
             rig: rig to which the file must belong; None does not check.
 
-        Returns:
-            The covariance.
-
         Raises:
             FileNotFoundError: for a missing file.
             ValueError: for another file, a damaged one, or one of another rig.
@@ -286,9 +283,6 @@ def jackknife(problem: BundleProblem) -> Jackknife:
     They include common errors of a frame beyond its points' noise: a bent board, blur, wrong exposure times.
     A plain jackknife's deviations are too large by 15 to 40 % with a dozen boards that determine all
     parameters between them; Bell and McCaffrey's (2002) correction removes that.
-
-    Returns:
-        The covariances.
 
     Raises:
         numpy.linalg.LinAlgError: if parameters are not observable.

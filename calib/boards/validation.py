@@ -44,7 +44,8 @@ def epipolar_errors(
     """Compute epipolar errors by pair: distances of points from their lines, averaged over both directions.
 
     Returns:
-        Errors in undistorted pixels, one for each common point; pairs without common points are absent.
+        Errors in undistorted pixels, one for each common point within both lens models; pairs without common
+        points are absent.
     """
     errors = {}
     for a, b in combinations(views, 2):

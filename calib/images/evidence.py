@@ -229,10 +229,10 @@ class DriftEvidence:
         cost: -2 log evidence of the rig and that drift by the points used; smaller is better, and only
             differences count.
         distances: function from a drift to all points' distances, in standard deviations of their noise.
-        z: the drift, in prior deviations.
-        r: distances without drift, by the linear model about z.
-        J: derivatives of the distances by the drift.
-        B: derivatives of the distances by what lens models leave.
+        z: the drift (k), in prior deviations.
+        r: distances (n) without drift, by the linear model about z.
+        J: derivatives (n, k) of the distances by the drift.
+        B: derivatives (n, s) of the distances by what lens models leave.
         scale: scale of the drift's prior deviations.
         fixed: part of the cost that does not depend on the distances.
         clipped: largest distance that counts.

@@ -92,9 +92,6 @@ def solve(residuals: Residuals, count: int, considered: int = 0) -> Solution:
         residuals: function of all parameters, the free ones first, that returns residuals in parts.
         count: number of free parameters.
         considered: number of further parameters that are uncertain, but not changed.
-
-    Returns:
-        The solution.
     """
     total = count + considered
     active = torch.ones(total, dtype=torch.bool)

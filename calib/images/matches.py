@@ -118,11 +118,11 @@ class SiftFeatures(NamedTuple):
     """SIFT features of one image.
 
     Attributes:
-        points: positions (x, y), pixels.
-        sizes: diameters, pixels.
-        directions: orientations, radians.
-        descriptors: descriptors of 128 numbers, one row a feature.
-        image: luminance with equalised contrast in which they were detected.
+        points: positions (n, 2), (x, y) in pixels.
+        sizes: diameters (n), pixels.
+        directions: orientations (n), radians.
+        descriptors: descriptors (n, 128).
+        image: luminance (h, w) with equalised contrast in which they were detected.
     """
 
     points: NDArray[np.float64]

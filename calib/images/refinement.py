@@ -231,9 +231,6 @@ class RefinementProblem:
             frames: matched points of each frame, by pair of names.
             sigma: prior standard deviations by kind; None for the usual ones (`SIGMA`).
 
-        Returns:
-            The problem.
-
         Raises:
             ValueError: if nothing is free, no pair is related by the rig, or no points are left to use.
         """
@@ -314,7 +311,7 @@ class RefinementProblem:
         it.
 
         Args:
-            force: accept it in spite of objections.
+            force: accept it in spite of objections, unless nothing moved.
 
         Returns:
             The refinement; its rig is the given one unless accepted.

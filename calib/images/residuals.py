@@ -22,7 +22,7 @@ from .matches import Pairs, PointMatches, fit_fundamental, line_distance, undist
 
 
 class EpipolarResiduals(NamedTuple):
-    """Signed epipolar distances in pixels, one per match.
+    """Signed epipolar distances in pixels, one per match; without meaning where not `valid`.
 
     Attributes:
         sampson: distance from the nearest pair of points that fits (Hartley & Zisserman 11.4.3), in both
@@ -303,7 +303,7 @@ def _rays(pair: Pair, x: Tensor, y: Tensor) -> tuple[tuple[Tensor, Tensor], Tens
 
 
 def own_distance(rig: Rig, pairs: Pairs) -> float:
-    """Compute the median distance of points from the lines of an F fitted to them: no rig can be nearer.
+    """Compute the median distance of points from the lines of an F fitted to them: about the least possible.
 
     Returns:
         Distance in undistorted pixels of beta; 0 if no F fits.

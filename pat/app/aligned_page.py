@@ -31,9 +31,6 @@ def aligned_page(aligned: Aligned, rig: Rig, facts: Facts) -> str:
     Args:
         rig: rig of the recorded files.
         facts: notes, warnings and figures.
-
-    Returns:
-        The HTML.
     """
     h, w = aligned.depth.shape
     figures = {"size": f"{w} x {h} pixels", "bands": ", ".join(aligned.bands)}

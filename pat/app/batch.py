@@ -258,9 +258,6 @@ class Batch:
     def from_json(cls, text: str, source: str = PLAN) -> Batch:
         """Parse the text of `to_json`.
 
-        Returns:
-            The batch.
-
         Raises:
             ValueError: naming `source`, for other text.
         """

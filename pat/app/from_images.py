@@ -112,9 +112,6 @@ def array_from_images(
         further: files of other captures by camera, used too where tags state cameras without parallax.
         say: function that is called with a line of text for each finding.
 
-    Returns:
-        The array.
-
     Raises:
         ValueError: in one line, for fewer than two images, an image of one colour, images that do not show
             the same things, and a focal length of an unknown camera.

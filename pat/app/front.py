@@ -118,7 +118,8 @@ def fuse(
     Raises:
         ValueError: a camera that the rig lacks, an image of another size, a rig whose views do not overlap,
             bands that the network does not make, `differentiable` with a memory limit, `store` or noise;
-            without a rig, images that do not show the same things.
+            without a rig, images that do not show the same things; with one, no `alpha`.
+        TypeError: a rig or settings of another type.
         NotImplementedError: within a transformation of `torch.func`.
 
     Warns:

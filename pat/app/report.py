@@ -67,9 +67,6 @@ def report_page(
         rig: rig of the images.
         alpha: name of alpha.
         facts: notes, warnings and figures.
-
-    Returns:
-        The HTML.
     """
     layers = {f"alpha: {alpha}": images[alpha]}
     layers |= {f"beta: {name}": images[name] for name in rig.betas(alpha) if name in images}

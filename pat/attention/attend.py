@@ -80,7 +80,7 @@ def attend(
             (x, y) to either, with the leading axes (n) or (B, n), which is called on one piece of alpha at a
             time and again in backward, so that not all explicit positions exist at once. Or the field
             `Local`: windows, of views of the same field of view; or `Dense`: all of beta, by
-                `scaled_dot_product_attention`.
+            `scaled_dot_product_attention`.
         samples: how many samples a segment has. None: one for each beta pixel of the longest valid one.
         interpolation: `bilinear` (differentiable in the geometry) or `nearest` (the paper's).
         bias: added to the scores; anything that broadcasts to (B, Ha, Wa, L); None for none.
@@ -260,6 +260,8 @@ def sample_positions(locations: Locations, query: Tensor, samples: int | None) -
     """Convert Segments or Positions to the one form that backends take, in their precision.
 
     Args:
+        locations: segments (ha, wa) or (b, ha, wa), or positions with one more axis.
+        query: features (b, d, ha, wa), for their sizes, device and precision.
         samples: samples of each segment; None for one on each beta pixel of the longest segment.
 
     Returns:

@@ -58,6 +58,9 @@ def forward_local(
     """Attend to windows around the same pixel of a view of equal size: nearest look-up, float32.
 
     Args:
+        query: features (b, d, h, w) of alpha.
+        key: features (b, d, h, w) of beta.
+        value: values (b, dv, h, w) of beta.
         field: size and spacing of the windows.
         bias: score (size²) added to each sample, the same for all pixels, where -inf skips the sample; None
             for none.
@@ -84,11 +87,9 @@ def backward_local(
     """Differentiate `forward_local` by query, key and value.
 
     Args:
-        inputs: query, key and value, as given to `forward_local`.
-        field: as given to it.
-        bias: as given to it; gets no gradient.
+        inputs: query, key and value, as given to `forward_local`; so are `field` and `bias`.
         outputs: results of `forward_local`.
-        upstream: gradient by the values.
+        upstream: gradient (b, dv, h, w) by the values.
         wanted: True for each of the three gradients to compute.
 
     Returns:
@@ -134,7 +135,7 @@ def backward(
         wanted: True for each of the five gradients to compute.
 
     Returns:
-        Five gradients, images channels last in memory; empty where not `wanted`.
+        Five gradients of the inputs' shapes, images channels last in memory; empty where not `wanted`.
     """
     query, key, value, positions, *_ = inputs
     b, d, ha, wa = query.shape

@@ -65,7 +65,7 @@ def backward(
         wanted: True for each of the five gradients to compute.
 
     Returns:
-        Five gradients; empty where not `wanted`.
+        Five gradients of the inputs' shapes; empty where not `wanted`.
     """
     query, key, value, positions, *_ = inputs
     b, _, ha, wa = query.shape

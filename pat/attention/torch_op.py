@@ -79,7 +79,7 @@ def attend_local(
     bias: Tensor | None,
     again: Callable[[Tensor, Tensor, Tensor], Tensor],
 ) -> Tensor:
-    """Compute `cpu.forward_local` with gradients by query, key and value.
+    """Compute `cpu.forward_local` with gradients by query, key and value, which are shaped as there.
 
     Args:
         field: size and spacing of the windows.

@@ -308,7 +308,7 @@ class _ViewRule:
         confidence: Float[Tensor, "h w"],
         values: NDArray[Any],
     ) -> AlignedView:
-        """Return a beta's values at alpha's pixels, which are `located` in it as prepared."""
+        """Return a beta's values (C, hb, wb) at alpha's pixels, which are `located` in it as prepared."""
         now = place.pair.beta
         assert isinstance(now, LensView)
         where, valid = chunked(lambda x: recorded_pixels(x, now, camera), located[0].double(), axis=0)
@@ -396,7 +396,7 @@ def filled(values: NDArray[Any], valid: NDArray[np.bool_], fill: Fill) -> NDArra
         fill: "none" for 0 or NaN, "propagate" for the nearest valid value.
 
     Returns:
-        Values of the same type; 0 or NaN everywhere if no pixel is valid.
+        Values (C, H, W) of the same type; 0 or NaN everywhere if no pixel is valid.
     """
     if fill == "none" or not valid.any():
         nothing = np.nan if np.issubdtype(values.dtype, np.floating) else 0

@@ -39,8 +39,8 @@ LARGEST_TIFF = 2**32 - 2**25
 class RecordedFiles(FilesOfCameras[NDArray[Any]]):
     """Values of an image file of each camera, read when asked for: counts, linear for raw images.
 
-    Images behind a colour filter pattern are demosaiced: red, green and blue counts. Access raises as
-    `read_recorded`.
+    Made of a rig and an image file of each camera. Images behind a colour filter pattern are demosaiced: red,
+    green and blue counts. Access raises as `read_recorded`.
     """
 
     def __getitem__(self, name: str) -> NDArray[Any]:

@@ -285,7 +285,7 @@ def checked_disparity(
         max_disparity: largest disparity, pixels.
 
     Returns:
-        Disparity (h, w) in pixels, negative where unknown, and a mask of the pixels that pass the check.
+        Disparity (h, w) in pixels, negative where unknown, and a mask (h, w) of pixels that pass the check.
     """
     ours = raw_disparity(left, right, max_disparity)
     # Seen from beta, alpha's points lie to the right: mirrored, to the left again.
@@ -332,9 +332,9 @@ def _softened(mono: Image, sharpness: float) -> Image:
 
 
 def raw_disparity(left: NDArray[np.uint8], right: NDArray[np.uint8], max_disparity: float) -> Image:
-    """Compute the disparity of the left image by OpenCV's semi-global matching, without a left-right check.
+    """Compute the disparity of a left image (h, w) by OpenCV's semi-global matching, without a check.
 
-    Images are padded, as OpenCV leaves columns at the left without disparity.
+    The right image has the same size; disparities up to `max_disparity` pixels are searched.
 
     Returns:
         Disparity (h, w) of the left image's pixels, in pixels; negative where unknown.

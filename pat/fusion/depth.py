@@ -65,7 +65,7 @@ def certain(output: FusionOutput, matches: Matches | None, inputs: Inputs) -> Fu
         matches: matches that it was given; None for none.
 
     Returns:
-        The output with these; unchanged without matches.
+        The output with these, and the largest as `overall` if it had one; unchanged without matches.
     """
     if matches is None:
         return output

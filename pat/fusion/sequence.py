@@ -166,9 +166,6 @@ class SequenceFusion:
             keys: the key frames.
             fetch: function that returns a key frame's colour, or None for one that could not be fused.
 
-        Returns:
-            The frame.
-
         Raises:
             ValueError: if none of the key frames around it could be fused.
         """

@@ -32,7 +32,7 @@ class Timeline:
         alpha: name of alpha.
 
     Raises:
-        ValueError: for a camera without a frame rate, or without frames.
+        ValueError: for a camera without a frame rate or frames, and without frames of alpha or any beta.
     """
 
     rig: Rig

@@ -81,9 +81,6 @@ class Views:
             depth: (near, far) in place of the rig's depth range; None for the rig's.
             field: field of all betas, or of each; None for the default.
 
-        Returns:
-            The views.
-
         Raises:
             ValueError: for a camera that the rig lacks, no image of alpha or of any beta, an image of another
                 size than the rig states, of another type, with values that are not finite or far outside

@@ -116,15 +116,12 @@ class MatchStatistics(NamedTuple):
 
         Args:
             alpha: alpha's image (B, 1, H, W).
-            soft: alpha, blurred to be no sharper than beta.
+            soft: alpha, blurred to be no sharper than beta; of its shape, as are the last four.
             values: beta's bands (B, C, H, W) at the matches.
-            combined: combination of these bands that is compared with alpha (B, 1, H, W).
+            combined: combination of these bands that is compared with alpha.
             brightness: that combination, normalised to alpha's brightness.
             valid: mask of the matches that are on beta.
             consistent: 1 where a match passes the left-right check, else 0.
-
-        Returns:
-            The statistics.
         """
         both = valid * consistent
         count = both.sum((-2, -1), keepdim=True) + 1

@@ -184,7 +184,7 @@ class _Windows(NamedTuple):
         return float((weight * np.abs(rest - self._mean(rest, weight))).sum() / max(weight.sum(), 1.0))
 
     def step(self, coefficients: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Return the change of the coefficients by one step; None for too little texture."""
+        """Return the change (3) of the coefficients (3), pixels, by one step; None for too little texture."""
         value, gx, gy, weight = self._sampled(coefficients)
         across = gx * self.normal[..., 0] + gy * self.normal[..., 1]
         along_segment = gx * self.normal[..., 1] - gy * self.normal[..., 0]

@@ -148,9 +148,6 @@ def coarse_mix(
             pixels of the whole beta.
         blocks: segments (B or 1, h / 2 factor, w / 2 factor) of blocks of twice the side.
         factor: whole number by which both images are reduced.
-
-    Returns:
-        The combination.
     """
     coarse_alpha, bands = avg_pool2d(alpha, factor), avg_pool2d(beta, factor)
     comparison = Comparison.from_images(coarse_alpha, bands, SpectralMix.equal(bands))

@@ -360,7 +360,14 @@ class _Sampled(NamedTuple):
         return cls(*(torch.cat(planes) for planes in zip(*parts)))
 
     def against(self, other: _Sampled, x: Tensor, y: Tensor) -> Ambiguity:
-        """Return the ambiguity with which most pixels agree."""
+        """Return the ambiguity of these inverse depths against another beta's with which most pixels agree.
+
+        Args:
+            x: columns of alpha's sampled pixels, of the planes' shape; `y` are their rows.
+
+        Returns:
+            The ambiguity; `NO_AMBIGUITY` unless clearly more pixels agree than without, or too few are known.
+        """
         both = self.known & other.known
         measured, w, rise, x, y = (plane[both] for plane in (self.w, other.w, self.pixels_per_w, x, y))
         if len(measured) < SETTINGS.sampled_rows:

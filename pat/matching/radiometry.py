@@ -359,7 +359,13 @@ class _Groups(NamedTuple):
 
     @classmethod
     def from_points(cls, x: Tensor, y: Tensor, where: Tensor) -> _Groups:
-        """Group points. Points are wrong if no smooth function of colour and place explains them."""
+        """Group points alike in colour and place; those that no smooth function explains count little.
+
+        Args:
+            x: bands (3, n) of beta.
+            y: alpha (n).
+            where: places (n, 2) in beta, in its width and height from its middle.
+        """
         grey, least = x.mean(0), SETTINGS.least
         design = torch.cat([x, x * grey, x * grey.square(), _shading_terms(where) * grey])
         ridge = 1e-6 * len(y) * torch.eye(len(design)).to(y)
@@ -395,7 +401,8 @@ class _Groups(NamedTuple):
     def explained_by(self, shading: Tensor, kinds: Sequence[_Kind], *, vignetted: bool) -> _Explanation:
         """Return the most probable response of these kinds after this shading is removed from beta.
 
-        Without a gamma and with one; if vignetted, with the shading that is left.
+        `shading` has the coefficients (s) of `_shading_terms`. Tried without a gamma and with one; if
+        vignetted, with the shading that is left.
         """
         gammas = self.y.new_tensor(SETTINGS.gammas)
         _, gram = self._modelled(gammas, shading, vignetted)

@@ -137,8 +137,7 @@ class _BlockCentres:
         return Segments(*(torch.cat(tensors) for tensors in zip(*parts)))
 
     def chosen(self, labels: Tensor) -> Segments:
-        """Return segments along x around the positions of whole labels, which a median makes agree with their
-        neighbours."""
+        """Return segments (h, w) along x around the positions of labels (h, w), smoothed by a median."""
         parts = []
         for rows in self.by_rows():
             locations = self.at(rows, slice(None))

@@ -100,10 +100,10 @@ WANTED = 0.8
 
 
 def exposure_gain(image: Float[Tensor, "c h w"]) -> float:
-    """Compute the gain that gives a dark or overexposed sRGB image ordinary brightness.
+    """Compute the gain that brings the brightest part of a dark or overexposed sRGB image to `WANTED`.
 
     Returns:
-        Factor of linear light; 1 for an image of ordinary brightness, and for one that is black.
+        Factor of linear light; 1 if that part is within `ORDINARY` already, and for a black image.
     """
     light = linear_from_srgb(luminance_of(image).mean(0)).flatten()
     brightest = float(light[:: max(light.numel() // 100_000, 1)].quantile(BRIGHT))

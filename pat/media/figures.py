@@ -27,7 +27,7 @@ def colour_depth(depth: Float[Tensor, "h w"]) -> Float[Tensor, "3 h w"]:
     """Colour a depth map by inverse depth, from its 1st to its 99th percentile.
 
     Returns:
-        RGB image 0..1; near is red, far is dark blue, unknown depth (not finite) is black.
+        RGB image 0..1, float32 on the CPU; near is red, far dark blue, unknown (not finite) black.
     """
     depth = depth.detach().cpu()
     has_depth = depth.isfinite()
@@ -48,7 +48,7 @@ def reduced(image: Float[Tensor, "c h w"], longest: int) -> Float[Tensor, "c h2 
     """Reduce an image so that its longer side has at most `longest` pixels (bicubic, antialiased).
 
     Returns:
-        The smaller image; the same tensor if it is small enough.
+        The smaller image, not clipped to 0..1; the same tensor if it is small enough.
     """
     factor = longest / max(image.shape[-2:])
     if factor >= 1:
@@ -100,8 +100,8 @@ def draw_panels(
     """Draw images side by side with titles, row by row, each scaled to its cell.
 
     Args:
-        panels: images (c, h, w), values 0..1, by title; a title may have several lines, and the font shrinks
-            until the longest fits. The first image sets the cells' shape.
+        panels: images (1 or 3, h, w), values 0..1, by title; a title may have several lines, and the font
+            shrinks until the longest fits. The first image sets the cells' shape.
         columns: panels in a row.
         width: width of the figure, in units of 110 pixels.
 

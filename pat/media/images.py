@@ -425,9 +425,6 @@ def _counts(planes: NDArray, label: str, bits: int | None, white: int) -> NDArra
 def exr_writer(path: Path) -> Any:
     """Import the package OpenEXR, for writing to `path`.
 
-    Returns:
-        The module.
-
     Raises:
         ValueError: naming the extra, if it is not installed.
     """

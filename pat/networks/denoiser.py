@@ -91,7 +91,7 @@ def rgb_of_opponent(bands: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]
 
 
 class LowLightNetwork(nn.Module):
-    """Denoisers of images of one band and of three.
+    """Denoisers of images of one band and of three; it is not called itself.
 
     Attributes:
         config: size of the networks.

@@ -54,7 +54,7 @@ class GuidedPAT(nn.Module):
         return alpha * (280.0 + 60.0 * max(len(betas) - 1, 0))
 
     def forward(self, inputs: Inputs, matches: Matches | None = None) -> FusionOutput:
-        """Fuse alpha (B, 1, H, W) with the betas, by their matches.
+        """Fuse alpha (B, 1, H, W), sides multiples of 16, with the betas, by their matches.
 
         Args:
             matches: result of `match(inputs)`; None raises.

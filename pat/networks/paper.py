@@ -44,6 +44,8 @@ class QueryAndKey(NamedTuple):
 class PAT(nn.Module):
     """The paper's network: features shared by all views, attention to each beta, fusion by convolutions.
 
+    Made of its configuration; weights are random.
+
     >>> PAT(PATConfig(betas=2, dim=8)).config.betas
     2
     """

@@ -176,7 +176,7 @@ def surroundings(alpha: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b d h/2 w/2"
     each radius (a local jet, Koenderink and van Doorn 1987).
 
     Returns:
-        Keys (B, 1 + 3 radii, H/2, W/2), in units of the settings' deviations.
+        Keys (B, 1 + 3 `scales`, H/2, W/2), in units of the settings' deviations.
     """
     half = avg_pool2d(alpha - 0.5, 2)  # for small numbers, of which float32 has more digits
     parts, (h, w) = [half / (SETTINGS.alike / 2)], half.shape[-2:]

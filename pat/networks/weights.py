@@ -66,8 +66,8 @@ def load_weights(name: str | Path, *, precision: Precision = "float32") -> Netwo
 
     Raises:
         FileNotFoundError: for no such file or name.
-        ValueError: for a file that is not of this format, is damaged or does not fit, another precision, or a
-            processor without bfloat16.
+        ValueError: for a file that is not of this format, is damaged or does not fit, another precision, or
+            bfloat16 where neither the processor has it nor CUDA is there.
     """
     if precision not in get_args(Precision):
         raise ValueError(f"precision is {precision!r}; wanted one of {', '.join(get_args(Precision))}")
@@ -178,7 +178,7 @@ def _is_of_pytorch(path: Path) -> bool:
 
 
 def misfit(network: nn.Module, state: Mapping[str, Tensor]) -> str:
-    """Describe the first tensor of a file that does not fit a network.
+    """Describe the first tensor of a file's `state` that does not fit a network.
 
     Returns:
         A phrase on a tensor that is missing, too many, or of another shape; empty if all fit.
@@ -202,9 +202,6 @@ def find_weights(name: str | Path) -> Path:
 
     Args:
         name: name of shipped weights, such as "mono-colour", or a path.
-
-    Returns:
-        The file.
 
     Raises:
         FileNotFoundError: if neither exists.

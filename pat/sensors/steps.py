@@ -20,7 +20,8 @@ from arraygeom.pixels import HW, resize_matrix
 class Step(ABC):
     """Base class of one step in the formation of an image, such as blur or noise.
 
-    A subclass defines `apply`, and `pixel_matrix` too if it moves or resizes the pixel grid.
+    A subclass defines `apply(image, generator)` of images (b, c, h, w), and `pixel_matrix` too if it moves or
+    resizes the pixel grid.
     """
 
     @abstractmethod
@@ -316,7 +317,7 @@ class Pairs(NamedTuple):
     Attributes:
         alpha: alpha's images, values 0..1.
         beta: beta's images, values 0..1.
-        case: index of each pair's case in the list of cases.
+        case: index of each pair's case in the list of cases, int64, on the generator's device.
     """
 
     alpha: Float[Tensor, "b ca ha wa"]
@@ -336,7 +337,7 @@ def augment(
         cases: cases to draw from; their steps must keep the size and the channels of an image.
 
     Returns:
-        Copies of the images, degraded, with the case of each pair.
+        Copies of the images, of the same shapes, with the case of each pair; those given stay.
 
     Raises:
         ValueError: naming the case, if it changes an image's shape.

@@ -23,7 +23,7 @@ ROWS = 64
 
 
 class ResidualBlock(nn.Module):
-    """Residual block: x + conv(leaky(conv(x))), both convolutions 3x3.
+    """Residual block: x + conv(leaky(conv(x))) of x (b, dim, h, w), both convolutions 3x3.
 
     Args:
         dim: number of channels, in and out.

@@ -164,7 +164,8 @@ def run_tasks(
 
     Args:
         workers: processes to run them in; by default this one.
-        resume: True to skip tasks whose file exists; otherwise such files are deleted first.
+        resume: True to skip tasks whose file or folder exists; otherwise files are deleted first, and a
+            folder in the way fails as an OSError.
         on_error: "stop" raises at a task's first ValueError, OSError or Warning; "skip" prints it and goes
             on.
         title: word before the progress bar.

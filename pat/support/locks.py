@@ -24,7 +24,8 @@ def folder_lock(folder: Path) -> Iterator[None]:
     """Context manager that makes a folder and keeps other commands out of it.
 
     The lock is a file locked by the system; a file beside it names the process and the host. The lock of a
-    dead process on this host, or in a container on it, is ignored. A folder left empty is removed again.
+    dead process on this host, or in a container on it, is ignored. Folders that it made are removed
+    again if they are empty.
 
     Raises:
         ValueError: if another command holds the folder, or it cannot be written.

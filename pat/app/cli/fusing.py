@@ -82,9 +82,6 @@ class Fusing(Known):
         Args:
             further: further fields of the settings, or `noise_by_default` of `settings`.
 
-        Returns:
-            The settings.
-
         Raises:
             ValueError: for invalid options.
         """
@@ -234,7 +231,7 @@ class Fusing(Known):
             say(f"network: {self.network} (--network NAME takes others)")
 
     def healed(self, views: ViewFiles) -> Rig:
-        """Compare the rig with the images, and correct it if they clearly contradict it.
+        """Compare the rig with the images, and refine it, or warn (`--misfit warn`), if they contradict it.
 
         Returns:
             The rig of the views, or the corrected one, which is then written beside the results too.

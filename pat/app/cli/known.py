@@ -93,9 +93,6 @@ class Known:
             noise_by_default: True to look for noise without --noise.
             further: further fields of the settings.
 
-        Returns:
-            The settings.
-
         Raises:
             ValueError: for invalid options.
         """
@@ -150,9 +147,6 @@ class Known:
             matches: file of matched points; None to match the images.
             flight: True to use several frames of each camera, not the first alone.
 
-        Returns:
-            The array.
-
         Raises:
             ValueError: for images that cannot be used, and a memory limit that their size exceeds.
         """
@@ -204,9 +198,6 @@ class KnownFile(NamedTuple):
     @classmethod
     def parse(cls, text: str) -> KnownFile:
         """Parse the option's text, and check that the file exists.
-
-        Returns:
-            The parsed value.
 
         Raises:
             UsageError: for other text, and a missing file.

@@ -212,9 +212,6 @@ def field_named(name: str) -> ReceptiveField | None:
 def load_rig(path: Path, depth: tuple[float, float] | None = None) -> Rig:
     """Load the rig of a file, with other depth bounds if given.
 
-    Returns:
-        The rig.
-
     Raises:
         FileNotFoundError: for a missing file.
         ValueError: for a file that is no rig, and invalid bounds.
@@ -235,9 +232,6 @@ def load_rig_or_say_no_image(path: Path, depth: tuple[float, float] | None) -> R
     Args:
         path: rig file.
         depth: (near, far) in place of the rig's bounds, metres; None for the rig's.
-
-    Returns:
-        The rig.
 
     Raises:
         FileNotFoundError: for a missing file.

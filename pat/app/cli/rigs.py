@@ -246,13 +246,14 @@ class Info:
         if alpha is None and len(rig.names) > MOST_CAMERAS:
             alpha, count = rig.names[0], len(rig.names)
             say(f"pairs with alpha '{alpha}' and its nearest cameras, of {count}: --alpha NAME for others")
-        cameras, pairs = summarise_cameras(rig), summarise_pairs(rig, alpha)
+        cameras = summarise_cameras(rig, None if self.json else MOST_ROWS)
+        pairs = summarise_pairs(rig, alpha)
         if self.json:
             document = {"cameras": [c._asdict() for c in cameras], "pairs": [p._asdict() for p in pairs]}
             return options.print_json(document)
-        if len(cameras) > MOST_ROWS:
-            say(f"the first {MOST_ROWS} of {len(cameras)} cameras: --json has all")
-        print_tables(cameras[:MOST_ROWS], pairs, unit)
+        if len(rig.names) > MOST_ROWS:
+            say(f"the first {MOST_ROWS} of {len(rig.names)} cameras: --json has all")
+        print_tables(cameras, pairs, unit)
 
 
 def warn_of_oddities(rig: Rig) -> None:

@@ -58,8 +58,8 @@ class Explorer:
         """Compute what is drawn for a state of the controls.
 
         Returns:
-            The values of `answers.answer`; for impossible controls {"error": message}, so that nothing is
-            raised for them.
+            The values of `answers.answer`, or for impossible controls `error`, a message; and the control
+            `asked` as it was given.
         """
         if self.scene is None:
             return {"error": self.error}
@@ -214,6 +214,8 @@ def opened(
         network: network of the paper, or its weights by name, whose attention is shown; None for correlations
             of windows.
         fields: further fields by name; None for none.
+        covariance: covariance of the rig's parameters, for bands; None for none.
+        files: files of the rig and the images, as for `Explorer`; None if unknown.
         controls: initial values of the controls (`explore`).
 
     Returns:

@@ -208,9 +208,6 @@ class ExplorerScene:
 def shipped_attention(name: str) -> PAT:
     """Load weights of the paper's network, cached.
 
-    Returns:
-        The network.
-
     Raises:
         ValueError: for weights of another network.
         FileNotFoundError: for unknown weights.
@@ -306,9 +303,6 @@ def pixel_of(state: ExplorerState) -> Float[Tensor, "1 2"]:
 
 def beta_report(scene: ExplorerScene, pair: Pair, name: str, state: ExplorerState) -> BetaReport:
     """Compute a pixel's samples in one beta, with weights and depths.
-
-    Returns:
-        The report.
 
     Raises:
         ValueError: if the field does not suit the pair.

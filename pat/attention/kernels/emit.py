@@ -116,9 +116,6 @@ def instruction(result):
 
     Args:
         result: function from the arguments' numba types to the result's type.
-
-    Returns:
-        The decorator.
     """
 
     def decorate(emit):

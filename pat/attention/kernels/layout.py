@@ -73,9 +73,9 @@ class Geometry(NamedTuple):
     """Positions of a call's samples; arrays are flat.
 
     Attributes:
-        points: ends of segments, or explicit positions, x and y of each pixel in turn.
-        mask: bytes, 1 for each segment or position that counts.
-        fractions: fractions of a segment at its samples, padded by `LANES`.
+        points: x and y of each pixel's two ends, or of its explicit positions, in turn.
+        mask: bytes, 1 for each segment (one a pixel) or position (`samples` a pixel) that counts.
+        fractions: fractions of a segment at its `samples`, padded by `LANES`.
         samples: number of samples per pixel.
         straight: True for segments, False for explicit positions.
         nearest: True for nearest pixels in place of bilinear interpolation.
@@ -111,7 +111,7 @@ class Call(NamedTuple):
         key: beta's features, flat, channels last.
         value: beta's values, flat, channels last.
         geometry: positions of the samples.
-        bias: numbers added to the scores.
+        bias: numbers added to the scores, `samples` a pixel; not read unless `biased`.
         biased: True if there is a bias.
         channels: number of channels of query and key.
         value_channels: number of channels of value.
@@ -134,8 +134,8 @@ class Share(NamedTuple):
         first: first alpha pixel of all callers.
         last: end of the alpha pixels.
         size: number of pixels of a piece, drawn from the counter.
-        counter: common counter of the callers.
-        block: the caller's own scratch.
+        counter: common counter (1) of the callers: the number of the next piece.
+        block: the caller's own scratch (`Block`).
     """
 
     first: int
@@ -146,12 +146,12 @@ class Share(NamedTuple):
 
 
 class Outputs(NamedTuple):
-    """Outputs of forward.
+    """Outputs of forward, to write: flat arrays, alpha's pixels image by image and row by row.
 
     Attributes:
-        value: weighted values.
-        statistics: four per pixel, if `measured`.
-        logsum: logarithms of the sums of exponentials.
+        value: weighted values, channels last.
+        statistics: x, y, spread and peak of each pixel, if `measured`.
+        logsum: logarithm of each pixel's sum of exponentials.
         measured: True if statistics are wanted.
     """
 
@@ -162,7 +162,7 @@ class Outputs(NamedTuple):
 
 
 class Saved(NamedTuple):
-    """Results of forward, and gradients by its outputs.
+    """Results of forward, and gradients by its outputs: flat arrays in the order of `Outputs`.
 
     Attributes:
         statistics: statistics of forward; those of pixel p start at `step` p.
@@ -185,9 +185,9 @@ class Gradients(NamedTuple):
     `points` and `bias` are added to, so they must be zero before.
 
     Attributes:
-        query: gradients by the query.
-        points: gradients by the segments' ends or the positions.
-        bias: gradients by the bias.
+        query: gradients by the query, `channels` a pixel.
+        points: gradients by the points, in their order in `Geometry`.
+        bias: gradients by the bias, `samples` a pixel.
         wants_query: True if `query` is wanted.
         wants_points: True if `points` is wanted.
         wants_bias: True if `bias` is wanted.
@@ -202,12 +202,12 @@ class Gradients(NamedTuple):
 
 
 class TapList(NamedTuple):
-    """Input of `scatter`, for each alpha pixel from `first` on.
+    """Input of `scatter`: a row for each alpha pixel from `first` on, whose first `tap_count` entries count.
 
     Attributes:
         first: first alpha pixel.
-        tap_count: number of its taps.
-        rows: beta's pixels of the taps.
+        tap_count: number of its taps (n, 1).
+        rows: numbers of beta's pixels of the taps (n, most).
         key_weight: weights of the taps in the gradient of key.
         value_weight: weights of the taps in the gradient of value.
     """

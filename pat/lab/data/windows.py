@@ -97,9 +97,6 @@ class RenderedView(NamedTuple):
 def read_view(folder: Path, name: str) -> RenderedView:
     """Read a camera's first frame as rendered.
 
-    Returns:
-        The view.
-
     Raises:
         ValueError: naming the folder, if it cannot be read, the camera is not calibrated, or sizes disagree
             with the rig.

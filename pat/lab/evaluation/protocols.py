@@ -53,9 +53,6 @@ def mono_colour_task(pair: StereoPair, rate: int) -> MonoColourTask:
         pair: pair of colour images.
         rate: factor by which beta is smaller than alpha, 1 or more.
 
-    Returns:
-        The task.
-
     Raises:
         ValueError: for a grey pair, and images of unequal sizes.
     """

@@ -130,9 +130,6 @@ def sets_markdown(
         rows: rows by data set; they include the methods "fusion" and "alpha".
         printed: published scores by data set, shown in a column of their own.
         depth: True to add the errors of disparity where its truth is known.
-
-    Returns:
-        Markdown text.
     """
     parts = []
     for name, of_set in rows.items():
@@ -149,9 +146,6 @@ def markdown(rows: Sequence[StereoRow], *, printed: PrintedScores = {}) -> str: 
     Args:
         rows: scores of one data set.
         printed: published scores by rate, shown as a column with a mean only.
-
-    Returns:
-        Markdown text.
     """
     return "\n".join(_table(own, printed.get(rate)) for rate, own in grouped(rows, "rate").items())
 

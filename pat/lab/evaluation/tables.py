@@ -35,9 +35,6 @@ def markdown_table(columns: Sequence[str], rows: Iterable[Sequence[object]], *, 
 
     Args:
         align: one letter, l or r, for each column; the last one repeats.
-
-    Returns:
-        The text.
     """
     return "".join(f"{line}\n" for line in (markdown_header(columns, align=align), *map(markdown_row, rows)))
 

@@ -154,9 +154,6 @@ class BlenderSettings:
     def render_settings(self) -> RenderSettings:
         """Combine preset and own entries, with one thread by default, as a farm has one worker for each core.
 
-        Returns:
-            The settings.
-
         Raises:
             ValueError: naming the entry, for an invalid one.
         """

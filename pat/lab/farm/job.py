@@ -197,9 +197,6 @@ class Shard:
         >>> Shard.parse("2/4").select(10)
         [1, 5, 9]
 
-        Returns:
-            The part.
-
         Raises:
             ValueError: for other text, and a number outside 1 to the count.
         """

@@ -64,9 +64,6 @@ def draw_layers(
         photos: textures to choose from.
         shapes: number of outlines to choose from.
         generator: random generator on the CPU.
-
-    Returns:
-        The layers.
     """
     g = generator
     shape = len(rigs.near), count[1]

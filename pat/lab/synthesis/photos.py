@@ -72,9 +72,6 @@ class PhotoBank:
             seed: seed of the patterns.
             choose: called with an image's number, returns True to take it; to hold some out.
 
-        Returns:
-            The bank.
-
         Raises:
             ValueError: if no image is found or chosen, and for a file that is no cache.
         """

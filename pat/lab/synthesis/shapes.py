@@ -55,9 +55,6 @@ def mesh(item: Object) -> Mesh:
 
     Patches of a plain shape do not share corners, so that edges between them are sharp; patches with relief
     do.
-
-    Returns:
-        The mesh.
     """
     extent = np.asarray(item.motion.keys[0].extent)
     surfaces = (_lathe(item.profile),) if item.shape == "lathe" else SURFACES[item.shape]

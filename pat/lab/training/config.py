@@ -174,9 +174,6 @@ def recipes() -> tuple[str, ...]:
 def load_config(name: str | Path) -> TrainConfig:
     """Load a recipe of the package by name, or a YAML file.
 
-    Returns:
-        The recipe.
-
     Raises:
         FileNotFoundError: if it is neither.
         ValueError: naming the entry, for an invalid recipe.
@@ -212,11 +209,7 @@ def parse_config(text: str, name: str = "config") -> TrainConfig:
 
 
 def config_text(config: TrainConfig) -> str:
-    """Format a recipe as YAML with every value written out; `parse_config` reads it back.
-
-    Returns:
-        The text.
-    """
+    """Format a recipe as YAML with every value written out; `parse_config` reads it back."""
     from arraygeom.runtime.safe_yaml import dump_yaml
 
     return dump_yaml(to_document(config, defaults=True), default_flow_style=None, width=118)
@@ -236,9 +229,6 @@ def command_line(arguments: list[str], prog: str = "pat lab train") -> TrainConf
     Args:
         arguments: arguments behind the command's name.
         prog: name of the command, for messages.
-
-    Returns:
-        The recipe.
 
     Raises:
         ValueError: for an invalid recipe, and for one that names code as its field where the arguments do

@@ -93,9 +93,6 @@ def rate_at(config: TrainConfig, step: int, share: float) -> float:
         config: recipe, for `rate`, `schedule` and `warmup`.
         step: number of the step, from 1.
         share: share of the run that is done, 1 at the end.
-
-    Returns:
-        The rate.
     """
     if config.schedule == "halving":
         fall = 0.5 ** int(min(share, 1) * 80 / 30)

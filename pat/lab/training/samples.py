@@ -232,9 +232,6 @@ def source_of(
         field: receptive field of all betas.
         device: device of the samples.
         folders: windows of rendered scenes and measured pairs, by kind.
-
-    Returns:
-        The source.
     """
     kinds = {"rectified": config.rectified_rigs, "general": config.general_rigs}
     betas = config.network.betas

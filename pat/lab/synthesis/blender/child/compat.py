@@ -12,9 +12,6 @@ LIBRARIES = "libx11-6 libxrender1 libxfixes3 libxi6 libxkbcommon0 libsm6 libgl1"
 def load() -> Any:
     """Import the module bpy.
 
-    Returns:
-        The module.
-
     Raises:
         ValueError: with the command to install what is missing, in one line.
     """
