@@ -204,8 +204,11 @@ def coverages(calibration: Calibration) -> dict[str, Coverage]:
     return by_camera
 
 
-def coverage_advice(calibration: Calibration) -> Iterator[str]:
+def coverage_advice(calibration: Calibration, *, always: bool = False) -> Iterator[str]:
     """Yield advice on each camera's coverage and, where something is missing, the views that would help most.
+
+    Args:
+        always: True to propose views where nothing is missing too.
 
     Yields:
         Sentences "camera: advice".
@@ -213,8 +216,12 @@ def coverage_advice(calibration: Calibration) -> Iterator[str]:
     for name, covered in coverages(calibration).items():
         yield from (f"{name}: {text}" for text in covered.missing)
         intrinsics = intrinsics_of(calibration.fit, name)
-        depth, lacking = float(np.mean(covered.depths)), covered.missing and len(intrinsics.covariance)
-        if lacking and (views := next_views(intrinsics, calibration.board, depth)):
+        depth, lacking = float(np.mean(covered.depths)), always or covered.missing
+        if (
+            lacking
+            and len(intrinsics.covariance)
+            and (views := next_views(intrinsics, calibration.board, depth))
+        ):
             listed = "; then ".join(view.text for view in views)
             gain = f"uncertainty from {views[0].before:.2g} to {views[-1].after:.2g} px"
             yield f"{name}: two more views would help most: {listed} ({gain})"

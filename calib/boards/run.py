@@ -201,5 +201,5 @@ def _calibrated_page(
         calibration = calibrate(views, board, lens=lens)
     except ValueError as error:
         return _page([*notes, str(error)])
-    notes = by_cameras([*notes, *calibration.notes, *coverage_advice(calibration)])
+    notes = by_cameras([*notes, *calibration.notes, *coverage_advice(calibration, always=True)])
     return report_html(calibration, notes=notes, further=REFRESH)

@@ -22,6 +22,7 @@ from arraygeom.runtime.threads import torch_in_one_thread
 
 from .depth_change import relative_change, share_outside
 from .evidence import SCALES, DriftEvidence, FitStatistics, fit_statistics, observations
+from .explanations import undetermined
 from .hypotheses import (
     FOCAL_SHARE,
     FOCAL_SPREAD,
@@ -109,6 +110,7 @@ class Diagnosis:
         depth: depth bounds (near, far) of the points by the named rig, in its unit; None if that rig states a
             depth range or too few points have depth.
         beyond: number of points left out because they lie beyond the range of a lens model of the given rig.
+        undetermined: sentences on pairs whose points determine no lines.
     """
 
     named: Hypothesis
@@ -121,6 +123,7 @@ class Diagnosis:
     certain: bool
     depth: tuple[float, float] | None = None
     beyond: int = 0
+    undetermined: tuple[str, ...] = ()
 
     @property
     def verdict(self) -> str:
@@ -158,7 +161,7 @@ class Diagnosis:
             )
         if self.named.kind != "nothing":
             lines.append(f"repaired: {self.after.as_text(unit)}")
-        lines.append(f"from {self.matches} points seen in two images")
+        lines += [f"from {self.matches} points seen in two images", *self.undetermined]
         if self.depth is not None:
             near, far = (f"{bound:.3g}" for bound in self.depth)
             lines.append(
@@ -181,6 +184,7 @@ class Diagnosis:
             "healthy": self.healthy,
             "matches": self.matches,
             "beyond_lenses": self.beyond,
+            "undetermined": self.undetermined,
             "depth": self.depth,
             "before": _rounded(self.before),
             "after": _rounded(self.after),
@@ -270,6 +274,7 @@ def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnos
         healthy=healthy,
         certain=named is not unchanged and all(others.values()),
         depth=depth_seen(named.rig, pairs) if named.rig.depth is None else None,
+        undetermined=undetermined(named.rig, pairs),
     )
 
 
