@@ -376,36 +376,6 @@ def test_what_lines_cannot_see_the_size_of_the_image_can(change, kind):
 def test_a_cropped_image_is_named(which):
     """A fifth was cut off at the left and the top, and K is for the whole image."""
     rig = same_size(unlike_pair())
-    cut = which(
-        lambda c: c.replace(K=c.K + vector(0.2 * c.hw[1], 0.2 * c.hw[0], 0)[:, None] * vector(0, 0, 1))
-    )
-    found = diagnose_matches(cut(rig), sizes(rig), seen_points(rig))
-    assert found.named.kind == "cropped", found.verdict
-    off = found.named.rig["second"].K[:2, 2] - rig["second"].K[:2, 2]
-    assert off.norm() < 0.05 * max(rig["second"].hw)
-
-
-def test_an_odd_principal_point_that_points_confirm_is_healthy():
-    """A sensor that is off its lens's axis by a tenth of its side."""
-    rig = same_size(unlike_pair()).perturbed({"second.centre": vector(32, -16)})
-    found = diagnose_matches(rig, sizes(rig), seen_points(rig))
-    assert found.healthy, found.verdict
-
-
-def test_which_of_two_cameras_was_zoomed_is_left_open():
-    """Lines of a rectified pair tell the ratio of the focal lengths alone."""
-    rig = rectified_pair()
-    bad = on_cameras(rig, ["left"], lambda c: with_numbers(c, focal=0.7)).replace(depth=None)
-    found = diagnose_matches(bad, sizes(rig), seen_points(rig))
-    assert found.named.kind == "focal length", found.verdict
-    assert {"left", "right"} == set(re.findall("left|right", found.verdict))
-    assert not found.certain
-
-
-@pytest.mark.parametrize("which", [one, each])
-def test_a_cropped_image_is_named(which):
-    """A fifth was cut off at the left and the top, and K is for the whole image."""
-    rig = same_size(unlike_pair())
     offset = vector(0, 0, 1)
     cut = which(lambda c: c.replace(K=c.K + 0.2 * vector(c.hw[1], c.hw[0], 0)[:, None] * offset))
     found = diagnose_matches(cut(rig), sizes(rig), seen_points(rig))
