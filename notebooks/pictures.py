@@ -36,8 +36,8 @@ from pat.lab.synthesis.blender import RenderSettings, render
 from pat.lab.synthesis.check import CheckLimits
 from pat.lab.synthesis.rendered import Rendered
 from pat.media.colour import exposed, srgb_image
-from pat.media.figures import colour_depth as depth_picture
 from pat.media.figures import GAP, draw_panels
+from pat.media.figures import colour_depth as depth_picture
 from pat.media.images import write_image
 from pat.support.metrics import score
 

@@ -46,8 +46,8 @@ STAGES: Mapping[str, Mapping[str, Callable[..., Any]]] = {
     "fill by attention": {"pat.networks.guided.completed": _without_attention},
     "fill by examples": {"pat.networks.guided.completed": _without_examples},
     "smoothing": {"pat.networks.guided.with_less_noise": lambda alpha, colour, weight: colour},
-    "depth beside edges": {"pat.fusion.fuse.beside_edges": lambda depth, *_: depth},
-    "depth filling": {"pat.fusion.fuse.background_filled": lambda frame, *_: frame.depth},
+    "median depth": {"pat.fusion.depth_filling.without_outliers": lambda depth: depth},
+    "depth filling": {"pat.fusion.depth_filling.background_filled": lambda frame, *_: frame.depth},
 }
 """Functions that a stage is replaced by, by the stage left out."""
 NETWORKS = {"choice and certainty": "classical"}

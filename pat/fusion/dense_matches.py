@@ -25,8 +25,7 @@ from ..media.images import Images
 from ..networks.protocol import FusionOutput, JoinsBands, required
 from ..support.blocks import without_autocast
 from .corrections import Corrections
-from .depth_edges import beside_edges
-from .depth_filling import background_filled
+from .depth_filling import final_depth
 from .inputs import prepared
 from .steps import steps_for, undone
 from .tiles import fused_in_tiles
@@ -114,5 +113,5 @@ def matched_depth(images: Images, rig: Rig, *, alpha: str, bands: int | None) ->
     inputs = inputs._replace(inputs=as_they_are)
     matches = match(as_they_are)
     frame = fused_in_tiles(network, inputs, matches, [whole(inputs.hw)], keep_matched=False).frame
-    depth = beside_edges(background_filled(frame, inputs), frame, inputs)
+    depth = final_depth(frame, inputs)
     return MatchedDepth(*undone(frame._replace(depth=depth), undo)[1:3])

@@ -1,4 +1,4 @@
-"""Depth where a match is far less certain than those around it: that of the plane through those."""
+"""Depth beyond single matches: planes where these are uncertain, and medians against outliers."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
@@ -54,6 +55,33 @@ ROWS, HALO = 512, 128
 those nearby."""
 
 
+def final_depth(frame: Frame, frame_inputs: FrameInputs) -> Float[Tensor, "h w"]:
+    """Compute the depth that a frame's result has: filled by planes, and without outliers.
+
+    Returns:
+        Depth (H, W), NaN where it was unknown; the frame's own where segments were around a known depth.
+    """
+    if any(beta.around for beta in frame_inputs.inputs.betas):
+        return frame.depth
+    return without_outliers(background_filled(frame, frame_inputs))
+
+
+def without_outliers(depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """Replace each depth by the median of 5 x 5 pixels, of inverse depth.
+
+    Unknown depth counts as far away; where most is unknown, a pixel keeps its own. Gradients are those of the
+    pixel's own inverse depth.
+
+    Returns:
+        Depth (H, W), NaN where it was unknown.
+    """
+    inverse = 1 / depth
+    median = torch.from_numpy(cv2.medianBlur(np.nan_to_num(numpy_of(inverse)), 5)).to(depth)
+    changed = depth.isfinite() & (median > 0)
+    following = torch.where(changed, median + (inverse - inverse.detach()), 1.0)
+    return torch.where(changed, 1 / following, depth)
+
+
 def background_filled(frame: Frame, frame_inputs: FrameInputs) -> Float[Tensor, "h w"]:
     """Replace depth of far less confidence than around it by that of a plane through the background.
 
@@ -64,11 +92,9 @@ def background_filled(frame: Frame, frame_inputs: FrameInputs) -> Float[Tensor, 
 
     Returns:
         Depth (H, W), metres, NaN where it was unknown; the frame's own where betas on several sides see
-        occluded points, and where segments were around a known depth.
+        occluded points.
     """
     depth, confidence, inputs = frame.depth, frame.confidence, frame_inputs.inputs
-    if any(beta.around for beta in inputs.betas):
-        return depth
     steps = [beta.field.pixels for beta in inputs.betas if beta.field.pixels is not None]
     if not steps:
         return depth

@@ -28,8 +28,7 @@ from ..support.blocks import without_autocast
 from ..support.memory import LEAST_BYTES, LEAST_MATCHED, check_limit, limited, parse_bytes, planned
 from .checks import warn_of_confidence
 from .corrections import Corrections, expected_work, find_corrections
-from .depth_edges import beside_edges
-from .depth_filling import background_filled
+from .depth_filling import final_depth
 from .frame import Frame
 from .inputs import FrameInputs, bytes_beside, prepared
 from .low_light import LowLight, Noise, check_noise, denoised_views
@@ -166,7 +165,7 @@ def fuse_frame(
             )
             del matches
         warn_of_confidence(network, fused.frame, inputs)
-        depth = beside_edges(background_filled(fused.frame, inputs), fused.frame, inputs)
+        depth = final_depth(fused.frame, inputs)
         frame = fused.frame._replace(depth=depth)
         if luminance != "alpha":
             frame = with_alpha_detail(frame, inputs.inputs.alpha[0, :, : inputs.hw[0], : inputs.hw[1]])

@@ -55,15 +55,12 @@ def match(inputs: Inputs, choice: Choice | None = None) -> Matches:
         raise ValueError(f"alpha has {w}x{h} pixels to match: pad both sides to whole multiples of {FINE}")
     if not inputs.learned:
         return transferred(inputs, located(inputs))
-    matches = in_each_beta(inputs)
-    if inputs.can_agree:
-        with torch.no_grad():
-            matches = with_certainty(chosen(inputs, matches, choice))
+    with torch.no_grad():
+        matches = with_certainty(chosen(inputs, in_each_beta(inputs), choice))
+        if inputs.can_agree:
             matches = with_likeliest_colours(inputs, matches, with_certainty(agreed(inputs, matches)))
     if torch.is_grad_enabled():
         matches = following(inputs, matches)
-    if not inputs.can_agree:
-        matches = with_certainty(chosen(inputs, matches, choice))
     return transferred(inputs, matches)
 
 

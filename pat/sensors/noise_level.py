@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
@@ -192,9 +191,10 @@ def _fitted(
         slope = (srgb_from_linear(signal * 1.01 + 1e-4) - value) / (0.01 * signal + 1e-4)
     weight = slope**2 / variance.clamp(min=1e-10)
     design = torch.stack([signal, torch.ones_like(signal)], -1) * weight[:, None]
-    from scipy.optimize import nnls  # here, as it takes long to import
-
-    (shot, read), _ = nnls(design.numpy(), np.ones(len(value)))
-    predicted = design @ torch.tensor([shot, read]).to(design)
+    wanted = torch.ones_like(value)[:, None]
+    free = torch.linalg.lstsq(design, wanted).solution
+    design = design * (free >= 0).mT  # what would be negative is 0, and the other is fitted alone
+    shot, read = torch.linalg.lstsq(design, wanted, driver="gelsd").solution.clamp(min=0)[:, 0].tolist()
+    predicted = design @ design.new_tensor([shot, read])
     error = float(predicted.clamp(min=1e-6).log().square().mean())
-    return NoiseLevel(float(shot), math.sqrt(read), added_to), error
+    return NoiseLevel(shot, math.sqrt(read), added_to), error

@@ -26,7 +26,7 @@ STAGES = {
     "choice": ["pat.matching.match.chosen"],
     "attention": ["pat.attention.attend._attend"],
     "network": ["pat.networks.guided.GuidedPAT.forward"],
-    "depth": ["pat.fusion.tiles.measured_depth", "pat.fusion.fuse.background_filled"],
+    "depth": ["pat.fusion.tiles.measured_depth", "pat.fusion.fuse.final_depth"],
     "write": ["pat.fusion.results.save_frame", "pat.app.report.report_page"],
 }
 """What is counted as each part, without the parts within it."""

@@ -7,7 +7,7 @@ from arraygeom import Curved, Distortion, Epipolar, Segments, pixel_grid
 from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.lenses import Equirectangular
 from pat.fusion.depth import measured_depth
-from pat.fusion.depth_filling import background_filled
+from pat.fusion.depth_filling import background_filled, without_outliers
 from pat.fusion.frame import Frame
 from pat.fusion.inputs import FrameInputs, Placement, frame_inputs, measured_along
 from pat.fusion.steps import quarter_turns
@@ -225,3 +225,27 @@ def test_depth_stays_where_its_interval_is_not_known(half_width):
     frame = wrong_in_the_middle()
     frame = frame._replace(half_width=torch.full_like(frame.depth, half_width))
     assert torch.equal(background_filled(frame, fields_along([4.0, 0.0])), frame.depth)
+
+
+def test_outliers_go_edges_stay_and_unknown_depth_stays_unknown():
+    wanted = torch.full((20, 30), 5.0)
+    wanted[:, 12:20] = 2.0
+    depth = wanted.clone()
+    depth[4, 5], depth[9, 15], depth[15, 25] = 1.0, 1e9, torch.nan
+    wanted[15, 25] = torch.nan
+    torch.testing.assert_close(without_outliers(depth), wanted, equal_nan=True)
+
+
+def test_unknown_depth_around_it_leaves_a_pixel_as_it_is():
+    depth = torch.full((9, 9), torch.nan)
+    depth[4, 4] = 3.0
+    torch.testing.assert_close(without_outliers(depth), depth, equal_nan=True)
+
+
+def test_gradients_of_a_median_are_those_of_the_pixel():
+    depth = torch.rand(8, 9) + 1
+    depth[2, 3] = torch.inf
+    depth.requires_grad_()
+    found = without_outliers(depth)
+    (1 / found).sum().backward()
+    torch.testing.assert_close(depth.grad, -1 / depth.detach().square())
