@@ -424,7 +424,10 @@ def _cropped(rig: Rig, pairs: Pairs) -> Iterator[Hypothesis]:
         z = most_probable(
             lambda z, after=after: sampson_of_pairs(after(z), pairs), z, torch.eye(len(z)).to(z)
         )
-        yield cropped(after(z), group)
+        repaired = after(z)
+        moved = max(float((repaired[name].K - rig[name].K)[:2, 2].norm()) for name in group)
+        if moved > LARGEST_CHANGE * SIGMA["centre"]:
+            yield cropped(repaired, group)
 
 
 def _degrees(rig: Rig, pairs: Pairs) -> list[Hypothesis]:
