@@ -109,7 +109,8 @@ def undetermined(rig: Rig, pairs: Pairs) -> tuple[str, ...]:
         points = undistort_matches(rig.pair(*names), matches)
         with suppress(ValueError):  # no F fits them, and none is needed
             link = fit_link(points, fit_fundamental(points)).link
-            explained = explain(points, Pair(*(View(hw=rig[name].hw) for name in names), link=link))
+            alpha, beta = (View(hw=rig[name].hw) for name in names)
+            explained = explain(points, Pair(alpha, beta, link=link))
             if not explained.has_lines:
                 sentences.append(f"by the points of {' and '.join(names)} alone, {explained.as_text()}")
     return tuple(sentences)
