@@ -94,15 +94,8 @@ class SystemsRun:
         """Print the scores, and the expected ones where they are of the same settings."""
         out = writable(self.out or Path("out/systems") / self.name, folder=True)
         if self.recording is None:
-            result = run_system(
-                self.name,
-                out,
-                say=say,
-                full=self.full,
-                scene=self.scene,
-                weights=self.network,
-                max_memory=self.max_memory,
-            )
+            how: dict[str, Any] = {"full": self.full, "scene": self.scene, "max_memory": self.max_memory}
+            result = run_system(self.name, out, say=say, weights=self.network, **how)
         elif self.name == "fast-slow":
             result = run_recorded(self.recording, out, weights=self.network, say=say)
         else:

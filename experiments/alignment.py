@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 from skimage.data import stereo_motorcycle
 from torch import Tensor
 
-from arraygeom import Camera, Pose, Rig, apply_homography, intrinsics, sample
-from arraygeom.pixels import pixel_grid
+from arraygeom import Camera, Pose, Rig, apply_homography, intrinsics, pixel_grid, sample
 from arraygeom.runtime.atomic import write_text
 from arraygeom.undistortion import pixels_between, recorded_pixels
 from calib.boards.detect import collect_folder
@@ -155,14 +154,9 @@ def index_text(scene: AlignmentScene, aligned: Aligned) -> list[str]:
 
 def aligned_scene(scene: AlignmentScene, min_confidence: float = LEAST_CONFIDENCE) -> Aligned:
     """Its bands at the pixels of alpha."""
-    return align(
-        scene.images,
-        scene.rig,
-        alpha=scene.alpha,
-        settings=FuseSettings(match_levels=scene.match_levels),
-        recorded=scene.recorded,
-        min_confidence=min_confidence,
-    )
+    settings = FuseSettings(match_levels=scene.match_levels)
+    how: dict[str, Any] = {"recorded": scene.recorded, "min_confidence": min_confidence}
+    return align(scene.images, scene.rig, alpha=scene.alpha, settings=settings, **how)
 
 
 def alignment_rows(scene: AlignmentScene, aligned: Aligned) -> list[AlignmentRow]:
@@ -225,10 +219,9 @@ def composites(scene: AlignmentScene, aligned: Aligned) -> dict[str, Float[Tenso
     images: list[list[NDArray[Any]]] = [[], []]
     for name in names:
         values, view = np.asarray(scene.recorded[name]), aligned[name]
-        rigid = by_homography(scene, name, straight, pinhole)
         by_plane, by_scene = (
             resampled_values(values, plane, "bilinear")[0] * (0.95 / np.percentile(values[0], 99))
-            for plane in (rigid, np.nan_to_num(view.positions))
+            for plane in (by_homography(scene, name, straight, pinhole), np.nan_to_num(view.positions))
         )
         images[0].append(by_plane)
         images[1].append(np.where(view.valid, by_scene, 1.0))
@@ -357,9 +350,7 @@ def alignment_markdown(rows: Sequence[AlignmentRow]) -> str:
     lines, pairs = [], [row for row in rows if "/" in row.scene]
     for name in dict.fromkeys(row.beta for row in pairs):
         mine = [row for row in pairs if row.beta == name]
-        means: dict[str, Any] = {
-            n: float(np.mean([getattr(row, n) for row in mine])) for n in (*SHARES, *MEDIANS)
-        }
+        means: dict[str, Any] = {n: np.mean([getattr(row, n) for row in mine]) for n in (*SHARES, *MEDIANS)}
         scene, off = f"{len(mine)} pairs", max(row.off for row in mine)
         lines.append(_line(mine[0]._replace(scene=scene, off=off, **means)))
     lines += [_line(row) for row in rows if row not in pairs]

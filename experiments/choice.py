@@ -80,15 +80,13 @@ class Kept(NamedTuple):
     def rows(self, top: int, count: int) -> Kept:
         """Some of all rows; the blurs are the same."""
         half = slice(top // FINE, (top + count) // FINE)
-        cut = {
-            n: getattr(self, n)[:, top : top + count] for n in ("alpha", "beta", "disparity", "truth", "seen")
-        }
+        names = ("alpha", "beta", "disparity", "truth", "seen")
+        cut = {n: getattr(self, n)[:, top : top + count] for n in names}
         return Kept(**cut, facts=self.facts[:, half], blurs=self.blurs)
 
     def upside_down(self) -> Kept:
         """The mirror image."""
-        flipped = {n: plane.flip(-2) for n, plane in self._asdict().items() if n != "blurs"}
-        return self._replace(**flipped)
+        return self._replace(**{n: plane.flip(-2) for n, plane in self._asdict().items() if n != "blurs"})
 
 
 def train_choice(config: ChoiceTraining) -> Path:
@@ -97,8 +95,7 @@ def train_choice(config: ChoiceTraining) -> Path:
     Raises ValueError where there are no photographs, or the folder holds a run of another recipe.
     """
     with config.folder():
-        network = config.network()
-        keep = partial(matched, network, without=config.without)
+        keep = partial(matched, config.network(), without=config.without)
         samples = [[Kept(**sample) for sample in config.kept(kind, keep)] for kind in KINDS]
         choice = Choice().to(config.device)
         config.train(choice, partial(losses, config, samples, choice))
@@ -158,8 +155,7 @@ def losses(
         near = (1 - FAR) / (1 + (apart / NEAR) ** 4) + FAR / (1 + apart)
         wrong = -(scores.log_softmax(1) + near.log()).logsumexp(1, keepdim=True)
         off = apart.gather(1, scores.argmax(1, keepdim=True))
-        right = (visible & (off <= 1)).to(logit)
-        stated = binary_cross_entropy_with_logits(logit, right, reduction="none")
+        stated = binary_cross_entropy_with_logits(logit, (visible & (off <= 1)).to(logit), reduction="none")
         beyond = off.clamp(min=0.02).log() - width
         interval = torch.maximum(SETTINGS.covered * beyond, (SETTINGS.covered - 1) * beyond)
         yield (wrong + 0.5 * (stated + interval))[truth > 0].mean()

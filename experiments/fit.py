@@ -108,8 +108,7 @@ def command(train: Callable[[Any], Path], recipe: type[Recipe], prog: str) -> No
     arguments = sys.argv[1:]
     try:
         base = read_recipe(recipe, arguments.pop(0)) if arguments and arguments[0][:1] != "-" else None
-        config = parse(recipe, arguments, prog=prog + " [RECIPE.yaml]", base=base)
-        print(train(config))
+        print(train(parse(recipe, arguments, prog=prog + " [RECIPE.yaml]", base=base)))
     except (ValueError, OSError) as error:
         sys.exit(f"{prog}: {error}")
 

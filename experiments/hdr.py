@@ -41,9 +41,8 @@ def merged(frame: Frame, rig: Rig, images: Mapping[str, Float[Tensor, "_ _ _"]],
     weight = torch.where(noise.isfinite(), frame.confidence / noise, 0.0)
     measured_weight = torch.where(measured < WHITE, 1 / (measured + READ_NOISE), 0.0)
     total = weight + measured_weight
-    light = torch.where(
-        total > 0, (weight * predicted + measured_weight * measured) / total.clamp(min=1e-12), measured
-    )
+    mean = (weight * predicted + measured_weight * measured) / total.clamp(min=1e-12)
+    light = torch.where(total > 0, mean, measured)
     light = torch.where((measured >= WHITE) & noise.isfinite(), torch.maximum(predicted, measured), light)
     return frame._replace(image=frame.image + srgb_from_linear(light[None]) - images[alpha])
 
@@ -51,8 +50,7 @@ def merged(frame: Frame, rig: Rig, images: Mapping[str, Float[Tensor, "_ _ _"]],
 def _at_alpha(frame: Frame, rig: Rig, image: Tensor, alpha: str, name: str) -> Float[Tensor, "h w"]:
     """Linear light of a beta at alpha's pixels, by depth; NaN where it is not known or outside the image."""
     a, b = rig.pair(alpha, name).cameras
-    X = a.to(torch.float32).unproject(pixel_grid(a.hw), frame.depth)
-    x, _, valid = b.to(torch.float32).project(X)
+    x, _, valid = b.to(torch.float32).project(a.to(torch.float32).unproject(pixel_grid(a.hw), frame.depth))
     sampled = sample(linear_from_srgb(image)[None], torch.where(valid[..., None], x, -1e3)[None])
     return torch.where(valid & sampled.valid[0], sampled.values[0, 0], torch.nan)
 

@@ -30,10 +30,7 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from arraygeom.pixels import pixel_grid
-from arraygeom.rig import Rig
-from arraygeom.sampling import sample
-from arraygeom.sensor import Band, Curve, Sensor
+from arraygeom import Band, Curve, Rig, Sensor, pixel_grid, sample
 from pat.lab.data.windows import read_view, scene_rig
 from pat.lab.synthesis.rendered import Rendered
 from pat.media.colour import REC601, linear_from_srgb, srgb_from_linear
@@ -120,13 +117,10 @@ class Spectral(Step):
         """One channel, or three for "rgb"."""
         channels = image.shape[1]
         if channels not in (3, 4):
-            raise ValueError(
-                f"a spectral response needs an image in RGB or RGB + NIR, got {channels} channels"
-            )
+            raise ValueError(f"a spectral response needs RGB or RGB + NIR, got {channels} channels")
         if self.response == "rgb":
             return image[:, :3]
-        weights = image.new_tensor(self._weights(channels))
-        return (image * weights[:, None, None]).sum(1, keepdim=True)
+        return (image * image.new_tensor(self._weights(channels))[:, None, None]).sum(1, keepdim=True)
 
     def _weights(self, channels: int) -> tuple[float, ...]:
         if self.response == "luminance":
@@ -185,9 +179,7 @@ def curve_weights(curve: Curve, channels: int = 3) -> tuple[float, ...]:
     gaussians = [(-0.5 * ((wavelength - c) / s) ** 2).exp() / s for c, s in CHANNELS[:channels]]
     overlaps = [float(torch.trapezoid(response * g, wavelength)) for g in gaussians]
     if sum(overlaps) < 1e-6:
-        raise ValueError(
-            "the response curve collects no light of the image's channels: check its wavelengths, in nm"
-        )
+        raise ValueError("the response curve collects no light of the image: check its wavelengths, in nm")
     return _shares(overlaps)
 
 
@@ -286,12 +278,10 @@ def read_chain(value: Any, where: str = "chain") -> tuple[Step, ...]:
     """The steps of a list as YAML has it. Raises ValueError naming the entry (`where`), the nearest name.
 
     >>> read_chain(["decode-srgb", {"noise": {"full_well": 8000, "read": 3}}, {"quantise": 12}])
-    (DecodeSRGB(), Noise(full_well=8000.0, read=3.0, counts='gaussian'), Quantise(bits=12))
+    (DecodeSRGB(), Noise(full_well=8000.0, read=3.0), Quantise(bits=12))
     """
     if not isinstance(value, list):
-        raise ValueError(
-            f"{where}: wanted a list of steps, such as [decode-srgb, {{noise: {{full_well: 8000}}}}]"
-        )
+        raise ValueError(f"{where}: wanted a list of steps, as [decode-srgb, {{noise: {{full_well: 8000}}}}]")
     return tuple(_step(entry, f"{where}[{i}]") for i, entry in enumerate(value))
 
 
@@ -304,9 +294,8 @@ def read_chains(value: Any, where: str = "sensors") -> dict[str, tuple[Step, ...
 
 def _step(entry: Any, where: str) -> Step:
     """One step of a chain. Raises ValueError naming the entry."""
-    name, options = (
-        next(iter(entry.items())) if isinstance(entry, Mapping) and len(entry) == 1 else (entry, {})
-    )
+    single = isinstance(entry, Mapping) and len(entry) == 1
+    name, options = next(iter(entry.items())) if single else (entry, {})
     if not isinstance(name, str):
         raise ValueError(f"{where}: is {entry!r}; wanted a step's name, or one name with its options")
     if name not in STEPS:

@@ -22,15 +22,8 @@ from experiments.evaluation.halves import of_half
 from pat import FuseSettings, fuse
 from pat.fusion.classical import classical
 from pat.fusion.steps import resolution_ratio
+from pat.lab.evaluation import stereo
 from pat.lab.evaluation.protocols import BASELINES, rectified_fusion
-from pat.lab.evaluation.stereo import (
-    DATA_SETS,
-    StereoRow,
-    evaluate_sets,
-    markdown,
-    sets_markdown,
-    structure_kept,
-)
 from pat.lab.evaluation.tables import markdown_table
 from pat.matching.normalisation import normalised
 from pat.media.colour import luminance_of, srgb_image
@@ -94,9 +87,10 @@ def showcase(data: Path, out: Path, weights: str = "mono-colour", rates: Sequenc
 def _pairs(network: FusionNetwork, data: Path, out: Path, rates: Sequence[int]) -> str:
     methods = {name: BASELINES[name] for name in ("alpha", "classical")}
     methods["fusion"] = rectified_fusion(network)
-    sets = {name: of_half(DATA_SETS[name](data / name), "report") for name in PAIRS}
-    rows = evaluate_sets(sets, methods, rates, out=out / "pairs")
-    return PAIRS_TEXT + sets_markdown(rows, depth=False)
+    sets = {name: of_half(stereo.DATA_SETS[name](data / name), "report") for name in PAIRS}
+    return PAIRS_TEXT + stereo.sets_markdown(
+        stereo.evaluate_sets(sets, methods, rates, out=out / "pairs"), depth=False
+    )
 
 
 class SyntimScene(NamedTuple):
@@ -130,8 +124,9 @@ def _syntim(network: FusionNetwork, scene: SyntimScene, out: Path) -> str:
     shown["depth"] = colour_depth(frame.depth)
     save_panels(shown, out / f"syntim_{name}.png", columns=3)
     rig.save(out / f"syntim_{name}.yaml")
-    rows = [StereoRow(name, 1, method, *score(image, left)) for method, image in results.items()]
-    return f"{SYNTIM_TEXT}{markdown(rows)}\n{structure_kept(rows)}\n\n![{name}](syntim_{name}.png)\n"
+    rows = [stereo.StereoRow(name, 1, method, *score(image, left)) for method, image in results.items()]
+    table = f"{stereo.markdown(rows)}\n{stereo.structure_kept(rows)}"
+    return f"{SYNTIM_TEXT}{table}\n\n![{name}](syntim_{name}.png)\n"
 
 
 def _syntim_image(folder: Path, scene: str, side: int) -> Tensor:
@@ -157,14 +152,8 @@ class FastSlowArray(NamedTuple):
 
 
 def _fast_and_slow(network: FusionNetwork, array: FastSlowArray, out: Path) -> str:
-    field = HomographyDisplacement(array.displacement)
-    frame = fuse(
-        array.images,
-        array.rig,
-        alpha=FAST,
-        network=network,
-        settings=FuseSettings(field=field, match_levels=True),
-    )
+    settings = FuseSettings(field=HomographyDisplacement(array.displacement), match_levels=True)
+    frame = fuse(array.images, array.rig, alpha=FAST, network=network, settings=settings)
     shown = {"alpha: the fast camera": array.images[FAST]}
     shown |= {f"beta: {name}": array.images[name] for name in SLOW}
     shown |= {"betas by the rough homography alone": transformed(array), "fusion": frame.image}
@@ -205,9 +194,7 @@ def published_matrices(file: Path) -> dict[str, Float[Tensor, "3 3"]]:
             for name, key in SLOW.items()
         }
     except (KeyError, TypeError, json.JSONDecodeError) as error:
-        raise ValueError(
-            f"{file}: wanted 3x3 matrices {', '.join(SLOW.values())} under 'pillow' ({error!r})"
-        ) from None
+        raise ValueError(f"{file}: no matrices {', '.join(SLOW.values())} of 'pillow' ({error!r})") from None
 
 
 def transformed(array: FastSlowArray) -> Float[Tensor, "3 h w"]:

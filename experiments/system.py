@@ -224,10 +224,9 @@ def _sequence(recorded: Recorded) -> tuple[list[str], Panels]:
         save_frame(frame, out / "frames", name=f"{i:03d}", view=view_of(rig, alpha, bits=8))
     write_video(out / "fused.mp4", [f.image for f in fused], rate=10)
     greys = [fusion.grey(i) for i in range(len(fused))]
-    base = [classical_baseline(rig, _images(fusion, i), alpha) for i in range(len(fused))]
     methods = {
         "alpha alone": [g.expand(3, -1, -1) for g in greys],
-        "classical": base,
+        "classical": [classical_baseline(rig, _images(fusion, i), alpha) for i in range(len(fused))],
         "fusion, each frame alone": [f.image for f in by_themselves],
         "fusion": [f.image for f in fused],
     }

@@ -105,10 +105,7 @@ class Reliability(NamedTuple):
 
 
 def judged(
-    network: FusionNetwork,
-    pairs: Iterable[StereoPair],
-    conditions: Sequence[str],
-    choices: Sequence[Path],
+    network: FusionNetwork, pairs: Iterable[StereoPair], conditions: Sequence[str], choices: Sequence[Path]
 ) -> Iterator[Judged]:
     """Every pair with true disparity under every condition, fused as `fuse` does.
 
@@ -220,8 +217,7 @@ def held(pixels: Sequence[Judged], stating: Callable[[Judged], Stated]) -> dict[
     def of(some: Sequence[int]) -> Held:
         right, error = (torch.cat([getattr(pixels[i], name) for i in some]) for name in ("right", "error"))
         probability, width = (torch.cat(planes) for planes in zip(*(stated[i] for i in some)))
-        covered = float((error <= width).float().mean())
-        return Held(Reliability.from_samples(probability, right), covered)
+        return Held(Reliability.from_samples(probability, right), float((error <= width).float().mean()))
 
     names = grouped(pixels, "condition")
     return {n: of([i for i, j in enumerate(pixels) if n in (j.condition, "all")]) for n in [*names, "all"]}
@@ -247,7 +243,6 @@ def save_reliability(held: dict[str, Held], path: Path) -> None:
     """The reliability diagram: a curve for each condition, and the diagonal."""
     curves = {"as stated": [(0.0, 0.0), (1.0, 1.0)]}
     for name, one in held.items():
-        enough = one.stated.share > 1 / 200
-        points = torch.stack(one.stated[:2], 1)[enough].tolist()
+        points = torch.stack(one.stated[:2], 1)[(one.stated.share > 1 / 200)].tolist()
         curves[name] = [(float(x), float(y)) for x, y in points]
     save_curves({"probability stated": curves}, path, ylabel="share of matches that are right")

@@ -19,7 +19,6 @@ from pat.lab.evaluation import protocols, stereo
 from pat.lab.evaluation.ablation import sample_photographs
 from pat.lab.evaluation.tables import write_csv
 from pat.matching.certainty import fitted_network
-from pat.media.figures import save_panels
 from pat.networks.paper import PAT
 from pat.networks.protocol import Comparing, FusionNetwork
 from pat.networks.weights import Network, load_weights
@@ -63,9 +62,7 @@ class Pairs(research.StereoSets):
         """All of them. Raises ValueError if there is none."""
         every = [pair for pairs in self.sets().values() for pair in pairs]
         if not every:
-            raise ValueError(
-                f"--half {self.half}: no pair belongs to that half: give more pairs, or the other half"
-            )
+            raise ValueError(f"--half {self.half}: no pair belongs to it: give more, or the other half")
         return every
 
 
@@ -97,8 +94,7 @@ class Evaluate(Pairs, research.Evaluate):
         field = paper.AuthorsRows() if self.as_authors else None
         if self.as_authors:
             sets = {name: map(paper.halved, pairs) for name, pairs in sets.items()}
-        settings = FuseSettings(field=field)
-        fusion = protocols.rectified_fusion(network, bands=bands, settings=settings)
+        fusion = protocols.rectified_fusion(network, bands=bands, settings=FuseSettings(field=field))
         methods = {**protocols.BASELINES, "fusion": fusion, **compared}
         rows = stereo.evaluate_sets(sets, methods, self.rates, out=self.out)
         text = stereo.sets_markdown(rows, printed=paper.PRINTED[self.protocol])
@@ -159,8 +155,7 @@ class Outside(Pairs):
     def run(self) -> None:
         """Write and print the table. Raises ValueError for no images, and for none with a true disparity."""
         pairs = with_truth([pair for pair in self.pairs() if pair.disparity is not None], self.half)
-        shown = progress("evaluating")(pairs, len(pairs))
-        rows = evaluate_outside(shown, load_weights(self.network))
+        rows = evaluate_outside(progress("evaluating")(pairs, len(pairs)), load_weights(self.network))
         finished(self.out / "outside.md", outside_markdown(rows))
 
 
@@ -186,19 +181,16 @@ class Certainty(Pairs):
         writable(self.out, folder=True)
         pairs = self.pairs()
         shown = progress("fusing")(pairs, len(pairs))
-        judged_pixels = with_truth(
+        judged = with_truth(
             list(certainty.judged(load_weights(self.network), shown, names, self.choices)), self.half
         )
         if self.fit:
-            write_tensors(self.fit, certainty.widened(judged_pixels).state_dict())
-            held = certainty.held(judged_pixels, certainty.by_thirds(judged_pixels))
+            write_tensors(self.fit, certainty.widened(judged).state_dict())
+            held = certainty.held(judged, certainty.by_thirds(judged))
         else:
-            held = certainty.held(
-                judged_pixels, lambda one: certainty.Stated.by(fitted_network(), one.numbers)
-            )
+            held = certainty.held(judged, lambda one: certainty.Stated.by(fitted_network(), one.numbers))
         certainty.save_reliability(held, self.out / "reliability.png")
-        text = certainty.held_markdown(held)
-        finished(self.out / "certainty.md", text, ", and reliability.png beside it")
+        finished(self.out / "certainty.md", certainty.held_markdown(held), ", and reliability.png beside it")
 
 
 @dataclass
@@ -221,10 +213,7 @@ class OnScenes:
         writable(self.out, folder=True)
         network: Network = load_weights(self.network)
         if not isinstance(network, Comparing):
-            raise ValueError(
-                f"--network {self.network}: "
-                "this network matches without attention, too: `pat lab ablate` takes it"
-            )
+            raise ValueError(f"--network {self.network}: it matches without attention: `pat lab ablate`")
         if network.betas not in (1, 3):
             wanted = "give some for one beta in colour, or for three with a band each"
             raise ValueError(f"--network {self.network}: they are for {network.betas} betas: {wanted}")
@@ -288,8 +277,7 @@ class Sweeps(OnScenes):
         chosen = self.chosen(sweeps.FIELDS)
         rigs = list(sweeps.points(self.sweeps or tuple(sweeps.SWEEPS), hw=self.hw))
         shown = progress("ablating")(rigs, len(rigs))
-        rows = sweeps.ablate(network, shown, chosen, scenes=self.scenes)
-        write_report(rows, self.out)
+        write_report(sweeps.ablate(network, shown, chosen, scenes=self.scenes), self.out)
         self.say_written()
 
 
@@ -301,7 +289,7 @@ class Fields(OnScenes):
     """Folder of Middlebury's pairs with true disparity; those of the report half."""
 
     def run(self) -> None:
-        """Write ablation.md, .csv, peaks.png (attention's maxima in three pictures); print the table."""
+        """Write ablation.md and .csv; print the table."""
         network = self.comparing(fields.fields_of(1.0))
         cases = list(fields.layered_cases(sample_photographs(), self.scenes))
         if self.middlebury is not None:
@@ -310,9 +298,6 @@ class Fields(OnScenes):
                 cases += fields.rectified_cases(pairs, linked=linked)
         shown = progress("fusing")(cases, len(cases))
         rows = fields.evaluate_fields(network, shown, fields=lambda most: self.chosen(fields.fields_of(most)))
-        looked_at = [case for case in cases if case.kind != "F alone"]
-        panels = fields.drawn_peaks(network, looked_at[:: -(-len(looked_at) // 3)])
-        save_panels(panels, self.out / "peaks.png", columns=4)
         write_text(self.out / "ablation.md", fields.fields_markdown(rows))
         write_csv(self.out / "ablation.csv", fields.FieldRow._fields, rows)
         self.say_written()

@@ -19,8 +19,7 @@ from jaxtyping import Bool, Float
 from torch import Generator, Tensor
 from torch.nn.functional import interpolate
 
-from arraygeom import Rectified
-from arraygeom.sampling import sample
+from arraygeom import Rectified, sample
 from arraygeom.viz import new_figure
 from pat import FuseSettings
 from pat.fusion.classical import classical_fusion, denoised_knowing, raw_disparity
@@ -72,8 +71,7 @@ class Condition:
     def recorded(self, pair: StereoPair) -> MonoColourTask:
         """The pair under this condition; what is drawn at random depends on the pair's name alone."""
         g = Generator().manual_seed(int(hashlib.sha256(pair.name.encode()).hexdigest()[:8], 16))
-        moved = replace(pair, right=self.right(pair.right))
-        task = mono_colour_task(moved, self.rate)
+        task = mono_colour_task(replace(pair, right=self.right(pair.right)), self.rate)
         alpha, beta = task.alpha, self.beta(task.beta)
         if self.alpha != "luma":
             alpha = luminance(task.ground_truth, _random_weights(g) if self.alpha == "random" else self.alpha)
@@ -98,10 +96,8 @@ def _moved(rows: float = 0.0, degrees: float = 0.0) -> Callable[[Tensor], Tensor
             torch.arange(h) - (h - 1) / 2 - rows, torch.arange(w) - (w - 1) / 2, indexing="ij"
         )
         columns = (c * x + s * y + (w - 1) / 2).clamp(0, w - 1)
-        lines = (c * y - s * x + (h - 1) / 2).clamp(0, h - 1)
-        where = torch.stack([columns, lines], -1).reshape(1, -1, 2)
-        sampled = sample(image[None], where, interpolation="bicubic").values
-        return sampled.reshape(image.shape).clamp(0, 1)
+        where = torch.stack([columns, (c * y - s * x + (h - 1) / 2).clamp(0, h - 1)], -1).reshape(1, -1, 2)
+        return sample(image[None], where, interpolation="bicubic").values.reshape(image.shape).clamp(0, 1)
 
     return moved
 
@@ -225,30 +221,22 @@ def evaluate_conditions(
             regions = regions_of(task)
             if condition == CONDITIONS["ideal"]:
                 bound = StereoResult(chroma_bound(task, condition.rate))
-                rows.append(_row(pair.name, name, "bound of beta's resolution", bound, task, regions))
+                rows.append(_row((pair.name, name, "bound of beta's resolution"), bound, task, regions))
             for method, run in methods_of(network, condition.noise).items():
                 result = run(task.alpha, task.beta, PAPER_DISPARITY)
-                rows.append(_row(pair.name, name, method, result, task, regions))
+                rows.append(_row((pair.name, name, method), result, task, regions))
     return rows
 
 
 def _row(
-    pair: str,
-    condition: str,
-    method: str,
-    result: StereoResult,
-    task: MonoColourTask,
-    regions: Mapping[str, Tensor],
+    names: tuple[str, str, str], result: StereoResult, task: MonoColourTask, regions: Mapping[str, Tensor]
 ) -> ConditionRow:
     image, truth = result.image.clamp(0, 1), task.ground_truth
     error = (image - truth).square().mean(0)
-    psnr = {
-        n: -10 * math.log10(max(float(error[region].mean()), 1e-12))
-        for n, region in regions.items()
-        if region.any()
-    }
+    means = {n: float(error[region].mean()) for n, region in regions.items() if region.any()}
+    psnr = {n: -10 * math.log10(max(mean, 1e-12)) for n, mean in means.items()}
     depth = depth_errors(result.disparity, task.disparity, regions)
-    return ConditionRow(pair, condition, method, score(image, truth).ssim, psnr, *depth)
+    return ConditionRow(*names, score(image, truth).ssim, psnr, *depth)
 
 
 def depth_errors(
@@ -316,9 +304,8 @@ def _depth(rows: Sequence[ConditionRow]) -> str:
         name = "OpenCV's SGBM" if method == "classical" else method
         rate = f"x{CONDITIONS[condition].rate}"
         lines.append([rate, name, f"{np.mean(errors):.2f} px", *(f"{share:.1f} %" for share in shares)])
-    return markdown_table(
-        ["beta", "", "end-point error", "within 1 px, of all", "of those that beta sees"], lines
-    )
+    columns = ["beta", "", "end-point error", "within 1 px, of all", "of those that beta sees"]
+    return markdown_table(columns, lines)
 
 
 Curves = Mapping[str, list[tuple[float, float]]]
@@ -347,9 +334,7 @@ def save_condition_curves(rows: Sequence[ConditionRow], path: Path) -> None:
         "electrons at white": {50: "50 electrons", 200: "200 electrons", 1000: "1000 electrons"},
         "rows off (px)": {0: "ideal", 1: "rows off 1 px", 3: "rows off 3 px"},
     }
-    plots = {
-        title: _curve(rows, points) for title, points in axes.items() if set(points.values()) <= conditions
-    }
+    plots = {title: _curve(rows, named) for title, named in axes.items() if set(named.values()) <= conditions}
     if plots:
         save_curves(plots, path, ylabel="PSNR (dB)")
 

@@ -30,7 +30,6 @@ from arraygeom import (
     Rectified,
     View,
     Widened,
-    apply_homography,
     pixel_grid,
 )
 from arraygeom.fields.straight import covering_displacement
@@ -39,7 +38,6 @@ from pat.lab.data.pairs import PAPER_DISPARITY, Disparity, StereoPair
 from pat.lab.evaluation.protocols import enlarged, hw_of, mono_colour_task, rectified_rig
 from pat.lab.evaluation.tables import grouped, markdown_table
 from pat.lab.synthesis.photos import PhotoBank
-from pat.media.figures import colour_depth
 from pat.networks.protocol import Comparing
 from pat.support.metrics import score
 
@@ -162,33 +160,6 @@ def _row(network: Comparing, case: Case, name: str, field: ReceptiveField) -> Fi
     psnr, ssim = score(result.image.clamp(0, 1), case.scene.ground_truth)
     mebibytes = math.nan if grown is None else grown / 2**20
     return FieldRow(case.kind, case.name, name, psnr, ssim, result.peaks(case.scene), seconds, mebibytes)
-
-
-def drawn_peaks(network: Comparing, cases: Iterable[Case]) -> dict[str, Tensor]:
-    """Images (3, h, w) by title, four for each case: alpha, parallax against infinity in truth and by the
-    peaks of calibrated segments, in the same colours, and red where a known one is off by more than a
-    pixel."""
-    panels: dict[str, Tensor] = {}
-    for case in cases:
-        alpha, beta = case.scene.images[ALPHA], case.scene.images[BETA]
-        result = fused(network, case.pair, alpha, beta, Epipolar())
-        hw = hw_of(alpha)
-        H = case.pair.homography_at(torch.tensor(torch.inf, dtype=torch.float64))
-        at_infinity = apply_homography(H, pixel_grid(hw, dtype=torch.float64)).x
-        visible = case.scene.visible
-        true, peak = ((x - at_infinity).norm(dim=-1) for x in (case.scene.position, result.peak[0]))
-        largest = true[visible].quantile(0.99)
-        moved = torch.cat([torch.where(visible, true, torch.nan), peak.clamp(max=largest)], 1)
-        true_drawn, found_drawn = colour_depth(1 / moved.clamp(min=0.1)).split(hw[1], dim=2)
-        wrong = visible & ((result.peak[0] - case.scene.position).norm(dim=-1) > 1)
-        red = torch.where(wrong, alpha.new_tensor([1.0, 0.0, 0.0])[:, None, None], alpha.expand(3, -1, -1))
-        panels |= {
-            f"{case.name}: alpha": alpha,
-            f"{case.name}: true parallax": true_drawn,
-            f"{case.name}: parallax of the peaks": found_drawn,
-            f"{case.name}: off by over a pixel": red,
-        }
-    return panels
 
 
 def fields_markdown(rows: Sequence[FieldRow]) -> str:

@@ -20,15 +20,10 @@ from pat.lab.evaluation.tables import markdown_table
 from pat.networks.paper import PAT
 from pat.networks.protocol import FusionNetwork
 
-UNITS = {
-    "rotation x": ("rotation", math.radians(1), 0),
-    "rotation y": ("rotation", math.radians(1), 1),
-    "rotation z": ("rotation", math.radians(1), 2),
-    "translation x": ("translation", 0.1, 0),
-    "translation y": ("translation", 0.1, 1),
-    "translation z": ("translation", 0.1, 2),
-    "focal length": ("focal", 0.01, None),
-    "k1": ("distortion", 1.0, 0),
+UNITS: dict[str, tuple[str, float, int | None]] = {
+    **{f"rotation {axis}": ("rotation", math.radians(1), i) for i, axis in enumerate("xyz")},
+    **{f"translation {axis}": ("translation", 0.1, i) for i, axis in enumerate("xyz")},
+    **{"focal length": ("focal", 0.01, None), "k1": ("distortion", 1.0, 0)},
 }
 """Parameter of beta, unit and axis by name: degrees, tenths of the baseline, 1 % of the focal length, 1."""
 AT, STEP = 0.07, 1e-3
@@ -44,9 +39,8 @@ def moved(rig: Rig, changes: dict[str, Tensor]) -> Rig:
     camera, steps = rig.cameras[BETA], dict[str, Tensor]()
     assert isinstance(camera, Camera)
     if "k1" in changes and camera.distortion is None:
-        rig = rig.with_camera(
-            BETA, camera.replace(distortion=Distortion("brown-conrady", camera.t.new_zeros(4)))
-        )
+        lens = Distortion("brown-conrady", camera.t.new_zeros(4))
+        rig = rig.with_camera(BETA, camera.replace(distortion=lens))
     sizes = {"translation": camera.t.norm(), "focal": camera.K[0, 0]}
     lengths = {"rotation": 3, "translation": 3, "focal": 2, "distortion": 4}
     for name, value in changes.items():
@@ -78,8 +72,7 @@ def cropped(sample: SampleArray) -> SampleArray:
     rig = sample.rig.crop(ALPHA, top, left, (h, w)).crop(BETA, beta_top, beta_left, (bh, bw))
     window = (..., slice(top, top + h), slice(left, left + w))
     of_beta = sample.images[BETA][:, beta_top : beta_top + bh, beta_left : beta_left + bw]
-    images = {ALPHA: sample.images[ALPHA][window], BETA: of_beta}
-    return SampleArray(rig, images, sample.ground_truth[window])
+    return SampleArray(rig, {ALPHA: sample.images[ALPHA][window], BETA: of_beta}, sample.ground_truth[window])
 
 
 def regions(rig: Rig) -> dict[str, Tensor]:
@@ -127,9 +120,8 @@ def gradient_rows(
             step = 10 * STEP if name == "k1" else STEP
             ends = (errors(network, name, by.detach() + by_step) for by_step in (step, -step))
             for region, slope, after, before in zip(masks, slopes, *ends):
-                rows.append(
-                    GradientRow(title, name, region, float(slope), float(after - before) / (2 * step))
-                )
+                difference = float(after - before) / (2 * step)
+                rows.append(GradientRow(title, name, region, float(slope), difference))
     return rows
 
 
@@ -158,8 +150,7 @@ def found_rig(
 
     def loss() -> Tensor:
         optimiser.zero_grad()
-        changes = {name: WRONG[name] * share for name, share in zip(names, left)}
-        pair = moved(rig, changes).pair(ALPHA, BETA)
+        pair = moved(rig, {name: WRONG[name] * share for name, share in zip(names, left)}).pair(ALPHA, BETA)
         value = -mean_score(pair, query, key, x)
         value.backward()
         return value
@@ -174,19 +165,11 @@ def mean_score(pair: Pair, query: Tensor, key: Tensor, x: Tensor) -> Tensor:
     field = Curved(96, nodes=16) if pair.has_lens else Epipolar()
     locations = sampling_locations(field, pair, x)
     samples = 96 if isinstance(locations, Segments) else None
-    gathered = attend(query, key, key, locations, samples=samples, border=4.0)
-    return (query * gathered).sum(1).mean()
+    return (query * attend(query, key, key, locations, samples=samples, border=4.0)).sum(1).mean()
 
 
-WRONG = {
-    "rotation x": 0.3,
-    "rotation y": 0.3,
-    "rotation z": 0.3,
-    "translation y": 0.5,
-    "translation z": 0.5,
-    "focal length": 1.0,
-    "k1": 0.03,
-}
+WRONG = dict.fromkeys(("rotation x", "rotation y", "rotation z"), 0.3)
+WRONG |= {"translation y": 0.5, "translation z": 0.5, "focal length": 1.0, "k1": 0.03}
 """Units by which each parameter is wrong at first: translations turn the baseline by 3 degrees."""
 RECOVERED = [*((name,) for name in WRONG), ("rotation x", "rotation y", "rotation z"), tuple(WRONG)]
 """Sets of parameters that are wrong together."""
@@ -201,9 +184,8 @@ def gradients_markdown(rows: Sequence[GradientRow]) -> str:
             f"{row.gradient:.3g} | {row.difference:.3g} | {100 * row.off:.1f} %" for row in mine.values()
         )
         lines.append([network, parameter, *" | ".join(cells).split(" | ")])
-    columns = [
-        f"{region}, {part}" for region in ("interior", "border") for part in ("gradient", "difference", "off")
-    ]
+    parts = ("gradient", "difference", "off")
+    columns = [f"{region}, {part}" for region in ("interior", "border") for part in parts]
     return markdown_table(["network", "parameter", *columns], lines)
 
 

@@ -67,9 +67,8 @@ def _row(
     pair: str, task: MonoColourTask, network: FusionNetwork, source: str, field_of: FieldOf
 ) -> OutsideRow:
     began = time.perf_counter()
-    fused = rectified_fusion(network, settings=FuseSettings(field=field_of(task)))(
-        task.alpha, task.beta, PAPER_DISPARITY
-    )
+    fusion = rectified_fusion(network, settings=FuseSettings(field=field_of(task)))
+    fused = fusion(task.alpha, task.beta, PAPER_DISPARITY)
     seconds = time.perf_counter() - began
     assert fused.disparity is not None
     error, within = disparity_errors(fused.disparity, _truth(task))
@@ -87,9 +86,8 @@ def _around(disparity: Float[Tensor, "h w"], valid: Tensor, tolerance: float) ->
 
 def _sgbm(task: MonoColourTask) -> ReceptiveField:
     beta = enlarged(luminance(task.beta), hw_of(task.alpha))
-    disparity, consistent = checked_disparity(
-        to_bytes(task.alpha[0]), to_bytes(beta[0]), round(PAPER_DISPARITY)
-    )
+    images = to_bytes(task.alpha[0]), to_bytes(beta[0])
+    disparity, consistent = checked_disparity(*images, round(PAPER_DISPARITY))
     return _around(torch.from_numpy(disparity), torch.from_numpy(consistent), 0.0)
 
 

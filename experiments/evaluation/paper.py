@@ -20,13 +20,7 @@ from pat.app.from_images import found_rig
 from pat.app.sample_array import BETA, SAMPLE
 from pat.fusion.steps import of_size
 from pat.lab.data.pairs import Disparity, StereoPair
-from pat.lab.evaluation.protocols import (
-    StereoMethod,
-    StereoResult,
-    cut_to_multiple,
-    hw_of,
-    rectified_fusion,
-)
+from pat.lab.evaluation.protocols import StereoMethod, StereoResult, cut_to_multiple, hw_of, rectified_fusion
 from pat.lab.evaluation.stereo import StereoRow
 from pat.media.images import read_image
 from pat.networks.protocol import FusionNetwork
@@ -101,9 +95,8 @@ def controls(network: FusionNetwork, *, bands: bool = False) -> dict[str, Stereo
 
     def shuffled(alpha: Tensor, beta: Tensor, max_disparity: float) -> StereoResult:
         field = ShuffledField(Rectified(max_disparity, alpha_is="left"))
-        return rectified_fusion(network, bands=bands, settings=FuseSettings(field=field))(
-            alpha, beta, max_disparity
-        )
+        fused = rectified_fusion(network, bands=bands, settings=FuseSettings(field=field))
+        return fused(alpha, beta, max_disparity)
 
     return {
         "no beta": lambda alpha, beta, most: fusion(alpha, torch.zeros_like(beta), most),

@@ -6,7 +6,7 @@ import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -60,9 +60,10 @@ def _tables(rows: Sequence[Row]) -> str:
     for measure, (label, form) in MEASURES.items():
         fields = grouped(rows, "field")
         drawn = {field: [_drawn(rows, field, value, measure) for value in values] for field in fields}
-        lines = [
-            [field, *(form.format(np.mean(v)) if v else "" for v in cells)] for field, cells in drawn.items()
-        ]
+        texts = {
+            field: [form.format(np.mean(v)) if v else "" for v in cells] for field, cells in drawn.items()
+        }
+        lines = [[field, *cells] for field, cells in texts.items()]
         parts.append(markdown_table([label, *(f"{v:g}" for v in values)], lines))
     notes = dict.fromkeys(f"{row.field} at {row.value:g}: {row.note}" for row in rows if row.note)
     return "\n".join(parts) + "".join(f"\n{note}." for note in notes) + "\n" * bool(notes)
@@ -95,9 +96,8 @@ def draw_sweep(axis: Axes, rows: Sequence[Row], measure: str) -> None:
         means = np.array([np.mean(drawn[value]) for value in measured])
         bounds = np.array([bootstrap_interval(drawn[value]) for value in measured]).reshape(-1, 2)
         spread = np.abs(np.nan_to_num(bounds.T - means)) if len(measured) else None
-        axis.errorbar(
-            measured, means, yerr=spread, label=field, marker="o", markersize=3, capsize=2, linewidth=1
-        )
+        style: dict[str, Any] = {"marker": "o", "markersize": 3, "capsize": 2, "linewidth": 1}
+        axis.errorbar(measured, means, yerr=spread, label=field, **style)
     axis.set_ylabel(MEASURES[measure][0], fontsize=8)
     axis.tick_params(labelsize=8)
     axis.grid(alpha=0.3)

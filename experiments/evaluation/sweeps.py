@@ -146,9 +146,8 @@ class Directly:
         ratio = resolution_ratio(pair)
         if not 0.8 < ratio < 1.25:
             larger = (round(hw[0] / ratio), round(hw[1] / ratio))
-            beta = interpolate(beta, larger, mode="bicubic", align_corners=False, antialias=ratio > 1).clamp(
-                0, 1
-            )
+            beta = interpolate(beta, larger, mode="bicubic", align_corners=False, antialias=ratio > 1)
+            beta = beta.clamp(0, 1)
             camera = camera.resize(larger)
         result = fused(network, Pair(pair.alpha, camera, pair.depth), images[ALPHA], beta[0], self.field)
         step = result.peak.new_tensor([hw[1] / camera.hw[1], hw[0] / camera.hw[0]])
@@ -166,9 +165,8 @@ class Resampled:
         level = rectified(rig, images)
         alpha, beta = (level.images[name] for name in (ALPHA, BETA))
         result = fused(network, level.rectification.pair, alpha, beta, self.field)
-        peaks = [
-            level.back(one.movedim(-1, 0), interpolation="nearest").movedim(0, -1) for one in result.peak
-        ]
+        planes = (level.back(one.movedim(-1, 0), interpolation="nearest") for one in result.peak)
+        peaks = [plane.movedim(0, -1) for plane in planes]
         there = apply_homography(torch.linalg.inv(level.rectification.H_beta), torch.stack(peaks).double()).x
         return Result(level.back(result.image), there)
 
@@ -267,9 +265,8 @@ def two(rig: Rig) -> Rig:
                 f"these scenes are made for pinholes and '{name}' has a lens ({model}): "
                 "give scenes of your own to pat.lab.evaluation.ablation.ablate"
             )
-    return Rig(
-        dict(zip((ALPHA, BETA), cameras)), depth=tuple(float(d) for d in rig.pair(first, second).depth_range)
-    )
+    near, far = (float(d) for d in rig.pair(first, second).depth_range)
+    return Rig(dict(zip((ALPHA, BETA), cameras)), depth=(near, far))
 
 
 def made(rig: Rig, bank: PhotoBank, number: int) -> RecordedScene:

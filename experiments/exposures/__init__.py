@@ -41,9 +41,8 @@ def record_scene(stage: SystemScene | RenderedScene) -> SystemRecording:
         filtered = luminance(lit) if name == alpha else banded(lit, sensor.response)
         exposed = filtered * light_of(sensor, rig[alpha].sensor)
         lights[name] = filtered[0]
-        raw[name] = [
-            record(exposed, (Noise(ELECTRONS, READ), Clip()), purpose_generator(stage.seed, name))[0]
-        ]
+        steps, generator = (Noise(ELECTRONS, READ), Clip()), purpose_generator(stage.seed, name)
+        raw[name] = [record(exposed, steps, generator)[0]]
         if name != alpha:
             bands[name] = banded(light(stage, alpha), sensor.response)[0]
     ground_truth = srgb_from_linear(torch.cat([bands[name] for name in rig.betas(alpha)]))

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from torch import Tensor
 
-from arraygeom import HomographyDisplacement
+from arraygeom import HomographyDisplacement, Rig
 from arraygeom.runtime.atomic import write_text
-from experiments.showcase import FAST, SCENE, SLOW, FastSlowArray, bright_gain, fast_and_slow_array
+from experiments.showcase import FAST, SCENE, SLOW, bright_gain, fast_and_slow_array
 from experiments.system import SystemResult, files_of, flicker, fused_frames
 from pat.app.cli.fusing import with_sensor
 from pat.fusion.frame import Frame
@@ -40,8 +40,7 @@ def run_recorded(folder: Path, out: Path, *, weights: str, say: Callable[[str], 
     rig, frames = array.rig, recorded_frames(folder)
     for name, rate in RATES.items():
         rig = with_sensor(rig, name, frame_rate=rate)
-    field = HomographyDisplacement(array.displacement)
-    settings = FuseSettings(field=field, match_levels=True)
+    settings = FuseSettings(field=HomographyDisplacement(array.displacement), match_levels=True)
     job = SequenceFusion(load_weights(weights), rig, frames, FAST, settings=settings)
     keys = [str(FAST_FRAMES[key.alpha]) for key in job.timeline.key_frames()]
     say(f"fusing key frames {', '.join(keys)}, then all")
@@ -53,7 +52,7 @@ def run_recorded(folder: Path, out: Path, *, weights: str, say: Callable[[str], 
     rows = [(name, f"{1000 * value:.2f}") for name, value in flickers.items()]
     note = "Flicker is the mean change of chroma from frame to frame where nothing moves.\n"
     table = f"{markdown_table(['', 'flicker x 1000'], rows)}\n{note}"
-    _write(out, array, frames, fused, by_themselves)
+    _write(out, array.rig, frames[FAST], fused, by_themselves)
     write_text(out / "scores.md", table)
     return SystemResult(table, files_of(out), {})
 
@@ -66,23 +65,16 @@ def recorded_frames(folder: Path) -> dict[str, list[Tensor]]:
     return {n: [srgb_image(luminance_of(p) * gains.get(n, 1.0)) for p in images] for n, images in raw.items()}
 
 
-def _write(
-    out: Path,
-    array: FastSlowArray,
-    frames: dict[str, list[Tensor]],
-    fused: list[Frame],
-    by_themselves: list[Frame],
-) -> None:
+def _write(out: Path, rig: Rig, alpha: list[Tensor], fused: list[Frame], alone: list[Frame]) -> None:
     """Frames, video, rig and figures."""
     for number, frame in zip(FAST_FRAMES, fused):
         save_frame(frame, out / "frames", name=str(number))
     write_video(out / "fused.mp4", [f.image for f in fused], rate=5)
-    array.rig.save(out / "rig.yaml")
+    rig.save(out / "rig.yaml")
     rows, columns = DETAIL
     detail = {f"frame {n}": f.image[:, rows, columns] for n, f in zip(FAST_FRAMES, fused)}
     detail |= {"confidence, 144": fused[3].confidence[None, rows, columns]}
-    detail |= {f"frame {n} alone": f.image[:, rows, columns] for n, f in zip(FAST_FRAMES, by_themselves)}
-    detail |= {"confidence, 144 alone": by_themselves[3].confidence[None, rows, columns]}
+    detail |= {f"frame {n} alone": f.image[:, rows, columns] for n, f in zip(FAST_FRAMES, alone)}
+    detail |= {"confidence, 144 alone": alone[3].confidence[None, rows, columns]}
     save_panels(detail, out / "details.png", columns=4)
-    whole = {"alpha, 144": frames[FAST][3], "fused, 144": fused[3].image}
-    save_panels(whole, out / "figure.png", columns=2)
+    save_panels({"alpha, 144": alpha[3], "fused, 144": fused[3].image}, out / "figure.png", columns=2)

@@ -51,8 +51,7 @@ def train_denoiser(config: DenoiserTraining) -> Path:
         network = network.to(config.device)
         bank = PhotoBank.load(*config.photos, cache=config.cache, seed=config.seed)
         config.train(network, partial(losses, config, bank, network))
-        facts = {"recipe": recipe_text(config)}
-        save_weights(network.half(), config.out / "best.safetensors", facts=facts)
+        save_weights(network.half(), config.out / "best.safetensors", facts={"recipe": recipe_text(config)})
     return config.out / "best.safetensors"
 
 
@@ -80,8 +79,7 @@ def windows(bank: PhotoBank, count: int, side: int, g: Generator) -> Tensor:
         w, h = bank.wh[texture, level].tolist()
         x, y = (below(max(n - side, 0) + 1, g) for n in (w, h))
         flips, gain = torch.randint(2, (3,), generator=g).tolist(), float(torch.rand((), generator=g))
-        image = flipped(bank.window(texture, level, (x, y), side), flips)
-        windows.append(image * min(0.4 + 1.2 * gain, 1.0))
+        windows.append(flipped(bank.window(texture, level, (x, y), side), flips) * min(0.4 + 1.2 * gain, 1.0))
     return torch.stack(windows)
 
 

@@ -52,9 +52,8 @@ def landscape(seed: int, rig: Rig, *, moving: float = 0.0) -> Scene:
 
 
 def _leafy(dark: Vec3, light: Vec3, scale: float, kind: TextureKind = "noise") -> Material:
-    paints = tuple(
-        Paint(rgb, LEAVES * share) for rgb, share in ((dark, 0.5), (light, 1.0), (dark, 0.7), (light, 0.9))
-    )
+    shades = (dark, 0.5), (light, 1.0), (dark, 0.7), (light, 0.9)
+    paints = tuple(Paint(rgb, LEAVES * share) for rgb, share in shades)
     texture = Texture(kind=kind, paints=paints, scale=scale, grain=0.25)
     return Material(texture=texture, roughness=0.9, specular=0.05)
 
@@ -62,12 +61,8 @@ def _leafy(dark: Vec3, light: Vec3, scale: float, kind: TextureKind = "noise") -
 _GRASS = _leafy((0.06, 0.14, 0.025), (0.13, 0.24, 0.05), 3.0)
 _BARK = plain(0.13, 0.09, 0.06, roughness=0.95, specular=0.05, grain=0.3)
 _WHITE = plain(0.74, 0.72, 0.68, roughness=0.6)
-_STONE = Material(
-    texture=Texture(
-        kind="noise", paints=(paint(0.34, 0.30, 0.25, nir=0.4), paint(0.45, 0.40, 0.34, nir=0.45)), scale=9
-    ),
-    roughness=0.95,
-)
+_GREYS = (paint(0.34, 0.30, 0.25, nir=0.4), paint(0.45, 0.40, 0.34, nir=0.45))
+_STONE = Material(texture=Texture(kind="noise", paints=_GREYS, scale=9), roughness=0.95)
 
 
 def _ground(rng: Generator) -> Iterator[Object]:
@@ -84,13 +79,7 @@ def _washing() -> Iterator[Object]:
     for side in (-2.45, 2.3):
         yield lathed(f"post {side}", (side, 0, 0), [(0, 2.1), (0.05, 2.1), (0.05, 0), (0, 0)], _BARK)
     yield box("line", (-0.07, -2.0, 0), (4.75, 0.012, 0.012), _WHITE)
-    dyes = (
-        (0.55, 0.03, 0.03),
-        (0.72, 0.70, 0.66),
-        (0.03, 0.09, 0.38),
-        (0.75, 0.50, 0.04),
-        (0.02, 0.02, 0.025),
-    )
+    dyes = (0.55, 0.03, 0.03), (0.72, 0.70, 0.66), (0.03, 0.09, 0.38), (0.75, 0.5, 0.04), (0.02, 0.02, 0.025)
     widths, heights = (0.62, 0.95, 0.7, 0.55, 0.6), (0.85, 0.6, 0.95, 0.75, 1.05)
     x = -2.1
     for i, (rgb, width, height) in enumerate(zip(dyes, widths, heights)):
@@ -148,11 +137,8 @@ def _trees(rng: Generator) -> Iterator[Object]:
         for j in range(11):
             offset = rng.uniform(-1, 1, 3) * (0.22, 0.24, 0.22)
             radius = float(rng.uniform(0.26, 0.42)) * height
-            middle = (
-                x + float(offset[0]) * height,
-                (-0.68 + float(offset[1])) * height,
-                z + float(offset[2]) * height,
-            )
+            dx, dy, dz = (float(step) for step in offset)
+            middle = (x + dx * height, (-0.68 + dy) * height, z + dz * height)
             yield _bush(f"crown{i}.{j}", middle, (radius, 0.8 * radius, radius), leaves, seed=100 * i + j)
 
 

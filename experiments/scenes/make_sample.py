@@ -29,12 +29,8 @@ def sample_cameras() -> dict[str, Camera]:
     mono = Camera(
         K=intrinsics(820.0, HW), cam_from_world=Pose.identity(), hw=HW, sensor=Sensor(response="mono")
     )
-    colour = Camera(
-        K=intrinsics((460.0, 460.0), (360, 560), (284.0, 172.0)),
-        cam_from_world=Pose.from_centre(rotation, centre),
-        hw=(360, 560),
-        sensor=Sensor(response="rgb"),
-    )
+    K, pose = intrinsics((460.0, 460.0), (360, 560), (284.0, 172.0)), Pose.from_centre(rotation, centre)
+    colour = Camera(K=K, cam_from_world=pose, hw=(360, 560), sensor=Sensor(response="rgb"))
     return {ALPHA: mono, BETA: colour}
 
 
@@ -48,9 +44,8 @@ def main(out: Path = SAMPLE, seed: int = 2, samples: int = 64) -> None:
     settings = RenderSettings(samples=samples, denoise="accurate", fast_light=False, bounces=4)
     with TemporaryDirectory() as folder:
         rendered = render(still_life(seed, rig), rig, Path(folder) / "scene", settings=settings)
-        ground_truth, beta_image = (
-            srgb_from_linear(rendered.frame(name).rgb[None]).clamp(0, 1) for name in (ALPHA, BETA)
-        )
+        lights = (rendered.frame(name).rgb[None] for name in (ALPHA, BETA))
+        ground_truth, beta_image = (srgb_from_linear(light).clamp(0, 1) for light in lights)
     mono = record(luminance(ground_truth), [Noise(8000, 3), Clip(), Quantise(8)], generator)
     colour = record(beta_image, [Noise(4000, 3), Clip(), Quantise(8)], generator)
     out.mkdir(parents=True, exist_ok=True)

@@ -12,9 +12,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from arraygeom.camera import Camera
-from arraygeom.pose import Pose
-from arraygeom.rig import Rig
+from arraygeom import Camera, Pose, Rig
 from pat.lab.synthesis.furnish import DEPTHS, vec
 from pat.lab.synthesis.scene import Key, Light, Material, Motion, Object, Paint, Scene, Texture, Vec3, World
 
@@ -80,9 +78,8 @@ def _placed(motion: Motion, pose: Pose) -> Motion:
 
 def _lit(light: Light, pose: Pose) -> Light:
     position, direction = (torch.tensor(v, dtype=pose.R.dtype) for v in (light.position, light.direction))
-    return replace(
-        light, position=vec(pose.apply(position).numpy()), direction=vec((pose.R @ direction).numpy())
-    )
+    position, direction = pose.apply(position), pose.R @ direction
+    return replace(light, position=vec(position.numpy()), direction=vec(direction.numpy()))
 
 
 def paint(*rgb: float, nir: float | None = None) -> Paint:
@@ -101,12 +98,8 @@ def plain(
 
 def wood(dark: Vec3, light: Vec3, scale: float) -> Material:
     """Two tones of wood with a wavy grain, `scale` rings a metre."""
-    paints = (
-        paint(*dark),
-        paint(*light),
-        paint(*(0.6 * d + 0.4 * v for d, v in zip(dark, light))),
-        paint(*light),
-    )
+    between = paint(*(0.6 * d + 0.4 * v for d, v in zip(dark, light)))
+    paints = (paint(*dark), paint(*light), between, paint(*light))
     texture = Texture(kind="wave", paints=paints, scale=scale, distortion=9.0, grain=0.12)
     return Material(texture=texture, roughness=0.35, specular=0.35)
 

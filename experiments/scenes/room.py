@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from pat.lab.synthesis.scene import Material, Object, Paint, Texture, Vec3
+from pat.lab.synthesis.scene import Material, Object, Paint, Texture, TextureKind, Vec3
 
 from .props import ball, box, lathed, moved, paint, plain, profile, wood
 
@@ -24,7 +24,7 @@ def furniture() -> Iterator[Object]:
     """The table's legs, a cupboard under the shelf, rug, armchair, chair, lamp, pictures and window."""
     yield from _under_the_table()
     yield box("skirting", (0, FLOOR - 0.07, WALL - 0.005), (8, 0.14, 0.02), _WHITE)
-    rug = _pattern("wave", (0.30, 0.045, 0.035), (0.42, 0.30, 0.17), 7.0, distortion=3.0)
+    rug = pattern("wave", (0.30, 0.045, 0.035), (0.42, 0.30, 0.17), 7.0, distortion=3.0)
     yield box("rug", (-0.25, FLOOR - 0.004, 0.0), (3.5, 0.008, 2.1), rug, yaw=-2)
     yield from moved(_armchair(), "armchair", (-2.25, FLOOR, 0.45), yaw=-38)
     yield from moved(_chair(), "chair", (1.75, FLOOR, -0.15), yaw=62)
@@ -33,9 +33,12 @@ def furniture() -> Iterator[Object]:
     yield from moved(_window(), "window", (2.45, -1.0, WALL - 0.03))
 
 
-def _pattern(kind: str, first: Vec3, second: Vec3, scale: float, *, distortion: float = 0.0) -> Material:
+def pattern(
+    kind: TextureKind, first: Vec3, second: Vec3, scale: float, distortion: float = 0.0, grain: float = 0.15
+) -> Material:
+    """A matt material of two colours."""
     paints = (paint(*first), paint(*second))
-    texture = Texture(kind=kind, paints=paints, scale=scale, distortion=distortion, grain=0.15)  # type: ignore[arg-type]
+    texture = Texture(kind=kind, paints=paints, scale=scale, distortion=distortion, grain=grain)
     return Material(texture=texture, roughness=0.95, specular=0.05)
 
 
@@ -52,25 +55,22 @@ def _under_the_table() -> Iterator[Object]:
         knob = (x + (0.22 if i % 2 == 0 else -0.22), 0.42, SHELF - 0.03)
         yield ball(f"knob{i}", knob, (0.03, 0.03, 0.03), BRASS)
     top = -1.145
-    yield box(
-        "carton", (-0.75, top - 0.13, SHELF + 0.15), (0.42, 0.26, 0.26), plain(0.36, 0.24, 0.13, grain=0.1)
-    )
-    yield box(
-        "case", (0.1, top - 0.07, SHELF + 0.15), (0.5, 0.14, 0.24), plain(0.05, 0.12, 0.11, grain=0.1), yaw=4
-    )
+    card, leather = plain(0.36, 0.24, 0.13, grain=0.1), plain(0.05, 0.12, 0.11, grain=0.1)
+    yield box("carton", (-0.75, top - 0.13, SHELF + 0.15), (0.42, 0.26, 0.26), card)
+    yield box("case", (0.1, top - 0.07, SHELF + 0.15), (0.5, 0.14, 0.24), leather, yaw=4)
     urn = profile(50, 340, 60, 340, 50, 300, 120, 220, 130, 140, 70, 0, 0, 0)
     yield lathed("urn", (0.82, top, SHELF + 0.15), urn, plain(0.50, 0.20, 0.08, roughness=0.3))
 
 
 def _armchair() -> Iterator[Object]:
-    cloth = _pattern("noise", (0.045, 0.13, 0.14), (0.07, 0.18, 0.19), 130.0)
+    cloth = pattern("noise", (0.045, 0.13, 0.14), (0.07, 0.18, 0.19), 130.0)
     yield box("base", (0, -0.23, 0), (0.78, 0.2, 0.72), cloth)
     yield box("back", (0, -0.55, 0.33), (0.78, 0.7, 0.15), cloth)
     yield ball("seat", (0, -0.37, -0.04), (0.6, 0.22, 0.72), cloth)
     for side in (-1, 1):
         yield box(f"arm{side}", (0.36 * side, -0.4, -0.01), (0.13, 0.38, 0.72), cloth)
         yield lathed(f"foot{side}", (0.32 * side, 0, -0.3), profile(30, 140, 15, 0, 0, 0), WALNUT)
-    checks = _pattern("checker", (0.7, 0.42, 0.04), (0.6, 0.5, 0.3), 9.0)
+    checks = pattern("checker", (0.7, 0.42, 0.04), (0.6, 0.5, 0.3), 9.0)
     yield ball("cushion", (0.03, -0.6, 0.2), (0.44, 0.4, 0.16), checks)
 
 
@@ -92,9 +92,8 @@ def _floor_lamp() -> Iterator[Object]:
 def _pictures() -> Iterator[Object]:
     sea = ((0.03, 0.10, 0.22), (0.55, 0.60, 0.62), (0.20, 0.33, 0.40), (0.62, 0.42, 0.22))
     field = ((0.45, 0.33, 0.06), (0.10, 0.20, 0.05), (0.55, 0.48, 0.35), (0.30, 0.07, 0.04))
-    for i, (x, y, w, h, paints) in enumerate(
-        ((-2.2, -1.15, 0.95, 0.7, sea), (-1.55, -0.75, 0.4, 0.5, field))
-    ):
+    pictures = (-2.2, -1.15, 0.95, 0.7, sea), (-1.55, -0.75, 0.4, 0.5, field)
+    for i, (x, y, w, h, paints) in enumerate(pictures):
         yield box(f"frame{i}", (x, y, WALL - 0.01), (w, h, 0.03), WALNUT)
         yield box(f"mount{i}", (x, y, WALL - 0.013), (w - 0.07, h - 0.07, 0.03), _WHITE)
         colours = tuple(paint(*rgb) for rgb in paints)
@@ -115,7 +114,6 @@ def _window() -> Iterator[Object]:
     for side in (-1, 1):
         for i in range(5):
             fold = profile(55, 2300, 55, 0, 0, 0)
-            yield lathed(
-                f"curtain{side}{i}", (side * (0.56 + 0.085 * i), 1.6, -0.09 - 0.02 * (i % 2)), fold, linen
-            )
+            foot = (side * (0.56 + 0.085 * i), 1.6, -0.09 - 0.02 * (i % 2))
+            yield lathed(f"curtain{side}{i}", foot, fold, linen)
     yield box("rail", (0, -0.72, -0.1), (2.1, 0.025, 0.025), BRASS)

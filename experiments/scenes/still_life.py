@@ -14,13 +14,12 @@ import numpy as np
 from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
-from arraygeom.camera import Camera
-from arraygeom.rig import Rig
+from arraygeom import Camera, Rig
 from pat.lab.synthesis.furnish import seeded, vec
 from pat.lab.synthesis.scene import Key, Light, Material, Motion, Object, Paint, Scene, Texture, Vec3, World
 
 from .props import arranged, ball, box, first_camera, lathed, moved, on_path, paint, plain, profile
-from .room import BRASS, FLOOR, OAK, SHELF, WALNUT, furniture
+from .room import BRASS, FLOOR, OAK, SHELF, WALNUT, furniture, pattern
 
 VIEW = 1.4
 """Metres of the still life that the first camera's image is wide."""
@@ -72,20 +71,8 @@ _LIGHTS = (
 # Surfaces ---------------------------------------------------------------------------------------------------
 
 
-_PLASTER = Material(
-    texture=Texture(
-        kind="noise", paints=(paint(0.40, 0.43, 0.36), paint(0.47, 0.50, 0.42)), scale=7.0, grain=0.05
-    ),
-    roughness=0.95,
-    specular=0.05,
-)
-_CLOTH = Material(
-    texture=Texture(
-        kind="checker", paints=(paint(0.62, 0.58, 0.50), paint(0.16, 0.25, 0.38)), scale=26.0, grain=0.1
-    ),
-    roughness=0.95,
-    specular=0.05,
-)
+_PLASTER = pattern("noise", (0.40, 0.43, 0.36), (0.47, 0.50, 0.42), 7.0, grain=0.05)
+_CLOTH = pattern("checker", (0.62, 0.58, 0.50), (0.16, 0.25, 0.38), 26.0, grain=0.1)
 
 # What is in the room ----------------------------------------------------------------------------------------
 
@@ -138,18 +125,15 @@ def _book(rng: Generator, name: str, x: float, floor: float, wh: tuple[float, fl
     width, height = wh
     z = SHELF + 0.05 + float(rng.uniform(0, 0.03)) + 0.09
     colour = tuple(float(c * rng.uniform(0.7, 1.3)) for c in _CLOTHBOUND[int(rng.integers(len(_CLOTHBOUND)))])
-    yield box(
-        name, (x, floor - height / 2, z), (width, height, 0.18), plain(*colour, roughness=0.6, grain=0.15)
-    )
+    cover = plain(*colour, roughness=0.6, grain=0.15)
+    yield box(name, (x, floor - height / 2, z), (width, height, 0.18), cover)
     bright = sum(colour) > 0.6
     label = plain(*((0.08, 0.05, 0.04) if bright else (0.62, 0.47, 0.20)), roughness=0.4)
-    for fraction in sorted(
-        rng.choice([0.12, 0.2, 0.35, 0.6, 0.8, 0.88], int(rng.integers(1, 4)), replace=False)
-    ):
+    places = rng.choice([0.12, 0.2, 0.35, 0.6, 0.8, 0.88], int(rng.integers(1, 4)), replace=False)
+    for fraction in sorted(places):
         position = (x, floor - height * (1 - float(fraction)), z - 0.0005)
-        yield box(
-            f"{name}.{fraction}", position, (width * 0.99, float(rng.uniform(0.004, 0.022)), 0.18), label
-        )
+        extent = (width * 0.99, float(rng.uniform(0.004, 0.022)), 0.18)
+        yield box(f"{name}.{fraction}", position, extent, label)
 
 
 def _plant(rng: Generator) -> Iterator[Object]:
@@ -166,8 +150,7 @@ def _plant(rng: Generator) -> Iterator[Object]:
         tip = rotation.apply([0, -1, 0])
         green = (0.05 + 0.05 * float(rng.uniform()), 0.20 + 0.12 * float(rng.uniform()), 0.035)
         paints = tuple(paint(*(factor * c for c in green), nir=0.55) for factor in (1.0, 1.35))
-        veins = Texture(kind="noise", paints=paints, scale=60.0)
-        leaf = Material(texture=veins, roughness=0.4, specular=0.4)
+        leaf = Material(texture=Texture(kind="noise", paints=paints, scale=60.0), roughness=0.4, specular=0.4)
         middle = np.array([x, -0.13, z]) + tip * length / 2
         blade = ball(f"leaf{i}", vec(middle), (0.035 + 0.02 * float(rng.uniform()), length, 0.004), leaf)
         key = replace(blade.motion.keys[0], rotation=vec(rotation.as_rotvec()))
@@ -176,14 +159,12 @@ def _plant(rng: Generator) -> Iterator[Object]:
 
 def _pottery() -> Iterator[Object]:
     glaze = {"roughness": 0.12, "specular": 0.6}
-    blue, white, red = (
-        plain(*c, **glaze) for c in ((0.02, 0.09, 0.33), (0.72, 0.70, 0.64), (0.45, 0.03, 0.02))
-    )
+    colours = (0.02, 0.09, 0.33), (0.72, 0.70, 0.64), (0.45, 0.03, 0.02)
+    blue, white, red = (plain(*colour, **glaze) for colour in colours)
     vase = profile(22, 330, 30, 335, 32, 330, 24, 300, 24, 260, 75, 190, 85, 130)
     yield lathed("vase", (-0.24, 0, 0.52), [*vase, *profile(50, 20, 50, 0, 0, 0)], blue)
-    bands = Texture(
-        kind="wave", paints=(paint(0.72, 0.66, 0.5), paint(0.5, 0.2, 0.07)), scale=60.0, distortion=0.6
-    )
+    clays = (paint(0.72, 0.66, 0.5), paint(0.5, 0.2, 0.07))
+    bands = Texture(kind="wave", paints=clays, scale=60.0, distortion=0.6)
     jar = profile(0, 235, 16, 235, 20, 220, 12, 205, 60, 190, 66, 180, 66, 170)
     jar += profile(90, 150, 100, 90, 70, 5, 70, 0, 0, 0)
     yield lathed("jar", (0.26, 0, 0.6), jar, Material(texture=bands, roughness=0.25, specular=0.5))
@@ -234,17 +215,10 @@ def _throw(duration: float) -> list[tuple[float, Vec3]]:
 
 
 def _lamp() -> Iterator[Object]:
-    shade = Material(
-        texture=Texture(paints=(paint(0.85, 0.62, 0.36),)), roughness=0.9, specular=0.1, emission=0.62
-    )
+    linen = Texture(paints=(paint(0.85, 0.62, 0.36),))
+    shade = Material(texture=linen, roughness=0.9, specular=0.1, emission=0.62)
     bulb = Material(texture=Texture(paints=(Paint(LAMPLIGHT, 1.0),)), emission=BULB)
     x, z = 0.62, 0.42
-    yield lathed(
-        "lamp",
-        (x, 0, z),
-        profile(0, 300, 8, 300, 8, 30, 30, 20, 80, 12, 80, 0),
-        BRASS,
-    )
-    rim = profile(72, 200, 74, 200, 140, 2, 142, 0, 138, 2)
-    yield lathed("shade", (x, -0.33, z), rim, shade)
+    yield lathed("lamp", (x, 0, z), profile(0, 300, 8, 300, 8, 30, 30, 20, 80, 12, 80, 0), BRASS)
+    yield lathed("shade", (x, -0.33, z), profile(72, 200, 74, 200, 140, 2, 142, 0, 138, 2), shade)
     yield ball("bulb", (x, -0.36, z), (0.05, 0.06, 0.05), bulb)

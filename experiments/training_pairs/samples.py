@@ -73,8 +73,7 @@ class PairTraining(Recipe):
         Raises:
             ValueError: where there are no photographs.
         """
-        made = {"pairs": self._real_pairs, "shapes": self._shape_pairs, "photos": self._photo_pairs}
-        return made[kind]()
+        return {"pairs": self._real_pairs, "shapes": self._shape_pairs, "photos": self._photo_pairs}[kind]()
 
     def kept(
         self, kind: str, make: Callable[[StereoPair, int], Mapping[str, Tensor] | None]

@@ -72,8 +72,7 @@ def _surfaces(disparity: Disparity) -> tuple[NDArray, NDArray]:
 
 def _last_known(x: NDArray) -> NDArray:
     """Each pixel's last value that is not NaN in its row."""
-    column = np.where(np.isnan(x), -1, np.arange(x.shape[1]))
-    last = np.maximum.accumulate(column, 1)
+    last = np.maximum.accumulate(np.where(np.isnan(x), -1, np.arange(x.shape[1])), 1)
     return np.where(last >= 0, np.take_along_axis(x, last.clip(0), 1), np.nan)
 
 

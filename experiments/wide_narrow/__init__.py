@@ -27,8 +27,7 @@ def record_scene(stage: SystemScene | RenderedScene) -> SystemRecording:
     """One frame."""
     image, depth = stage.seen("narrow")
     generator = purpose_generator(stage.seed, "record")
-    sharp = linear_from_srgb(image)
-    ground_truth = defocused(sharp, depth, stage.rig)
+    ground_truth = defocused(linear_from_srgb(image), depth, stage.rig)
     tele = record(luminance(ground_truth), (Noise(10_000, 3), Clip()), generator)
     wide = record(stage.seen("wide")[0], (DecodeSRGB(), Noise(6_000, 3), Clip(), Mosaic("RGGB")), generator)
     return SystemRecording({"narrow": [tele[0]], "wide": [wide[0]]}, [srgb_from_linear(ground_truth[0])])

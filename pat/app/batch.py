@@ -27,19 +27,10 @@ from arraygeom import Rig, ThroughLenses, Widened
 from arraygeom.fields import FIELDS
 from arraygeom.io.native import read_text as rig_of_text
 from arraygeom.io.native import write as rig_text
+from arraygeom.runtime import together
 from arraygeom.runtime.atomic import write_text
 from arraygeom.runtime.safe_yaml import dump_yaml, load_yaml
 from arraygeom.runtime.threads import in_parallel
-from arraygeom.runtime.together import (
-    LISTS,
-    digest,
-    list_file,
-    read_about,
-    retire,
-    sweep,
-    write_listed,
-    write_together,
-)
 
 from ..fusion.checks import confidence_checked
 from ..fusion.frame import Frame
@@ -61,7 +52,7 @@ from ..support.memory import limited
 from ..support.tensor_files import read_tensors, write_tensors
 
 SETTINGS, VIDEO = "settings.yaml", "fused.mp4"
-KEYS, PLAN = f"{LISTS}/keys", "plan.json"
+KEYS, PLAN = f"{together.LISTS}/keys", "plan.json"
 
 PLAN_FORMAT = "pat-batch 1"
 _network = lru_cache(maxsize=2)(load_weights)
@@ -114,9 +105,7 @@ class Batch:
             raise ValueError(f"no image of alpha, '{self.alpha}'")
         if not self.sequence and len({len(files) for files in self.files.values()}) > 1:
             counts = ", ".join(f"{len(files)} of '{name}'" for name, files in self.files.items())
-            raise ValueError(
-                f"frames need as many images of each camera, got {counts}; or is it for `pat sequence`?"
-            )
+            raise ValueError(f"frames need as many images of each camera, got {counts}")
 
     @cached_property
     def names(self) -> list[str]:
@@ -127,13 +116,13 @@ class Batch:
     @cached_property
     def dependencies(self) -> str:
         """Everything that the results depend on, as YAML text."""
-        digest = hashlib.sha256(find_weights(self.weights).read_bytes()).hexdigest()
+        stamp = hashlib.sha256(find_weights(self.weights).read_bytes()).hexdigest()
         entries = json.loads(self.to_json())
         files = entries.pop("files")
         for name in ("format", "out", "strict"):
             del entries[name]
         del entries["settings"]["max_memory"]
-        entries["weights"] = f"{self.weights} (SHA-256 {digest[:16]})"
+        entries["weights"] = f"{self.weights} (SHA-256 {stamp[:16]})"
         if self.sequence:
             entries["frames"] = {name: len(paths) for name, paths in files.items()}
         return dump_yaml(entries)
@@ -141,22 +130,22 @@ class Batch:
     @cached_property
     def _of_sequence(self) -> str:
         """Digest of settings and all images of a sequence; empty for independent frames."""
-        files = {name: list(map(digest, paths)) for name, paths in self.files.items()}
+        files = {name: list(map(together.digest, paths)) for name, paths in self.files.items()}
         return _digest([self.dependencies, files]) if self.sequence else ""
 
     def inputs(self, i: int) -> str:
         """Return a digest of the settings and the images that frame `i` depends on: all images in
         a sequence."""
-        own = {name: digest(files[i]) for name, files in self.files.items() if not self.sequence}
+        own = {name: together.digest(files[i]) for name, files in self.files.items() if not self.sequence}
         return self._of_sequence or _digest([self.dependencies, own])
 
     def list_file(self, i: int) -> Path:
         """Return the path of a frame's list of files, which exists once the frame is complete."""
-        return list_file(self.out, fused_group(self.names[i]))
+        return together.list_file(self.out, fused_group(self.names[i]))
 
     def _is_made(self, i: int) -> bool:
         """True if a frame is complete and made from these images and settings."""
-        about = read_about(self.out, fused_group(self.names[i]))
+        about = together.read_about(self.out, fused_group(self.names[i]))
         return about is not None and about.get("inputs") == self.inputs(i)
 
     def fused_file(self, i: int) -> Path:
@@ -211,7 +200,7 @@ class Batch:
             report = run_tasks(tasks, title="frames", **{**how, "resume": True})
             if video is not None and (report.made or report.kept):
                 made = [self.fused_file(i) for i in many if self.list_file(i).exists()]
-                with write_together(self.out, group=VIDEO, last=VIDEO) as folder:
+                with together.write_together(self.out, group=VIDEO, last=VIDEO) as folder:
                     write_video(folder / VIDEO, (read_image(p) for p in made), rate=video)
             if not report.failed:
                 shutil.rmtree(self.out / KEYS)
@@ -230,7 +219,7 @@ class Batch:
                 "give the same ones, or another --out"
             )
         vars(self).pop("_of_sequence", None)  # files may have changed since another run
-        sweep(self.out)
+        together.sweep(self.out)
         refuse_to_replace(self.out, self.names)
         same = [partial(self._is_made, i) for i in range(len(self.names))]
         made = in_parallel(same) if resume else [False] * len(same)
@@ -239,10 +228,10 @@ class Batch:
             shutil.rmtree(self.out / KEYS, ignore_errors=True)
         for name, kept in zip(self.names, made):
             if not kept:
-                retire(self.out, fused_group(name))
-        sweep(self.out / KEYS)
+                together.retire(self.out, fused_group(name))
+        together.sweep(self.out / KEYS)
         write_text(before, self._of_sequence)
-        write_listed(file, text)
+        together.write_listed(file, text)
         write_text(self.out / KEYS / PLAN, self.to_json())
 
     def to_json(self) -> str:
@@ -316,7 +305,6 @@ class Batch:
             with confidence_checked(strict=self.strict):
                 frame = self._frame(i)
             view = view_of(self.rig, self.alpha, bits=self.bits, bands=len(frame.image))
-            bands = band_names(frame, self._betas) or self._propagated_bands(frame)
             save_frame(
                 frame,
                 self.out,
@@ -324,7 +312,7 @@ class Batch:
                 kind=self.kind,
                 view=view,
                 name=self.names[i],
-                bands=bands,
+                bands=band_names(frame, self._betas) or self._propagated_bands(frame),
                 about={"inputs": inputs or self.inputs(i)},
             )
 
@@ -364,9 +352,7 @@ def _plain(value: object) -> object:
     kind = type(value).__name__
     if FIELD_CLASSES.get(kind) is not type(value):
         supported = ", ".join(FIELD_CLASSES)
-        raise ValueError(
-            f"a batch's field is written to a file, which {value!r} cannot be: give one of {supported}"
-        )
+        raise ValueError(f"a batch cannot write {value!r} to its file: give one of {supported}")
     return {"kind": kind, **vars(value)}
 
 
@@ -430,15 +416,11 @@ def find_images(text: str | Path, *, name: str = "") -> list[Path]:
     path = Path(text)
     label = f"{name}: " if name else ""
     if path.suffix.lower() in VIDEO_SUFFIXES:
-        raise ValueError(
-            f"{label}{path}: is a video, which only `pat fuse` without a rig reads: save its frames"
-        )
+        raise ValueError(f"{label}{path}: is a video, which needs `pat fuse` without a rig: save its frames")
     if path.is_dir():
         files = _images_in(path)
-    elif path.exists():
-        files = [path]
     else:
-        files = [p for p in path.parent.glob(path.name) if p.is_file()]
+        files = [path] if path.exists() else [p for p in path.parent.glob(path.name) if p.is_file()]
     files = sorted((p for p in files if p == path or not p.name.startswith(".")), key=_natural)
     if not files:
         below = [str(p) for p in sorted(path.iterdir()) if _images_in(p)] if path.is_dir() else []
@@ -448,9 +430,7 @@ def find_images(text: str | Path, *, name: str = "") -> list[Path]:
     for file in files:
         if (other := frames.setdefault(file.stem, file)) != file:
             pattern = file.with_name(f"*{file.suffix}")
-            raise ValueError(
-                f"{label}{other} and {file.name} are one frame: give a pattern, such as '{pattern}'"
-            )
+            raise ValueError(f"{label}{other} and {file.name} are one frame: give a pattern, as '{pattern}'")
     return files
 
 

@@ -125,9 +125,7 @@ def array_from_images(
         range_of(name, image)
     for name, length in focal.items():
         if name not in sources or not 0 < length < math.inf:
-            raise ValueError(
-                f"focal {name}={length:g}: no camera of {', '.join(sources)}, or not positive: mend it"
-            )
+            raise ValueError(f"focal {name}={length:g}: no camera of {', '.join(sources)}, or not positive")
     notes: list[str] = []
 
     def note(line: str) -> None:
@@ -137,17 +135,11 @@ def array_from_images(
     tagged = None if images else _tagged_rig(files, note)
     if tagged is not None and focal:
         raise ValueError("focal: the images' tags state the focal lengths: leave it out")
-    for name in files:
-        images[name] = read_image(files[name], name=name)
-    sizes = image_sizes(images)
-    by_pair = (
-        None
-        if matches is None
-        else {
-            pair: PointMatches(*points)
-            for pair, points in read_matches(matches, {n: files.get(n, n) for n in sources}, sizes).items()
-        }
-    )
+    images |= {name: read_image(file, name=name) for name, file in files.items()}
+    by_pair: Pairs | None = None
+    if matches is not None:
+        given = read_matches(matches, {n: files.get(n, n) for n in sources}, image_sizes(images))
+        by_pair = {pair: PointMatches(*points) for pair, points in given.items()}
     images = {name: _textured(f"{name}: {files.get(name, 'the image')}", images[name]) for name in sources}
     alpha = _chosen_alpha(images, alpha, note)
     if tagged is not None:
@@ -196,9 +188,7 @@ def by_camera(sources: ImageSources) -> Mapping[str, str | Path | Tensor]:
         for source in sources:
             if not isinstance(source, str | Path):
                 got = type(source).__name__
-                raise TypeError(
-                    f"an image is a {got} without a name: give files, or {{NAME: tensor}} by camera"
-                )
+                raise TypeError(f"an image is a {got} without a name: give files, or {{NAME: tensor}}")
         sources = camera_names([Path(path) for path in sources])
     if len(sources) < 2:
         raise ValueError(f"an array has two images or more, got {len(sources)}")
@@ -234,9 +224,7 @@ def camera_names(paths: Sequence[Path]) -> dict[str, Path]:
     return {f"camera{i}": path for i, path in enumerate(paths, 1)}
 
 
-def frames_of_videos(
-    videos: Mapping[str, Path], folder: Path
-) -> tuple[dict[str, list[Path]], dict[str, float]]:
+def video_frames(videos: Mapping[str, Path], folder: Path) -> tuple[dict[str, list[Path]], dict[str, float]]:
     """Write the frames of videos as image files into a folder.
 
     Files get their video's modification time, by which a resumed job recognises them.
@@ -419,9 +407,7 @@ def found_rig(
     known = lengths.keys() & {alpha, *betas}
     observed = {} if known else _observed_focal_lengths(uncalibrated, alpha, with_lines)
     for name, (length, deviation) in observed.items():
-        note(
-            f"{name}: focal length {length / factors[name]:.0f} pixels +- {deviation:.0%}, by matched points"
-        )
+        note(f"{name}: focal length {length / factors[name]:.0f} px +- {deviation:.0%}, by matched points")
     lengths |= {name: length for name, (length, _) in observed.items()}
     rig = _calibrated(uncalibrated, reduced, alpha, betas, lengths, bands, note, by_pair is None)
     if rig.name == UNSCALED and known != {alpha, *betas}:
@@ -441,9 +427,8 @@ def _observed_focal_lengths(
     for name in betas:
         LOG.info("looking for the focal length of %s and %s", alpha, name)
         views = {n: uncalibrated.rig[n] for n in (alpha, name)}
-        fits.append(
-            common_focal_length(views, uncalibrated.rig.links[alpha, name], uncalibrated.matches[alpha, name])
-        )
+        link, matches = uncalibrated.rig.links[alpha, name], uncalibrated.matches[alpha, name]
+        fits.append(common_focal_length(views, link, matches))
     best = min((fit for fit in fits if fit is not None), key=lambda fit: fit.deviation, default=None)
     if best is None:
         return {}
@@ -601,9 +586,7 @@ def _chosen_alpha(images: Images, alpha: str | None, note: Say) -> str:
         why = "the only grey image"
     elif sum(images[name].shape[-2:] == (h, w) for name in grey or images) > 1:
         why = "the first of images of one size"
-    note(
-        f"alpha, whose view and detail the result has: {chosen} ({w}x{h}, {why}; --alpha NAME takes another)"
-    )
+    note(f"alpha, whose view and detail the result has: {chosen} ({w}x{h}, {why}; --alpha takes another)")
     return chosen
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import wraps
 from pathlib import Path
-from typing import NamedTuple, ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 from torch import Tensor
 
@@ -26,21 +26,6 @@ from ..networks.weights import load_weights, weights_for
 from ..support.blocks import without_autocast
 
 P, T = ParamSpec("P"), TypeVar("T")
-
-
-class _Complete(NamedTuple):
-    """Complete arguments of fusion and alignment.
-
-    Attributes:
-        found: True if the rig was found from the images.
-    """
-
-    images: Images
-    rig: Rig
-    alpha: str
-    network: FusionNetwork
-    settings: FuseSettings
-    found: bool
 
 
 def _images_first(function: Callable[P, T]) -> Callable[P, T]:
@@ -127,16 +112,11 @@ def fuse(
             as `warnings.simplefilter("error", LowConfidenceWarning)`.
     """
     known = _known(images, rig, alpha, network, settings, explain)
-    if known.found and settings.luminance == "alpha" and not differentiable and settings.noise is None:
-        known = known._replace(settings=replace(known.settings, noise="auto"))
+    if rig is None and settings.luminance == "alpha" and not differentiable and settings.noise is None:
+        known["settings"] = replace(known["settings"], noise="auto")
     return fuse_frame(
-        known.images,
-        known.rig,
-        alpha=known.alpha,
-        network=known.network,
-        settings=known.settings,
+        **known,
         corrections=corrections,
-        explain=explain,
         progress=progress,
         announce=announce,
         store=store,
@@ -195,18 +175,12 @@ def align(
             missing, no numbers, or of another size than the rig says.
         TypeError: for arguments in the wrong order, and settings of another type.
     """
-    known = _known(images, rig, alpha, network, settings, explain)
     return align_frame(
-        known.images,
-        known.rig,
-        alpha=known.alpha,
-        network=known.network,
-        settings=known.settings,
+        **_known(images, rig, alpha, network, settings, explain),
         recorded=recorded,
         interpolation=interpolation,
         min_confidence=min_confidence,
         fill=fill,
-        explain=explain,
         progress=progress,
         announce=announce,
         matcher=matcher,
@@ -220,10 +194,11 @@ def _known(
     network: FusionNetwork | str | Path | None,
     settings: FuseSettings,
     explain: Callable[[str], None] | None,
-) -> _Complete:
-    """Images as tensors, rig, alpha, network and settings: as given, or found."""
+) -> dict[str, Any]:
+    """Arguments of `fuse_frame` and `align_frame` by name: as given, or found."""
     if not isinstance(settings, FuseSettings):
         raise TypeError(f"settings are a {type(settings).__name__}: give FuseSettings(depth=..., noise=...)")
+    shown: Images
     say = explain or (lambda line: None)
     if rig is None:
         from .from_images import array_from_images
@@ -231,30 +206,24 @@ def _known(
         weights = str(network) if isinstance(network, str | Path) else None
         array = array_from_images(images, alpha=alpha, weights=weights, say=say)
         settings = replace(settings, match_levels=settings.match_levels or array.match_levels)
-        ready = _loaded(array.weights if network is None else network)
-        return _Complete(array.images, array.rig, array.alpha, ready, settings, found=True)
-    rig = Rig.load(rig) if isinstance(rig, str | Path) else rig
-    if not isinstance(rig, Rig):
-        raise TypeError(f"the rig is a {type(rig).__name__}: give a Rig, or its file")
-    if alpha is None:
-        raise ValueError(f"alpha: give the camera whose view is wanted, one of {', '.join(rig.names)}")
-    shown, rig = _with_images(images, rig, rig.require(alpha))
+        shown, rig, alpha = array.images, array.rig, array.alpha
+        network = array.weights if network is None else network
+    else:
+        rig = Rig.load(rig) if isinstance(rig, str | Path) else rig
+        if not isinstance(rig, Rig):
+            raise TypeError(f"the rig is a {type(rig).__name__}: give a Rig, or its file")
+        if alpha is None:
+            raise ValueError(f"alpha: give the camera whose view is wanted, one of {', '.join(rig.names)}")
+        shown, rig = _with_images(images, rig, rig.require(alpha))
     if network is None:
         betas = (shown[name] for name in rig.betas(alpha) if name in shown)
         network = weights_for([len(image) for image in betas if isinstance(image, Tensor)])
         say(f"network: {network}")
-    return _Complete(shown, rig, alpha, _loaded(network), settings, found=False)
-
-
-def _loaded(network: FusionNetwork | str | Path) -> FusionNetwork:
-    """The network itself, or that of weights by name or file."""
-    if isinstance(network, str | Path):
-        return load_weights(network)
+    network = load_weights(network) if isinstance(network, str | Path) else network
     if not isinstance(network, FusionNetwork):
-        raise TypeError(
-            f"network is a {type(network).__name__}: give the name or file of weights, or a network"
-        )
-    return network
+        raise TypeError(f"network is a {type(network).__name__}: give weights by name or file, or a network")
+    named = {"images": shown, "rig": rig, "alpha": alpha, "network": network}
+    return {**named, "settings": settings, "explain": explain}
 
 
 def _with_images(images: ImageSources, rig: Rig, alpha: str) -> tuple[Images, Rig]:

@@ -29,9 +29,7 @@ class HealingSettings:
     """Settings for correcting a rig by the images that are fused."""
 
     nearer: float = size(4.0, "How many times nearer to their lines held-out points must come")
-    of_own: float = size(
-        2.0, "How many times as far from them as from those of an F of their own they may be then"
-    )
+    of_own: float = size(2.0, "How many times as far as from those of their own F they may be then")
     slack: float = size(0.25, "And so many pixels of the matched images more")
 
 
@@ -105,9 +103,7 @@ def healed_rig(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> Healed | N
     cameras = dict(rig.cameras)
     for name in small:
         cameras[name] = refined.rig.resize(name, rig[name].hw)[name].replace(sensor=rig[name].sensor)
-    text = (
-        f"the rig is healed by these images: points lay {before:.1f} px from their lines, {after:.2f} px now"
-    )
+    text = f"the rig is healed by these images: points lay {before:.1f} px from their lines, now {after:.2f}"
     if refined.depth is not None:
         text += f"; depth changes by {refined.depth.change:.0%} (median), and is rough"
     depth = _depth_range(refined.rig, pairs)

@@ -23,6 +23,7 @@ from arraygeom.viz import COLOURS, frustum, frustum_size
 from ..fusion.frame import Frame, picture_of
 from ..media.colour import to_bytes
 from ..media.figures import colour_depth, reduced
+from ..media.images import Images
 from ..support.memory import how_many_fit
 
 LONGEST = 1600
@@ -56,9 +57,7 @@ class Facts(NamedTuple):
     classical: Float[Tensor, "_ _ _"] | None = None
 
 
-def report_page(
-    frame: Frame, images: Mapping[str, Float[Tensor, "_ _ _"]], rig: Rig, alpha: str, facts: Facts
-) -> str:
+def report_page(frame: Frame, images: Images, rig: Rig, alpha: str, facts: Facts) -> str:
     """Compose the HTML page of a fused frame: images under a slider, overlays, the rig, figures.
 
     Args:
@@ -159,10 +158,7 @@ def rig_drawing(rig: Rig, alpha: str) -> str:
     if not cameras:
         return ""
     size = frustum_size(cameras)
-    lines = {
-        name: [line[:, [0, 2]] * (1, -1) for line in frustum(camera, size)]
-        for name, camera in cameras.items()
-    }
+    lines = {n: [line[:, [0, 2]] * (1, -1) for line in frustum(c, size)] for n, c in cameras.items()}
     points = np.concatenate([line for some in lines.values() for line in some])
     low, extent = points.min(0), float(np.ptp(points, axis=0).max()) or 1.0
     drawn, labels = [], list[tuple[float, float, float]]()

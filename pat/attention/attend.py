@@ -27,14 +27,11 @@ from torch.autograd import forward_ad
 from torch.nn.functional import scaled_dot_product_attention
 from torch.utils.checkpoint import checkpoint
 
-from arraygeom.camera import View
+from arraygeom import Dense, Local, Pair, Positions, Segments, View, lazily, pixel_grid
 from arraygeom.checks import check_above, check_tensors
-from arraygeom.fields import Dense, Local, lazily
-from arraygeom.pair import Pair
-from arraygeom.pixels import HW, pixel_coordinates, pixel_grid
+from arraygeom.pixels import HW, pixel_coordinates
 from arraygeom.runtime.chunks import chunked
 from arraygeom.runtime.tracing import needs_numbers, transformations
-from arraygeom.segments import Positions, Segments
 from pat.attention import reference, torch_op
 from pat.attention.reference import Attended, AttentionInputs, SamplePositions, accumulated
 
@@ -135,20 +132,9 @@ def attend_with_statistics(
     return Attended(*_attend(*given, measured=True))
 
 
-def _attend(
-    query: Tensor,
-    key: Tensor,
-    value: Tensor,
-    locations: Locations | Callable[[Tensor], Locations] | Local | Dense,
-    samples: int | None,
-    interpolation: Interpolation,
-    bias: Tensor | None,
-    border: float,
-    backend: Backend,
-    *,
-    measured: bool,
-) -> tuple[Tensor, ...]:
-    """Values, and if `measured` the statistics."""
+def _attend(*given: Any, measured: bool) -> tuple[Tensor, ...]:
+    """Values, and if `measured` the statistics; `given` are the arguments of `attend` in order."""
+    query, key, value, locations, samples, interpolation, bias, border, backend = given
     check_tensors((), query=query, key=key, value=value)
     if not torch.compiler.is_compiling():
         check_above(0, border=border)
@@ -178,9 +164,8 @@ def _attend(
             faded = seen.clamp(min=LEAST_VISIBLE).log()
             bias = faded if bias is None else bias + faded
             v = v * _visibility(pixel_grid((k.shape[2], k.shape[3])).to(v), (k.shape[2], k.shape[3]), border)
-        attended = _run(
-            AttentionInputs(q, k, v, form, _bias(bias, q, form.samples), nearest), backend, measured
-        )
+        inputs = AttentionInputs(q, k, v, form, _bias(bias, q, form.samples), nearest)
+        attended = _run(inputs, backend, measured)
         return attended if measured else attended[:1]
 
     if not callable(locations):
@@ -200,13 +185,9 @@ def _check(query: Tensor, key: Tensor, value: Tensor, interpolation: str, backen
         raise ValueError(f"query, key and value must not be empty, got {shapes}")
     if not (query.dtype == key.dtype == value.dtype and query.dtype in DTYPES):
         names = ", ".join(str(t.dtype) for t in (query, key, value))
-        raise TypeError(
-            f"query, key and value must be all float64, float32, bfloat16 or float16, got {names}"
-        )
+        raise TypeError(f"query, key, value must be all float64, float32, bfloat16 or float16, got {names}")
     if not query.device == key.device == value.device:
-        raise ValueError(
-            f"query, key and value are on {query.device}, {key.device} and {value.device}: move them"
-        )
+        raise ValueError(f"query, key, value are on {query.device}, {key.device}, {value.device}: move them")
     if interpolation not in ("bilinear", "nearest"):
         raise ValueError(f"interpolation must be 'bilinear' or 'nearest', got {interpolation!r}")
     if backend not in get_args(Backend):
@@ -277,31 +258,21 @@ def sample_positions(locations: Locations, query: Tensor, samples: int | None) -
     elif isinstance(locations, Positions):
         points, mask, straight = locations.xy, locations.mask, False
         if samples not in (None, points.shape[-2]):
-            raise ValueError(
-                f"samples is {samples}, but the positions given are {points.shape[-2]} a pixel: omit it"
-            )
+            raise ValueError(f"samples is {samples}, the positions are {points.shape[-2]} a pixel: omit it")
         samples = points.shape[-2]
     else:
-        raise TypeError(
-            f"locations must be Segments, Positions or a function that returns them, got {type(locations)}"
-        )
+        raise TypeError(f"locations are {type(locations)}: give Segments, Positions or a function of these")
     if mask.dtype != torch.bool:
-        raise TypeError(
-            f"the locations' mask (valid) must be bool, got {mask.dtype}: compare it, as in mask > 0"
-        )
+        raise TypeError(f"the locations' mask must be bool, got {mask.dtype}: compare it, as in mask > 0")
     if samples is None:
         samples = samples_for(Segments(points[..., 0, :], points[..., 1, :], mask[..., 0]))
     if samples < 1:
         raise ValueError(f"samples must be at least 1, got {samples}")
     b, _, ha, wa = query.shape
-    if tuple(mask.shape[:-1]) not in ((ha, wa), (b, ha, wa), (1, ha, wa)):
-        raise ValueError(
-            f"locations have the leading axes {tuple(mask.shape[:-1])}, want {(ha, wa)} or {(b, ha, wa)}"
-        )
+    if (got := tuple(mask.shape[:-1])) not in ((ha, wa), (b, ha, wa), (1, ha, wa)):
+        raise ValueError(f"locations have the leading axes {got}, want {(ha, wa)} or {(b, ha, wa)}")
     if points.device != query.device:
-        raise ValueError(
-            f"locations are on {points.device}, the features are on {query.device}: move one of them"
-        )
+        raise ValueError(f"locations are on {points.device}, features on {query.device}: move one of them")
     if mask.dim() == 3:
         points, mask = points[None], mask[None]
     count_in = torch.float64 if query.dtype == torch.float64 else torch.float32
@@ -313,8 +284,7 @@ def samples_for(segments: Segments) -> int:
     is valid."""
     what = "the number of samples of the longest segment (give `samples`)"
     needs_numbers(what, segments.start, segments.end)
-    lengths = torch.where(segments.valid, segments.length.detach(), 0)
-    return int(lengths.max().ceil()) + 1
+    return int(torch.where(segments.valid, segments.length.detach(), 0).max().ceil()) + 1
 
 
 def _bias(bias: Tensor | None, query: Tensor, samples: int) -> Tensor | None:
@@ -343,9 +313,8 @@ def _missing(*tensors: Tensor | None) -> str:
     if torch.compiler.is_compiling():
         return ""
     under_way = transformations()
-    if "Jvp" in under_way or any(
-        t is not None and forward_ad.unpack_dual(t).tangent is not None for t in tensors
-    ):
+    tangents = (forward_ad.unpack_dual(t).tangent for t in tensors if t is not None)
+    if "Jvp" in under_way or any(tangent is not None for tangent in tangents):
         return "forward mode"
     return "gradients by torch.func (by torch.autograd it has)" if "Grad" in under_way else ""
 

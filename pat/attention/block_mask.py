@@ -36,7 +36,6 @@ def segment_block_mask(segments: Segments, hw: HW, *, radius: float = 0.5, block
         along = ((u * dx + v * dy) / (dx * dx + dy * dy).clamp(min=1e-12)).clamp(0, 1)
         return valid & ((u - along * dx).square() + (v - along * dy).square() <= radius**2)
 
-    queries = valids.shape[1]
     return create_block_mask(
-        within, batch, None, queries, hw[0] * hw[1], device=segments.valid.device, BLOCK_SIZE=block
+        within, batch, None, valids.shape[1], hw[0] * hw[1], device=segments.valid.device, BLOCK_SIZE=block
     )

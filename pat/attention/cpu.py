@@ -144,35 +144,22 @@ def backward(
     upstream = _flat(channels_last(cotangents[0].to(counted)))
     measured = saved[0], cotangents[1].to(counted).contiguous()
     statistics, statistics_upstream = (t if t.numel() else t.new_zeros(4) for t in measured)
-    forward_results = kernels.Saved(
-        statistics=_flat(statistics),
-        logsum=_flat(saved[1]),
-        value_upstream=upstream,
-        statistics_upstream=_flat(statistics_upstream),
-        step=4 if saved[0].numel() else 0,
-    )
+    step = 4 if saved[0].numel() else 0
+    results = kernels.Saved(_flat(statistics), _flat(saved[1]), upstream, _flat(statistics_upstream), step)
     query_out, key_out, value_out = (
         _new(*((b, *t.shape[2:], t.shape[1]) if want else (0,)), dtype=counted).zero_()
         for t, want in zip((query, key, value), wanted)
     )
     points_out = query.new_zeros((b, *positions.points.shape[1:]) if wanted[3] else 0, dtype=counted)
     bias_out = query.new_zeros((b, ha, wa, positions.samples) if wanted[4] else 0, dtype=counted)
-    gradients = kernels.Gradients(
-        _flat(query_out),
-        _flat(points_out),
-        _flat(bias_out),
-        wants_query=wanted[0],
-        wants_points=wanted[3],
-        wants_bias=wanted[4],
-    )
+    outputs = _flat(query_out), _flat(points_out), _flat(bias_out)
+    gradients = kernels.Gradients(*outputs, wanted[0], wanted[3], wanted[4])
     taps = _tap_list(b * ha * wa, call)
     step = len(taps.tap_count)
     for first in range(0, b * ha * wa, step):
         last, here = min(first + step, b * ha * wa), taps._replace(first=first)
         shares = _shares(first, last, call)
-        in_parallel(
-            [partial(kernels.backward, call, forward_results, share, here, gradients) for share in shares]
-        )
+        in_parallel([partial(kernels.backward, call, results, share, here, gradients) for share in shares])
         for_keys = _channel_tasks(here, here.key_weight, last, call.query, d, key_out)
         for_values = _channel_tasks(here, here.value_weight, last, upstream, call.value_channels, value_out)
         in_parallel([*for_keys, *for_values])
@@ -244,13 +231,9 @@ def _tap_list(pixels: int, call: kernels.Call) -> kernels.TapList:
     geometry = call.geometry
     stride = (geometry.samples * (1 if geometry.nearest else 4) // kernels.LANES + 2) * kernels.LANES
     pixels = min(pixels, max(64, SCRATCH_TAPS // stride))
-    return kernels.TapList(
-        first=0,
-        tap_count=np.empty((pixels, 1), np.int32),
-        rows=np.empty((pixels, stride), np.int32),
-        key_weight=np.empty((pixels, stride), geometry.fractions.dtype),
-        value_weight=np.empty((pixels, stride), geometry.fractions.dtype),
-    )
+    counts, rows = np.empty((pixels, 1), np.int32), np.empty((pixels, stride), np.int32)
+    weights = (np.empty((pixels, stride), geometry.fractions.dtype) for _ in range(2))
+    return kernels.TapList(0, counts, rows, *weights)
 
 
 def _channel_tasks(

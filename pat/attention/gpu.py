@@ -6,8 +6,7 @@ gradients by the weights, which all of them need, follows from forward's outputs
 peak, a sample's weight has the gradient g.v + a x + b y + s |(x, y) - position|^2 / (2 spread) + k [it is the
 best]; the mean of this over the weights is g.out + (a, b).position + s spread / 2 + k peak.
 
-Beta's gradients are added to with atomics: of float32, in no fixed order; or, if torch is asked for
-deterministic algorithms, of 64-bit fixed point numbers, whose sums do not depend on the order.
+Beta's gradients are added to with atomics of float32, in no fixed order.
 `TRITON_INTERPRET=1`, set before the first import, runs the same code on the CPU, for tests.
 """
 
@@ -29,8 +28,6 @@ PIXELS = 8
 """Alpha pixels of one program."""
 LEAST = tl.constexpr(LEAST_DEVIATION)
 SLACK = tl.constexpr(EDGE_SLACK)
-FIXED_BITS = 61
-"""Bits of an int64 that a sum of fixed point numbers may take."""
 
 
 def forward(inputs: AttentionInputs, measured: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -75,54 +72,22 @@ def backward(
         t.contiguous() if t.numel() else t.new_zeros(b, ha, wa, 4)
         for t in (saved[0], cotangents[1].to(counted))
     )
-    fixed = torch.are_deterministic_algorithms_enabled()
-    scales = (
-        _scales(query, key, value, upstream, statistics_upstream)
-        if fixed
-        else query.new_ones(2, dtype=counted)
-    )
-    sums = torch.int64 if fixed else counted
-    images = [t.new_zeros(b, *t.shape[2:], t.shape[1], dtype=sums) for t in (key, value)]
+    images = [t.new_zeros(b, *t.shape[2:], t.shape[1], dtype=counted) for t in (key, value)]
     query_out = query.new_empty(b, ha, wa, query.shape[1])
     points_out = query.new_zeros(b, *positions.points.shape[1:], dtype=counted)
     bias_out = query.new_zeros((b, ha, wa, positions.samples) if wanted[4] else 1, dtype=counted)
     tensors, options = _call(inputs)
     _backward[_programs(query)](
         *tensors,
-        *(statistics, saved[1], saved[2], channels_last(saved[3]), upstream, statistics_upstream, scales),
+        *(statistics, saved[1], saved[2], channels_last(saved[3]), upstream, statistics_upstream),
         *(query_out, *images, points_out, bias_out),
         **options,
         WANTS_BIAS=wanted[4],
-        FIXED=fixed,
     )
-    if fixed:
-        images = [(t.double() / s.double()).to(counted) for t, s in zip(images, scales)]
     key_out, value_out = (t.to(query.dtype).permute(0, 3, 1, 2) for t in images)
-    gradients = (
-        query_out.permute(0, 3, 1, 2),
-        key_out,
-        value_out,
-        points_out.sum_to_size(positions.points.shape),
-        bias_out,
-    )
+    points_out = points_out.sum_to_size(positions.points.shape)
+    gradients = query_out.permute(0, 3, 1, 2), key_out, value_out, points_out, bias_out
     return tuple(t if want else t.new_empty(0) for t, want in zip(gradients, wanted))
-
-
-def _scales(
-    query: Tensor, key: Tensor, value: Tensor, upstream: Tensor, statistics_upstream: Tensor
-) -> Tensor:
-    """Factors for key's and value's gradients that make their sums fit into fixed point.
-
-    The weights of a pixel sum to 1, so that the gradients by its scores sum to no more than twice the largest
-    gradient by a weight.
-    """
-    pixels = query.shape[0] * query.shape[2] * query.shape[3]
-    diagonal = float(key.shape[2] ** 2 + key.shape[3] ** 2) ** 0.5
-    pull = upstream.abs().amax().double()
-    by_weight = pull * value.abs().amax().double() * value.shape[1]
-    by_weight = by_weight + statistics_upstream.abs().amax().double() * (3 * diagonal + 1)
-    most = torch.stack([2 * by_weight * query.abs().amax().double(), pull]) * pixels
-    return torch.exp2(FIXED_BITS - most.clamp(min=1e-30).log2().ceil()).to(accumulated(query))
 
 
 def _programs(query: Tensor) -> tuple[int]:
@@ -326,26 +291,20 @@ def _forward(
 
 
 @compiled
-def _add(out, pixel, weight, x, channel, D, live, scale, FIXED):
+def _add(out, pixel, weight, x, channel, D, live):
     """Add weight x to pixels of an image."""
-    address = out + pixel[:, None] * D + channel[None, :]
-    add = weight[:, None] * x
-    if FIXED:
-        add = add.to(tl.float64) * scale
-        tl.atomic_add(address, tl.floor(add + 0.5).to(tl.int64), mask=live)
-    else:
-        tl.atomic_add(address, add, mask=live)
+    tl.atomic_add(out + pixel[:, None] * D + channel[None, :], weight[:, None] * x, mask=live)
 
 
 @compiled
-def _add_around(out, pixel, across, below, u, v, weight, x, channel, D, live, scale, NEAREST, FIXED):
+def _add_around(out, pixel, across, below, u, v, weight, x, channel, D, live, NEAREST):
     if NEAREST:
-        _add(out, pixel, weight, x, channel, D, live, scale, FIXED)
+        _add(out, pixel, weight, x, channel, D, live)
     else:
-        _add(out, pixel, weight * (1 - u) * (1 - v), x, channel, D, live, scale, FIXED)
-        _add(out, pixel + across, weight * u * (1 - v), x, channel, D, live, scale, FIXED)
-        _add(out, pixel + below, weight * (1 - u) * v, x, channel, D, live, scale, FIXED)
-        _add(out, pixel + across + below, weight * u * v, x, channel, D, live, scale, FIXED)
+        _add(out, pixel, weight * (1 - u) * (1 - v), x, channel, D, live)
+        _add(out, pixel + across, weight * u * (1 - v), x, channel, D, live)
+        _add(out, pixel + below, weight * (1 - u) * v, x, channel, D, live)
+        _add(out, pixel + across + below, weight * u * v, x, channel, D, live)
 
 
 @compiled
@@ -384,7 +343,6 @@ def _backward(
     out,
     upstream,
     statistics_upstream,
-    scales,
     query_out,
     key_out,
     value_out,
@@ -401,7 +359,6 @@ def _backward(
     BIASED: tl.constexpr,
     NUMBER: tl.constexpr,
     WANTS_BIAS: tl.constexpr,
-    FIXED: tl.constexpr,
 ):
     p, alive, place, first = _places(pixels, alpha_pixels, height, width, PIXELS, SHARED)
     c, cv = tl.arange(0, D_BLOCK), tl.arange(0, DV_BLOCK)
@@ -415,7 +372,6 @@ def _backward(
     mean_x, mean_y, spread, peak, gx, gy, gpeak, pull = _upstream(
         statistics, statistics_upstream, p, alive, NUMBER
     )
-    key_scale, value_scale = tl.load(scales).to(tl.float64), tl.load(scales + 1).to(tl.float64)
     by_query = tl.zeros([PIXELS, D_BLOCK], NUMBER)
     x_start, y_start = tl.zeros([PIXELS], NUMBER), tl.zeros([PIXELS], NUMBER)
     x_end, y_end = tl.zeros([PIXELS], NUMBER), tl.zeros([PIXELS], NUMBER)
@@ -436,8 +392,8 @@ def _backward(
         slope = slope + 0.5 * pull * (dx * dx + dy * dy - spread * spread)
         by_score = w * (slope + gpeak * (tl.where(at_best == i, 1.0, 0.0) - peak))
         by_query += by_score[:, None] * _blended(key, pixel, across, below, u, v, c, D, live, NEAREST, NUMBER)
-        _add_around(key_out, pixel, across, below, u, v, by_score, q, c, D, live, key_scale, NEAREST, FIXED)
-        _add_around(value_out, pixel, across, below, u, v, w, g, cv, DV, live_v, value_scale, NEAREST, FIXED)
+        _add_around(key_out, pixel, across, below, u, v, by_score, q, c, D, live, NEAREST)
+        _add_around(value_out, pixel, across, below, u, v, w, g, cv, DV, live_v, NEAREST)
         dx, dy = w * (gx + pull * (x - mean_x)), w * (gy + pull * (y - mean_y))
         if not NEAREST:
             across_s = (1 - v) * (s1 - s0) + v * (s3 - s2)

@@ -108,8 +108,7 @@ def mean_score(compared: Compared) -> Float[Tensor, "b ha wa"]:
     """
     query, key, _, locations, samples, interpolation, _ = compared
     nothing = torch.zeros_like(query), torch.zeros_like(key)
-    even = attend(*nothing, key, locations, samples=samples, interpolation=interpolation)
-    return (query * even).sum(1)
+    return (query * attend(*nothing, key, locations, samples=samples, interpolation=interpolation)).sum(1)
 
 
 @torch.no_grad()

@@ -138,8 +138,7 @@ def _attend(*given: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 def _inputs(tensors: Any, form: Any) -> AttentionInputs:
     """Attention inputs from `INPUTS` and the first three of `OPTIONS`."""
     (query, key, value, points, mask, bias), (samples, straight, nearest) = tensors, form
-    positions = SamplePositions(points, mask, samples, straight)
-    return AttentionInputs(query, key, value, positions, bias, nearest)
+    return AttentionInputs(query, key, value, SamplePositions(points, mask, samples, straight), bias, nearest)
 
 
 @_attend.register_fake
@@ -187,8 +186,7 @@ def _(query, key, value, points, mask, bias, statistics, logsum, *rest):
 
 def _keep(ctx, inputs, output) -> None:
     query, key, value, points, mask, bias, *ctx.options = inputs
-    backend = ctx.options[-2]
-    out = output[0] if backend == "triton" else None
+    out = output[0] if ctx.options[-2] == "triton" else None
     ctx.save_for_backward(query, key, value, points, mask, bias, *output[1:], out)
 
 
@@ -213,9 +211,7 @@ def _differentiate_again(ctx, *cotangents):
     """The gradient of the gradient: the reference is run again, and its gradient differentiated."""
     *form, measured, backend, strict, wanted = ctx.options
     if strict:
-        raise NotImplementedError(
-            f"backend '{backend}' has no second-order gradients: ask for backend=\"reference\""
-        )
+        raise NotImplementedError(f"'{backend}' has no second-order gradients: ask for backend=\"reference\"")
     saved = [_input_again(t) for t in ctx.saved_tensors]
     query, key, value, points, _, bias, *_ = saved
     upstream = saved[10:]

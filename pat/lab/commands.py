@@ -81,8 +81,7 @@ class Evaluate(StereoSets):
         from .evaluation import protocols, stereo
 
         sets = self.sets()
-        network = load_weights(self.network)
-        methods = {**protocols.BASELINES, "fusion": protocols.rectified_fusion(network)}
+        methods = {**protocols.BASELINES, "fusion": protocols.rectified_fusion(load_weights(self.network))}
         rows = stereo.evaluate_sets(sets, methods, self.rates, out=self.out)
         self.write(rows, stereo.sets_markdown(rows))
 
@@ -158,9 +157,7 @@ class Ablate:
 
         if self.scenes < 1:
             raise ValueError(f"--scenes: {self.scenes}: give at least 1")
-        layered = [
-            name for name in ("photos", "scenes", "hw") if getattr(self, name) != getattr(Ablate, name)
-        ]
+        layered = [n for n in ("photos", "scenes", "hw") if getattr(self, n) != getattr(Ablate, n)]
         if self.rendered is not None and layered:
             raise ValueError(f"--{', --'.join(layered)}: of layered scenes: leave out with --rendered")
         writable(self.out, folder=True)
@@ -352,7 +349,7 @@ class Import:
         say(f"written: {self.out} (PAT for {what})")
 
 
-class WeightsCommands:
+class Weights:
     """Convert weights of other programs."""
 
     commands: ClassVar[Mapping[str, Any]] = {"import": Import}

@@ -87,9 +87,7 @@ def _pfm(path: Path) -> NDArray[np.float32]:
         raise ValueError(f"{path}: not a grey PFM file: give one that begins with 'Pf', or float TIFF")
     w, h, scale = int(head[1]), int(head[2]), float(head[3])
     if (size := len(content) - head.end()) != 4 * h * w:
-        raise ValueError(
-            f"{path}: has {size} bytes of values, {w}x{h} are {4 * h * w}: the file is not whole"
-        )
+        raise ValueError(f"{path}: has {size} bytes of values, {w}x{h} are {4 * h * w}: it is not whole")
     values = np.frombuffer(content, "<f4" if scale < 0 else ">f4", offset=head.end())
     return values.reshape(h, w)[::-1].astype(np.float32)
 

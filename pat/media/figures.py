@@ -111,9 +111,7 @@ def draw_panels(
     wide = round(110 * width) // columns - GAP
     h, w = next(iter(panels.values())).shape[-2:]
     high = round(wide * h / w)
-    longest = max(
-        ImageFont.load_default(16).getlength(line) for title in panels for line in title.split("\n")
-    )
+    longest = max(map(ImageFont.load_default(16).getlength, "\n".join(panels).split("\n")))
     font = ImageFont.load_default(min(16, 16 * wide / max(longest, 1)))
     above = TITLE * (1 + max(title.count("\n") for title in panels))
     cell_wh = wide + GAP, high + above

@@ -22,23 +22,10 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from arraygeom.runtime import image_bytes
 from arraygeom.runtime.atomic import write_atomically
 from arraygeom.runtime.chunks import ROWS, spans
 from arraygeom.runtime.extras import install_line
-from arraygeom.runtime.image_bytes import (
-    JPEG,
-    MINISBLACK,
-    MINISWHITE,
-    PNG,
-    PNM_OF_TEXT,
-    SEPARATE,
-    TIFF,
-    decodable,
-    first_tiff_page,
-    has_further_images,
-    jpeg_colours,
-    tiff_colours,
-)
 from arraygeom.runtime.warned import warn
 
 from .headers import HW, ImageHeader, image_header
@@ -143,7 +130,7 @@ def _planes(
     header = image_header(content)
     if header is None:
         raise ValueError(f"{label}: is no image that can be read: give a PNG, TIFF, JPEG or PNM file")
-    if content[:4] in TIFF and has_further_images(content):
+    if content[:4] in image_bytes.TIFF and image_bytes.has_further_images(content):
         warn(f"{label}: holds several images: the first is taken; save the others as files of their own")
     applied = _applied(header, orientation, label)
     _check_header(header.upright if applied > 1 else header.hw, hw, label)
@@ -272,7 +259,7 @@ def _decode(content: bytes, header: ImageHeader, label: str) -> tuple[NDArray, i
     OpenCV shifts TIFF values of fewer than 16 bits up, and scales 8-bit values of text PNM files to 255.
     """
     values = decoded(_without_orientation(content, header))
-    page = first_tiff_page(content) if content[:4] in TIFF else None
+    page = image_bytes.first_tiff_page(content) if content[:4] in image_bytes.TIFF else None
     if page is not None:
         values = _as_tiff_states(values, page, content, label)
     if values is None and page is not None and page.dtype is not None and page.dtype not in DECODED:
@@ -283,7 +270,7 @@ def _decode(content: bytes, header: ImageHeader, label: str) -> tuple[NDArray, i
         raise ValueError(f"{label}: its header says another size than its pixels have: save it again")
     if page is not None and values.dtype == np.uint16 and header.bits < 16:
         return values >> (16 - header.bits), 2**header.bits - 1
-    if content[:2] in PNM_OF_TEXT and values.dtype == np.uint8:
+    if content[:2] in image_bytes.PNM_OF_TEXT and values.dtype == np.uint8:
         values = ((values.astype(np.uint16) * header.white + 254) // 255).astype(np.uint8)
     return values, header.white
 
@@ -294,16 +281,17 @@ def _as_tiff_states(values: NDArray | None, page: Any, content: bytes, label: st
     OpenCV returns the first of several bands that are no colours; beyond 8 bits it mixes planes and takes
     white for black.
     """
-    bands, grey = page.samplesperpixel, page.photometric in (MINISWHITE, MINISBLACK)
+    bands, grey = page.samplesperpixel, page.photometric in (image_bytes.MINISWHITE, image_bytes.MINISBLACK)
     if bands not in (1, 3, 4) or (bands == 4 and grey):
         raise ValueError(f"{label}: has {bands} channels: {CHANNELS}")
     if values is None:
         return None
     deep = values.dtype != np.uint8
-    if bands > 1 and (grey or (deep and page.planarconfig == SEPARATE)):
-        colours = tiff_colours(content)
+    if bands > 1 and (grey or (deep and page.planarconfig == image_bytes.SEPARATE)):
+        colours = image_bytes.tiff_colours(content)
         return None if colours is None else colours[..., [2, 1, 0, 3][:bands]]
-    return 65535 - values if page.photometric == MINISWHITE and values.dtype == np.uint16 else values
+    inverted = page.photometric == image_bytes.MINISWHITE and values.dtype == np.uint16
+    return 65535 - values if inverted else values
 
 
 def _without_orientation(content: bytes, header: ImageHeader) -> bytes:
@@ -328,11 +316,11 @@ def decoded(content: bytes, flags: int = cv2.IMREAD_UNCHANGED) -> NDArray | None
     Returns:
         Values (h, w) or (h, w, channels), blue first, type as stored; None for a damaged file.
     """
-    if content[:2] == JPEG and flags == cv2.IMREAD_UNCHANGED:
+    if content[:2] == image_bytes.JPEG and flags == cv2.IMREAD_UNCHANGED:
         with suppress(Exception):  # damaged, which `decodable` says
-            if (colours := jpeg_colours(content)) is not None:
+            if (colours := image_bytes.jpeg_colours(content)) is not None:
                 return colours[..., 0] if colours.shape[2] == 1 else colours[..., ::-1]
-    level, checked = _log_level(0), decodable(content)
+    level, checked = _log_level(0), image_bytes.decodable(content)
     try:
         return None if checked is None else cv2.imdecode(np.frombuffer(checked, np.uint8), flags)
     except cv2.error:
@@ -362,7 +350,7 @@ def decoded_photograph(path: Path, flags: int, *, least: int = 1) -> NDArray | N
     values = decoded(content, flags | (cv2.IMREAD_ANYDEPTH if header.white else 0))
     if values is None or not header.white:
         return values
-    full = 255 if content[:2] in PNM_OF_TEXT and values.dtype == np.uint8 else header.white
+    full = 255 if content[:2] in image_bytes.PNM_OF_TEXT and values.dtype == np.uint8 else header.white
     return np.rint(np.minimum(values / full, 1) * 255).astype(np.uint8)
 
 
@@ -375,7 +363,7 @@ def _opaque(values: NDArray, content: bytes, label: str, white: int) -> NDArray:
     full = white or (np.iinfo(values.dtype).max if np.issubdtype(values.dtype, np.integer) else 1.0)
     if (values[..., 3] != full).any():
         raise ValueError(f"{label}: has transparent pixels: flatten it and save it without alpha channel")
-    grey = content.startswith(PNG) and content[25] == GREY_WITH_ALPHA
+    grey = content.startswith(image_bytes.PNG) and content[25] == GREY_WITH_ALPHA
     return values[..., 0] if grey else values[..., :3]
 
 
@@ -396,9 +384,7 @@ def _counts(planes: NDArray, label: str, bits: int | None, white: int) -> NDArra
     """Scale integers to 0..1. Raises ValueError for values beyond the stated bits."""
     stored, largest = max(white.bit_length(), 8), int(planes.max())
     if bits and bits > stored:
-        raise ValueError(
-            f"{label}: has {stored} bits a value, the rig says {bits}: correct 'bits', or give the raw file"
-        )
+        raise ValueError(f"{label}: has {stored} bits a value, the rig says {bits}: correct 'bits'")
     if largest > white:
         raise ValueError(f"{label}: has values up to {largest}, its header says {white}: save it again")
     few = 0 < largest < 2**12 or HIGHLIGHTS <= largest < 2**14

@@ -47,8 +47,7 @@ def in_srgb(values: NDArray, content: bytes, label: str) -> NDArray:
         if "srgb" in name.lower() and "linear" not in name.lower():
             return values
         if values.dtype != np.uint8:
-            text = f"{label}: colour profile '{name}' is ignored, as values have 16 bits: save it in sRGB"
-            warn(text)
+            warn(f"{label}: colour profile '{name}' is ignored, as values have 16 bits: save it in sRGB")
             return values
         converted = _converted(values, opened)
     except (ImageCms.PyCMSError, OSError, ValueError) as error:
@@ -76,8 +75,7 @@ def _converted(values: NDArray, profile: ImageCms.ImageCmsProfile) -> NDArray:
     image = Image.fromarray(values if grey else np.ascontiguousarray(values[..., ::-1]))
     srgb = ImageCms.createProfile("sRGB")
     intent = ImageCms.Intent.RELATIVE_COLORIMETRIC
-    converted = ImageCms.profileToProfile(image, profile, srgb, intent, outputMode="RGB")
-    colours = np.asarray(converted)
+    colours = np.asarray(ImageCms.profileToProfile(image, profile, srgb, intent, outputMode="RGB"))
     return colours[..., 1].copy() if grey else colours[..., ::-1]
 
 

@@ -58,8 +58,7 @@ class RecordedTags(NamedTuple):
         """
         content = bytearray(path.read_bytes())
         first = int.from_bytes(content[4:8], "little")
-        count = int.from_bytes(content[first : first + 2], "little")
-        end = first + 2 + ENTRY * count
+        end = first + 2 + ENTRY * int.from_bytes(content[first : first + 2], "little")
         entries = [bytes(content[i : i + ENTRY]) for i in range(first + 2, end, ENTRY)]
         for tag, values in self.directories.items():
             directory = TiffImagePlugin.ImageFileDirectory_v2(group=tag)
@@ -117,8 +116,7 @@ def packet_of_bands(packet: bytes, bands: Sequence[str], wavelengths: Sequence[f
         return b""
     listed = dict(zip(LISTED, (bands, [] if None in wavelengths else [f"{w:g}" for w in wavelengths])))
     for described in root.iter(f"{RDF}Description"):
-        keys = [*described.attrib, *(child.tag for child in described)]
-        for key in dict.fromkeys(keys):
+        for key in dict.fromkeys([*described.attrib, *(child.tag for child in described)]):
             uri, _, name = key.removeprefix("{").partition("}")
             maker = next((maker for maker in (PIX4D, DJI, MICASENSE) if maker in uri), None)
             of_one = maker == MICASENSE and name != "CaptureId"

@@ -105,8 +105,7 @@ def read_video(path: str | Path) -> Video:
 GREY_ROUNDED = 4 / 255
 """Colour difference to which codecs round grey: for MPEG-4 in OpenCV's conversion, 3 counts of 255."""
 CONTRAST = 10.0
-"""Ratio of brightness range to colour difference above which a picture counts as grey: a black
-one does not."""
+"""Ratio of brightness range to colour difference above which a picture is grey: a black one is not."""
 
 
 def is_grey(image: Float[Tensor, "3 h w"]) -> bool:

@@ -22,8 +22,7 @@ CURVE = 65
 SMOOTHED = 7
 """Side in pixels of the window over which the signal is averaged."""
 SIDE, GROUPS, FEWEST = 12, 16, 40
-"""Blocks for the estimate: their side in pixels, number of groups of about equal value, least blocks in a
-group."""
+"""Blocks for the estimate: their side in pixels, groups of about equal value, least blocks in a group."""
 SMOOTHEST, SHARE = 0.05, 0.677
 """Quantile of a group's variances that stands for noise alone, and its ratio to the variance of white noise
 (measured on 40,000 blocks of it)."""
@@ -139,9 +138,7 @@ class NoiseLevel:
         value, mean, _ = self._curves(image)
         return image + _interpolated(_smoothed(_smoothed(image)), mean, value - mean)
 
-    def _curves(
-        self, like: Tensor
-    ) -> tuple[Float[Tensor, "b n"], Float[Tensor, "b n"], Float[Tensor, "b n"]]:
+    def _curves(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Ideal values with mean and deviation of their recorded values, for noise taken as normal."""
         value = torch.linspace(0, 1, CURVE, device=like.device).to(like)
         normal = torch.special.ndtri((torch.arange(CURVE, device=like.device).to(like) + 0.5) / CURVE)
@@ -181,9 +178,7 @@ def _smoothest(image: Float[Tensor, "1 c h w"]) -> tuple[Float[Tensor, " n"], Fl
     return torch.stack([*values, mean.new_zeros(())])[:-1], torch.stack([*variances, mean.new_zeros(())])[:-1]
 
 
-def _fitted(
-    added_to: AddedTo, value: Float[Tensor, " n"], variance: Float[Tensor, " n"]
-) -> tuple[NoiseLevel, float]:
+def _fitted(added_to: AddedTo, value: Tensor, variance: Tensor) -> tuple[NoiseLevel, float]:
     """Noise level by least squares of relative errors, and its mean squared logarithmic error."""
     signal, slope = value, torch.ones_like(value)
     if added_to == "light":
@@ -195,6 +190,5 @@ def _fitted(
     free = torch.linalg.lstsq(design, wanted).solution
     design = design * (free >= 0).mT  # what would be negative is 0, and the other is fitted alone
     shot, read = torch.linalg.lstsq(design, wanted, driver="gelsd").solution.clamp(min=0)[:, 0].tolist()
-    predicted = design @ design.new_tensor([shot, read])
-    error = float(predicted.clamp(min=1e-6).log().square().mean())
+    error = float((design @ design.new_tensor([shot, read])).clamp(min=1e-6).log().square().mean())
     return NoiseLevel(shot, math.sqrt(read), added_to), error

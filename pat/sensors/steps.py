@@ -144,41 +144,29 @@ def _area_weights(old: int, new: int) -> Tensor:
 
 @dataclass(frozen=True)
 class Noise(Step):
-    """Shot and read noise on linear values; the result is not clipped.
+    """Shot and read noise on linear values, from a normal distribution of variance signal + read^2.
+
+    The result is not clipped, and differentiable.
 
     Attributes:
         full_well: electrons at value 1, more than 0.
         read: standard deviation of the read noise in electrons, 0 or more.
-        counts: "gaussian" draws from a normal distribution of variance signal + read² and is differentiable;
-            "poisson" counts electrons, which differs visibly below about ten of them, with the gradient of
-            the mean.
-
     Raises:
-        ValueError: for numbers outside these ranges or NaN, or other counts.
+        ValueError: for numbers outside these ranges or NaN.
     """
 
     full_well: float
     read: float = 0.0
-    counts: Literal["gaussian", "poisson"] = "gaussian"
 
     def __post_init__(self) -> None:
         if not (self.full_well > 0 and self.read >= 0):
             got = f"{self.full_well:g} and {self.read:g}"
             raise ValueError(f"noise: wanted full_well > 0 and read >= 0 electrons, got {got}")
-        if self.counts not in ("gaussian", "poisson"):
-            raise ValueError(f"noise: counts is 'gaussian' or 'poisson', got {self.counts!r}")
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
-        if self.counts == "poisson":
-            return self._counted(image, generator)
+
         variance = (image.clamp(min=0) * self.full_well + self.read**2) / self.full_well**2
         return image + (variance + 1e-20).sqrt() * normal(image.shape, image, generator)
-
-    def _counted(self, image: Tensor, generator: Generator) -> Tensor:
-        expected = (image.detach().clamp(min=0) * self.full_well).to(generator.device)
-        electrons = torch.poisson(expected, generator=generator).to(image)
-        electrons = electrons + self.read * normal(image.shape, image, generator)
-        return image + (electrons / self.full_well - image).detach()
 
 
 @dataclass(frozen=True)
@@ -356,7 +344,5 @@ def _same_size(image: Tensor, steps: Sequence[Step], generator: Generator, name:
     degraded = record(image, steps, generator)
     if degraded.shape != image.shape:
         old, new = tuple(image.shape[1:]), tuple(degraded.shape[1:])
-        raise ValueError(
-            f'case "{name}" changes {old} to {new}; the cases of a batch must keep the size: add a Resample'
-        )
+        raise ValueError(f'case "{name}" changes {old} to {new}, and a batch has one size: add a Resample')
     return degraded

@@ -77,9 +77,8 @@ def conv(inputs: int, outputs: int, *, stride: int = 1) -> nn.Sequential:
     Returns:
         The two layers in sequence, with padding 1: (b, inputs, h, w) to (b, outputs, h / stride, w / stride).
     """
-    return nn.Sequential(
-        nn.Conv2d(inputs, outputs, 3, stride=stride, padding=1), nn.LeakyReLU(0.1, inplace=True)
-    )
+    convolution = nn.Conv2d(inputs, outputs, 3, stride=stride, padding=1)
+    return nn.Sequential(convolution, nn.LeakyReLU(0.1, inplace=True))
 
 
 def channels_last(x: Float[Tensor, "b d h w"]) -> Float[Tensor, "b d h w"]:

@@ -209,9 +209,7 @@ LINE_EVERY = 30.0
 """Seconds between lines of progress without a terminal."""
 
 
-def followed(
-    outcomes: Iterable[T], *, title: str, total: int, done: int = 0, console: Console
-) -> Iterator[T]:
+def followed(outcomes: Iterable[T], *, title: str, total: int, done: int, console: Console) -> Iterator[T]:
     """Show the progress of outcomes while they are consumed: a bar on a terminal, else a line now and then.
 
     Args:

@@ -43,9 +43,7 @@ def parse_bytes(amount: float | str) -> float:
         size = math.nan
     if not LEAST <= size < math.inf:
         meant = f": is {number}GiB meant?" if 0 < size < LEAST and unit == "B" else ""
-        raise ValueError(
-            f"max_memory: '{amount}' is no memory for a process: give bytes, as 4GiB or 500MB{meant}"
-        )
+        raise ValueError(f"max_memory: '{amount}' is no memory: give bytes, as 4GiB or 500MB{meant}")
     return size
 
 

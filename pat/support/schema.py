@@ -10,6 +10,8 @@ import math
 import types
 import typing
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -25,17 +27,14 @@ def to_document(value: Any, *, defaults: bool = False) -> Any:
     Returns:
         The document, ready for YAML or JSON.
     """
+    plain = partial(to_document, defaults=defaults)
     if dataclasses.is_dataclass(value):
         entries = {f: getattr(value, f.name) for f in dataclasses.fields(value)}
-        return {
-            f.name: to_document(v, defaults=defaults)
-            for f, v in entries.items()
-            if defaults or v != _default(f)
-        }
+        return {f.name: plain(v) for f, v in entries.items() if defaults or v != _default(f)}
     if isinstance(value, tuple | list):
-        return [to_document(v, defaults=defaults) for v in value]
+        return [plain(v) for v in value]
     if isinstance(value, dict):
-        return {k: to_document(v, defaults=defaults) for k, v in value.items()}
+        return {k: plain(v) for k, v in value.items()}
     return str(value) if isinstance(value, Path) else value
 
 
@@ -189,12 +188,13 @@ def _read_plain(kind: Any, value: Any, entry: str) -> Any:
     the entry."""
     if kind is Any:
         return value
+    if kind in (int, float) and isinstance(value, str):
+        with suppress(ValueError):
+            value = float(value)
     if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
         if math.isnan(value):
             raise ValueError(f"{entry}: is NaN; wanted a number")
         return float(value)
-    if kind in (int, float) and isinstance(value, str) and _is_number(value):
-        value = float(value)
     if kind is int and isinstance(value, float) and value.is_integer():
         value = int(value)
     if kind is int and isinstance(value, int) and abs(value) >= 2**63:
@@ -209,16 +209,29 @@ def _read_plain(kind: Any, value: Any, entry: str) -> Any:
 _PLAIN = {float: "a number", int: "a whole number", str: "text", bool: "true or false", Path: "a path"}
 
 
-def _is_number(text: str) -> bool:
-    """True for text that is a number, also inf, which YAML reads as text."""
-    try:
-        return not math.isnan(float(text))
-    except ValueError:
-        return False
-
-
 def _below(entry: str, key: object) -> str:
     return f"{entry}.{key}" if entry else str(key)
+
+
+def check_fields(config: Any, names: str, least: float, most: float = math.inf, above: bool = False) -> None:
+    """Check that numbers of a dataclass are in a range.
+
+    Args:
+        config: instance of the dataclass.
+        names: names of the fields, with spaces between.
+        least: lower bound.
+        most: upper bound.
+        above: True to exclude `least`.
+
+    Raises:
+        ValueError: naming the first field that is outside, or NaN.
+    """
+    for name in names.split():
+        value = getattr(config, name)
+        if not least <= value <= most or (above and value == least):
+            wanted = f"{'more than' if above else 'at least'} {least:g}"
+            wanted = wanted if most == math.inf else f"from {least:g} to {most:g}"
+            raise ValueError(f"{name} must be {wanted}, got {value:g}")
 
 
 def near(name: object, choices: Iterable[object]) -> str:

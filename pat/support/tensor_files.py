@@ -17,9 +17,7 @@ from arraygeom.runtime.atomic import write_atomically
 Network = TypeVar("Network", bound=nn.Module)
 
 
-def write_tensors(
-    path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None
-) -> None:
+def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str] = {}) -> None:
     """Write tensors and metadata to a safetensors file, atomically, with a digest of the tensors.
 
     Args:
@@ -31,7 +29,7 @@ def write_tensors(
     whole = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     try:
         with write_atomically(path) as temporary:
-            save_file(whole, temporary, {**(metadata or {}), DIGEST: digest(whole)})
+            save_file(whole, temporary, {**metadata, DIGEST: digest(whole)})
     except SafetensorError as error:
         raise OSError(f"{path}: {' '.join(str(error).split())}") from None
 

@@ -14,7 +14,6 @@ from statistics import median
 
 import torch
 
-from arraygeom.fields import named_field
 from pat.app.cli.parser import script
 from pat.lab.evaluation.ablation import sample_photographs
 from pat.lab.training.config import TrainConfig, load_config
@@ -26,7 +25,7 @@ from tests.benchmarks.printed import spread, timed
 
 
 def source(config: TrainConfig) -> SampleSource:
-    return source_of(config, sample_photographs(), 0, named_field(config.field))
+    return source_of(config, sample_photographs(), 0)
 
 
 def stepped(objective: Objective, given: Sample, repeats: int) -> list[float]:

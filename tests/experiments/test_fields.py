@@ -9,7 +9,6 @@ from arraygeom import Dense, Epipolar, EpipolarLine, Rectified, sample
 from arraygeom.fields.grid import FieldOnGrid
 from experiments.evaluation.fields import (
     FieldRow,
-    drawn_peaks,
     evaluate_fields,
     fields_markdown,
     fields_of,
@@ -103,20 +102,6 @@ def test_a_network_of_several_betas_gets_a_band_each(pair):
     two = PAT(PATConfig(betas=2, in_channels=1, dim=8))
     rows = evaluate_fields(two, [case], fields=lambda max_displacement: {"epipolar": Epipolar()})
     assert rows[0].note == "this PAT is made for 2 betas, got 3"
-
-
-def test_drawn_peaks_are_red_where_the_table_counts_them_wrong(network, pair):
-    case = next(rectified_cases([pair]))
-    row = evaluate_fields(network, [case], fields=lambda max_displacement: {"epipolar": Epipolar()})[0]
-    alpha, true, found, off = drawn_peaks(network, [case]).values()
-    red = (off == torch.tensor([1.0, 0, 0])[:, None, None]).all(0)
-    known = case.scene.visible
-    assert int(red.sum()) == round((1 - row.peaks) * int(known.sum()))
-    assert (off[:, ~red] == alpha.expand(3, -1, -1)[:, ~red]).all()
-    assert (true[:, ~known] == 0).all()
-    drawn = true[:, known]
-    assert (drawn == drawn[:, :1]).all()  # the parallax is 5 pixels everywhere
-    assert found.std() > 0.1
 
 
 def test_weights_for_two_bands_are_refused_at_once(tmp_path, refusal):

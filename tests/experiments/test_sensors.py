@@ -124,7 +124,7 @@ mono:
   - spectral: luminance
   - motion-blur: {shutter: 0.01, velocity: [300, 0]}
   - resample: 0.5
-  - noise: {full_well: 8e3, read: 3, counts: poisson}
+  - noise: {full_well: 8e3, read: 3}
   - clip
   - quantise: 12
 blue:
@@ -139,7 +139,7 @@ def test_a_file_says_what_each_camera_does():
     chains = read_chains(yaml.safe_load(TEXT))
     assert chains["mono"] == (
         *(DecodeSRGB(), Spectral("luminance"), MotionBlur(0.01, (300.0, 0.0)), Resample(0.5)),
-        *(Noise(8000.0, 3.0, "poisson"), Clip(), Quantise(12)),
+        *(Noise(8000.0, 3.0), Clip(), Quantise(12)),
     )
     assert chains["blue"] == (
         *(Spectral(Band(450.0, 40.0)), Resample((10, 12), "bicubic")),

@@ -178,10 +178,10 @@ def test_a_bit_that_changed_in_a_checkpoint_or_in_weights_is_seen(tmp_path):
 def test_a_checkpoint_of_another_network_or_optimiser_is_refused(tmp_path):
     checkpoint = collect(*cases.training(), FACTS)
     tensors = {name: t for name, t in checkpoint.tensors.items() if not name.startswith("average")}
-    with pytest.raises(ValueError, match="to another network"):
+    with pytest.raises(ValueError, match="another network"):
         restore(checkpoint._replace(tensors=tensors), *cases.training())
     for name in ("optimiser/x/exp_avg", "optimiser/0/exp_avg", "optimiser/99/step"):
-        with pytest.raises(ValueError, match="to another optimiser"):
+        with pytest.raises(ValueError, match="another optimiser"):
             restore(
                 checkpoint._replace(tensors=checkpoint.tensors | {name: torch.ones(3)}), *cases.training()
             )

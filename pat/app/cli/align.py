@@ -49,8 +49,7 @@ class Align(Around):
 
     out: Out = Path("out")
     """Folder for aligned.tif (all bands, with names and wavelengths), NAME_visibility.png (255 seen, 128
-    occluded, 0 beyond the edge), NAME_confidence.png, NAME_positions.npy, depth.tif, visibility.txt and
-    index.html."""
+    occluded, 0 outside), NAME_confidence.png, NAME_positions.npy, depth.tif, visibility.txt, index.html."""
     interpolation: Literal["nearest", "bilinear", "cubic"] = "bilinear"
     """Interpolation between recorded values; nearest keeps them."""
     confidence: float = 0.5
@@ -129,16 +128,8 @@ class Align(Around):
             again = i or flight
             images = ViewFiles(array.recorded, paths, alpha=array.alpha) if again else array.images
             name = _name_of(files, array.alpha, paths)
-            yield _Frame(
-                array.rig,
-                array.recorded,
-                images,
-                paths,
-                array.alpha,
-                array.notes,
-                name,
-                rig_found=array.lasting is not None,
-            )
+            found = array.lasting is not None
+            yield _Frame(array.rig, array.recorded, images, paths, array.alpha, array.notes, name, found)
 
     def _align(self, frame: _Frame) -> None:
         """Align a frame, write its files and print the summary."""
@@ -152,14 +143,15 @@ class Align(Around):
         begin = time.monotonic()
         options.say_when_compiling()
         with folder_lock(self.out):
-            if frame.name:
-                self._refuse_several()
+            if frame.name and self.around is not None:
+                raise UsageError("--around", "a single frame: give one image of each camera")
             sweep(self.out)
             separate = "separate" in self._extras
             refuse_to_replace(self.out, frame.recorded.names, separate=separate, name=frame.name)
             aligned = self._aligned(frame)
-            shown = "page" in self._extras and not frame.name
-            page = self._page(aligned, frame, time.monotonic() - begin) if shown else None
+            pages = {}
+            if "page" in self._extras and not frame.name:
+                pages["index.html"] = self._page(aligned, frame, time.monotonic() - begin)
             written = save_aligned(
                 aligned,
                 self.out,
@@ -168,7 +160,7 @@ class Align(Around):
                 name=frame.name,
                 keep=frame.files.values(),
                 recorded=RecordedFiles(frame.recorded, frame.files),
-                pages={} if page is None else {"index.html": page},
+                pages=pages,
             )
             if frame.rig_found:
                 write_listed(self.out / FOUND_RIG, write(frame.recorded))
@@ -176,11 +168,6 @@ class Align(Around):
         prefix = f"{frame.name}_" if frame.name else ""
         print((self.out / f"{prefix}visibility.txt").read_text(), end="")
         say(f"written to {self.out}: {', '.join(path.name for path in written)}")
-
-    def _refuse_several(self) -> None:
-        """Raise UsageError for --around with several frames."""
-        if self.around is not None:
-            raise UsageError("--around", "a single frame: give one image of each camera")
 
     def _aligned(self, frame: _Frame) -> Aligned:
         """Align a frame, with the plan and a bar on the terminal."""
@@ -208,8 +195,7 @@ class Align(Around):
         from ..report import Facts
 
         texts = [str(message) for message in options.WARNED]
-        facts = Facts((*self._notes, *frame.notes), texts, seconds)
-        return aligned_page(aligned, frame.recorded, facts)
+        return aligned_page(aligned, frame.recorded, Facts((*self._notes, *frame.notes), texts, seconds))
 
 
 @dataclass(frozen=True)

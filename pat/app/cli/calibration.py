@@ -35,9 +35,7 @@ class Calibrate:
 
     photos: Annotated[Path, Option("FOLDER", positional=True)]
     """Folder with the images (or videos) of all cameras."""
-    board: Annotated[
-        tuple[str, ...], Option("BOARD", f"Once for each board in the images: {BOARDS}", repeat=True)
-    ] = ()
+    board: Annotated[tuple[str, ...], Option("BOARD", f"Once for each board: {BOARDS}", repeat=True)] = ()
     out: Out = Path("rig.yaml")
     """The rig file; its report (.html) and covariance (.covariance.json) are written beside it."""
     camera: Annotated[tuple[str, ...], Option("NAME=PATTERN", repeat=True)] = ()
@@ -115,9 +113,7 @@ class PrintBoard:
     board: BoardName
     out: Out = Path("board.pdf")
     """File to write, ending in .pdf or .svg."""
-    paper: Annotated[
-        Literal["A4", "letter", "A3", "A2", "A1", "A0"] | None, Option("{A4,letter,A3,A2,A1,A0}")
-    ] = None
+    paper: Literal["A4", "letter", "A3", "A2", "A1", "A0"] | None = None
     """Sheet to centre the board on; without it the page is as large as the board with its margin."""
 
     def run(self) -> None:

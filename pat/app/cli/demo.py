@@ -54,10 +54,8 @@ class Demo:
         columns: dict[str, dict[str, str]] = {}
         for name, (array, noise) in arrays.items():
             say(f"{name}: classical fusion")
-            methods = {
-                "alpha alone": array.images[ALPHA].expand(3, -1, -1),
-                **classical_methods(network, array, noise),
-            }
+            alone = array.images[ALPHA].expand(3, -1, -1)
+            methods = {"alpha alone": alone, **classical_methods(network, array, noise)}
             say(f"{name}: fusion with the network '{self.network}'")
             settings = FuseSettings(noise=noise)
             frame = fuse_with_progress(self.network, array.rig, array.images, alpha=ALPHA, settings=settings)

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
     from ...fusion.frame import Frame
     from ..from_images import ImageArray
-    from ..report import Facts
 
 LOG = logging.getLogger(__name__)
 EXTRAS = "page", "classical", "points", "none"
@@ -54,7 +53,7 @@ class Fuse(Around, Fusing):
     """Folder for fused.png, confidence.png, depth.tif, depth_16.png (16 bits; 0 is unknown), depth.png,
     depth_nearest.tif and depth_farthest.tif (the true depth is between them in 9 of 10 pixels; not by
     assumed focal lengths), index.html (a page that shows them) and view.yaml (the rig of the fused view)."""
-    exposure: Annotated[Literal["auto", "keep"] | None, Option("{auto,keep}")] = None
+    exposure: Literal["auto", "keep"] | None = None
     """Brightness of the fused image: auto makes a dark or overexposed one as bright as a photograph; keep
     leaves it as alpha has it. By default auto without a rig, else keep."""
     extras: Annotated[str, Option("NAME[,NAME]")] = "page"
@@ -94,9 +93,7 @@ class Fuse(Around, Fusing):
         """
         if several := [name for name, paths in files.items() if len(paths) > 1]:
             count = len(files[several[0]])
-            raise UsageError(
-                several[0], "one image; `pat batch` and `pat sequence` fuse many", f"{count} images"
-            )
+            raise UsageError(several[0], "one image; `pat batch` fuses many", f"{count} images")
         return files
 
     def _fuse(self, frame: Recordings) -> None:
@@ -109,11 +106,9 @@ class Fuse(Around, Fusing):
         from ...media.raw import developed_rig
         from ...support.locks import folder_lock
 
-        begin, alpha, found = time.monotonic(), frame.alpha, frame.found
+        alpha, found, self._begin = frame.alpha, frame.found, time.monotonic()
         if "points" in self._extras and not isinstance(frame.rig[alpha], Camera):
-            raise UsageError(
-                "--extras points", "a calibrated alpha, and the rig has only F for it: leave it out"
-            )
+            raise UsageError("--extras points", "a calibrated alpha, and its camera has F alone")
         with folder_lock(self.out):
             sweep(self.out)
             refuse_to_replace(self.out)
@@ -129,8 +124,7 @@ class Fuse(Around, Fusing):
                 self.note(no_depth(rig, alpha))
             further, pages = self._options_of_saving(fused, rig, frame), {}
             if {"page", "classical"} & self._extras:
-                facts = self._facts(rig, () if found is None else found.notes, time.monotonic() - begin)
-                pages["index.html"] = self._page(fused, rig, images, alpha, facts, gain)
+                pages["index.html"] = self._page(fused, rig, images, frame, gain)
             written = save_frame(fused, self.out, along=along, pages=pages, **further)
             shutil.rmtree(self.tiles, ignore_errors=True)
         say(f"written to {self.out}: {', '.join(path.name for path in written)}")
@@ -186,41 +180,31 @@ class Fuse(Around, Fusing):
             "bands": bands,
         }
 
-    def _facts(self, rig: Rig, adopted: tuple[str, ...], seconds: float) -> Facts:
-        """Notes, warnings and figures of the page."""
+    def _page(
+        self, frame: Frame, rig: Rig, images: Mapping[str, Tensor], given: Recordings, gain: float
+    ) -> str:
+        """HTML of index.html; with the classical baseline if requested, as bright as the fused image, and a
+        message if the cameras do not allow it."""
         from arraygeom.runtime.text import length_unit
 
         from ...support.memory import peak_memory
-        from ..report import Facts
+        from ..report import LONGEST, Facts, report_page
 
-        notes = [f"network: {self.network or 'mono-colour'}", *self._notes, *adopted]
+        alpha, found = given.alpha, given.found
+        notes = [f"network: {self.network or 'mono-colour'}", *self._notes, *(found.notes if found else ())]
         warned = [str(message) for message in options.WARNED]
-        return Facts(notes, warned, seconds, peak_memory(), length_unit(rig))
-
-    def _page(
-        self, frame: Frame, rig: Rig, images: Mapping[str, Tensor], alpha: str, facts: Facts, gain: float
-    ) -> str:
-        """HTML of index.html, with the classical baseline if requested."""
-        from ..report import report_page
-
+        facts = Facts(notes, warned, time.monotonic() - self._begin, peak_memory(), length_unit(rig))
         if "classical" in self._extras:
-            facts = facts._replace(classical=self._classical(rig, images, alpha, gain))
+            from ...fusion.classical import classical_view
+            from ...media.colour import exposed
+
+            try:
+                with options.working("classical baseline"):
+                    view = classical_view(rig, images, alpha, longest=LONGEST)
+                facts = facts._replace(classical=exposed(view, gain))
+            except ValueError as error:
+                say(f"no classical baseline: {error}")
         return report_page(frame, images, rig, alpha, facts)
-
-    def _classical(self, rig: Rig, images: Mapping[str, Tensor], alpha: str, gain: float) -> Tensor | None:
-        """Classical baseline, as bright as the fused image; None, and a message, if the cameras do not allow
-        it."""
-        from ...fusion.classical import classical_view
-        from ...media.colour import exposed
-        from ..report import LONGEST
-
-        try:
-            with options.working("classical baseline"):
-                view = classical_view(rig, images, alpha, longest=LONGEST)
-                return exposed(view, gain)
-        except ValueError as error:
-            say(f"no classical baseline: {error}")
-            return None
 
     def _exposed(self, frame: Frame, found: ImageArray | None) -> tuple[Frame, float]:
         """Frame with the requested brightness, and the factor of light."""
@@ -248,12 +232,7 @@ def no_depth(rig: Rig, alpha: str) -> str:
 
 
 def fuse_with_progress(
-    weights: str,
-    rig: Rig,
-    images: Mapping[str, Tensor],
-    *,
-    device: str = "cpu",
-    **further: Any,
+    weights: str, rig: Rig, images: Mapping[str, Tensor], *, device: str = "cpu", **further: Any
 ) -> Frame:
     """Fuse with weights by name, showing the plan and a bar on the terminal.
 

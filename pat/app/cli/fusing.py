@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
 
 from ...media.suffixes import IMAGE_SUFFIXES, VIDEO_SUFFIXES
 from . import options
@@ -70,6 +70,8 @@ class Fusing(Known):
     format: Format = "png"
     """Format of the fused image and bits a channel: by default 16 if an image has more than 8; tif32 and exr
     hold linear light as floats."""
+
+    takes_videos: ClassVar[bool] = False
 
     @property
     def kind(self) -> Literal["png", "tif", "exr"]:
@@ -162,7 +164,7 @@ class Fusing(Known):
         """Images with the rig found from the first ones; frames of videos go to a folder."""
         from ...support.locks import folder_lock
         from ..batch import find_images
-        from ..from_images import camera_names, frames_of_videos
+        from ..from_images import camera_names, video_frames
 
         if self.depth:
             raise UsageError("--depth", "a rig: give one with --rig RIG")
@@ -180,8 +182,9 @@ class Fusing(Known):
         files: Files
         rates: Mapping[str, float] = {}
         if videos:
-            self.refuse_videos(videos)
-            files, rates = frames_of_videos(cameras, folder)
+            if not self.takes_videos:
+                raise UsageError(f"{videos[0]}", "images; `pat sequence` takes videos")
+            files, rates = video_frames(cameras, folder)
         else:
             files = {name: find_images(path) for name, path in cameras.items()}
             refuse_same(files)
@@ -193,14 +196,6 @@ class Fusing(Known):
     def known_files(self) -> list[Path]:
         """Return further files that the options name."""
         return []
-
-    def refuse_videos(self, videos: Sequence[Path]) -> None:
-        """Refuse videos; overridden for sequences.
-
-        Raises:
-            UsageError: always.
-        """
-        raise UsageError(f"{videos[0]}", "images; `pat sequence` takes videos")
 
     def _checked(self, files: Files) -> Files:
         """Files of the frames. Raises ValueError for files where results would go."""
@@ -336,9 +331,7 @@ def refuse_same(files: Mapping[str, Sequence[Path]]) -> None:
     """
     for (a, (first, *_)), (b, (second, *_)) in combinations(files.items(), 2):
         if first.is_file() and second.is_file() and filecmp.cmp(first, second, shallow=False):
-            raise ValueError(
-                f"the images of '{a}' and '{b}' are the same image, {second}: give each camera its own"
-            )
+            raise ValueError(f"'{a}' and '{b}' have the same image, {second}: give each camera its own")
 
 
 def is_named(path: Path) -> bool:

@@ -60,9 +60,8 @@ class Known:
     depth: Depth = None
     """Near and far bounds in metres, instead of the rig's; far may be inf."""
     misfit: Literal["correct", "warn", "refuse"] = "correct"
-    """If matches lie beside the rig's search segments: correct moves the segments to them, and warns where
-    images still do not fit; warn only warns; refuse corrects, and writes nothing where they still do not
-    fit."""
+    """If matches lie beside the rig's search segments: correct moves these, and warns where images still do
+    not fit; warn only warns; refuse corrects, and writes nothing where they still do not fit."""
     response: Annotated[str, Option("fit|rec601|R,G,B")] = "fit"
     """Weights of red, green and blue in a mono alpha; fit finds them from matches, with gain and gamma."""
     match_levels: bool = False
@@ -331,19 +330,16 @@ def _around_matches(
     from arraygeom.io.point_matches import read_matches
 
     fields = dict.fromkeys(rig.betas(alpha), field)
-    matches = read_matches(path, files, {name: rig[name].hw for name in files})
-    for names, points in matches.items():
+    for names, points in read_matches(path, files, {name: rig[name].hw for name in files}).items():
         if alpha not in names:
             continue
         (a, b) = (names, points) if names[0] == alpha else (names[::-1], points[::-1])
-        alpha_view, beta_view = rig[a[0]], rig[a[1]]
-        assert isinstance(alpha_view, LensView)
+        view, beta_view = rig[a[0]], rig[a[1]]
+        assert isinstance(view, LensView)
         assert isinstance(beta_view, LensView)
         if rig.pair(*a).calibrated:
             _check_matches(path, a, rig.pair(*a), *b)
-        fields[a[1]] = AroundMatches.from_points(
-            *b, alpha_view.hw, views=(alpha_view, beta_view), field=field
-        )
+        fields[a[1]] = AroundMatches.from_points(*b, view.hw, views=(view, beta_view), field=field)
     return fields
 
 

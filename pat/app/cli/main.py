@@ -24,16 +24,8 @@ class Lab:
 
     # By name: the lab uses all rooms, and none of them imports it.
     commands: ClassVar[Mapping[str, Any]] = {
-        name: f"pat.lab.commands:{command}"
-        for name, command in {
-            "train": "Train",
-            "render": "Render",
-            "evaluate": "Evaluate",
-            "ablate": "Ablate",
-            "data": "Data",
-            "settings": "Settings",
-            "weights": "WeightsCommands",
-        }.items()
+        name: f"pat.lab.commands:{name.capitalize()}"
+        for name in ("train", "render", "evaluate", "ablate", "data", "settings", "weights")
     }
 
 

@@ -10,7 +10,7 @@ import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from tempfile import TemporaryFile
 from threading import Lock
@@ -35,10 +35,7 @@ WEIGHT_NAMES = tuple(sorted(path.stem for path in SHIPPED.glob("*.safetensors"))
 
 FIELD_NAMES = ("epipolar", "line", "homography", "rectified", "nearest", "local", "dense", "curved")
 """Keys of `arraygeom.fields.FIELDS`, whose import takes torch."""
-FIELD_HELP = (
-    f"Receptive field in the other cameras: {', '.join(FIELD_NAMES)}, or MODULE:OBJECT for your own; "
-)
-FIELD_HELP += "auto takes what the rig allows."
+FIELD_HELP = f"Receptive field: auto (as the rig allows), {', '.join(FIELD_NAMES)}, or MODULE:OBJECT."
 FieldName = Annotated[str, Option("NAME", FIELD_HELP)]
 
 
@@ -56,13 +53,9 @@ def response_of(text: str) -> Any:
     try:
         red, green, blue = (float(number) for number in text.split(","))
     except ValueError:
-        raise ValueError(
-            f"--response: '{text}' is neither 'fit' nor 'rec601' nor R,G,B, such as 0.33,0.33,0.33"
-        ) from None
+        raise ValueError(f"--response: expected fit, rec601 or R,G,B, as .3,.4,.3, got '{text}'") from None
     if not 0.8 <= red + green + blue <= 1.25:  # an exposure is fitted or stated, not a part of the weights
-        raise ValueError(
-            f"--response: {text} add up to {red + green + blue:.3g}: give weights that add up to 1"
-        )
+        raise ValueError(f"--response: {text} add up to {red + green + blue:.3g}: they must add up to 1")
     return red, green, blue
 
 
@@ -86,18 +79,14 @@ def noise_of(texts: Iterable[str], *, by_default: bool = False) -> Any:
     if entries in (["estimate"], ["none"]):
         return None if entries == ["none"] else "estimate"
     if {"estimate", "none"} & {*entries}:
-        raise ValueError(
-            f"--noise: got {', '.join(entries)}: give estimate or none alone, or NAME=ELECTRONS of each"
-        )
+        raise ValueError(f"--noise: got {', '.join(entries)}: give estimate or none alone, or NAME=ELECTRONS")
     levels = []
     for entry in entries:
         name, _, numbers = entry.partition("=")
         try:
             electrons, *read = (float(number) for number in numbers.split(","))
         except ValueError:
-            raise ValueError(
-                f"--noise: '{entry}' is neither estimate nor none nor NAME=ELECTRONS[,READ], as mono=200,2"
-            ) from None
+            raise ValueError(f"--noise: got '{entry}': give estimate, none, NAME=ELECTRONS[,READ]") from None
         if (count := 1 + len(read)) > 2:
             raise ValueError(f"--noise: '{entry}' has {count} numbers; wanted electrons at white, read noise")
         levels.append((name, NoiseLevel.from_electrons(electrons, sum(read))))
@@ -154,9 +143,8 @@ def writable(out: Path, *, folder: bool = False, option: str = "--out") -> Path:
         ValueError: for a folder where a file is wanted, a file in the way, or no permission.
     """
     if out.exists() and out.is_dir() != folder:
-        raise ValueError(
-            f"{option}: {out} is a {'folder: name a file in it' if out.is_dir() else 'file: name a folder'}"
-        )
+        kind = "folder: name a file in it" if out.is_dir() else "file: name a folder"
+        raise ValueError(f"{option}: {out} is a {kind}")
     above = out if out.exists() else next(p for p in out.absolute().parents if p.exists())
     if above != out and not above.is_dir():
         raise ValueError(f"{option}: {above} is a file, so {out} cannot be made: give another path")
@@ -167,9 +155,7 @@ def writable(out: Path, *, folder: bool = False, option: str = "--out") -> Path:
         with TemporaryFile(dir=place):  # of a drive that is read-only, or as root, permissions say little
             return out
     except OSError as error:
-        raise ValueError(
-            f"{option}: {place} cannot be written to ({error.strerror}): give another path, or permission"
-        ) from None
+        raise ValueError(f"{option}: {place} cannot be written to ({error.strerror}): change it") from None
 
 
 def device_of(name: str) -> str:
@@ -242,9 +228,7 @@ def load_rig_or_say_no_image(path: Path, depth: tuple[float, float] | None) -> R
     try:
         return load_rig(path, depth)
     except UnknownRigFormat:
-        raise ValueError(
-            f"{path}: {NO_IMAGE}; nor is it a rig file (`pat rig convert --help` names formats)"
-        ) from None
+        raise ValueError(f"{path}: {NO_IMAGE}; nor is it a rig (see `pat rig convert --help`)") from None
 
 
 def refuse_missing(path: Path, *, rig: bool) -> None:
@@ -347,9 +331,7 @@ def by_frame(files: Mapping[str, Sequence[Path]]) -> list[dict[str, Path]]:
     counts = {name: len(paths) for name, paths in files.items()}
     if len(set(counts.values())) > 1:
         listed = ", ".join(f"'{name}' {count}" for name, count in counts.items())
-        raise ValueError(
-            f"every camera needs an image of every frame; there are {listed}: give each camera as many"
-        )
+        raise ValueError(f"every camera needs an image of every frame; there are {listed}: give each as many")
     return [dict(zip(files, paths)) for paths in zip(*files.values())]
 
 
@@ -360,9 +342,7 @@ def _named_file(option: str, text: str) -> tuple[str, Path]:
     file = path or text
     if not Path(file).suffix:
         raise ValueError(f"{option}: expected NAME=FILE, as mono=a.png, got '{text}'")
-    raise ValueError(
-        f"{option} {text}: which camera is it of? Give NAME=FILE, such as {Path(file).stem}={file}"
-    )
+    raise ValueError(f"{option} {text}: of which camera? Give NAME=FILE, such as {Path(file).stem}={file}")
 
 
 def _named_number(option: str, text: str) -> tuple[str, float]:
@@ -434,11 +414,9 @@ def working(title: str) -> Iterator[Callable[[str], None]]:
 
     from ...support.steps import steps_shown
 
-    title_column, step_column = (
-        TextColumn(text, markup=False) for text in ("{task.description}", "{task.fields[step]}")
-    )
+    text = partial(TextColumn, markup=False)
     title = printable(title)
-    columns = SpinnerColumn(), title_column, TimeElapsedColumn(), step_column
+    columns = SpinnerColumn(), text("{task.description}"), TimeElapsedColumn(), text("{task.fields[step]}")
     terminal, printed = console().is_terminal, time.monotonic()
     with Progress(*columns, console=console(), transient=True, disable=not terminal) as bar:
         task = bar.add_task(title, total=None, step="")

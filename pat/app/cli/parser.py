@@ -39,7 +39,6 @@ class UsageError(ValueError):
     """
 
     def __init__(self, option: str, expected: str, got: object = None, *, text: str = "") -> None:
-        self.option, self.expected, self.got = option, expected, got
         said = f"expected {expected}" + (f", got {got}" if got is not None else "")
         super().__init__(f"{option}: {text or said}")
 
@@ -65,21 +64,16 @@ class Option:
     repeat: bool = False
 
 
-def words_of(metavar: str | tuple[str, ...] | None) -> str:
-    """Return the values that an option wants, as its help names them."""
-    return metavar if isinstance(metavar, str) else " ".join(metavar or ())
-
-
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         option, _, said = message.removeprefix("argument ").partition(": ")
         if option.startswith("the following"):
             option = said.partition(", ")[0]
-            raise UsageError(
-                option, "a value", text=f"is needed: {(self._entry(option).help or '').rstrip('.')}"
-            )
+            text = f"is needed: {(self._entry(option).help or '').rstrip('.')}"
+            raise UsageError(option, "a value", text=text)
         if re.match(r"expected .* arguments?$", said):
-            said = words_of(self._entry(option).metavar)
+            metavar = self._entry(option).metavar
+            said = metavar if isinstance(metavar, str) else " ".join(metavar or ())
         raise UsageError(option, said.removeprefix("expected "))
 
     def _entry(self, option: str) -> argparse.Action:
@@ -127,12 +121,13 @@ def parse(
     for entry in entries:
         title = "arguments" if entry.option.positional else heading_of.get(entry.name, "options")
         entry.add_to(groups[title])
-    values = [entry.metavar for entry in entries if entry.option.positional]
-    parser.usage = " ".join([parser.prog, *values, "[options]"]).replace("%", "%%")
+    positional = [entry.metavar for entry in entries if entry.option.positional]
+    parser.usage = " ".join([parser.prog, *positional, "[options]"]).replace("%", "%%")
     known, rest = parser.parse_known_intermixed_args(words)
     if rest:
         raise _unknown(rest[0], [f"--{entry.dashed}" for entry in entries if not entry.option.positional])
-    given = {name: value for name, value in vars(known).items() if value is not argparse.SUPPRESS}
+    values = {name: value for name, value in vars(known).items() if value is not argparse.SUPPRESS}
+    given = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
     return _changed(base, given) if base is not None else kind(**given)
 
 
@@ -229,28 +224,18 @@ class _Entry:
         convert, metavar = _conversion(members[0] if several else self.kind)
         how |= {"type": convert, "metavar": self.option.metavar or metavar}
         if several and self.option.repeat:
-            how |= {"action": _Append}
+            how |= {"action": "append"}
         elif several and members[1:] == (...,):
-            how |= {"action": _Tuple, "nargs": "*"}
+            how |= {"nargs": "*"}
         elif several:
             names = tuple((self.option.metavar or " ".join([metavar] * len(members))).split())
-            how |= {"action": _Tuple, "nargs": len(members), "metavar": names}
+            how |= {"nargs": len(members), "metavar": names}
         required = self.default is MISSING
         if self.option.positional:
             group.add_argument(self.name, **how, **({} if several or required else {"nargs": "?"}))
         else:
             names = (flag, *([self.option.short] if self.option.short else []), *self.option.also)
             group.add_argument(*names, required=required, **how)
-
-
-class _Tuple(argparse.Action):
-    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: Any = None) -> None:
-        setattr(namespace, self.dest, tuple(values))
-
-
-class _Append(argparse.Action):
-    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: Any = None) -> None:
-        setattr(namespace, self.dest, (*getattr(namespace, self.dest, ()), values))
 
 
 def _conversion(kind: Any) -> tuple[Callable[[str], Any], str]:
@@ -305,8 +290,7 @@ def field_docs(kind: Any) -> dict[str, str]:
         if parent is object:
             continue
         (body,) = ast.parse(textwrap.dedent(inspect.getsource(parent))).body
-        statements = typing.cast(ast.ClassDef, body).body
-        for field, text in pairwise(statements):
+        for field, text in pairwise(typing.cast(ast.ClassDef, body).body):
             if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
                 docs[ast.unparse(field.target)] = str(getattr(text.value, "value", ""))
     return docs

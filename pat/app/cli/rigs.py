@@ -13,18 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from . import options
 from .known import MatchesFile
-from .options import (
-    Depth,
-    FieldName,
-    Images,
-    MaybeOut,
-    Name,
-    Numbers,
-    Out,
-    RigFile,
-    load_rig,
-    say,
-)
+from .options import Depth, FieldName, Images, MaybeOut, Name, Numbers, Out, RigFile, say
 from .parser import Option
 
 if TYPE_CHECKING:
@@ -47,8 +36,7 @@ class Show:
     """Images to draw on, if wanted; with two or more, points are matched in them."""
     out: Out = Path("out/show")
     """Folder for rig.png (cameras in space; if calibrated), fields.png (search segments of some pixels) and,
-    with images, matches.png (patches around points matched in the images, and how far they lie from their
-    lines)."""
+    with images, matches.png (patches around matched points, and how far they lie from their lines)."""
 
     def run(self) -> None:
         """Write the drawings, and warn of a rig that does not fit the images.
@@ -65,7 +53,7 @@ class Show:
 
         options.writable(self.out, folder=True)
         refuse_others(self.out, ["rig.png", "fields.png", "matches.png"], group="show")
-        rig = load_rig(self.rig)
+        rig = options.load_rig(self.rig)
         alpha = rig.require(self.alpha or rig.names[0])
         images = options.read_images(rig, self.image)
         warn_of_misfit(rig, images)
@@ -179,12 +167,13 @@ class Explore:
 
         if self.save is not None:
             options.writable(self.save, option="--save")
-        rig = load_rig(self.rig)
+        rig = options.load_rig(self.rig)
         images = options.read_images(rig, self.image) if self.image else None
         if images:
             warn_of_misfit(rig, images)
         options.field_named(self.field)
         beside = self.rig.with_suffix(".covariance.json")
+        files = {"": self.rig, **options.files_by_name(self.image)}
         explorer = opened(
             rig,
             images,
@@ -192,10 +181,7 @@ class Explore:
             network=self.network,
             field=self.field,
             covariance=RigCovariance.load(beside, rig) if beside.is_file() else None,
-            files={
-                "": str(self.rig),
-                **{name: str(file) for name, file in options.files_by_name(self.image).items()},
-            },
+            files={name: str(file) for name, file in files.items()},
         )
         if explorer.error:
             raise ValueError(explorer.error)
@@ -234,7 +220,7 @@ class Info:
         from arraygeom.runtime.text import length_unit
         from arraygeom.summary import summarise_cameras, summarise_pairs
 
-        rig = load_rig(self.rig, self.depth)
+        rig = options.load_rig(self.rig, self.depth)
         if rig.name:
             say(rig.name)
         warn_of_oddities(rig)
@@ -272,8 +258,7 @@ def print_tables(cameras: Sequence[CameraSummary], pairs: Sequence[PairSummary],
     from rich.table import Table
 
     fine, baseline = ("mm", "baseline m") if unit == "m" else (f"{unit}/1000", "baseline")
-    footprint = f"{fine} a pixel, near - far"
-    of_cameras = Table("camera", "pixels", "focal px", "view deg", footprint, box=None)
+    of_cameras = Table("camera", "pixels", "focal px", "view deg", f"{fine} a pixel, near - far", box=None)
     of_lenses = Table("camera", "lens", "covers", "coefficients", box=None)
     for c in cameras:
         further = _two(c.focal), _two(c.field_of_view, " x "), _two(c.footprint, " - ")
@@ -309,8 +294,7 @@ class Convert:
     lens: Annotated[str | None, Option("MODEL")] = None
     """Lens model of the coefficients, as brown-conrady or kannala-brandt: for files that do not say."""
     refit: bool = False
-    """Replace a lens whose model ends within the image, as at a pole, by a fitted brown-conrady lens (k1 k2
-    p1 p2 k3)."""
+    """Replace a lens whose model ends within the image by a fitted brown-conrady lens (k1 k2 p1 p2 k3)."""
     write_as: Annotated[str, Option("FORMAT")] = "native"
     """Format of the target."""
 
@@ -357,9 +341,8 @@ class Doctor:
     """An image of each of two or more cameras."""
     matches: MatchesFile = None
     out: MaybeOut = None
-    """Rig file to write if a mistake is found: the repaired rig. A former file is kept as
-    NAME.old. Exit status 4, and nothing is written, if several mistakes with different repairs explain the
-    images as well."""
+    """The repaired rig to write if a mistake is found. A former file is kept as NAME.old. Exit status
+    4, and nothing is written, if several mistakes with different repairs explain the images as well."""
     json: bool = False
     """Print JSON instead of text."""
 
@@ -376,7 +359,7 @@ class Doctor:
 
         if self.out is not None:
             options.writable(self.out)
-        rig = load_rig(self.rig)
+        rig = options.load_rig(self.rig)
         with options.working("matching features and trying mistakes"):
             images = options.read_images(rig, self.image, sized=False)
             diagnosis = diagnose(rig, images, given_matches(self.matches, self.image, images))
@@ -424,8 +407,7 @@ class Refine:
     """Rig file to write."""
     matches: MatchesFile = None
     free: tuple[str, ...] = ("rotation", "translation", "focal", "centre")
-    """Free parameters: rotation, translation, focal, centre (principal_point), distortion; or
-    CAMERA.rotation."""
+    """Free parameters: rotation, translation, focal, centre (principal_point), distortion; CAMERA.KIND."""
     sigma: Annotated[tuple[str, ...], Option("KIND=NUMBER")] = ()
     """Standard deviation of a parameter before refinement: degrees, pixels; translation, focal relative."""
     force: bool = False
@@ -443,14 +425,12 @@ class Refine:
         from calib.images.refinement import refine
 
         options.writable(self.out)
-        rig = load_rig(self.rig)
+        rig = options.load_rig(self.rig)
         deviations = options.numbers_by_name(self.sigma, "--sigma")
         options.say_when_compiling()
         frames = options.read_frames(rig, self.image)
         if self.matches is not None and len(frames) > 1:
-            raise ValueError(
-                f"--matches needs a single frame, and {len(frames)} are given: give one image of each camera"
-            )
+            raise ValueError(f"--matches needs one frame, got {len(frames)}: give one image of each camera")
         matches = given_matches(self.matches, self.image, frames[0])
         with options.working("matching features and refining"):
             refined = refine(
@@ -558,17 +538,13 @@ class RigDiff:
             figure_file(options.writable(self.out))
         if self.matches is not None and not self.image:
             raise ValueError("--matches needs --image: give the images of the cameras, NAME=FILE for each")
-        a, b = load_rig(self.first), load_rig(self.second)
+        a, b = options.load_rig(self.first), options.load_rig(self.second)
         depth = self.depth or (a.depth or b.depth)
         if depth is None:
-            raise ValueError(
-                "--depth: neither rig states the depths it is used between: give NEAR FAR, metres"
-            )
+            raise ValueError("--depth: neither rig states a depth range: give NEAR FAR, metres")
         near, far = (float(bound) for bound in depth)
         beside = [path.with_suffix(".covariance.json") for path in (self.first, self.second)]
-        covariances = [
-            RigCovariance.load(path, rig) if path.is_file() else None for path, rig in zip(beside, (a, b))
-        ]
+        covariances = [RigCovariance.load(p, rig) if p.is_file() else None for p, rig in zip(beside, (a, b))]
         difference = rig_difference(a, b, covariances=(covariances[0], covariances[1]), depth=(near, far))
         for path, covariance in zip(beside, covariances):
             if covariance is None and any(covariances):

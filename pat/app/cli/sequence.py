@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
@@ -34,6 +34,7 @@ class FuseSequence(FuseBatch):
         **FuseBatch.headings,
     }
     command: ClassVar[str] = "sequence"
+    takes_videos: ClassVar[bool] = True
 
     out: Out = Path("out")
     """Folder for NAME_fused.png and the like of each frame, called as alpha's file, and fused.mp4."""
@@ -54,9 +55,6 @@ class FuseSequence(FuseBatch):
 
         warn_of_gaps(files)
         return files
-
-    def refuse_videos(self, videos: Sequence[Path]) -> None:
-        """Accept videos: they are sequences."""
 
     def timed(self, rig: Rig) -> Rig:
         """Set the cameras' frame rates and time offsets that the command line states.

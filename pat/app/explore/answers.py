@@ -91,9 +91,9 @@ def answer(scene: ExplorerScene, alpha: str, controls: Controls) -> dict[str, An
         for name, beta in betas.items():
             problem = other.problems.get(name)
             beta["second"] = {"problem": problem} if problem else drawn(other.betas[name])
-    pins = [pinned(scene, alpha, {**controls, "x": x}) for x in controls["pins"]]
+
     return {
-        "pins": pins,
+        "pins": [pinned(scene, alpha, {**controls, "x": x}) for x in controls["pins"]],
         "x": list(image_pixel(controls["x"][0], controls["x"][1], scene.rig[alpha].hw)),
         "depth": number(report.depth),
         "betas": betas,
@@ -127,9 +127,7 @@ def pinned(scene: ExplorerScene, alpha: str, controls: Controls) -> dict[str, An
     """Compute samples and match in each beta of a pixel that stays drawn."""
     report = inspect_pixel(scene, explorer_state(scene.rig, alpha, controls))
     shown = {name: drawn(beta) for name, beta in report.betas.items()}
-    found = {
-        name: {k: beta[k] for k in ("samples", "match")} for name, beta in shown.items() if "match" in beta
-    }
+    found = {n: {k: beta[k] for k in ("samples", "match")} for n, beta in shown.items() if "match" in beta}
     return {"x": list(image_pixel(controls["x"][0], controls["x"][1], scene.rig[alpha].hw)), "betas": found}
 
 
@@ -278,8 +276,7 @@ def slider_ranges(rig: Rig) -> list[list[Any]]:
     longest = max(float((camera.centre - cameras[0].centre).norm()) for camera in cameras) or 1.0
     for name, (label, low, high, step, usual) in ERRORS.items():
         size = longest if "{unit}" in label else 1.0
-        steps = [size * low, size * high, size * step, usual]
-        ranges.append([name, label.format(unit=unit), steps, True])
+        ranges.append([name, label.format(unit=unit), [size * low, size * high, size * step, usual], True])
     lenses = [camera.distortion.coefficients for camera in cameras if camera.distortion is not None]
     largest = max(lenses, key=lambda numbers: numbers.numel(), default=torch.zeros(1))
     for i, value in enumerate(largest.flatten().tolist()):

@@ -66,9 +66,7 @@ class Explorer:
         try:
             for name, _, options in choices(self.scene, self.controls):
                 if controls[name] not in options:
-                    raise ValueError(
-                        f"{name}: {controls[name]!r:.80} was not given when the explorer was started"
-                    )
+                    raise ValueError(f"{name}: the explorer was started without {controls[name]!r:.80}")
             return {**answer(self.scene, self.alpha, controls), "asked": controls.get("asked")}
         except (ValueError, TypeError, AttributeError, LookupError, ArithmeticError, RuntimeError) as error:
             return {"error": str(error), "asked": controls.get("asked")}

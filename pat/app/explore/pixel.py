@@ -436,8 +436,7 @@ def correlations(
     """
     steps = (pixel_grid((2 * RADIUS + 1, 2 * RADIUS + 1), dtype=x.dtype) - RADIUS).reshape(-1, 2)
     transformed = steps @ jacobian(pair, x).T
-    alpha_features = window_features(alpha, x, steps)
-    return (window_features(beta, xy, transformed) @ alpha_features.T)[:, 0]
+    return (window_features(beta, xy, transformed) @ window_features(alpha, x, steps).T)[:, 0]
 
 
 def jacobian(pair: Pair, x: Float[Tensor, "1 2"]) -> Float[Tensor, "2 2"]:

@@ -20,26 +20,6 @@ from .forward import forward
 from .layout import Call, Geometry, Gradients, Outputs, Saved, Share, TapList, block_scratch
 from .local import ROWS, attend_rows, differentiate_rows
 
-__all__ = [
-    "LANES",
-    "ROWS",
-    "SOURCES",
-    "Call",
-    "Geometry",
-    "Gradients",
-    "Outputs",
-    "Saved",
-    "Share",
-    "TapList",
-    "attend_rows",
-    "backward",
-    "block_scratch",
-    "differentiate_rows",
-    "forward",
-    "scatter",
-]
-
-
 SOURCES = [*Path(__file__).parent.glob("*.py")]
 
 for _entry in (forward, backward, scatter, attend_rows, differentiate_rows):

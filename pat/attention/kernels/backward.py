@@ -25,13 +25,7 @@ def backward(call, saved, share, taps, gradients):
         taps: `TapList` to write: beta's pixels and weights, which `scatter` adds up later.
         gradients: `Gradients` to write, of query, points and bias.
     """
-    call, saved, share, taps, gradients = (
-        pointers(call),
-        pointers(saved),
-        pointers(share),
-        pointers(taps),
-        pointers(gradients),
-    )
+    call, saved, share, taps, gradients = pointers((call, saved, share, taps, gradients))
     begin = share.first + take(share.counter) * share.size
     while begin < share.last:
         end = min(begin + share.size, share.last)

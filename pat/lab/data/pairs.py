@@ -148,8 +148,7 @@ def middlebury_pairs(root: str | Path) -> Iterator[StereoPair]:
         ValueError: for a folder without a pair.
     """
     root = _folder(root)
-    scenes = _some(_middlebury_scenes(root), root)
-    return (_middlebury_pair(root, *scene) for scene in scenes)
+    return (_middlebury_pair(root, *scene) for scene in _some(_middlebury_scenes(root), root))
 
 
 def folder_pairs(root: str | Path) -> Iterator[StereoPair]:
@@ -165,10 +164,9 @@ def folder_pairs(root: str | Path) -> Iterator[StereoPair]:
         ValueError: for a folder without a pair.
     """
     root = _folder(root)
-    files = _some(_named(root), root)
     return (
         StereoPair(_pair_name(root, left), read_image(left), read_image(right), PAPER_DISPARITY)
-        for left, right in files
+        for left, right in _some(_named(root), root)
     )
 
 

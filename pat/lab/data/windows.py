@@ -13,11 +13,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from arraygeom.camera import Camera
-from arraygeom.pixels import HW, map_homogeneous, pixel_grid, resize_matrix
-from arraygeom.rig import Rig
-from arraygeom.sampling import sample
-from arraygeom.undistortion import pinhole_view, resampled
+from arraygeom import Camera, Rig, pinhole_view, pixel_grid, resampled, resize_matrix, sample
+from arraygeom.pixels import HW, map_homogeneous
 from pat.lab.synthesis.rendered import RENDER_FILE, Rendered, is_rendered
 
 AGAIN = "remove it and run 'pat lab render' again"
@@ -173,8 +170,7 @@ def reduced_depth(depth: Float[Tensor, "n h w"], hw: HW) -> Float[Tensor, "n h2 
     old = (depth.shape[-2], depth.shape[-1])
     if old == hw:
         return depth
-    back = resize_matrix(hw, old)
-    x = map_homogeneous(back[:2], pixel_grid(hw, dtype=torch.float64)).to(depth)[None]
+    x = map_homogeneous(resize_matrix(hw, old)[:2], pixel_grid(hw, dtype=torch.float64)).to(depth)[None]
     between = 1 / sample(1 / depth[:, None], x).values[:, 0]
     nearest = sample(depth[:, None], x, interpolation="nearest").values[:, 0]
     even = (between / nearest - 1).abs() < 0.01

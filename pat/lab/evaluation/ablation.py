@@ -77,8 +77,7 @@ RIGS = RigDistribution(
     rotation=3.0,
     decentring=0.05,
 )
-"""Rig distribution of the layered scenes: beta's focal length is 1/3 to 1 of alpha's, at equal
-image sizes."""
+"""Rigs of the layered scenes: beta's focal length is 1/3 to 1 of alpha's, at equal image sizes."""
 DENSE_LIMIT = 2**31
 """Bytes of explicit positions above which the dense field is omitted."""
 RATIOS = (1.0, 1.5, 2.0)
@@ -235,9 +234,8 @@ def disparity(network: FusionNetwork, pair: Pair) -> float:
         Pixels of beta as the network receives it (resized if it needs equal resolutions); 1 or more.
     """
     if pair.has_lens:
-        segments = Curved(bounds=natural_bounds(pair))(
-            pair, coarse_grid(pair.alpha.hw).reshape(-1, 2).double()
-        )
+        grid = coarse_grid(pair.alpha.hw).reshape(-1, 2).double()
+        segments = Curved(bounds=natural_bounds(pair))(pair, grid)
         reached = (segments.xy - segments.xy[:, :1]).norm(dim=-1)[segments.mask & segments.mask[:, :1]]
         return float(reached.amax()) if len(reached) else 1.0
     scale = resolution_ratio(pair)
@@ -246,11 +244,7 @@ def disparity(network: FusionNetwork, pair: Pair) -> float:
 
 
 def layered_cases(
-    count: int,
-    *,
-    photos: Sequence[Path] = (),
-    hw: HW = (240, 320),
-    seed: int = 0,
+    count: int, *, photos: Sequence[Path] = (), hw: HW = (240, 320), seed: int = 0
 ) -> Iterator[AblationCase]:
     """Render cases from layered photographs, with some noise.
 

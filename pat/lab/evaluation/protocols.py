@@ -96,8 +96,7 @@ class StereoResult(NamedTuple):
 
 
 StereoMethod = Callable[[Tensor, Tensor, float], StereoResult]
-"""Fusion method: called with alpha (1, h, w), beta (3, hb, wb) and the largest disparity in
-alpha's pixels."""
+"""Fusion method: called with alpha (1, h, w), beta (3, hb, wb), the largest disparity in alpha's pixels."""
 
 
 def enlarged(beta: Float[Tensor, "c hb wb"], hw: HW) -> Float[Tensor, "c h w"]:

@@ -84,8 +84,7 @@ def rectified(rig: Rig, images: Mapping[str, Tensor]) -> Warped:
     canvas = plane.pair.alpha.hw
     made = {name: warped(images[name], torch.linalg.inv(H), canvas).clamp(0, 1) for name, H in views}
     near, far = (float(d) for d in pair.depth_range)
-    level = Rig(dict(zip((first, second), plane.pair.cameras)), depth=(near, far))
-    return Warped(level, made, plane, pair)
+    return Warped(Rig(dict(zip((first, second), plane.pair.cameras)), depth=(near, far)), made, plane, pair)
 
 
 def whole_alpha(pair: Pair) -> Rectification:
@@ -104,17 +103,13 @@ def whole_alpha(pair: Pair) -> Rectification:
     corners = torch.tensor([[-0.5, -0.5], [w - 0.5, -0.5], [-0.5, h - 0.5], [w - 0.5, h - 0.5]]).to(alpha.K)
     rays = product(rough.R_alpha, alpha.rays(corners)[0][..., None])[..., 0]
     if not bool((rays[..., 2] > 0).all()):
-        raise ValueError(
-            "the baseline is too near an optical axis: part of alpha lies behind the rectified image"
-        )
+        raise ValueError("the baseline is too near an optical axis: part of alpha is behind the other view")
     focal = alpha.K[:2, :2].det().abs().sqrt()
     x = focal * rays[..., :2] / rays[..., 2:]
     low, high = x.amin(0), x.amax(0)
     columns, rows = (int(n) for n in (high - low).ceil())
     if rows * columns > LARGEST * h * w:
-        raise ValueError(
-            f"the baseline is near an optical axis: the rectified image has {columns}x{rows} pixels"
-        )
+        raise ValueError(f"the baseline is near an optical axis: the rectified image has {columns}x{rows} px")
     return rectify(pair, K=intrinsics(focal, (h, w), tuple(-low - 0.5)), hw=(rows, columns))
 
 

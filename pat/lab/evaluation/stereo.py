@@ -107,11 +107,8 @@ def evaluate_pairs(
             results = {n: method(task.alpha, task.beta, max_disparity) for n, method in methods.items()}
             rows += [_row(pair.name, rate, name, result, task) for name, result in results.items()]
             if images:
-                shown = [
-                    enlarged(task.beta, hw_of(task.alpha)),
-                    *(r.image.clamp(0, 1) for r in results.values()),
-                ]
-                strip = torch.cat([*shown, task.ground_truth], -1)
+                fused = [result.image.clamp(0, 1) for result in results.values()]
+                strip = torch.cat([enlarged(task.beta, hw_of(task.alpha)), *fused, task.ground_truth], -1)
                 write_image(images / f"{pair.name.replace('/', '-')}_x{rate}.png", strip)
     return rows
 

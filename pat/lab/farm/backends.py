@@ -13,10 +13,8 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from arraygeom.batching import stack
-from arraygeom.camera import Camera
+from arraygeom import Camera, Rig, stack
 from arraygeom.pixels import HW
-from arraygeom.rig import Rig
 from pat.lab.synthesis.blender.environment import blender_python
 from pat.lab.synthesis.blender.lens import lens_for
 from pat.lab.synthesis.blender.settings import PRESETS, RenderSettings
@@ -31,15 +29,14 @@ from pat.lab.synthesis.rendered import RENDER_FILE, RenderedFrame, frame_file, s
 from pat.lab.synthesis.rig_distribution import RigDistribution
 from pat.lab.synthesis.rigs import RigBatch, in_frame_of
 from pat.media.colour import linear_from_srgb
-from pat.support.schema import from_document
+from pat.support.schema import check_fields, from_document
 
 FARTHEST = 50.0
 """Multiple of the near bound at which layered scenes end for rigs that see to infinity."""
 
 
 Renderer = Callable[[int, Path], None]
-"""Function of a seed and a folder that renders and checks a scene into that folder, which it makes. Raises
-ValueError."""
+"""Function of a seed and a folder that makes the folder, and renders and checks a scene into it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,9 +59,8 @@ class LayeredSettings:
     oversampling: int = 2
 
     def __post_init__(self) -> None:
-        for name, least in (("edge", 32), ("oversampling", 1)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
+        check_fields(self, "edge", 32)
+        check_fields(self, "oversampling", 1)
         if not 1 <= self.layers[0] <= self.layers[1]:
             raise ValueError(f"layers must be two numbers, at least 1 and in order, got {self.layers}")
 
@@ -214,15 +210,12 @@ def rig_from_alpha(rig: Rig) -> RigBatch:
         if not isinstance(camera, Camera):
             raise ValueError(f"camera '{name}' is not calibrated: rendering needs its K, R and t")
         if camera.distortion is not None:
-            raise ValueError(
-                f"camera '{name}' has a lens model, layered scenes have none: use Blender, or omit it"
-            )
+            raise ValueError(f"camera '{name}' has a lens, layered scenes have none: use Blender, or omit it")
     if rig.depth is None:
         raise ValueError("the rig has no depth range: add `depth: [near, far]` in metres to its file")
     near, far = (float(d) for d in rig.depth)
-    far = min(far, FARTHEST * near)
+
     cameras = [c.to(torch.float64) for c in rig.cameras.values() if isinstance(c, Camera)]
     relative = [stack([in_frame_of(cameras[0], c)]) for c in cameras]
-    return RigBatch(
-        relative, torch.tensor([near], dtype=torch.float64), torch.tensor([far], dtype=torch.float64)
-    )
+    bounds = (torch.tensor([d], dtype=torch.float64) for d in (near, min(far, FARTHEST * near)))
+    return RigBatch(relative, *bounds)

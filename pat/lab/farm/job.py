@@ -13,6 +13,7 @@ import os
 import platform
 import shutil
 import time
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
@@ -33,7 +34,7 @@ from pat.sensors import seed_for
 from pat.support.jobs import JobError, JobReport, Task, Workers, run_tasks
 from pat.support.locks import folder_lock
 from pat.support.memory import resident
-from pat.support.schema import from_document, read_yaml, to_document
+from pat.support.schema import check_fields, from_document, read_yaml, to_document
 
 from .backends import BlenderSettings, LayeredSettings, Renderer
 
@@ -61,9 +62,7 @@ class RetryLimits:
     refusals: int = 20
 
     def __post_init__(self) -> None:
-        for name in ("timeout", "refusals"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be above 0, got {getattr(self, name):g}")
+        check_fields(self, "timeout refusals", 0, above=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -261,11 +260,9 @@ def render(
         arguments = json.dumps(to_document(config)), work
         folders = {i: root / "scenes" / f"{i:06d}" for i in shard.select(scenes)}
         check_space(root, sum(not folder.exists() for folder in folders.values()), scene_bytes)
+        tasks = [Task(f, make_scene, (*arguments, f, i), f"scene {i}") for i, f in folders.items()]
         return run_tasks(
-            [
-                Task(folder, make_scene, (*arguments, folder, i), f"scene {i}")
-                for i, folder in folders.items()
-            ],
+            tasks,
             workers=Workers(workers, scheduler, apart=True, timeout=config.limits.timeout),
             resume=True,
             on_error="skip",
@@ -300,10 +297,8 @@ def versions() -> dict[str, str]:
     """Return the versions of the installed packages that rendering uses, by name."""
     versions = {"python": platform.python_version()}
     for package in ("arraygeom-pat", "torch", "numpy", "OpenEXR"):
-        try:
+        with suppress(PackageNotFoundError):
             versions[package] = version(package)
-        except PackageNotFoundError:
-            continue
     return versions
 
 

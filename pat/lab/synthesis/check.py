@@ -12,10 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from arraygeom.pair import Pair
-from arraygeom.pixels import pixel_grid
-from arraygeom.rig import Rig
-from arraygeom.sampling import sample
+from arraygeom import Pair, Rig, pixel_grid, sample
 
 from .rendered import RenderedFrame, depth_between
 
@@ -66,9 +63,8 @@ def check_views(
     for name in sorted({a for a, _ in together}):
         overlap = max(pairs[f"{a} > {b}"]["visible"] for a, b in together if a == name)
         if overlap < limits.overlap:
-            reasons.append(
-                f"{name}: the other cameras see {overlap:.0%} of what it sees (at least {limits.overlap:.0%})"
-            )
+            least = f"at least {limits.overlap:.0%}"
+            reasons.append(f"{name}: the other cameras see {overlap:.0%} of what it sees ({least})")
     return {"accepted": not reasons, "reasons": reasons, "views": views, "pairs": pairs}
 
 
@@ -108,8 +104,7 @@ def texture(rgb: Float[Tensor, "3 h w"], patch: int = 8) -> Float[Tensor, ""]:
     grey = rgb.mean(0)[None, None].clamp(0, 1)
     mean = avg_pool2d(grey, min(patch, *rgb.shape[1:]))
     square = avg_pool2d(grey**2, min(patch, *rgb.shape[1:]))
-    deviation = (square - mean**2).clamp(min=0).sqrt()
-    return (deviation > 0.02 * mean.clamp(min=0.01)).float().mean()
+    return ((square - mean**2).clamp(min=0).sqrt() > 0.02 * mean.clamp(min=0.01)).float().mean()
 
 
 def pair_figures(pair: Pair, here: RenderedFrame, there: RenderedFrame) -> dict[str, float]:
@@ -163,9 +158,7 @@ def _chosen(frame: RenderedFrame, most: int) -> tuple[Tensor, Tensor, Tensor]:
     return grid[finite][::step], frame.depth[finite][::step].double(), frame.index[finite][::step]
 
 
-def _compared(
-    here: RenderedFrame, x: Float[Tensor, "n 2"], there: RenderedFrame, target: Float[Tensor, "n 2"]
-) -> tuple[Tensor, Tensor]:
+def _compared(here: RenderedFrame, x: Tensor, there: RenderedFrame, target: Tensor) -> tuple[Tensor, Tensor]:
     """Median difference of colours, and the shift of one image against the other that explains most of it."""
     slopes = torch.cat(torch.gradient(here.rgb, dim=(-1, -2)))[None]
     mine, dx, dy = sample(torch.cat([here.rgb[None], slopes], 1).double(), x[None]).values[0].split(3)

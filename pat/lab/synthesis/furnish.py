@@ -13,9 +13,8 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from arraygeom.camera import Camera
+from arraygeom import Camera, Rig
 from arraygeom.pixels import coarse_grid
-from arraygeom.rig import Rig
 
 from .scene import (
     Key,
@@ -196,8 +195,7 @@ def _lights(setting: Setting, room: _Room) -> tuple[Light, ...]:
     """Two to four lamps beside and above the cameras, perhaps a sun; of similar brightness together in all
     scenes."""
     rng = setting.rng
-    count = int(rng.integers(2, 5))
-    shares = rng.dirichlet(np.full(count, 3.0)) * _IRRADIANCE * rng.uniform(0.8, 1.2)
+    shares = rng.dirichlet(np.full(int(rng.integers(2, 5)), 3.0)) * _IRRADIANCE * rng.uniform(0.8, 1.2)
     target = room.at(np.array([0.0, 0.0, 0.2]))
     lights = [_lamp(setting, room, target, float(share)) for share in shares]
     if rng.uniform() < 0.6:
@@ -253,10 +251,9 @@ def _object(
 
 def _crowded(centre: NDArray, radius: float, others: list[Object]) -> bool:
     """True if much of the object would be inside another one."""
-    for key in (other.motion.keys[0] for other in others):
-        if np.linalg.norm(centre - key.position) < 0.5 * (radius + np.linalg.norm(key.extent) / 2):
-            return True
-    return False
+    keys = [other.motion.keys[0] for other in others]
+    radii = [0.5 * (radius + np.linalg.norm(key.extent) / 2) for key in keys]
+    return any(np.linalg.norm(centre - key.position) < reach for key, reach in zip(keys, radii))
 
 
 def _extent(rng: Generator, shape: Shape, radius: float) -> NDArray:

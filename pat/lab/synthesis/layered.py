@@ -15,12 +15,9 @@ from jaxtyping import Float, Int
 from torch import Generator, Tensor
 from torch.nn.functional import avg_pool2d
 
-from arraygeom.camera import Camera
-from arraygeom.homography import plane_homography
-from arraygeom.pixels import HW, pixel_grid, to_homogeneous
-from arraygeom.pose import Pose
+from arraygeom import Camera, Pose, pixel_grid, plane_homography, sample
+from arraygeom.pixels import HW, to_homogeneous
 from arraygeom.runtime.chunks import chunked
-from arraygeom.sampling import sample
 
 from .layers import Layers, draw_layers
 from .outlines import outlines
@@ -227,5 +224,4 @@ def _steps(distance: Tensor) -> Tensor:
 
 
 def _oversampling(alpha: Camera, camera: Camera) -> int:
-    ratio = float((alpha.K[:, 0, 0] / camera.K[:, 0, 0]).median())
-    return min(max(round(ratio), 1), _MAX_OVERSAMPLING)
+    return min(max(round(float((alpha.K[:, 0, 0] / camera.K[:, 0, 0]).median())), 1), _MAX_OVERSAMPLING)

@@ -155,8 +155,7 @@ def _inverse_depths(rigs: RigBatch, shape: tuple[int, int], g: Generator) -> Ten
     low, high = 1 / rigs.far[:, None], 1 / rigs.near[:, None]
     where = uniform((0, 1), shape, g)
     even = torch.lerp(low, high, where)
-    logarithmic = low * (high / low) ** where
-    q = torch.where(torch.rand(B, 1, generator=g) < 0.6, even, logarithmic)
+    q = torch.where(torch.rand(B, 1, generator=g) < 0.6, even, (low * (high / low) ** where))
     flat = torch.rand(B, 1, generator=g) < 0.125
     q = torch.where(flat, q[:, :1] * (1 + 0.05 * where), q)
     q[:, 0] = torch.where(flat[:, 0], q[:, 0], low[:, 0])
@@ -170,14 +169,12 @@ def _not_nearer(rigs: RigBatch, q: Tensor, normal: Tensor, ray: Tensor, radius: 
     `radius` is the layer's radius in alpha's pixels.
     """
     slope = normal[..., :2].norm(dim=-1) / (normal * ray).sum(-1).clamp(min=1e-3)
-    grown = 1 + slope * radius / rigs.cameras[0].K[:, :1, 0]
-    return torch.minimum(q, 1 / (rigs.near[:, None] * grown))
+    return torch.minimum(q, 1 / (rigs.near[:, None] * (1 + slope * radius / rigs.cameras[0].K[:, :1, 0])))
 
 
 def _painters(normal: Tensor) -> Tensor:
     """Rotations `plane_from_world` with rows e1, e2, normal; e2 points where the plane recedes fastest."""
-    forward = torch.tensor([0.0, 0, 1], dtype=torch.float64)
-    e2 = normalize(forward - normal[..., 2:] * normal, dim=-1)
+    e2 = normalize(torch.tensor([0.0, 0, 1], dtype=torch.float64) - normal[..., 2:] * normal, dim=-1)
     return torch.stack([torch.linalg.cross(e2, normal), e2, normal], -2)
 
 

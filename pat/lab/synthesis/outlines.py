@@ -42,8 +42,7 @@ def _distance(mask: np.ndarray) -> np.ndarray:
 
 
 def _filled(points: np.ndarray) -> np.ndarray:
-    mask = np.zeros((_FINE, _FINE), np.uint8)
-    return cv2.fillPoly(mask, [_pixels(points)], (1,))
+    return cv2.fillPoly(np.zeros((_FINE, _FINE), np.uint8), [_pixels(points)], (1,))
 
 
 def _pixels(points: np.ndarray) -> np.ndarray:

@@ -41,8 +41,7 @@ def _mixed(images: list[np.ndarray], rng: np.random.Generator) -> np.ndarray:
     shape, paint = (_window(images[i], rng) for i in rng.integers(len(images), size=2))
     shape, paint = (_smoothed(p, rng) if rng.random() < 0.4 else p for p in (shape, paint))
     luminance = 0.15 + 0.7 * (shape @ _LUMINANCE)
-    chroma = paint - (paint @ _LUMINANCE)[..., None]
-    return luminance[..., None] + rng.uniform(0.5, 1.5) * chroma
+    return luminance[..., None] + rng.uniform(0.5, 1.5) * (paint - (paint @ _LUMINANCE)[..., None])
 
 
 def _window(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -84,12 +84,9 @@ class PhotoBank:
                     np.savez(file, *images)
         chosen = [p for i, p in enumerate(images) if choose(i)]
         if not chosen:
-            raise ValueError(
-                f"{len(images)} photographs are too few to learn from some and to hold others out: give more"
-            )
+            raise ValueError(f"{len(images)} photographs are too few to learn from and hold out: give more")
         rng = np.random.default_rng(seed)
-        extra = patterns(rng, 48) + recoloured(chosen, rng, 48)
-        return cls(chosen + extra, photos=len(chosen))
+        return cls(chosen + patterns(rng, 48) + recoloured(chosen, rng, 48), photos=len(chosen))
 
     def __len__(self) -> int:
         return len(self.wh)
@@ -122,12 +119,9 @@ class PhotoBank:
         scale = torch.exp2(-fine)
         half_pixel = xy.mT + 0.5
         low = self._bilinear(index, half_pixel * scale - 0.5)
-        high = self._bilinear(index + 1, half_pixel * (0.5 * scale) - 0.5)
-        return torch.lerp(low, high, weight)
+        return torch.lerp(low, self._bilinear(index + 1, half_pixel * (0.5 * scale) - 0.5), weight)
 
-    def window(
-        self, texture: int, level: int, xy: tuple[int, int], side: int
-    ) -> Float[Tensor, "3 side side"]:
+    def window(self, texture: int, level: int, xy: tuple[int, int], side: int) -> Float[Tensor, "3 n n"]:
         """Cut a square from one level of a texture, mirrored beyond its sides.
 
         Args:
@@ -157,8 +151,7 @@ class PhotoBank:
 
     def _fetch(self, index: Tensor) -> Tensor:
         packed = self.texels[index]
-        channels = torch.stack([packed & 255, (packed >> 8) & 255, packed >> 16])
-        return channels.float().mul_(1 / 255)
+        return torch.stack([packed & 255, (packed >> 8) & 255, packed >> 16]).float().mul_(1 / 255)
 
 
 def _mirrored(i: Tensor, n: Tensor) -> Tensor:
@@ -175,9 +168,7 @@ def _cached(file: Path) -> list[np.ndarray]:
         with np.load(file) as archive:
             return list(archive.values())
     except (BadZipFile, AttributeError, EOFError, OSError, TypeError, ValueError) as error:
-        raise ValueError(
-            f"{file}: not a cache of photographs ({error}): remove it, or name another"
-        ) from None
+        raise ValueError(f"{file}: not a cache of photographs ({error}): remove it") from None
 
 
 def read_photographs(folders: tuple[str | Path, ...], max_edge: int) -> list[np.ndarray]:

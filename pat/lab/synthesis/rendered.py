@@ -20,9 +20,8 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
-from arraygeom.rig import Rig
+from arraygeom import Rig, sample
 from arraygeom.runtime.atomic import flush
-from arraygeom.sampling import sample
 
 RENDER_FILE = "render.json"
 """Last file written: a folder that has it is complete."""

@@ -54,6 +54,4 @@ class RigDistribution:
             if not 0 < low <= high < math.inf:
                 raise ValueError(f"{name} must be two positive numbers in order, got {low:g} and {high:g}")
         if self.betas < 1 or not self.resolutions or not min(self.resolutions) > 0:
-            raise ValueError(
-                f"betas must be at least 1 and resolutions positive, got {self.betas}, {self.resolutions}"
-            )
+            raise ValueError(f"betas must be 1 or more, resolutions > 0: {self.betas}, {self.resolutions}")

@@ -11,9 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from arraygeom.camera import Camera
+from arraygeom import Camera, Pose, rotation_from_vector
 from arraygeom.pixels import HW
-from arraygeom.pose import Pose, rotation_from_vector
 
 from .rig_distribution import Range, RigDistribution
 
@@ -156,5 +155,4 @@ def _rotation_towards(direction: Tensor, old: Tensor) -> Tensor:
     a, b = (v / v.norm(dim=-1, keepdim=True) for v in (direction, old))
     axis = torch.linalg.cross(a, b)
     sine = axis.norm(dim=-1, keepdim=True)
-    angle = torch.atan2(sine, (a * b).sum(-1, keepdim=True))
-    return axis * angle / sine.clamp(min=1e-12)
+    return axis * torch.atan2(sine, (a * b).sum(-1, keepdim=True)) / sine.clamp(min=1e-12)

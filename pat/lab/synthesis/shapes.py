@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from .scene import Object, Relief, Shape, Vec3
 
 Patch = Callable[[NDArray, NDArray], tuple[NDArray, NDArray, NDArray]]
-"""Function from (s, t) in 0..1 to (x, y, z) on the shape in [-0.5, 0.5]^3. From outside, s is right where t
-is down."""
+"""Function from (s, t) in 0..1 to (x, y, z) in [-0.5, 0.5]^3. From outside, s is right where t is down."""
 
 TORUS = 0.3
 """Radius of a torus's tube divided by that of its outline."""

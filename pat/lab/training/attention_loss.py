@@ -107,8 +107,7 @@ def _true_scores(compared: Compared, target: Target) -> tuple[Tensor, Tensor]:
     query, key, how = compared.query, compared.key, compared.interpolation
     first, second = (sample(key, xy.to(key), interpolation=how) for xy in (target.first, target.second))
     share = target.share[:, None].to(key)
-    scores = (query * ((1 - share) * first.values + share * second.values)).sum(1)
-    return scores, first.valid & second.valid
+    return (query * ((1 - share) * first.values + share * second.values)).sum(1), first.valid & second.valid
 
 
 def _mean(values: Tensor, where: Tensor) -> Tensor:

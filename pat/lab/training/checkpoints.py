@@ -77,9 +77,7 @@ def restore(checkpoint: Checkpoint, network: nn.Module, optimiser: Optimizer, av
         parts.setdefault(section, {})[rest] = tensor
     wrong = misfit(network, parts["network"]) or misfit(average, parts["average"])
     if wrong:
-        raise ValueError(
-            f"the checkpoint belongs to another network ({wrong}): give its own recipe, or another --out"
-        )
+        raise ValueError(f"the checkpoint is of another network ({wrong}): give its recipe, or another --out")
     network.load_state_dict(parts["network"])
     average.load_state_dict(parts["average"])
     optimiser.load_state_dict(optimiser.state_dict() | {"state": _state(parts["optimiser"], optimiser)})
@@ -93,9 +91,7 @@ def _state(tensors: Mapping[str, Tensor], optimiser: Optimizer) -> dict[int, dic
         i, _, key = name.partition("/")
         number = int(i) if i.isdecimal() else len(shapes)
         if number >= len(shapes) or tuple(tensor.shape) not in ((), shapes[number]):
-            raise ValueError(
-                f"the checkpoint belongs to another optimiser ({name}): give its own recipe, or another --out"
-            )
+            raise ValueError(f"the checkpoint is of another optimiser ({name}): give another --out")
         state.setdefault(number, {})[key] = tensor
     return state
 
@@ -158,18 +154,15 @@ def read_checkpoint(path: Path) -> Checkpoint | None:
 
 
 def _are_facts(facts: object) -> bool:
-    if not isinstance(facts, dict) or not all(
-        type(facts.get(name)) in kinds for name, kinds in FACTS.items()
-    ):
+    if not isinstance(facts, dict) or any(type(facts.get(n)) not in kinds for n, kinds in FACTS.items()):
         return False
     return facts["step"] >= 0 and 0 <= facts["minutes"] < LONGEST and not math.isnan(facts["best"])
 
 
 def _files(folder: Path) -> list[Path]:
     """Checkpoint files, newest first."""
-    return sorted(
-        (p for p in folder.glob("step-*.safetensors") if re.fullmatch(r"step-\d+", p.stem)), reverse=True
-    )
+    files = [p for p in folder.glob("step-*.safetensors") if re.fullmatch(r"step-\d+", p.stem)]
+    return sorted(files, reverse=True)
 
 
 def _no_room(folder: Path, step: int, tensors: Mapping[str, Tensor], error: Exception) -> str:

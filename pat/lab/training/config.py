@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 from pat.app.cli.parser import Option, parse
 from pat.lab.synthesis.rig_distribution import RigDistribution
 from pat.networks.configs import PATConfig
-from pat.support.schema import from_document, near, parse_yaml, to_document
+from pat.support.schema import check_fields, from_document, near, parse_yaml, to_document
 
 RECIPES = Path(__file__).parent / "recipes"
 RECTIFIED = RigDistribution(mode="rectified", parallax=(6.0, 110.0))
@@ -45,9 +45,7 @@ class RecordingConfig:
     """The ground truth is the scene itself; else it has alpha's luminance as recorded, noise included."""
 
     def __post_init__(self) -> None:
-        for name in ("gain", "blur", "noise", "paper", "lens"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"{name} is a probability, 0 to 1, got {getattr(self, name):g}")
+        check_fields(self, "gain blur noise paper lens", 0, 1)
         if not 0 <= self.miscalibrated < math.inf:
             raise ValueError(f"miscalibrated must be 0 or more pixels, got {self.miscalibrated:g}")
 
@@ -135,32 +133,21 @@ class TrainConfig:
     """Log figures and images for TensorBoard too."""
 
     def __post_init__(self) -> None:
-        for name in ("steps", "batch", "groups", "average", "validate", "save", "held_out"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        for name in ("attention", "warmup", "seed"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name} must be 0 or more, got {getattr(self, name):g}")
+        check_fields(self, "steps batch groups average validate save held_out", 1)
+        check_fields(self, "attention warmup seed", 0)
+        check_fields(self, "minutes rate reuse clip", 0, above=True)
+        check_fields(self, "rectified rendered measured", 0, 1)
         if not all(0 <= momentum < 1 for momentum in self.momenta):
             raise ValueError(f"momenta must be from 0 to below 1, got {self.momenta}")
-        for name in ("minutes", "rate", "reuse", "clip"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be more than 0, got {getattr(self, name):g}")
+
         if min(self.hw) < 16 or any(side % 16 for side in self.hw):
             raise ValueError(f"hw must be multiples of 16, got {self.hw[0]} x {self.hw[1]}")
-        self._check_sources()
 
-    def _check_sources(self) -> None:
-        for name in ("rectified", "rendered", "measured"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"{name} is a share of the batches, 0 to 1, got {getattr(self, name):g}")
         for name in ("rendered", "measured"):
             share, folders = getattr(self, name), getattr(self, f"{name}_from")
             if bool(share) != bool(folders):
                 given = "there is no folder" if share else f"{folders[0]} is given"
-                raise ValueError(
-                    f"{name} is {share:g} and {given}: give both `{name}` and `{name}_from`, or neither"
-                )
+                raise ValueError(f"{name} is {share:g} and {given}: give `{name}` and `{name}_from`")
         total = self.rendered + self.measured
         if total > 1:
             raise ValueError(f"rendered and measured are shares of the batches, {total:g} in all")
@@ -180,9 +167,7 @@ def load_config(name: str | Path) -> TrainConfig:
     """
     path = next((p for p in (RECIPES / f"{name}.yaml", Path(name)) if p.is_file()), None)
     if path is None:
-        raise FileNotFoundError(
-            f"no recipe '{name}' (it is a file or a name of the package){near(name, recipes())}"
-        )
+        raise FileNotFoundError(f"no recipe '{name}' (a file, or a shipped name){near(name, recipes())}")
     return parse_config(path.read_text(encoding="utf-8"), str(path))
 
 
@@ -198,9 +183,7 @@ def parse_config(text: str, name: str = "config") -> TrainConfig:
     values = parse_yaml(text, name)
     try:
         if not values:
-            raise ValueError(
-                f"the recipe is empty: write entries (name: value), or take {', '.join(recipes())}"
-            )
+            raise ValueError(f"the recipe is empty: write entries, or take {', '.join(recipes())}")
         if not isinstance(values, Mapping):
             raise ValueError(f"wanted entries (name: value), got {values!r}")
         return from_document(TrainConfig, values)
@@ -219,8 +202,7 @@ def save_config(config: TrainConfig, path: Path) -> None:
     """Write a recipe to a YAML file, atomically."""
     from arraygeom.runtime.atomic import write_text
 
-    text = config_text(config)
-    write_text(path, text)
+    write_text(path, config_text(config))
 
 
 def command_line(arguments: list[str], prog: str = "pat lab train") -> TrainConfig:

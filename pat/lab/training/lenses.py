@@ -8,11 +8,9 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from arraygeom.camera import Camera
-from arraygeom.distortion import BROWN_CONRADY, Distortion
-from arraygeom.pixels import pixel_grid
+from arraygeom import Camera, Distortion, pixel_grid, resampled
+from arraygeom.distortion import BROWN_CONRADY
 from arraygeom.sampling import Sampled
-from arraygeom.undistortion import resampled
 
 STRONGEST = 0.3
 """Largest |k1| of a random lens."""
@@ -50,9 +48,7 @@ def through_lenses(
         for p, pinhole, lens in zip(images.cpu(), pinholes, lenses)
     ]
     captured = recorded(torch.cat(distorted).clamp(0, 1).to(images.device)).cpu()
-    back = [
-        resampled(p, lens, pinhole, extended=True) for p, lens, pinhole in zip(captured, lenses, pinholes)
-    ]
+    back = [resampled(p, lens, view, extended=True) for p, lens, view in zip(captured, lenses, pinholes)]
     values, valid = (torch.cat(parts) for parts in zip(*back))
     return Sampled(values.clamp(min=0).to(images), valid.to(images.device))
 

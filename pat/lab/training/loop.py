@@ -8,7 +8,7 @@ import time
 from contextlib import closing, nullcontext
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -219,14 +219,9 @@ class Run:
     def _save(self, *, done: bool) -> None:
         if self.watch:
             self.watch.steps.flush()
-            facts: dict[str, Any] = {
-                "step": self.step,
-                "best": self.best,
-                "minutes": self.minutes,
-                "done": done,
-            }
-            facts["recipe"] = config_text(self.config)
-            state = collect(self.network, self.adam, self.average, facts)
+            facts = {"step": self.step, "best": self.best, "minutes": self.minutes, "done": done}
+            recipe = {"recipe": config_text(self.config)}
+            state = collect(self.network, self.adam, self.average, facts | recipe)
             write_checkpoint(self.config.out / CHECKPOINTS, state)
 
     def _offence(self, samples: list[Sample]) -> str:

@@ -46,9 +46,7 @@ class Process:
             ValueError: if the groups cannot be distributed evenly.
         """
         if groups % self.count:
-            raise ValueError(
-                f"{groups} groups cannot be shared by {self.count} processes: give --groups a multiple"
-            )
+            raise ValueError(f"{groups} groups for {self.count} processes: give --groups a multiple")
         return list(range(self.rank, groups, self.count))
 
     def together(self, objective: nn.Module) -> nn.Module:
@@ -121,9 +119,7 @@ def _device(name: str) -> torch.device:
     try:
         device = torch.device(name)
     except RuntimeError:
-        raise ValueError(
-            f"device '{name}' is not one that torch knows: give auto, cpu, cuda or cuda:N"
-        ) from None
+        raise ValueError(f"device '{name}': torch does not know it: give auto, cpu, cuda or cuda:N") from None
     if device.type == "cuda" and not torch.cuda.is_available():
         raise ValueError(f"device '{name}': there is no GPU that torch can use; give --device cpu")
     if device.type == "cuda" and device.index is None:

@@ -14,8 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import islice
-from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -176,8 +175,7 @@ class SampleSource:
     def _made(self, planned: Planned, g: Generator) -> ArrayBatch:
         if planned.kind in self.folders:
             crops = self.folders[planned.kind]
-            betas = self.config.network.betas
-            return crops.sample(self.config.batch, g, number=planned.scenes, betas=betas)
+            return crops.sample(self.config.batch, g, number=planned.scenes, betas=self.config.network.betas)
         return self.layered[planned.kind].sample(self.config.batch, g)
 
 
@@ -204,70 +202,48 @@ def scenes(config: TrainConfig, *, device: str = "cpu") -> tuple[SampleSource, S
     Raises:
         ValueError: for no photographs, or too few to hold some out, and other data that cannot be used.
     """
-    field, n = named_field(config.field), config.held_out
-    layered = config.rendered + config.measured < 1
+    n, layered = config.held_out, config.rendered + config.measured < 1
     bank, unseen = photographs(config) if layered else (None, None)
-
-    def source(photos: PhotoBank | None, seed: int, choose: Callable[[int], bool]) -> SampleSource:
-        return source_of(config, photos, seed, field, device, crops(config, seed, device, choose))
-
-    learn = source(bank, config.seed + 1, lambda i: i % n != 0)
-    return learn, source(unseen, config.seed + 2, lambda i: i % n == 0)
+    learn = source_of(config, bank, config.seed + 1, device, lambda i: i % n != 0)
+    return learn, source_of(config, unseen, config.seed + 2, device, lambda i: i % n == 0)
 
 
 def source_of(
     config: TrainConfig,
     photos: PhotoBank | None,
     seed: int,
-    field: ReceptiveField,
     device: str = "cpu",
-    folders: Mapping[str, Crops] = {},
+    choose: Callable[[int], bool] = lambda i: True,
 ) -> SampleSource:
-    """Make a source of a recipe's samples.
+    """Open a recipe's layered scenes, rendered scenes and measured pairs.
 
     Args:
         config: recipe.
-        photos: textures; None if all batches come from `folders`.
-        seed: random seed of scenes and degradations.
-        field: receptive field of all betas.
-        device: device of the samples.
-        folders: windows of rendered scenes and measured pairs, by kind.
-    """
-    kinds = {"rectified": config.rectified_rigs, "general": config.general_rigs}
-    betas = config.network.betas
-    layered = {
-        kind: LayeredScenes(photos, replace(rigs, betas=betas), hw=config.hw, seed=seed, device=device)
-        for kind, rigs in kinds.items()
-        if photos is not None
-    }
-    return SampleSource(config, layered, folders, seed, field)
-
-
-def crops(config: TrainConfig, seed: int, device: str, choose: Callable[[int], bool]) -> dict[str, Crops]:
-    """Open the recipe's rendered scenes and measured pairs.
-
-    Args:
-        config: recipe.
-        seed: seed of the order in which items are used.
+        photos: textures of layered scenes; None if all batches come from the recipe's folders.
+        seed: random seed of scenes, degradations and the order in which items are used.
         device: device of the samples.
         choose: called with an item's number, returns True to take it.
 
     Returns:
-        Windows by kind ("rendered", "measured"); kinds without a folder are absent.
+        The source.
 
     Raises:
         ValueError: for folders that cannot be used.
     """
-    general, rectified = config.general_rigs.resolutions, config.rectified_rigs.resolutions
-    sources: dict[str, tuple[type[Crops], tuple[Path, ...], tuple[float, ...]]] = {
-        "rendered": (RenderedCrops, config.rendered_from, general),
-        "measured": (MeasuredPairs, config.measured_from, rectified),
+    rectified, general = config.rectified_rigs, config.general_rigs
+    how: dict[str, Any] = {"hw": config.hw, "seed": seed, "device": device}
+    layered = {
+        kind: LayeredScenes(photos, replace(rigs, betas=config.network.betas), **how)
+        for kind, rigs in {"rectified": rectified, "general": general}.items()
+        if photos is not None
     }
-    return {
-        name: kind(folders, hw=config.hw, resolutions=resolutions, seed=seed, device=device, choose=choose)
-        for name, (kind, folders, resolutions) in sources.items()
-        if folders
-    }
+    folders: dict[str, Crops] = {}
+    how["choose"] = choose
+    if config.rendered_from:
+        folders["rendered"] = RenderedCrops(config.rendered_from, resolutions=general.resolutions, **how)
+    if config.measured_from:
+        folders["measured"] = MeasuredPairs(config.measured_from, resolutions=rectified.resolutions, **how)
+    return SampleSource(config, layered, folders, seed, named_field(config.field))
 
 
 def photographs(config: TrainConfig) -> tuple[PhotoBank, PhotoBank]:
@@ -401,10 +377,8 @@ def perturbed(pair: Pair, pixels: float, g: Generator) -> Pair:
     alpha, beta = pair.cameras
     drawn = torch.randn(len(beta.K), 3, generator=g, dtype=torch.float64).to(beta.K)
     rotation = rotation_from_vector(drawn * pixels / beta.K[:, :1, 0])
-    moved: Camera = beta.replace(
-        cam_from_world=Pose(rotation, torch.zeros_like(beta.t)) @ beta.cam_from_world
-    )
-    return Pair(alpha, moved, pair.depth)
+    turned = Pose(rotation, torch.zeros_like(beta.t)) @ beta.cam_from_world
+    return Pair(alpha, beta.replace(cam_from_world=turned), pair.depth)
 
 
 def transfer(pair: Pair, depth: Tensor, beta_depth: Tensor) -> tuple[Tensor, Tensor]:

@@ -15,19 +15,10 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from arraygeom.batching import stack
-from arraygeom.camera import Camera
-from arraygeom.pixels import HW, pixel_grid
-from arraygeom.rig import Rig
-from pat.lab.data.windows import (
-    RenderedView,
-    pinhole_of,
-    read_view,
-    scene_folders,
-    scene_rig,
-    undistorted,
-    window,
-)
+from arraygeom import Camera, Rig, pixel_grid, stack
+from arraygeom.pixels import HW
+from pat.lab.data import windows
+from pat.lab.data.windows import RenderedView
 from pat.lab.synthesis.layered import ArrayBatch
 from pat.lab.synthesis.rigs import below, in_frame_of, one_of, scaled
 from pat.media.colour import srgb_image
@@ -114,14 +105,12 @@ class RenderedCrops(Crops):
     """
 
     def _find(self, roots: Sequence[Path], choose: Callable[[int], bool]) -> None:
-        folders = [folder for root in roots for folder in scene_folders(root)]
+        folders = [folder for root in roots for folder in windows.scene_folders(root)]
         self.folders = chosen(folders, choose, f"rendered scenes of {', '.join(map(str, roots))}")
-        rigs = [scene_rig(folder) for folder in self.folders]
+        rigs = [windows.scene_rig(folder) for folder in self.folders]
         self.names = [rig.names for rig in rigs]
         self.alphas = [large_enough(folder, rig, self.hw) for folder, rig in zip(self.folders, rigs)]
-        self._view = lru_cache(3 * ACTIVE)(
-            lambda scene, name: undistorted(read_view(self.folders[scene], name))
-        )
+        self._view = lru_cache(3 * ACTIVE)(self._read)
 
     def sample(self, batch: int, generator: Generator, *, number: int, betas: int = 1) -> ArrayBatch:
         """Draw windows from the scenes that are active for group `number`.
@@ -145,6 +134,9 @@ class RenderedCrops(Crops):
         with torch.no_grad():
             drawn = [self._windows(one_of(scenes, generator), sizes, generator) for _ in range(batch)]
         return batched(drawn, self.device)
+
+    def _read(self, scene: int, name: str) -> RenderedView:
+        return windows.undistorted(windows.read_view(self.folders[scene], name))
 
     def _windows(self, scene: int, sizes: list[HW], g: Generator) -> list[RenderedView]:
         """Alpha's window and one of each beta."""
@@ -197,9 +189,7 @@ def chosen(every: list[T], choose: Callable[[int], bool], what: str) -> list[T]:
     """
     items = [item for i, item in enumerate(every) if choose(i)]
     if not items:
-        raise ValueError(
-            f"{what}: {len(every)} are too few to learn from some and to hold others out: give more"
-        )
+        raise ValueError(f"{what}: {len(every)} are too few to learn from and to hold out: give more")
     return items
 
 
@@ -217,18 +207,14 @@ def large_enough(folder: Path, rig: Rig, hw: HW) -> list[str]:
     Raises:
         ValueError: if none is large enough, a camera is not calibrated, or there is only one.
     """
-    sizes = {name: pinhole_of(c).hw for name, c in rig.cameras.items() if isinstance(c, Camera)}
+    sizes = {name: windows.pinhole_of(c).hw for name, c in rig.cameras.items() if isinstance(c, Camera)}
     count = len(rig.names)
     if len(sizes) < max(count, 2):
-        raise ValueError(
-            f"{folder}: has {len(sizes)} calibrated cameras of {count}: all must be, two at least"
-        )
+        raise ValueError(f"{folder}: {len(sizes)} of {count} cameras are calibrated: all must be, and two")
     names = [name for name, size in sizes.items() if size[0] >= hw[0] and size[1] >= hw[1]]
     if not names:
         listed = ", ".join(f"{name} {w}x{h}" for name, (h, w) in sizes.items())
-        raise ValueError(
-            f"{folder}: no image is as large as the samples, {hw[1]}x{hw[0]} ({listed}): lower `hw`"
-        )
+        raise ValueError(f"{folder}: no image is as large as samples, {hw[1]}x{hw[0]} ({listed}): lower `hw`")
     return names
 
 
@@ -254,11 +240,8 @@ def beside(alpha: RenderedView, beta: RenderedView, size: HW, hw: HW, g: Generat
     depth = middle.new_tensor(1 / (share / near + (1 - share) / far))
     projected = beta.camera.project(alpha.camera.unproject(middle, depth))
     shift = DECENTRED * (2 * torch.rand(2, generator=g, dtype=torch.float64) - 1)
-    centre = (
-        projected.x
-        if bool(projected.valid)
-        else middle.new_tensor([beta.camera.hw[1] / 2, beta.camera.hw[0] / 2])
-    )
+    centre = middle.new_tensor([beta.camera.hw[1] / 2, beta.camera.hw[0] / 2])
+    centre = projected.x if bool(projected.valid) else centre
     x, y = (centre + shift * middle.new_tensor([wanted[1], wanted[0]])).tolist()
     top, left = (_inside(c - n / 2, n, whole) for c, n, whole in zip((y, x), wanted, beta.camera.hw))
     return finite_window(beta, top, left, wanted, size)
@@ -281,11 +264,10 @@ def finite_window(view: RenderedView, top: int, left: int, size: HW, hw: HW) -> 
     Returns:
         The window, with its camera.
     """
-    cut = window(view, top, left, size, hw)
+    cut = windows.window(view, top, left, size, hw)
     rays, _ = cut.camera.rays(pixel_grid(hw, dtype=torch.float64))
-    return cut._replace(
-        depth=torch.where(cut.depth.isposinf(), (SKY / rays.norm(dim=-1)).to(cut.depth), cut.depth)
-    )
+    depth = torch.where(cut.depth.isposinf(), (SKY / rays.norm(dim=-1)).to(cut.depth), cut.depth)
+    return cut._replace(depth=depth)
 
 
 def bounds(depth: Float[Tensor, "b h w"]) -> Float[Tensor, "b 2"]:

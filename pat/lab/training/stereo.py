@@ -17,9 +17,8 @@ from jaxtyping import Float
 from PIL import Image, UnidentifiedImageError
 from torch import Generator, Tensor
 
-from arraygeom.camera import Camera, intrinsics
+from arraygeom import Camera, Pose, intrinsics
 from arraygeom.pixels import HW
-from arraygeom.pose import Pose
 from pat.lab.data.pairs import PairFiles, pair_files
 from pat.lab.data.windows import reduced
 from pat.lab.synthesis.layered import ArrayBatch
@@ -83,9 +82,7 @@ class MeasuredPairs(Crops):
             raise ValueError(f"{pair.left} is grey: pairs to train on must be in colour")
         h, w = self.hw
         if left[0] < h or left[1] < w:
-            raise ValueError(
-                f"{pair.left} is {_described(left)}, smaller than the samples, {w}x{h}: lower `hw`"
-            )
+            raise ValueError(f"{pair.left} is {_described(left)}, below samples of {w}x{h}: lower `hw`")
         disparity_files(pair)
 
     def read(self, pair: PairFiles) -> Pictures:
@@ -158,9 +155,7 @@ def disparity_files(pair: PairFiles) -> tuple[Path, Path]:
         left, right = (pair.left.with_name(name) for name in names)
         if left.is_file() and right.is_file():
             return left, right
-    raise ValueError(
-        f"{pair.left.parent}: wanted the true disparity of both images beside them, disp1.png and disp5.png"
-    )
+    raise ValueError(f"{pair.left.parent}: the true disparities are missing, disp1.png and disp5.png")
 
 
 def depth_of(disparity: Float[Tensor, "b h w"], width: int) -> Float[Tensor, "b h w"]:
@@ -205,9 +200,8 @@ def assumed_cameras(
     batch, _, h, w = images[0].shape
     K = intrinsics(float(w), (h, w)).expand(batch, 3, 3)
     t = torch.zeros(batch, 3, dtype=torch.float64)
-    alpha = Camera(
-        K=K, cam_from_world=Pose(torch.eye(3, dtype=torch.float64).expand(batch, 3, 3), t), hw=(h, w)
-    )
+    pose = Pose(torch.eye(3, dtype=torch.float64).expand(batch, 3, 3), t)
+    alpha = Camera(K=K, cam_from_world=pose, hw=(h, w))
     beta = alpha.replace(cam_from_world=Pose(alpha.R, torch.stack([-side, t[:, 1], t[:, 2]], -1)))
     betas = [beta.resize((p.shape[-2], p.shape[-1])) for p in images[1:]]
     cameras = [camera.to(device, torch.float32) for camera in (alpha, *betas)]
@@ -222,9 +216,7 @@ def _header(file: Path) -> tuple[int, int, int]:
         with Image.open(file) as image:
             return image.height, image.width, 1 if image.mode[0] in "1LIF" else 3
     except (OSError, UnidentifiedImageError):
-        raise ValueError(
-            f"{file}: not an image that can be read: give a whole PNG, TIFF or JPEG file"
-        ) from None
+        raise ValueError(f"{file}: not an image that can be read: give a PNG, TIFF or JPEG") from None
 
 
 def _described(header: tuple[int, int, int]) -> str:

@@ -10,15 +10,8 @@ from typing import Any
 
 import torch
 from jaxtyping import Float
+from rich import progress
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    Progress,
-    TaskProgressColumn,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 from torch import Tensor
 from torch.nn.functional import interpolate
 
@@ -53,13 +46,13 @@ class Watch:
         _keep_lines(self.out / "steps.csv", step, lambda line: int(line.partition(",")[0]), header=HEADER)
         _keep_lines(self.out / "log.jsonl", step, lambda line: json.loads(line)["step"])
         self.steps = (self.out / "steps.csv").open("a", encoding="utf-8")
-        self.bar = Progress(
-            TextColumn("step {task.fields[step]}"),
-            BarColumn(),
-            TaskProgressColumn(),
-            TextColumn("loss {task.fields[loss]:.4f}  {task.fields[speed]:.1f} scenes/s"),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
+        self.bar = progress.Progress(
+            progress.TextColumn("step {task.fields[step]}"),
+            progress.BarColumn(),
+            progress.TaskProgressColumn(),
+            progress.TextColumn("loss {task.fields[loss]:.4f}  {task.fields[speed]:.1f} scenes/s"),
+            progress.TimeElapsedColumn(),
+            progress.TimeRemainingColumn(),
             console=Console(stderr=True),
             disable=not Console(stderr=True).is_terminal,
         )
@@ -140,9 +133,8 @@ def _row(network: FusionNetwork, sample: Sample) -> Tensor:
 
 def _keep_lines(path: Path, step: int, step_of: Any, *, header: str = "") -> None:
     """Remove the lines of steps after `step`, and an incomplete last line."""
-    lines = (
-        path.read_text(encoding="utf-8").splitlines(keepends=True)[bool(header) :] if path.is_file() else []
-    )
+    text = path.read_text(encoding="utf-8") if path.is_file() else ""
+    lines = text.splitlines(keepends=True)[bool(header) :]
     earlier = [line for line in lines if line.endswith("\n") and step_of(line) <= step]
     write_text(path, header + "".join(earlier))
 

@@ -50,7 +50,7 @@ def test_without_noise_nothing_is_biased():
 def test_light_is_recorded_as_the_forward_model_does():
     """The same distribution as the chain of sensor steps."""
     image = torch.full((1, 1, 300, 300), 0.4)
-    chain = [DecodeSRGB(), Noise(100, 3, counts="poisson"), Clip(), EncodeSRGB()]
+    chain = [DecodeSRGB(), Noise(100, 3), Clip(), EncodeSRGB()]
     other = record(image, chain, generator_for(0, "chain"))
     ours = NoiseLevel.from_electrons(100, 3).recorded(image, generator_for(0, "ours"))
     quantiles = torch.linspace(0.02, 0.98, 13)

@@ -42,24 +42,14 @@ def test_linear_and_srgb_encoded_are_inverses_and_match_the_standard():
     assert run(torch.full((1, 1, 1, 1), 0.5), DecodeSRGB()).item() == pytest.approx(0.214041, abs=1e-6)
 
 
-@pytest.mark.parametrize("counts", ["gaussian", "poisson"])
-def test_noise_follows_the_mean_variance_line(counts):
+def test_noise_follows_the_mean_variance_line():
     full_well, read = 1000.0, 8.0
     signal = torch.linspace(0.05, 0.95, 10, dtype=torch.float64).view(10, 1, 1, 1).expand(10, 1, 300, 300)
-    noisy = run(signal, Noise(full_well, read, counts))
+    noisy = run(signal, Noise(full_well, read))
     electrons = noisy.flatten(1) * full_well
     slope, offset = np.polyfit(electrons.mean(1).numpy(), electrons.var(1).numpy(), 1)
     assert slope == pytest.approx(1, abs=0.03)
     assert offset == pytest.approx(read**2, abs=10)
-
-
-def test_poisson_counts_whole_electrons_and_passes_the_gradient_of_the_mean():
-    image = torch.full((1, 1, 100, 100), 0.003, dtype=torch.float64, requires_grad=True)
-    electrons = run(image, Noise(1000, 0, "poisson")) * 1000
-    torch.testing.assert_close(electrons, electrons.round())
-    assert (electrons == 0).float().mean().item() == pytest.approx(np.exp(-3), abs=0.01)
-    electrons.sum().backward()
-    assert (image.grad == 1000).all()
 
 
 def test_noise_is_seeded_and_differs_between_images():
@@ -244,8 +234,7 @@ def test_mistakes_are_named():
     for numbers in ((0.0, 0.0), (math.nan, 0.0), (100.0, math.nan)):
         with pytest.raises(ValueError, match="full_well > 0"):
             Noise(*numbers)
-    with pytest.raises((ValueError, TypeError), match="counts"):
-        Noise(100, counts="normal")
+
     for factor in (0.0, math.nan):
         with pytest.raises(ValueError, match="resample"):
             Resample(factor)
@@ -260,5 +249,5 @@ def test_mistakes_are_named():
         with pytest.raises(ValueError, match="sigma must be 0 or more pixels"):
             GaussianBlur(sigma)
     halved = DegradationCase("halve", beta=(Resample(0.5),))
-    with pytest.raises(ValueError, match="must keep the size"):
+    with pytest.raises(ValueError, match='"halve"'):
         augment(noise_image(1, 1, 8, 8), noise_image(1, 3, 8, 8), [halved], generator())

@@ -175,7 +175,7 @@ def test_the_time_left_is_right_within_half_once_two_tasks_are_done(seconds, mon
             yield one
 
     console = Console(file=text, width=80, get_time=lambda: now[0])
-    assert list(followed(outcomes(), title="jobs", total=len(seconds), console=console)) == seconds
+    assert list(followed(outcomes(), title="jobs", total=len(seconds), done=0, console=console)) == seconds
     lines = text.getvalue().splitlines()
     assert "left" not in lines[0]
     assert lines[-1] == f"jobs: {len(seconds)} of {len(seconds)}"

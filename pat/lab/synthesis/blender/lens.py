@@ -11,10 +11,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import map_coordinates
 from torch import Tensor
 
-from arraygeom.camera import Camera, View
-from arraygeom.pixels import map_homogeneous, pixel_grid
-from arraygeom.pose import Pose
-from arraygeom.sampling import sample
+from arraygeom import Camera, Pose, View, pixel_grid, sample
+from arraygeom.pixels import map_homogeneous
 
 from ..rendered import depth_between
 
@@ -121,9 +119,7 @@ def lens_for(camera: View, name: str) -> Lens:
         raise ValueError(f"camera '{name}' is batched {tuple(camera.K.shape[:-2])}: render one rig at a time")
     camera = camera.to(dtype=torch.float64, device="cpu")
     upright = _upright(camera, name)
-    if camera.distortion is None:
-        return Lens(upright, None, None)
-    return _wide(camera, upright, name)
+    return Lens(upright, None, None) if camera.distortion is None else _wide(camera, upright, name)
 
 
 def _upright(camera: Camera, name: str) -> Camera:
@@ -163,8 +159,7 @@ def _wide(camera: Camera, upright: Camera, name: str) -> Lens:
     if w * h > _MOST_PIXELS:
         raise ValueError(f"camera '{name}': its lens needs an image of {w}x{h} pixels: crop the camera")
     K = torch.tensor([[f, 0, -float(low[0])], [0, f, -float(low[1])], [0, 0, 1]], dtype=torch.float64)
-    x = map_homogeneous(K[:2], plane)
-    return Lens(upright.replace(K=K, hw=(h, w)), x, valid)
+    return Lens(upright.replace(K=K, hw=(h, w)), map_homogeneous(K[:2], plane), valid)
 
 
 def _finest(plane: Float[Tensor, "h w 2"], valid: Bool[Tensor, "h w"]) -> Float[Tensor, ""]:

@@ -19,7 +19,7 @@ class RenderSettings:
         denoise: denoiser.
         fast_light: True for Blender's fast approximation of indirect light.
         bounces: reflections of light.
-        device: "auto" takes a GPU if one is usable.
+
         threads: CPU threads; 0 uses all cores.
         infrared: True to render near infrared beside colours.
         duration: seconds to render, at each camera's frame rate and time offset; 0 renders one frame of each
@@ -32,7 +32,7 @@ class RenderSettings:
     denoise: Literal["none", "fast", "accurate"] = "fast"
     fast_light: bool = True
     bounces: int = 2
-    device: Literal["auto", "cpu", "gpu"] = "cpu"
+
     threads: int = 0
     infrared: bool = False
     duration: float = 0.0
@@ -43,5 +43,4 @@ PRESETS: dict[str, dict[str, Any]] = {
     "fast": {"width": 512},
     "paper": {"width": 2048, "samples": 32, "denoise": "accurate", "fast_light": False, "bounces": 4},
 }
-"""Presets by name, as differences from the defaults: 512 pixels wide, or as the paper's 2048 at higher
-quality."""
+"""Presets by name, beside the defaults: 512 pixels wide, or as the paper's 2048 at higher quality."""

@@ -44,7 +44,7 @@ class Studio:
         version: Blender's version.
 
     Raises:
-        ValueError: if Blender is not installed, or no GPU is usable for device "gpu".
+        ValueError: if Blender is not installed.
         BrokenProcessPool: if its process dies.
     """
 

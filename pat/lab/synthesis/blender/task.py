@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
-import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from importlib.metadata import version
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 from uuid import uuid4
 
@@ -29,8 +28,6 @@ from .settings import RenderSettings
 from .studio import NOTHING, Studio, index_name
 
 _RATE = 30.0
-_SHARED_MEMORY = Path("/dev/shm")
-_SCRATCH = "pat-render-"
 
 
 class Shot(NamedTuple):
@@ -72,7 +69,7 @@ def render(scene: Scene, rig: Rig, out: Path, *, settings: RenderSettings) -> Re
     lenses = {name: lens_for(camera, name) for name, camera in rig.cameras.items()}
     planned = shots(rig, settings)
     refuse_inside(scene, rig, planned)
-    with _staged(out) as folder, _scratch() as scratch, closing(Studio(scene, settings, scratch)) as studio:
+    with _staged(out) as folder, _studio(scene, settings, out.parent) as studio:
         files: dict[str, list[dict[str, Any]]] = {name: [] for name in rig.names}
         first: dict[str, RenderedFrame] = {}
         for shot in planned:
@@ -178,15 +175,7 @@ def _staged(out: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def _scratch() -> Iterator[Path]:
-    """Temporary folder, in memory if possible, for the files that Blender writes.
-
-    Its name holds the process number: folders of killed processes are removed.
-    """
-    where = _SHARED_MEMORY if os.access(_SHARED_MEMORY, os.W_OK) else None
-    for left in _SHARED_MEMORY.glob(f"{_SCRATCH}*") if where else ():
-        owner = left.name.removeprefix(_SCRATCH).partition("-")[0]
-        if owner.isdecimal() and not Path(f"/proc/{owner}").exists():
-            shutil.rmtree(left, ignore_errors=True)
-    with tempfile.TemporaryDirectory(dir=where, prefix=f"{_SCRATCH}{os.getpid()}-") as folder:
-        yield Path(folder)
+def _studio(scene: Scene, settings: RenderSettings, beside: Path) -> Iterator[Studio]:
+    """Blender with a scene, and a temporary folder within `beside` for the files that it writes."""
+    with TemporaryDirectory(dir=beside) as scratch, closing(Studio(scene, settings, Path(scratch))) as studio:
+        yield studio

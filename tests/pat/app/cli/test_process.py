@@ -130,7 +130,8 @@ finally: assert "torch" not in sys.modules
 
 def test_an_image_without_a_camera_is_explained(refusal):
     said = refusal("fuse", ROOT / "README.md", "--image", "mono.png")
-    assert "--image mono.png: which camera is it of? Give NAME=FILE, such as mono=mono.png" in said
+    assert "--image mono.png" in said
+    assert "mono=mono.png" in said
 
 
 @pytest.mark.parametrize("command", ["fuse", "align"])

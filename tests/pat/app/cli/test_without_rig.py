@@ -170,8 +170,8 @@ def test_what_cannot_be_fused_is_one_line_and_leaves_nothing(folder, tmp_path, r
         "other.png": "points seen in both 'mono' and 'other' agree",
         "flat.png": "flat.png: is of one colour",
         "ramp.png": "hardly any texture",
-        "copy.png": "are the same image",
-        "again.png other.png again_copy.png": "images of 'again' and 'again_copy' are the same image",
+        "copy.png": "'mono' and 'copy'",
+        "again.png other.png again_copy.png": "'again' and 'again_copy'",
         "clip.mp4": "clip.mp4 is a video and",
         "x.heic": "x.heic: ",
         "none.png": "none.png: no such image",
@@ -262,7 +262,7 @@ def test_the_rate_that_is_asked_for_is_that_of_the_video(
             write_image(path, halved[1][name])
     (tmp_path / "fused.mp4").write_bytes(b"of a former sequence")
     monkeypatch.setattr(
-        "pat.app.from_images.frames_of_videos", lambda *_: (files, {"mono": 12.0, "colour": 24.0})
+        "pat.app.from_images.video_frames", lambda *_: (files, {"mono": 12.0, "colour": 24.0})
     )
     monkeypatch.setattr("pat.media.images.has_many_bits", lambda path: False)
     command = FuseSequence(given=(Path("mono.mp4"), Path("colour.mp4")), out=tmp_path, **options)

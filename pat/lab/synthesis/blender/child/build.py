@@ -254,8 +254,7 @@ def _voronoi(nodes: _Nodes, texture: Part) -> Any:
 
 def _brick(nodes: _Nodes, texture: Part) -> Any:
     greys = {"Color1": (0.0, 0.0, 0.0, 1.0), "Color2": (0.7, 0.7, 0.7, 1.0), "Mortar": (1.0, 1.0, 1.0, 1.0)}
-    node = nodes.texture("Brick", _coordinates(nodes, texture, "UV"), **greys, Scale=0.5)
-    return node.outputs["Color"]
+    return nodes.texture("Brick", _coordinates(nodes, texture, "UV"), **greys, Scale=0.5).outputs["Color"]
 
 
 def _plain(nodes: _Nodes, texture: Part) -> Any:

@@ -21,9 +21,7 @@ def load() -> Any:
         raise ValueError(f"Blender's environment has no {error.name}: make it again") from None
     except ImportError as error:
         library = str(error).partition(":")[0]
-        raise ValueError(
-            f"Blender needs system libraries ({library} is missing): apt-get install -y {LIBRARIES}"
-        ) from None
+        raise ValueError(f"Blender needs {library} of the system: apt-get install -y {LIBRARIES}") from None
 
 
 def new_scene(bpy: Any) -> Any:
@@ -64,24 +62,3 @@ def factor(node: Any) -> Any:
     """Return the single-valued output of a texture node: 'Factor', 'Fac' before 5.0, or its first."""
     outputs = node.outputs
     return outputs.get("Factor") or outputs.get("Fac") or outputs[0]
-
-
-def use_gpu(bpy: Any) -> bool:
-    """Enable the GPUs that Cycles can use.
-
-    Returns:
-        True if there is one.
-    """
-    preferences = bpy.context.preferences.addons["cycles"].preferences
-    for kind in ("OPTIX", "CUDA", "HIP", "METAL", "ONEAPI"):
-        try:
-            preferences.compute_device_type = kind
-        except TypeError:
-            continue
-        preferences.refresh_devices()
-        devices = [d for d in preferences.devices if d.type == kind]
-        for device in devices:
-            device.use = True
-        if devices:
-            return True
-    return False
