@@ -226,6 +226,9 @@ def cropped(rig: Rig, names: Sequence[str]) -> Hypothesis:
     Args:
         rig: the rig with principal points of the images as they are.
         names: names of the cameras.
+
+    Returns:
+        The hypothesis, with that rig.
     """
     u, v = (float(c) for c in rig[names[0]].K[:2, 2])
     words = f"image of {', '.join(map(repr, names))} cropped: principal point at about ({u:.0f}, {v:.0f})"
