@@ -8,7 +8,7 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --no-input -
 
 DATA ?= ../shared/data
 
-.PHONY: help env synthesis demo showcase readme pairs stages conditions certainty without-rig alignment paper-network paper-tables outside fields formats test test-long check format bench bench-job train notebooks docs drawings wheel fuzz mistakes kills transformations gradients
+.PHONY: help env synthesis demo showcase readme pairs stages conditions certainty without-rig alignment paper-network paper-tables outside fields trained-fields formats test test-long check format bench bench-job train notebooks docs drawings wheel fuzz mistakes kills transformations gradients
 
 help:
 	@echo "make demo       fuse the sample array into out/demo"
@@ -23,6 +23,8 @@ help:
 	@echo "make paper-tables  the paper's Tables 1 and 2 by its network, into docs/reports/paper.md"
 	@echo "make outside    fuse with disparities from elsewhere, into docs/reports/outside.md"
 	@echo "make fields     every receptive field by the network pat-supervised, into docs/reports/paper.md"
+	@echo "make trained-fields  the paper's network, narrow, trained anew with each field on PHOTOS=$(DATA)/photos/city100,"
+	@echo "                into docs/reports/paper.md; half an hour of one core"
 	@echo "make formats    the table of rig formats, from what their readers state, into docs/rigs.md"
 	@echo "make without-rig  fuse with rigs found from the images, against known ones, into docs/reports/without_rig.md"
 	@echo "make test       the tests"
@@ -114,6 +116,12 @@ paper-tables: $(READY)
 fields: $(READY)
 	@$(BIN)/python -m experiments fields --middlebury $(DATA)/middlebury --out out/fields
 	@$(BIN)/python -m docs.update_readme --document docs/reports/paper.md --block fields=out/fields/ablation.md
+
+PHOTOS ?= $(DATA)/photos/city100
+
+trained-fields: $(READY)
+	@$(BIN)/python -m experiments trained-fields --photos $(PHOTOS) --out out/trained-fields
+	@$(BIN)/python -m docs.update_readme --document docs/reports/paper.md --block trained-fields=out/trained-fields/trained.md
 
 test: $(READY)
 	@echo "== tests"

@@ -5,11 +5,12 @@ Cameras, rigs, two-view geometry and receptive fields as tensor operations; see 
 
 from collections.abc import Callable
 from importlib import import_module
+from types import FunctionType
 from typing import Any
 
 from .batching import stack
 from .camera import Camera, LensView, Projected, View, intrinsics
-from .checks import unchecked
+from .checks import checked, unchecked
 from .distortion import Distortion
 from .epipolar import (
     Depth,
@@ -150,6 +151,12 @@ __all__ = [
     "warp",
     "world_rays",
 ]
+
+
+for _name in __all__:
+    if isinstance(globals()[_name], FunctionType) and _name != "unchecked":
+        globals()[_name] = checked(globals()[_name])
+        globals()[_name].__module__ = __name__  # so that it is pickled by name
 
 
 def __dir__() -> list[str]:

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.utils._pytree import GetAttrKey, register_pytree_node, tree_leaves
 from torch.utils.data._utils.collate import default_collate_fn_map
 
-from .checks import derived
+from .checks import check_methods, derived
 from .pixels import broadcast_shapes
 
 T = TypeVar("T", bound="Batched")
@@ -41,6 +41,8 @@ class Batched:
             flatten_with_keys_fn=_flattened_with_keys,  # type: ignore[arg-type]
         )
         torch.serialization.add_safe_globals([cls])
+        if cls.__module__.startswith("arraygeom."):
+            check_methods(cls)
 
     @property
     def batch_shape(self) -> torch.Size:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, is_dataclass
+from numbers import Real as Number
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 
 import torch
@@ -11,7 +12,7 @@ from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
 from .batching import Batched
-from .checks import check_above, check_batches, check_hw, check_K, check_pixels, check_tensors, checking
+from .checks import check_above, check_batches, check_hw, check_K, checking
 from .distortion import Distortion
 from .kornia_models import from_kornia_model, to_kornia_model
 from .lenses.common import on_plane
@@ -201,7 +202,6 @@ class LensView(View):
             Directions (z = 1 for pinholes, unit length with a `Distortion`, any length by other models), and
             True where the lens model has one; elsewhere the direction means nothing.
         """
-        check_pixels(x)
         normalised = map_homogeneous(torch.linalg.inv(self.K)[..., :2, :], x)
         if self.distortion is None:
             return to_homogeneous(normalised), torch.ones_like(normalised[..., 0], dtype=torch.bool)
@@ -349,7 +349,6 @@ class Camera(LensView):
         Raises:
             ValueError: if pixels and depths, broadcast, are more than either, as (n, 2) beside (n, 1).
         """
-        check_tensors((), depth=depth)
         rays, valid = self.rays(x)
         z = rays[..., 2]
         _check_pairs(z.shape, depth.shape)
@@ -362,13 +361,14 @@ class Camera(LensView):
         return torch.where(valid[..., None], X, torch.nan)
 
     def to_kornia(self) -> PinholeCamera | CameraModel:
-        """Convert to kornia: a `PinholeCamera`, batched (B, 4, 4), or with a lens a `CameraModel`.
+        """Convert to kornia: a `PinholeCamera`, batched (B, 4, 4), or a `CameraModel` with a distorting lens.
 
         Kornia's camera models (`kornia.sensors.camera`) have no pose: keep `cam_from_world`. Pixels and axes
         agree. `PinholeCamera.scale` moves the principal point differently: `resize` first.
 
         Raises:
-            ValueError: for a lens that kornia does not have.
+            ValueError: for a lens, or prism or tilt terms, that kornia does not have, and with a lens for a K
+                that is skewed or rotated.
         """
         from kornia.geometry.camera import PinholeCamera
 
@@ -424,7 +424,7 @@ def _check_pairs(pixels: torch.Size, depths: torch.Size) -> None:
     """Raises ValueError unless pixels and depths, broadcast, are as many as one of both."""
     try:
         fits = broadcast_shapes(pixels, depths) in (pixels, depths)
-    except RuntimeError:
+    except (RuntimeError, ValueError):
         fits = False
     if not fits:
         raise ValueError(
@@ -464,6 +464,8 @@ def _two(value: Any, name: str) -> tuple[Any, Any]:
     if isinstance(value, Tensor) and value.numel() > 1:
         value = tuple(value)
     pair = tuple(value) if isinstance(value, tuple | list) else (value, value)
+    if any(not isinstance(v, Number | Tensor) for v in pair):
+        raise TypeError(f"{name} is {value!r}: give one number or two, in pixels")
     if len(pair) != 2:
         raise ValueError(
             f"{name} is one number or two, in pixels; got {len(pair)}: make one K a camera and stack them"

@@ -7,17 +7,22 @@ Values are not available while torch compiles, traces or transforms: nothing is 
 
 from __future__ import annotations
 
+import inspect
 import math
 import operator
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, TypeVar
+from functools import cache, partial, wraps
+from numbers import Integral, Real
+from types import FunctionType, UnionType
+from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import torch
+from jaxtyping import AbstractArray
 from torch import Tensor
 
-from .pixels import broadcast_shapes
+from .pixels import HW, broadcast_shapes
 from .runtime.tracing import followed
 
 T = TypeVar("T")
@@ -190,7 +195,7 @@ def check_above(least: float, *, whole: bool = False, itself: bool = True, **val
 
     Raises:
         ValueError: for another number, infinity or NaN.
-        TypeError: for a value that is no number; text such as "3" passes unless `whole`.
+        TypeError: for a value that is no number.
     """
     bound = f"of {least:g} or more" if itself else f"above {least:g}"
     wanted = f"wanted a {'whole' if whole else 'finite'} number {bound}"
@@ -198,7 +203,7 @@ def check_above(least: float, *, whole: bool = False, itself: bool = True, **val
         if value is None or isinstance(value, Tensor):
             continue
         try:
-            number = operator.index(value) if whole else float(value)
+            number = operator.index(value) if whole or isinstance(value, str) else float(value)
         except (TypeError, ValueError):
             raise TypeError(f"{name} is a {type(value).__name__}: {wanted}") from None
         if not (number > least or (itself and number == least)) or number == math.inf:
@@ -222,19 +227,6 @@ def check_bounds(near: Any, far: Any) -> None:
             raise ValueError(f"{name} is {value:g}: wanted metres above 0")
     if isinstance(near, int | float) and isinstance(far, int | float) and near > far:
         raise ValueError(f"near is {near:g} m and far {far:g} m: exchange them")
-
-
-def check_pixels(x: Any) -> None:
-    """Check that x are pixels (\\*n, 2).
-
-    Raises:
-        ValueError: for another shape.
-        TypeError: for a value that is no tensor.
-    """
-    if not isinstance(x, Tensor):
-        raise TypeError(f"the pixels are a {type(x).__name__}: give a tensor of (x, y)")
-    if x.ndim < 1 or x.shape[-1] != 2:
-        raise ValueError(f"the pixels have shape {tuple(x.shape)}; wanted (..., 2), each (x, y)")
 
 
 def check_tensors(last: tuple[int, ...], **values: Any) -> None:
@@ -264,6 +256,137 @@ def check_field(field: Any) -> None:
             f"a field is a function of a pair and alpha's pixels, this is a {type(field).__name__}: "
             "give a field such as Epipolar()"
         )
+
+
+def checked(function: Callable[..., T]) -> Callable[..., T]:
+    """Decorator that checks a public function's arguments by their annotations, each kind in one sentence.
+
+    Tensors are checked for their type, last axes and device, sizes as `check_hw`; numbers, cameras, poses,
+    pairs, rigs and fields for their type. Nothing is checked while torch compiles or transforms.
+
+    Args:
+        function: function or method; what its annotations leave open is not checked.
+
+    Returns:
+        The function, which raises TypeError or ValueError before it does anything.
+    """
+
+    @wraps(function)
+    def call(*args: Any, **kwargs: Any) -> T:
+        if checking():
+            _check_arguments(function, args, kwargs)
+        return function(*args, **kwargs)
+
+    return call
+
+
+def _check_arguments(function: Callable[..., Any], args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> None:
+    names, refusals = _refusals(function)
+    given = {**dict(zip(names, args)), **kwargs}
+    for name, value in given.items():
+        if name in refusals and (error := refusals[name](name, value)):
+            raise error
+    _check_devices(given)
+
+
+def check_methods(cls: type) -> None:
+    """Check the arguments of a class's public methods, as `checked`."""
+    for name, member in list(vars(cls).items()):
+        if isinstance(member, FunctionType) and not name.startswith("_"):
+            setattr(cls, name, checked(member))
+        elif isinstance(member, classmethod) and not name.startswith("_"):
+            setattr(cls, name, classmethod(checked(member.__func__)))
+
+
+def _check_devices(given: Mapping[str, Any]) -> None:
+    """Raise ValueError for tensors, a single number excepted, on several devices."""
+    devices = {name: t.device for name, t in given.items() if isinstance(t, Tensor) and t.ndim}
+    if len(set(devices.values())) > 1:
+        listed = ", ".join(f"{name} on {device}" for name, device in devices.items())
+        raise ValueError(f"{listed}: give all on one device")
+
+
+@cache
+def _refusals(
+    function: Callable[..., Any],
+) -> tuple[list[str], dict[str, Callable[[str, Any], Exception | None]]]:
+    """Names of a function's positional arguments, and functions that say what is wrong with an argument."""
+    function = inspect.unwrap(function)
+    parameters = inspect.signature(function).parameters
+    names = [name for name, p in parameters.items() if p.kind == p.POSITIONAL_OR_KEYWORD]
+    try:
+        hints = get_type_hints(function)
+    except NameError:  # of another package, imported for type checkers alone
+        return names, {}
+    made: dict[str, Callable[[str, Any], Exception | None]] = {}
+    for name, hint in hints.items():
+        hint = getattr(hint, "__bound__", None) or hint
+        kinds = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+        if name != "return" and all(map(_is_checked, kinds)):
+            made[name] = partial(_refusal, kinds)
+    return names, made
+
+
+def _is_checked(kind: Any) -> bool:
+    if kind in (HW, int, float, str, type(None)) or get_origin(kind) in (Sequence, Mapping):
+        return True
+    own = isinstance(kind, type) and kind.__module__.startswith("arraygeom.")
+    return own or (isinstance(kind, type) and issubclass(kind, AbstractArray))
+
+
+def _refusal(kinds: Sequence[Any], name: str, value: Any) -> Exception | None:
+    """Return the error for a value that should be of one of these kinds; None for a value that is."""
+    if value is None and type(None) in kinds:
+        return None
+    errors = [_fault(kind, name, value) for kind in kinds if kind is not type(None)]
+    return None if None in errors else errors[0]
+
+
+def _fault(kind: Any, name: str, value: Any) -> Exception | None:
+    held = f"{name} is a {type(value).__name__}"
+    if kind == HW:
+        return _raised(check_hw, value)
+    if kind in (int, float):
+        number = isinstance(value, Integral if kind is int else Real)
+        scalar = isinstance(value, Tensor) and value.ndim == 0
+        return None if number or scalar else TypeError(f"{held}: give a number")
+    if kind is str:
+        return None if isinstance(value, str) else TypeError(f"{held}: give a name")
+    if get_origin(kind) is Mapping:
+        return None if isinstance(value, Mapping) else TypeError(f"{held}: give a mapping by name")
+    if get_origin(kind) is Sequence:
+        (item,) = get_args(kind)
+        several = isinstance(value, Sequence) and not isinstance(value, str)
+        if not several and not isinstance(value, Tensor):
+            return TypeError(f"{held}: give a list")
+        found = (_fault(item, f"an item of {name}", one) for one in value if _is_checked(item))
+        return next(filter(None, found), None)
+    if not issubclass(kind, AbstractArray):
+        if getattr(kind, "_is_protocol", False):
+            return _raised(check_field, value)
+        return None if isinstance(value, kind) else TypeError(f"{held}: give a {kind.__name__}")
+    axes = kind.dim_str.split()
+    if not isinstance(value, Tensor):
+        return TypeError(f"{held}: give a tensor of shape ({', '.join(axes)})")
+    fixed = [axis for axis in axes if axis[0] not in "*."]
+    fits = value.ndim == len(axes) if len(fixed) == len(axes) else value.ndim >= len(fixed)
+    last = [(int(axis), n) for axis, n in zip(reversed(axes), reversed(value.shape)) if axis.isdigit()]
+    if not fits or any(wanted != n for wanted, n in last):
+        return ValueError(f"{name} has shape {tuple(value.shape)}; wanted ({', '.join(axes)})")
+    if str(value.dtype).removeprefix("torch.") not in kind.dtypes:
+        return TypeError(
+            f"{name} holds {value.dtype}: wanted {kind.__name__.partition('[')[0].lower()} numbers"
+        )
+    return None
+
+
+def _raised(check: Callable[[Any], None], value: Any) -> Exception | None:
+    """The error that a check raises; None for none."""
+    try:
+        check(value)
+    except (TypeError, ValueError) as error:
+        return error
+    return None
 
 
 def _shape(shape: tuple[int, ...]) -> str:

@@ -13,7 +13,6 @@ import torch
 from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
-from .checks import check_tensors
 from .homography import infinite_homography
 from .pixels import HW, floating, map_homogeneous, product, to_homogeneous
 from .pose import Pose, cross_matrix, in_float64, matvec
@@ -90,7 +89,6 @@ def epipoles(F: Float[Tensor, "*b 3 3"]) -> tuple[Float[Tensor, "*b 3"], Float[T
         ValueError: for another shape.
         TypeError: for a value that is no tensor.
     """
-    check_tensors((3, 3), F=F)
     U, _, Vh = torch.linalg.svd(F)
     return Vh[..., 2, :], U[..., :, 2]
 

@@ -115,8 +115,8 @@ def fit_homography(x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"]) -> Float[Te
         differentiable, through ten Gauss-Newton steps at the end.
 
     Raises:
-        ValueError: for fewer points, NaN, and if there is no such homography: points on a line, or some that
-            would be behind.
+        ValueError: for fewer points, NaN, and if there is no such homography, as some points would be behind.
+            Points on a line are not told: any of many homographies comes back.
         TypeError: for points that are no tensors.
     """
     check_tensors((2,), x=x, y=y)

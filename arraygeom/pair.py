@@ -206,10 +206,6 @@ class Pair(Batched):
             return self.homography_at(torch.tensor(torch.inf, dtype=torch.float64))
         return resize_matrix(self.alpha.hw, self.beta.hw)
 
-    def resize_beta(self, hw: HW) -> Pair:
-        """Return the pair whose beta records images of another size."""
-        return self.transform_beta(resize_matrix(self.beta.hw, hw), hw)
-
     def transform_beta(self, A: Float[Tensor, "3 3"], hw: HW) -> Pair:
         """Return the pair in which beta's pixels are x' ~ A x and its image's size is `hw`."""
         eye = torch.eye(3, dtype=A.dtype)
@@ -227,14 +223,15 @@ class Pair(Batched):
             in front of both cameras.
 
         Raises:
-            ValueError: unless both cameras are calibrated and central.
+            ValueError: unless both cameras are calibrated and central, and for depths that are not positive.
         """
         alpha, beta = self._central("homography")
+        depth = torch.as_tensor(depth).to(alpha.K)
+        if checking() and not depth.is_meta and not bool((depth > 0).all()):
+            raise ValueError(f"a plane at a depth of {_shown(depth)} has no homography: give metres above 0")
         normal = alpha.K.new_tensor([0.0, 0.0, 1.0])
         pose = self.beta_from_alpha
-        return plane_homography(
-            alpha.K, beta.K, pose.R, pose.t, normal=normal, d=-torch.as_tensor(depth).to(alpha.K)
-        )
+        return plane_homography(alpha.K, beta.K, pose.R, pose.t, normal=normal, d=-depth)
 
     def _central(self, what: str) -> tuple[Camera, Camera]:
         """Both cameras. Raises ValueError if the rays of one do not meet in a point."""

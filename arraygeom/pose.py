@@ -12,7 +12,7 @@ from jaxtyping import Float, Real
 from torch import Tensor
 
 from .batching import Batched
-from .checks import check_batches, check_numbers, check_rotation, check_tensors, checking, derived
+from .checks import check_batches, check_numbers, check_rotation, checking, derived
 from .pixels import broadcast_shapes, broadcasts, floating, product
 from .runtime.text import angle, range_text
 from .runtime.tracing import traced
@@ -89,7 +89,7 @@ class Pose(Batched):
         return cls.from_centre(torch.stack([x, torch.linalg.cross(z, x), z], -2), centre)
 
     @classmethod
-    def from_matrix(cls, matrix: Float[Tensor, "*b 4 4"]) -> Pose:
+    def from_matrix(cls, matrix: Float[Tensor, "*b _ 4"]) -> Pose:
         """Make a pose of [R t], (*b, 4, 4) or (*b, 3, 4)."""
         return cls(matrix[..., :3, :3], matrix[..., :3, 3])
 
@@ -103,9 +103,18 @@ class Pose(Batched):
 
     @classmethod
     def from_quaternion(cls, q: Float[Tensor, "*b 4"], t: Float[Tensor, "*b 3"]) -> Pose:
-        """Make a pose of quaternions (w, x, y, z), of any length but zero."""
+        """Make a pose of quaternions (w, x, y, z), of any length but zero.
+
+        Returns:
+            The pose.
+
+        Raises:
+            ValueError: for a quaternion of length zero.
+        """
         from kornia.geometry.conversions import quaternion_to_rotation_matrix
 
+        if checking() and not bool(q.any(-1).all()):
+            raise ValueError("a quaternion is 0: give (w, x, y, z) of a length above 0")
         return cls(quaternion_to_rotation_matrix(q), t)
 
     @property
@@ -128,6 +137,8 @@ class Pose(Batched):
         return Se3(So3(Quaternion(self.quaternion)), self.t)
 
     def __matmul__(self, other: Pose) -> Pose:
+        if not isinstance(other, Pose):
+            raise TypeError(f"a Pose times a {type(other).__name__}: give a Pose, or `apply` it to points")
         return derived(Pose, product(self.R, other.R), matvec(self.R, other.t) + self.t)
 
     def inverse(self) -> Pose:
@@ -145,7 +156,6 @@ class Pose(Batched):
             ValueError: for points of other than three numbers, or without the batch's axes.
             TypeError: for points that are no tensor.
         """
-        check_tensors((3,), points=X)
         X, batch = floating(X), self.batch_shape
         if not broadcasts(batch, X.shape[:-1]):
             raise ValueError(
@@ -222,8 +232,6 @@ def rotation_from_vector(w: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
         TypeError: for a value that is no tensor.
     """
     from kornia.geometry.conversions import axis_angle_to_rotation_matrix
-
-    check_tensors((3,), w=w)
 
     return axis_angle_to_rotation_matrix(w)
 

@@ -67,7 +67,14 @@ def relative_pose(
 
     Returns:
         The pose; scale is unknown, so the baseline has length 1.
+
+    Raises:
+        ValueError: for no matches, or another number of them in the two images.
     """
+    if x.shape != x_beta.shape or not x.numel():
+        raise ValueError(
+            f"wanted matches (n, 2) in both images, got {tuple(x.shape)} and {tuple(x_beta.shape)}"
+        )
     from kornia.geometry.epipolar import essential_from_fundamental
 
     poses = poses_from_essential(in_float64(essential_from_fundamental, F, K_alpha, K_beta))

@@ -189,8 +189,10 @@ class Rig(Batched):
             round) if there is one.
 
         Raises:
-            ValueError: for an unknown name.
+            ValueError: for an unknown name, and one camera given twice.
         """
+        if self.require(alpha) == self.require(beta):
+            raise ValueError(f"a pair is of two cameras, and both are '{alpha}': name another beta")
         link = self.links.get((alpha, beta))
         if link is None and (beta, alpha) in self.links:
             link = self.links[beta, alpha].reversed()

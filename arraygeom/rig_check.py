@@ -217,7 +217,9 @@ def _reduced(hw: HW) -> HW:
 
 
 def _overlap(pair: Pair) -> bool:
-    """True if the segment of any pixel of a grid reaches beta's image."""
+    """True if the segment of any pixel of a grid reaches beta's image, and where no segment is known."""
+    if pair.depth is None and not (pair.alpha.has_pinhole_view and pair.beta.has_pinhole_view):
+        return True
     locations = recorded_field(pair)(pair, _grid(pair.alpha).to(pair.cameras[0].K))
     return bool((locations.valid if hasattr(locations, "valid") else locations.mask).any())
 

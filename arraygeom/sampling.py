@@ -10,7 +10,6 @@ from jaxtyping import Bool, Float, Real
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from .checks import check_tensors
 from .pixels import HW, floating, within
 from .runtime.threads import in_parallel
 from .runtime.tracing import followed
@@ -78,8 +77,6 @@ def sample(
         TypeError: for values that are no tensors.
         NotImplementedError: in forward mode (jvp, jacfwd, hessian).
     """
-    check_tensors((), image=image)
-    check_tensors((2,), x=x)
     if image.ndim != 4 or not image.numel() or not image.is_floating_point() or x.ndim < 2:
         raise ValueError(
             f"wanted images (B, C, H, W) of floating-point numbers and pixels (B, ..., 2), got {image.dtype} "

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
 from .camera import Camera
-from .checks import check_above, check_tensors
+from .checks import check_above
 from .epipolar import Depth, beside, depth_from_track, track
 from .lenses.common import on_plane
 from .multiview import world_rays
@@ -73,7 +73,6 @@ def triangulate(
         raise ValueError(
             f"wanted pixels (views, ..., 2) of {len(cameras)} >= 2 cameras, got {tuple(x.shape)}"
         )
-    check_tensors((2,), x=x)
     check_above(0, itself=False, deviation=deviation)
     if seen is not None and (seen.shape != x.shape[:-1] or seen.dtype != torch.bool):
         raise ValueError(f"seen is {seen.dtype} {tuple(seen.shape)}; wanted bools {tuple(x.shape[:-1])}")

@@ -151,7 +151,12 @@ def resampled(
 
     Returns:
         Values (1, C, H, W), 0 where source sees nothing unless `extended`, and validity.
+
+    Raises:
+        ValueError: for an image of another size than source's.
     """
+    if tuple(image.shape[-2:]) != tuple(source.hw):
+        raise ValueError(f"the image is {tuple(image.shape[-2:])}, its camera {tuple(source.hw)}: resize one")
 
     def part(x: Tensor) -> Sampled:
         return sampled_between(

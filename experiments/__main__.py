@@ -149,6 +149,7 @@ class Experiments:
         "certainty": commands.Certainty,
         "sweeps": commands.Sweeps,
         "fields": commands.Fields,
+        "trained-fields": commands.TrainedFields,
         "record": Record,
     }
 

@@ -53,7 +53,7 @@ class SystemScene(LayeredScenes):
 
     def camera(self, name: str) -> Camera:
         """A camera of the rig as a batch of one, in alpha's frame."""
-        alpha, camera = self.rig.pair(self.alpha, name).cameras
+        alpha, camera = self.rig[self.alpha], self.rig[name]
         return stack([in_frame_of(alpha, camera).replace(distortion=None)])
 
     @torch.no_grad()

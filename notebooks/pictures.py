@@ -43,7 +43,7 @@ from pat.support.metrics import score
 
 __all__ = ["depth_picture", "exposed"]
 
-SHOWN, STORED = 700, 900
+SHOWN, STORED = 640, 760
 """Width of a picture on the page, and the most pixels across that are kept of it."""
 
 sys.path.append(str(Path(__file__).parents[1]))
@@ -199,9 +199,10 @@ def psnr_column(markdown: str) -> dict[str, float]:
 
 
 def is_drawing(figure: Figure) -> bool:
-    """Tell whether a figure has lines, points and words only: no images, and no maps in colours."""
+    """Tell whether a figure has few lines, points and words only: no images, and no maps in colours."""
     return not any(
-        axes.images or any(isinstance(c, TriMesh) for c in axes.collections) for axes in figure.axes
+        axes.images or any(isinstance(c, TriMesh) or len(c.get_paths()) > 200 for c in axes.collections)
+        for axes in figure.axes
     )
 
 
@@ -215,8 +216,8 @@ def png(figure: Figure) -> tuple[bytes, dict[str, int]] | None:
     """Return a figure with images as PNG, shown at 90 pixels to the inch; None for a drawing."""
     if is_drawing(figure):
         return None
-    image = Image.open(BytesIO(print_figure(figure, "png", dpi=144, base64=False)))
-    return as_png(image, round(image.width * 90 / 144), Image.Dither.NONE)
+    image = Image.open(BytesIO(print_figure(figure, "png", dpi=120, base64=False)))
+    return as_png(image, round(image.width * 90 / 120), Image.Dither.NONE)
 
 
 def frame_png(frame: Frame) -> tuple[bytes, dict[str, int]]:

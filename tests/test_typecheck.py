@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from arraygeom import Camera, Pose, intrinsics, sample
+from arraygeom import Camera, Pose, intrinsics
 from pat.media.colour import from_luma_chroma
 from pat.support.blocks import enlarge
 
@@ -22,12 +22,12 @@ def refused():
 
 
 def test_packages_are_checked_as_they_are_imported():
-    image, x = torch.zeros(1, 3, 4, 5), torch.zeros(1, 7, 2)
-    assert sample(image, x).values.shape == (1, 3, 7)
+    luma, chroma = torch.zeros(1, 4, 5), torch.zeros(2, 4, 5)
+    assert from_luma_chroma(luma, chroma).shape == (3, 4, 5)
     with refused():
-        sample(image[0], x)
+        from_luma_chroma(luma[0], chroma)
     with refused():
-        sample("image", x)
+        from_luma_chroma("image", chroma)
 
 
 def test_axes_of_one_name_are_equally_long():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Literal, NamedTuple
@@ -17,12 +18,12 @@ from torch import Tensor
 from ..camera import Camera, LensView, View
 from ..checks import check_above, check_bounds, check_field
 from ..distortion import Distortion
-from ..epipolar import FRONT, Track, beside, clipped
+from ..epipolar import FRONT, Clipped, Track, beside, clipped
 from ..pair import Pair
 from ..pixels import HW, floating, map_homogeneous, product, within
 from ..runtime.chunks import spans
 from ..runtime.threads import in_parallel
-from ..runtime.tracing import traced
+from ..runtime.tracing import needs_numbers, traced
 from ..segments import Positions, Segments, fractions_on_image, sample_fractions
 from ..undistortion import pinhole_view
 from .protocol import PIECE, ReceptiveField, answered, compilable
@@ -204,7 +205,7 @@ class RayCurve(NamedTuple):
     last: Float[Tensor, "*n 3"]
     valid: Bool[Tensor, "*n"]
     beta: Camera
-    wide: bool
+    wide: Tensor | bool
     inverse: tuple[Tensor, Tensor]
 
     @classmethod
@@ -224,24 +225,35 @@ class RayCurve(NamedTuple):
         start, rays, ahead = _lines(alpha, x, bounds)
         offset = beside(pose.t, x.ndim, trailing=1)
         points = Track(_each(pose.R, rays), offset if start is None else offset + _each(pose.R, start))
-        limits = None if beta.distortion is None or not beta.central else undistorted_limits(beta)
+        wide: Tensor | bool = False
         if beta.distortion is None:
             h, w = beta.hw
             pixels = Track(_each(beta.K, points.a), _each(beta.K, points.b))
             visible = clipped(pixels, near, far, (-0.5, -0.5, w - 0.5, h - 0.5))
-        elif limits is None:
-            visible = clipped(points, near, far, None, in_front=not beta.distortion.sees_behind)
         else:
-            visible = clipped(points, near, far, [beside(v, x.ndim - 1) for v in limits])
+            ahead_only = not beta.distortion.sees_behind
+
+            def everywhere() -> Clipped:
+                return clipped(points, near, far, None, in_front=ahead_only)
+
+            if beta.central:
+                narrow, limits = undistorted_limits(beta)
+                around = [beside(v, x.ndim - 1) for v in limits]
+                wide = ~narrow
+                bounded = _either(wide, everywhere, lambda: clipped(points, near, far, around))
+                visible = Clipped(*bounded)
+            else:
+                visible, wide = everywhere(), not beta.parallel
         w_far, w_near = (beside(1 / d.to(x.dtype), x.ndim - 1) for d in (far, near))
         ends = (
             w_far + torch.where(visible.valid, s, 0.0) * (w_near - w_far) for s in (visible.high, visible.low)
         )
         near_end, far_end = (torch.where(visible.valid, v, 1.0) for v in ends)
-        wide = beta.distortion is not None and limits is None and not beta.parallel
         valid = ahead & visible.valid
         if beta.central:
             return cls.between(points, near_end, far_end, valid, beta, wide)
+        if torch.compiler.is_compiling():  # loops within loops, which it would write out
+            needs_numbers("the part of a ray that a camera shows whose rays do not meet in a point", x)
         remote = REMOTE / beside(pose.t.norm(dim=-1) + near.to(x.dtype), x.ndim - 1)
         near_end, far_end = (torch.maximum(v, remote) for v in (near_end, far_end))
         whole = cls.between(points, near_end, far_end, valid, beta, wide)
@@ -249,7 +261,13 @@ class RayCurve(NamedTuple):
 
     @classmethod
     def between(
-        cls, points: Track, near_end: Tensor, far_end: Tensor, valid: Tensor, beta: Camera, wide: bool
+        cls,
+        points: Track,
+        near_end: Tensor,
+        far_end: Tensor,
+        valid: Tensor,
+        beta: Camera,
+        wide: Tensor | bool,
     ) -> RayCurve:
         """Make the curve of a track of points in beta's frame between two inverse depths."""
         first, last = (points.a + v[..., None] * points.b for v in (near_end, far_end))
@@ -297,7 +315,7 @@ class RayCurve(NamedTuple):
         given = (
             *ends,
             self.valid.reshape(n).contiguous().numpy(),
-            LensNumbers.from_camera(self.beta, wide=self.wide),
+            LensNumbers.from_camera(self.beta, wide=bool(self.wide)),
         )
         rest = (*(t.numpy() for t in fractions), self.beta.hw, xy, mask)
         in_parallel([partial(curved_positions, *span, *given, *rest) for span in spans(n, PIECE)])
@@ -306,7 +324,6 @@ class RayCurve(NamedTuple):
             torch.from_numpy(xy).reshape(*axes, samples, 2), torch.from_numpy(mask).reshape(*axes, samples)
         )
 
-    @torch.no_grad()
     def nodes(self, count: int) -> Float[Tensor, "*n k"]:
         """Compute the fractions of the way from `first` to `last`, 0..1, at which to follow the curve.
 
@@ -385,7 +402,7 @@ class RayCurve(NamedTuple):
             Pixels (*n, l, 2), and True (*n, l) where the lens model sees the point; whether it is on the
             image is not checked.
         """
-        weights = self._weights_in_angle(fraction) if self.wide else self._weights_in_pixels(fraction)
+        weights = self._weights(fraction)
         s = (weights[1] / (weights[0] + weights[1]))[..., None]
         X = torch.lerp(self.first[..., None, :], self.last[..., None, :], s)
         far_enough = X.square().sum(-1) > FRONT**2
@@ -396,12 +413,22 @@ class RayCurve(NamedTuple):
 
     def inverse_depth(self, fraction: Tensor) -> Tensor:
         """Compute the inverse depth (or distance) in alpha of the points at fractions (*n, l)."""
-        weights = self._weights_in_angle(fraction) if self.wide else self._weights_in_pixels(fraction)
+        weights = self._weights(fraction)
         return self._inverse_at(weights[1] / (weights[0] + weights[1]))
 
     def _inverse_at(self, s: Tensor) -> Tensor:
         first, last = (v[..., None] for v in self.inverse)
         return torch.lerp(first, last, s)
+
+    def _weights(self, u: Tensor) -> tuple[Tensor, Tensor]:
+        """Return shares of first and of last in the point that is a fraction u along, in the curve's own
+        measure."""
+        if self.wide is False:
+            return self._weights_in_pixels(u)
+        first, last = _either(
+            self.wide, lambda: self._weights_in_angle(u), lambda: self._weights_in_pixels(u)
+        )
+        return first, last
 
     def _weights_in_pixels(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """Return shares of first and of last in the point whose pixel, without the lens, is a fraction u
@@ -495,12 +522,12 @@ TINY = 1e-24
 """Squared sine of two rays, times their squared lengths, below which they have one direction."""
 
 
-def undistorted_limits(camera: Camera) -> tuple[Tensor, Tensor, Tensor, Tensor] | None:
+def undistorted_limits(camera: Camera) -> tuple[Tensor, tuple[Tensor, ...]]:
     """Compute the bounds of a lens's image in normalised undistorted points, 2 % wider.
 
     Returns:
-        x low, y low, x high, y high, (*b) each; None if the image reaches 75 degrees off axis, or over the
-        domain of its lens model, and where numbers cannot decide (`traced`).
+        True if they bound it, False if the image reaches 75 degrees off axis, or over the domain of its lens
+        model; and x low, y low, x high, y high, (*b) each.
     """
     h, w = camera.hw
     along = torch.linspace(0, 1, 17).to(camera.K)
@@ -512,11 +539,20 @@ def undistorted_limits(camera: Camera) -> tuple[Tensor, Tensor, Tensor, Tensor] 
     rays, valid = camera.rays(edges)
     ahead = valid & (rays[..., 2] > 1e-3)
     xy = rays[..., :2] / torch.where(ahead, rays[..., 2], 1.0)[..., None]
-    if traced() or not bool((ahead & (xy.square().sum(-1) < WIDE**2)).all()):
-        return None
     low, high = xy.amin(-2), xy.amax(-2)
     margin = 0.02 * (high - low)
-    return (*(low - margin).unbind(-1), *(high + margin).unbind(-1))  # type: ignore[return-value]
+    limits = (*(low - margin).unbind(-1), *(high + margin).unbind(-1))
+    return (ahead & (xy.square().sum(-1) < WIDE**2)).all(), limits
+
+
+def _either(condition: Tensor | bool, yes: Callable[[], Tensors], no: Callable[[], Tensors]) -> Tensors:
+    """Return one of two tuples of tensors; while torch traces, both are computed."""
+    if not traced():
+        return yes() if condition else no()
+    return tuple(torch.where(torch.as_tensor(condition), a, b) for a, b in zip(yes(), no()))
+
+
+Tensors = tuple[Tensor, ...]
 
 
 def _each(M: Tensor, v: Tensor) -> Tensor:

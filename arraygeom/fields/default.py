@@ -124,7 +124,8 @@ def recorded_field(pair: Pair, *, samples: int = 256, nodes: int = 64) -> Recept
         nodes: nodes of `Curved`.
 
     Returns:
-        The field, through lenses where a view has one.
+        The field, through lenses where a view has one; without a pinhole view it is `Curved`, which needs a
+        depth range.
     """
     field = straight_field(pair)
     if isinstance(field, Epipolar) and pair.depth is None:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..batching import tensors_of
 from ..camera import Camera
-from ..checks import check_field, check_pixels
+from ..checks import check_field
 from ..pair import Pair
 from ..pixels import floating, pixel_grid
 from ..runtime.chunks import chunked
@@ -51,9 +51,6 @@ def sampling_locations(
         ValueError: for pixels of another shape, an invalid result of the field, or whatever the field raises
             for this pair.
     """
-    check_field(field)
-    if x is not None:
-        check_pixels(x)
     return answered(field, pair, all_pixels(pair) if x is None else floating(x))
 
 

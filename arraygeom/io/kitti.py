@@ -31,6 +31,10 @@ HEAD = r"(?m)^(P0|P_rect_0\d):"
 def read(source: RigSource) -> Rig:
     """Read the rectified cameras: P0..P3 of `calib.txt`, P_rect and S_rect of `calib_cam_to_cam.txt`.
 
+    Returns:
+        The rig of cam0, cam1 ..., in metres. Where no image size is stated, as in `calib.txt`, it is the one
+        asked for, else twice the principal point, with a warning.
+
     Raises:
         RigFileError: for a damaged file, or one without such a camera.
     """

@@ -90,8 +90,8 @@ def capture_of(path: Path) -> list[Path]:
     Its images lie in one folder, and their names differ only after the last "_".
 
     Returns:
-        Files, sorted, `path` as any other; those whose tags state no camera are left out. For a name without
-        "_" `path` alone.
+        Files, sorted, without those whose tags state no camera, `path` included. For a name without "_"
+        `path` alone.
     """
     stem = path.stem.rpartition("_")[0]
     beside = sorted(

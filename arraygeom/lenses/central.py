@@ -55,8 +55,9 @@ def central_project(model: str, c: Tensor, X: Tensor) -> tuple[Tensor, Tensor]:
         c: coefficients (*b, 1.., k) of the model, in its order.
 
     Returns:
-        Distorted normalised points (*n, 2), and True (*n) within the cone that the model sees and for
-        coefficients within its bounds. Other directions give the nearest point of the cone's border.
+        Distorted normalised points (*n, 2), and True (*n) within the cone and the range that the model sees
+        and for coefficients within its bounds. Other directions give the nearest point of the cone's border,
+        zero and straight behind (0, 0). NaN is not looked for.
     """
     kind = MODELS[model]
     c, sound = _sound(kind, c)

@@ -44,7 +44,7 @@ class LensModel(Batched):
 
         Returns:
             Points of the image plane (*n, 2), which `Camera.K` takes to pixels, and True where seen; others
-        mean nothing. A batch of lenses (*b) takes points (*b, ..., 3).
+            mean nothing. A batch of lenses (*b) takes points (*b, ..., 3).
 
         Raises:
             NotImplementedError: in this base class.

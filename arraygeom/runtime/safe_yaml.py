@@ -50,12 +50,12 @@ def load_json(text: str) -> Any:
     """Load the document of a JSON text.
 
     Returns:
-        Plain values.
+        Plain values; NaN and Infinity are floats, as by `json`.
 
     Raises:
         json.JSONDecodeError: with the line, for text that is not JSON.
-        ValueError: for repeated keys, a lone surrogate (half a character, which cannot be printed), and too
-            deep nesting.
+        ValueError: for repeated keys, an escaped lone surrogate (half a character, which cannot be printed),
+            integers of thousands of digits, and too deep nesting.
     """
     try:
         document = json.loads(text, object_pairs_hook=_without_repeated_keys)

@@ -156,7 +156,7 @@ def sweep(folder: Path, stem: str | None = None) -> None:
         stem: file stem or group to restrict this to; None for all.
 
     Raises:
-        OSError: if files cannot be moved or removed.
+        OSError: if files cannot be moved or removed; folders that cannot be removed stay.
     """
     recover(folder, stem)
     for path in _temporary(folder, stem):

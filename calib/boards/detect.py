@@ -474,8 +474,8 @@ def collect_folder(
 
     Raises:
         FileNotFoundError: for a missing folder.
-        ValueError: naming images and cause, if a camera's images differ in size, none shows the board, or
-            they show a board of another size.
+        ValueError: for an image that cannot be read, a camera whose images differ in size or of which none
+            shows the board, and images that show a board of another size.
     """
     photos = find_photos(Path(folder), patterns=patterns)
     jobs = [job for moments in photos.values() for job in moments.items()]

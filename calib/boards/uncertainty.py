@@ -242,7 +242,7 @@ def compensation(by_pose: np.ndarray, moved: np.ndarray) -> np.ndarray:
         moved: changes of the pixels (m, 2, f), each of f to be fitted, or (m, 2) for one.
 
     Returns:
-        Motions (6, f): rotation vector in radians, translation in metres.
+        Motions (6, f), for one (6, 1): rotation vector in radians, translation in metres.
     """
     return np.asarray(
         np.linalg.lstsq(by_pose.reshape(-1, 6), moved.reshape(len(by_pose) * 2, -1), rcond=None)[0]

@@ -394,12 +394,14 @@ def depths_near_lines(pair: Pair, matches: PointMatches, *, within: float) -> Fl
 def seen_depths(pair: Pair, matches: PointMatches) -> tuple[float, float]:
     """Estimate the depth bounds of matched points, in the rig's unit, in front of alpha.
 
+    Points within 3 px of their lines count, that are in front and near enough for their depth to be known.
+
     Returns:
         0.9 of the nearest and 1.25 of the farthest depth, without the outermost 2 % of the points to either
         side.
 
     Raises:
-        ValueError: for fewer than `ENOUGH` points in front.
+        ValueError: for fewer than `ENOUGH` such points.
     """
     depth = depths_near_lines(pair, matches, within=3.0)
     if len(depth) < ENOUGH:

@@ -139,8 +139,8 @@ def apply_change(rig: Rig, parameters: Sequence[FreeParameter], z: Float[Tensor,
     """Change a rig's parameters.
 
     Args:
-        z: changes of all components of `parameters`, one vector after the other, in prior standard
-            deviations.
+        z: changes of all components of `parameters`, one vector after the other: standard normal
+            coordinates of the prior, each vector's change being its `root` times them.
 
     Returns:
         The changed rig, differentiable in z.

@@ -218,8 +218,14 @@ def dense_matches(
 def depth_bounds(rig: Rig, matches: PointMatches) -> tuple[float, float] | None:
     """Estimate near and far of the matched points of a rig of two cameras, extended.
 
+    Points more than `NEAR_LINE` pixels off their lines are left out.
+
+    Args:
+        matches: points of the rig's first camera (alpha) and its second.
+
     Returns:
-        Depths in the rig's unit, far possibly infinite; None for fewer than `ENOUGH` points with parallax.
+        Depths along the first camera's axis in the rig's unit, far possibly infinite; None for fewer than
+        `ENOUGH` points with parallax.
     """
     pair = _pair(rig)
     inverse = 1 / depths_near_lines(pair, matches, within=NEAR_LINE)

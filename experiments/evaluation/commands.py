@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar
 
@@ -19,12 +19,13 @@ from pat.lab.evaluation import protocols, stereo
 from pat.lab.evaluation.ablation import sample_photographs
 from pat.lab.evaluation.tables import write_csv
 from pat.matching.certainty import fitted_network
+from pat.media.figures import save_panels
 from pat.networks.paper import PAT
 from pat.networks.protocol import Comparing, FusionNetwork
 from pat.networks.weights import Network, load_weights
 from pat.support.tensor_files import write_tensors
 
-from . import certainty, conditions, fields, gradients, paper, stages, sweeps
+from . import certainty, conditions, fields, gradients, paper, stages, sweeps, trained_fields
 from .halves import of_half
 from .outside import evaluate_outside, outside_markdown
 from .sweep_report import write_report
@@ -301,3 +302,43 @@ class Fields(OnScenes):
         write_text(self.out / "ablation.md", fields.fields_markdown(rows))
         write_csv(self.out / "ablation.csv", fields.FieldRow._fields, rows)
         self.say_written()
+
+
+@dataclass
+class TrainedFields:
+    """Train the paper's network, narrow, anew with each field, and compare them on unseen scenes.
+
+    Segments, rows, windows, the true position and segments elsewhere; a run that stopped is continued.
+    Example: python -m experiments trained-fields --photos photos --seeds 0 1
+    """
+
+    photos: tuple[Path, ...]
+    """Folders of photographs: the textures of layered scenes."""
+    seeds: tuple[int, ...] = (0, 1)
+    """Seeds of weights, scenes and noise."""
+    steps: int = 500
+    """Steps of each training."""
+    batches: int = 32
+    """Batches of unseen scenes that each is scored on."""
+    hw: Annotated[tuple[int, int], Option("H W")] = trained_fields.RECIPE.hw
+    """Height and width of the images."""
+    out: Out = Path("out/trained-fields")
+    """Folder for the runs, trained.md and errors.png."""
+
+    def run(self) -> None:
+        """Write and print the table. Raises ValueError for no photographs, and runs of another recipe."""
+        writable(self.out, folder=True)
+        recipe = replace(
+            trained_fields.RECIPE,
+            photos=self.photos,
+            cache=self.out / "photographs.npz",
+            steps=self.steps,
+            validate=self.steps,
+            save=max(self.steps // 4, 1),
+            hw=self.hw,
+            out=self.out,
+            device="cpu",
+        )
+        rows, panels = trained_fields.compare_trained(recipe, self.seeds, batches=self.batches, each=say)
+        save_panels(panels, self.out / "errors.png", columns=3)
+        finished(self.out / "trained.md", trained_fields.trained_markdown(rows), ", and errors.png beside it")

@@ -322,6 +322,9 @@ def _missing(*tensors: Tensor | None) -> str:
 def chosen_backend(backend: Backend, device: str) -> str:
     """Resolve "auto", and check that a backend can serve tensors on a device.
 
+    Args:
+        device: type of the device, such as "cuda", without a number.
+
     Returns:
         "cpu", "triton" or "reference".
 

@@ -33,7 +33,8 @@ class SamplePositions(NamedTuple):
     """Sampling locations in one form; the batch axis p is 1 or b.
 
     Attributes:
-        points: (p, ha, wa, n, 2): the n samples, or for `straight` the start and end of a segment.
+        points: (p, ha, wa, n, 2), (x, y) in beta's pixels: the n samples, or for `straight` the start and
+            end of a segment.
         mask: (p, ha, wa, n or 1), True for valid samples.
         samples: samples of each pixel.
         straight: True for segments.

@@ -107,7 +107,8 @@ def classical(rig: Rig, images: Mapping[str, Tensor], alpha: str, beta: str) -> 
         beta: name of the beta, of three bands or one.
 
     Returns:
-        Three bands with alpha's luminance, or one, 0..1, at alpha's pixels.
+        Three bands with alpha's luminance, or one, 0..1, at alpha's pixels; where beta does not see a pixel,
+        by seen ones that are similar.
 
     Raises:
         ValueError: for lenses, no depth range, and for cameras that look along the line between them or have

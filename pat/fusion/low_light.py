@@ -27,6 +27,7 @@ from ..sensors.steps import normal
 from ..support.convolutions import convolutions_in_parallel
 from ..support.settings import physics, size, tuned
 from .frame import Frame
+from .non_local_means import averaged_with_alike
 from .steps import FusionStep
 from .views import Views
 
@@ -59,7 +60,7 @@ class LowLightSettings:
         "noise that a demosaicing has smoothed shows as half or less",
     )
     found_bytes: float = size(12.0, "Of a position in a beta and its confidence")
-    update: float = size(0.3, "The time of the betas' update over that of denoising the views, about")
+    averaging: float = size(0.4, "The time of averaging over that of denoising the views, about")
 
 
 SETTINGS = LowLightSettings()
@@ -124,10 +125,10 @@ class LowLight:
         *,
         keep_alpha: bool = False,
     ) -> Frame:
-        """Add the brightness that betas recorded to a frame fused from the denoised views.
+        """Add the brightness and colours that betas recorded to a frame fused from the denoised views.
 
-        Brightness is alpha's alone if not all betas are RGB, and where no combination of beta's bands is
-        similar to alpha.
+        Betas that are not all RGB are only denoised one by one, and brightness is alpha's alone where no
+        combination of beta's bands is similar to alpha.
 
         Args:
             frame: frame fused from the denoised views, its steps not undone yet.
@@ -144,16 +145,15 @@ class LowLight:
         LOG.info("denoising the fused image")
         alpha, image, views = self.views.alpha, frame.image, self.prepared(steps)
         alpha_view = views.pop(alpha)
-        in_colour = all(view.recorded.shape[1] == 3 for view in views.values())
+        if all(view.recorded.shape[1] == 3 for view in views.values()):
+            betas = [exposed(view, response) for view in views.values()]
+            if alpha in self.noisy and response.explains and not keep_alpha:
+                grain = self._grain(steps)
+                seen = [brightness(view, grain[name][None], response) for name, view in zip(views, betas)]
+                image = image + brightness_change(alpha_view, seen, matched)
+            image = colours_averaged(image, betas, matched)
         if keep_alpha:
             image = image + self._stepped(self.given.images, steps)[alpha] - alpha_view.denoised[0]
-        elif in_colour and alpha in self.noisy and response.explains:
-            grain = self._grain(steps)
-            seen = [
-                brightness(exposed(view, response), grain[name][None], response)
-                for name, view in views.items()
-            ]
-            image = image + brightness_change(alpha_view, seen, matched)
         return frame._replace(image=image)
 
     def prepared(self, steps: Sequence[FusionStep]) -> dict[str, NoisyView]:
@@ -208,7 +208,7 @@ def denoised_views(views: Views, noise: Noise | None) -> tuple[Views, LowLight]:
         without = replace(views, images={})
         return views, LowLight(without, without, {})
     denoised = views.replace({name: view.denoised[0] for name, view in noisy.items()})
-    return denoised, LowLight(views, denoised, noisy, SETTINGS.update * (time.perf_counter() - begin))
+    return denoised, LowLight(views, denoised, noisy, SETTINGS.averaging * (time.perf_counter() - begin))
 
 
 def warn_of_noise(name: str, image: Float[Tensor, "c h w"], view: NoisyView) -> None:
@@ -361,3 +361,48 @@ def brightness_change(
         there = (sample(plane, positions[None]).values for plane in beta)
         estimate = estimate + in_tiles(changed, estimate, alpha.recorded, alpha.deviation, *there, confidence)
     return (estimate - alpha.denoised)[0]
+
+
+@torch.no_grad()
+def colours_averaged(
+    image: Float[Tensor, "3 h w"], betas: Sequence[NoisyView], matched: Float[Tensor, "n 3 h w"]
+) -> Float[Tensor, "3 h w"]:
+    """Average the fused image's colours with those that RGB betas recorded, over similar pixels nearby.
+
+    Args:
+        image: image fused from the denoised views.
+        betas: recorded and denoised images of each beta, at alpha's exposure.
+        matched: positions of alpha's pixels in each beta, x and y, with their confidence.
+
+    Returns:
+        The image with the same luma; unchanged without noise in the betas.
+    """
+    beta, confidence = warped(betas, matched)
+    deviation = float(beta.deviation.mean())
+    if not deviation:
+        return image
+
+    def averaged(fused: Tensor, recorded: Tensor, confidence: Tensor) -> Tensor:
+        return averaged_with_alike(fused[0], recorded[0], confidence[0], deviation)[None]
+
+    return in_tiles(averaged, image[None], beta.recorded, confidence)[0]
+
+
+def warped(
+    betas: Sequence[NoisyView], matched: Float[Tensor, "n 3 h w"]
+) -> tuple[NoisyView, Float[Tensor, "1 1 h w"]]:
+    """Warp all betas to alpha's pixels, and average them weighted by their confidences.
+
+    Args:
+        matched: positions of alpha's pixels in each beta, x and y, with their confidence.
+
+    Returns:
+        The average, as recorded, denoised and deviation, and the largest confidence of a beta.
+    """
+    positions, confidence = matched[:, :2].movedim(1, -1), matched[:, 2]
+    images = [
+        torch.cat([sample(plane, x[None]).values for plane in beta]) for beta, x in zip(betas, positions)
+    ]
+    weight = (confidence + 1e-6) / (confidence + 1e-6).sum(0)
+    mixed = torch.stack([w * image for w, image in zip(weight, images)]).sum(0)
+    return NoisyView(*mixed.split(1)), confidence.amax(0)[None, None]

@@ -19,8 +19,6 @@ from torch.nn.functional import interpolate
 from arraygeom import (
     Camera,
     Curved,
-    Epipolar,
-    EpipolarLine,
     LensView,
     Moved,
     Pair,
@@ -34,6 +32,7 @@ from arraygeom import (
     resampled,
 )
 from arraygeom.fields.default import default_field
+from arraygeom.fields.protocol import lazily
 from arraygeom.fields.ray_depth import rough_transfer
 from arraygeom.pixels import HW, coarse_grid, map_homogeneous, shift_matrix
 from arraygeom.undistortion import pixels_between
@@ -141,8 +140,8 @@ def upright(views: Views) -> StepResult:
 def equal_resolution(network: FusionNetwork, views: Views) -> StepResult:
     """Resize betas to about alpha's angular resolution where views meet.
 
-    A calibrated beta that would be enlarged is first cropped to the part that search segments touch, if that
-    is much smaller.
+    A beta that would be enlarged is first cropped to the part that search segments touch, if that is much
+    smaller.
 
     Returns:
         The views; there is nothing to undo.
@@ -157,22 +156,29 @@ def equal_resolution(network: FusionNetwork, views: Views) -> StepResult:
 
 
 def _cropped(network: FusionNetwork, views: Views, name: str) -> Views:
-    """Crop a calibrated beta to the part that search segments touch, if much smaller: it would be enlarged
-    for nothing.
+    """Crop a beta to the part that search segments touch, if much smaller: it would be enlarged for nothing,
+    and be compared with alpha by the levels of what alpha does not see.
 
-    Not where the field may depend on the images' sizes.
+    Not where the field says something else for the cropped image: it depends on the image's size.
     """
-    pair, field = views.pair(name), views.fields.get(name)
-    h, w = pair.beta.hw
-    follows = field is None or isinstance(field, (Epipolar, EpipolarLine))
-    if not follows or pair.link is not None or not pair.calibrated or resolution_ratio(pair) > 0.8:
+    h, w = views.rig[name].hw
+    if resolution_ratio(views.pair(name)) > 0.8:
         return views
-    locations = (field or default_field(pair))(pair, coarse_grid(pair.alpha.hw).reshape(-1, 2))
-    top, bottom, left, right = box_around(ends_of(locations), (h, w), network.beta_halo, network.multiple)
+    ends = _coarse_ends(views, name)
+    top, bottom, left, right = box_around(ends, (h, w), network.beta_halo, network.multiple)
     if (bottom - top) * (right - left) > 0.75 * h * w:
         return views
     rig = views.rig.transformed(name, shift_matrix(left, top), (bottom - top, right - left))
-    return views.replace({name: views.images[name][..., top:bottom, left:right]}, rig=rig)
+    cropped = views.replace({name: views.images[name][..., top:bottom, left:right]}, rig=rig)
+    again = _coarse_ends(cropped, name) + ends.new_tensor([left, top])
+    return cropped if ends.shape == again.shape and torch.allclose(ends, again, atol=0.01) else views
+
+
+def _coarse_ends(views: Views, name: str) -> Float[Tensor, "n 2"]:
+    """Return the ends of a beta's search segments, or its sampling positions, of some of alpha's pixels."""
+    pair = views.pair(name)
+    x = coarse_grid(pair.alpha.hw).reshape(-1, 2)
+    return ends_of(lazily(views.fields.get(name) or default_field(pair), pair)(x))
 
 
 def normalise_betas(views: Views, *, undone: bool = False) -> StepResult:

@@ -50,7 +50,7 @@ class Views:
         alpha: name of alpha.
         fields: receptive fields of betas; None, or no entry, for the pair's default field.
         alpha_in_colour: True if alpha's image was recorded in colour.
-        joined: names of the betas that a beta of several bands was joined from.
+        joined: for each beta that was joined from several, by its name, the names of those.
     """
 
     rig: Rig

@@ -183,7 +183,7 @@ def equalising_blurs(
 
     Returns:
         Standard deviations in pixels for each image of the batch, of `image` and of `other`; 0 for the one
-        that is not the sharper.
+        that is not the sharper, at most the largest of `SETTINGS.blurs`.
     """
     image_sharpness, other_sharpness = ([_sharpness(p) for p in images] for images in (image, other))
     return [_equal_blur(p, s) for p, s in zip(image, other_sharpness)], [

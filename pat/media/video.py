@@ -74,7 +74,8 @@ class Video(NamedTuple):
     """Frames of a video file, read as they are asked for.
 
     Attributes:
-        frames: images 0..1, RGB (3, h, w), or grey (1, h, w) if the first is grey (`is_grey`).
+        frames: iterator, to be read once, of images 0..1, RGB (3, h, w), or grey (1, h, w) if the first is
+            grey (`is_grey`).
         rate: frames for each second.
     """
 

@@ -63,8 +63,8 @@ class GuidedPAT(nn.Module):
             The image (B, C, H, W) in the betas' bands, with position, deviation and confidence in each beta.
 
         Raises:
-            ValueError: without matches, for matches of other inputs, and for betas whose bands do not add up
-                to the configured number.
+            ValueError: without matches, for matches of other sizes or numbers of betas, and for betas whose
+                bands do not add up to the configured number, unless one of several has them all.
         """
         matches = required(matches, inputs)
         carried = [_as_alpha(m.carried, inputs.alpha) for m in matches.betas]

@@ -114,6 +114,7 @@ def weights_for(bands: Sequence[int]) -> str:
 def set_precision(network: nn.Module, precision: Precision, *, compiled: bool = False) -> None:
     """Set the precision of a network's convolutions in place, and optionally compile them by torch.compile.
 
+    Weights and results stay float32: `forward` of the network's children is replaced by one under autocast.
     Attention is left out, whose search segments are functions that torch.compile would break at.
 
     Args:

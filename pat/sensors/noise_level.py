@@ -89,6 +89,10 @@ class NoiseLevel:
         in light and noise in values is chosen. Noise that demosaicing, resampling or a codec has smoothed is
         underestimated; fine texture all over the image is taken for noise.
 
+        Args:
+            image: image, values 0..1, which is not checked; where it is black, or brighter than .95, nothing
+                is estimated.
+
         Returns:
             The noise level; zero for an image with sides under 14 pixels, or one that is all clipped or
             without variation.

@@ -21,9 +21,10 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[s
     """Write tensors and metadata to a safetensors file, atomically, with a digest of the tensors.
 
     Args:
-        metadata: texts by name to store with them; None for the digest alone.
+        metadata: texts by name to store beside the digest.
 
     Raises:
+        RuntimeError: for tensors that share memory.
         OSError: naming the file, if writing fails, for instance on a full disk.
     """
     whole = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}

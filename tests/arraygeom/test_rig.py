@@ -1,6 +1,7 @@
 import dataclasses
 import math
 import re
+from functools import partial
 
 import pytest
 import torch
@@ -24,7 +25,7 @@ from arraygeom import (
     rotation_from_vector,
 )
 from arraygeom.io import read_rig
-from arraygeom.lenses import RollingShutter
+from arraygeom.lenses import FlatPort, RollingShutter
 from arraygeom.pose import rotation_error
 from arraygeom.runtime.text import UNSCALED
 from arraygeom.summary import summarise_cameras, summarise_pairs
@@ -35,7 +36,8 @@ EVERYTHING = ("rotation", "translation", "focal", "centre")
 
 def test_a_pair_follows_what_happens_to_betas_image_as_its_rig_does():
     for rig in (random_rig(0), known_by_f(random_rig(0))):
-        one, other = rig.pair("alpha", "beta").resize_beta((30, 31)), rig.resize("beta", (30, 31))
+        one, other = rig.pair("alpha", "beta"), rig.resize("beta", (30, 31))
+        one = one.transform_beta(resize_matrix(one.beta.hw, (30, 31)), (30, 31))
         assert one.beta.hw == other["beta"].hw
         torch.testing.assert_close(one.fundamental, other.pair("alpha", "beta").fundamental)
 
@@ -217,6 +219,30 @@ def test_a_rig_of_many_cameras_is_described_in_seconds(own_lenses, monkeypatch):
 
     few, more = numbers(40), numbers(160)
     assert more < 1.5 * few
+
+
+def test_some_of_many_different_lenses_are_looked_at(monkeypatch):
+    monkeypatch.setattr(rig_check, "MOST_LENSES", 10)
+    looked, fold = [], Distortion("brown-conrady", torch.tensor([-0.6, 0, 0, 0]).double())
+    coverage = rig_check.coverage
+    monkeypatch.setattr(rig_check, "coverage", lambda camera: looked.append(camera) or coverage(camera))
+    cameras = {
+        f"c{i}": Camera(K=intrinsics(90.0 + i, (80, 100)), cam_from_world=Pose.identity(), hw=(80, 100))
+        for i in range(40)
+    }
+    rig = Rig({name: camera.replace(distortion=fold) for name, camera in cameras.items()})
+    assert any("lens model" in sentence for sentence in rig_check.file_oddities(rig))
+    assert len(looked) == 10
+
+
+def test_a_rig_under_water_without_a_depth_range_is_checked():
+    """Nothing is known of what such cameras see of each other: no complaint, and no error."""
+    one = partial(torch.tensor, dtype=torch.float64)
+    port = FlatPort(distance=one(0.05), thickness=one(0.01), glass=one(1.52), water=one(1.333))
+    poses = [Pose.identity(), Pose.from_centre(torch.eye(3).double(), torch.tensor([0.1, 0, 0]).double())]
+    K = intrinsics(600.0, (480, 640))
+    cameras = [Camera(K=K, cam_from_world=pose, hw=(480, 640), distortion=port) for pose in poses]
+    assert not any("sees nothing" in s for s in Rig({"a": cameras[0], "b": cameras[1]}).check())
 
 
 @pytest.mark.parametrize(("t", "depth"), [(1e-3, (50, 100)), (60, (1, 2)), (1e-6, (1, 2))])

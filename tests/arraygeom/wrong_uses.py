@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import math
+import traceback
 import warnings
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -24,21 +26,53 @@ from arraygeom import (
     Local,
     Moved,
     NearestVoxels,
+    Pair,
     Pose,
     Rectified,
     Rig,
     Segments,
     Sensor,
     ThroughLenses,
+    Track,
     Widened,
+    apply_homography,
+    approximated,
+    bundle_adjusted,
+    consistent_depth,
+    default_field,
+    depth_from_track,
+    depth_of,
+    epipolar_distance,
+    epipolar_lines,
     epipoles,
+    essential_matrix,
     fit_homography,
+    fit_similarity,
+    fundamental_matrix,
+    infinite_homography,
     intrinsics,
+    lazily,
+    pinhole_view,
+    pixel_grid,
+    plane_homography,
+    plane_sweep,
+    poses_from_essential,
+    rectify,
+    relative_pose,
     reprojection_residuals,
+    resampled,
+    resize_matrix,
     rotation_from_vector,
     sample,
     sampling_locations,
+    segments_between,
+    shift_origin,
+    stack,
+    to_grid,
+    track,
     triangulate,
+    warp,
+    world_rays,
 )
 
 HW = (48, 64)
@@ -47,6 +81,7 @@ EYE, ZERO = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float6
 OPENGL = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))
 ASIDE = torch.tensor([-0.1, 0, 0], dtype=torch.float64)
 X = torch.tensor([[20.0, 20.0]], dtype=torch.float64)
+IMAGE = torch.rand(1, 3, *HW, generator=torch.Generator().manual_seed(0))
 
 
 def camera(**changes: Any) -> Camera:
@@ -208,6 +243,126 @@ WRONG: dict[str, Callable[[], Any]] = {
     "residuals of one view of two": lambda: reprojection_residuals(
         [camera(), moved()], ZERO[None] + 2, X[None]
     ),
+    "a camera for a pair": lambda: depth_of(camera(), X, X),
+    "a camera for a pair, in a field": lambda: sampling_locations(Epipolar(), camera(), X),
+    "a camera for a pair, to rectify": lambda: rectify(camera()),
+    "a camera for a pair, to warp": lambda: warp(camera(), IMAGE, torch.ones(1, *HW)),
+    "a rig for a pair": lambda: depth_of(rig(), X, X),
+    "a rig for a pair, by default": lambda: default_field(rig()),
+    "a pair for a rig": lambda: consistent_depth(pair(), {"alpha": torch.ones(HW)}, "alpha"),
+    "a pair for a camera": lambda: world_rays(pair(), X),
+    "a rig for a camera": lambda: pinhole_view(rig()),
+    "a matrix for a pose": lambda: essential_matrix(torch.eye(4)),
+    "a matrix for a pose, in F": lambda: fundamental_matrix(K, K, torch.eye(4)),
+    "a pose for a rotation": lambda: infinite_homography(K, K, Pose(EYE, ASIDE)),
+    "a camera for K": lambda: infinite_homography(camera(), K, EYE),
+    "a pair's cameras for segments": lambda: segments_between(camera(), X, X, HW),
+    "a rig for cameras": lambda: triangulate(rig(), X.expand(2, 1, 2)),
+    "pairs for cameras": lambda: triangulate([pair(), pair()], X.expand(2, 1, 2)),
+    "pixels of no size": lambda: pixel_grid((0, 5)),
+    "pixels of a tensor's shape": lambda: pixel_grid(IMAGE.shape),
+    "pixels of one number": lambda: pixel_grid(48),
+    "pixels of floats": lambda: pixel_grid((4.5, 6.0)),
+    "a grid of no size": lambda: to_grid(X, (0, 64)),
+    "a grid of three numbers": lambda: to_grid(ZERO[None], HW),
+    "resized from nothing": lambda: resize_matrix((0, 5), HW),
+    "resized to a factor": lambda: resize_matrix(HW, 2.0),
+    "resized to nothing": lambda: camera().resize((0, 64)),
+    "resized to (width, height, channels)": lambda: camera().resize((64, 48, 3)),
+    "resized, a rig, to a factor": lambda: rig().resize("beta", 0.5),
+    "resized, a camera unknown": lambda: rig().resize("gamma", HW),
+    "cropped to nothing": lambda: camera().crop(0, 0, (0, 0)),
+    "cropped at text": lambda: camera().crop("top", 0, HW),
+    "rotated by degrees": lambda: camera().rot90(90.5),
+    "scaled by 0": lambda: rig().scaled(0.0),
+    "scaled by a tensor of three": lambda: rig().scaled(ZERO),
+    "a homography 4 x 4": lambda: apply_homography(torch.eye(4), X),
+    "a homography a vector": lambda: apply_homography(ZERO, X),
+    "a homography of whole numbers": lambda: apply_homography(torch.eye(3, dtype=torch.int64), X),
+    "points exchanged with a homography": lambda: apply_homography(X, EYE),
+    "points homogeneous, in a homography": lambda: apply_homography(EYE, ZERO[None]),
+    "lines of a homogeneous point": lambda: epipolar_lines(EYE, ZERO[None]),
+    "lines of F 3 x 4": lambda: epipolar_lines(torch.zeros(3, 4), X),
+    "distances of points of three numbers": lambda: epipolar_distance(EYE, X, ZERO[None]),
+    "F exchanged with points": lambda: epipolar_distance(X, EYE, X),
+    "an origin of a vector": lambda: shift_origin(ZERO, 1),
+    "an origin of text": lambda: shift_origin(EYE, "matlab"),
+    "a plane's normal of four numbers": lambda: plane_homography(
+        K, K, EYE, ASIDE, normal=torch.ones(4), d=torch.tensor(-2.0)
+    ),
+    "a plane at a number": lambda: plane_homography(K, K, EYE, ASIDE, normal=ZERO, d=-2.0),
+    "t before R": lambda: plane_homography(K, K, ASIDE, EYE, normal=ZERO, d=torch.tensor(-2.0)),
+    "a similarity of one point": lambda: fit_similarity(X, X),
+    "a similarity of other counts": lambda: fit_similarity(X.expand(3, 2), X.expand(4, 2)),
+    "a similarity of three numbers": lambda: fit_similarity(ZERO.expand(3, 3), ZERO.expand(3, 3)),
+    "a track of a pair": lambda: track(pair(), X, X, X),
+    "a track's depth of three numbers": lambda: depth_from_track(Track(ZERO[None], ZERO), ZERO[None]),
+    "a track's depth, of points": lambda: depth_from_track(X, X),
+    "poses of F 3 x 4": lambda: poses_from_essential(torch.zeros(3, 4)),
+    "a relative pose of points of other counts": lambda: relative_pose(
+        EYE, K, K, X.expand(8, 2), X.expand(7, 2)
+    ),
+    "a relative pose without points": lambda: relative_pose(EYE, K, K, X[:0], X[:0]),
+    "a relative pose, K and points exchanged": lambda: relative_pose(EYE, X, X, K, K),
+    "a bundle of a list": lambda: bundle_adjusted([camera()], ZERO[None], X[None], free=["*"]),
+    "a bundle of points of two numbers": lambda: bundle_adjusted(rig(), X, X.expand(2, 1, 2), free=["*"]),
+    "a bundle of one view of two": lambda: bundle_adjusted(rig(), ZERO[None] + 2, X[None], free=["*.t*"]),
+    "residuals, seen as numbers": lambda: reprojection_residuals(
+        [camera()], ZERO[None] + 2, X[None], seen=torch.ones(1, 1)
+    ),
+    "residuals of a camera": lambda: reprojection_residuals(camera(), ZERO[None] + 2, X[None]),
+    "warped without its batch": lambda: warp(pair(), IMAGE[0], torch.ones(1, *HW)),
+    "warped by a number": lambda: warp(pair(), IMAGE, 2.0),
+    "warped by depths of another size": lambda: warp(pair(), IMAGE, torch.ones(1, 8, 8)),
+    "swept at one depth": lambda: plane_sweep(pair(), IMAGE, torch.tensor(2.0)),
+    "swept at a list": lambda: plane_sweep(pair(), IMAGE, [2.0, 3.0]),
+    "swept, an image of another size": lambda: plane_sweep(pair(), IMAGE[..., :8], torch.ones(2)),
+    "consistent, depths a list": lambda: consistent_depth(rig(), [torch.ones(HW)], "alpha"),
+    "consistent, a map of another size": lambda: consistent_depth(
+        rig(), {"alpha": torch.ones(8, 8)}, "alpha"
+    ),
+    "consistent, no such camera": lambda: consistent_depth(rig(), {"alpha": torch.ones(HW)}, "gamma"),
+    "resampled from a pair": lambda: resampled(IMAGE[0], pair(), pair()),
+    "resampled with a batch": lambda: resampled(IMAGE, camera(), camera()),
+    "resampled an array": lambda: resampled(IMAGE[0].numpy(), camera(), camera()),
+    "resampled, an image of another size": lambda: resampled(IMAGE[0, :, :8], camera(), camera()),
+    "rectified to no size": lambda: rectify(pair(), hw=(0, 64)),
+    "rectified by fx": lambda: rectify(pair(), K=60.0),
+    "rectified along the baseline": lambda: rectify(
+        Pair(camera(), camera(cam_from_world=Pose(EYE, EYE[2] / 10)), None)
+    ),
+    "approximated without depth": lambda: approximated(rig(depth=None).pair("alpha", "beta")),
+    "approximated F": lambda: approximated(Link(EYE)),
+    "locations without a field": lambda: sampling_locations(None, pair(), X),
+    "lazily, a name": lambda: lazily("epipolar", pair()),
+    "stacked nothing": lambda: stack([]),
+    "stacked unlike": lambda: stack([camera(), Pose(EYE, ZERO)]),
+    "stacked sizes": lambda: stack([camera(), camera(hw=(24, 32), K=K)]),
+    "indexed a single camera": lambda: camera()[0],
+    "projected on another device": lambda: apply_homography(EYE, X.to("meta")),
+    "projected NaN for a camera": lambda: camera().project(None),
+    "focal lengths of three numbers": lambda: intrinsics((1.0, 2.0, 3.0), HW),
+    "a focal length of text": lambda: intrinsics("wide", HW),
+    "intrinsics of no size": lambda: intrinsics(60.0, (0, 64)),
+    "a pose looking at itself": lambda: Pose.look_at(ZERO, ZERO),
+    "a pose looking at two numbers": lambda: Pose.look_at(X[0], ZERO),
+    "a pose of a 3 x 3 matrix": lambda: Pose.from_matrix(EYE),
+    "a pose of a quaternion of 0": lambda: Pose.from_quaternion(torch.zeros(4), ZERO),
+    "a pose of a quaternion of three": lambda: Pose.from_quaternion(ZERO, ZERO),
+    "a pose times a matrix": lambda: Pose(EYE, ZERO) @ EYE,
+    "a camera for an alpha": lambda: rig().pair(camera(), "beta"),
+    "a pair with itself": lambda: rig().pair("alpha", "alpha"),
+    "a parameter unknown": lambda: rig().parameters(free=["beta.zoom"]),
+    "parameters as text": lambda: rig().parameters(free="beta.rotation"),
+    "a camera that is a path": lambda: rig().with_camera("beta", "beta.png"),
+    "segments of no samples": lambda: Epipolar()(pair(), X).positions(0),
+    "segments at a list": lambda: Epipolar()(pair(), X).at([0.5]),
+    "segments masked to no size": lambda: Epipolar()(pair(), X).mask((0, 5)),
+    "a homography at a depth of 0": lambda: pair().homography_at(0.0),
+    "a homography at text": lambda: pair().homography_at("near"),
+    "a link of a list": lambda: Link([[0.0] * 3] * 3),
+    "a disparity of text": lambda: Rectified("8"),
+    "a camera for K's image": lambda: sample(camera(), X[None]),
     # What nothing can know of:
     "pixels (y, x)": lambda: sampling_locations(Epipolar(), pair(), X.flip(-1)),
     "pixels normalised": lambda: sampling_locations(Epipolar(), pair(), X / 64),
@@ -233,6 +388,9 @@ def answer(use: Callable[[], Any]) -> str:
         try:
             made = use()
         except (TypeError, ValueError, Warning) as error:
+            last = traceback.extract_tb(error.__traceback__)[-1].filename
+            if "tests" in Path(last).parts or "arraygeom" not in Path(last).parts:
+                raise
             return f"{type(error).__name__}: {error}"
     return " ".join(made.check()[:1]) if isinstance(made, Rig) else ""
 

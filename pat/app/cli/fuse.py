@@ -106,7 +106,7 @@ class Fuse(Around, Fusing):
         from ...media.raw import developed_rig
         from ...support.locks import folder_lock
 
-        alpha, found, self._begin = frame.alpha, frame.found, time.monotonic()
+        alpha, found, begin = frame.alpha, frame.found, time.monotonic()
         if "points" in self._extras and not isinstance(frame.rig[alpha], Camera):
             raise UsageError("--extras points", "a calibrated alpha, and its camera has F alone")
         with folder_lock(self.out):
@@ -124,7 +124,7 @@ class Fuse(Around, Fusing):
                 self.note(no_depth(rig, alpha))
             further, pages = self._options_of_saving(fused, rig, frame), {}
             if {"page", "classical"} & self._extras:
-                pages["index.html"] = self._page(fused, rig, images, frame, gain)
+                pages["index.html"] = self._page(fused, rig, images, frame, gain, begin)
             written = save_frame(fused, self.out, along=along, pages=pages, **further)
             shutil.rmtree(self.tiles, ignore_errors=True)
         say(f"written to {self.out}: {', '.join(path.name for path in written)}")
@@ -181,10 +181,16 @@ class Fuse(Around, Fusing):
         }
 
     def _page(
-        self, frame: Frame, rig: Rig, images: Mapping[str, Tensor], given: Recordings, gain: float
+        self,
+        frame: Frame,
+        rig: Rig,
+        images: Mapping[str, Tensor],
+        given: Recordings,
+        gain: float,
+        begin: float,
     ) -> str:
         """HTML of index.html; with the classical baseline if requested, as bright as the fused image, and a
-        message if the cameras do not allow it."""
+        message if the cameras do not allow it. `begin` is the clock's time when the work began."""
         from arraygeom.runtime.text import length_unit
 
         from ...support.memory import peak_memory
@@ -193,7 +199,7 @@ class Fuse(Around, Fusing):
         alpha, found = given.alpha, given.found
         notes = [f"network: {self.network or 'mono-colour'}", *self._notes, *(found.notes if found else ())]
         warned = [str(message) for message in options.WARNED]
-        facts = Facts(notes, warned, time.monotonic() - self._begin, peak_memory(), length_unit(rig))
+        facts = Facts(notes, warned, time.monotonic() - begin, peak_memory(), length_unit(rig))
         if "classical" in self._extras:
             from ...fusion.classical import classical_view
             from ...media.colour import exposed

@@ -137,14 +137,16 @@ class Known:
         matches: Path | None = None,
         flight: bool = False,
     ) -> ImageArray:
-        """Find the array from each camera's first image; `match_levels` is then set as the array needs it.
+        """Find the array from each camera's first image, of a flight from those of its middle capture.
+
+        Prints what it finds; `match_levels` is set to True if the array needs it.
 
         Args:
             files: image files by camera, in the order of frames.
             weights: name of the weights; None to choose them by the bands.
             focal: focal lengths in pixels by camera.
             matches: file of matched points; None to match the images.
-            flight: True to use several frames of each camera, not the first alone.
+            flight: True to use other captures too, unless `matches` are given.
 
         Raises:
             ValueError: for images that cannot be used, and a memory limit that their size exceeds.
@@ -199,7 +201,8 @@ class KnownFile(NamedTuple):
         """Parse the option's text, and check that the file exists.
 
         Raises:
-            UsageError: for other text, and a missing file.
+            UsageError: for another name than these, and a missing file.
+            ValueError: for what is no NAME=NUMBER, and a name given twice.
         """
         path, *parts = text.split(",")
         numbers = options.numbers_by_name(parts, "--around")

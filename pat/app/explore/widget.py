@@ -27,7 +27,7 @@ class FieldWidget(anywidget.AnyWidget):
     The browser changes `controls`; the widget then sets `answer`.
 
     Args:
-        explorer: scene to show, or an error.
+        explorer: scene to show, as `opened` returns it; of one with an error the message is shown.
     """
 
     _esm = MODULE

@@ -224,7 +224,7 @@ class Taps(NamedTuple):
 
     Attributes:
         tap_count: number of a pixel's taps.
-        rows: beta's pixels of the taps.
+        rows: flat numbers of beta's pixels, one for each tap, as in `TapList`.
     """
 
     tap_count: Any

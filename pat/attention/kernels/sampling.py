@@ -249,7 +249,8 @@ def distribute(numbers, geometry, here, by_tap):
         numbers: number of each sample, padded with 0 to a multiple of LANES.
         geometry: `Geometry` of the call.
         here: the pixel's part of the `Block`, after `find_samples`.
-        by_tap: number of each tap to write, padded with 0.
+        by_tap: number of each tap to write, padded with 0; with room for `TAP_BLOCK` more, up to a multiple
+            of LANES.
     """
     n, m = here.sample_count[0], here.tap_count[0]
     if geometry.nearest and m == n:

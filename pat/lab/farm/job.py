@@ -275,7 +275,8 @@ def write_manifest(config: RenderConfig, root: Path) -> None:
     """Write the manifest of a job into its folder `root`, or check that the existing one is of the same job.
 
     Raises:
-        ValueError: if the folder holds scenes of another configuration, or of an unknown one.
+        ValueError: if the manifest is of another configuration, or does not say; a folder of scenes without
+            one gets it.
     """
     path, identity = root / MANIFEST, json.loads(json.dumps(config.identity()))
     if path.is_file():
@@ -305,7 +306,10 @@ def versions() -> dict[str, str]:
 def check_space(root: Path, scenes: int, scene_bytes: float) -> None:
     """Check that the disk of folder `root` holds `scenes` more scenes of `scene_bytes` bytes each.
 
+    `RESERVE` bytes stay free beside them.
+
     Raises:
+        FileNotFoundError: for a missing folder.
         ValueError: with how many would fit, if it does not.
     """
     need, free = scenes * scene_bytes + RESERVE, shutil.disk_usage(root).free

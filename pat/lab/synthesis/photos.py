@@ -62,15 +62,16 @@ class PhotoBank:
         seed: int = 0,
         choose: Callable[[int], bool] = lambda i: True,
     ) -> PhotoBank:
-        """Load all images under the folders, grey or in colour, and add 96 patterns made from `seed`.
+        """Load all images under the folders, grey or in colour, and add 48 patterns and 48 mixtures of them.
 
         Args:
             folders: folders, searched with their subfolders; not read if the cache exists.
-            max_edge: longest side in pixels that images are reduced to.
+            max_edge: longest side in pixels that images are reduced to; without effect once the cache exists.
             cache: .npz file, written on the first call and read on later ones; it is not checked against the
                 folders. None for no cache.
-            seed: seed of the patterns.
-            choose: called with an image's number, returns True to take it; to hold some out.
+            seed: seed of the patterns and mixtures.
+            choose: called with an image's number in the order of paths, returns True to take it; to hold some
+                out.
 
         Raises:
             ValueError: if no image is found or chosen, and for a file that is no cache.

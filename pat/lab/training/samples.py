@@ -118,6 +118,9 @@ def plan(config: TrainConfig, seed: int) -> Iterator[Planned]:
 class SampleSource:
     """Samples by number of the step; calling it with a count yields the first group of that many steps.
 
+    A group is one process's share of a step: a `Sample`. Each call begins at step 0, and yields the same for
+    the same seed.
+
     Attributes:
         config: recipe.
         layered: layered scenes by kind of their rigs.
@@ -277,7 +280,8 @@ def degraded(
     Args:
         scene: scenes with ground truth.
         g: random generator of the degradations.
-        field: receptive field of all betas.
+        field: receptive field of all betas; one with a method `of_depth` is asked for that of alpha's true
+            depth, (b, h, w) in metres: an upper bound.
         recording: probabilities of degradations.
 
     Returns:
@@ -294,7 +298,8 @@ def degraded(
         if two_views and _chance(recording.paper, g):
             alpha, betas[0], _ = augment(alpha, betas[0], paper_cases(), g)
         pair = pair_of(scene, i, g)
-        on_grid.append(FieldOnGrid.from_field(field, perturbed(pair, recording.miscalibrated, g)))
+        known = getattr(field, "of_depth", lambda depth: field)(scene.depth[0])
+        on_grid.append(FieldOnGrid.from_field(known, perturbed(pair, recording.miscalibrated, g)))
         where, seen = transfer(pair, scene.depth[0], scene.depth[i].masked_fill(~beta.valid, torch.nan))
         position.append(where)
         visible.append(seen)

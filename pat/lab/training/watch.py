@@ -79,10 +79,10 @@ class Watch:
                 self.board.add_scalar(name, value, step)
 
     def validated(self, facts: Mapping[str, float]) -> None:
-        """Report the figures of a validation: print them, write them to log.jsonl, and to TensorBoard.
+        """Report the figures of a validation: print them and write them to log.jsonl, and two to TensorBoard.
 
         Args:
-            facts: figures by name; rounded to 4 digits.
+            facts: figures by name, rounded to 4 decimals: `step`, and for TensorBoard `psnr` and `matched`.
         """
         line = json.dumps({k: round(v, 4) for k, v in facts.items()})
         self.bar.console.print(line, highlight=False) if not self.bar.disable else print(line, flush=True)

@@ -126,7 +126,11 @@ def test_views_of_the_same_points_are_solved_once(small, monkeypatch):
     found = intrinsics.initial_camera("mono", views, BOARD, "brown-conrady")
     assert len(counts) == 2
     assert found.views.count > sum(len(d.ids) for d in counts[0][1].seen.values())
-    assert solved("mono", found.views, BOARD, "brown-conrady")[0] == found.camera
+    again = solved("mono", found.views, BOARD, "brown-conrady")[0]
+    torch.testing.assert_close(again.K, found.camera.K, rtol=1e-6, atol=0)  # OpenCV 5 is not the same twice
+    torch.testing.assert_close(
+        again.distortion.coefficients, found.camera.distortion.coefficients, rtol=1e-4, atol=1e-6
+    )
 
 
 def test_perfect_corners_recover_the_ground_truth():

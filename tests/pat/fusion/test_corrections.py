@@ -242,7 +242,7 @@ def test_clipped_points_say_nothing_of_the_response(network, middle):
     [(1.0, None, True), (0.5, None, False), (0.5, 0.01, True), (3.0, None, False)],
 )
 def test_a_band_is_clipped_at_the_largest_value_that_it_can_have(most, exposure, expected):
-    """That is 1; the image's own where its exposure scaled it; and highlights above 1 leave 1 unclipped."""
+    """The largest is 1, the image's own where its exposure scaled it; highlights leave 1 unclipped."""
     image = torch.full((1, 3, 8, 9), 0.2)
     image[0, 0, 4, 4], image[0, 1, 0, 0] = min(most, 1.0), most
     clipped = clipped_in(image, Sensor(exposure=exposure))

@@ -6,12 +6,10 @@ from functools import cache, partial
 
 import pytest
 import torch
-from torch.nn.functional import avg_pool2d
 
 import pat.fusion.low_light
 import pat.fusion.tiles
 from arraygeom import Pair, Rectified, Rig, View
-from arraygeom import sample as sample_at
 from arraygeom.distortion import Distortion
 from arraygeom.fields.grid import FieldOnGrid
 from pat import FuseSettings, fuse
@@ -27,6 +25,7 @@ from pat.fusion.low_light import (
     denoised_views,
     noise_levels,
     shown_noise,
+    warped,
 )
 from pat.fusion.tiles import Tile, fuse_tile
 from pat.fusion.views import Views
@@ -98,6 +97,14 @@ def test_low_light_against_the_classical_baseline_and_denoising_before_it(fused,
 def test_an_estimated_level_does_about_as_well_as_a_stated_one(fused):
     sample = middle_of_sample()
     assert psnr(fused(50, told=False).image, sample) > psnr(fused(50).image, sample) - 0.5
+
+
+def test_averaged_colours_improve_on_denoising_alone(network, fused, monkeypatch):
+    sample, images, noise = in_low_light(50)
+    averaged = fused(50).image
+    monkeypatch.setattr("pat.fusion.low_light.averaged_with_alike", lambda image, *_: image)
+    alone = fuse(images, sample.rig, alpha=ALPHA, network=network, settings=FuseSettings(noise=noise)).image
+    assert psnr(averaged, sample) > psnr(alone, sample) + 0.02
 
 
 @pytest.mark.parametrize(("electrons", "gain"), [(50, 0.05), (5000, 0.5)])
@@ -279,7 +286,7 @@ def test_what_is_held_for_low_light_is_planned_for(network):
 def test_the_time_announced_has_the_correction_in_it(network, monkeypatch):
     sample, images, noise = in_low_light(200)
     monkeypatch.setattr(pat.fusion.tiles, "ESTIMATED", 0)
-    slow = replace(pat.fusion.low_light.SETTINGS, update=1e4)
+    slow = replace(pat.fusion.low_light.SETTINGS, averaging=1e4)
     monkeypatch.setattr(pat.fusion.low_light, "SETTINGS", slow)
     plans, steps = [], []
     with steps_shown(steps.append):
@@ -296,6 +303,18 @@ def test_the_time_announced_has_the_correction_in_it(network, monkeypatch):
     assert [s.split(" (")[0] for s in steps if "denoising" in s] == wanted
 
 
+def test_betas_are_mixed_by_confidence():
+    one, other = (NoisyView(*torch.full((3, 1, 3, 4, 5), value).unbind()) for value in (0.2, 0.8))
+    where = torch.stack(torch.meshgrid(torch.arange(5.0), torch.arange(4.0), indexing="xy"), -1)
+    seen = torch.zeros(4, 5)
+    seen[:, 2:] = 0.9
+    found = torch.stack([torch.cat([where.movedim(-1, 0), c[None]]) for c in (seen, 0.9 - seen)])
+    mixed, confidence = warped([one, other], found)
+    torch.testing.assert_close(mixed.recorded[0, 0, :, 2:], torch.full((4, 3), 0.2), atol=1e-4, rtol=0)
+    torch.testing.assert_close(mixed.recorded[0, 0, :, :2], torch.full((4, 2), 0.8), atol=1e-4, rtol=0)
+    assert float(confidence.min()) == pytest.approx(0.9)
+
+
 def test_positions_of_parts_are_in_the_whole_betas(network, monkeypatch):
     ones = torch.ones(1, 2, 4, 5)
     output = FusionOutput(torch.zeros(1, 3, 4, 5), [ones], [ones[:, 0]], [0.5 * ones[:, 0]])
@@ -309,22 +328,20 @@ def test_positions_of_parts_are_in_the_whole_betas(network, monkeypatch):
     assert found[0, :, 1, 1].tolist() == [8.0, 3.0, 0.5]
 
 
-def test_positions_are_those_of_the_matched_points(network, monkeypatch):
-    """Beta's own brightness at the positions that are found resembles alpha's."""
+def test_positions_are_those_of_the_matched_colours(network, monkeypatch):
+    """Beta's own colours at the positions that are found resemble the fused image."""
     sample, images, noise = in_low_light(200)
     seen = {}
 
-    def noted(alpha, betas, found):
-        x = found[0, :2].movedim(0, -1)
-        there = sample_at(betas[0].recorded, x[None]).values
-        seen.update(alpha=alpha.denoised, beta=there, confidence=found[0, 2])
-        return 0
+    def noted(image, betas, found):
+        beta, confidence = warped(betas, found)
+        seen.update(image=image[None], beta=beta, confidence=confidence)
+        return image
 
-    monkeypatch.setattr("pat.fusion.low_light.brightness_change", noted)
+    monkeypatch.setattr("pat.fusion.low_light.colours_averaged", noted)
     fuse(images, sample.rig, alpha=ALPHA, network=network, settings=FuseSettings(noise=noise))
-    sure = seen["confidence"] > 0.8
-    off = avg_pool2d(seen["beta"] - seen["alpha"], 5, 1, 2)[0, 0]
-    assert float(off[sure].abs().mean()) < 0.04
+    high = (seen["confidence"] > 0.8).expand_as(seen["image"])
+    assert float((seen["beta"].denoised - seen["image"])[high].abs().mean()) < 0.04
 
 
 def test_a_darker_beta_keeps_its_colours(network, fused):

@@ -2,9 +2,11 @@
 
 import pytest
 import torch
+from scipy.optimize import nnls
 
 from experiments.sensors import DecodeSRGB, EncodeSRGB
 from pat.sensors import Clip, Noise, NoiseLevel, generator_for, record
+from pat.sensors.noise_level import _fitted
 from tests.pat.layered_array import load_sample
 
 LEVELS = {
@@ -87,3 +89,14 @@ def test_what_is_no_level_is_refused():
         NoiseLevel.from_electrons(100, -2)
     with pytest.raises((ValueError, TypeError), match=r"light|values"):  # by type, where types are checked
         NoiseLevel(0.01, added_to="srgb")
+
+
+@pytest.mark.parametrize("rises", [-0.9, 0.0, 3.0])
+def test_shot_and_read_noise_are_the_nearest_that_are_not_negative(rises):
+    """Noise that falls with brightness is read noise alone: SciPy's solver finds the same."""
+    value = torch.linspace(0.1, 0.9, 12).double()
+    variance = 1e-4 * (1 + rises * value)
+    found, _ = _fitted("values", value, variance)
+    design = torch.stack([value, torch.ones_like(value)], -1) / variance[:, None]
+    (shot, read), _ = nnls(design.numpy(), torch.ones_like(value).numpy())
+    assert (found.shot, found.read**2) == pytest.approx((shot, read), rel=1e-6, abs=1e-12)
