@@ -245,7 +245,8 @@ def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnos
     unchanged = named = tried[0]
     table = sorted(tried if fits else tried[1:], key=lambda h: misfit[h])
     equal, usual = EQUAL[0] * misfit[table[0]] + EQUAL[1], USUAL_MISFIT * max(map(max, sizes.values()))
-    fitting = [h for h in table if misfit[h] <= max(equal, usual)]
+    explained = max(2 * usual, EXPLAINED[1] * fit[unchanged].misfit)
+    fitting = [h for h in table if misfit[h] <= max(usual, min(equal, explained))]
     likelier = [h for h in fitting if fits and unlikelihood(h.rig) + MARGIN < unlikelihood(rig)]
     healthy = fits and misfit[unchanged] < HEALTHY_MISFIT and not likelier
     as_good: list[Hypothesis] = []
@@ -411,7 +412,7 @@ def _zoomed(rig: Rig, pairs: Pairs) -> list[Hypothesis]:
 
 
 def _cropped(rig: Rig, pairs: Pairs) -> Iterator[Hypothesis]:
-    """Fit principal points, of one camera or of all, where the rig's are far off the middle of the image."""
+    """Fit principal points, of one camera or of all, if the rig has them far off the middle."""
     odd = [name for name in cameras_of(rig, pairs) if may_be_cropped(rig, name)]
     for group in [*([odd] if len(odd) > 1 else []), *([name] for name in odd)]:
         middle = centred(rig, group)
@@ -425,8 +426,7 @@ def _cropped(rig: Rig, pairs: Pairs) -> Iterator[Hypothesis]:
             lambda z, after=after: sampson_of_pairs(after(z), pairs), z, torch.eye(len(z)).to(z)
         )
         repaired = after(z)
-        moved = max(float((repaired[name].K - rig[name].K)[:2, 2].norm()) for name in group)
-        if moved > LARGEST_CHANGE * SIGMA["centre"]:
+        if not any(may_be_cropped(repaired, name) for name in group):
             yield cropped(repaired, group)
 
 

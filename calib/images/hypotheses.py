@@ -31,8 +31,9 @@ UNITS = {
 }
 SHIFTS = {"half-pixel shift": 0.5, "one-pixel shift": 1.0}
 """Shifts of pixels by kind; a drift of a calibrated camera's principal point has the same effect."""
-OFF_CENTRE = 0.05
-"""Standard deviation of a principal point from the image's middle, as a share of the longer side."""
+OFF_CENTRE, FAR_OFF = 0.05, 0.175
+"""Standard deviation of a principal point from the image's middle, as a share of the longer side; and the
+distance beyond which it is that of no whole image."""
 FOCAL_SHARE, FOCAL_SPREAD = 1.2, 0.7
 """Median focal length as a share of the image's longer side, and the standard deviation of its logarithm."""
 SHORTEST_FOCAL = 0.2
@@ -205,8 +206,8 @@ def zoomed(rig: Rig, names: Sequence[str], factor: float) -> Hypothesis:
 
 
 def may_be_cropped(rig: Rig, name: str) -> bool:
-    """Return True if a camera's principal point is farther from the image's middle than is likely."""
-    return isinstance(rig[name], Camera) and _centre_offset(rig[name]) > OFF_CENTRE
+    """Return True if a camera's principal point is farther from the image's middle than in whole images."""
+    return isinstance(rig[name], Camera) and _centre_offset(rig[name]) > FAR_OFF
 
 
 def centred(rig: Rig, names: Sequence[str]) -> Rig:
