@@ -27,6 +27,9 @@ from .residuals import FEW, displacements
 
 OFF = 4.0
 """Distance, in standard deviations of the points' noise, beyond which a point is off an explanation."""
+LEAST_SHARE = 0.02
+"""Least share of points off a homography for lines: wrong matches that happen to lie along lines pass for
+right ones."""
 STEPS = 20
 """Weightings of the fit of a homography and lenses."""
 
@@ -51,7 +54,7 @@ class Explanation(NamedTuple):
     @property
     def has_lines(self) -> bool:
         """True if the points determine epipolar lines: many move along them, far more than lie off them."""
-        return self.beyond >= max(self.wrong + FEW, 2 * self.wrong)
+        return self.beyond >= max(self.wrong + FEW, 2 * self.wrong, LEAST_SHARE * self.points)
 
     def as_text(self, *, focal_lengths: bool = False) -> str:
         """Return the explanation taken and what it leaves undetermined, as a phrase without a full stop.

@@ -384,6 +384,13 @@ def test_a_cropped_image_is_named(which):
     assert off.norm() < 0.05 * max(rig["second"].hw)
 
 
+def test_a_drifted_principal_point_is_no_crop():
+    """It stays where those of whole images are."""
+    rig = same_size(unlike_pair())
+    found = diagnose_matches(rig.perturbed({"second.centre": vector(-20, 10)}), sizes(rig), seen_points(rig))
+    assert found.named.kind == "nothing", found.verdict
+
+
 def test_an_odd_principal_point_that_points_confirm_is_healthy():
     """A sensor that is off its lens's axis by a tenth of its side."""
     rig = same_size(unlike_pair()).perturbed({"second.centre": vector(32, -16)})

@@ -3,7 +3,18 @@
 import pytest
 import torch
 
-from arraygeom import Camera, Distortion, Link, Pair, Pose, Rig, View, intrinsics, rotation_from_vector
+from arraygeom import (
+    Camera,
+    Distortion,
+    Link,
+    Pair,
+    Pose,
+    Rig,
+    View,
+    epipolar_lines,
+    intrinsics,
+    rotation_from_vector,
+)
 from arraygeom.runtime.text import ASSUMED, OPEN, UNSCALED
 from calib.images.doctor import diagnose_matches
 from calib.images.explanations import explain
@@ -78,6 +89,15 @@ def test_doctor_and_refine_say_what_the_points_leave_open(depth, t):
 def test_a_few_wrong_matches_make_no_lines(wrong):
     matches = points_of(wall)
     matches.beta[:wrong] += vector(25.0, 3.0) * torch.linspace(-1, 1.5, wrong).double()[:, None]
+    assert not explained(matches).has_lines
+
+
+def test_wrong_matches_along_lines_make_no_lines():
+    """Fourteen of 3,000, which the search for points that agree with lines lets through."""
+    matches = points_of(wall, count=3000)
+    line = epipolar_lines(fit_fundamental(matches), matches.alpha[::200])
+    along = torch.stack([-line[:, 1], line[:, 0]], -1) / line[:, :2].norm(dim=-1, keepdim=True)
+    matches.beta[::200] += 5 * along
     assert not explained(matches).has_lines
 
 
