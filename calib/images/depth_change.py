@@ -23,8 +23,9 @@ from .residuals import FEW, match_depths, share
 
 DEPTH_KEPT = 0.003
 """Relative standard deviation of depth, as given, as evidence."""
-SMALL = 0.01
-"""Change of depth, relative, up to which depth counts as kept: a refinement makes it worse by no more."""
+SMALL = 0.015
+"""Change of depth, relative, up to which depth counts as kept: rotations of .2 degrees change it by nearly as
+much on the rigs for tuning."""
 BEYOND = 1.5
 """Factor of depth beyond the rig's depth range at which a point counts as outside."""
 

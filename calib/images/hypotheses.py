@@ -196,12 +196,9 @@ def zoomed(rig: Rig, names: Sequence[str], factor: float) -> Hypothesis:
     short = all(is_short(rig[name]) for name in names)
     words = f"focal length of {who} in millimetres" if short else f"image of {who} zoomed or cropped"
 
-    def change(camera: Camera) -> Camera:
-        K = camera.K.clone()
-        K[:2, :2] *= factor
-        return camera.replace(K=K)
-
     words += f": about {focal_length_of(rig[names[0]]) * factor:.0f} px"
+    scale = torch.diag(torch.tensor([factor, factor, 1.0], dtype=torch.float64))
+    change = partial(_partly_scaled, scale, slice(0, 2))
     return Hypothesis("focal length", words, on_cameras(rig, names, change), approximate=True)
 
 

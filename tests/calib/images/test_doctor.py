@@ -13,6 +13,7 @@ from arraygeom import Camera, Distortion, Link, Pose, Rig, View, triangulate
 from arraygeom.lenses import PolynomialFisheye
 from arraygeom.runtime.text import UNSCALED
 from calib.images.doctor import diagnose, diagnose_matches
+from calib.images.evidence import DriftEvidence
 from calib.images.hypotheses import TRANSPOSE, hypotheses, on_cameras, swap
 from calib.images.least_squares import most_probable
 from calib.images.matches import PointMatches
@@ -21,7 +22,7 @@ from calib.images.residuals import sampson_of_pairs
 from pat.app.cli.main import main
 from pat.media.images import write_image
 from tests.benchmarks.bench_drift import drifted
-from tests.benchmarks.bench_names import OPENGL, negated, reordered, shifted, turned
+from tests.benchmarks.bench_names import OPENGL, cropped, negated, reordered, shifted, turned
 from tests.calib.scenes import rectified_images, rectified_pair, seen_points, texture, unlike_pair, vector
 from tests.calib.simulated import simulated_matches, simulated_rig
 
@@ -387,8 +388,18 @@ def test_a_cropped_image_is_named(which):
 def test_a_drifted_principal_point_is_no_crop():
     """It stays where those of whole images are."""
     rig = same_size(unlike_pair())
-    found = diagnose_matches(rig.perturbed({"second.centre": vector(-20, 10)}), sizes(rig), seen_points(rig))
-    assert found.named.kind == "nothing", found.verdict
+    drifted_rig = rig.perturbed({"second.centre": vector(-20, 10)})
+    found = diagnose_matches(drifted_rig, sizes(rig), seen_points(rig))
+    assert "cropped" not in {hypothesis.kind for hypothesis in found.tried}
+
+
+def test_evidence_is_that_of_the_best_drift_that_was_met():
+    """The first step overshoots; the cost was that of the start, and the drift another."""
+    rig = unlike_pair()
+    ((names, points),) = seen_points(rig).items()
+    used = torch.ones(len(points.alpha), dtype=torch.bool)
+    found = DriftEvidence.from_points(one(cropped)(rig), {names: points}, used, 0.1)
+    assert found.cost == pytest.approx(found._at(found.z, used))
 
 
 def test_an_odd_principal_point_that_points_confirm_is_healthy():
