@@ -1,4 +1,4 @@
-"""Checks of image files' bytes, for decoders that trust them.
+"""Headers, checks and decoding of image files' bytes, for decoders that trust them.
 
 OpenCV 4.11 to 4.13 crash on damaged animated PNGs, take missing parts of a planar TIFF for black, do not read
 a text PNM without a line break at its end, and return pixels where libjpeg and libtiff report damage.
@@ -6,12 +6,13 @@ a text PNM without a line break at its end, and return pixels where libjpeg and 
 
 from __future__ import annotations
 
+import re
 import struct
 import zlib
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from io import BytesIO
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,15 +24,173 @@ ANIMATION = (b"acTL", b"fcTL", b"fdAT")
 """Chunks of a PNG file next to those of its first image."""
 SEPARATE = 2
 """TIFF PlanarConfiguration for one plane after the other."""
-MINISWHITE, MINISBLACK = 0, 1
+GREY_TIFF = MINISWHITE, _MINISBLACK = 0, 1
 """Values of TIFF PhotometricInterpretation."""
 YCBCR = 6
 DEFLATE, PACKBITS, LZW, JPEG_IN_TIFF = (8, 32946), 32773, 5, 7
 """Values of TIFF Compression."""
 REDUCED, MASK = 1, 4
 """Values of a TIFF directory's NewSubfileType."""
+ORIENTATION = 274
+"""Number of the orientation tag."""
+UNCHANGED = -1
+"""OpenCV's IMREAD_UNCHANGED."""
 DAMAGED = (OSError, SyntaxError, ValueError, struct.error, LookupError, TypeError, ArithmeticError)
 """Exceptions of Pillow and tifffile for a damaged header."""
+
+
+class ImageHeader(NamedTuple):
+    """Header of an image file.
+
+    Attributes:
+        hw: stored (height, width).
+        orientation: EXIF orientation tag, 1 to 8; 1 where there is none.
+        bits: bits of a value in TIFF, PNG and PNM files; 0 for others.
+        white: largest value of a PNM file, or of a TIFF file with 9 to 15 bits a value; 0 for others.
+        page: tifffile's TiffPage of a TIFF file's first image; None for other files.
+        several: True for a TIFF file with more images of the first one's size that are no copies or masks of
+            it.
+    """
+
+    hw: tuple[int, int]
+    orientation: int = 1
+    bits: int = 0
+    white: int = 0
+    page: Any = None
+    several: bool = False
+
+    @property
+    def upright(self) -> tuple[int, int]:
+        """(height, width) after the orientation is applied."""
+        return self.hw[::-1] if self.orientation >= 5 else self.hw
+
+
+def image_header(content: bytes) -> ImageHeader | None:
+    """Parse the header of a PNG, TIFF, JPEG, PNM, BMP or WebP file from its bytes.
+
+    Returns:
+        The header; None for another format and for a damaged file.
+    """
+    from PIL import BmpImagePlugin, JpegImagePlugin, WebPImagePlugin
+
+    # `Image.open` would refuse large images that are expected here
+    kinds: dict[bytes, Any] = {
+        JPEG: JpegImagePlugin.JpegImageFile,
+        b"RI": WebPImagePlugin.WebPImageFile,
+        b"BM": BmpImagePlugin.BmpImageFile,
+    }
+    try:
+        if content.startswith(PNG):  # by hand: Pillow decodes the whole image to find a tag behind it
+            width, height = struct.unpack_from(">II", content, 16)
+            tags = [
+                content[start + 8 : end - 4] for kind, start, end in png_chunks(content) if kind == b"eXIf"
+            ]
+            return ImageHeader((height, width), _exif_orientation(tags[-1] if tags else b""), content[24])
+        if content[:4] in TIFF:
+            return _tiff(content)
+        if content[:2] not in kinds:
+            return _pnm(content)
+        image = kinds[content[:2]](BytesIO(content))
+    except DAMAGED:
+        return None
+    return ImageHeader(image.size[::-1], _exif_orientation(image.info.get("exif", b"")))
+
+
+def _pnm(content: bytes) -> ImageHeader | None:
+    """Parse a PNM header by hand: Pillow does not report the largest value."""
+    gap = rb"(?:\s|#[^\n]*\n)+"
+    largest = gap + rb"(\d{1,5})" if content[1:2] in b"2356" else rb"()"
+    form = rb"P[1-6]" + gap + rb"(\d{1,9})" + gap + rb"(\d{1,9})" + largest + rb"\s"
+    header = re.match(form, content[:4096])
+    if header is None:
+        return None
+    white = int(header[3] or 0)
+    return ImageHeader((int(header[2]), int(header[1])), bits=max(white.bit_length(), 8), white=white)
+
+
+def _tiff(content: bytes) -> ImageHeader | None:
+    several = False
+    with _quiet_tiff(content) as file:
+        page = file.pages.first
+        hw = int(page.imagelength), int(page.imagewidth)
+        with suppress(*DAMAGED):
+            second = file.pages[1]
+            same = hw == (second.imagelength, second.imagewidth)
+            several = bool(same and not second.subfiletype & (REDUCED | MASK))
+    bits, tag = int(np.max(page.bitspersample)), page.tags.get(ORIENTATION)
+    white = 2**bits - 1 if 8 < bits < 16 else 0
+    return (
+        ImageHeader(hw, _known(tag.value) if tag else 1, bits, white, page, several) if min(hw) > 0 else None
+    )
+
+
+def _exif_orientation(exif: bytes) -> int:
+    """Orientation in an EXIF block; 1 if the block is damaged."""
+    from PIL import Image
+
+    tags = Image.Exif()
+    try:
+        tags.load(exif)
+        return _known(tags.get(ORIENTATION, 1))
+    except DAMAGED:
+        return 1
+
+
+def _known(orientation: object) -> int:
+    return int(orientation) if isinstance(orientation, int) and 1 <= orientation <= 8 else 1
+
+
+def stored_values(content: bytes, header: ImageHeader) -> Any:
+    """Decode an image file's values as the file states them.
+
+    OpenCV applies orientation tags of TIFF files, returns the first of several bands that are no colours,
+    mixes planes beyond 8 bits, takes white for black, and shifts values of fewer than 16 bits up; it scales
+    8-bit values of text PNM files to 255.
+
+    Returns:
+        Values (h, w) or (h, w, channels), blue first, type as stored; None for a damaged file.
+    """
+    page, original = header.page, content
+    if page is not None and header.orientation != 1:
+        tag, changed = page.tags[ORIENTATION], bytearray(content)
+        struct.pack_into(page.parent.byteorder + tag.dataformat, changed, tag.valueoffset, 1)
+        content = bytes(changed)
+    values = decoded(content)
+    if page is not None and values is not None:
+        bands, grey = page.samplesperpixel, page.photometric in GREY_TIFF
+        if bands > 1 and (grey or (values.dtype != np.uint8 and page.planarconfig == SEPARATE)):
+            colours = _tiff_colours(original)
+            values = None if colours is None else colours[..., [2, 1, 0, 3][:bands]]
+        elif page.photometric == MINISWHITE and values.dtype == np.uint16:
+            values = 65535 - values
+        if header.white and values is not None and values.dtype == np.uint16:
+            values = values >> (16 - header.bits)
+    if content[:2] in PNM_OF_TEXT and values is not None and values.dtype == np.uint8:
+        values = ((values.astype(np.uint16) * header.white + 254) // 255).astype(np.uint8)
+    return values
+
+
+def decoded(content: bytes, flags: int = UNCHANGED) -> Any:
+    """Decode an image file's bytes by OpenCV without its messages.
+
+    Returns:
+        Values (h, w) or (h, w, channels), blue first, type as stored or by OpenCV's flags; None for a damaged
+        file.
+    """
+    import cv2
+
+    if content[:2] == JPEG and flags == UNCHANGED:
+        with suppress(Exception):  # damaged, which `decodable` says
+            if (colours := _jpeg_colours(content)) is not None:
+                return colours[..., 0] if colours.shape[2] == 1 else colours[..., ::-1]
+    logging = cv2 if hasattr(cv2, "setLogLevel") else getattr(cv2.utils, "logging")  # noqa: B009  # OpenCV 5
+    level, checked = logging.setLogLevel(0), decodable(content)
+    try:
+        return None if checked is None else cv2.imdecode(np.frombuffer(checked, np.uint8), flags)
+    except cv2.error:
+        return None
+    finally:
+        logging.setLogLevel(level)
 
 
 def decodable(content: bytes) -> bytes | None:
@@ -71,20 +230,7 @@ def _is_undamaged(content: bytes, chunk: tuple[bytes, int, int]) -> bool:
     return kind[:1].islower() or content[end - 4 : end] == found.to_bytes(4, "big")
 
 
-def first_tiff_page(content: bytes) -> Any:
-    """Parse the first directory of a TIFF file, without messages about damage.
-
-    Returns:
-        tifffile's TiffPage.
-
-    Raises:
-        ValueError: or another of `DAMAGED`, if there is none.
-    """
-    with _quiet_tiff(content) as file:
-        return file.pages.first
-
-
-def tiff_colours(content: bytes) -> Any:
+def _tiff_colours(content: bytes) -> Any:
     """Read the values of a TIFF file's first image, which has several bands, by tifffile.
 
     Returns:
@@ -97,18 +243,6 @@ def tiff_colours(content: bytes) -> Any:
     except (*DAMAGED, zlib.error):
         return None
     return values.transpose(1, 2, 0) if page.planarconfig == SEPARATE else values
-
-
-def has_further_images(content: bytes) -> bool:
-    """Return True for a TIFF file with more images of the first one's size that are no copies or
-    masks of it."""
-    try:
-        with _quiet_tiff(content) as file:
-            first, second = file.pages.first, file.pages[1]
-            first_size, second_size = ((page.imagelength, page.imagewidth) for page in (first, second))
-            return bool(first_size == second_size and not second.subfiletype & (REDUCED | MASK))
-    except DAMAGED:
-        return False
 
 
 @contextmanager
@@ -127,7 +261,8 @@ def _quiet_tiff(content: bytes) -> Iterator[Any]:
 def _is_whole(content: bytes) -> bool:
     """True if all strips or tiles of a TIFF file's first image lie within the file and decompress."""
     try:
-        page = first_tiff_page(content)
+        with _quiet_tiff(content) as file:
+            page = file.pages.first
     except DAMAGED:
         return False
     # Not `page.dataoffsets`, which leaves out what it does not expect.
@@ -181,13 +316,13 @@ def _lengths(page: Any, i: int) -> Collection[int]:
 def _is_sound(content: bytes) -> bool:
     """True if libjpeg decodes a JPEG without a warning, or it has other colours."""
     try:
-        jpeg_colours(content)
+        _jpeg_colours(content)
     except Exception:  # the decoder raises nothing narrower
         return False
     return True
 
 
-def jpeg_colours(content: bytes) -> Any:
+def _jpeg_colours(content: bytes) -> Any:
     """Decode the bytes of a JPEG file by libjpeg-turbo, to the same values as OpenCV.
 
     Returns:

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image, ImageOps
 
-from arraygeom.runtime.image_bytes import decodable
+from arraygeom.runtime.image_bytes import ORIENTATION, decoded
 
 Grey = UInt8[np.ndarray, "h w"]
 
@@ -29,9 +29,6 @@ VIDEOS = {".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg"}
 MOST_FRAMES = 80
 """Largest number of frames used from a video: every first, second, fourth, eighth ..., so that videos of
 somewhat different lengths share them."""
-
-ORIENTATION = 274
-"""Number of EXIF's orientation tag."""
 
 FrameKey = int | str
 
@@ -214,12 +211,10 @@ def _orientation(file: Path) -> int:
 
 
 def _decode_file(path: Path) -> np.ndarray:
-    tag, content = _orientation(path), decodable(path.read_bytes())
-    flags = (
-        cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR
-    )  # orientation tags are applied, as when images are fused
-    image = cv2.imdecode(np.frombuffer(content, np.uint8), flags) if content else None
-    if not content or image is None:
+    tag, content = _orientation(path), path.read_bytes()
+    # orientation tags are applied, as when images are fused
+    image = decoded(content, cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR)
+    if image is None:
         raise ValueError(f"{path}: not an image that can be read: give a complete PNG, TIFF or JPEG file")
     if tag > 1 and content[8:12] == b"WEBP":  # of which OpenCV applies none
         with Image.open(path) as stored:

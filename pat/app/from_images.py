@@ -22,6 +22,7 @@ from torch.nn.functional import interpolate
 from arraygeom import LensView, Link, Rig, Sensor, View, apply_homography, resize_matrix
 from arraygeom.io.point_matches import read_matches
 from arraygeom.io.xmp import named_by_band, rig_of_images, states_cameras
+from arraygeom.pixels import HW
 from arraygeom.runtime.progress import log_step, part, stage
 from arraygeom.runtime.text import ASSUMED, OPEN, REGISTERED, UNSCALED
 from arraygeom.undistortion import pixels_between
@@ -29,15 +30,15 @@ from calib.images.focal_length import common_focal_length
 from calib.images.from_images import UncalibratedRig, link_of_points, rig_from_images, usable_matches
 from calib.images.known_intrinsics import centres_found
 from calib.images.lenses import describe_lenses
-from calib.images.matches import Pairs, PointMatches, image_sizes, match_cameras, undistort_matches
+from calib.images.matches import Pairs, PointMatches, match_cameras, undistort_matches
 from calib.images.self_calibration import RefinedPair, joined, refined_by_depth, self_calibrated
 
 from ..fusion.dense_matches import MatchedDepth, matched_depth
 from ..fusion.steps import without_lenses
 from ..fusion.views import is_in_colour, range_of, read_view
-from ..media.headers import focal_length
 from ..media.images import ImageSources, read_image, write_image
 from ..media.raw import developed_rig
+from ..media.tags import focal_length
 from ..media.video import read_video
 from ..networks.weights import load_weights
 
@@ -138,7 +139,8 @@ def array_from_images(
     images |= {name: read_image(file, name=name) for name, file in files.items()}
     by_pair: Pairs | None = None
     if matches is not None:
-        given = read_matches(matches, {n: files.get(n, n) for n in sources}, image_sizes(images))
+        sizes = {name: _hw(image) for name, image in images.items()}
+        given = read_matches(matches, {n: files.get(n, n) for n in sources}, sizes)
         by_pair = {pair: PointMatches(*points) for pair, points in given.items()}
     images = {name: _textured(f"{name}: {files.get(name, 'the image')}", images[name]) for name in sources}
     alpha = _chosen_alpha(images, alpha, note)
@@ -199,7 +201,7 @@ def _focal_lengths(
     images: Images, files: Mapping[str, Path], user_focal: Mapping[str, float], note: Say
 ) -> dict[str, float]:
     """Focal lengths in pixels, as given or else by the files' tags; cameras without either are absent."""
-    by_tags = {n: focal_length(files[n], (x.shape[-2], x.shape[-1])) for n, x in images.items() if n in files}
+    by_tags = {n: focal_length(files[n], _hw(x)) for n, x in images.items() if n in files}
     lengths = {n: length for n, length in {**by_tags, **user_focal}.items() if length and n in images}
     for name, length in lengths.items():
         note(f"{name}: focal length {length:.0f} pixels, {'as given' if name in user_focal else 'by EXIF'}")
@@ -394,8 +396,7 @@ def found_rig(
     reduced = {name: scaled(image, factors[name]) for name, image in images.items()}
     lengths = {name: length * factors[name] for name, length in focal.items()}
     if by_pair is not None:
-        old, new = image_sizes(images), image_sizes(reduced)
-        by_pair = _moved(by_pair, {name: resize_matrix(old[name], new[name]) for name in images})
+        by_pair = _moved(by_pair, {n: resize_matrix(_hw(x), _hw(reduced[n])) for n, x in images.items()})
     with part(0, LINES):
         uncalibrated = rig_from_images(reduced, focal=lengths, alpha=alpha, matches=by_pair)
     betas = [name for name in images if (alpha, name) in uncalibrated.rig.links]
@@ -548,8 +549,12 @@ def _moved(pairs: Pairs, maps: Mapping[str, Tensor]) -> dict[tuple[str, str], Po
 def resized_rig(rig: Rig, images: Images) -> Rig:
     """Return the rig with its cameras resized to the images' sizes."""
     for name in rig.names:
-        rig = rig.resize(name, (int(images[name].shape[-2]), int(images[name].shape[-1])))
+        rig = rig.resize(name, _hw(images[name]))
     return rig
+
+
+def _hw(image: Tensor) -> HW:
+    return int(image.shape[-2]), int(image.shape[-1])
 
 
 def scaled(image: Float[Tensor, "c h w"], factor: float) -> Float[Tensor, "c h2 w2"]:

@@ -19,8 +19,8 @@ from arraygeom.runtime.atomic import write_text
 from arraygeom.runtime.file_names import file_names
 from arraygeom.runtime.together import refuse_others, write_together
 
-from ..media.images import read_recorded, write_image
-from ..media.raw import demosaiced, recorded_bands
+from ..media.images import read_recorded, recorded_bands, write_image
+from ..media.raw import demosaiced
 from ..media.tags import RecordedTags, recorded_tags
 from .align import Aligned
 from .results import with_links

@@ -31,8 +31,8 @@ from arraygeom.pixels import HW
 from arraygeom.runtime.warned import warn
 
 from ..media.colour import luminance_of as grey
-from ..media.images import Images, read_image
-from ..media.raw import develop, developed_rig, recorded_bands
+from ..media.images import Images, read_image, recorded_bands
+from ..media.raw import develop, developed_rig
 from ..support.memory import check_limit
 
 T = TypeVar("T")

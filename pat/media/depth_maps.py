@@ -16,10 +16,10 @@ from PIL import Image
 from torch import Tensor
 
 from arraygeom import Camera, pixel_grid, world_rays
+from arraygeom.pixels import HW
 from arraygeom.runtime.atomic import write_atomically
 
 from .colour import to_bytes
-from .headers import HW
 from .images import read_recorded
 
 MILLIMETRE = 0.001

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import io
 import struct
+import warnings
+import zlib
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
@@ -20,16 +22,18 @@ import tifffile
 import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
+from PIL import Image, ImageCms
 from torch import Tensor
 
+from arraygeom import Sensor
+from arraygeom.pixels import HW
 from arraygeom.runtime import image_bytes
 from arraygeom.runtime.atomic import write_atomically
 from arraygeom.runtime.chunks import ROWS, spans
 from arraygeom.runtime.extras import install_line
+from arraygeom.runtime.image_bytes import ImageHeader, image_header
 from arraygeom.runtime.warned import warn
 
-from .headers import HW, ImageHeader, image_header
-from .profiles import in_srgb, with_srgb_profile
 from .suffixes import RAW_SUFFIXES
 
 FEW_BITS = (8, 10, 12, 14)
@@ -48,6 +52,8 @@ GREY_WITH_ALPHA = 4
 MOST_PIXELS = 2**28
 """Pixels above which an image is read only if its size is expected: some 3 GiB in colour."""
 
+_JPEG_PART = 65_000
+"""Bytes of a colour profile that fit in one segment of a JPEG file."""
 _HEIF = tuple(b"ftyp" + brand for brand in (b"heic", b"heix", b"mif1", b"msf1", b"heim", b"heis"))
 
 
@@ -130,15 +136,35 @@ def _planes(
     header = image_header(content)
     if header is None:
         raise ValueError(f"{label}: is no image that can be read: give a PNG, TIFF, JPEG or PNM file")
-    if content[:4] in image_bytes.TIFF and image_bytes.has_further_images(content):
+    if header.several:
         warn(f"{label}: holds several images: the first is taken; save the others as files of their own")
     applied = _applied(header, orientation, label)
     _check_header(header.upright if applied > 1 else header.hw, hw, label)
-    values, white = _decode(content, header, label)
-    values = _opaque(_upright(values, applied), content, label, white)
+    if (page := header.page) is not None:
+        bands, grey = page.samplesperpixel, page.photometric in image_bytes.GREY_TIFF
+        if bands not in (1, 3, 4) or (bands == 4 and grey):
+            raise ValueError(f"{label}: has {bands} channels: {CHANNELS}")
+    values = image_bytes.stored_values(content, header)
+    if values is None and page is not None and page.dtype is not None and page.dtype not in DECODED:
+        raise ValueError(f"{label}: has {page.dtype} values: {KINDS}")
+    if values is None:
+        raise ValueError(f"{label}: is damaged, or not whole: copy it again, or save it as PNG or TIFF")
+    if values.shape[:2] != header.hw:
+        raise ValueError(f"{label}: its header says another size than its pixels have: save it again")
+    values = _opaque(_upright(values, applied), content, label, header.white)
     if orientation == "apply":
         values = in_srgb(values, content, label)
-    return (values[None] if values.ndim == 2 else values[..., ::-1].transpose(2, 0, 1)), white
+    return (values[None] if values.ndim == 2 else values[..., ::-1].transpose(2, 0, 1)), header.white
+
+
+def recorded_bands(values: Any, sensor: Sensor) -> Any:
+    """Reduce three equal bands to one for a camera that the rig declares grey.
+
+    Returns:
+        Values (1, h, w) in that case; otherwise `values` unchanged.
+    """
+    grey = len(values) == 3 and sensor.response not in (None, "rgb")
+    return values[:1] if grey and all((values[0] == band).all() for band in values[1:]) else values
 
 
 def write_image(
@@ -253,82 +279,6 @@ def _upright(values: NDArray, orientation: int) -> NDArray:
     return values[rows, columns]
 
 
-def _decode(content: bytes, header: ImageHeader, label: str) -> tuple[NDArray, int]:
-    """Decode values as stored; with the largest possible value where a TIFF or PNM file states it, else 0.
-
-    OpenCV shifts TIFF values of fewer than 16 bits up, and scales 8-bit values of text PNM files to 255.
-    """
-    values = decoded(_without_orientation(content, header))
-    page = image_bytes.first_tiff_page(content) if content[:4] in image_bytes.TIFF else None
-    if page is not None:
-        values = _as_tiff_states(values, page, content, label)
-    if values is None and page is not None and page.dtype is not None and page.dtype not in DECODED:
-        raise ValueError(f"{label}: has {page.dtype} values: {KINDS}")
-    if values is None:
-        raise ValueError(f"{label}: is damaged, or not whole: copy it again, or save it as PNG or TIFF")
-    if values.shape[:2] != header.hw:
-        raise ValueError(f"{label}: its header says another size than its pixels have: save it again")
-    if page is not None and values.dtype == np.uint16 and header.bits < 16:
-        return values >> (16 - header.bits), 2**header.bits - 1
-    if content[:2] in image_bytes.PNM_OF_TEXT and values.dtype == np.uint8:
-        values = ((values.astype(np.uint16) * header.white + 254) // 255).astype(np.uint8)
-    return values, header.white
-
-
-def _as_tiff_states(values: NDArray | None, page: Any, content: bytes, label: str) -> NDArray | None:
-    """Correct OpenCV's reading of a TIFF file by the file's tags.
-
-    OpenCV returns the first of several bands that are no colours; beyond 8 bits it mixes planes and takes
-    white for black.
-    """
-    bands, grey = page.samplesperpixel, page.photometric in (image_bytes.MINISWHITE, image_bytes.MINISBLACK)
-    if bands not in (1, 3, 4) or (bands == 4 and grey):
-        raise ValueError(f"{label}: has {bands} channels: {CHANNELS}")
-    if values is None:
-        return None
-    deep = values.dtype != np.uint8
-    if bands > 1 and (grey or (deep and page.planarconfig == image_bytes.SEPARATE)):
-        colours = image_bytes.tiff_colours(content)
-        return None if colours is None else colours[..., [2, 1, 0, 3][:bands]]
-    inverted = page.photometric == image_bytes.MINISWHITE and values.dtype == np.uint16
-    return 65535 - values if inverted else values
-
-
-def _without_orientation(content: bytes, header: ImageHeader) -> bytes:
-    """Bytes of a TIFF file with orientation 1: OpenCV always applies the tag in TIFF files."""
-    if header.tag is None or header.orientation == 1:
-        return content
-    place, form = header.tag
-    changed = bytearray(content)
-    struct.pack_into(form, changed, place, 1)
-    return bytes(changed)
-
-
-def _log_level(level: int) -> int:
-    """Set OpenCV's log level and return the former one. OpenCV 5 has the function in another module."""
-    logging = cv2 if hasattr(cv2, "setLogLevel") else getattr(cv2.utils, "logging")  # noqa: B009
-    return int(logging.setLogLevel(level))
-
-
-def decoded(content: bytes, flags: int = cv2.IMREAD_UNCHANGED) -> NDArray | None:
-    """Decode an image file's bytes by OpenCV without its messages.
-
-    Returns:
-        Values (h, w) or (h, w, channels), blue first, type as stored; None for a damaged file.
-    """
-    if content[:2] == image_bytes.JPEG and flags == cv2.IMREAD_UNCHANGED:
-        with suppress(Exception):  # damaged, which `decodable` says
-            if (colours := image_bytes.jpeg_colours(content)) is not None:
-                return colours[..., 0] if colours.shape[2] == 1 else colours[..., ::-1]
-    level, checked = _log_level(0), image_bytes.decodable(content)
-    try:
-        return None if checked is None else cv2.imdecode(np.frombuffer(checked, np.uint8), flags)
-    except cv2.error:
-        return None
-    finally:
-        _log_level(level)
-
-
 def decoded_photograph(path: Path, flags: int, *, least: int = 1) -> NDArray | None:
     """Decode an image file to 8 bits by OpenCV.
 
@@ -347,8 +297,9 @@ def decoded_photograph(path: Path, flags: int, *, least: int = 1) -> NDArray | N
     header = image_header(content)
     if header is None or min(header.hw) < least or header.hw[0] * header.hw[1] > MOST_PIXELS:
         return None
-    values = decoded(content, flags | (cv2.IMREAD_ANYDEPTH if header.white else 0))
-    if values is None or not header.white:
+    pnm = header.white and header.page is None
+    values = image_bytes.decoded(content, flags | (cv2.IMREAD_ANYDEPTH if pnm else 0))
+    if values is None or not pnm:
         return values
     full = 255 if content[:2] in image_bytes.PNM_OF_TEXT and values.dtype == np.uint8 else header.white
     return np.rint(np.minimum(values / full, 1) * 255).astype(np.uint8)
@@ -481,3 +432,85 @@ def _quantised(colours: NDArray, bits: int) -> NDArray:
         rows = np.clip(colours[first:last], 0, 1).astype(np.float64)
         counts[first:last] = np.rint(rows * (2**bits - 1))
     return counts
+
+
+@cache
+def srgb_profile() -> bytes:
+    """Return the bytes of an ICC profile of sRGB, with a fixed date (bytes 24 to 35) so that files are
+    reproducible."""
+    made = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    return made[:24] + struct.pack(">6H", 2000, 1, 1, 0, 0, 0) + made[36:]
+
+
+def in_srgb(values: NDArray, content: bytes, label: str) -> NDArray:
+    """Convert decoded values to sRGB if their file has another colour profile.
+
+    Args:
+        values: (h, w) or (h, w, 3) with blue first.
+        content: bytes of the image file.
+        label: prefix of warnings.
+
+    Returns:
+        Values in sRGB, of the same shape and type. Values of 16 bits, and values with a profile that cannot
+        be used, are returned unchanged with a warning.
+    """
+    profile = _embedded(content)
+    if profile is None:
+        return values
+    try:
+        opened = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        name = ImageCms.getProfileDescription(opened).strip()
+        if "srgb" in name.lower() and "linear" not in name.lower():
+            return values
+        if values.dtype != np.uint8:
+            warn(f"{label}: colour profile '{name}' is ignored, as values have 16 bits: save it in sRGB")
+            return values
+        converted = _converted(values, opened)
+    except (ImageCms.PyCMSError, OSError, ValueError) as error:
+        warn(f"{label}: its colour profile cannot be used ({error}): save it in sRGB")
+        return values
+    warn(f"{label}: converted from colour profile '{name}' to sRGB")
+    return converted
+
+
+def _embedded(content: bytes) -> bytes | None:
+    """ICC profile in an image file; None without one."""
+    if not any(mark in content for mark in (b"iCCP", b"ICC_PROFILE", b"ICCP", b"acsp")):
+        return None
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with Image.open(io.BytesIO(content)) as image:
+                return image.info.get("icc_profile")
+    except (OSError, SyntaxError, ValueError, TypeError, struct.error, Image.DecompressionBombError):
+        return None
+
+
+def _converted(values: NDArray, profile: ImageCms.ImageCmsProfile) -> NDArray:
+    grey = values.ndim == 2
+    image = Image.fromarray(values if grey else np.ascontiguousarray(values[..., ::-1]))
+    srgb = ImageCms.createProfile("sRGB")
+    intent = ImageCms.Intent.RELATIVE_COLORIMETRIC
+    colours = np.asarray(ImageCms.profileToProfile(image, profile, srgb, intent, outputMode="RGB"))
+    return colours[..., 1].copy() if grey else colours[..., ::-1]
+
+
+def with_srgb_profile(content: bytes, suffix: str) -> bytes:
+    """Add an sRGB profile to the bytes of an image file in colour: in a grey one it is not valid.
+
+    Args:
+        content: bytes of the file.
+        suffix: suffix of its name in small letters, such as ".png".
+
+    Returns:
+        The bytes of a PNG or JPEG file with the profile; of other files unchanged.
+    """
+    if suffix == ".png":
+        body = b"iCCP" + b"sRGB\0\0" + zlib.compress(srgb_profile())
+        chunk = struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body))
+        return content[:33] + chunk + content[33:]
+    if suffix in (".jpg", ".jpeg"):
+        segment = b"ICC_PROFILE\0\1\1" + srgb_profile()
+        assert len(segment) < _JPEG_PART
+        return content[:2] + b"\xff\xe2" + struct.pack(">H", len(segment) + 2) + segment + content[2:]
+    return content

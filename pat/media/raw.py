@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable
-from typing import Any
 
 import cv2
 import numpy as np
@@ -48,16 +47,6 @@ def develop(
     linear = image if sensor.coding == "linear" else linear_from_srgb(image)
     scale = linear.new_tensor(factor if len(linear) == 3 else factor[1:2])
     return srgb_from_linear(linear * scale[:, None, None])
-
-
-def recorded_bands(values: Any, sensor: Sensor) -> Any:
-    """Reduce three equal bands to one for a camera that the rig declares grey.
-
-    Returns:
-        Values (1, h, w) in that case; otherwise `values` unchanged.
-    """
-    grey = len(values) == 3 and sensor.response not in (None, "rgb")
-    return values[:1] if grey and all((values[0] == band).all() for band in values[1:]) else values
 
 
 LIGHT = "luminance of light"

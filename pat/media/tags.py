@@ -1,7 +1,8 @@
-"""Tags of image files on where, when and by which camera they were taken, for images made of them."""
+"""Tags of image files on where, when and by which camera they were taken."""
 
 from __future__ import annotations
 
+import math
 import re
 import struct
 import xml.etree.ElementTree as ET
@@ -12,6 +13,8 @@ from typing import Any, NamedTuple
 from PIL import ExifTags, Image, TiffImagePlugin
 
 from arraygeom.io.xmp import DJI, MICASENSE, PIX4D, RDF, xmp_packet
+from arraygeom.pixels import HW
+from arraygeom.runtime.image_bytes import DAMAGED
 
 EXIF, GPS = int(ExifTags.IFD.Exif), int(ExifTags.IFD.GPSInfo)
 KEPT = {
@@ -130,3 +133,40 @@ def packet_of_bands(packet: bytes, bands: Sequence[str], wavelengths: Sequence[f
                 for value in values:
                     ET.SubElement(sequence, f"{RDF}li").text = value
     return ET.tostring(root)
+
+
+_FOCAL, _FOCAL_35MM, _WIDTH, _HEIGHT = 0x920A, 0xA405, 0xA002, 0xA003
+_PLANE_RESOLUTION, _PLANE_UNIT = 0xA20E, 0xA210
+_DIAGONAL_35MM = 43.267
+"""Diagonal of 36 x 24 mm, in mm."""
+_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
+"""Millimetres of the EXIF units of a sensor's resolution: inch, cm, mm, micrometre."""
+
+
+def focal_length(path: str | Path, hw: HW) -> float | None:
+    """Read a photograph's focal length from its EXIF tags.
+
+    Args:
+        hw: size of the image that the focal length is wanted for; the file's first image may be a thumbnail.
+
+    Returns:
+        Focal length in pixels, from the sensor's resolution or else the 35 mm equivalent; None if the tags do
+        not state it or the file cannot be read.
+    """
+    try:
+        with Image.open(path) as image:
+            tags = image.getexif().get_ifd(EXIF)
+        focal, resolution = (_number(tags.get(tag)) for tag in (_FOCAL, _PLANE_RESOLUTION))
+        unit = _MM.get(int(_number(tags.get(_PLANE_UNIT)) or 2))
+        if focal and resolution and unit:
+            longer = max(_number(tags.get(tag)) or 0.0 for tag in (_WIDTH, _HEIGHT)) or max(hw)
+            return focal * resolution / unit * max(hw) / longer
+        film = _number(tags.get(_FOCAL_35MM))
+        return film * math.hypot(*hw) / _DIAGONAL_35MM if film else None
+    except (*DAMAGED, Image.DecompressionBombError):
+        return None
+
+
+def _number(value: object) -> float | None:
+    number = float(value) if value is not None else 0.0  # type: ignore[arg-type]
+    return number if math.isfinite(number) and number > 0 else None

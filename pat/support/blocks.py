@@ -10,13 +10,9 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn.functional import pixel_unshuffle
 from torch.utils._pytree import tree_map
 
-from arraygeom.fields.protocol import compilable
 from arraygeom.runtime.chunks import chunked
-
-from .unshuffle_numba import unshuffle
 
 ROWS = 64
 """Rows that the largest stages of a U-Net compute at a time."""
@@ -87,37 +83,6 @@ def channels_last(x: Float[Tensor, "b d h w"]) -> Float[Tensor, "b d h w"]:
     Shape and values stay (b, d, h, w).
     """
     return x.contiguous(memory_format=torch.channels_last)
-
-
-def stacked(*parts: Float[Tensor, "b _ _ _"]) -> Float[Tensor, "b d h w"]:
-    """Concatenate feature maps along channels, in `channels_last` memory.
-
-    Args:
-        parts: tensors of one batch size; each has the smallest part's sides or exactly twice those. The
-            larger ones are first rearranged as by `pixel_unshuffle(·, 2)`, four channels for each one. Other
-            sides are not refused.
-
-    Returns:
-        Tensor (b, d, h, w) of the smallest sides, its channels in the order of the parts.
-    """
-    h, w = (min(tensor.shape[side] for tensor in parts) for side in (-2, -1))
-    if not all(map(plain, parts)):
-        same = (tensor if tensor.shape[-1] == w else pixel_unshuffle(tensor, 2) for tensor in parts)
-        return torch.cat([channels_last(tensor) for tensor in same], 1)
-    counts = [tensor.shape[1] * (tensor.shape[-1] // w) ** 2 for tensor in parts]
-    out = parts[0].new_empty(len(parts[0]), h, w, sum(counts))
-    for tensor, target in zip(parts, out.split(counts, -1)):
-        if tensor.shape[-1] == w:
-            target.copy_(tensor.movedim(1, -1))
-        else:
-            for image, of in zip(tensor.numpy(), target.numpy()):
-                unshuffle(image[:, ::2], image[:, 1::2], of)
-    return out.movedim(-1, 1)
-
-
-def plain(x: Tensor) -> bool:
-    """Return True for a float32 tensor on the CPU that needs no gradient: compiled loops accept it."""
-    return x.dtype == torch.float32 and compilable(x) and not x.requires_grad
 
 
 def enlarge(x: Float[Tensor, "b d h w"], factor: int = 2) -> Float[Tensor, "b d h*{factor} w*{factor}"]:

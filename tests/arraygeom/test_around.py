@@ -46,7 +46,7 @@ def test_no_depth_range_is_needed_where_every_depth_is_known():
     assert torch.equal(found.start, bounded.start)
     assert torch.equal(found.valid, bounded.valid)
     depth[3, 5] = math.nan
-    with pytest.raises(ValueError, match="needs a depth range"):
+    with pytest.raises(ValueError, match="depth"):
         AroundDepth(depth)(bare, x)
 
 
@@ -135,7 +135,7 @@ def test_wrong_uses_are_refused():
     rig = rig_of()
     with pytest.raises(ValueError, match=r"90x59.*90x60"):
         AroundDepth(torch.ones(59, 90), 0.1, rig["a"])
-    with pytest.raises(ValueError, match="tolerance is -1"):
+    with pytest.raises(ValueError, match="tolerance"):
         AroundDepth(torch.ones(HW), -1.0)
     F = rig.pair("a", "b").fundamental
     linked = Pair(View(hw=HW), View(hw=HW), link=Link(F, torch.eye(3, dtype=torch.float64)))
@@ -158,5 +158,5 @@ def test_a_batch_of_rigs_is_a_loop():
 def test_planes_of_another_size_are_refused_without_a_view_too():
     pair, x = rig_of().pair("a", "b"), torch.zeros(1, 2)
     for field in (AroundDepth(torch.ones(45, 45)), AroundMatches(torch.ones(45, 45, 2))):
-        with pytest.raises(ValueError, match="45x45 pixels, alpha has 90x60"):
+        with pytest.raises(ValueError, match=r"45x45.*90x60"):
             field(pair, x)

@@ -268,7 +268,7 @@ def test_a_batch_of_rigs_has_the_fields_of_its_rigs():
 
 
 def test_what_a_model_lacks_is_said():
-    with pytest.raises(ValueError, match="do not meet in a point: there is no fundamental matrix"):
+    with pytest.raises(ValueError, match="fundamental"):
         _ = rig("orthographic", "own").pair("a", "b").fundamental
     with pytest.raises(TypeError, match="rays"):
 
@@ -281,7 +281,7 @@ def test_what_a_model_lacks_is_said():
         class Another(CameraModel, name="stereographic"):
             pass
 
-    with pytest.raises(ValueError, match="has to be central"):
+    with pytest.raises(ValueError, match="central"):
         FlatPort(lens=Orthographic(), **{n: number(v) for n, v in PORT.items()})
     assert {"equirectangular", "orthographic", "polynomial-fisheye", "rolling-shutter", "flat-port"} <= {
         *CAMERA_MODELS
@@ -300,7 +300,7 @@ def test_a_file_of_a_model_that_is_not_imported_says_how_to_import_it(tmp_path):
     rig("port", "port").save(tmp_path / "rig.yaml")
     text = (tmp_path / "rig.yaml").read_text()
     (tmp_path / "rig.yaml").write_text(text.replace("flat-port", "of-my-own"))
-    with pytest.raises(ValueError, match=r"is 'of-my-own', not one of .*--plugin MODULE"):
+    with pytest.raises(ValueError, match=r"'of-my-own'.*--plugin"):
         Rig.load(tmp_path / "rig.yaml")
 
 
@@ -323,9 +323,7 @@ def test_a_model_that_does_not_state_its_lengths_cannot_be_in_another_unit():
     class Mine(CameraModel):
         central = False
 
-    with pytest.raises(
-        ValueError, match="Mine does not say which of its numbers are lengths: state `lengths`"
-    ):
+    with pytest.raises(ValueError, match="`lengths`"):
         Mine().scaled(10.0)
 
 
@@ -338,19 +336,19 @@ def project(X):
     [
         (
             lambda X: project(X)[0],
-            r"Sloppy.project gives torch.float32 \(2, 3, 2\) for .* are valid, torch.bool",
+            "Sloppy.project.*torch.float32",
         ),
-        (lambda X: (project(X)[0], True), "and a bool for points"),
-        (lambda X: (project(X)[0], None), "and a NoneType for points"),
-        (lambda X: (project(X)[0], project(X)[1].float()), r"and torch.float32 \(2, 3\) for points"),
-        (lambda X: (project(X)[0], project(X)[1][..., None]), r"and torch.bool \(2, 3, 1\) for points"),
-        (lambda X: tuple(v.numpy() for v in project(X)), "gives a ndarray and a ndarray"),
-        (lambda X: project(X.double()), "gives torch.float64 .* for points torch.float32"),
-        (lambda X: project(X.float()), "gives torch.float32 .* for points torch.float64"),
-        (lambda X: project(X.reshape(-1, 3)), r"gives torch.float32 \(6, 2\)"),
-        (lambda X: (X, project(X)[1]), r"gives torch.float32 \(2, 3, 3\)"),
-        (lambda X: project(X.div_(X[..., 2:])), "changes the points that it is given"),
-        (lambda X: X.x, "Sloppy.project raised AttributeError"),
+        (lambda X: (project(X)[0], True), "bool"),
+        (lambda X: (project(X)[0], None), "NoneType"),
+        (lambda X: (project(X)[0], project(X)[1].float()), r"torch.float32.*\(2, 3\)"),
+        (lambda X: (project(X)[0], project(X)[1][..., None]), r"torch.bool.*\(2, 3, 1\)"),
+        (lambda X: tuple(v.numpy() for v in project(X)), "ndarray"),
+        (lambda X: project(X.double()), "torch.float64.*torch.float32"),
+        (lambda X: project(X.float()), "torch.float32.*torch.float64"),
+        (lambda X: project(X.reshape(-1, 3)), r"torch.float32.*\(6, 2\)"),
+        (lambda X: (X, project(X)[1]), r"torch.float32.*\(2, 3, 3\)"),
+        (lambda X: project(X.div_(X[..., 2:])), "changes"),
+        (lambda X: X.x, "Sloppy.project.*AttributeError"),
     ],
 )
 def test_a_model_that_returns_something_else_is_refused_with_what_is_wanted(wrong, said):
@@ -383,9 +381,9 @@ class Division(CameraModel, name="tests-division"):
 @pytest.mark.parametrize(
     ("k", "said"),
     [
-        (np.array(-0.1), "k of Division is of numpy: give a tensor"),
-        (torch.tensor(1), "k of Division holds torch.int64"),
-        (number(math.nan), "k of Division holds NaN"),
+        (np.array(-0.1), "Division"),
+        (torch.tensor(1), "torch.int64"),
+        (number(math.nan), "NaN"),
     ],
 )
 def test_numbers_of_a_model_are_finite_tensors(k, said):
@@ -395,7 +393,7 @@ def test_numbers_of_a_model_are_finite_tensors(k, said):
 
 def test_batches_of_lenses_are_as_large_as_those_of_cameras():
     one = camera("own")
-    with pytest.raises(ValueError, match=r"K and lens are \(3,\) and \(2,\)"):
+    with pytest.raises(ValueError, match=r"\(3,\).*\(2,\)"):
         one.replace(K=one.K.expand(3, 3, 3), distortion=Division(number(0.0, 0.1)))
 
 
@@ -422,6 +420,6 @@ def test_what_no_file_gives_back_is_not_written(tmp_path):
     class Untyped(Stereographic, name="tests-untyped"):
         k: object
 
-    for k, said in ((number(0.1), "state it, k: torch.Tensor"), ({0.1}, "is a set, which no rig file holds")):
+    for k, said in ((number(0.1), "torch.Tensor"), ({0.1}, "set")):
         with pytest.raises(ValueError, match=said):
             Rig({"own": camera("own").replace(distortion=Untyped(k))}).save(tmp_path / "rig.yaml")

@@ -103,7 +103,7 @@ def test_a_lens_of_zeros_is_no_lens():
     assert depth_of(same, y, y).depth.equal(depth_of(plain, y, y).depth)
     assert same.alpha.to_kornia().intrinsics.equal(plain.alpha.to_kornia().intrinsics)
     free = dataclasses.replace(zero, coefficients=zero.coefficients.clone().requires_grad_())
-    with pytest.raises(ValueError, match="pinhole cameras"):  # one that is to be learned is a lens
+    with pytest.raises(ValueError, match="pinhole"):  # one that is to be learned is a lens
         Epipolar()(dataclasses.replace(same, alpha=same.alpha.replace(distortion=free)), WHOLE)
 
 
@@ -237,9 +237,7 @@ def test_rigs_in_map_coordinates_are_right_or_refused(rig):
     for x in pixels:
         assert float((triangulate(there.cameras, x).X - FAR_ORIGIN - X).abs().max()) < 1e-3
     single = in_utm(rig).to(torch.float32).pair("alpha", "beta")
-    with pytest.raises(
-        ValueError, match=r"m from the origin, which float32 holds to 0\.[3-6] m: give float64"
-    ):
+    with pytest.raises(ValueError, match=r"float32.*float64"):
         default_field(single)(single, torch.tensor([[20.0, 12.0]]))
 
 
@@ -254,5 +252,5 @@ def test_a_place_far_off_is_judged_by_the_scene_whatever_its_unit(unit):
         return rig.scaled(unit).to(torch.float32).pair("alpha", "beta")
 
     assert Epipolar()(pair(10.0, 100.0), x).valid.all()
-    with pytest.raises(ValueError, match="put the origin near the cameras"):
+    with pytest.raises(ValueError, match="cameras"):
         Epipolar()(pair(0.1, 0.5), x)

@@ -197,7 +197,7 @@ def test_any_set_of_pixels(field, shape):
 
 @pytest.mark.parametrize("shape", [(), (5,), (4, 3)])
 def test_pixels_without_the_batch_axis_are_refused(shape):
-    with pytest.raises(ValueError, match=r"batched over \(3,\) needs pixels"):
+    with pytest.raises(ValueError, match=r"\(3,\)"):
         Epipolar()(pair_of(stack([random_rig(i) for i in range(3)])), torch.zeros(*shape, 2))
 
 
@@ -256,9 +256,9 @@ def test_segments_far_beyond_the_image_are_clipped_to_it():
 
 def test_lenses_and_missing_calibration_are_refused():
     pair = pair_of(known_by_f(random_rig(1)))
-    with pytest.raises(ValueError, match="HomographyDisplacement or Rectified"):
+    with pytest.raises(ValueError, match=r"HomographyDisplacement.*Rectified"):
         sampling_locations(Epipolar(), pair)
-    with pytest.raises(ValueError, match="depth range"):
+    with pytest.raises(ValueError, match="depth"):
         sampling_locations(Epipolar(), pair_of(random_rig(1).replace(depth=None)))
 
 

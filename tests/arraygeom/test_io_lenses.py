@@ -131,7 +131,7 @@ def test_zeds_sizes(tmp_path):
     torch.testing.assert_close(
         read_rig(tmp_path / "SN1.conf")["right"].centre, read_rig(FIXTURES / "zed.conf")["right"].centre
     )
-    with pytest.raises(RigFileError, match="has no cameras of 1920x1080; it has 1280x720, 672x376"):
+    with pytest.raises(RigFileError, match=r"1920x1080.*1280x720"):
         read_rig(FIXTURES / "zed.conf", hw=(1080, 1920))
 
 
@@ -181,7 +181,7 @@ def metashape_polynomials(x, y, f, cx, cy, b1, b2, k, p):
 def test_metashape():
     """Lengths are twice those of the chunk; b's transform is camera->chunk."""
     assert recognise(FIXTURES / "metashape.xml") == "metashape"
-    with pytest.warns(RigFileWarning, match="1 cameras that are not aligned"):
+    with pytest.warns(RigFileWarning, match="aligned"):
         rig = read_rig(FIXTURES / "metashape.xml")
     assert rig.names == ("a.jpg", "b.jpg")
     one = metashape_frame(POINTS, 500, 3.5, -2.25, 1.5, 0.75, (-0.1, 0.02, -0.003, 0), (0.001, -0.002)) - 0.5

@@ -200,7 +200,7 @@ def test_a_rig_is_made_of_kornia_pinholes():
         Rig({"a": pinhole(), "b": BETA}, (1, 2)),
     ):
         assert rig == Rig({"a": ALPHA, "b": BETA}, depth=(1, 2))
-    with pytest.raises(TypeError, match="'b' is a str"):
+    with pytest.raises(TypeError, match="'b'"):
         Rig({"a": ALPHA, "b": "colour"})
 
 
@@ -239,7 +239,7 @@ def test_a_stereo_camera_of_kornia_is_refused():
 
     P = torch.tensor([[[500.0, 0, 320, 0], [0, 500, 240, 0], [0, 0, 1, 0]]])
     right = P - torch.tensor([0.0, 0, 0, 50])[None, None] * torch.tensor([1.0, 0, 0])[None, :, None]
-    with pytest.raises(TypeError, match="StereoCamera is none of"):
+    with pytest.raises(TypeError, match="StereoCamera"):
         Camera.from_kornia(StereoCamera(P, right))
 
 
@@ -247,9 +247,9 @@ def test_unequal_batches_and_lenses_are_refused():
     with pytest.raises(ValueError, match=r"{'a': 2, 'b': 3}"):
         Rig.from_kornia({"a": pinhole(2), "b": pinhole(3)})
     bent = RIG.with_camera("beta", BETA.replace(distortion=Distortion("brown-conrady", LENS)))
-    with pytest.raises(ValueError, match=r"have no pose \(beta\)"):
+    with pytest.raises(ValueError, match="beta"):
         bent.to_kornia()
-    with pytest.raises(ValueError, match="kornia has no camera without a calibration: b"):
+    with pytest.raises(ValueError, match=r"\bb\b"):
         Rig({"a": ALPHA, "b": LensView(hw=(4, 4), K=ALPHA.K)}).to_kornia()
 
 
@@ -307,12 +307,12 @@ def test_lenses_are_kornias_camera_models(name):
 def test_lenses_that_kornia_lacks_are_named():
     prism = torch.cat([LENS, torch.full((4,), 0.01, dtype=F64)])
     for lens, what in (
-        (Distortion("double-sphere", LENS[:2]), "kornia has no double-sphere model: it has pinholes"),
-        (Distortion("brown-conrady", prism), "this lens also prism or tilt terms"),
+        (Distortion("double-sphere", LENS[:2]), "kornia.*double-sphere"),
+        (Distortion("brown-conrady", prism), "prism"),
     ):
         with pytest.raises(ValueError, match=what):
             ALPHA.replace(distortion=lens).to_kornia()
-    with pytest.raises(ValueError, match="skewed or rotated"):
+    with pytest.raises(ValueError, match="rotated"):
         ALPHA.replace(distortion=Distortion("brown-conrady", LENS)).rot90(1).to_kornia()
 
 

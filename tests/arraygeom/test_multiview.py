@@ -171,9 +171,9 @@ def test_float32_rays_at_12_megapixels():
 def test_planes_of_another_size_than_their_camera_are_refused():
     camera = Camera(K=intrinsics(10.0, (8, 10)), hw=(8, 10), cam_from_world=Pose.identity())
     rig = Rig({"a": camera, "b": camera})
-    with pytest.raises(ValueError, match=r"the image given is \(4, 5\), its camera \(8, 10\): resize one"):
+    with pytest.raises(ValueError, match=r"\(4, 5\).*\(8, 10\)"):
         warp(rig.pair("a", "b"), torch.ones(1, 3, 4, 5), torch.ones(1, 8, 10))
-    with pytest.raises(ValueError, match="depth map of 'b' is"):
+    with pytest.raises(ValueError, match="'b'"):
         consistent_depth(rig, {"a": torch.ones(8, 10), "b": torch.ones(4, 5)}, "a")
-    with pytest.raises(ValueError, match="no depth map of 'a', only of b"):
+    with pytest.raises(ValueError, match="'a'"):
         consistent_depth(rig, {"b": torch.ones(8, 10)}, "a")

@@ -37,7 +37,7 @@ def test_homogeneous_map_is_the_matrix_product():
     torch.testing.assert_close(map_homogeneous(M, x), expected)
     torch.testing.assert_close(map_homogeneous(M, x[:1]), torch.einsum("bki,hwi->bhwk", M, homogeneous[0]))
     torch.testing.assert_close(map_homogeneous(M[0], x[0, 0, 0]), expected[0, 0, 0])
-    with pytest.raises(ValueError, match="batched over"):
+    with pytest.raises(ValueError, match="batched"):
         map_homogeneous(M[None], x[0, 0, 0])
 
 

@@ -110,7 +110,7 @@ def test_points_of_whole_pixels_are_those_of_floats(dtype):
 
 
 def test_numbers_of_a_rig_are_not_made_integers():
-    with pytest.raises(TypeError, match="float32 or float64"):
+    with pytest.raises(TypeError, match=r"float32.*float64"):
         random_rig(1).to(torch.int64)
 
 
@@ -214,7 +214,7 @@ def test_a_batch_of_cameras_meets_the_leading_axes_of_points(shape):
 @pytest.mark.parametrize("shape", [(), (5,), (4, 3)])
 def test_points_without_the_batch_axis_are_refused(shape):
     pose = stack([Pose.identity()] * 3)
-    with pytest.raises(ValueError, match="need points"):
+    with pytest.raises(ValueError, match="points"):
         pose.apply(torch.zeros(*shape, 3, dtype=torch.float64))
 
 
@@ -240,12 +240,12 @@ def test_intrinsics_keep_the_gradient():
     assert focal.grad == 2
     assert centre.grad.tolist() == [1, 1]
     assert intrinsics((torch.tensor(5.0), 6.0), (3, 3)).diagonal().tolist() == [5, 6, 1]
-    with pytest.raises(ValueError, match="one number or two"):
+    with pytest.raises(ValueError, match="number"):
         intrinsics(torch.ones(3), (480, 640))
 
 
 def test_a_batch_of_rigs_is_not_one_rig_file(tmp_path):
-    with pytest.raises(ValueError, match="a rig file holds one rig and this is a batch"):
+    with pytest.raises(ValueError, match="batch"):
         stack([random_rig(0), random_rig(1)]).save(tmp_path / "rig.yaml")
     assert not list(tmp_path.iterdir())
 
@@ -254,11 +254,11 @@ def test_numbers_that_a_format_leaves_out_are_named(tmp_path):
     from arraygeom.io import RigFileWarning, write_rig
 
     rig = random_rig(1)
-    with pytest.warns(RigFileWarning, match="do not hold the rig's depth range: use the native") as found:
+    with pytest.warns(RigFileWarning, match="depth") as found:
         write_rig(rig, tmp_path / "chain.yaml", format="kalibr")
     assert len(found) == 1
     write_rig(Rig(rig.cameras), tmp_path / "chain.yaml", format="kalibr")
-    with pytest.warns(RigFileWarning, match="do not hold the rig's place in the world: use the native"):
+    with pytest.warns(RigFileWarning, match="world"):
         write_rig(Rig({"beta": rig["beta"]}), tmp_path / "camera.yml", format="opencv")
     placed = rig["beta"].replace(cam_from_world=Pose.identity())
     write_rig(Rig({"beta": placed}), tmp_path / "camera.yml", format="opencv")

@@ -81,7 +81,7 @@ def test_rotations_there_and_back():
 
 
 def test_what_cannot_be_rectified_is_refused():
-    with pytest.raises(ValueError, match="no baseline"):
+    with pytest.raises(ValueError, match="baseline"):
         rectify(two_cameras().pair("alpha", "beta"))
-    with pytest.raises(ValueError, match="optical axis"):
+    with pytest.raises(ValueError, match="optical"):
         rectify(two_cameras(centre=(0, 0, 0.3)).pair("alpha", "beta"))

@@ -101,7 +101,7 @@ def test_float32_is_adjusted_in_float64():
 
 def test_batches_and_wrong_shapes_are_refused():
     rig, X, x = bundle()
-    with pytest.raises(ValueError, match="one rig of calibrated cameras"):
+    with pytest.raises(ValueError, match="calibrated"):
         bundle_adjusted(stack([rig, rig]), X, x, free=["*"])
     with pytest.raises(ValueError, match="3 cameras, 12 points, 2"):
         bundle_adjusted(rig, X, x[:2], free=["*"])

@@ -88,7 +88,7 @@ def test_a_rotated_co_located_camera_sees_a_rotated_image():
 
 def test_one_camera_at_a_time():
     c = camera("brown-conrady")
-    with pytest.raises(ValueError, match="one camera at a time"):
+    with pytest.raises(ValueError, match="camera"):
         pinhole_view(c.replace(K=c.K[None], cam_from_world=Pose(c.R[None], c.t[None])))
 
 

@@ -54,7 +54,7 @@ def test_the_true_position_is_known_in_training():
     segments, seen = made.fields[0].straight, made.visible[0]
     assert (segments.start - made.position[0])[seen & segments.valid].abs().max() < 1e-3
     assert segments.valid[seen].float().mean() > 0.99
-    with pytest.raises(ValueError, match="true position"):
+    with pytest.raises(ValueError, match="position"):
         TruePosition()(PAIR, X)
 
 

@@ -77,9 +77,7 @@ class Align(Around):
         image, with_rig = ((), False) if flight else named_images(self.given, self.image, "align")
         options.writable(self.out, folder=True)
         self.settings()
-        extras = self._extras = {*self.extras.split(",")}
-        if unknown := extras - {*EXTRAS}:
-            raise UsageError("--extras", f"some of {', '.join(EXTRAS)}", min(unknown))
+        self._extras = options.some_of(self.extras, EXTRAS)
         with self.judged():
             for frame in self._frames_with_rig(image) if with_rig else self._frames_without(flight):
                 self._align(frame)
@@ -102,7 +100,7 @@ class Align(Around):
         from ...fusion.views import ViewFiles
         from ..healing import checked_rig
 
-        rig = options.load_rig_or_say_no_image(self.given[0], self.depth)
+        rig = options.load_rig(self.given[0], self.depth, or_image=True)
         alpha, files = files_by_camera(rig, self.alpha, self.given, image)
         files = matched_frames(files)
         for i, paths in enumerate(options.by_frame(files)):

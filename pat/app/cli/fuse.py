@@ -70,9 +70,7 @@ class Fuse(Around, Fusing):
             UsageError: for invalid options.
             ValueError: for images or a rig that cannot be used.
         """
-        extras = self._extras = {*self.extras.split(",")}
-        if unknown := extras - {*EXTRAS}:
-            raise UsageError("--extras", f"some of {', '.join(EXTRAS)}", min(unknown))
+        self._extras = options.some_of(self.extras, EXTRAS)
         image, with_rig = self.named("fuse")
         options.device_of(self.device)
         with self.judged(), self.recordings(image, with_rig=with_rig) as frame:
@@ -96,89 +94,70 @@ class Fuse(Around, Fusing):
             raise UsageError(several[0], "one image; `pat batch` fuses many", f"{count} images")
         return files
 
-    def _fuse(self, frame: Recordings) -> None:
+    def _fuse(self, given: Recordings) -> None:
         """Fuse the frame and write its files."""
         from arraygeom import Camera
-        from arraygeom.runtime.together import sweep
+        from arraygeom.runtime.together import LISTS, sweep
 
-        from ...fusion.results import refuse_to_replace, save_frame
-        from ...fusion.views import ViewFiles
+        from ...fusion.inputs import measured_along
+        from ...fusion.results import band_names, describe_bands, refuse_to_replace, save_frame, view_of
+        from ...fusion.views import ViewFiles, Views
         from ...media.raw import developed_rig
         from ...support.locks import folder_lock
 
-        alpha, found, begin = frame.alpha, frame.found, time.monotonic()
-        if "points" in self._extras and not isinstance(frame.rig[alpha], Camera):
+        alpha, found, points, begin = given.alpha, given.found, "points" in self._extras, time.monotonic()
+        if points and not isinstance(given.rig[alpha], Camera):
             raise UsageError("--extras points", "a calibrated alpha, and its camera has F alone")
         with folder_lock(self.out):
             sweep(self.out)
             refuse_to_replace(self.out)
             images: Mapping[str, Tensor]
             if found is None:
-                views = ViewFiles(frame.rig, frame.first, alpha=alpha)
-                rig, images = developed_rig(self.healed(views), frame.files), views
+                views = ViewFiles(given.rig, given.first, alpha=alpha)
+                rig, images = developed_rig(self.healed(views), given.files), views
             else:
                 rig, images = found.rig, found.images
-            fused, along = self._fused(rig, images, frame)
-            fused, gain = self._exposed(fused, found)
-            if not fused.depth.isfinite().any():
+            field, tiles = options.field_named(self.field), self.out / LISTS / "tiles"
+            along = measured_along(Views(rig, images, alpha, dict.fromkeys(images, field)))
+            searched, around = self.with_known(images, rig, alpha, given.first, field)
+            settings = self.fuse_settings(noise_by_default=self.luminance in ("alpha", "recorded"))
+            frame = fuse_with_progress(
+                self.network or "mono-colour",
+                searched,
+                images,
+                alpha=alpha,
+                device=self.device,
+                settings=replace(settings, field=around),
+                explain=self.note,
+                store=tiles,
+            )
+            frame, gain = self._exposed(frame, found)
+            if not frame.depth.isfinite().any():
                 self.note(no_depth(rig, alpha))
-            further, pages = self._options_of_saving(fused, rig, frame), {}
+            bands = band_names(frame, (name for name in rig.betas(alpha) if name in given.files))
+            if said := describe_bands(frame, bands, self.kind):
+                self.note(said)
+            if points:
+                self.note("points.ply: the pixels of known depth, in alpha's frame")
+            pages = {}
             if {"page", "classical"} & self._extras:
-                pages["index.html"] = self._page(fused, rig, images, frame, gain, begin)
-            written = save_frame(fused, self.out, along=along, pages=pages, **further)
-            shutil.rmtree(self.tiles, ignore_errors=True)
+                pages["index.html"] = self._page(frame, rig, images, given, gain, begin)
+            written = save_frame(
+                frame,
+                self.out,
+                bits=self.bits,
+                kind=self.kind,
+                view=view_of(rig, alpha, bits=self.bits, bands=len(frame.image)),
+                points=rig[alpha] if points else None,
+                rig=None if found is None else found.lasting,
+                bands=bands,
+                along=along,
+                pages=pages,
+            )
+            shutil.rmtree(tiles, ignore_errors=True)
         say(f"written to {self.out}: {', '.join(path.name for path in written)}")
         if pages:
             say(f"to see the result, open {self.out / 'index.html'} in a browser")
-
-    @property
-    def tiles(self) -> Path:
-        """Folder of finished tiles, until all are done."""
-        from arraygeom.runtime.together import LISTS
-
-        return self.out / LISTS / "tiles"
-
-    def _fused(
-        self, rig: Rig, images: Mapping[str, Tensor], frame: Recordings
-    ) -> tuple[Frame, Literal["depth", "distance"]]:
-        """Fused frame, and what its depth is measured along. Tiles of an earlier command are reused."""
-        from ...fusion.inputs import measured_along
-        from ...fusion.views import Views
-
-        field = options.field_named(self.field)
-        along = measured_along(Views(rig, images, frame.alpha, dict.fromkeys(images, field)))
-        rig, around = self.with_known(images, rig, frame.alpha, frame.first, field)
-        settings = self.fuse_settings(noise_by_default=self.luminance in ("alpha", "recorded"))
-        fused = fuse_with_progress(
-            self.network or "mono-colour",
-            rig,
-            images,
-            alpha=frame.alpha,
-            device=self.device,
-            settings=replace(settings, field=around),
-            explain=self.note,
-            store=self.tiles,
-        )
-        return fused, along
-
-    def _options_of_saving(self, frame: Frame, fused: Rig, recorded: Recordings) -> dict[str, Any]:
-        """Options of `save_frame`; notes the content of some files."""
-        from ...fusion.results import band_names, describe_bands, view_of
-
-        alpha, points = recorded.alpha, "points" in self._extras
-        bands = band_names(frame, (name for name in fused.betas(alpha) if name in recorded.files))
-        if said := describe_bands(frame, bands, self.kind):
-            self.note(said)
-        if points:
-            self.note("points.ply: the pixels of known depth, in alpha's frame")
-        return {
-            "bits": self.bits,
-            "kind": self.kind,
-            "view": view_of(fused, alpha, bits=self.bits, bands=len(frame.image)),
-            "points": fused[alpha] if points else None,
-            "rig": None if recorded.found is None else recorded.found.lasting,
-            "bands": bands,
-        }
 
     def _page(
         self,

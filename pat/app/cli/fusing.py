@@ -154,7 +154,7 @@ class Fusing(Known):
         """Images of the given rig."""
         if self.focal:
             raise UsageError("--focal", "no rig, which states focal lengths: leave it out")
-        rig = self.timed(options.load_rig_or_say_no_image(self.given[0], self.depth))
+        rig = self.timed(options.load_rig(self.given[0], self.depth, or_image=True))
         alpha, files = files_by_camera(rig, self.alpha, self.given, image)
         files = self._checked(files)
         self._choose_weights(rig, alpha, {name: paths[0] for name, paths in files.items()})

@@ -151,7 +151,8 @@ class Known:
         Raises:
             ValueError: for images that cannot be used, and a memory limit that their size exceeds.
         """
-        from ...media.headers import image_header
+        from arraygeom.runtime.image_bytes import image_header
+
         from ...support.memory import check_limit
         from ..from_images import array_from_images
 

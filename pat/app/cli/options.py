@@ -195,8 +195,13 @@ def field_named(name: str) -> ReceptiveField | None:
         raise ValueError(f"--field: {error}") from None
 
 
-def load_rig(path: Path, depth: tuple[float, float] | None = None) -> Rig:
+def load_rig(path: Path, depth: tuple[float, float] | None = None, *, or_image: bool = False) -> Rig:
     """Load the rig of a file, with other depth bounds if given.
+
+    Args:
+        path: rig file.
+        depth: (near, far) in place of the rig's bounds, metres; None for the rig's.
+        or_image: True where an image may be given too, as the message for another file then says.
 
     Raises:
         FileNotFoundError: for a missing file.
@@ -204,31 +209,34 @@ def load_rig(path: Path, depth: tuple[float, float] | None = None) -> Rig:
     """
     refuse_missing(path, rig=True)
     from arraygeom import Rig
+    from arraygeom.io.source import UnknownRigFormat
 
-    rig = Rig.load(path)
+    try:
+        rig = Rig.load(path)
+    except UnknownRigFormat:
+        if or_image:
+            said = f"{NO_IMAGE}; nor is it a rig (see `pat rig convert --help`)"
+            raise ValueError(f"{path}: {said}") from None
+        raise
     return rig if depth is None else rig.replace(depth=depth)
 
 
 NO_IMAGE = "is no image: images end in .png, .tif, .jpg and the like"
 
 
-def load_rig_or_say_no_image(path: Path, depth: tuple[float, float] | None) -> Rig:
-    """Load the rig of a command's first argument; the message for another file asks if it is an image.
+def some_of(text: str, names: Sequence[str], option: str = "--extras") -> set[str]:
+    """Parse a value such as "page,points".
 
-    Args:
-        path: rig file.
-        depth: (near, far) in place of the rig's bounds, metres; None for the rig's.
+    Returns:
+        The names in it.
 
     Raises:
-        FileNotFoundError: for a missing file.
-        ValueError: for a file that is no rig, and invalid bounds.
+        UsageError: for a name that is none of `names`.
     """
-    from arraygeom.io.source import UnknownRigFormat
-
-    try:
-        return load_rig(path, depth)
-    except UnknownRigFormat:
-        raise ValueError(f"{path}: {NO_IMAGE}; nor is it a rig (see `pat rig convert --help`)") from None
+    given = {*text.split(",")}
+    if unknown := given - {*names}:
+        raise UsageError(option, f"some of {', '.join(names)}", min(unknown))
+    return given
 
 
 def refuse_missing(path: Path, *, rig: bool) -> None:

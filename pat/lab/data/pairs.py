@@ -91,11 +91,15 @@ class PairFiles(NamedTuple):
         left: left image.
         right: right image.
         max_disparity: largest disparity, pixels of left.
+        ground_truth: true disparity of left; None if unknown.
+        scale: counts of that file for a pixel of disparity.
     """
 
     left: Path
     right: Path
     max_disparity: float
+    ground_truth: Path | None = None
+    scale: int = 1
 
 
 class _Middlebury(NamedTuple):
@@ -148,7 +152,7 @@ def middlebury_pairs(root: str | Path) -> Iterator[StereoPair]:
         ValueError: for a folder without a pair.
     """
     root = _folder(root)
-    return (_middlebury_pair(root, *scene) for scene in _some(_middlebury_scenes(root), root))
+    return (_read(root, files) for files in _some(_middlebury(root), root))
 
 
 def folder_pairs(root: str | Path) -> Iterator[StereoPair]:
@@ -164,10 +168,7 @@ def folder_pairs(root: str | Path) -> Iterator[StereoPair]:
         ValueError: for a folder without a pair.
     """
     root = _folder(root)
-    return (
-        StereoPair(_pair_name(root, left), read_image(left), read_image(right), PAPER_DISPARITY)
-        for left, right in _some(_named(root), root)
-    )
+    return (_read(root, files) for files in _some(_named(root), root))
 
 
 def pair_files(root: str | Path) -> list[PairFiles]:
@@ -181,9 +182,7 @@ def pair_files(root: str | Path) -> list[PairFiles]:
         ValueError: for a folder without a pair.
     """
     root = _folder(root)
-    files = {left: PairFiles(left, right, PAPER_DISPARITY) for left, right in _named(root)}
-    for left, layout in _middlebury_scenes(root):
-        files[left] = PairFiles(left, left.with_name(layout.right), 255 / layout.scale)
+    files = {pair.left: pair for pair in (*_named(root), *_middlebury(root))}
     return [files[left] for left in _some(sorted(files), root)]
 
 
@@ -200,40 +199,34 @@ def _some(items: list[T], root: Path) -> list[T]:
     return items
 
 
-def _middlebury_scenes(root: Path) -> list[tuple[Path, _Middlebury]]:
-    """Left images in folders of Middlebury's collections, in order."""
+def _middlebury(root: Path) -> list[PairFiles]:
+    """Pairs in folders of Middlebury's collections, in order."""
     return sorted(
-        (file, layout)
-        for key, layout in MIDDLEBURY.items()
+        PairFiles(file, file.with_name(right), 255 / scale, file.with_name(ground_truth), scale)
+        for key, (left, right, ground_truth, scale) in MIDDLEBURY.items()
         for file in files_below(root)
-        if file.name == layout.left and any(key in folder for folder in file.parts[-3:-1])
+        if file.name == left and any(key in folder for folder in file.parts[-3:-1])
     )
 
 
-def _middlebury_pair(root: Path, left: Path, layout: _Middlebury) -> StereoPair:
-    counts = read_image(left.with_name(layout.ground_truth))[0] * 255
-    return StereoPair(
-        left.parent.relative_to(root).as_posix(),
-        read_image(left),
-        read_image(left.with_name(layout.right)),
-        max_disparity=255 / layout.scale,
-        disparity=Disparity(counts / layout.scale, counts > 0),
-    )
-
-
-def _named(root: Path) -> list[tuple[Path, Path]]:
-    """Left and right files by their names: the first of `LEFT_AND_RIGHT` whose right image exists."""
+def _named(root: Path) -> list[PairFiles]:
+    """Pairs by their files' names: the first of `LEFT_AND_RIGHT` whose right image exists."""
     before = root.as_posix()
-    files: list[tuple[Path, Path]] = []
+    files: list[PairFiles] = []
     for left in (file for file in files_below(root) if file.suffix.lower() in IMAGE_SUFFIXES):
         inside = left.as_posix()[len(before) :]
         marks = [(mark, other) for mark, other in LEFT_AND_RIGHT if mark in inside]
         rights = (Path(before + other.join(inside.rsplit(mark, 1))) for mark, other in marks)
-        files += [(left, right) for right in rights if right.is_file()][:1]
+        files += [PairFiles(left, right, PAPER_DISPARITY) for right in rights if right.is_file()][:1]
     return files
 
 
-def _pair_name(root: Path, left: Path) -> str:
-    """Path of `left` without its mark: `0001_L.png` is pair `0001`."""
-    name = left.relative_to(root).with_suffix("").as_posix()
-    return re.sub(r"(^|[/_])(L|left|image_2|colored_0|view1|im2|im0)($|/)", r"\3", name).strip("/") or name
+def _read(root: Path, files: PairFiles) -> StereoPair:
+    """Pair of images. A name such as `0001_L.png` loses its mark; of Middlebury's the folder is the name."""
+    left, right, most, ground_truth, scale = files
+    name, disparity = left.relative_to(root).with_suffix("").as_posix(), None
+    name = re.sub(r"(^|[/_])(L|left|image_2|colored_0|view1|im2|im0)($|/)", r"\3", name).strip("/") or name
+    if ground_truth is not None:
+        counts = read_image(ground_truth)[0] * 255
+        name, disparity = left.parent.relative_to(root).as_posix(), Disparity(counts / scale, counts > 0)
+    return StereoPair(name, read_image(left), read_image(right), most, disparity)

@@ -37,7 +37,7 @@ def test_a_calibration_is_shown_in_a_few_lines(found):
 def test_lenses_that_there_are_not():
     """They counted as none, without a word."""
     views = see(Rig({"cam": TRUE}), board_poses(4, spread=0.4), noise=0.2)
-    with pytest.raises(ValueError, match="lens of 'cam': None is none of brown-conrady, rational"):
+    with pytest.raises(ValueError, match=r"'cam'.*brown-conrady"):
         calibrate(views, BOARD, lens={"other": "none"})
 
 

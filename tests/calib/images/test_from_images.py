@@ -66,7 +66,7 @@ def test_points_in_one_spot_are_held_out_too():
         return {("a", "b"): PointMatches(alpha, alpha + moved + 0.05 * torch.randn(60, 2))}
 
     assert rig_from_images(images, matches=matches((22, 46))).distance["a", "b"] < 1
-    with pytest.raises(ValueError, match="in one spot, so that none can be held out"):
+    with pytest.raises(ValueError, match="spot"):
         rig_from_images(images, matches=matches((22, 22)))
 
 

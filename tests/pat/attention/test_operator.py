@@ -40,10 +40,10 @@ def test_refuses_what_does_not_fit(change, error, text):
 @pytest.mark.parametrize(
     ("look", "samples", "error", "text"),
     [
-        (segments(3, 2), 4, ValueError, "leading axes"),
-        (segments(2, 2, 3), 4, ValueError, "leading axes"),
-        (segments(2, 3), 0, ValueError, "at least 1"),
-        (segments(2, 3).positions(4), 5, ValueError, "omit it"),
+        (segments(3, 2), 4, ValueError, "leading"),
+        (segments(2, 2, 3), 4, ValueError, "leading"),
+        (segments(2, 3), 0, ValueError, r"\b1\b"),
+        (segments(2, 3).positions(4), 5, ValueError, "omit"),
         ((0, 0), 4, TypeError, "Segments"),
     ],
 )
@@ -53,7 +53,7 @@ def test_refuses_sampling_locations_that_do_not_fit(look, samples, error, text):
 
 
 def test_refuses_a_bias_that_does_not_broadcast():
-    with pytest.raises(ValueError, match=r"bias \(7,\) does not broadcast to \(1, 2, 3, 4\)"):
+    with pytest.raises(ValueError, match=r"\(7,\).*\(1, 2, 3, 4\)"):
         operator._bias(torch.zeros(7), Q, 4)
 
 

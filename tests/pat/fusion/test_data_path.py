@@ -157,23 +157,23 @@ def test_images_without_a_rig_are_checked_alike(change, message):
 def test_views_name_what_is_wrong():
     rig, images = rig_of("ab"), {"a": smooth(1, 0), "b": smooth(3, 1)}
     for wrong, message in (
-        ({"b": images["b"]}, "no image of alpha, 'a'"),
+        ({"b": images["b"]}, "'a'"),
         ({"a": images["a"]}, "alpha, 'a'"),
-        (images | {"c": images["b"]}, "no camera 'c'"),
-        (images | {"b": images["b"][:, :-1]}, "the image of 'b' is 96x63, the rig says 96x64"),
-        (images | {"b": images["b"] * torch.nan}, "NaN or infinite"),
-        (images | {"b": images["b"] * 255}, r"the image of 'b' has values up to 2\d\d.*: divide them"),
-        (images | {"a": images["a"] * 30}, r"the image of 'a' has values up to 3\d.*: divide them"),
-        (images | {"b": 2 * images["b"] - 1}, r"the image of 'b' has values down to -.*: images are in 0"),
+        (images | {"c": images["b"]}, "'c'"),
+        (images | {"b": images["b"][:, :-1]}, "'b'.*96x63"),
+        (images | {"b": images["b"] * torch.nan}, "NaN"),
+        (images | {"b": images["b"] * 255}, "'b'"),
+        (images | {"a": images["a"] * 30}, "'a'"),
+        (images | {"b": 2 * images["b"] - 1}, "'b'"),
         (
             images | {"b": (images["b"] * 255).to(torch.uint8)},
-            r"'b' is uint8 of shape \(3, 64, 96\): wanted float32",
+            "'b'.*uint8",
         ),
-        (images | {"a": images["a"].half()}, "'a' is float16 of shape"),
-        (images | {"a": images["a"][0]}, r"'a' is float32 of shape \(64, 96\): wanted float32 \(C, H, W\)"),
-        (images | {"b": images["b"].to("meta")}, "'b' is torch.strided on meta: give a dense tensor"),
-        (images | {"b": images["b"].to_sparse()}, "'b' is torch.sparse_coo on cpu: give a dense tensor"),
-        (images | {"b": images["b"].movedim(0, -1)}, r"of shape \(64, 96, 3\): wanted float32 \(C, H, W\)"),
+        (images | {"a": images["a"].half()}, "'a'.*float16"),
+        (images | {"a": images["a"][0]}, "'a'.*float32"),
+        (images | {"b": images["b"].to("meta")}, "'b'.*torch.strided"),
+        (images | {"b": images["b"].to_sparse()}, "'b'.*torch.sparse_coo"),
+        (images | {"b": images["b"].movedim(0, -1)}, r"\(64, 96, 3\).*float32"),
     ):
         with pytest.raises(ValueError, match=message):
             Views.of(rig, wrong, alpha="a")

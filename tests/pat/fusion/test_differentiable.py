@@ -108,9 +108,9 @@ def test_a_differentiable_fusion_is_of_the_whole_frame(cropped, tmp_path):
     rig, images, _ = cropped
     network = load_weights("mono-colour")
     for more, message in (
-        ({"settings": FuseSettings(max_memory="2GiB")}, "max_memory and store"),
-        ({"store": tmp_path}, "max_memory and store"),
-        ({"settings": FuseSettings(noise="estimate")}, "leave out noise"),
+        ({"settings": FuseSettings(max_memory="2GiB")}, "max_memory.*store"),
+        ({"store": tmp_path}, "max_memory.*store"),
+        ({"settings": FuseSettings(noise="estimate")}, "noise"),
     ):
         with pytest.raises(ValueError, match=message):
             fuse(images, rig, alpha="mono", network=network, differentiable=True, **more)

@@ -216,16 +216,16 @@ def test_what_is_no_field_or_no_list_is_refused_in_a_line():
     def ends(pair, x):
         return x, x
 
-    with pytest.raises(ValueError, match="the field ends gave a tuple: fields give Segments or Positions"):
+    with pytest.raises(ValueError, match=r"ends.*tuple"):
         fuse(images, rig, alpha="mono", network=network_of("GuidedPAT"), settings=FuseSettings(field=ends))
 
     def fewer(pair, x):
         found = Epipolar()(pair, x)
         return Segments(found.start[:-1], found.end[:-1], found.valid[:-1])
 
-    with pytest.raises(ValueError, match="the field fewer gave"):
+    with pytest.raises(ValueError, match="fewer"):
         fuse(images, rig, alpha="mono", network=network_of("GuidedPAT"), settings=FuseSettings(field=fewer))
-    with pytest.raises(ValueError, match=r"got mono\.png: give a list"):
+    with pytest.raises(ValueError, match=r"mono\.png"):
         fuse("mono.png")
 
 
@@ -233,23 +233,21 @@ def test_an_image_of_one_colour_is_named():
     """A black frame is not reported as a rig that does not fit."""
     rig, images = scene()
     images["colour"] = torch.ones(3, 64, 96)
-    with pytest.warns(UserWarning, match="'colour' is of one colour, with nothing to match: give another"):
+    with pytest.warns(UserWarning, match="'colour'"):
         fuse(images, rig, alpha="mono", network=network_of("GuidedPAT"))
 
 
 def test_a_network_elsewhere_is_refused():
     """Its result would be NaN."""
     rig, images = scene()
-    with pytest.raises(ValueError, match="'mono' is on cpu, the network on meta: give all on one device"):
+    with pytest.raises(ValueError, match="'mono'"):
         fuse(images, rig, alpha="mono", network=network_of("PAT").to("meta"))
 
 
 def test_precision_is_that_of_the_weights():
     rig, images = scene()
     network, double = network_of("PAT"), {name: image.double() for name, image in images.items()}
-    with pytest.raises(
-        ValueError, match=r"float64, the network's weights are float32: .*network.to\(torch.float64\)"
-    ):
+    with pytest.raises(ValueError, match=r"float64.*float32"):
         fuse(double, rig, alpha="mono", network=network)
     whole = fuse(images, rig, alpha="mono", network=network).image
     with torch.autocast("cpu", torch.bfloat16):
@@ -286,7 +284,7 @@ def test_memory_decides_the_tiles():
     area = max((t.outer[1] - t.outer[0]) * (t.outer[3] - t.outer[2]) for t in tiles)
     assert network.working_bytes(area, [0]) <= 2**31
     assert sum((t.inner[1] - t.inner[0]) * (t.inner[3] - t.inner[2]) for t in tiles) == math.prod(hw)
-    with pytest.raises(ValueError, match="80 or more"):
+    with pytest.raises(ValueError, match="80"):
         tiles_within(network, frame, 2.0**20)
 
 
@@ -409,12 +407,12 @@ def test_fields_of_cameras_that_are_not_there_and_other_bands_of_alpha_are_refus
     (rig, images), network = scene(), network_of("GuidedPAT")
     with pytest.raises(ValueError, match="'color'"):
         fuse(images, rig, alpha="mono", network=network, settings=FuseSettings(field={"color": Epipolar()}))
-    with pytest.raises(ValueError, match="no camera 'color'; did you mean 'colour'"):
+    with pytest.raises(ValueError, match=r"'color'.*'colour'"):
         fuse({**images, "color": images["colour"]}, rig, alpha="mono", network=network)
     for bands in (2, 4):
         with pytest.raises(ValueError, match=f"alpha, 'mono', has {bands} bands"):
             fuse({**images, "mono": texture(bands, (64, 96))}, rig, alpha="mono", network=network)
-    with pytest.raises(ValueError, match=r"'colour' is float32 of shape \(0, 64, 96\)"):
+    with pytest.raises(ValueError, match=r"'colour'.*float32"):
         fuse({**images, "colour": images["colour"][:0]}, rig, alpha="mono", network=network)
 
 

@@ -73,8 +73,8 @@ def test_betas_luminance_has_alphas_detail(sample, fused, monkeypatch):
 @pytest.mark.parametrize(
     ("weights", "options", "message"),
     [
-        ("mono-spectral", {"luminance": "beta"}, "needs weights for RGB betas"),
-        ("mono-colour", {"luminance": "mix", "noise": "estimate"}, "leave one of them out"),
+        ("mono-spectral", {"luminance": "beta"}, "RGB"),
+        ("mono-colour", {"luminance": "mix", "noise": "estimate"}, "noise"),
     ],
 )
 def test_what_cannot_be_is_refused(sample, weights, options, message):

@@ -88,7 +88,7 @@ def test_positions_are_where_the_wall_is(inputs):
 def test_matches_are_located_first_and_coloured_then(inputs):
     whole, (bare,) = match(inputs), located(inputs).betas
     assert bare.colours is None
-    with pytest.raises(ValueError, match="no colours"):
+    with pytest.raises(ValueError, match="colours"):
         bare.carried  # noqa: B018
     sure = replace(bare, chosen=whole.betas[0].chosen, certainty=whole.betas[0].certainty)
     (again,) = transferred(inputs, Matches((sure,))).betas
@@ -139,7 +139,7 @@ def test_matches_of_other_inputs_are_refused(network, inputs):
 
 
 def test_a_network_that_needs_matches_says_so(network, inputs):
-    with pytest.raises(ValueError, match="fuses by matches"):
+    with pytest.raises(ValueError, match="matches"):
         network(inputs)
 
 

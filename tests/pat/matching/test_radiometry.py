@@ -237,5 +237,5 @@ def test_fusion_of_another_response():
 
 @pytest.mark.parametrize("wrong", [(0.5, 0.5), (0.5, -0.1, 0.6), (0.0, 0.0, 0.0), (float("nan"), 1.0, 1.0)])
 def test_wrong_responses_are_refused(wrong):
-    with pytest.raises(ValueError, match="three weights, of red, green and blue"):
+    with pytest.raises(ValueError, match="weights"):
         stated_response(wrong)

@@ -54,7 +54,7 @@ def test_tangents_touch_their_curve_at_the_match():
 )
 def test_sets_are_fused_and_said_to_have_no_order(field):
     s = middle_of_sample()
-    with pytest.warns(UserWarning, match="without an order"):
+    with pytest.warns(UserWarning, match="order"):
         frame = fuse(
             s.images,
             s.rig,

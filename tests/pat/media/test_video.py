@@ -55,16 +55,16 @@ def test_what_goes_wrong_leaves_no_file(tmp_path):
 
     with pytest.raises(OSError, match="disk"):
         write_video(tmp_path / "a.mp4", broken())
-    with pytest.raises(ValueError, match="size of the first"):
+    with pytest.raises(ValueError, match="size"):
         write_video(tmp_path / "a.mp4", [torch.zeros(3, 32, 32), torch.zeros(3, 32, 34)])
     with pytest.raises(ValueError, match="2 x 2"):
         write_video(tmp_path / "a.mp4", frames(1, (1, 9)))
     with pytest.raises(ValueError, match="at least one"):
         write_video(tmp_path / "a.mp4", [])
-    with pytest.raises(ValueError, match=r"ends in .mp4"):
+    with pytest.raises(ValueError, match=r"\.mp4"):
         write_video(tmp_path / "a.gif", frames(2))
     for rate in (-3.0, 0.0, float("nan"), float("inf")):
-        with pytest.raises(ValueError, match=r"frames a second: give .001 to 1000"):
+        with pytest.raises(ValueError, match="1000"):
             write_video(tmp_path / "a.mp4", frames(2), rate=rate)
     assert os.listdir(tmp_path) == []
 

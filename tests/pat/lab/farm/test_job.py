@@ -220,7 +220,7 @@ def test_more_scenes_than_disk_are_refused_before_the_first(config, tmp_path, mo
     with pytest.raises(ValueError, match=r"5000 .*1.0 MB .*5.1 GB .* 32 "):
         check_space(tmp_path, 5000, 1e6)
     check_space(tmp_path, 0, 1e6)
-    with pytest.raises(ValueError, match="100000 more scenes"):
+    with pytest.raises(ValueError, match="100000"):
         render(RenderConfig.load(config), scenes=100_000, out=tmp_path / "data")
     assert not done(tmp_path / "data")
 
@@ -232,7 +232,7 @@ def test_a_disk_that_fills_stops_the_job_cleanly(config, tmp_path, monkeypatch):
 
     monkeypatch.setattr(LayeredSettings, "renderer", lambda *_: full)
     monkeypatch.setattr("pat.support.jobs._in_processes", jobs_here)
-    with pytest.raises(JobError, match="is full: free space"):
+    with pytest.raises(JobError, match="full"):
         render(RenderConfig.load(config), scenes=3, out=tmp_path / "data")
     assert not done(tmp_path / "data")
     assert not (tmp_path / "data/.work").exists()
@@ -248,7 +248,7 @@ def test_one_run_at_a_time_writes_to_a_shard(config, tmp_path, monkeypatch):
     chosen, out = RenderConfig.load(config), tmp_path / "data"
 
     def meanwhile(*_):
-        with pytest.raises(ValueError, match="another command is writing there"):
+        with pytest.raises(ValueError, match="command"):
             render(chosen, scenes=2, out=out, shard=Shard(1, 2))
         return iter(())
 
@@ -282,7 +282,7 @@ def test_no_renderer_is_made_for_a_rig_it_cannot_render(backend, config, tmp_pat
     monkeypatch.setattr("pat.lab.farm.backends.blender_python", lambda: "")
     (tmp_path / "rig.yaml").write_text("cameras: {mono: {size: [96, 64]}}")
     write(config, backend=backend)
-    with pytest.raises(ValueError, match="camera 'mono' is not calibrated"):
+    with pytest.raises(ValueError, match="'mono'"):
         RenderConfig.load(config).renderer()
 
 
@@ -291,6 +291,6 @@ def test_rigs_that_layers_cannot_show_are_refused():
     lens = Distortion("brown-conrady", camera.K.new_tensor([0.1, 0, 0, 0]))
     with pytest.raises(ValueError, match="'a'"):
         rig_from_alpha(Rig({"a": camera.replace(distortion=lens)}, depth=(1, 2)))
-    with pytest.raises(ValueError, match="no depth range"):
+    with pytest.raises(ValueError, match="depth"):
         rig_from_alpha(Rig({"a": camera}))
     assert rig_from_alpha(Rig({"a": camera}, depth=(1, float("inf")))).far.tolist() == [50.0]

@@ -60,7 +60,7 @@ def test_a_lathe_is_what_its_profile_sweeps():
     np.testing.assert_allclose(np.linalg.norm(surface.vertices, axis=1), 1, atol=1e-6)
     a, b, c, d = (surface.vertices[surface.faces[:, i]] for i in range(4))
     assert ((np.cross(c - a, d - b) * (a + b + c + d)).sum(-1) > 0).all()
-    with pytest.raises(ValueError, match="a lathe, and nothing else, needs a profile"):
+    with pytest.raises(ValueError, match="profile"):
         Object(name="o", shape="cube", motion=Motion((key,)), profile=profile)
 
 
@@ -73,9 +73,9 @@ def test_photographs_come_from_the_folder(tmp_path):
 
 
 def test_what_cannot_be_generated_is_said(tmp_path):
-    with pytest.raises(ValueError, match="no images"):
+    with pytest.raises(ValueError, match="images"):
         photographs(0, unlike_cameras(), tmp_path)
-    with pytest.raises(ValueError, match="no calibrated camera"):
+    with pytest.raises(ValueError, match="calibrated"):
         abstract(0, Rig({"a": View(hw=(4, 4))}))
     with pytest.raises(ValueError, match=r"'still-life': .*abstract, photographs"):
         generator_named("still-life")
