@@ -244,7 +244,8 @@ def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnos
     misfit = {h: f.penalised_misfit for h, f in fit.items()}
     unchanged = named = tried[0]
     table = sorted(tried if fits else tried[1:], key=lambda h: misfit[h])
-    equal, usual = EQUAL[0] * misfit[table[0]] + EQUAL[1], USUAL_MISFIT * max(map(max, sizes.values()))
+    least = misfit[next(h for h in table if not h.approximate)]  # estimated numbers fit a rig's misfit too
+    equal, usual = EQUAL[0] * least + EQUAL[1], USUAL_MISFIT * max(map(max, sizes.values()))
     explained = max(2 * usual, EXPLAINED[1] * fit[unchanged].misfit)
     fitting = [h for h in table if misfit[h] <= max(usual, min(equal, explained))]
     likelier = [h for h in fitting if fits and unlikelihood(h.rig) + MARGIN < unlikelihood(rig)]
@@ -254,7 +255,7 @@ def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnos
         as_good = [h for h in table if misfit[h] <= equal]
         named = min(as_good, key=tried.index)
     elif likelier:
-        unlike = {h: _off_sizes(h.rig, pairs) for h in likelier}
+        unlike = {h: _off_sizes(h.rig, pairs) + MARGIN * h.approximate for h in likelier}
         named = next(h for h in tried if unlike.get(h, math.inf) <= min(unlike.values()) + TIE)
         as_good = sorted(likelier, key=lambda h: unlike[h])
     elif not healthy:

@@ -50,8 +50,8 @@ SCALES = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 4.0)
 """Drifts tried, in units of the prior deviations."""
 RARE = 6.0
 """Factor of log(1 + s^2) in -2 log probability of a drift of scale s: larger drifts are rarer."""
-STEPS = 6
-"""Steps of Gauss and Newton to the most probable drift; the best counts, as the first may overshoot."""
+STEPS = 12
+"""Most steps of Gauss and Newton to the most probable drift; the best counts, as the first may overshoot."""
 NO_BETTER = 0.1
 """Change of the evidence below which these steps end."""
 CLIPPED = 30.0
