@@ -201,6 +201,9 @@ class LensView(View):
         Returns:
             Directions (z = 1 for pinholes, unit length with a `Distortion`, any length by other models), and
             True where the lens model has one; elsewhere the direction means nothing.
+
+        Raises:
+            ValueError: for points without the axes of a batch of cameras.
         """
         normalised = map_homogeneous(torch.linalg.inv(self.K)[..., :2, :], x)
         if self.distortion is None:
@@ -388,7 +391,7 @@ class Camera(LensView):
         """Convert a camera of kornia.
 
         Args:
-            batched: True keeps a batch of one as a batch.
+            batched: True keeps a batch of one as a batch; a `CameraModel` keeps its axes as they are.
             cam_from_world: pose for a `CameraModel`, which has none; None for the identity.
 
         Raises:
@@ -449,6 +452,7 @@ def intrinsics(
 
     Raises:
         ValueError: for more than two numbers.
+        TypeError: for values that are no numbers.
     """
     fx, fy = _two(focal, "focal")
     cx, cy = _two(((hw[1] - 1) / 2, (hw[0] - 1) / 2) if centre is None else centre, "centre")

@@ -68,6 +68,9 @@ def apply_homography(H: Float[Tensor, "*b 3 3"], x: Real[Tensor, "*n 2"]) -> Tra
 
     Returns:
         Points, valid where finite and the homogeneous scale is positive; elsewhere zero, with zero gradient.
+
+    Raises:
+        ValueError: for points without the axes of a batched H.
     """
     X, Y, scale = map_homogeneous(H, x).unbind(-1)
     valid = (scale > SMALLEST_SCALE) & X.isfinite() & Y.isfinite()
@@ -86,7 +89,7 @@ def fit_similarity(x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"]) -> Float[Te
     Umeyama 1991 in two dimensions, in closed form: as complex numbers y = a x + b.
 
     Returns:
-        Matrix (3, 3), differentiable.
+        Matrix (3, 3) of the points' type, differentiable.
 
     Raises:
         ValueError: if all points of x coincide.
@@ -118,6 +121,7 @@ def fit_homography(x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"]) -> Float[Te
         ValueError: for fewer points, NaN, and if there is no such homography, as some points would be behind.
             Points on a line are not told: any of many homographies comes back.
         TypeError: for points that are no tensors.
+        NotImplementedError: within `torch.func.vmap`.
     """
     check_tensors((2,), x=x, y=y)
     if x.shape != y.shape or x.ndim != 2 or len(x) < 4:

@@ -31,7 +31,8 @@ def to_kornia_model(K: Float[Tensor, "*b 3 3"], hw: HW, lens: LensModel | None) 
         lens: the lens; None for a pinhole.
 
     Raises:
-        ValueError: for a skewed or rotated K, and lenses that kornia does not have.
+        ValueError: for a skewed or rotated K, and for lenses, or prism or tilt terms, that kornia does not
+            have.
     """
     from kornia.image import ImageSize
     from kornia.sensors.camera import CameraModel, CameraModelType

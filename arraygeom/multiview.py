@@ -78,7 +78,7 @@ def warp(
         point is in front of beta and on its image. Differentiable in image, depth and cameras.
 
     Raises:
-        ValueError: for an image or depth of another size than its camera's.
+        ValueError: for an image or depth of another size than its camera's, and uncalibrated cameras.
     """
     for what, plane, view in (("image", image, pair.beta), ("depth", depth, pair.alpha)):
         _check_size(f"the {what} given", plane, view.hw)
@@ -101,7 +101,7 @@ def plane_sweep(pair: Pair, image: Float[Tensor, "b c h w"], depths: Float[Tenso
         Values (B, C, D, Ha, Wa), and validity (B, D, Ha, Wa).
 
     Raises:
-        ValueError: for an image of another size than beta's.
+        ValueError: for an image of another size than beta's, and uncalibrated cameras.
     """
     planes = depths[:, None, None, None].expand(-1, len(image), *pair.alpha.hw)
     swept = [warp(pair, image, plane) for plane in planes]
@@ -170,7 +170,8 @@ def consistent_depth(
         The fused map, differentiable in depths and cameras.
 
     Raises:
-        ValueError: if alpha has no map, or a map has another size than its camera.
+        ValueError: if alpha has no map, a map has another size than its camera, or a camera is not
+            calibrated.
     """
     if rig.require(alpha) not in depths:
         raise ValueError(f"there is no depth map of '{alpha}', only of {', '.join(depths)}")

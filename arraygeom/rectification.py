@@ -53,6 +53,7 @@ def rectify(pair: Pair, *, K: Float[Tensor, "3 3"] | None = None, hw: HW | None 
     Raises:
         ValueError: for uncalibrated pairs, lenses, batches, no baseline, and a baseline so near an optical
             axis (motion forwards) that the new images would lie beside the old ones.
+        NotImplementedError: within `torch.func.vmap`.
     """
     alpha, beta = pair.cameras
     if pair.has_lens:

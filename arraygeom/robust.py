@@ -78,8 +78,8 @@ def least_squares(
         terms: k explaining terms of each of n values.
         values: values to explain; axes *m are solved at once.
         weight: weight of each value, at least 0.
-        precision: inverse covariance of a prior of zero mean; None for no prior, when terms may be dependent;
-            on the CPU alone.
+        precision: inverse covariance of a prior of zero mean; None for no prior: terms may then be dependent,
+            and must be on the CPU.
 
     Returns:
         Coefficients c (k, *m); without a prior the shortest of all solutions.

@@ -54,7 +54,7 @@ def invert_increasing(
 
     Args:
         f: function that returns its value and its slope; f(0) = 0, rising on the bracket.
-        y: values (*n).
+        y: values (*n), at least 0.
         high: ends of the brackets, which broadcast to y.
         iterations: largest number of iterations.
 

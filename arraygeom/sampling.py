@@ -69,7 +69,8 @@ def sample(
         extended: True to give positions outside the area the value of the nearest pixel, as valid.
 
     Returns:
-        Values (B, C, *n), and validity; outside values are 0 and not valid unless `extended`. Differentiable
+        Values (B, C, *n) in the images' type, and validity; outside values are 0 and not valid unless
+        `extended`. Differentiable in image and positions.
         in image and positions.
 
     Raises:

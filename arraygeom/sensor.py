@@ -39,7 +39,8 @@ class Curve:
         response: response at each wavelength.
 
     Raises:
-        ValueError: for no samples, or numbers that differ.
+        ValueError: for no samples, or unequal numbers of wavelengths and responses; the values are not
+            checked.
     """
 
     wavelength: tuple[float, ...]

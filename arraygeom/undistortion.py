@@ -27,13 +27,15 @@ def pinhole_view(camera: AnyLensView) -> AnyLensView:
     """Make the pinhole camera that covers an image with a lens, up to `WIDEST` off axis.
 
     Position, orientation and K stay except for the principal point: pixels in the middle keep their size.
-    Links follow by `rig.transformed(name, view.K @ camera.K^-1, view.hw)`.
+    Rays that do not meet in a point are taken to. Links follow by `rig.transformed(name, view.K @
+    camera.K^-1, view.hw)`.
 
     Returns:
         The camera without its lens, usually of another size.
 
     Raises:
         ValueError: for a batch of cameras, and an image without a pixel inside its lens's range.
+        NotImplementedError: within `torch.func.vmap`.
     """
     needs_numbers("the size of a pinhole view", camera.K)
     if camera.K.ndim > 2:

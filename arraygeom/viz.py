@@ -119,7 +119,8 @@ def depth_outline(rig: Rig, cameras: Mapping[str, Camera], alpha: str | None) ->
         alpha: name of alpha; None for the first camera.
 
     Returns:
-        Arrays (n, 3) of world points; empty without a depth range, or for bounds too far away.
+        Arrays (n, 3) of world points; empty without a depth range. A bound beyond 6 times the rig's extent is
+        left out.
     """
     if rig.depth is None:
         return []
@@ -132,7 +133,9 @@ def depth_outline(rig: Rig, cameras: Mapping[str, Camera], alpha: str | None) ->
 
 
 def image_border(hw: HW) -> Float[Tensor, "n 2"]:
-    """Return points around the image's area, from its first corner back to it, 16 on each side, in pixels."""
+    """Return float64 points around the image's area, from its first corner back to it, 16 on each side, in
+    pixels.
+    """
     h, w = hw
     corners = torch.tensor([[0.0, 0], [w, 0], [w, h], [0, h], [0, 0]], dtype=torch.float64) - 0.5
     steps = torch.arange(16, dtype=torch.float64)[:, None] / 16
@@ -261,14 +264,16 @@ def draw_matches(
 ) -> Figure:
     """Draw patches around points matched between alpha and each beta, with the lines that the rig gives.
 
-    Above, alpha's patch, 18 pixels to either side of the point; below, beta's around the match, with the line
-    of alpha's point and the distance in pixels. Matches lie on their lines only if the rig is right.
+    Seven matches of each beta at most are drawn, spread over the image. Above, alpha's patch, 18 pixels to
+    either side of the point; below, beta's around the match, with the line of alpha's point and the distance
+    in pixels. Matches lie on their lines only if the rig is right.
 
     Args:
-        matches: points (x, y) of alpha and of the beta, by beta.
+        matches: points (x, y) of alpha and of the beta, by beta, in pixels as recorded.
 
     Raises:
         ImportError: without matplotlib.
+        ValueError: if neither calibration nor F is known.
     """
     count, half = 7, 18
     figure = new_figure(figsize=(1.55 * count, 3.7 * len(matches)), layout="constrained")

@@ -219,6 +219,9 @@ class RayCurve(NamedTuple):
 
         Returns:
             The curves, in the precision of x; not valid where nothing is on beta's image.
+
+        Raises:
+            NotImplementedError: within `torch.func.vmap`.
         """
         pose = pair.beta_from_alpha.to(x.dtype)
         alpha, beta = (c.to(x.dtype) for c in pair.cameras)
@@ -303,6 +306,9 @@ class RayCurve(NamedTuple):
 
         Returns:
             Positions (*n, samples, 2) in beta's pixels, in the precision of `first`, without gradient.
+
+        Raises:
+            ValueError: for fewer than 1 sample.
         """
         from .curve_kernels import curved_positions
 

@@ -73,8 +73,12 @@ def default_field(pair: Pair) -> ReceptiveField:
         `HomographyDisplacement` for a pair with another link, calibrated or not (a link was measured between
         these very images). `Epipolar` for another calibrated pair; called, it raises ValueError without a
         depth range: a search of the whole line must be requested (`EpipolarLine`). `Rectified` with alpha on
-        either side where only sizes are known. With lenses `Curved` in place of `Epipolar`, with
-        the bounds of `natural_bounds`, and `ThroughLenses` of any other.
+        either side where only sizes are known. With lenses `Curved` in place of `Epipolar`, with the bounds
+        of `natural_bounds`, and `ThroughLenses` of any other; `Curved` always where a view has no pinhole
+        view.
+
+    Raises:
+        ValueError: for an uncalibrated pair with a view without a pinhole view.
     """
     return _through_lenses(straight_field(pair), pair)
 
@@ -126,6 +130,9 @@ def recorded_field(pair: Pair, *, samples: int = 256, nodes: int = 64) -> Recept
     Returns:
         The field, through lenses where a view has one; without a pinhole view it is `Curved`, which needs a
         depth range.
+
+    Raises:
+        ValueError: as `default_field`.
     """
     field = straight_field(pair)
     if isinstance(field, Epipolar) and pair.depth is None:

@@ -65,6 +65,7 @@ class FieldOnGrid:
 
         Raises:
             ValueError: for an invalid result of the field, or whatever the field raises for this pair.
+            TypeError: for an object that is no field.
         """
         evaluate, hw = lazily(field, pair), hw or pair.alpha.hw
         device = device_of(pair)

@@ -67,7 +67,7 @@ class Epipolar:
             Near and far, in the rig's unit.
 
         Raises:
-            ValueError: if neither states one.
+            ValueError: if neither states one, or near is beyond far.
         """
         if self.near is not None and self.far is not None:
             return depth_range(self.near, self.far)
@@ -331,6 +331,7 @@ def approximated(pair: Pair) -> Pair:
     Raises:
         ValueError: for uncalibrated or batched pairs, lenses, no depth range, and where beta sees nothing
             between the bounds.
+        NotImplementedError: within `torch.func.vmap`.
     """
     alpha, _ = pair.cameras
     if alpha.K.ndim > 2:

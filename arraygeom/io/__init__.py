@@ -97,7 +97,7 @@ def read_rig(
     check_above(0, itself=False, scale=scale)
     path = Path(path)
     if not path.exists():
-        raise FileNotFoundError(f"{path}: no such rig file")
+        raise FileNotFoundError(f"{path}: no such rig file: check the path")
     if not (path.is_file() or path.is_dir()):
         raise RigFileError(path, None, "is neither a file nor a folder")
     format = recognise(path) if format is None else format
@@ -146,6 +146,7 @@ def write_rig(rig: Rig, path: str | Path, *, format: str = "native") -> None:
     Raises:
         ValueError: for an unknown format, a rig that the format cannot hold, and a batch.
         FileExistsError: for a folder with files of these names that nothing here wrote.
+        OSError: if it cannot be written.
     """
     if format not in WRITERS:
         raise ValueError(f"cannot write rig format '{format}' (known: {', '.join(WRITERS)})")

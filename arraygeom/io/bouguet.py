@@ -39,6 +39,7 @@ def read(source: RigSource) -> Rig:
 
     Raises:
         RigFileError: for a damaged file, or missing variables.
+        ImportError: without scipy.
     """
     fields = source.at(load_variables(source))
     if "fc_left" not in fields:

@@ -34,13 +34,15 @@ class _Element(NamedTuple):
 
 
 def load_variables(source: RigSource) -> dict[str, Any]:
-    """Load the variables of a .mat file made of structs, cells, text and numbers.
+    """Load the variables of a .mat file that are made of structs, cells, text and numbers; others are left
+    out.
 
     Returns:
         Values by name: structs as mappings, numbers as arrays or scalars.
 
     Raises:
         RigFileError: for an empty or damaged file, or one of another version.
+        ImportError: without scipy.
     """
     data = source.content()
     if not data:

@@ -64,6 +64,7 @@ def read(source: RigSource) -> Rig:
     Raises:
         RigFileError: for a damaged file, a MATLAB object in place of a struct, unknown units, or a
             fundamental matrix that contradicts the pose.
+        ImportError: without scipy.
     """
     fields = _outermost(source)
     if "CameraParameters1" not in fields:

@@ -23,7 +23,7 @@ HEAD = r"(?m)^cam0\s*=\s*\["
 
 
 def read(source: RigSource) -> Rig:
-    """Read the pair cam0, cam1, with the depth range of the stated disparities.
+    """Read the pair cam0, cam1, in metres, with the depth range of the stated disparities, or none.
 
     Raises:
         RigFileError: for a damaged file, a baseline that is not positive, or a contradictory `doffs`.

@@ -41,7 +41,8 @@ def recognises(path: Path, head: str) -> bool:
 def read(source: RigSource) -> Rig:
     """Read the streams that are images, by name, each at its largest size, or the requested one.
 
-    A stream without the requested size is read at the first size that is listed.
+    A stream without the requested size is read at the first size that is listed. "Depth", or else the first
+    stream, is at the origin.
 
     Raises:
         RigFileError: for a damaged file, no stream, one without extrinsics, or an unsupported lens.

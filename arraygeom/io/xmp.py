@@ -92,6 +92,9 @@ def capture_of(path: Path) -> list[Path]:
     Returns:
         Files, sorted, without those whose tags state no camera, `path` included. For a name without "_"
         `path` alone.
+
+    Raises:
+        OSError: for a file that cannot be opened.
     """
     stem = path.stem.rpartition("_")[0]
     beside = sorted(
@@ -133,6 +136,9 @@ def named_by_band(paths: Sequence[Path]) -> dict[str, Path]:
         Files by name: the band's, in lower case, "rgb" for three bands. If a tag is missing or two are equal,
         all are named by the end of the file's name after the last "_", else by the whole name, else
         "camera1", "camera2", ...
+
+    Raises:
+        OSError: for a file that cannot be opened.
     """
     bands = []
     for path in paths:
@@ -454,6 +460,7 @@ def image_tags(path: Path) -> ImageTags | None:
 
     Raises:
         OSError: for a file that cannot be opened.
+        ImportError: without Pillow, for a file with XMP.
     """
     xmp = _xmp(path.read_bytes())
     if not xmp:

@@ -41,7 +41,8 @@ def fisheye_unproject(c: Tensor, xy_d: Tensor) -> tuple[Tensor, Tensor]:
         c: coefficients k1 to k4 (*b, 1.., 4).
 
     Returns:
-        Directions (*n, 3) in the camera's frame, and True (*n) up to the radius of `fisheye_limit`.
+        Directions (*n, 3) in the camera's frame, from points farther out that of the border there; and True
+        (*n) within the radius of `fisheye_limit`.
     """
     limit = once(fisheye_limit, c).to(xy_d)
     u_d = xy_d.square().sum(-1)

@@ -171,7 +171,10 @@ class CameraModel(LensModel):
         """Return the same model with other numbers.
 
         Args:
-            coefficients: numbers (*b, n), in the order of the property `coefficients`; another count fails.
+            coefficients: numbers (*b, n), in the order of the property `coefficients`.
+
+        Raises:
+            RuntimeError: for another count of numbers.
         """
         tensors = self._own()  # type: ignore[attr-defined]
         sizes = [t.shape[t.ndim - axes :].numel() for t, axes in tensors.values()]

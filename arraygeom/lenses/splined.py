@@ -93,7 +93,8 @@ class Splined(CameraModel, name="splined"):
         Found by Newton's method, whose last two steps are differentiable.
 
         Returns:
-            Directions (*n, 3) in the camera's frame, and True (*n) where there is one within the knots.
+            Directions (*n, 3) in the camera's frame, and True (*n) where there is one within the knots;
+            elsewhere the direction means nothing.
         """
         xy, finite = finite_points(xy)
         with torch.no_grad():

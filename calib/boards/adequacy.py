@@ -131,6 +131,7 @@ def next_views(intrinsics: Intrinsics, board: Board, depth: float, *, count: int
 
     Args:
         depth: depth in metres at which uncertainty is evaluated.
+        count: number of views; a view may be proposed again.
 
     Returns:
         Up to `count` views; none for points in space, or if the image shows hardly any of the board in every

@@ -250,6 +250,9 @@ def camera_table(calibration: Calibration, covers: Mapping[str, Coverage]) -> st
 
     Args:
         covers: coverage by camera.
+
+    Returns:
+        HTML.
     """
     rows = []
     for name, camera in calibration.fit.problem.cameras.items():
@@ -328,7 +331,10 @@ def _table(rows: Sequence[Mapping[str, str]]) -> str:
 
 
 def draw_scene(calibration: Calibration) -> Figure:
-    """Draw the rig alone, and the rig with the boards from above."""
+    """Draw the rig alone, and the rig with the boards from above.
+
+    Lengths are in metres.
+    """
     figure = draw_rig(Rig({escaped(n): c for n, c in calibration.rig.cameras.items()}))
     figure.set_size_inches(10.4, 4.6)
     axes: Any = figure.axes[0]

@@ -134,7 +134,8 @@ def watch(
     """Calibrate again and write a page whenever images arrive in a folder, until `finished` or Ctrl-C.
 
     The page is the calibration's report, with what is missing and the views that would help most; before
-    there is one, it says where the board was found and what is wrong.
+    there is one, it says where the board was found and what is wrong. Images that cannot be read are tried
+    again; those already read stay known when their files go.
 
     Args:
         page: HTML file to write.
@@ -148,6 +149,7 @@ def watch(
 
     Raises:
         OSError: if the page cannot be written, or the folder is missing.
+        KeyboardInterrupt: for Ctrl-C.
     """
     seen: dict[tuple[str, FrameKey], DetectedImage] = {}
     shown: tuple[int, str] | None = None

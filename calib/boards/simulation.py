@@ -39,6 +39,8 @@ def simulate_photos(
 ) -> Pose:
     """Render photographs of a board in `count` random poses, into `folder`/CAMERA/000.png and so on.
 
+    Grey images of 8 bits; folders are made, and files of these names replaced.
+
     Args:
         count: number of poses, and of images of each camera.
         noise: standard deviation of the noise, in grey values of 255.
@@ -50,6 +52,7 @@ def simulate_photos(
     Raises:
         ValueError: for a rig without calibrated cameras, cameras that nowhere see a board together, a `count`
             below 1, and a negative `noise`.
+        OSError: if files cannot be written.
     """
     if not 0 <= noise < math.inf:
         raise ValueError(f"noise is a standard deviation in grey values, 0 or more; got {noise:g}")

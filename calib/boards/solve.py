@@ -289,7 +289,9 @@ def adjust(problem: BundleProblem, *, rounds: int = 4, equal_noise: bool = False
 def readjusted(problem: BundleProblem) -> BundleProblem:
     """Adjust a problem again from the solution of nearly the same one, with its noise.
 
-    Returns the problem.
+
+    Returns:
+        The adjusted problem, after at most 10 steps; the given one stays as it is.
     """
     return _minimised(problem, iterations=10)[0]
 
@@ -299,6 +301,9 @@ def noise(problem: BundleProblem, parameters: int) -> dict[str, float]:
 
     Args:
         parameters: number of fitted parameters, by which degrees of freedom are reduced.
+
+    Returns:
+        Standard deviations by camera; those of few points are drawn towards the cameras' mean.
     """
     residuals = problem.residuals
     numbers = 2 * sum(len(r) for r in residuals.values())

@@ -185,7 +185,7 @@ def _april_grid(text: str, columns: int, rows: int, tag: float, options: Mapping
 def _kalibr_target(path: Path) -> str:
     """Convert Kalibr's target file to a board's text. Raises ValueError, FileNotFoundError."""
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file of a target")
+        raise FileNotFoundError(f"{path}: no such file of a target: check the path")
     try:
         target = load_yaml(path.read_text(encoding="utf-8"))
         if target["target_type"] == "aprilgrid":
@@ -239,7 +239,7 @@ def _known_points(text: str) -> KnownPoints:
     file, _, dictionary = text.partition(".csv")
     path = Path(f"{file}.csv")
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file of points")
+        raise FileNotFoundError(f"{path}: no such file of points: check the path")
     try:
         with path.open(encoding="utf-8-sig", newline="") as lines:
             table = csv.DictReader(lines, skipinitialspace=True)
@@ -370,6 +370,8 @@ def write_board(board: str, out: Path, *, paper: str | None = None) -> Path:
 
     Raises:
         ValueError: for another suffix, text that is no board, and a board that does not fit on the sheet.
+        FileNotFoundError: for a missing target file.
+        OSError: if the file cannot be written.
     """
     if out.suffix.lower() not in (".pdf", ".svg"):
         raise ValueError(f"{out}: a board is written as .pdf or .svg, which keep its true size")

@@ -284,6 +284,9 @@ def jackknife(problem: BundleProblem) -> Jackknife:
     A plain jackknife's deviations are too large by 15 to 40 % with a dozen boards that determine all
     parameters between them; Bell and McCaffrey's (2002) correction removes that.
 
+    Returns:
+        Covariances of the cameras' free parameters and of the boards' shapes, and the shapes after a step.
+
     Raises:
         numpy.linalg.LinAlgError: if parameters are not observable.
     """
@@ -335,6 +338,9 @@ def with_disagreement(solved: Solved, board: Board, *, unchecked: bool = False) 
 
     Returns:
         The solution with that covariance, the factor in `raised`, and notes.
+
+    Raises:
+        numpy.linalg.LinAlgError: if parameters are not observable by the frames.
     """
     problem, covariance, notes = solved.problem, solved.covariance, list[str]()
     raised, frames = 1.0, len(problem.frames)

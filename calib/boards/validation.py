@@ -173,10 +173,10 @@ def compare_lenses(views: Mapping[str, BoardViews], board: Board) -> dict[str, L
     Models that contradict frames which others fit are left out.
 
     Returns:
-        Comparisons by camera.
+        Comparisons by camera, without errors for too few frames.
 
     Raises:
-        ValueError: if no camera can be calibrated with the usual model.
+        ValueError: if a camera with enough frames cannot be calibrated with the usual model.
     """
     return {name: _compared(name, v, board) for name, v in views.items()}
 

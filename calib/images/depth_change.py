@@ -63,6 +63,9 @@ def relative_change(original: Rig, refined: Rig, pairs: Pairs) -> float:
     Returns:
         The median of |depth after / depth before - 1| over points observable in `original`; NaN for fewer
         than `FEW`. Points without depth afterwards (behind a camera, too far) count as 1.
+
+    Raises:
+        ValueError: for pairs with neither cameras nor F.
     """
     before, after = (observed_depths(rig, pairs) for rig in (original, refined))
     usable = (after / before - 1).abs()[~before.isnan()].nan_to_num(1.0)
@@ -75,6 +78,9 @@ def observed_depths(rig: Rig, pairs: Pairs) -> Float[Tensor, " n"]:
     Returns:
         Depths in the rig's unit (metres), the pairs' points one after the other, detached; NaN for points
         behind a camera, with too little parallax, or of uncalibrated pairs.
+
+    Raises:
+        ValueError: for pairs with neither cameras nor F.
     """
     depth, front, observable = match_depths(rig, pairs)
     return torch.where(front & observable, depth, torch.nan).detach()
@@ -87,6 +93,9 @@ def share_outside(rig: Rig, pairs: Pairs) -> float:
 
     Returns:
         A share in 0..1; 0 without a calibrated pair, NaN for fewer than `FEW` such points.
+
+    Raises:
+        ValueError: for pairs with neither cameras nor F.
     """
     depth, front, observable = match_depths(rig, pairs)
     if bool(depth.isnan().all()):
@@ -110,6 +119,9 @@ def log_depths(
     Returns:
         A function of z that returns a list of one tensor, the logarithms of the depths in alpha,
         differentiable in z; None for fewer than `FEW` points.
+
+    Raises:
+        ValueError: for pairs with neither cameras nor F.
     """
     observable = ~torch.stack([observed_depths(rig, pairs) for rig in rigs]).isnan().any(0)
     if int(observable.sum()) < FEW:

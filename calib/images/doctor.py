@@ -103,10 +103,11 @@ class Diagnosis:
         equal: other kinds of mistakes that explain the images as well.
         before: statistics of the given rig.
         after: statistics of the repaired rig.
-        tried: statistics of all hypotheses, best first.
+        tried: statistics of the hypotheses, the least misfit first; without the given rig where images are
+            not of its sizes.
         matches: number of points used.
         healthy: True if the given rig fits the images.
-        certain: True if all explanations as good as the named one lead to the same rig.
+        certain: True if a mistake is named, and all explanations as good lead to the same rig.
         depth: depth bounds (near, far) of the points by the named rig, in its unit; None if that rig states a
             depth range or too few points have depth.
         beyond: number of points left out because they lie beyond the range of a lens model of the given rig.
@@ -221,6 +222,8 @@ def diagnose(rig: Rig, images: Images, matches: Pairs | None = None) -> Diagnosi
 def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnosis:
     """Find the usual mistake, if any, in a rig, by points matched between images of these sizes.
 
+    At most `MOST` points of a pair are used, evenly spaced in their list.
+
     Args:
         sizes: height and width of each camera's image, which the rig may state otherwise.
         pairs: matched points by pair of cameras.
@@ -229,7 +232,7 @@ def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnos
         The mistake with its repaired rig, and what else was compared.
 
     Raises:
-        ValueError: for a rig that relates none of the pairs.
+        ValueError: for a camera that the rig lacks, or if it relates none of the pairs.
     """
     pairs = {names: _thinned(matches) for names, matches in related(rig, pairs).items()}
     fits = all(rig[name].hw == hw for name, hw in sizes.items())

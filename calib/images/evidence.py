@@ -103,11 +103,17 @@ class FitStatistics(NamedTuple):
 def fit_statistics(
     tried: Sequence[Hypothesis], pairs: Pairs
 ) -> tuple[dict[Hypothesis, FitStatistics], Bool[Tensor, " n"], float]:
-    """Compute the statistics of every hypothesis from the same points: the inliers of the best of them.
+    """Compute the statistics of every hypothesis: distances by the inliers of the best of them, shares and
+    depth by all points.
+
+    `tried` must have "nothing" among its kinds.
 
     Returns:
         Statistics by hypothesis; a mask of the inliers among all points of all pairs; and the standard
         deviation of their distances, pixels, at least `LEAST_NOISE`.
+
+    Raises:
+        ValueError: for pairs with neither cameras nor F.
     """
     observed = observations([hypothesis.rig for hypothesis in tried], pairs)
     inliers, floor = _inliers(tried, observed.off, pairs)
@@ -135,7 +141,8 @@ class PointObservations(NamedTuple):
     """All points of all pairs (n) under several rigs (k).
 
     Attributes:
-        off: signed distance from the epipolar line, pixels of beta, within +-`LARGEST_DISTANCE`.
+        off: signed distance from the epipolar line, pixels of beta, within +-`LARGEST_DISTANCE`, which is
+            also that of pixels without a ray.
         depth: depth in alpha, in the rig's unit; NaN where unobservable.
         front: mask of the points in front of both cameras.
     """
@@ -150,6 +157,12 @@ def observations(rigs: Sequence[Rig], pairs: Pairs) -> PointObservations:
 
     Args:
         rigs: rigs with the same cameras.
+
+    Returns:
+        Distances, depths and masks, detached: one row a rig, the pairs' points one after the other.
+
+    Raises:
+        ValueError: for pairs with neither cameras nor F.
     """
     parts = [_observations([rig.pair(*names) for rig in rigs], matches) for names, matches in pairs.items()]
     return PointObservations(*(torch.cat(tensors, 1) for tensors in zip(*parts)))

@@ -42,7 +42,8 @@ class Explanation(NamedTuple):
         points: number of the points.
         beyond: number of points off H and smooth lenses, along the lines of F.
         wrong: number of points off these lines.
-        noise: standard deviation of the distances from the lines, pixels of beta.
+        noise: standard deviation of the distances from the lines, or for few points (`registration`) from
+            their places by H; pixels of beta.
     """
 
     H: Float[Tensor, "3 3"]

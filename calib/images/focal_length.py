@@ -70,6 +70,8 @@ def common_focal_length(views: Mapping[str, View], link: Link, matches: PointMat
 def fit_focal_length(views: Mapping[str, View], link: Link, matches: PointMatches) -> FocalFit | None:
     """Fit a common focal length from several starts, whether or not the points determine it.
 
+    At most `POINTS` points are used, the same ones for the same number of matches.
+
     Returns:
         The most probable fit; None for views of different sizes, a mirrored one, or points that no pose has
         in front of both cameras.

@@ -47,7 +47,8 @@ class UncalibratedRig(NamedTuple):
     Attributes:
         rig: views related by links; named `OPEN` if the points of some link leave its lines undetermined.
         fits: links with the points that agree, and their reach along the lines from the rough map.
-        distance: median distance of held-out points from their lines, pixels of beta.
+        distance: median distance of held-out points from their lines, pixels of beta; empty for points too
+            few for lines.
         by_focal: True where the given focal lengths were used.
         explained: simplest explanation of the points, lines or one homography.
         matches: all consistent matches, in pixels as recorded.
@@ -111,7 +112,7 @@ def rig_from_images(
 
     Raises:
         ValueError: in one line, for images that cannot be matched (too few, equal, without texture), too few
-            points, or a focal length that is not positive or of no camera.
+            points, no image of `alpha`, or a focal length that is not positive or of no camera.
     """
     focal = dict(focal or {})
     for name, length in focal.items():

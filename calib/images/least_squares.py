@@ -92,6 +92,9 @@ def solve(residuals: Residuals, count: int, considered: int = 0) -> Solution:
         residuals: function of all parameters, the free ones first, that returns residuals in parts.
         count: number of free parameters.
         considered: number of further parameters that are uncertain, but not changed.
+
+    Returns:
+        The solution, detached; its `z` are the free parameters alone.
     """
     total = count + considered
     active = torch.ones(total, dtype=torch.bool)

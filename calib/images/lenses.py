@@ -18,7 +18,11 @@ TERMS = 4
 
 
 def with_lenses(rig: Rig) -> Rig:
-    """Return the rig with a lens without distortion for those linked views that have no lens."""
+    """Return the rig with a lens without distortion for those linked views that have no lens.
+
+    Their lens is a `brown-conrady` of zeros, the focal length half the longer side; the same rig if none
+    lacks one.
+    """
     for name in dict.fromkeys(name for pair in rig.links for name in pair):
         if not isinstance(view := rig[name], LensView):
             K = intrinsics(max(view.hw) / 2, view.hw)
@@ -52,7 +56,7 @@ def describe_lenses(rig: Rig) -> str:
 
 
 def largest_distortion(view: LensView) -> Float[Tensor, ""]:
-    """Compute the largest distortion of a lens beyond that of the nearest homography, pixels."""
+    """Compute the largest distortion of a lens beyond that of the nearest homography, pixels (float64)."""
     x = coarse_grid(view.hw).reshape(-1, 2)
     undistorted, valid = view.to(torch.float64).undistort(x)
     x, undistorted = x[valid], undistorted[valid]

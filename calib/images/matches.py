@@ -381,8 +381,11 @@ def depths_near_lines(pair: Pair, matches: PointMatches, *, within: float) -> Fl
     front.
 
     Returns:
-        Depths in the rig's unit (metres), of these points alone; points too far for their depth to be known
+        Depths in the rig's unit, float64, of these points alone; points too far for their depth to be known
         are left out.
+
+    Raises:
+        ValueError: for an uncalibrated pair.
     """
     undistorted = PointMatches(pair.alpha.undistort(matches.alpha)[0], pair.beta.undistort(matches.beta)[0])
     near = matches.only(line_distance(undistorted, pair.fundamental) <= within)
@@ -401,7 +404,7 @@ def seen_depths(pair: Pair, matches: PointMatches) -> tuple[float, float]:
         side.
 
     Raises:
-        ValueError: for fewer than `ENOUGH` such points.
+        ValueError: for fewer than `ENOUGH` such points, or an uncalibrated pair.
     """
     depth = depths_near_lines(pair, matches, within=3.0)
     if len(depth) < ENOUGH:
@@ -452,10 +455,10 @@ def fit_homography(matches: PointMatches) -> Float[Tensor, "3 3"]:
     """Fit H to a few points, as near to a similarity as they allow; wrong ones among them count little.
 
     Returns:
-        H with beta ~ H alpha.
+        H with beta ~ H alpha, float64, without gradient.
 
     Raises:
-        ValueError: for fewer than `FEWEST` points, and for points in one spot.
+        ValueError: for fewer than `FEWEST` points, points in one spot, and points that no similarity fits.
     """
     from scipy.optimize import least_squares  # here, as it takes long to import
 

@@ -60,7 +60,7 @@ class FreeParameter:
 
     @cached_property
     def root(self) -> Float[Tensor, "k k"]:
-        """Lower triangular root of the prior covariance: the change is root z."""
+        """Lower triangular root of the prior covariance, float64: the change is root z."""
         eye = torch.eye(len(self.sigma), dtype=torch.float64)
         correlation = torch.where(eye > 0, eye, self.correlation)
         return self.sigma[:, None] * torch.linalg.cholesky(correlation)
@@ -82,7 +82,7 @@ def free_parameters(
     Args:
         free: kinds ("rotation", "translation", "focal", "centre" or "principal_point", "distortion"), or
             patterns over "camera.kind".
-        sigma: standard deviations by kind that override `SIGMA`; None for none.
+        sigma: standard deviations by kind, in the units of `SIGMA`, instead of its values; None for these.
 
     Returns:
         One parameter vector per camera and kind, then one per link; possibly none.
@@ -120,7 +120,7 @@ def considered_parameters(
     Args:
         names: names of the cameras.
         free: free parameters.
-        sigma: standard deviations by kind that override `SIGMA`; None for none.
+        sigma: standard deviations by kind, in the units of `SIGMA`, instead of its values; None for these.
 
     Returns:
         One parameter vector per camera and kind.

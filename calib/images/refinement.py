@@ -100,7 +100,8 @@ def refine(
     Args:
         frames: one image (C, H, W) in 0..1 per camera, by name, of the rig's sizes.
         free: free parameters: kinds such as "rotation" or "focal", or patterns over "camera.kind".
-        sigma: prior standard deviations by kind, in the rig's units; None for the usual ones (`SIGMA`).
+        sigma: prior standard deviations by kind, in the units of `SIGMA` (radians, pixels, shares of the
+            longest baseline and of the focal length); None for the usual ones.
         force: True to follow the lines however depth changes, and accept the result in spite of objections.
         matches: points of each frame used instead of matching its images; None to match them.
 
@@ -142,10 +143,10 @@ def refine_matches(
     Args:
         frames: matched points of each frame, by pair of names.
         free: free parameters: kinds such as "rotation" or "focal", or patterns over "camera.kind".
-        sigma: prior standard deviations by kind, in the rig's units; None for the usual ones (`SIGMA`).
+        sigma: prior standard deviations by kind, as `refine` takes them; None for the usual ones.
         force: True to follow the lines however depth changes, and accept the result in spite of objections.
         keep_depth: False for a rig whose depths are only assumed: nothing but the free parameters is
-            uncertain then, depth may change in any way, and nothing is refused.
+            uncertain then, depth may change in any way, and nothing is refused, whatever `force` says.
 
     Returns:
         The refined rig if accepted, else the given one, with changes and objections.
@@ -174,7 +175,7 @@ def fitted(
     Args:
         frames: matched points of each frame, by pair of names.
         free: free parameters: kinds or patterns.
-        sigma: prior standard deviations by kind; None for the usual ones (`SIGMA`).
+        sigma: prior standard deviations by kind, as `refine` takes them; None for the usual ones.
         near_depth: False to let depth change in any way.
 
     Returns:
@@ -230,7 +231,7 @@ class RefinementProblem:
         Args:
             free: free parameters: kinds or patterns.
             frames: matched points of each frame, by pair of names.
-            sigma: prior standard deviations by kind; None for the usual ones (`SIGMA`).
+            sigma: prior standard deviations by kind, as `refine` takes them; None for the usual ones.
 
         Raises:
             ValueError: if nothing is free, no pair is related by the rig, or no points are left to use.
@@ -389,8 +390,8 @@ def systematic_columns(rig: Rig, pairs: Pairs) -> Float[Tensor, "m s"]:
     """Compute derivatives of all Sampson distances by the distortion that lens models leave uncorrected.
 
     Returns:
-        One row a point, four columns a camera, in pixels per prior deviation (`SYSTEMATIC`); 0 for pairs
-        known by F.
+        One row a point, four columns a camera, float64 without gradient, in pixels per prior deviation
+        (`SYSTEMATIC`); 0 for pairs known by F.
     """
     names = [name for name in cameras_of(rig, pairs) if isinstance(rig[name], Camera)]
     columns = {name: slice(4 * i, 4 * i + 4) for i, name in enumerate(names)}

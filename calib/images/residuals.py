@@ -182,7 +182,8 @@ def systematic_modes(pair: Pair, matches: PointMatches) -> tuple[Float[Tensor, "
     fifth order, and decentred along x and along y.
 
     Returns:
-        Four columns for alpha and four for beta, one row a match; 0 where a pixel has no ray.
+        Four columns for alpha and four for beta, one row a match, without gradient; 0 where a pixel has no
+        ray.
 
     Raises:
         ValueError: for a pair with neither cameras nor F.
@@ -221,7 +222,8 @@ def lines_basis(pair: Pair, matches: PointMatches) -> Float[Tensor, "n 8"]:
     For calibrated pairs the matrix is E, between rays.
 
     Returns:
-        Pixels per unit of each degree of freedom, one row a match; 0 where a pixel has no ray.
+        Pixels per unit of each degree of freedom, one row a match, without gradient; 0 where a pixel has no
+        ray.
 
     Raises:
         ValueError: for a pair with neither cameras nor F.
@@ -238,7 +240,7 @@ def lines_basis(pair: Pair, matches: PointMatches) -> Float[Tensor, "n 8"]:
 
 
 def related(rig: Rig, pairs: Pairs) -> dict[tuple[str, str], PointMatches]:
-    """Select those of the pairs that the rig relates: calibrated ones and those with an F.
+    """Select those of the pairs that the rig relates: calibrated ones and those with a link.
 
     Returns:
         Matches by pair of names.
@@ -358,6 +360,8 @@ def split(
 ) -> tuple[dict[tuple[str, str], PointMatches], dict[tuple[str, str], PointMatches]]:
     """Split points into those to use and those to hold out: whole frames if several, else squares of alpha's
     image.
+
+    Of several frames the last are held out: one in `HELD_OUT`, rounded down, and at least one.
 
     Returns:
         Matches to use and to hold out, by pair of names.

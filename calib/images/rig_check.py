@@ -60,6 +60,9 @@ def find_misfit(rig: Rig, images: Images) -> Misfit | None:
     Returns:
         The misfit if the rig fits badly; None if it fits, and where nothing can be said: too few matched
         points, images of another size, cameras that are not related.
+
+    Raises:
+        ValueError: for a camera that the rig lacks.
     """
     chosen = {name: images[name] for name in list(images.keys())[:MOST_CAMERAS]}
     if len(chosen) < 2 or any(rig[name].hw != tuple(image.shape[1:]) for name, image in chosen.items()):

@@ -108,6 +108,9 @@ def self_calibrated(
 
     Returns:
         The pair, with the depth range of the points; None for points that no poses explain.
+
+    Raises:
+        ValueError: for points that are all in one spot.
     """
     alpha, beta = views
     lenses = {
@@ -226,6 +229,9 @@ def depth_bounds(rig: Rig, matches: PointMatches) -> tuple[float, float] | None:
     Returns:
         Depths along the first camera's axis in the rig's unit, far possibly infinite; None for fewer than
         `ENOUGH` points with parallax.
+
+    Raises:
+        ValueError: for an uncalibrated rig.
     """
     pair = _pair(rig)
     inverse = 1 / depths_near_lines(pair, matches, within=NEAR_LINE)

@@ -31,6 +31,9 @@ def aligned_page(aligned: Aligned, rig: Rig, facts: Facts) -> str:
     Args:
         rig: rig of the recorded files.
         facts: notes, warnings and figures.
+
+    Returns:
+        The HTML.
     """
     h, w = aligned.depth.shape
     figures = {"size": f"{w} x {h} pixels", "bands": ", ".join(aligned.bands)}
@@ -55,7 +58,9 @@ def shown_layers(aligned: Aligned, rig: Rig | None = None) -> dict[str, Float[Te
         rig: rig of the recorded files, for NDVI; None to take values as light.
 
     Returns:
-        Images (1 or 3, h, w), 0..1, by name; a derived layer with a camera's name, such as "colour", is
+        Images (1 or 3, h, w), 0..1, by name: a camera's for its one or three bands, else for its first one,
+        and a band's own for the others; a derived layer with a camera's name, such as "colour", is called
+        "derived colour".
         called "derived colour".
     """
     layers, derived = {}, {}
@@ -87,7 +92,8 @@ def ndvi(aligned: Aligned, rig: Rig | None = None) -> NDArray[np.float32] | None
             take values as light.
 
     Returns:
-        The index (h, w), -1..1; NaN where a camera does not see the point. None without bands near 840 and
+        The index (h, w), -1..1; NaN where a camera does not see the point, or records no light. None without
+        a band within `NEAREST` of 840 nm and another within it of 660 nm.
         660 nm.
     """
     nir, red = (_band_near(aligned, wave) for wave in (NEAR_INFRARED, RED))

@@ -102,7 +102,7 @@ class Batch:
         for name in self.files:
             self.rig.require(name)
         if self.alpha not in self.files:
-            raise ValueError(f"no image of alpha, '{self.alpha}'")
+            raise ValueError(f"no image of alpha, '{self.alpha}', only of {', '.join(self.files)}")
         if not self.sequence and len({len(files) for files in self.files.values()}) > 1:
             counts = ", ".join(f"{len(files)} of '{name}'" for name, files in self.files.items())
             raise ValueError(f"frames need as many images of each camera, got {counts}")
@@ -115,7 +115,11 @@ class Batch:
 
     @cached_property
     def dependencies(self) -> str:
-        """Everything that the results depend on, as YAML text."""
+        """Everything but the images that the results depend on, as YAML text.
+
+        Raises:
+            FileNotFoundError: for unknown weights.
+        """
         stamp = hashlib.sha256(find_weights(self.weights).read_bytes()).hexdigest()
         entries = json.loads(self.to_json())
         files = entries.pop("files")
@@ -179,6 +183,7 @@ class Batch:
                 rate.
             ImportError: for a video without the extra `video`.
             FileExistsError: for files in the way that no run wrote.
+            OSError: if files cannot be written, on a full disk for instance.
         """
         if video is not None:
             check_video(video)
@@ -300,6 +305,7 @@ class Batch:
 
         Raises:
             ValueError: if it cannot be fused.
+            OSError: if a file cannot be read or written.
         """
         with limited(self.settings.limit):
             with confidence_checked(strict=self.strict):
@@ -407,16 +413,17 @@ def find_images(text: str | Path, *, name: str = "") -> list[Path]:
         name: name of the camera, for messages.
 
     Returns:
-        Files in natural order, numbers in names counting as such.
+        Files in natural order, numbers in names counting as such; of a folder those with the suffix of an
+        image. Hidden ones are left out; a single file may have any other suffix than a video's.
 
     Raises:
         FileNotFoundError: if there is none.
-        ValueError: for a video, and two files of one name.
+        ValueError: for a video, and two files whose names differ in the suffix alone.
     """
     path = Path(text)
     label = f"{name}: " if name else ""
     if path.suffix.lower() in VIDEO_SUFFIXES:
-        raise ValueError(f"{label}{path}: is a video, which needs `pat fuse` without a rig: save its frames")
+        raise ValueError(f"{label}{path}: is a video, for `pat sequence` without a rig: save its frames")
     if path.is_dir():
         files = _images_in(path)
     else:

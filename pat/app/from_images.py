@@ -113,10 +113,14 @@ def array_from_images(
         further: files of other captures by camera, used too where tags state cameras without parallax.
         say: function that is called with a line of text for each finding.
 
+    Returns:
+        The array: alpha, and the betas that show enough of what alpha shows.
+
     Raises:
-        ValueError: in one line, for fewer than two images, an image of one colour, images that do not show
-            the same things, and a focal length of an unknown camera.
-        FileNotFoundError: for a missing file.
+        ValueError: in one line, for fewer than two images, tensors that are no image in 0..1, an image of one
+            colour, images that do not show the same things, and a focal length that is not positive, of an
+            unknown camera, or beside tags that state it.
+        FileNotFoundError: for a missing file, and unknown weights.
         TypeError: for an image without a name that is no file.
     """
     sources, focal = by_camera(sources), focal or {}
@@ -126,7 +130,9 @@ def array_from_images(
         range_of(name, image)
     for name, length in focal.items():
         if name not in sources or not 0 < length < math.inf:
-            raise ValueError(f"focal {name}={length:g}: no camera of {', '.join(sources)}, or not positive")
+            raise ValueError(
+                f"focal: '{name}={length:g}' is of no camera ({', '.join(sources)}), or not positive"
+            )
     notes: list[str] = []
 
     def note(line: str) -> None:
@@ -251,7 +257,7 @@ def video_frames(videos: Mapping[str, Path], folder: Path) -> tuple[dict[str, li
             write_image(files[name][-1], image)
             os.utime(files[name][-1], ns=(path.stat().st_mtime_ns,) * 2)
         if not files[name]:
-            raise ValueError(f"{path}: a video without frames")
+            raise ValueError(f"{path}: holds no frames: is the video whole?")
     return files, rates
 
 
@@ -547,7 +553,11 @@ def _moved(pairs: Pairs, maps: Mapping[str, Tensor]) -> dict[tuple[str, str], Po
 
 
 def resized_rig(rig: Rig, images: Images) -> Rig:
-    """Return the rig with its cameras resized to the images' sizes."""
+    """Return the rig with its cameras resized to the images' sizes.
+
+    Returns:
+        The rig; `images` must have all of its cameras.
+    """
     for name in rig.names:
         rig = rig.resize(name, _hw(images[name]))
     return rig

@@ -106,6 +106,7 @@ def fuse(
             without a rig, images that do not show the same things; with one, no `alpha`.
         TypeError: a rig or settings of another type.
         NotImplementedError: within a transformation of `torch.func`.
+        FileNotFoundError: a missing file, or weights of an unknown name.
 
     Warns:
         LowConfidenceWarning: the images hardly match: the rig is probably wrong. A filter makes it an error,
@@ -174,6 +175,7 @@ def align(
         ValueError: for what `fuse` refuses, a network that uses no matches, and recorded values that are
             missing, no numbers, or of another size than the rig says.
         TypeError: for arguments in the wrong order, and settings of another type.
+        FileNotFoundError: for a missing file, or weights of an unknown name.
     """
     return align_frame(
         **_known(images, rig, alpha, network, settings, explain),

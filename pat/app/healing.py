@@ -79,6 +79,8 @@ def checked_rig(views: ViewFiles, *, heal: bool) -> Healed | None:
 def healed_rig(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> Healed | None:
     """Refine a rig by points matched between alpha and the betas, however far its parameters have to move.
 
+    The stated depth range is widened where matched points lie beyond it.
+
     Args:
         rig: rig of the image files.
         images: images (c, h, w) by camera.

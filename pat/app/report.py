@@ -66,6 +66,9 @@ def report_page(frame: Frame, images: Images, rig: Rig, alpha: str, facts: Facts
         rig: rig of the images.
         alpha: name of alpha.
         facts: notes, warnings and figures.
+
+    Returns:
+        The HTML; images are reduced to `LONGEST` pixels.
     """
     layers = {f"alpha: {alpha}": images[alpha]}
     layers |= {f"beta: {name}": images[name] for name in rig.betas(alpha) if name in images}
@@ -115,7 +118,7 @@ def filled_page(
         overlays: URLs of overlays to switch, by name.
         figures: values of the table, by title.
         facts: notes and warnings.
-        parts: further parts as HTML, by placeholder.
+        parts: further parts as HTML, by placeholder; "RIG" is needed.
 
     Returns:
         The HTML.

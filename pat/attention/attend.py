@@ -249,7 +249,8 @@ def sample_positions(locations: Locations, query: Tensor, samples: int | None) -
         The positions, with a leading batch axis of 1 or b.
 
     Raises:
-        ValueError: for wrong axes, another device, or a number of samples that contradicts the positions.
+        ValueError: for wrong axes, another device, no samples, or a number of samples that contradicts the
+            positions.
         TypeError: for other types, and a mask that is not bool.
     """
     if isinstance(locations, Segments):

@@ -82,7 +82,7 @@ class Compared(NamedTuple):
 
 
 def log_sum(compared: Compared) -> Float[Tensor, "b ha wa"]:
-    """Compute log sum_l exp(query . key(x_l)) over the samples that count.
+    """Compute log sum_l exp(query . key(x_l)) over the samples that count; `border` is not applied.
 
     Returns:
         Log sums (b, ha, wa); meaningless where no sample counts. Differentiable once by query and key. If the
@@ -101,7 +101,7 @@ def log_sum(compared: Compared) -> Float[Tensor, "b ha wa"]:
 
 
 def mean_score(compared: Compared) -> Float[Tensor, "b ha wa"]:
-    """Compute the mean score (query . key) of a pixel's samples that count.
+    """Compute the mean score (query . key) of a pixel's samples that count; `border` is not applied.
 
     Returns:
         Scores (b, ha, wa), differentiable; 0 where no sample counts.
@@ -115,7 +115,8 @@ def mean_score(compared: Compared) -> Float[Tensor, "b ha wa"]:
 def peak_position(compared: Compared) -> Float[Tensor, "b 2 ha wa"]:
     """Compute the position of the largest weight, as the mean under a much sharper softmax.
 
-    Scores are multiplied by `SHARPENED`; samples whose scores are nearly equal are averaged.
+    Scores are multiplied by `SHARPENED`; samples whose scores are nearly equal are averaged; `border` is not
+    applied.
 
     Returns:
         Positions (x, y) in beta's pixels, (b, 2, ha, wa), float32, without gradient; 0 where no sample

@@ -60,7 +60,8 @@ Recorded = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class AlignedView:
-    """One camera's values at alpha's H x W pixels; `numpy.asarray` gives the values.
+    """One camera's values at alpha's H x W pixels; `numpy.asarray` gives the values. Alpha's own are all
+    seen, with confidence 1.
 
     Attributes:
         values: (C, H, W), in the recorded type; 0 (NaN for floats) where the camera does not see the point,
@@ -183,11 +184,12 @@ def align_frame(
         matcher: function from inputs to matches.
 
     Returns:
-        Values, masks and positions by camera, with alpha's depth.
+        Values, masks and positions by camera, with alpha's depth: NumPy arrays, without gradients.
 
     Raises:
         ValueError: as `pat.align`; for a network that uses no matches, and recorded values that are missing,
             no numbers, or of another size.
+        TypeError: for what `matcher` returns if that is no `Matches`.
     """
     rule = _ViewRule(interpolation, min_confidence, fill)
     rig = with_pixels(rig)
@@ -394,6 +396,7 @@ def filled(values: NDArray[Any], valid: NDArray[np.bool_], fill: Fill) -> NDArra
 
     Args:
         fill: "none" for 0 or NaN, "propagate" for the nearest valid value.
+        valid: mask (H, W) of the valid pixels.
 
     Returns:
         Values (C, H, W) of the same type; 0 or NaN everywhere if no pixel is valid.

@@ -96,6 +96,7 @@ def save_aligned(
     Raises:
         ValueError: for two files of one name, and rather than overwrite a file of `keep`.
         FileExistsError: for files in the way that no run wrote.
+        OSError: if files cannot be written; those of a former alignment stay.
     """
     prefix = f"{name}_" if name else ""
     files = _files(aligned, separate, positions, recorded)

@@ -17,7 +17,6 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from arraygeom import Camera, Pair, Rig
@@ -26,6 +25,7 @@ from ..matching.filters import filled
 from ..media.colour import from_luma_chroma, luminance, luminance_of, to_bytes
 from ..media.figures import reduced
 from ..sensors import NoiseLevel
+from ..support.neighbours import nearest_points
 from .frame import Frame
 from .steps import undistort
 from .views import Views
@@ -55,13 +55,14 @@ UNRECTIFIABLE = "the cameras look along the line between them: such a pair canno
 
 
 def classical_baseline(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> Float[Tensor, "_ h w"]:
-    """Fuse by `classical` with the first beta if it is in colour, else with each beta, one band each.
+    """Fuse by `classical` with the first beta that has an image if it is in colour, else with each beta, one
+    band each.
 
     Returns:
         The fused bands (C, h, w), those of several betas concatenated, 0..1.
 
     Raises:
-        ValueError: for lenses, no depth range, and cameras that cannot be rectified.
+        ValueError: for uncalibrated cameras, lenses, no depth range, and cameras that cannot be rectified.
     """
     betas = [name for name in rig.betas(alpha) if name in images]
     if images[betas[0]].shape[0] == 3:
@@ -78,10 +79,10 @@ def classical_view(
         longest: largest number of pixels of an image's longer side.
 
     Returns:
-        The fused bands at alpha's pixels, lenses included.
+        The fused bands (C, h, w), 0..1, at the pixels of the reduced alpha, lens included.
 
     Raises:
-        ValueError: for cameras that are not calibrated, and for those that cannot be rectified.
+        ValueError: for cameras that are not calibrated or cannot be rectified, and no depth range.
     """
     if names := [name for name in images if not isinstance(rig[name], Camera)]:
         raise ValueError(
@@ -111,8 +112,8 @@ def classical(rig: Rig, images: Mapping[str, Tensor], alpha: str, beta: str) -> 
         by seen ones that are similar.
 
     Raises:
-        ValueError: for lenses, no depth range, and for cameras that look along the line between them or have
-            one centre.
+        ValueError: for uncalibrated cameras, lenses, no depth range, and for cameras that look along the line
+            between them or have one centre.
     """
     pair, mono, other = rig.pair(alpha, beta), luminance_of(images[alpha]), images[beta]
     if pair.has_lens:
@@ -140,10 +141,13 @@ def classical_fusion(
     alpha is at (x - d, y) in beta enlarged to alpha's size, 0 <= d <= `max_disparity`.
 
     Args:
+        alpha: grey image, values 0..1.
+        beta: colour image, values 0..1.
         max_disparity: largest disparity, in alpha's pixels.
 
     Returns:
-        Red, green and blue with alpha's luminance, 0..1.
+        Red, green and blue with alpha's luminance, 0..1; where beta does not see a pixel, by seen ones that
+        are similar.
 
     Raises:
         ValueError: for a `max_disparity` that is not positive.
@@ -286,7 +290,8 @@ def checked_disparity(
         max_disparity: largest disparity, pixels.
 
     Returns:
-        Disparity (h, w) in pixels, negative where unknown, and a mask (h, w) of pixels that pass the check.
+        Disparity (h, w) in pixels, from x in the left image to x - disparity in the right, negative where
+        unknown; and a mask (h, w) of pixels that pass the check.
     """
     ours = raw_disparity(left, right, max_disparity)
     # Seen from beta, alpha's points lie to the right: mirrored, to the left again.
@@ -401,7 +406,7 @@ def _by_examples(values: Image, seen: NDArray[np.bool_], mono: Image) -> Image:
     sources[::2, ::2] = seen[::2, ::2]
     if sources.sum() < EXAMPLES or not asked.any():
         return out
-    distance, index = cKDTree(features[sources]).query(features[asked], k=EXAMPLES)
+    index, distance = nearest_points(features[sources], features[asked], EXAMPLES)
     weight = np.exp(-np.square(distance / (distance[:, :1] + 0.15)))
     out[:, asked] = (values[:, sources][:, index] * weight).sum(-1) / weight.sum(-1)
     return out

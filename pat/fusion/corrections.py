@@ -143,7 +143,8 @@ def find_corrections(
 ) -> Corrections:
     """Estimate alpha's response and the betas' misalignments, by matching reduced images.
 
-    A response is fitted for RGB betas only; nothing is estimated for a network without matches.
+    A response is fitted for RGB betas only, misalignments if every beta has a segment for each pixel; nothing
+    is estimated for a network without matches.
 
     Args:
         response: "fit" to estimate it, "rec601", three weights of red, green and blue, or a `Response`.

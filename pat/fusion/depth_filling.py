@@ -91,8 +91,8 @@ def background_filled(frame: Frame, frame_inputs: FrameInputs) -> Float[Tensor, 
     bounds that were searched. No gradient passes through planes.
 
     Returns:
-        Depth (H, W), metres, NaN where it was unknown; the frame's own where betas on several sides see
-        occluded points.
+        Depth (H, W), in the rig's unit, NaN where it was unknown; the frame's own where betas on several
+        sides see occluded points.
     """
     depth, confidence, inputs = frame.depth, frame.confidence, frame_inputs.inputs
     steps = [beta.field.pixels for beta in inputs.betas if beta.field.pixels is not None]

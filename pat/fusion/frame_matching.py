@@ -31,7 +31,8 @@ class MissingFramesWarning(UserWarning):
 def matched_frames(files: Files) -> dict[str, list[Path]]:
     """Relate the files of several cameras by the names and numbers in them, frame by frame.
 
-    Warns of frames that some camera lacks, and where nothing but their order relates files.
+    Names count if half of all frames or more are then whole, or else numbers, or else names without their
+    common beginning. Warns of frames that some camera lacks, and where nothing but their order relates files.
 
     Args:
         files: files of each camera, in order.

@@ -33,7 +33,7 @@ class Frames(Protocol):
 
 
 class ImageFiles:
-    """Image files of one camera, read and developed (`pat.media.raw`) when asked for.
+    """Image files of one camera, read and developed when asked for; that raises as `read_view` does.
 
     Args:
         paths: files, in the order of time.

@@ -70,7 +70,7 @@ class FuseSettings:
             detail, where alpha sees another part of the spectrum, or their "mix".
 
     Raises:
-        ValueError: for a noise or a response of another kind.
+        ValueError: for a noise or a response of another kind; the rest is checked when it is used.
     """
 
     depth: tuple[float, float] | None = None
@@ -133,6 +133,7 @@ def fuse_frame(
         ValueError: for images that do not fit the rig or the network, views that do not overlap, settings
             that contradict each other, and a memory limit that is too small.
         NotImplementedError: within a transformation of `torch.func`.
+        TypeError: for settings or corrections of another type.
     """
     align = not differentiable if settings.align is None else settings.align
     settings = replace(_given(FuseSettings, settings), align=align)

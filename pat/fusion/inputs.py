@@ -109,7 +109,8 @@ def prepared(
         The inputs, and the functions that take a frame back to the views, last step first.
 
     Raises:
-        ValueError: for views that do not overlap, and images of another precision than the network's weights.
+        ValueError: for views that do not overlap, and images of another precision or device than the
+            network's weights.
     """
     check_precision(views, network)
     LOG.info("preparing %d images", len(views.images))
@@ -163,9 +164,12 @@ def frame_inputs(network: FusionNetwork, views: Views) -> FrameInputs:
 
 
 def clipped_in(image: Float[Tensor, "1 c h w"], sensor: Sensor) -> Float[Tensor, "1 c h w"] | None:
-    """Compute the mask of bands at their largest value, or beside such a pixel; None if there are none.
+    """Compute the mask of bands at their largest value, or beside such a pixel: 1 there, else 0, in the
+    image's type.
+
 
     The largest value is 1; the image's own if that is more, or if its exposure is stated, which scaled it.
+    None if no value is so large.
     """
     image = image.detach()
     largest = float(image.max())

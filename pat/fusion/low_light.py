@@ -183,6 +183,8 @@ class LowLight:
 def denoised_views(views: Views, noise: Noise | None) -> tuple[Views, LowLight]:
     """Denoise the views that have noticeable noise.
 
+    Warns if the noise stated for a camera is far more than its image shows.
+
     Args:
         noise: noise level by camera, "estimate" to estimate each, "auto" to do so only if an image shows
             noise plainly; None for no denoising.
@@ -348,7 +350,7 @@ def brightness_change(
         matched: positions of alpha's pixels in each beta, x and y, with their confidence.
 
     Returns:
-        Values to add to each band, (1, H, W).
+        Values to add to each band, (1, H, W), without gradient.
     """
 
     def changed(estimate: Tensor, *planes: Tensor) -> Tensor:
@@ -375,7 +377,7 @@ def colours_averaged(
         matched: positions of alpha's pixels in each beta, x and y, with their confidence.
 
     Returns:
-        The image with the same luma; unchanged without noise in the betas.
+        The image with the same luma, without gradient; unchanged without noise in the betas.
     """
     beta, confidence = warped(betas, matched)
     deviation = float(beta.deviation.mean())

@@ -48,10 +48,12 @@ class Flow(NamedTuple):
 def flow_between(a: Float[Tensor, "1 h w"], b: Float[Tensor, "1 h w"]) -> Flow:
     """Compute optical flow from frame a to b by dense inverse search (Kroeger et al. 2016).
 
-    Values of b are first brought to a's mean: flickering light is no motion.
+    Frames are grey, 0..1, on the CPU. Values of b are first brought to a's mean: flickering light is no
+    motion.
 
     Returns:
-        The flow, weighted by forward-backward consistency and photometric similarity; 0 off the image.
+        The flow, weighted by forward-backward consistency and photometric similarity; the weight is 0 where
+        motion leaves the image.
     """
     b = b * (a.mean() / b.mean().clamp(min=1e-6))
     there, back = _steps(a, b), _steps(b, a)

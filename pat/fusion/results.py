@@ -122,6 +122,7 @@ def save_frame(
 
     Raises:
         FileExistsError: for files in the way that no fusion wrote.
+        OSError: if files cannot be written; those of a former frame stay.
     """
     frame = frame.mapped(lambda tensor: tensor.detach().cpu())
     prefix = f"{name}_" if name else ""

@@ -390,7 +390,8 @@ def fuse_sequence(
         Frames at alpha's pixels.
 
     Raises:
-        ValueError: for frame rates that are not known and for recordings that do not overlap in time.
+        ValueError: for a negative speed, unknown frame rates, recordings that do not overlap in time, and a
+            frame that cannot be fused: all when the frames are asked for.
     """
     job = SequenceFusion(network, rig, frames, alpha, speed, settings)
     keys = job.timeline.key_frames()

@@ -140,7 +140,8 @@ def upright(views: Views) -> StepResult:
 def equal_resolution(network: FusionNetwork, views: Views) -> StepResult:
     """Resize betas to about alpha's angular resolution where views meet.
 
-    A beta that would be enlarged is first cropped to the part that search segments touch, if that is much
+    Betas within a quarter of it keep their size. A beta that would be enlarged is first cropped to the part
+    that search segments touch, if that is much smaller.
     smaller.
 
     Returns:
@@ -339,7 +340,7 @@ def of_size(image: Float[Tensor, "c h w"], hw: HW) -> Float[Tensor, "c h2 w2"]:
 def hw_at_alphas_resolution(pair: Pair) -> HW:
     """Return the size of beta's image with pixels of about alpha's size where the views meet.
 
-    Its own size if its pixels are nearly so.
+    Its own size if its pixels are nearly so; else at least 16 a side.
     """
     scale, (h, w) = resolution_ratio(pair), pair.beta.hw
     if 0.8 < scale < 1.25:
@@ -357,7 +358,7 @@ def resolution_ratio(pair: Pair) -> float:
 
 def quarter_turns(pair: Pair) -> int:
     """Return the number of quarter turns (see `Camera.rot90`), 0 to 3, that make beta's image upright like
-    alpha's."""
+    alpha's; 0 if undefined."""
     steps = _steps_in_beta(pair)
     if steps is None:
         return 0

@@ -242,7 +242,7 @@ class FusedTile(NamedTuple):
 
 
 def fuse_tile(network: FusionNetwork, frame: FrameInputs, matches: Matches | None, tile: Tile) -> FusedTile:
-    """Fuse a tile.
+    """Fuse a tile of a frame, with the whole frame's matches (None for a network that uses none).
 
     Returns:
         Its inner part.
@@ -294,7 +294,10 @@ def fused_in_tiles(
         store: folder of finished tiles, read and written; None for none.
 
     Returns:
-        The whole frame.
+        The whole frame, in the form of one tile. A stored tile that is damaged is fused again.
+
+    Raises:
+        OSError: if a finished tile cannot be written to `store`.
     """
 
     def make(tile: Tile) -> FusedTile:

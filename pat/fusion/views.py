@@ -236,7 +236,7 @@ def check_precision(views: Views, network: Any) -> None:
 
 
 def check_bands(views: Views, wanted: int | None) -> None:
-    """Refuse betas whose bands do not fit a network; warn of three equal bands.
+    """Refuse betas of which neither one nor all together have a network's bands; warn of three equal bands.
 
     Args:
         wanted: number of bands of the network's image; None for any.
@@ -396,6 +396,8 @@ def read_view(
     rig: Rig, name: str, path: str | Path, *, like: Sensor | None = None, sized: bool = True
 ) -> Float[Tensor, "c h w"]:
     """Read and develop the image of one camera.
+
+    Warns of many clipped pixels, and of colour where the rig states one band.
 
     Args:
         rig: the cameras.

@@ -105,6 +105,9 @@ class Evaluate(StereoSets):
         Args:
             rows: scores by data set, for the CSV file.
             text: scores in Markdown, for scores.md.
+
+        Raises:
+            OSError: if they cannot be written.
         """
         from arraygeom.runtime.atomic import write_text
 
@@ -273,6 +276,7 @@ class Train:
 
         Raises:
             ValueError: naming the entry, for a recipe that cannot be used.
+            FileNotFoundError: for a missing recipe.
         """
         from .training.config import command_line
 

@@ -414,7 +414,7 @@ def filled_from(
             and take only the difference from it from examples.
 
     Returns:
-        One fill at all pixels, or with `regressed` the regression and the fill.
+        One fill at all pixels, or with `regressed` the regression and the fill; detached.
     """
     planes = zip(numpy_of(colour), numpy_of(alpha[:, 0]), numpy_of(weight[:, 0]), to_bytes(alpha[:, 0]))
     fills = []

@@ -184,7 +184,8 @@ def matched_by_labels(
         facts: number of statistics to compute: 1 (left-right error), or 3 (margin and cost too).
 
     Returns:
-        Disparity, pixels of the beta given, and the statistics, 0 to 1, as in `BetaMatches`.
+        Disparity, pixels of the beta given, and the statistics, 0 to 1, as in `BetaMatches`; on the CPU,
+        detached.
     """
     alpha, beta = (numpy_of(image[:, 0]) for image in (views.alpha, views.beta))
     disparity, measured = _matched_blocks(alpha, beta, geometry, windows, settings, facts)

@@ -123,6 +123,9 @@ def write_points(
 
     Returns:
         The number of points. Their coordinates are the camera's, x right, y down, z ahead, in metres.
+
+    Raises:
+        OSError: if it cannot be written.
     """
     has_depth = depth.isfinite()
     x = pixel_grid(camera.hw, dtype=torch.float64)[has_depth]

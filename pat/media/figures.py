@@ -81,6 +81,9 @@ def save_figure(figure: Figure, path: Path, *, dpi: int = 110) -> Path:
 
     Returns:
         The path.
+
+    Raises:
+        OSError: if it cannot be written.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 

@@ -187,6 +187,7 @@ def write_image(
     Raises:
         ValueError: for an image of integers, another number of channels, values that are not finite, or a
             format that cannot hold it.
+        OSError: if it cannot be written.
     """
     path = Path(path)
     if not image.is_floating_point():

@@ -106,13 +106,14 @@ def demosaiced(raw: Float[Tensor, "1 h w"], pattern: str) -> Float[Tensor, "3 h 
 
     Args:
         raw: values of the mosaic, 0..1; others are clipped.
-        pattern: OpenCV's name of the mosaic: "BG", "GB", "RG" or "GR".
+        pattern: colours of the first two pixels of the first row, then of the second, such as "RGGB".
 
     Returns:
-        RGB image of the same size, clipped to 0..1, without gradient.
+        RGB image of the same size, clipped to 0..1.
 
     Raises:
         AttributeError: for another pattern.
+        RuntimeError: for values that require a gradient.
     """
     code = getattr(cv2, f"COLOR_Bayer{pattern}2RGB_EA")
     counts = np.rint(raw[0].clamp(0, 1).cpu().numpy().astype(np.float64) * 65535).astype(np.uint16)

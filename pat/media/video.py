@@ -31,6 +31,7 @@ def write_video(path: str | Path, frames: Iterable[Float[Tensor, "c h w"]], *, r
         ImportError: without the extra `video`.
         ValueError: for no frames, frames of different sizes or under 2 x 2, another suffix, or a rate outside
             .001 to 1000.
+        OSError: if it cannot be written.
     """
     path = Path(path)
     if path.suffix.lower() not in (".mp4", ".mkv"):

@@ -44,6 +44,9 @@ def save_weights(
 
     Args:
         facts: texts by name (recipe, seed, figures) to store in the file too; None for none.
+
+    Raises:
+        OSError: naming the file, if it cannot be written.
     """
     metadata = {
         "format": FORMAT,

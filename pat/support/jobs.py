@@ -361,7 +361,8 @@ def _failed(task: Task, future: Future) -> TaskOutcome:
 
 
 def attempt(task: Task, threads: int) -> TaskOutcome:
-    """Run a task in this process, unless its file exists, and catch ValueError, OSError and Warning.
+    """Run a task in this process, unless its file exists, and catch ValueError, OSError and Warning; others
+    pass.
 
     Args:
         threads: torch's number of threads, which is set for the whole process.

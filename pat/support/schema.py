@@ -67,7 +67,7 @@ def read_yaml(path: str | Path) -> Any:
     """
     path = Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
+        raise FileNotFoundError(f"{path}: no such file: check the path")
     return parse_yaml(path.read_bytes(), str(path))
 
 

@@ -72,6 +72,8 @@ class Align(Around):
         Raises:
             UsageError: for invalid options.
             ValueError: for images or a rig that cannot be used.
+            FileNotFoundError: for a missing file.
+            SystemExit: as `judged`.
         """
         flight = self._flight()
         image, with_rig = ((), False) if flight else named_images(self.given, self.image, "align")

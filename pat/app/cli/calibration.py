@@ -58,6 +58,7 @@ class Calibrate:
 
         Raises:
             ValueError: without a board, for invalid options, and for images that cannot be used.
+            FileNotFoundError: for a missing folder, start or board file.
         """
         from calib.boards.run import calibrate_photos
 
@@ -121,6 +122,7 @@ class PrintBoard:
 
         Raises:
             ValueError: for a text that is no board, and a sheet that it does not fit on.
+            FileNotFoundError: for a missing target file.
         """
         from calib.boards.target import page_note, parse_board, write_board
 

@@ -31,6 +31,7 @@ class Demo:
 
         Raises:
             FileExistsError: for files in the way that no run wrote.
+            FileNotFoundError: for unknown weights.
         """
         from arraygeom.runtime.together import refuse_others, write_listed, write_together
 

@@ -69,6 +69,8 @@ class Fuse(Around, Fusing):
         Raises:
             UsageError: for invalid options.
             ValueError: for images or a rig that cannot be used.
+            FileNotFoundError: for a missing file, and unknown weights.
+            SystemExit: as `judged`.
         """
         self._extras = options.some_of(self.extras, EXTRAS)
         image, with_rig = self.named("fuse")
@@ -91,7 +93,9 @@ class Fuse(Around, Fusing):
         """
         if several := [name for name, paths in files.items() if len(paths) > 1]:
             count = len(files[several[0]])
-            raise UsageError(several[0], "one image; `pat batch` fuses many", f"{count} images")
+            raise UsageError(
+                several[0], "one image; `pat batch` or `pat sequence` fuses many", f"{count} images"
+            )
         return files
 
     def _fuse(self, given: Recordings) -> None:
@@ -107,7 +111,7 @@ class Fuse(Around, Fusing):
 
         alpha, found, points, begin = given.alpha, given.found, "points" in self._extras, time.monotonic()
         if points and not isinstance(given.rig[alpha], Camera):
-            raise UsageError("--extras points", "a calibrated alpha, and its camera has F alone")
+            raise UsageError("--extras points", "a calibrated alpha, and it has F alone: leave it out")
         with folder_lock(self.out):
             sweep(self.out)
             refuse_to_replace(self.out)
@@ -233,6 +237,7 @@ def fuse_with_progress(
 
     Raises:
         ValueError: as `fuse`, and for a GPU that is not available.
+        FileNotFoundError: for unknown weights.
     """
     from ...networks.weights import load_weights
     from ..front import fuse

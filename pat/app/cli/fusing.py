@@ -142,6 +142,7 @@ class Fusing(Known):
         Raises:
             ValueError: for options that contradict each other, before images are read, and images that cannot
                 be used.
+            FileNotFoundError: for a missing file.
         """
         self.fuse_settings()
         if with_rig:

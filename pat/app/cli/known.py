@@ -150,6 +150,7 @@ class Known:
 
         Raises:
             ValueError: for images that cannot be used, and a memory limit that their size exceeds.
+            FileNotFoundError: for a missing file, and unknown weights.
         """
         from arraygeom.runtime.image_bytes import image_header
 
@@ -211,7 +212,7 @@ class KnownFile(NamedTuple):
             raise UsageError("--around", "FILE[,scale=METRES][,tolerance=SHARE]", min(unknown))
         known = cls(Path(path), **numbers)
         if not known.path.is_file():
-            raise UsageError("--around", "a file of matched points, or a depth map; no such file", path)
+            raise UsageError("--around", "an existing depth map, or file of matched points", path)
         return known
 
     @property

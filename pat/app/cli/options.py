@@ -155,11 +155,14 @@ def writable(out: Path, *, folder: bool = False, option: str = "--out") -> Path:
         with TemporaryFile(dir=place):  # of a drive that is read-only, or as root, permissions say little
             return out
     except OSError as error:
-        raise ValueError(f"{option}: {place} cannot be written to ({error.strerror}): change it") from None
+        raise ValueError(f"{option}: {place} cannot be written to ({error.strerror}): give another") from None
 
 
 def device_of(name: str) -> str:
     """Resolve a device's name.
+
+    Args:
+        name: "cpu", "cuda", or "auto" for a GPU if there is one.
 
     Returns:
         "cpu" or "cuda".

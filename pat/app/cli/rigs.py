@@ -44,6 +44,7 @@ class Show:
         Raises:
             ValueError: for a rig or images that cannot be used.
             FileExistsError: for files in the way that no run wrote.
+            FileNotFoundError: for a missing file.
         """
         from arraygeom import Camera
         from arraygeom.runtime.together import refuse_others, write_together
@@ -160,9 +161,8 @@ class Explore:
 
         Raises:
             ValueError: for a rig or images that it cannot show.
+            FileNotFoundError: for a missing file.
         """
-        from calib.boards.uncertainty import RigCovariance
-
         from ..explore import opened, serve
 
         if self.save is not None:
@@ -172,7 +172,11 @@ class Explore:
         if images:
             warn_of_misfit(rig, images)
         options.field_named(self.field)
-        beside = self.rig.with_suffix(".covariance.json")
+        covariance = None
+        if (beside := self.rig.with_suffix(".covariance.json")).is_file():
+            from calib.boards.uncertainty import RigCovariance  # imports matplotlib
+
+            covariance = RigCovariance.load(beside, rig)
         files = {"": self.rig, **options.files_by_name(self.image)}
         explorer = opened(
             rig,
@@ -180,7 +184,7 @@ class Explore:
             alpha=self.alpha,
             network=self.network,
             field=self.field,
-            covariance=RigCovariance.load(beside, rig) if beside.is_file() else None,
+            covariance=covariance,
             files={name: str(file) for name, file in files.items()},
         )
         if explorer.error:
@@ -215,6 +219,7 @@ class Info:
 
         Raises:
             ValueError: for a file that is no rig, and an unknown alpha.
+            FileNotFoundError: for a missing file.
         """
         from arraygeom.io import ANY_SCALE, recognise
         from arraygeom.runtime.text import length_unit
@@ -311,7 +316,7 @@ class Convert:
 
         hw = None if self.size is None else (self.size[1], self.size[0])
         if hw is not None and min(hw) < 1:
-            raise ValueError("--size: wanted width and height in pixels")
+            raise ValueError(f"--size: wanted width and height in pixels, got {hw[1]} {hw[0]}")
         rig = read_rig(self.source, format=self.read_as, hw=hw, lens=self.lens)
         if hw is not None and all(view.hw != hw for view in rig.cameras.values()):
             h, w = rig[rig.names[0]].hw
@@ -419,6 +424,8 @@ class Refine:
 
         Raises:
             ValueError: for a rig, images or options that cannot be used.
+            FileNotFoundError: for a missing file.
+            SystemExit: with status 4, as above.
         """
         from arraygeom.io.native import write
         from arraygeom.runtime.atomic import write_text
@@ -484,6 +491,7 @@ class RigFromImages:
 
         Raises:
             ValueError: for images with too little in common.
+            FileNotFoundError: for a missing file.
         """
         from arraygeom.runtime.text import OPEN
         from calib.images.from_images import rig_from_images
@@ -528,6 +536,7 @@ class RigDiff:
 
         Raises:
             ValueError: for rigs of other cameras, no depth range, and options that contradict each other.
+            FileNotFoundError: for a missing file.
         """
         from calib.boards.rig_diff import draw_difference, rig_difference
         from calib.boards.uncertainty import RigCovariance

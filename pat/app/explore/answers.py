@@ -39,9 +39,9 @@ DEFAULTS: Controls = {
 """Controls of an unchanged rig.
 
 baseline is a factor of all betas' distance from alpha; `errors` are changes of cameras by name (`ALL`: of all
-betas), each by the names of `ERRORS`; `camera` is the one that the sliders change; near and far are metres.
-`pins` are pixels of alpha that stay drawn. `clicked` is a beta and a pixel of it, whose match becomes alpha's
-pixel.
+betas), each by the names of `ERRORS`; `camera` is the one that the sliders change; near and far are in the
+rig's unit. `pins` are pixels of alpha that stay drawn. `clicked` is a beta and a pixel of it, whose match
+becomes alpha's pixel.
 """
 ERRORS: dict[str, tuple[str, float, float, float, float]] = {
     "rx": ("rotation x (degrees)", -3.0, 3.0, 0.01, 0.0),
@@ -210,9 +210,9 @@ def drawn(beta: BetaReport) -> dict[str, Any]:
     """Convert a beta's report to plain values for JSON.
 
     Returns:
-        `samples` and `match` in beta's pixels, `weights`, `depths` and `depth` in metres (None where
-        unknown), and `off`, the distance of the images' match from the line, pixels; or a `problem` if no
-        sample is on the image.
+        `samples` and `match` in beta's pixels, `weights`, `depths` and `depth` in the rig's unit (None where
+        unknown), `off`, the distance of the images' match from the line, pixels, and `band`, its corners in
+        beta's pixels (both None where there is none); or a `problem` if no sample is on the image.
     """
     if not bool(beta.valid.any()):
         return {"problem": "no part of the segment lies in this image: the views do not overlap here"}
@@ -229,8 +229,8 @@ def drawn(beta: BetaReport) -> dict[str, Any]:
 
 
 def top_view(rig: Rig, alpha: str) -> list[dict[str, Any]]:
-    """List the cameras from above, in alpha's axes: each centre (right, forward) and viewing direction,
-    metres.
+    """List the cameras from above, in alpha's axes: each centre (right, forward), in the rig's unit, and
+    viewing direction.
 
     Returns:
         Plain values; empty if alpha is not calibrated.

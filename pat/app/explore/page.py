@@ -157,8 +157,8 @@ def geometry(rig: Rig, alpha: str) -> dict[str, Any]:
     """Return the calibrated cameras as plain numbers, for the page's own computation.
 
     Returns:
-        Name of `alpha`; `cameras` by name, each with K, R, centre (metres) and hw; `near` and `far`, at most
-        1e9 metres. The rig must have a depth range.
+        Name of `alpha`; `cameras` by name, each with K, R, centre and hw; `near` and `far`, at most 1e9.
+        Lengths are in the rig's unit; the rig must have a depth range.
     """
     cameras = {
         name: {k: getattr(camera, k).tolist() for k in ("K", "R", "centre")} | {"hw": list(camera.hw)}
@@ -300,7 +300,7 @@ def room_image(camera: Camera, alpha: Camera, half: Float[Tensor, "3"]) -> Float
     """Render the room for one camera.
 
     Args:
-        half: half the room's size in alpha's axes, metres, with alpha in its middle.
+        half: half the room's size in alpha's axes, in the rig's unit, with alpha in its middle.
 
     Returns:
         Image (1, h, w), 0 where the lens has no ray.

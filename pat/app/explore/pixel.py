@@ -62,8 +62,8 @@ class ExplorerState:
         alpha: name of alpha.
         x: pixel (x, y) of alpha.
         family: name of the receptive field; "auto" for the default.
-        near: near bound, metres; None for the rig's.
-        far: far bound, metres; None for the rig's.
+        near: near bound, in the rig's unit; None for the rig's.
+        far: far bound, in the rig's unit; None for the rig's.
         weights: `WINDOWS`, or the name of a network.
     """
 
@@ -101,7 +101,7 @@ class BetaReport(NamedTuple):
         valid: True for samples in the image.
         ends: start and end of a segment; None for other fields.
         weight: weight of each sample, summing to 1.
-        depth: depth of each sample, metres; NaN where it has none.
+        depth: depth of each sample in alpha, in the rig's unit; NaN where it has none.
         value: weighted mean of beta's image.
         peak: largest weight.
         offset: best match of the images; None without a segment or a clear match.
@@ -127,7 +127,7 @@ class PixelReport(NamedTuple):
         betas: report by beta.
         problems: reason, in a sentence, by beta that has no report.
         colour: fused colour, RGB or grey.
-        depth: depth by all betas, metres; NaN if unknown.
+        depth: depth by all betas, in the rig's unit; NaN if unknown.
     """
 
     betas: dict[str, BetaReport]
@@ -480,7 +480,8 @@ def depths(
         valid: mask of the samples in the image.
 
     Returns:
-        Depths in metres; NaN for invalid samples, samples without depth, and pairs that are not calibrated.
+        Depths in the rig's unit; NaN for invalid samples, samples without depth, and pairs that are not
+        calibrated.
     """
     if pair.link is not None or not pair.calibrated:
         return torch.full_like(xy[:, 0], torch.nan)
@@ -490,8 +491,9 @@ def depths(
 
 
 def joint_depth(betas: Mapping[str, BetaReport]) -> float:
-    """Return the inverse of the weighted mean inverse depth of all betas, metres; NaN if no sample has a
-    depth."""
+    """Return the inverse of the weighted mean inverse depth of all betas, in the rig's unit; NaN if no sample
+    has a depth.
+    """
     inverse, total = 0.0, 0.0
     for beta in betas.values():
         has_depth = beta.depth.isfinite()

@@ -91,9 +91,9 @@ def explore(
         covariance: covariance of the rig's parameters, as `calib` writes it, for 95 % bands around segments;
             None for none.
         controls: initial values of the controls: `field` and `second` (names of fields), `weights`, `near`
-            and `far` (metres), `baseline` (factor), `errors` (changes by camera, such as
-            {"colour": {"ry": 0.5, "cx": 3}}), `camera` (the one that sliders change), `pins`
-            (pixels of alpha that stay drawn).
+            and `far` (in the rig's unit), `baseline` (factor), `errors` (changes by camera, such as
+            {"colour": {"ry": 0.5, "cx": 3}}), `camera` (the one that sliders change), `pins` (pixels of alpha
+            that stay drawn).
 
     Returns:
         The widget; problems with the input are shown in it. Its `rig` is the rig as changed.

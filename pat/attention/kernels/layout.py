@@ -53,8 +53,8 @@ def block_scratch(samples: int, channels: int, number: np.dtype) -> Block:
         number: type of computation, float32 or float64.
 
     Returns:
-        An array (BLOCK, length) for each line of `LAYOUT`, the values of a pixel side by side; not
-        initialised.
+        An array (BLOCK, length) for each line of `LAYOUT`, the values of a pixel side by side, int32 or of
+        type `number`; not initialised.
     """
     lengths = {"pixel": 1, "sample": samples + LANES, "tap": 4 * samples + 2 * LANES, "channel": channels}
     ends = {"integer": 0, "number": 0}

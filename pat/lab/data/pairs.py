@@ -149,7 +149,7 @@ def middlebury_pairs(root: str | Path) -> Iterator[StereoPair]:
 
     Raises:
         FileNotFoundError: for a missing folder.
-        ValueError: for a folder without a pair.
+        ValueError: for a folder without a pair; and while they are read, for an image that cannot be.
     """
     root = _folder(root)
     return (_read(root, files) for files in _some(_middlebury(root), root))
@@ -165,7 +165,7 @@ def folder_pairs(root: str | Path) -> Iterator[StereoPair]:
 
     Raises:
         FileNotFoundError: for a missing folder.
-        ValueError: for a folder without a pair.
+        ValueError: for a folder without a pair; and while they are read, for an image that cannot be.
     """
     root = _folder(root)
     return (_read(root, files) for files in _some(_named(root), root))

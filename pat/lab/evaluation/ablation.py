@@ -232,6 +232,9 @@ def disparity(network: FusionNetwork, pair: Pair) -> float:
 
     Returns:
         Pixels of beta as the network receives it (resized if it needs equal resolutions); 1 or more.
+
+    Raises:
+        ValueError: for a pair that is not calibrated or has no depth range.
     """
     if pair.has_lens:
         grid = coarse_grid(pair.alpha.hw).reshape(-1, 2).double()
@@ -258,7 +261,7 @@ def layered_cases(
         One case at a time.
 
     Raises:
-        ValueError: for folders without images.
+        ValueError: for folders without images, when the first case is asked for.
     """
     bank = PhotoBank.load(*photos) if photos else sample_photographs()
     scenes, g = LayeredScenes(bank, RIGS, hw=hw, seed=seed), Generator().manual_seed(seed)
@@ -277,7 +280,7 @@ def rendered_cases(folder: Path, *, seed: int = 0) -> Iterator[AblationCase]:
 
     Raises:
         FileNotFoundError: for a missing folder.
-        ValueError: for a folder without scenes.
+        ValueError: for a folder without scenes, or with an incomplete one.
     """
 
     def case(path: Path) -> AblationCase:

@@ -55,6 +55,7 @@ def mono_colour_task(pair: StereoPair, rate: int) -> MonoColourTask:
 
     Raises:
         ValueError: for a grey pair, and images of unequal sizes.
+        RuntimeError: for images smaller than `rate`.
     """
     if pair.left.shape[0] != 3 or pair.right.shape[0] != 3:
         raise ValueError(f"{pair.name}: the mono + colour protocol needs colour images, and these are grey")

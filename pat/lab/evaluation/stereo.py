@@ -127,6 +127,12 @@ def sets_markdown(
         rows: rows by data set; they include the methods "fusion" and "alpha".
         printed: published scores by data set, shown in a column of their own.
         depth: True to add the errors of disparity where its truth is known.
+
+    Returns:
+        Markdown.
+
+    Raises:
+        KeyError: for a pair with "fusion" and without "alpha".
     """
     parts = []
     for name, of_set in rows.items():
@@ -143,6 +149,9 @@ def markdown(rows: Sequence[StereoRow], *, printed: PrintedScores = {}) -> str: 
     Args:
         rows: scores of one data set.
         printed: published scores by rate, shown as a column with a mean only.
+
+    Returns:
+        Markdown; the mean of several pairs has a 95 % bootstrap interval.
     """
     return "\n".join(_table(own, printed.get(rate)) for rate, own in grouped(rows, "rate").items())
 

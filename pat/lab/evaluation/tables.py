@@ -62,6 +62,9 @@ def write_csv(path: str | Path, columns: Sequence[str], rows: Iterable[Sequence[
         path: file, replaced if there is one.
         columns: cells of the header.
         rows: cells of each line; None is written as an empty cell.
+
+    Raises:
+        OSError: if it cannot be written.
     """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")

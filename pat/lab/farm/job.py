@@ -163,6 +163,7 @@ class RenderConfig:
 
         Raises:
             ValueError: for a rig that cannot be rendered.
+            FileNotFoundError: for a missing file of the rig.
         """
         return sum(10.0 * h * w for h, w in self.settings.images(Rig.load(self.rig))) + 20_000
 
@@ -244,6 +245,7 @@ def render(
         ValueError: for what cannot be rendered, scenes or workers below 1, more scenes than the disk holds,
             or a folder in use or of another configuration.
         JobError: if the job cannot go on, such as on a full disk.
+        ImportError: for a `scheduler` without the package of Dask.
     """
     if scenes < 1 or workers < 1:
         raise ValueError(f"give at least one scene and one worker, got --scenes {scenes} --workers {workers}")
@@ -326,14 +328,14 @@ def make_scene(config_text: str, work: Path, scene: Path, index: int) -> None:
     """Render one scene from the first seed that the self-check accepts, and publish its folder.
 
     Args:
-        config_text: the `RenderConfig` as YAML, with absolute paths.
+        config_text: the `RenderConfig` as JSON, with absolute paths.
         work: folder for unfinished scenes, on the disk of `scene`.
         scene: folder of the finished scene; an existing one stays.
         index: number of the scene, from which its seeds follow.
 
     Raises:
         ValueError: if `refusals` seeds are refused.
-        JobError: if no scene can be made, such as on a full disk.
+        JobError: if no scene can be made: a full disk, or a configuration that cannot be used.
     """
     config, render_scene = _ready(config_text)
     reason = ""
@@ -408,7 +410,7 @@ def summarise(root: Path) -> str:
 
     Raises:
         FileNotFoundError: for a missing folder.
-        ValueError: for a folder without scenes.
+        ValueError: for a folder without scenes, with an incomplete one, or whose first rig cannot be read.
     """
     from statistics import median
 

@@ -116,11 +116,12 @@ def pair_figures(pair: Pair, here: RenderedFrame, there: RenderedFrame) -> dict[
         there: beta's frame, of the same time.
 
     Returns:
-        Figures by name. Shares of alpha's pixels of known depth: `inside` beta's image, `visible` there,
-        `hidden` behind something nearer, `contradicted` in front of beta's surface; points beside an edge in
-        beta count for none of these. Of visible points: `median`, `p95` and `p99` of the error in alpha's
-        pixels, `colour`, the median difference relative to brightness, and `shift`, the displacement in
-        pixels that explains most of it. Without visible points only the shares.
+        Figures by name. Shares of alpha's pixels of known depth: `inside` beta's image, `visible` there
+        (projected back by beta's depth to within a pixel), `hidden` behind something nearer, `contradicted`
+        in front of beta's surface; points beside an edge in beta count for none of the last three. Of visible
+        points: `median`, `p95` and `p99` of the error in alpha's pixels, `colour`, the median difference
+        relative to brightness, and `shift`, the displacement in pixels that explains most of it. Without
+        visible points only the shares.
     """
     alpha, beta = (camera.to(dtype=torch.float64) for camera in pair.cameras)
     x, depth, index = _chosen(here, 200_000)

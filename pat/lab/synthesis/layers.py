@@ -64,6 +64,9 @@ def draw_layers(
         photos: textures to choose from.
         shapes: number of outlines to choose from.
         generator: random generator on the CPU.
+
+    Returns:
+        The layers; those seen at a grazing angle are not `present`.
     """
     g = generator
     shape = len(rigs.near), count[1]

@@ -112,7 +112,10 @@ _MOST = 6e4
 
 
 def save_frame(path: Path, frame: RenderedFrame) -> None:
-    """Write the arrays of a frame to an .npz file, synced to disk; not atomically."""
+    """Write the arrays of a frame to an .npz file, synced to disk; not atomically.
+
+    Colours are stored as float16, at most 60,000; object numbers as uint16.
+    """
     arrays: dict[str, NDArray] = {}
     for name, value in vars(frame).items():
         if isinstance(value, Tensor):

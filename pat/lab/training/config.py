@@ -212,6 +212,9 @@ def command_line(arguments: list[str], prog: str = "pat lab train") -> TrainConf
         arguments: arguments behind the command's name.
         prog: name of the command, for messages.
 
+    Returns:
+        The recipe.
+
     Raises:
         ValueError: for an invalid recipe, and for one that names code as its field where the arguments do
             not.

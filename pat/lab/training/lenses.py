@@ -78,7 +78,7 @@ def lens_over(pinhole: Camera, g: Generator, lost: float = 0.0) -> Camera:
 
 
 def border(camera: Camera) -> Float[Tensor, "n 2"]:
-    """Return the pixels (x, y) on the border of a camera's image; corners appear twice."""
+    """Return the pixels (x, y), float64, on the border of a camera's image; corners appear twice."""
     x = pixel_grid(camera.hw, dtype=torch.float64)
     return torch.cat([x[0], x[-1], x[:, 0], x[:, -1]])
 

@@ -72,7 +72,7 @@ def former_run(config: TrainConfig) -> Checkpoint | None:
         The checkpoint; None if there is none.
 
     Raises:
-        ValueError: if the folder holds another recipe's run, or no readable checkpoint.
+        ValueError: if the folder holds another recipe's run, or checkpoints of which none can be read.
     """
     checkpoint = newest_checkpoint(config.out / CHECKPOINTS)
     if checkpoint is None:

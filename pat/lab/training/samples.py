@@ -183,7 +183,10 @@ class SampleSource:
 
 
 def made_ahead(samples: Iterator[list[Sample]]) -> Iterator[list[Sample]]:
-    """Yield the same samples, while a thread makes the next step's."""
+    """Yield the same samples, while a thread makes the next step's.
+
+    `samples` must be without end.
+    """
     with ThreadPoolExecutor(1) as beside:
         coming = beside.submit(next, samples)
         while True:
@@ -204,6 +207,7 @@ def scenes(config: TrainConfig, *, device: str = "cpu") -> tuple[SampleSource, S
 
     Raises:
         ValueError: for no photographs, or too few to hold some out, and other data that cannot be used.
+        FileNotFoundError: for a missing folder.
     """
     n, layered = config.held_out, config.rendered + config.measured < 1
     bank, unseen = photographs(config) if layered else (None, None)
@@ -232,6 +236,7 @@ def source_of(
 
     Raises:
         ValueError: for folders that cannot be used.
+        FileNotFoundError: for a missing folder.
     """
     rectified, general = config.rectified_rigs, config.general_rigs
     how: dict[str, Any] = {"hw": config.hw, "seed": seed, "device": device}

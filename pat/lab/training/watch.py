@@ -95,7 +95,10 @@ class Watch:
 
     def show(self, network: FusionNetwork, samples: list[Sample], step: int) -> None:
         """Write an image of validation samples: beta, alpha, fused image, ground truth, confidence side by
-        side."""
+        side.
+
+        It is `images/step-N.png` in the run's folder, the first scene of up to `SHOWN` groups.
+        """
         sheet = contact_sheet(network, samples[:SHOWN])
         write_image(self.out / "images" / f"step-{step:06d}.png", sheet)
         if self.board:

@@ -73,6 +73,10 @@ class Studio:
 
         Returns:
             Channels (h, w), float32, by Blender's names: colours, depth, object index.
+
+        Raises:
+            ValueError: for what Blender refuses, in one line.
+            BrokenProcessPool: if its process dies.
         """
         places = [_place(thing.motion, time) for thing in self.scene.objects]
         self._ask(places=places, spectrum=spectrum, path=str(self.path), **_aim(camera))

@@ -92,7 +92,10 @@ def render(scene: Scene, rig: Rig, out: Path, *, settings: RenderSettings) -> Re
 
 
 def fitted(rig: Rig, settings: RenderSettings) -> Rig:
-    """Return the rig resized to the settings' width; the rig itself if there is none."""
+    """Return the rig resized to the settings' width; the rig itself if there is none.
+
+    Sides have at least 4 pixels.
+    """
     if settings.width is None:
         return rig
     scale = settings.width / max(camera.hw[1] for camera in rig.cameras.values())
@@ -104,6 +107,8 @@ def fitted(rig: Rig, settings: RenderSettings) -> Rig:
 
 def shots(rig: Rig, settings: RenderSettings) -> list[Shot]:
     """List the frames to render: each camera from its time offset on, at its frame rate, for the duration.
+
+    A camera without a frame rate has 30 frames a second.
 
     Returns:
         Frames by camera, then by time; at least one for each camera.

@@ -53,6 +53,18 @@ def test_every_command_has_help_that_reads_well(path, capsys):
     assert "(default: )" not in text
 
 
+def test_the_explorer_needs_no_matplotlib(tmp_path):
+    code = f"""
+import sys
+sys.modules["matplotlib"] = None
+from pat.app.cli.main import main
+main(["explore", "pat/app/sample/rig.yaml", "--save", {str(tmp_path / "page.html")!r}])
+"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "page.html").is_file()
+
+
 def test_names_are_those_of_the_package():
     from arraygeom.fields.default import FIELDS
     from pat.networks.weights import shipped
