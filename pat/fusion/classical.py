@@ -55,16 +55,19 @@ UNRECTIFIABLE = "the cameras look along the line between them: such a pair canno
 
 
 def classical_baseline(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> Float[Tensor, "_ h w"]:
-    """Fuse by `classical` with the first beta that has an image if it is in colour, else with each beta, one
-    band each.
+    """Fuse by `classical` with the first beta that has an image if it is in colour, else with each beta.
 
     Returns:
-        The fused bands (C, h, w), those of several betas concatenated, 0..1.
+        The fused bands (C, h, w), 0..1: red, green and blue of the first beta, or the bands of each beta, in
+        order.
 
     Raises:
-        ValueError: for uncalibrated cameras, lenses, no depth range, and cameras that cannot be rectified.
+        ValueError: for no beta with an image, uncalibrated cameras, lenses, no depth range, and cameras that
+            cannot be rectified.
     """
     betas = [name for name in rig.betas(alpha) if name in images]
+    if not betas:
+        raise ValueError(f"none of the betas of '{alpha}' has an image: give one of another camera")
     if images[betas[0]].shape[0] == 3:
         return classical(rig, images, alpha, betas[0])
     return torch.cat([classical(rig, images, alpha, name) for name in betas])
