@@ -249,8 +249,7 @@ def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnos
     table = sorted(tried if fits else tried[1:], key=lambda h: misfit[h])
     least = misfit[next(h for h in table if not h.approximate)]  # estimated numbers fit a rig's misfit too
     equal, usual = EQUAL[0] * least + EQUAL[1], USUAL_MISFIT * max(map(max, sizes.values()))
-    explained = max(2 * usual, EXPLAINED[1] * fit[unchanged].misfit)
-    fitting = [h for h in table if misfit[h] <= max(usual, min(equal, explained))]
+    fitting = [h for h in table if misfit[h] <= min(max(equal, usual), 3 * usual)]
     likelier = [h for h in fitting if fits and unlikelihood(h.rig) + MARGIN < unlikelihood(rig)]
     healthy = fits and misfit[unchanged] < HEALTHY_MISFIT and not likelier
     as_good: list[Hypothesis] = []
