@@ -529,7 +529,7 @@ def test_an_alpha_in_colour_and_a_beta_without_are_said(small, capsys):
         main(arguments(small))
     text = " ".join(capsys.readouterr().err.split())
     assert "alpha, 'mono'" in text
-    assert "'colour'" in text
+    assert "image of 'colour'" in text
 
 
 def test_a_bad_out_is_found_before_the_fusion(small, refusal, monkeypatch):
