@@ -8,7 +8,6 @@ from .noise_level import NoiseLevel
 from .steps import (
     BoxBlur,
     Clip,
-    DegradationCase,
     GaussianBlur,
     Jitter,
     Noise,
@@ -17,7 +16,6 @@ from .steps import (
     Step,
     augment,
     generator_for,
-    paper_cases,
     record,
     seed_for,
 )
@@ -25,7 +23,6 @@ from .steps import (
 __all__ = [
     "BoxBlur",
     "Clip",
-    "DegradationCase",
     "GaussianBlur",
     "Jitter",
     "Noise",
@@ -35,7 +32,6 @@ __all__ = [
     "Step",
     "augment",
     "generator_for",
-    "paper_cases",
     "record",
     "seed_for",
 ]

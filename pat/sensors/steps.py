@@ -267,45 +267,13 @@ def normal(shape: Sequence[int], like: Tensor, generator: Generator) -> Tensor:
     return noise.to(like.device)
 
 
-@dataclass(frozen=True)
-class DegradationCase:
-    """One way to degrade the two images of a pair.
-
-    Attributes:
-        name: name of the case, used in messages.
-        alpha: steps for alpha's image.
-        beta: steps for beta's image.
-    """
-
-    name: str
-    alpha: tuple[Step, ...] = ()
-    beta: tuple[Step, ...] = ()
-
-
-def paper_cases() -> tuple[DegradationCase, ...]:
-    """Return the paper's four degradations of an (alpha, beta) pair, for `augment`.
-
-    The paper does not state the blur; here it is a box of 5 pixels.
-
-    Returns:
-        Four cases: alpha blurred; beta blurred, reduced to half the size and back, or both.
-    """
-    reduced = (Resample(0.5, "bicubic"), Resample(2.0, "bicubic"), Clip())
-    return (
-        DegradationCase("blur alpha", alpha=(BoxBlur(5),)),
-        DegradationCase("blur beta", beta=(BoxBlur(5),)),
-        DegradationCase("reduce beta", beta=reduced),
-        DegradationCase("blur and reduce beta", beta=(BoxBlur(5), *reduced)),
-    )
-
-
 class Pairs(NamedTuple):
     """Degraded images of both cameras.
 
     Attributes:
         alpha: alpha's images, values 0..1.
         beta: beta's images, values 0..1.
-        case: index of each pair's case in the list of cases, int64, on the generator's device.
+        case: number of each pair's case, int64, on the generator's device.
     """
 
     alpha: Float[Tensor, "b ca ha wa"]
@@ -314,35 +282,30 @@ class Pairs(NamedTuple):
 
 
 def augment(
-    alpha: Float[Tensor, "b ca ha wa"],
-    beta: Float[Tensor, "b cb hb wb"],
-    cases: Sequence[DegradationCase],
-    generator: Generator,
+    alpha: Float[Tensor, "b ca ha wa"], beta: Float[Tensor, "b cb hb wb"], generator: Generator
 ) -> Pairs:
-    """Degrade each pair of a batch by one case drawn at random, all equally likely.
+    """Degrade each pair of a batch by one of the paper's four cases, drawn at random, all equally likely.
+
+    0: alpha blurred; 1: beta blurred; 2: beta reduced to half the size and back; 3: both. The paper does not
+    state the blur; here it is a box of 5 pixels.
 
     Args:
-        cases: cases to draw from; their steps must keep the size and the channels of an image.
+        alpha: alpha's images.
+        beta: beta's images, with even sides.
+        generator: random generator.
 
     Returns:
         Copies of the images, of the same shapes, with the case of each pair; those given stay.
-
-    Raises:
-        ValueError: naming the case, if it changes an image's shape.
     """
+    blur: tuple[Step, ...] = (BoxBlur(5),)
+    reduced: tuple[Step, ...] = (Resample(0.5, "bicubic"), Resample(2.0, "bicubic"), Clip())
+    cases: list[tuple[tuple[Step, ...], tuple[Step, ...]]]
+    cases = [(blur, ()), ((), blur), ((), reduced), ((), blur + reduced)]
     drawn = torch.randint(len(cases), (len(alpha),), generator=generator, device=generator.device)
     alpha, beta = alpha.clone(), beta.clone()
-    for i, case in enumerate(cases):
+    for i, (of_alpha, of_beta) in enumerate(cases):
         index = (drawn == i).nonzero()[:, 0].to(alpha.device)
         if len(index):
-            alpha[index] = _same_size(alpha[index], case.alpha, generator, case.name)
-            beta[index] = _same_size(beta[index], case.beta, generator, case.name)
+            alpha[index] = record(alpha[index], of_alpha, generator)
+            beta[index] = record(beta[index], of_beta, generator)
     return Pairs(alpha, beta, drawn)
-
-
-def _same_size(image: Tensor, steps: Sequence[Step], generator: Generator, name: str) -> Tensor:
-    degraded = record(image, steps, generator)
-    if degraded.shape != image.shape:
-        old, new = tuple(image.shape[1:]), tuple(degraded.shape[1:])
-        raise ValueError(f'case "{name}" changes {old} to {new}, and a batch has one size: add a Resample')
-    return degraded

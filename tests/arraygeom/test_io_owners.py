@@ -169,7 +169,7 @@ def test_a_fisheye_by_its_numbers_names(tmp_path):
 def test_several_cameras_without_a_place_are_refused(missing, tmp_path):
     cameras = [{"K": MATRIX, "dist": C, **POSED} for _ in range(2)]
     del cameras[1][missing]
-    with pytest.raises(RigFileError, match=rf"cameras\[1\]: has .* no {missing}"):
+    with pytest.raises(RigFileError, match=rf"cameras\[1\].*\b{missing}\b"):
         read(tmp_path / "a.json", {"cameras": cameras})
 
 

@@ -162,7 +162,7 @@ def test_a_choice_must_be_one(tmp_path):
     write_tensors(tmp_path / "other.safetensors", {"a": torch.zeros(3)})
     (tmp_path / "text.safetensors").write_text("none")
     for name in ("other", "text"):
-        with pytest.raises(ValueError, match=f"{name}.safetensors: not (the|a safetensors)"):
+        with pytest.raises(ValueError, match=f"{name}.safetensors: "):
             unseeing([tmp_path / f"{name}.safetensors"], "2006_third/Wood1")
 
 

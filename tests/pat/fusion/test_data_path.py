@@ -142,15 +142,15 @@ def test_each_field_is_evaluated_once_a_pixel(tiled, monkeypatch):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda image: image.numpy(), "is a ndarray: give a tensor"),
-        (lambda image: image[..., :60].movedim(0, -1), r"of shape \(64, 60, 3\): wanted"),
-        (lambda image: (image * 255).to(torch.uint8), "is uint8"),
-        (lambda image: image * 30, "values up to 3"),
+        (lambda image: image.numpy(), "ndarray"),
+        (lambda image: image[..., :60].movedim(0, -1), r"\(64, 60, 3\)"),
+        (lambda image: (image * 255).to(torch.uint8), "uint8"),
+        (lambda image: image * 30, "values"),
     ],
 )
 def test_images_without_a_rig_are_checked_alike(change, message):
     """Images of wrong kinds are refused by name before any rig is estimated."""
-    with pytest.raises((TypeError, ValueError), match=f"the image of 'b' .*{message}"):
+    with pytest.raises((TypeError, ValueError), match=f"'b'.*{message}"):
         fuse({"a": smooth(1, 0), "b": change(smooth(3, 1))})
 
 

@@ -410,7 +410,7 @@ def test_fields_of_cameras_that_are_not_there_and_other_bands_of_alpha_are_refus
     with pytest.raises(ValueError, match=r"'color'.*'colour'"):
         fuse({**images, "color": images["colour"]}, rig, alpha="mono", network=network)
     for bands in (2, 4):
-        with pytest.raises(ValueError, match=f"alpha, 'mono', has {bands} bands"):
+        with pytest.raises(ValueError, match=f"'mono'.*{bands}"):
             fuse({**images, "mono": texture(bands, (64, 96))}, rig, alpha="mono", network=network)
     with pytest.raises(ValueError, match=r"'colour'.*float32"):
         fuse({**images, "colour": images["colour"][:0]}, rig, alpha="mono", network=network)

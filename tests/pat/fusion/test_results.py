@@ -42,7 +42,7 @@ def test_a_full_disk_leaves_the_former_files_all_of_one_frame(tmp_path):
     former = Frame(torch.full((3, 60, 80), 0.5), *torch.ones(3, 60, 80))
     save_frame(former, tmp_path, kind="tif", bits=16)
     before = {p.name: p.read_bytes() for p in tmp_path.iterdir() if p.is_file()}
-    with room_for(25_000), pytest.raises(OSError, match=r"/fused\.tif'$") as caught:
+    with room_for(25_000), pytest.raises(OSError, match=r"/fused\.tif") as caught:
         save_frame(Frame(torch.rand(3, 60, 80), *torch.rand(3, 60, 80)), tmp_path, kind="tif", bits=16)
     assert caught.value.filename == str(tmp_path / "fused.tif")
     assert {p.name: p.read_bytes() for p in tmp_path.iterdir() if p.is_file()} == before

@@ -179,23 +179,23 @@ def holed(plane):
 @pytest.mark.parametrize(
     ("plane", "change", "problem"),
     [
-        ("disparity", holed, "disparity is NaN or infinite: give any, with little certainty"),
-        ("facts", holed, "facts is NaN"),
-        ("bands", holed, "bands is NaN"),
-        ("weight", holed, "weight is NaN"),
-        ("certainty", holed, "certainty is NaN"),
-        ("certainty", lambda plane: plane + 7, "certainty is not within 0 to 1"),
-        ("disparity", Tensor.double, "disparity and facts are float64 and float32: give one type"),
-        ("disparity", Tensor.long, r"disparity is int64 \(1, 1, 64, 96\): wanted a tensor of floats"),
-        ("facts", lambda plane: enlarged(plane), r"facts is float32 .*: wanted .* \(1, 3, 32, 48\)"),
-        ("bands", lambda plane: plane[:, :1], r"bands is float32 \(1, 1, .*: wanted .* \(1, 3, 64, 96\)"),
-        ("fills", lambda plane: plane[:, :, :1], r"fills is float32 .*: wanted .* \(1, 1, 3, 64, 96\)"),
+        ("disparity", holed, "disparity.*NaN"),
+        ("facts", holed, "facts.*NaN"),
+        ("bands", holed, "bands.*NaN"),
+        ("weight", holed, "weight.*NaN"),
+        ("certainty", holed, "certainty.*NaN"),
+        ("certainty", lambda plane: plane + 7, "certainty"),
+        ("disparity", Tensor.double, "float64.*float32"),
+        ("disparity", Tensor.long, "disparity.*int64"),
+        ("facts", lambda plane: enlarged(plane), "facts.*float32"),
+        ("bands", lambda plane: plane[:, :1], "bands.*float32"),
+        ("fills", lambda plane: plane[:, :, :1], "fills.*float32"),
         (
             "likeness",
             lambda plane: plane.expand(-1, 3, -1, -1),
-            r"likeness is .*: wanted .* \(1, 1, 64, 96\)",
+            r"likeness.*\(1, 1, 64, 96\)",
         ),
-        ("chosen", lambda plane: plane[..., ::2, ::2], r"chosen is float32 \(1, 1, 32, 48\): wanted"),
+        ("chosen", lambda plane: plane[..., ::2, ::2], "chosen.*float32"),
     ],
 )
 def test_matches_of_ones_own_are_checked(network, flat, plane, change, problem):
@@ -209,7 +209,7 @@ def test_matches_of_ones_own_are_checked(network, flat, plane, change, problem):
             return Matches((replace(found, colours=found.carried._replace(**{plane: changed})),))
         return Matches((replace(found, **{plane: change(getattr(found, plane))}),))
 
-    with pytest.raises(ValueError, match=f"these matches' {problem}"):
+    with pytest.raises(ValueError, match=problem):
         fuse(
             images,
             rig,

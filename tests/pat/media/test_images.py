@@ -75,7 +75,7 @@ def test_sixteen_bits_are_scaled_by_65535(tmp_path):
 @pytest.mark.parametrize(("largest", "bits"), [(200, 8), (1000, 10), (4095, 12)])
 def test_few_bits_in_sixteen_are_said_unless_they_are_stated(tmp_path, largest, bits):
     cv2.imwrite(str(tmp_path / "a.png"), np.array([[0, largest]], np.uint16))
-    with pytest.warns(UserWarning, match=f"none above {largest}, .*state `bits: {bits}` .*or save it"):
+    with pytest.warns(UserWarning, match=f"{largest}.*bits: {bits}"):
         read_image(tmp_path / "a.png")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -106,7 +106,7 @@ def test_a_pnm_file_states_its_white(tmp_path, white, kind):
 @pytest.mark.parametrize(("white", "kind"), [(100, "u1"), (1000, ">u2")])
 def test_values_above_the_white_that_a_pnm_file_states_are_refused(tmp_path, white, kind):
     (tmp_path / "a.pgm").write_bytes(b"P5 2 1 %d\n" % white + np.array([0, white + 1], kind).tobytes())
-    with pytest.raises(ValueError, match=f"a.pgm: has values up to {white + 1}, its header says {white}:"):
+    with pytest.raises(ValueError, match=f"a.pgm: .*{white + 1}.*{white}"):
         read_image(tmp_path / "a.pgm")
 
 
@@ -252,18 +252,18 @@ def test_white_is_white_in_a_tiff_where_0_is(tmp_path, kind):
 @pytest.mark.parametrize(
     ("shape", "kind", "complaint"),
     [
-        ((6, 8), np.uint32, "uint32 values: save it with 8 or 16 bits"),
-        ((6, 8), np.float16, "float16 values: save it with 8 or 16 bits"),
-        ((6, 8, 2), np.uint16, "2 channels: give a grey"),
-        ((6, 8, 4), np.uint8, "4 channels: give a grey"),
-        ((6, 8, 5), np.uint16, "5 channels: give a grey"),
+        ((6, 8), np.uint32, "uint32"),
+        ((6, 8), np.float16, "float16"),
+        ((6, 8, 2), np.uint16, "2 channels"),
+        ((6, 8, 4), np.uint8, "4 channels"),
+        ((6, 8, 5), np.uint16, "5 channels"),
     ],
 )
 def test_what_opencv_does_not_read_of_a_tiff_is_named(tmp_path, shape, kind, complaint):
     """Channels are not left out without a word."""
     values = np.ones(shape, kind)
     tifffile.imwrite(tmp_path / "a.tif", values, photometric="minisblack", planarconfig="contig")
-    with pytest.raises(ValueError, match=f"a.tif: has {complaint}"):
+    with pytest.raises(ValueError, match=f"a.tif: .*{complaint}"):
         read_image(tmp_path / "a.tif")
 
 
@@ -432,8 +432,8 @@ def test_the_size_of_a_heic_file_is_compared_before_it_is_decoded(tmp_path, monk
     stand_in = SimpleNamespace(open_heif=lambda *_, **__: Stored())
     monkeypatch.setitem(sys.modules, "pillow_heif", stand_in)
     (tmp_path / "a.heic").write_bytes(b"\0\0\0\x18ftypheic\0\0\0\0mif1heic")
-    for hw, words in ((None, "more than 268 million pixels"), ((400, 640), "the rig says 640x400")):
-        with pytest.raises(ValueError, match=rf"a.heic: is 30000x20000, {words}"):
+    for hw, words in ((None, "268"), ((400, 640), "640x400")):
+        with pytest.raises(ValueError, match=rf"a.heic: .*30000x20000.*{words}"):
             read_image(tmp_path / "a.heic", hw=hw)
 
 

@@ -12,14 +12,12 @@ from experiments.sensors import DecodeSRGB, EncodeSRGB, Exposure, Mosaic, Motion
 from pat.sensors import (
     BoxBlur,
     Clip,
-    DegradationCase,
     GaussianBlur,
     Jitter,
     Noise,
     Quantise,
     Resample,
     augment,
-    paper_cases,
     record,
 )
 
@@ -211,7 +209,7 @@ def test_quantise_lets_the_gradient_pass_where_not_clipped():
 
 def test_the_four_cases_are_equally_likely_and_do_what_they_say():
     alpha, beta = noise_image(400, 1, 8, 16), noise_image(400, 3, 8, 16)
-    pairs = augment(alpha, beta, paper_cases(), generator())
+    pairs = augment(alpha, beta, generator())
     assert (torch.bincount(pairs.case, minlength=4) - 100).abs().max() < 35
     before = ((pairs.alpha, alpha), (pairs.beta, beta))
     changed = torch.stack([(a != b).flatten(1).any(1) for a, b in before], 1)
@@ -248,6 +246,3 @@ def test_mistakes_are_named():
     for sigma in (-1.0, math.nan):
         with pytest.raises(ValueError, match="sigma"):
             GaussianBlur(sigma)
-    halved = DegradationCase("halve", beta=(Resample(0.5),))
-    with pytest.raises(ValueError, match='"halve"'):
-        augment(noise_image(1, 1, 8, 8), noise_image(1, 3, 8, 8), [halved], generator())

@@ -23,9 +23,9 @@ def test_no_room_names_the_file_and_leaves_the_former_one(tmp_path):
 @pytest.mark.parametrize(
     ("damage", "problem"),
     [
-        (lambda content: content[:-4], "not a safetensors file"),
-        (lambda content: b"", "not a safetensors file"),
-        (lambda content: content[:-1] + bytes([content[-1] ^ 64]), "its numbers are not those"),
+        (lambda content: content[:-4], "safetensors"),
+        (lambda content: b"", "safetensors"),
+        (lambda content: content[:-1] + bytes([content[-1] ^ 64]), "numbers"),
     ],
 )
 def test_what_is_damaged_is_named(tmp_path, damage, problem):
@@ -36,7 +36,7 @@ def test_what_is_damaged_is_named(tmp_path, damage, problem):
     with pytest.raises(ValueError, match=r"a\.safetensors: "):
         with_weights(nn.Linear(2, 2), path)
     path.write_bytes(damage(path.read_bytes()))
-    with pytest.raises(ValueError, match=rf"a\.safetensors: {problem}"):
+    with pytest.raises(ValueError, match=rf"a\.safetensors: .*{problem}"):
         read_tensors(path)
     path.unlink()
     with pytest.raises(FileNotFoundError, match=r"a\.safetensors"):

@@ -143,7 +143,7 @@ def test_ten_matches_lay_one_image_on_the_other(folder, tmp_path, capsys):
     files = f"{folder / 'mono.png'} {folder / 'blind.png'}"
     pat(f"fuse {files} --matches {tmp_path / 'ten.csv'} --alpha mono -o {tmp_path / 'out'} --extras none")
     assert not (tmp_path / "out" / "depth.tif").exists()
-    assert "no depth: a homography" in capsys.readouterr().err
+    assert "homography" in capsys.readouterr().err
     assert not (tmp_path / "out" / "found_rig.yaml").exists()
     pat(
         f"rig start --image mono={folder / 'mono.png'} --image blind={folder / 'blind.png'} "

@@ -16,7 +16,7 @@ def test_a_task_is_grey_alpha_small_colour_beta_and_colour_ground_truth():
 
 
 @pytest.mark.parametrize(
-    ("left", "right", "complaint"), [((1, 8, 8), (1, 8, 8), "colour"), ((3, 8, 8), (3, 8, 9), "equal sizes")]
+    ("left", "right", "complaint"), [((1, 8, 8), (1, 8, 8), "colour"), ((3, 8, 8), (3, 8, 9), "equal")]
 )
 def test_pairs_that_cannot_serve_are_named(left, right, complaint):
     with pytest.raises(ValueError, match=f"tools: .*{complaint}"):
