@@ -41,9 +41,7 @@ ROS = "camera_matrix:\n  data: 1\ndistortion_model: none\n"
 def test_rig_files_that_would_grow_are_refused_at_once(head, attack, tmp_path):
     (tmp_path / "rig.yaml").write_text(head + attack)
     start = time.process_time()
-    with pytest.raises(
-        RigFileError, match=r"line \d+.*(aliases repeat|nest|more than 2,000,000|alias \*a)"
-    ):
+    with pytest.raises(RigFileError, match=r"line \d+.*(aliases repeat|nest|more than 2,000,000|alias \*a)"):
         Rig.load(tmp_path / "rig.yaml")
     assert time.process_time() - start < 4
 
