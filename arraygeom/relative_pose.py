@@ -21,6 +21,9 @@ def poses_from_essential(E: Float[Tensor, "*b 3 3"]) -> Pose:
 
     Returns:
         `beta_from_alpha`, a batch (*b, 4).
+
+    Raises:
+        ValueError: if any E of the batch is zero or not finite.
     """
     from kornia.geometry.epipolar import decompose_essential_matrix_no_svd
 

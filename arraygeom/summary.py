@@ -45,7 +45,7 @@ class CameraSummary(NamedTuple):
 
 
 class PairSummary(NamedTuple):
-    """Summary of alpha and one beta; None without a depth range.
+    """Summary of alpha and one beta.
 
     Attributes:
         alpha: name of alpha.
@@ -55,7 +55,8 @@ class PairSummary(NamedTuple):
         seen: share of alpha's pixels with a segment in beta.
         length: (median, largest) length of the segments, pixels of beta; None without any.
         depth_step: change of depth at (near, far) that moves a point by one pixel of beta, metres: the median
-            of alpha's pixels whose point beta sees, NaN if it sees none.
+            of alpha's pixels whose point beta sees, NaN if it sees none; None without depth range or
+            baseline.
     """
 
     alpha: str

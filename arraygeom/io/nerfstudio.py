@@ -54,11 +54,13 @@ def read(source: RigSource) -> Rig:
 def write(rig: Rig) -> str:
     """Format a transforms.json with intrinsics in each frame.
 
+    Depth range, links and sensors have no place in it and are left out.
+
     Returns:
         The text of the file.
 
     Raises:
-        ValueError: for what the format cannot hold.
+        ValueError: for lenses that the format cannot hold, and cameras that are not calibrated.
     """
     frames = [_frame(name, camera) for name, camera in calibrated(rig, "nerfstudio")]
     return json.dumps({"frames": frames}, indent=1) + "\n"

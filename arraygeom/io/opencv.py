@@ -39,7 +39,10 @@ def recognises(path: Path, head: str) -> bool:
 
 
 def read(source: RigSource) -> Rig:
-    """Read one camera "camera" at the origin, a stereo pair "left" and "right", or cameras named in the file.
+    """Read one camera "camera", a stereo pair "left" and "right", or cameras named in the file.
+
+    A camera without a stated pose is at the origin. An image size that is not stated is guessed, with
+    a warning.
 
     Raises:
         RigFileError: for a damaged file, half a pair, or cameras without a common frame.

@@ -89,9 +89,8 @@ class PolynomialFisheye(CameraModel, name="polynomial-fisheye"):
             slope = slope + (i + 2) * k[..., i] * theta ** (i + 1)
         return ratio, slope
 
-    @torch.no_grad()
     def _limit(self) -> Tensor:
-        """Largest valid angle (*b): float64 on the CPU."""
+        """Largest valid angle (*b): float64 on the CPU, without gradient."""
         k, widest = (t.detach().to("cpu", torch.float64) for t in (self.k, self.widest))
         widest = widest.clamp(max=math.pi)
         if not k.shape[-1]:

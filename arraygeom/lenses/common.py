@@ -76,7 +76,7 @@ def once(bound: Callable[[Tensor], Tensor], c: Tensor) -> Tensor:
         c: coefficients (*b, n).
 
     Returns:
-        Bounds (*b).
+        Bounds (*b), without gradient; perhaps the cached tensor itself: not to be changed in place.
     """
     if c.ndim > 1 and len(c) > 1 and c.stride(0) == 0:
         return once(bound, c[:1]).expand(c.shape[:-1])

@@ -50,15 +50,15 @@ def imported(name: str, what: str) -> Any:
         The object, or the module where no object is named.
 
     Raises:
-        ValueError: for a module or object that does not exist, or a module that fails with ImportError,
-            AttributeError or ValueError; other errors of the module pass.
+        ValueError: for a module or object that does not exist, a relative name, or a module that fails with
+            ImportError, AttributeError, TypeError or ValueError; other errors of the module pass.
     """
     module, _, attribute = name.partition(":")
     try:
         sys.path.insert(0, str(Path.cwd()))
         found = importlib.import_module(module)
         return getattr(found, attribute) if attribute or ":" in name else found
-    except (ImportError, AttributeError, ValueError) as error:
+    except (ImportError, AttributeError, TypeError, ValueError) as error:
         raise ValueError(f"the {what} '{name}' cannot be imported: {error}") from None
     finally:
         sys.path.pop(0)

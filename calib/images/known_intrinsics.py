@@ -49,7 +49,8 @@ def centres_found(
     """Estimate translations of pinhole cameras, and refine their orientations, from one image of each.
 
     Alpha is at the origin, and the baseline of the first beta is 1, unless the rig states translations, whose
-    scale is kept. Cameras that match with none are left out.
+    scale is kept. Cameras that match with none are left out. Views should be of about equal scale and
+    orientation, and parallax a small share of the image (`WINDOW`).
 
     Args:
         rig: pinhole cameras of known intrinsics and roughly known orientation.

@@ -59,7 +59,8 @@ def checked_rig(views: ViewFiles, *, heal: bool) -> Healed | None:
         heal: True to refine the rig where it is not wrong and points determine it far better; False to warn.
 
     Returns:
-        The refined rig; None if the rig fits, or there was a warning.
+        The refined rig; None if the rig fits, if there was a warning, and where nothing can be said, as
+        with too few matched points (`find_misfit`).
     """
     try:
         images = dict(views)

@@ -17,7 +17,6 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from arraygeom import Camera, Pair, Rig
@@ -26,6 +25,7 @@ from ..matching.filters import filled
 from ..media.colour import from_luma_chroma, luminance, luminance_of, to_bytes
 from ..media.figures import reduced
 from ..sensors import NoiseLevel
+from ..support.neighbours import nearest_points
 from .frame import Frame
 from .steps import undistort
 from .views import Views
@@ -55,16 +55,19 @@ UNRECTIFIABLE = "the cameras look along the line between them: such a pair canno
 
 
 def classical_baseline(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> Float[Tensor, "_ h w"]:
-    """Fuse by `classical` with the first beta that has an image if it is in colour, else with each beta, one
-    band each.
+    """Fuse by `classical` with the first beta that has an image if it is in colour, else with each beta.
 
     Returns:
-        The fused bands (C, h, w), those of several betas concatenated, 0..1.
+        The fused bands (C, h, w), 0..1: red, green and blue of the first beta, or the bands of each beta, in
+        order.
 
     Raises:
-        ValueError: for uncalibrated cameras, lenses, no depth range, and cameras that cannot be rectified.
+        ValueError: for no beta with an image, uncalibrated cameras, lenses, no depth range, and cameras that
+            cannot be rectified.
     """
     betas = [name for name in rig.betas(alpha) if name in images]
+    if not betas:
+        raise ValueError(f"none of the betas of '{alpha}' has an image: give one of another camera")
     if images[betas[0]].shape[0] == 3:
         return classical(rig, images, alpha, betas[0])
     return torch.cat([classical(rig, images, alpha, name) for name in betas])
@@ -406,7 +409,7 @@ def _by_examples(values: Image, seen: NDArray[np.bool_], mono: Image) -> Image:
     sources[::2, ::2] = seen[::2, ::2]
     if sources.sum() < EXAMPLES or not asked.any():
         return out
-    distance, index = cKDTree(features[sources]).query(features[asked], k=EXAMPLES)
+    index, distance = nearest_points(features[sources], features[asked], EXAMPLES)
     weight = np.exp(-np.square(distance / (distance[:, :1] + 0.15)))
     out[:, asked] = (values[:, sources][:, index] * weight).sum(-1) / weight.sum(-1)
     return out

@@ -216,6 +216,8 @@ def denoised_views(views: Views, noise: Noise | None) -> tuple[Views, LowLight]:
 def warn_of_noise(name: str, image: Float[Tensor, "c h w"], view: NoisyView) -> None:
     """Warn if the noise that is stated for an image is far more than it shows.
 
+    Far more is by `SETTINGS.far_more`. There is no warning where the image shows no noise at all.
+
     Args:
         name: name of the camera.
         image: image as recorded, values 0..1.

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
+from ..support.neighbours import nearest_points
 from ..support.settings import size, tuned
 
 Plane = NDArray[np.float32]
@@ -75,8 +75,7 @@ def by_examples(
         return colour
     features = [(plane[sources], plane[asked]) for plane in _features(alpha, directions)]
     known, wanted = (np.stack(planes, 1) for planes in zip(*features))
-    tree = cKDTree(known, compact_nodes=False, balanced_tree=False)
-    _, index = tree.query(wanted, k=SETTINGS.neighbours, eps=SETTINGS.error)
+    index, _ = nearest_points(known, wanted, SETTINGS.neighbours, SETTINGS.error)
     share = weight[EVERY][sources][index]
     share = (share / share.sum(1, keepdims=True)).astype(np.float32)
     out = np.empty_like(colour)

@@ -313,11 +313,12 @@ def winners(total, first, count, segments, hw, corner, large, claims, labels):
         hw: height and width of beta.
         corner: first row and column of the block.
         large: the large penalty, in whose units margin and cost are.
-        claims: for each pixel of beta, and one more, the least cost with which a pixel of alpha matches it
-            and that pixel's label (16 bits each); updated.
+        claims: int32, for each pixel of beta, and one more, the least cost with which a pixel of alpha
+            matches it and that pixel's label (16 bits each), at first the largest int32; updated.
         labels: three arrays to write, of the block: disparity, the best label to a fraction; numbers (h, w, 1
-            or 3): the whole label, its margin to the second best (`UNRELATED` if there is none), and its
-            cost; and position in beta, pixels counted row by row (height times width for none).
+            or 3): the whole label, by how much the second best costs more (one that is no neighbour of it, or
+            `UNRELATED` if there is none), and its cost; and position in beta, pixels counted row by row
+            (height times width for none).
     """
     (end, along, length, cut), (rows, columns), (top, left) = segments, hw, corner
     disparity, facts, positions = labels

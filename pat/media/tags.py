@@ -101,6 +101,7 @@ def packet_of_bands(packet: bytes, bands: Sequence[str], wavelengths: Sequence[f
     """Adjust one camera's XMP packet for an image of several bands at that camera's pixels.
 
     Tags of its own band are left out (vignetting, radiometry); the camera, its pose and its flight stay.
+    Bands and wavelengths replace Pix4D's tags of them; a packet without such tags gets none.
 
     Args:
         packet: XMP packet of the camera's file.

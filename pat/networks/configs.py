@@ -22,8 +22,8 @@ class PATConfig:
         block_bias: True for biases in residual blocks, which the authors' code has not.
         fusion_bias: True for a bias of the 1x1 fusion, as the authors' code has.
         values_after_block: True for values computed from the features of the keys, as in the authors' code.
-        normalised: True for one more input channel of every image: its luminance without the mean and
-            contrast of its surroundings, which a grey and a colour camera see alike.
+        normalised: True for one more input channel of every image: the mean of its channels, without mean
+            and contrast of its surroundings, which a grey and a colour camera see alike.
         equal_resolution: True to resize betas to about alpha's angular resolution first.
     """
 

@@ -131,10 +131,10 @@ class NoiseLevel:
         return _interpolated(_smoothed(image), mean, deviation)
 
     def unbiased(self, image: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
-        """Correct the bias of a noisy image, so that local means are those of the ideal image.
+        """Correct the bias of a noisy image, so that local means come near the ideal image's.
 
-        Clipping at black makes the mean too bright, sRGB encoding makes it too dark: by up to 0.05 and 0.03
-        for 50 electrons at white. Denoisers that average values keep this bias.
+        Clipping at black makes the mean too bright, the more so with read noise; sRGB encoding makes it too
+        dark. Denoisers that average values keep this bias.
 
         Returns:
             The corrected sRGB image, of the same shape; not clipped.

@@ -37,7 +37,6 @@ def score(image: Float[Tensor, "_ _ _"], ground_truth: Float[Tensor, "_ _ _"]) -
     Returns:
         PSNR in dB, infinite for equal images, and SSIM of Wang et al. 2004: Gaussian window of sigma 1.5 (11
         x 11), K1 = 0.01, K2 = 0.03, population covariance. NaN values give NaN.
-        population covariance. NaN values give NaN.
 
     Raises:
         ValueError: if the shapes differ, or a side is under 11 pixels.

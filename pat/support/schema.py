@@ -39,10 +39,10 @@ def to_document(value: Any, *, defaults: bool = False) -> Any:
 
 
 def from_document(kind: type[T], document: Any, entry: str = "") -> T:
-    """Convert a document to a dataclass, or to another annotated type.
+    """Convert a document to a dataclass, or to another type that its fields may have.
 
     Args:
-        kind: the type wanted.
+        kind: dataclass, or plain type, `Path`, `Literal`, tuple, mapping or union; not `list`.
         document: mappings, lists and plain values; text such as "1e3" is accepted for a number.
         entry: name of the document's place in messages.
 

@@ -21,6 +21,7 @@ import tomllib
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
+SAMPLE = ROOT / "pat" / "app" / "sample"
 EXPLORE = """
 from pathlib import Path
 import pat
@@ -113,7 +114,7 @@ def used(folder: Path, wheel: Path, python: str, which: str, torch: str | None, 
         shutil.rmtree(work, ignore_errors=True)
         work.mkdir()
         for name in ("mono.png", "colour.png"):
-            shutil.copy(ROOT / "pat" / "data" / "sample" / name, work)
+            shutil.copy(SAMPLE / name, work)
         (work / "explore.py").write_text(EXPLORE)
         times = [timed(here, step.split(), work) for step in STEPS.values()]
         times += [
@@ -135,7 +136,7 @@ def geometry_alone(folder: Path, wheel: Path, python: str, torch: str | None, ke
     try:
         words = ["--constraint", ROOT / "constraints.txt", *([f"torch=={torch}"] if torch else ["torch"])]
         call(here, "pip", "install", *words, wheel)
-        shutil.copy(ROOT / "pat" / "data" / "sample" / "rig.yaml", folder)
+        shutil.copy(SAMPLE / "rig.yaml", folder)
         seconds = timed(here, ["python", "-c", GEOMETRY], folder)
         packages = call(here, "python", "-m", "pip", "list", "--format=freeze").split()
         print(
@@ -156,7 +157,7 @@ def lowest(torch: str | None) -> str:
     """Last patches of the oldest versions pyproject.toml allows; without torch if a version is given."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     pinned = [re.sub(r">=(\d+)$", r">=\1.0", requirement) for requirement in project["dependencies"]]
-    pinned = [re.sub(">=(.*)", r"==\1.*", requirement) for requirement in pinned]
+    pinned = [re.sub(">=([^,]*).*", r"==\1.*", requirement) for requirement in pinned]
     return "\n".join(line for line in pinned if not (torch and line.startswith("torch==")))
 
 

@@ -182,13 +182,13 @@ def device_of(name: str) -> str:
 
 
 def field_named(name: str) -> ReceptiveField | None:
-    """Make the receptive field of that name.
+    """Make the receptive field of that name; for MODULE:OBJECT import the module, which runs its code.
 
     Returns:
         The field; None for "auto".
 
     Raises:
-        ValueError: for an unknown name.
+        ValueError: for an unknown name, and a module or object that cannot be imported.
     """
     from arraygeom.fields import named_field
 
@@ -310,10 +310,11 @@ def read_frames(rig: Rig, texts: Iterable[str]) -> list[dict[str, Tensor]]:
     """Read images of `--image NAME=FILE` as frames: the first of every camera, then the second ones.
 
     Returns:
-        Images by camera, for each frame.
+        Images (C, H, W) in 0..1 by camera, for each frame, of the files' own sizes.
 
     Raises:
-        ValueError: for no images, and cameras with unequal numbers of them.
+        ValueError: for no images, text other than NAME=FILE, cameras that the rig lacks, cameras with unequal
+            numbers of images, and files that are no images.
         FileNotFoundError: for a missing file.
     """
     from ...fusion.views import read_view

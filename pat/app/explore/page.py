@@ -58,8 +58,8 @@ class Explorer:
         """Compute what is drawn for a state of the controls.
 
         Returns:
-            The values of `answers.answer`, or for impossible controls `error`, a message; and the control
-            `asked` as it was given.
+            The values of `answers.answer`, or for impossible controls and without a scene `error`, a
+            message; with a scene also the control `asked` as it was given.
         """
         if self.scene is None:
             return {"error": self.error}

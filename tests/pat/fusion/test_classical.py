@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from arraygeom import Camera, Pose, Rig
-from pat.fusion.classical import _rectified_plane, _regressed, classical, classical_fusion
+from pat.fusion.classical import _rectified_plane, _regressed, classical, classical_baseline, classical_fusion
 from pat.lab.data import StereoPair, middlebury_pairs
 from pat.lab.evaluation.protocols import mono_colour_task
 from pat.media.colour import luminance, to_luma_chroma
@@ -178,3 +178,12 @@ def test_teddy_keeps_its_colours(shared_data):
     )
     assert result.psnr > grey.psnr + 10
     assert result.ssim > grey.ssim + 0.1
+
+
+def test_a_baseline_without_the_image_of_a_beta_is_refused():
+    K = torch.tensor([[160.0, 0, 79.5], [0, 160, 47.5], [0, 0, 1]])
+    rig = Rig(
+        {name: Camera(K=K, cam_from_world=Pose.identity(), hw=(96, 160)) for name in "ab"}, depth=(1.0, 9.0)
+    )
+    with pytest.raises(ValueError, match="'a'"):
+        classical_baseline(rig, {"a": torch.zeros(1, 96, 160)}, "a")

@@ -114,9 +114,9 @@ def test_of_many_seen_pixels_some_are_searched_and_all_unseen_ones_filled(monkey
     weight = np.ones((h, w), np.float32)
     weight[:, :400] = 0.0
     searched = []
-    tree = examples.cKDTree
+    search = examples.nearest_points
     monkeypatch.setattr(examples, "SETTINGS", replace(SETTINGS, sources=2000))
-    monkeypatch.setattr(examples, "cKDTree", lambda x, **how: searched.append(len(x)) or tree(x, **how))
+    monkeypatch.setattr(examples, "nearest_points", lambda x, *of: searched.append(len(x)) or search(x, *of))
     found = by_examples(np.where(weight > 0, colour, np.float32(9)), alpha, weight, ROWS)
     assert len(searched) == 1
     assert 500 < searched[0] <= 2000

@@ -8,6 +8,7 @@ from arraygeom import Rig
 from arraygeom.fields import FIELDS
 from arraygeom.io import READERS
 from arraygeom.lenses import CAMERA_MODELS
+from arraygeom.runtime.extras import imported
 from tests.pat.commands import pat
 
 MINE = '''
@@ -97,3 +98,9 @@ def test_an_installed_plugin_needs_no_option(mine, monkeypatch, capsys):
     monkeypatch.syspath_prepend(mine)
     pat("rig convert array.mine native.yaml")
     assert Rig.load(mine / "native.yaml").names == ("left", "right")
+
+
+@pytest.mark.parametrize("name", ["./own.py:Field", "nowhere:Field", "math:nothing"])
+def test_what_cannot_be_imported_is_named(name):
+    with pytest.raises(ValueError, match="field"):
+        imported(name, "field")

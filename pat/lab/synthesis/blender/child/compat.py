@@ -13,7 +13,8 @@ def load() -> Any:
     """Import the module bpy.
 
     Raises:
-        ValueError: with the command to install what is missing, in one line.
+        ValueError: where bpy cannot be imported, in one line; it names the missing module, or the
+            command that installs missing libraries of the system.
     """
     try:
         return importlib.import_module("bpy")

@@ -1,0 +1,31 @@
+"""Nearest neighbours among points of a few dimensions."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
+
+KD_TREE = 4
+"""OpenCV's number of a single k-d tree, whose search is exact up to its `eps`."""
+
+
+def nearest_points(
+    points: Float[NDArray, "n d"], queries: Float[NDArray, "m d"], count: int, error: float = 0.0
+) -> tuple[Int[NDArray, "m count"], Float[NDArray, "m count"]]:
+    """Find the nearest points of each query by a k-d tree (OpenCV's FLANN).
+
+    Args:
+        points: points to search, `count` at least.
+        queries: points whose neighbours are wanted.
+        count: number of neighbours of each.
+        error: share by which a neighbour may be farther away than the one it stands for; 0 searches exactly.
+
+    Returns:
+        Rows of `points`, nearest first, and Euclidean distances, float32.
+    """
+    points, queries = (np.ascontiguousarray(x, np.float32) for x in (points, queries))
+    tree = cv2.flann.Index(points, {"algorithm": KD_TREE, "leaf_max_size": 10})
+    index, squared = tree.knnSearch(queries, count, params={"eps": error})
+    return index, np.sqrt(squared)
