@@ -121,7 +121,8 @@ PHOTOS ?= $(DATA)/photos/city100
 
 trained-fields: $(READY)
 	@$(BIN)/python -m experiments trained-fields --photos $(PHOTOS) --out out/trained-fields
-	@$(BIN)/python -m docs.update_readme --document docs/reports/paper.md --block trained-fields=out/trained-fields/trained.md
+	@$(BIN)/python -m docs.update_readme --document docs/reports/paper.md --block trained-fields=out/trained-fields/trained.md \
+		--image out/trained-fields/errors.png docs/reports/trained_fields.jpg
 
 test: $(READY)
 	@echo "== tests"

@@ -14,7 +14,7 @@ from torch import Tensor
 from .batching import Batched
 from .checks import check_above, check_batches, check_hw, check_K, checking
 from .distortion import Distortion
-from .kornia_models import from_kornia_model, to_kornia_model
+from .kornia_models import from_kornia_model, to_kornia_model, to_pinhole
 from .lenses.common import on_plane
 from .lenses.model import LensModel, check_model
 from .pixels import (
@@ -95,7 +95,7 @@ class View(Batched):
         hw = self.hw if quarter_turns % 2 == 0 else (self.hw[1], self.hw[0])
         return self.transformed(rot90_matrix(self.hw, quarter_turns), hw)
 
-    def transformed(self: AnyView, A: Float[Tensor, "3 3"], hw: HW) -> AnyView:
+    def transformed(self: AnyView, A: Float[Tensor, "*b 3 3"], hw: HW) -> AnyView:
         """Return the view of images with pixels x' ~ A x and size `hw`."""
         return self.replace(hw=hw)
 
@@ -255,8 +255,16 @@ class LensView(View):
         """
         return self._each_through(lambda lens, xy: lens.distort(xy), x)
 
-    def transformed(self: AnyLensView, A: Float[Tensor, "3 3"], hw: HW) -> AnyLensView:
-        """Return the view of images with pixels x' ~ A x and size `hw`: K' = A K."""
+    def transformed(self: AnyLensView, A: Float[Tensor, "*b 3 3"], hw: HW) -> AnyLensView:
+        """Return the view of images with pixels x' ~ A x and size `hw`: K' = A K.
+
+        A may be that of kornia's augmentations (`transform_matrix`), mirrored too, one for each of a batch.
+
+        Raises:
+            ValueError: for a perspective A, whose images no K describes.
+        """
+        if checking() and not bool(((A[..., 2, :] - A.new_tensor([0, 0, 1])).abs() < 1e-6).all()):
+            raise ValueError("A is a perspective, which no K follows: crop, resize, mirror, rotate or shear")
         return self.replace(K=product(A.to(self.K), self.K), hw=hw)
 
     def _each_through(self, f: ThroughLens, x: Tensor) -> tuple[Tensor, Tensor]:
@@ -373,16 +381,9 @@ class Camera(LensView):
             ValueError: for a lens, or prism or tilt terms, that kornia does not have, and with a lens for a K
                 that is skewed or rotated.
         """
-        from kornia.geometry.camera import PinholeCamera
-
         if self.distortion is not None and not self.distortion.harmless:
             return to_kornia_model(self.K, self.hw, self.distortion)
-        R, t, K = self.R.reshape(-1, 3, 3), self.t.reshape(-1, 3), self.K.reshape(-1, 3, 3)
-        row = K.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(K), 1, 4)
-        intrinsics = torch.cat([torch.cat([K, K.new_zeros(len(K), 3, 1)], -1), row], -2)
-        extrinsics = torch.cat([torch.cat([R, t[..., None]], -1), row], -2)
-        h, w = (K.new_full((len(K),), n) for n in self.hw)
-        return PinholeCamera(intrinsics, extrinsics, h, w)
+        return to_pinhole(self.K, self.cam_from_world, self.hw)
 
     @classmethod
     def from_kornia(

@@ -1,8 +1,9 @@
-"""Conversion of intrinsics and lenses to and from kornia's camera models (`kornia.sensors.camera`), which
-have no pose."""
+"""Conversion to and from kornia's camera models (`kornia.sensors.camera`), which have no pose, its batches of
+pinholes and its stereo cameras."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import torch
@@ -14,8 +15,10 @@ from .distortion import BROWN_CONRADY, KANNALA_BRANDT, Distortion
 from .lenses import Orthographic
 from .lenses.model import LensModel
 from .pixels import HW, broadcast_shapes
+from .pose import Pose
 
 if TYPE_CHECKING:
+    from kornia.geometry.camera import PinholeCamera, StereoCamera
     from kornia.sensors.camera import CameraModel
 
 BROWN_TERMS = 8
@@ -86,3 +89,57 @@ def from_kornia_model(model: CameraModel) -> tuple[Float[Tensor, "*b 3 3"], HW, 
     elif isinstance(model.distortion, KannalaBrandtK3Transform):
         lens = Distortion(KANNALA_BRANDT, numbers)
     return model.matrix(), (int(model.height), int(model.width)), lens
+
+
+def to_pinhole(K: Float[Tensor, "*b 3 3"], cam_from_world: Pose, hw: HW) -> PinholeCamera:
+    """Make kornia's `PinholeCamera`, a batch of one or more."""
+    from kornia.geometry.camera import PinholeCamera
+
+    intrinsics = pad(K.reshape(-1, 3, 3), (0, 1, 0, 1))
+    intrinsics[:, 3, 3] = 1
+    h, w = (K.new_full((len(intrinsics),), n) for n in hw)
+    return PinholeCamera(intrinsics, cam_from_world.matrix.reshape(-1, 4, 4), h, w)
+
+
+def pinholes_by_name(
+    cameras: Mapping[str, PinholeCamera] | PinholeCamera | StereoCamera, hw: HW | None = None
+) -> Mapping[str, PinholeCamera]:
+    """Name kornia's cameras; the cameras of a batch are "camera0" and so on, of a pair "left" and "right".
+
+    Args:
+        cameras: pinholes by name, which stay; a batch of pinholes; or a `StereoCamera`.
+        hw: height and width of the images of a `StereoCamera`, whose left camera is at the world's origin.
+
+    Raises:
+        ValueError: for a `StereoCamera` without `hw`.
+        TypeError: for anything else.
+    """
+    from kornia.geometry.camera import PinholeCamera, StereoCamera
+
+    if isinstance(cameras, Mapping):
+        return cameras
+    if isinstance(cameras, PinholeCamera):
+        parts = cameras.intrinsics, cameras.extrinsics, cameras.height, cameras.width
+        return {
+            f"camera{i}": PinholeCamera(*each) for i, each in enumerate(zip(*(p.split(1) for p in parts)))
+        }
+    if not isinstance(cameras, StereoCamera):
+        kind = type(cameras).__name__
+        raise TypeError(f"a {kind} is none of PinholeCameras by name, a batch of them, and StereoCamera")
+    if hw is None:
+        raise ValueError("a StereoCamera states no image size: give hw=(height, width)")
+    made = {}
+    for name, P in (("left", cameras.rectified_left_camera), ("right", cameras.rectified_right_camera)):
+        K = P[..., :3]
+        made[name] = to_pinhole(
+            K, Pose(torch.eye(3).to(K).expand_as(K), torch.linalg.solve(K, P[..., 3])), hw
+        )
+    return made
+
+
+def to_pinhole_batch(cameras: Mapping[str, PinholeCamera]) -> PinholeCamera:
+    """Join cameras, as `Rig.to_kornia` returns them, to one batch, in their order; sizes may differ."""
+    from kornia.geometry.camera import PinholeCamera
+
+    parts = [(c.intrinsics, c.extrinsics, c.height, c.width) for c in cameras.values()]
+    return PinholeCamera(*map(torch.cat, zip(*parts)))

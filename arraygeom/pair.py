@@ -68,11 +68,11 @@ class Link(Batched):
     def _text(self) -> str:
         return "F" if self.H is None else "F and H" if self.F.any() else "H"
 
-    def transformed(self, A_alpha: Float[Tensor, "3 3"], A_beta: Float[Tensor, "3 3"]) -> Link:
+    def transformed(self, A_alpha: Float[Tensor, "*b 3 3"], A_beta: Float[Tensor, "*c 3 3"]) -> Link:
         """Return the link between images whose pixels are A x of the old ones."""
         A_alpha, A_beta = A_alpha.to(self.F), A_beta.to(self.F)
         back = torch.linalg.inv(A_alpha)
-        F = product(product(torch.linalg.inv(A_beta).T, self.F), back)
+        F = product(product(torch.linalg.inv(A_beta).mT, self.F), back)
         H = None if self.H is None else product(product(A_beta, self.H), back)
         return Link(F, H, self.spread and self.spread * _enlargement(A_beta))
 

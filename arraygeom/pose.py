@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import reduce
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from jaxtyping import Float, Real
@@ -19,6 +19,7 @@ from .runtime.tracing import traced
 
 if TYPE_CHECKING:
     from kornia.geometry.liegroup import Se3
+    from kornia.geometry.pose import NamedPose
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -125,12 +126,20 @@ class Pose(Batched):
         return rotation_matrix_to_quaternion(self.R)
 
     @classmethod
-    def from_kornia(cls, pose: Se3) -> Pose:
-        """Make a pose of kornia's `Se3`, with its gradient."""
-        return cls.from_matrix(pose.matrix())
+    def from_kornia(cls, pose: Se3 | NamedPose) -> Pose:
+        """Make a pose of kornia's `Se3`, or of the `Se3` of a `NamedPose`, with its gradient.
+
+        Raises:
+            ValueError: for a pose in the plane (`Se2`).
+        """
+        given: Any = getattr(pose, "pose", pose)
+        return cls.from_matrix(given.matrix())
 
     def to_kornia(self) -> Se3:
-        """Convert to kornia's `Se3`, which stores a quaternion: R comes back except for rounding."""
+        """Convert to kornia's `Se3`, which stores a quaternion: R comes back except for rounding.
+
+        `kornia.geometry.pose.NamedPose(pose.to_kornia(), "world", "mono")` gives its frames their names.
+        """
         from kornia.geometry.liegroup import Se3, So3
         from kornia.geometry.quaternion import Quaternion
 

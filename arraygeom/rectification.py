@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -15,6 +15,9 @@ from .pair import Pair
 from .pixels import HW, product
 from .pose import Pose, cross_matrix, matvec, rotation_from_vector, rotation_vector
 from .runtime.tracing import needs_numbers
+
+if TYPE_CHECKING:
+    from kornia.geometry.camera import StereoCamera
 
 
 class Rectification(NamedTuple):
@@ -135,3 +138,26 @@ def _middle_ray(camera: Camera, R: Tensor) -> Tensor:
     """Ray of the image's middle in the rotated frame."""
     h, w = camera.hw
     return matvec(R, camera.rays(camera.K.new_tensor([(w - 1) / 2, (h - 1) / 2]))[0])
+
+
+def to_stereo_camera(pair: Pair) -> StereoCamera:
+    """Convert a rectified pair, alpha on the left, as `arraygeom.rectify` makes it (`.pair`).
+
+    Raises:
+        ValueError: for a pair that is not rectified, or whose beta is not to the right of alpha.
+    """
+    from kornia.geometry.camera import StereoCamera
+
+    alpha, beta = pair.cameras
+    pose, K = pair.beta_from_alpha, alpha.K.reshape(-1, 3, 3)
+    t = pose.t.reshape(-1, 3)
+    turned, other = (pose.R - torch.eye(3).to(pose.R)).abs().max(), (beta.K - alpha.K).abs().max()
+    aside = (t[:, 1:].abs().amax(-1) > -ROUNDED * t[:, 0]).any()
+    if pair.has_lens or bool(aside | (turned > ROUNDED) | (other > ROUNDED * K.max())):
+        raise ValueError("kornia's StereoCamera is a rectified pair, beta on the right: rectify(pair).pair")
+    right = K[..., :1] * t[:, :1, None]
+    return StereoCamera(torch.cat([K, torch.zeros_like(right)], -1), torch.cat([K, right], -1))
+
+
+ROUNDED = 1e-5
+"""Difference of two numbers, relative, that rounding in float32 explains."""

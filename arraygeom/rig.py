@@ -17,12 +17,13 @@ from torch import Tensor
 from .batching import Batched, map_tensors
 from .camera import Camera, LensView, View, view_facts
 from .checks import check_above, check_tensors, checking, derived
+from .kornia_models import pinholes_by_name
 from .pair import Link, Pair, depth_range
 from .pixels import HW, resize_matrix, rot90_matrix, shift_matrix
 from .runtime.text import baseline_text, depth_text, length_unit
 
 if TYPE_CHECKING:
-    from kornia.geometry.camera import PinholeCamera
+    from kornia.geometry.camera import PinholeCamera, StereoCamera
 
 SERVICES: dict[str, Callable[..., Any]] = {}
 """Functions of higher modules that `Rig` offers as methods, by name: the package registers them."""
@@ -81,27 +82,31 @@ class Rig(Batched):
 
     @classmethod
     def from_kornia(
-        cls, cameras: Mapping[str, PinholeCamera], *, batched: bool = False, **fields: Any
+        cls,
+        cameras: Mapping[str, PinholeCamera] | PinholeCamera | StereoCamera,
+        *,
+        hw: HW | None = None,
+        batched: bool = False,
+        **fields: Any,
     ) -> Rig:
-        """Make a rig of kornia's pinholes by name.
+        """Make a rig of kornia's cameras.
 
-        Kornia's cameras are always batched; `Rig(cameras)` serves as well, for batches of one or more as they
-        come.
+        Kornia's cameras are always batched; `Rig(cameras)` takes pinholes by name as well, for batches of one
+        or more as they come.
 
         Args:
+            cameras: pinholes by name; a batch of pinholes, which are the rig's cameras "camera0", "camera1"
+                and so on; or a `StereoCamera`, whose cameras are "left" and "right".
+            hw: height and width of a `StereoCamera`'s images, which it does not state; else unused.
             batched: True keeps batches of one as batches.
             fields: further fields of the rig, such as `depth`.
 
         Raises:
-            ValueError: for batches of unequal length.
-            TypeError: for other cameras than kornia's pinholes by name.
+            ValueError: for batches of unequal length, and a `StereoCamera` without `hw`.
+            TypeError: for other cameras.
         """
-        if not isinstance(cameras, Mapping):
-            kind = type(cameras).__name__
-            raise TypeError(
-                f"a {kind} is no mapping of kornia's PinholeCamera by name: give each camera a name"
-            )
-        made = {name: Camera.from_kornia(camera, batched=True) for name, camera in cameras.items()}
+        named = pinholes_by_name(cameras, hw)
+        made = {name: Camera.from_kornia(camera, batched=True) for name, camera in named.items()}
         lengths = {name: camera.batch_shape[0] for name, camera in made.items()}
         if len(set(lengths.values())) > 1:
             raise ValueError(
@@ -218,12 +223,12 @@ class Rig(Batched):
         A = rot90_matrix(self[name].hw, quarter_turns)
         return self.transformed(name, A, self[name].rot90(quarter_turns).hw)
 
-    def transformed(self, name: str, A: Float[Tensor, "3 3"], hw: HW) -> Rig:
-        """Change the pixels of one camera's image, as a crop, resize or rotation does.
+    def transformed(self, name: str, A: Float[Tensor, "*b 3 3"], hw: HW) -> Rig:
+        """Change the pixels of one camera's image, as a crop, resize, rotation or mirror does.
 
         Args:
             name: name of the camera.
-            A: matrix from pixels before to pixels after.
+            A: affine matrix from pixels before to pixels after, or one for each rig of a batch.
             hw: height and width after.
 
         Returns:

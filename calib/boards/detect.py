@@ -371,6 +371,8 @@ def _reason(grey: Grey, board: Board, *, confirmed: bool) -> str:
         return "the images have hardly any contrast: expose them longer, or light the board"
     if confirmed and isinstance(board, MarkedBoard):
         seen = len(_tags(grey, board.dictionary, board.border if isinstance(board, AprilGrid) else 1))
+        if seen < 4 and (other := _other_dictionary(grey, board)):
+            return f"{other}: another board"
         return (
             f"{seen} of its markers are readable there, too few side by side: leave the image out, or take "
             "it nearer, less steeply, or sharper"
@@ -388,7 +390,7 @@ def _reason(grey: Grey, board: Board, *, confirmed: bool) -> str:
         return "the images are blurred: focus, and hold the board still"
     margin = "" if isinstance(board, MarkedBoard) else " completely and with its white margin"
     right = "" if confirmed else "is its name right, and "
-    return f"no such board is visible{margin}: {right}is it in the image, large and lit?"
+    return f"no such board is visible{margin}: {right}is it in the image, large, lit and sharp?"
 
 
 def _marker_reason(grey: Grey, board: MarkedBoard) -> str | None:
@@ -410,18 +412,24 @@ def _marker_reason(grey: Grey, board: MarkedBoard) -> str | None:
             f"markers up to number {max(ids)} are visible and the board has "
             f"{board.markers[0]} to {last}: is its size right?"
         )
+    _, every, _ = cv2.aruco.ArucoDetector(marker_dictionary(board.dictionary)).detectMarkers(grey)
+    if every is not None and len(every) >= len(ids) + 4:
+        return "its markers are visible twice: show one such board, and no reflection of it"
     if len(ids) >= 4:
         legacy = " A board drawn by OpenCV before 4.6 needs ':legacy' at the end of its name"
         return (
             f"{len(ids)} of its markers are visible, but not at their positions: "
             f"is the size right (across x down)?{legacy if isinstance(board, Charuco) else ''}"
         )
+    other = _other_dictionary(grey, board)
+    return other and f"{other}: name that one"
+
+
+def _other_dictionary(grey: Grey, board: MarkedBoard) -> str | None:
+    """Name a dictionary of which an image shows markers; None without one."""
     for name in OTHER_DICTIONARIES:
         if len(markers := _tags(grey, name, 1)) >= 6:
-            return (
-                f"{len(markers)} markers of the dictionary {name} are visible, "
-                f"not of {board.dictionary}: name that one"
-            )
+            return f"{len(markers)} markers of the dictionary {name} are visible, not of {board.dictionary}"
     return None
 
 

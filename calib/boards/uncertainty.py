@@ -364,7 +364,7 @@ def with_disagreement(solved: Solved, board: Board, *, unchecked: bool = False) 
             notes.append(
                 "frames disagree more than the points' noise explains: standard deviations are raised, "
                 f"by up to {raised:.1f}, to those of a jackknife over frames (is the board flat and printed "
-                "true to size, and were the images sharp?)"
+                "true to size, and did it stand still, as rolling shutters shear what moves?)"
             )
     return replace(solved, covariance=covariance, raised=raised, notes=(*solved.notes, *notes))
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from jaxtyping import Bool, Float
@@ -19,22 +20,29 @@ from arraygeom.pose import rotation_vector
 from arraygeom.runtime.text import length_unit
 from arraygeom.runtime.threads import torch_in_one_thread
 
-from .depth_change import relative_change
+from .depth_change import relative_change, share_outside
 from .evidence import SCALES, DriftEvidence, FitStatistics, fit_statistics, observations
+from .explanations import undetermined
 from .hypotheses import (
+    FOCAL_SHARE,
+    FOCAL_SPREAD,
+    OFF_CENTRE,
     SHIFTS,
     TURNS,
     Hypothesis,
+    centred,
+    cropped,
     focal_length_of,
     from_degrees,
     hypotheses,
     ignored_lens,
-    implausible,
     in_degrees,
-    is_plausible,
     is_short,
+    may_be_cropped,
+    unlikelihood,
     zoomed,
 )
+from .least_squares import most_probable
 from .matches import (
     Images,
     Pairs,
@@ -45,8 +53,8 @@ from .matches import (
     image_sizes,
     match_cameras,
 )
-from .parameters import LARGEST_CHANGE, SIGMA
-from .residuals import image_parts, line_distances, related, within_lenses
+from .parameters import LARGEST_CHANGE, SIGMA, apply_change, free_parameters
+from .residuals import image_parts, line_distances, related, sampson_of_pairs, within_lenses
 
 LOG = logging.getLogger(__name__)
 
@@ -56,11 +64,11 @@ HEALTHY_MISFIT = 0.2
 """Misfit in pixels below which a rig is healthy."""
 USUAL_MISFIT = 0.0015
 """Misfit, as a share of the image's longer side, below which a rig is healthy if no mistake explains it."""
-FOCAL_SHARES, FOCAL_SHARE = (0.3, 3.0), 1.2
-"""Focal lengths that are tried (lowest and highest), and the one preferred among equal ones, all as shares of
-the image's longer side."""
-OF_SIZES = ("resized", "focal length")
-"""Kinds of mistakes that an image's size shows where lines may not."""
+FOCAL_SHARES = (0.3, 3.0)
+"""Focal lengths that are tried, lowest and highest, as shares of the image's longer side."""
+ROUNDS, UNLIKELY = 3, 0.03
+"""Rounds of a search, and pixels that a number costs which is one prior deviation off, for where points do
+not determine it."""
 EQUAL = (1.4, 0.03)
 """Explanations count as equal whose misfit is less than 1.4 times the best one's plus 0.03 px."""
 LARGEST_REMAINDER = (0.33, 0.2)
@@ -69,7 +77,7 @@ drifted rig somewhat; and the least share of another explanation's remainder tha
 both are to be compared."""
 MARGIN, TIE = 12.0, 2.0
 """Lead in -2 log evidence over a drift that a mistake needs to be named, within which others are as good; and
-the lead within which the likelier mistake is named."""
+the lead within which the likelier mistake is named. A repair with estimated numbers needs `MARGIN` more."""
 MOST_COMPARED = 10
 """Number of explanations whose evidence is computed: those with the least misfit."""
 EXPLAINED, ROUGHLY = (2 * HEALTHY_MISFIT, 0.06), 0.9
@@ -78,6 +86,9 @@ pixels for hypotheses whose rig is approximate."""
 SAME_DEPTH, SAME_DISTANCE = 1e-3, 1e-3
 """Differences below which two rigs are the same: of depths (relative), and of distances from lines (pixels),
 in the median."""
+OUTSIDE = 100.0
+"""-2 log evidence against a repair that brings all points out of the depth range; a share of them has its
+share of it."""
 BARREL, PINCUSHION = -0.6, 0.4
 """Bounds of k1 times the squared radius of the farthest corner, at z = 1."""
 
@@ -100,6 +111,7 @@ class Diagnosis:
         depth: depth bounds (near, far) of the points by the named rig, in its unit; None if that rig states a
             depth range or too few points have depth.
         beyond: number of points left out because they lie beyond the range of a lens model of the given rig.
+        undetermined: sentences on pairs whose points determine no lines.
     """
 
     named: Hypothesis
@@ -112,6 +124,7 @@ class Diagnosis:
     certain: bool
     depth: tuple[float, float] | None = None
     beyond: int = 0
+    undetermined: tuple[str, ...] = ()
 
     @property
     def verdict(self) -> str:
@@ -149,7 +162,7 @@ class Diagnosis:
             )
         if self.named.kind != "nothing":
             lines.append(f"repaired: {self.after.as_text(unit)}")
-        lines.append(f"from {self.matches} points seen in two images")
+        lines += [f"from {self.matches} points seen in two images", *self.undetermined]
         if self.depth is not None:
             near, far = (f"{bound:.3g}" for bound in self.depth)
             lines.append(
@@ -172,6 +185,7 @@ class Diagnosis:
             "healthy": self.healthy,
             "matches": self.matches,
             "beyond_lenses": self.beyond,
+            "undetermined": self.undetermined,
             "depth": self.depth,
             "before": _rounded(self.before),
             "after": _rounded(self.after),
@@ -227,42 +241,44 @@ def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnos
     tried = hypotheses(rig, sizes)
     if fits:
         tried += [*_ignored_lens(rig, pairs), *_degrees(rig, pairs), *_depth_range(rig, pairs)]
-        tried += _zoomed(rig, pairs)
+        tried += [*_zoomed(rig, pairs), *_cropped(rig, pairs)]
     LOG.info("trying %d mistakes on %d pairs", len(tried), len(pairs))
     fit, inliers, noise = fit_statistics(tried, pairs)
     misfit = {h: f.penalised_misfit for h, f in fit.items()}
     unchanged = named = tried[0]
     table = sorted(tried if fits else tried[1:], key=lambda h: misfit[h])
-    odd = implausible(rig) if fits else []
-    by_size = [h for h in table if odd and h.kind in OF_SIZES and is_plausible(h.rig, odd)]
-    by_size = [h for h in by_size if misfit[h] <= EQUAL[0] * misfit[unchanged] + EQUAL[1]]
-    healthy = fits and misfit[unchanged] < HEALTHY_MISFIT and not by_size
+    least = misfit[next(h for h in table if not h.approximate)]  # estimated numbers fit a rig's misfit too
+    equal, usual = EQUAL[0] * least + EQUAL[1], USUAL_MISFIT * max(map(max, sizes.values()))
+    fitting = [h for h in table if misfit[h] <= min(max(equal, usual), 3 * usual)]
+    likelier = [h for h in fitting if fits and unlikelihood(h.rig) + MARGIN < unlikelihood(rig)]
+    healthy = fits and misfit[unchanged] < HEALTHY_MISFIT and not likelier
     as_good: list[Hypothesis] = []
     if not fits:
-        as_good = [h for h in table if misfit[h] <= EQUAL[0] * misfit[table[0]] + EQUAL[1]]
+        as_good = [h for h in table if misfit[h] <= equal]
         named = min(as_good, key=tried.index)
+    elif likelier:
+        unlike = {h: _off_sizes(h.rig, pairs) + MARGIN * h.approximate for h in likelier}
+        named = next(h for h in tried if unlike.get(h, math.inf) <= min(unlike.values()) + TIE)
+        as_good = sorted(likelier, key=lambda h: unlike[h])
     elif not healthy:
-        if not misfit[unchanged] < HEALTHY_MISFIT:
-            LOG.info("comparing the mistakes that leave least with a drift")
-            mirrored = fit[unchanged].handed < 0.5
-            named, as_good = _by_evidence(misfit, table, pairs, inliers, noise, mirrored=mirrored)
-        if named is unchanged and by_size:
-            named, as_good = min(by_size, key=lambda h: _far_from_range(h, fit[h].depth)), by_size
-        usual = USUAL_MISFIT * max(max(hw) for hw in sizes.values())
+        LOG.info("comparing the mistakes that leave least with a drift")
+        mirrored = fit[unchanged].handed < 0.5
+        named, as_good = _by_evidence(misfit, table, pairs, inliers, noise, mirrored=mirrored)
         healthy = named is unchanged and not as_good and misfit[unchanged] < usual
-    equal = {h.kind: h for h in reversed(as_good) if h.kind != named.kind}
-    others = (h for h in as_good if h is not named)
+    others = {h: _same_rig(named.rig, h.rig, pairs) for h in as_good if h is not named}
+    others_of_kind = {h.kind: h for h in reversed(others) if h.kind != named.kind or not others[h]}
     return Diagnosis(
         named,
-        tuple(equal.values()),
+        tuple(others_of_kind.values()),
         before=fit[unchanged],
         after=fit[named],
         tried={h: fit[h] for h in table},
         matches=(points_used := sum(len(matches.alpha) for matches in pairs.values())),
         beyond=points - points_used,
         healthy=healthy,
-        certain=named is not unchanged and all(_same_rig(named.rig, h.rig, pairs) for h in others),
+        certain=named is not unchanged and all(others.values()),
         depth=depth_seen(named.rig, pairs) if named.rig.depth is None else None,
+        undetermined=undetermined(named.rig, pairs),
     )
 
 
@@ -285,24 +301,26 @@ def _by_evidence(
     Args:
         misfit: pixels of each hypothesis, likely ones first.
         table: the hypotheses, those with the least misfit first.
+        mirrored: True if the points are mirrored in the rig as given.
 
     Returns:
         The chosen hypothesis, and all that are as good as it, or as the drift, best first.
     """
     unchanged = next(iter(misfit))
     limit = LARGEST_REMAINDER[0] * misfit[unchanged]
-    candidates = [h for h in table if h is not unchanged and misfit[h] <= limit][:MOST_COMPARED]
+    candidates = [h for h in table if h is not unchanged and misfit[h] <= limit]
     if not candidates:
         return unchanged, []
     limit = misfit[candidates[0]] / LARGEST_REMAINDER[1] + EQUAL[1]
+    candidates = [h for h in candidates if misfit[h] <= limit][:MOST_COMPARED]
     evidence_for = {
-        h: DriftEvidence.from_points(h.rig, pairs, inliers, noise)
+        h: DriftEvidence.from_points(h.rig, pairs, inliers, noise, unlikelihood(h.rig))
         for h in (unchanged, *candidates)
-        if misfit[h] <= limit or h is unchanged
     }
     drift = evidence_for.pop(unchanged)
     least = min(evidence.cost for evidence in evidence_for.values())
-    best = next(h for h in misfit if h in evidence_for and evidence_for[h].cost <= least + TIE)
+    costs = {h: evidence.cost + MARGIN * h.approximate for h, evidence in evidence_for.items()}
+    best = next(h for h in misfit if costs.get(h, math.inf) <= min(costs.values()) + TIE)
     allowed = max(ROUGHLY if best.approximate else EXPLAINED[0], EXPLAINED[1] * misfit[unchanged])
     parts = image_parts(unchanged.rig, pairs)
     parts_left_out = (inliers & (parts != number) for number in parts.unique().tolist())
@@ -317,6 +335,12 @@ def _by_evidence(
     ranked = sorted(evidence_for, key=lambda h: evidence_for[h].cost)
     as_good = [h for h in ranked if evidence_for[h].cost <= bound or misfit[h] <= near]
     return best if is_named else unchanged, as_good
+
+
+def _off_sizes(rig: Rig, pairs: Pairs) -> float:
+    """Return -2 log probability of a rig by the images' sizes and its depth range, which lines do not see."""
+    outside = share_outside(rig, pairs)
+    return unlikelihood(rig) + OUTSIDE * (1.0 if math.isnan(outside) else outside)
 
 
 def _same_rig(rig: Rig, other: Rig, pairs: Pairs) -> bool:
@@ -347,26 +371,31 @@ def _ignored_lens(rig: Rig, pairs: Pairs) -> list[Hypothesis]:
         return []
     corners = [rig[name].rays(coarse_grid(rig[name].hw).reshape(-1, 2))[0][:, :2] for name in bare]
     squared = max(float(rays.norm(dim=-1).max()) for rays in corners) ** 2
-    lowest, highest = BARREL / squared, PINCUSHION / squared
-    k1 = 0.0
-    for _ in range(3):
-        candidates = torch.linspace(lowest, highest, 13, dtype=torch.float64).tolist()
-        off = observations([ignored_lens(rig, bare, k).rig for k in candidates], pairs).off
-        best = int(off.abs().median(1).values.argmin())
-        k1, step = candidates[best], candidates[1] - candidates[0]
-        lowest, highest = k1 - step, k1 + step
-    return [ignored_lens(rig, bare, k1)]
+    k1 = BARREL / squared, PINCUSHION / squared
+    return [_searched(partial(ignored_lens, rig, bare), k1, (0.0, 1 / squared), pairs)[0]]
 
 
-def _far_from_range(hypothesis: Hypothesis, depth: float) -> float:
-    """Return the absolute log ratio of the points' median depth to the middle of the depth range.
+def _searched(
+    make: Callable[[float], Hypothesis], bounds: tuple[float, float], prior: tuple[float, float], pairs: Pairs
+) -> tuple[Hypothesis, float]:
+    """Search for the number of a mistake that leaves points nearest their lines, in the median.
 
-    0 where the rig states no range or one that begins at 0, or the depth is unknown.
+    Args:
+        make: function from the number to the hypothesis.
+        bounds: least and largest number.
+        prior: mean and standard deviation of the number without points.
+
+    Returns:
+        The hypothesis, and its number.
     """
-    if hypothesis.rig.depth is None or not (depth > 0 and float(hypothesis.rig.depth[0]) > 0):
-        return 0.0
-    near, far = (float(bound) for bound in hypothesis.rig.depth)
-    return abs(math.log(depth) - math.log(near * min(far, 100 * near)) / 2)
+    (low, high), (mean, deviation) = bounds, prior
+    for _ in range(ROUNDS):
+        numbers = torch.linspace(low, high, 25, dtype=torch.float64)
+        off = observations([make(number).rig for number in numbers.tolist()], pairs).off
+        off = off.abs().median(1).values + UNLIKELY * ((numbers - mean) / deviation).square()
+        best, step = float(numbers[off.argmin()]), (high - low) / 24
+        low, high = best - step, best + step
+    return make(best), best
 
 
 def _zoomed(rig: Rig, pairs: Pairs) -> list[Hypothesis]:
@@ -376,19 +405,32 @@ def _zoomed(rig: Rig, pairs: Pairs) -> list[Hypothesis]:
     short = [name for name in names if is_short(rig[name])]
     zooms = []
     for group in [short] if short else [[name] for name in names]:
-        length, side = focal_length_of(rig[group[0]]), max(rig[group[0]].hw)
-        low, high = (math.log(share * side / length) for share in FOCAL_SHARES)
-        for _ in range(3):
-            factors = torch.linspace(low, high, 25, dtype=torch.float64).exp().tolist()
-            off = observations([zoomed(rig, group, factor).rig for factor in factors], pairs).off
-            off = off.abs().median(1).values
-            equal = [f for f, o in zip(factors, off) if o <= EQUAL[0] * off.min() + EQUAL[1]]
-            best = min(equal, key=lambda f: abs(math.log(f * length / (FOCAL_SHARE * side))))
-            step = (high - low) / 24
-            low, high = math.log(best) - step, math.log(best) + step
-        if abs(math.log(best)) > LARGEST_CHANGE * SIGMA["focal"]:
-            zooms.append(zoomed(rig, group, best))
+        share = focal_length_of(rig[group[0]]) / max(rig[group[0]].hw)
+        low, high, middle = (math.log(s / share) for s in (*FOCAL_SHARES, FOCAL_SHARE))
+        make = partial(lambda group, zoom: zoomed(rig, group, math.exp(zoom)), group)
+        found, zoom = _searched(make, (low, high), (middle, FOCAL_SPREAD), pairs)
+        if abs(zoom) > LARGEST_CHANGE * SIGMA["focal"]:
+            zooms.append(found)
     return zooms
+
+
+def _cropped(rig: Rig, pairs: Pairs) -> Iterator[Hypothesis]:
+    """Fit principal points, of one camera or of all, if the rig has them far off the middle."""
+    odd = [name for name in cameras_of(rig, pairs) if may_be_cropped(rig, name)]
+    for group in [*([odd] if len(odd) > 1 else []), *([name] for name in odd)]:
+        middle = centred(rig, group)
+        sigma = {"centre": OFF_CENTRE * max(rig[group[0]].hw)}
+        parameters = free_parameters(
+            middle, cameras_of(rig, pairs), free=[f"{name}.centre" for name in group], sigma=sigma
+        )
+        after = partial(apply_change, middle, parameters)
+        z = torch.zeros(sum(len(u.sigma) for u in parameters), dtype=torch.float64)
+        z = most_probable(
+            lambda z, after=after: sampson_of_pairs(after(z), pairs), z, torch.eye(len(z)).to(z)
+        )
+        repaired = after(z)
+        if not any(may_be_cropped(repaired, name) for name in group):
+            yield cropped(repaired, group)
 
 
 def _degrees(rig: Rig, pairs: Pairs) -> list[Hypothesis]:

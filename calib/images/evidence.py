@@ -50,10 +50,10 @@ SCALES = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 4.0)
 """Drifts tried, in units of the prior deviations."""
 RARE = 6.0
 """Factor of log(1 + s^2) in -2 log probability of a drift of scale s: larger drifts are rarer."""
-STEPS = 4
-"""Steps of Gauss and Newton to the most probable drift."""
+STEPS = 12
+"""Most steps of Gauss and Newton to the most probable drift; the best counts, as the first may overshoot."""
 NO_BETTER = 0.1
-"""Improvement of the evidence below which these steps end."""
+"""Change of the evidence below which these steps end."""
 CLIPPED = 30.0
 """Largest residual that counts, pixels."""
 
@@ -262,12 +262,15 @@ class DriftEvidence:
     clipped: float
 
     @classmethod
-    def from_points(cls, rig: Rig, pairs: Pairs, used: Bool[Tensor, " n"], noise: float) -> DriftEvidence:
+    def from_points(
+        cls, rig: Rig, pairs: Pairs, used: Bool[Tensor, " n"], noise: float, prior: float = 0.0
+    ) -> DriftEvidence:
         """Fit the drift of a rig to some of its matched points.
 
         Args:
             used: mask of the points to use, among all points of all pairs.
             noise: standard deviation of the points' distances, pixels.
+            prior: -2 log probability of the rig without any points.
 
         Returns:
             The rig's drift with its evidence.
@@ -281,22 +284,24 @@ class DriftEvidence:
         r, J = jacobian(distances, z)
         B = systematic_columns(rig, pairs) / noise
         wrong_side = _rotation_to_plausible_depth(rig, pairs)
-        fixed = {scale: RARE * math.log1p(scale**2) + (wrong_side / scale) ** 2 for scale in SCALES}
+        rare = {scale: RARE * math.log1p(scale**2) for scale in SCALES}
+        fixed = {scale: prior + rare[scale] + (wrong_side / scale) ** 2 for scale in SCALES}
 
         def cost_of(scale: float) -> float:
             explained, volume, _ = _drift(r[used], J[used], B[used], scale)
             return explained + volume + fixed[scale]
 
-        best = min(SCALES, key=cost_of)
-        evidence = cls(math.inf, distances, z, r, J, B, best, fixed[best], CLIPPED / noise)
+        scale = min(SCALES, key=cost_of)
+        evidence = cls(math.inf, distances, z, r, J, B, scale, fixed[scale], CLIPPED / noise)
+        tried = []
         for _ in range(STEPS):
-            cost = evidence._at(evidence.z, used)
-            if not cost < evidence.cost - NO_BETTER:
-                return replace(evidence, cost=min(cost, evidence.cost))
+            tried.append(replace(evidence, cost=evidence._at(evidence.z, used)))
+            if len(tried) > 1 and abs(tried[-1].cost - tried[-2].cost) < NO_BETTER:
+                break
             z = evidence._refitted(used)
             r, J = jacobian(distances, z)
-            evidence = replace(evidence, cost=cost, z=z, r=r - J @ z, J=J)
-        return evidence
+            evidence = replace(evidence, z=z, r=r - J @ z, J=J)
+        return min(tried, key=lambda fitted: fitted.cost)
 
     def by(self, used: Bool[Tensor, " n"]) -> float:
         """Return the cost by other points, of this drift or of the best by them to first order: the lower

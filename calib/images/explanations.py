@@ -10,6 +10,7 @@ the baseline, and without focal lengths not the proportions of depth either: the
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import NamedTuple
 
 import cv2
@@ -17,15 +18,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from arraygeom import Pair, apply_homography, epipolar_lines
+from arraygeom import Pair, Rig, View, apply_homography, epipolar_lines
 from arraygeom.pixels import to_homogeneous
 from arraygeom.robust import cauchy, normal_deviation, robust_least_squares
 
-from .matches import LOCALISED, PointMatches
+from .matches import LOCALISED, Pairs, PointMatches, fit_fundamental, fit_link, undistort_matches
 from .residuals import FEW, displacements
 
 OFF = 4.0
 """Distance, in standard deviations of the points' noise, beyond which a point is off an explanation."""
+LEAST_SHARE = 0.02
+"""Least share of points off a homography for lines: wrong matches that happen to lie along lines pass for
+right ones."""
 STEPS = 20
 """Weightings of the fit of a homography and lenses."""
 
@@ -51,7 +55,7 @@ class Explanation(NamedTuple):
     @property
     def has_lines(self) -> bool:
         """True if the points determine epipolar lines: many move along them, far more than lie off them."""
-        return self.beyond >= max(self.wrong + FEW, 2 * self.wrong)
+        return self.beyond >= max(self.wrong + FEW, 2 * self.wrong, LEAST_SHARE * self.points)
 
     def as_text(self, *, focal_lengths: bool = False) -> str:
         """Return the explanation taken and what it leaves undetermined, as a phrase without a full stop.
@@ -62,8 +66,8 @@ class Explanation(NamedTuple):
         if not self.has_lines:
             return (
                 f"one homography fits {self.points - self.beyond} of {self.points} matched points to "
-                f"{self.noise:.2f} px (a plane, cameras at one place, or a far scene), and is used; unknown: "
-                "epipolar lines and depth"
+                f"{self.noise:.2f} px (a plane, cameras at one place, or a far scene); unknown: epipolar "
+                "lines and depth"
             )
         bas_relief = "" if focal_lengths else " and, without focal lengths, the proportions of depth"
         return (
@@ -96,6 +100,24 @@ def explain(matches: PointMatches, pair: Pair) -> Explanation:
     noise = normal_deviation(distance, LOCALISED / OFF)
     beyond, wrong = (int((off > OFF * noise).sum()) for off in (along, distance))
     return Explanation(H, len(x), beyond, wrong, noise)
+
+
+def undetermined(rig: Rig, pairs: Pairs) -> tuple[str, ...]:
+    """Describe the pairs whose points determine no lines, with an F of their own instead of the rig's.
+
+    Returns:
+        A sentence a pair, without a full stop; nothing for pairs whose points determine lines.
+    """
+    sentences = []
+    for names, matches in pairs.items():
+        points = undistort_matches(rig.pair(*names), matches)
+        with suppress(ValueError):  # no F fits them, and none is needed
+            link = fit_link(points, fit_fundamental(points)).link
+            alpha, beta = (View(hw=rig[name].hw) for name in names)
+            explained = explain(points, Pair(alpha, beta, link=link))
+            if not explained.has_lines:
+                sentences.append(f"by the points of {' and '.join(names)} alone, {explained.as_text()}")
+    return tuple(sentences)
 
 
 def registration(H: Float[Tensor, "3 3"], matches: PointMatches) -> Explanation:

@@ -31,9 +31,11 @@ UNITS = {
 }
 SHIFTS = {"half-pixel shift": 0.5, "one-pixel shift": 1.0}
 """Shifts of pixels by kind; a drift of a calibrated camera's principal point has the same effect."""
-OFF_CENTRE, FAR_OFF = 0.05, 0.15
-"""Distance of a principal point from the image's middle, as a share of the longer side, up to which it is
-plausible, and beyond which it is not."""
+OFF_CENTRE, FAR_OFF = 0.05, 0.175
+"""Standard deviation of a principal point from the image's middle, as a share of the longer side; and the
+distance beyond which it is that of no whole image."""
+FOCAL_SHARE, FOCAL_SPREAD = 1.2, 0.7
+"""Median focal length as a share of the image's longer side, and the standard deviation of its logarithm."""
 SHORTEST_FOCAL = 0.2
 """Least focal length in pixels, as a share of the image's longer side: shorter ones are in another unit."""
 TRANSPOSE = torch.eye(3, dtype=torch.float64)[[1, 0, 2]]
@@ -69,7 +71,8 @@ class Hypothesis:
 def hypotheses(rig: Rig, sizes: Mapping[str, HW]) -> list[Hypothesis]:
     """List the rig as given, and the single mistakes plausible in a rig whose images have these sizes.
 
-    Mistakes whose repair must be estimated from points are left out (`ignored_lens`, `zoomed`, `in_degrees`).
+    Mistakes whose repair must be estimated from points are left out (`ignored_lens`, `zoomed`, `cropped`,
+    `in_degrees`).
     Where images do not have the sizes that the rig states, only mistakes that explain the sizes are listed.
 
     Returns:
@@ -112,16 +115,15 @@ def _beyond_drift(K: Tensor, changed_K: Tensor) -> bool:
     return bool(torch.maximum(focal, centre) > LARGEST_CHANGE)
 
 
-def implausible(rig: Rig) -> list[str]:
-    """List the cameras whose principal point or focal length no image of their size has."""
-    views = [(name, view) for name, view in rig.cameras.items() if isinstance(view, LensView)]
-    return [name for name, view in views if _centre_offset(view) > FAR_OFF or is_short(view)]
+def unlikelihood(rig: Rig) -> float:
+    """Return -2 log probability of a rig's focal lengths and principal points by its images' sizes.
 
-
-def is_plausible(rig: Rig, names: Sequence[str]) -> bool:
-    """Return True if these cameras' principal points and focal lengths are usual ones of their images."""
-    views = [view for name in names if isinstance(view := rig[name], LensView)]
-    return all(_centre_offset(view) <= OFF_CENTRE and not is_short(view) for view in views)
+    The least likely camera counts alone, as those of one kind share their oddities; a constant is left out.
+    """
+    views = [view for view in rig.cameras.values() if isinstance(view, LensView)]
+    off_centre = [_centre_offset(view) / OFF_CENTRE for view in views]
+    focal = [math.log(focal_length_of(view) / (FOCAL_SHARE * max(view.hw))) / FOCAL_SPREAD for view in views]
+    return max((c**2 + f**2 for c, f in zip(off_centre, focal)), default=0.0)
 
 
 def is_short(view: LensView) -> bool:
@@ -137,8 +139,11 @@ def focal_length_of(view: LensView) -> float:
 def _centre_offset(view: LensView) -> float:
     """Return the distance of the principal point from the middle of the image, as a share of its
     longer side."""
-    middle = view.K.new_tensor([view.hw[1] - 1, view.hw[0] - 1]) / 2
-    return float((view.K[:2, 2] - middle).norm()) / max(view.hw)
+    return float((view.K[:2, 2] - _middle(view)).norm()) / max(view.hw)
+
+
+def _middle(view: LensView) -> Tensor:
+    return view.K.new_tensor([view.hw[1] - 1, view.hw[0] - 1]) / 2
 
 
 def ignored_lens(rig: Rig, bare: Sequence[str], k1: float) -> Hypothesis:
@@ -191,13 +196,41 @@ def zoomed(rig: Rig, names: Sequence[str], factor: float) -> Hypothesis:
     short = all(is_short(rig[name]) for name in names)
     words = f"focal length of {who} in millimetres" if short else f"image of {who} zoomed or cropped"
 
+    words += f": about {focal_length_of(rig[names[0]]) * factor:.0f} px"
+    scale = torch.diag(torch.tensor([factor, factor, 1.0], dtype=torch.float64))
+    change = partial(_partly_scaled, scale, slice(0, 2))
+    return Hypothesis("focal length", words, on_cameras(rig, names, change), approximate=True)
+
+
+def may_be_cropped(rig: Rig, name: str) -> bool:
+    """Return True if a camera's principal point is farther from the image's middle than in whole images."""
+    return isinstance(rig[name], Camera) and _centre_offset(rig[name]) > FAR_OFF
+
+
+def centred(rig: Rig, names: Sequence[str]) -> Rig:
+    """Return the rig with these cameras' principal points in the middle of their images."""
+
     def change(camera: Camera) -> Camera:
         K = camera.K.clone()
-        K[:2, :2] *= factor
+        K[:2, 2] = _middle(camera)
         return camera.replace(K=K)
 
-    words += f": about {focal_length_of(rig[names[0]]) * factor:.0f} px"
-    return Hypothesis("focal length", words, on_cameras(rig, names, change), approximate=True)
+    return on_cameras(rig, names, change)
+
+
+def cropped(rig: Rig, names: Sequence[str]) -> Hypothesis:
+    """Build the hypothesis that images of some cameras were cropped, and K was for the whole images.
+
+    Args:
+        rig: the rig with principal points of the images as they are.
+        names: names of the cameras.
+
+    Returns:
+        The hypothesis, with that rig.
+    """
+    u, v = (float(c) for c in rig[names[0]].K[:2, 2])
+    words = f"image of {', '.join(map(repr, names))} cropped: principal point at about ({u:.0f}, {v:.0f})"
+    return Hypothesis("cropped", words, rig, approximate=True)
 
 
 def in_degrees(rig: Rig, turns: Mapping[str, int]) -> Hypothesis:
@@ -424,7 +457,7 @@ def _of_sizes(rig: Rig, wrong: Sequence[str], sizes: Mapping[str, HW]) -> Iterat
         as_cropped = resized(FITS["cropped at the right and the bottom"])
         yield Hypothesis("x and y exchanged", f"size of {label} written as height, width", as_cropped)
     for words, matrix in FITS.items():
-        yield Hypothesis("resized", f"image of {label} {words}", resized(matrix))
+        yield Hypothesis(words.split()[0], f"image of {label} {words}", resized(matrix))
 
 
 def _rotated(rig: Rig, groups: Sequence[Group]) -> Iterator[Hypothesis]:

@@ -61,6 +61,7 @@ class Refinement:
         held_out: statistics of the held-out points, before and after.
         depth: change of depth; None for uncalibrated rigs and too few points of observable depth.
         objections: reasons not to accept the result, in words.
+        undetermined: sentences on pairs whose points determine no lines.
     """
 
     rig: Rig
@@ -70,6 +71,7 @@ class Refinement:
     held_out: tuple[LineStatistics, LineStatistics]
     depth: DepthChange | None = None
     objections: tuple[str, ...] = ()
+    undetermined: tuple[str, ...] = ()
 
     def as_text(self) -> str:
         """Return the changes, the distances of held-out points and the change of depth as lines of text."""
@@ -81,6 +83,7 @@ class Refinement:
             *(f"{verdict}: {objection}" for objection in self.objections),
             *(f"changed: {change}" for change in self.changes),
             describe_lenses(self.rig) if self.accepted else "the rig is unchanged",
+            *self.undetermined,
         ]
         if self.unobservable:
             lines.append(f"fixed, as these images do not determine them: {', '.join(self.unobservable)}")

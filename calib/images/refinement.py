@@ -28,6 +28,7 @@ from arraygeom.runtime.progress import log_step, part, stage
 from arraygeom.runtime.threads import torch_in_one_thread
 
 from .depth_change import DEPTH_KEPT, DepthChange, log_depths, relative_change, share_outside
+from .explanations import undetermined
 from .least_squares import (
     Residuals,
     Solution,
@@ -345,6 +346,7 @@ class RefinementProblem:
             ),
             depth=depth,
             objections=tuple(objections),
+            undetermined=undetermined(refined, self.used),
         )
 
     def _no_nearer(self, before: Tensor, solution: Solution) -> str:

@@ -485,7 +485,7 @@ def _calibrated(
     first = next(iter(pairs))
     assumed = [name for name in (alpha, *pairs) if name not in focal]
     of = f" {alpha} to {first}" if len(betas) > 1 else ""
-    rough = f"; focal lengths of {', '.join(assumed)} are assumed: depths are right up to a factor"
+    rough = f"; focal lengths of {', '.join(assumed)} are assumed, and the proportions of depth with them"
     note(f"depths are multiples of the baseline{of}{rough if assumed else ''}")
     scales = {name: _relative_scale(depths[first], depths[name]) if name in depths else 1.0 for name in pairs}
     rig = joined(pairs, scales)

@@ -28,7 +28,7 @@ from arraygeom.io.native import write
 from arraygeom.pose import rotation_vector
 from calib.images.depth_change import share_outside
 from calib.images.doctor import Diagnosis, diagnose_matches
-from calib.images.hypotheses import TRANSPOSE, on_cameras, on_pixels, rotated_view, swap
+from calib.images.hypotheses import TRANSPOSE, on_cameras, on_pixels, rotated_view, swap, unlikelihood
 from calib.images.matches import match_cameras, seen_depths
 from calib.images.residuals import median_off
 from pat.app.cli.parser import script
@@ -210,8 +210,10 @@ class Judge:
 
 
 def observable(case: Case, bad: Rig) -> bool:
-    """Return True if images can show a rig's gross mistake: more than its own misfit, or points where none
-    is."""
+    """Return True if images can show a rig's gross mistake: more than its own misfit, points where none is,
+    or a principal point or focal length that no image of that size has."""
+    if unlikelihood(bad) > unlikelihood(case.rig) + 16:
+        return True
     given, wrong = (median_off(rig, case.matches) for rig in (case.rig, bad))
     return wrong > max(given + 0.5, 3 * given) or share_outside(bad, case.matches) > 0.5
 

@@ -4,21 +4,38 @@ from __future__ import annotations
 
 import base64
 import io
+import json
 import math
+from contextlib import suppress
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from arraygeom import Camera, Distortion, Pose, Rig, rotation_from_vector
+from arraygeom import Camera, Distortion, Pair, Pose, Rig, Segments, rotation_from_vector
 from arraygeom.io.native import write as rig_text
 from arraygeom.lenses.model import LensModel
+from arraygeom.pixels import HW
 from arraygeom.runtime.text import length_unit
 
 from ...media.colour import to_bytes
-from .pixel import FAMILIES, WINDOWS, BetaReport, ExplorerScene, ExplorerState, image_pixel, inspect_pixel
+from .pixel import (
+    FAMILIES,
+    WINDOWS,
+    BetaReport,
+    ExplorerScene,
+    ExplorerState,
+    PixelReport,
+    beta_report,
+    image_pixel,
+    inspect_pixel,
+    located,
+    pixel_of,
+    with_depths,
+)
 
 ALL = "all betas"
 """The `camera` whose sliders change all betas alike."""
@@ -31,6 +48,7 @@ DEFAULTS: Controls = {
     "near": None,
     "far": None,
     "baseline": 1.0,
+    "map": "none",
     "camera": ALL,
     "errors": {},
     "pins": [],
@@ -40,8 +58,8 @@ DEFAULTS: Controls = {
 
 baseline is a factor of all betas' distance from alpha; `errors` are changes of cameras by name (`ALL`: of all
 betas), each by the names of `ERRORS`; `camera` is the one that the sliders change; near and far are in the
-rig's unit. `pins` are pixels of alpha that stay drawn. `clicked` is a beta and a pixel of it, whose match
-becomes alpha's pixel.
+rig's unit. `map` is one of `MAPS`; `pins` are pixels of alpha that stay drawn; `clicked` is a beta and one
+of its pixels, whose match becomes alpha's pixel.
 """
 ERRORS: dict[str, tuple[str, float, float, float, float]] = {
     "rx": ("rotation x (degrees)", -3.0, 3.0, 0.01, 0.0),
@@ -59,6 +77,12 @@ ERRORS: dict[str, tuple[str, float, float, float, float]] = {
 Rotations are about its own axes, steps along those of alpha (in longest baselines), pixels are
 added, the focal length is multiplied. "lens0", "lens1", ... are added to the numbers of the lens.
 """
+MAPS = ("none", "length, px", "betas that see it", "depth range seen", "entropy of weights")
+"""Maps of the whole image: length of the segment or curve, pixels of beta; number of betas with a
+sample; share of the depth range, in inverse depth, at which beta sees the point; entropy of the weights, 1 if
+all are alike. All but the number are means over the betas."""
+GRID = 24
+"""Columns of alpha's pixels for which maps, and the answers of a saved page that cannot compute, are made."""
 WIDEST = 1280
 """Pixels of the longer side of a displayed image."""
 FARTHEST = 1000.0
@@ -85,6 +109,8 @@ def answer(scene: ExplorerScene, alpha: str, controls: Controls) -> dict[str, An
     report = inspect_pixel(scene, explorer_state(scene.rig, alpha, controls))
     betas: dict[str, Any] = {name: {"problem": text} for name, text in report.problems.items()}
     betas |= {name: drawn(beta) for name, beta in report.betas.items()}
+    for name, beta in betas.items():
+        beta["epipole"] = epipole(scene.rig, alpha, name)
     if controls["second"] != "none":
         second = {**controls, "field": controls["second"]}
         other = inspect_pixel(scene, explorer_state(scene.rig, alpha, second))
@@ -98,7 +124,8 @@ def answer(scene: ExplorerScene, alpha: str, controls: Controls) -> dict[str, An
         "depth": number(report.depth),
         "betas": betas,
         "backwards": backwards,
-        "top": top_view(scene.rig, alpha),
+        "top": top_view(scene.rig, alpha, report),
+        "map": whole_map(scene, alpha, controls),
         "rig": "" if scene.rig is rig else rig_text(scene.rig),
     }
 
@@ -223,17 +250,26 @@ def drawn(beta: BetaReport) -> dict[str, Any]:
         "depths": [number(float(d)) for d in beta.depth[beta.valid]],
         "match": rounded(beta.xy[best]),
         "depth": number(float(beta.depth[best])),
-        "off": None if beta.offset is None else round(beta.offset.distance, 2),
+        "off": None if beta.offset is None else round(beta.offset, 2),
         "band": None if beta.band is None else rounded(beta.band),
     }
 
 
-def top_view(rig: Rig, alpha: str) -> list[dict[str, Any]]:
-    """List the cameras from above, in alpha's axes: each centre (right, forward), in the rig's unit, and
-    viewing direction.
+def epipole(rig: Rig, alpha: str, beta: str) -> list[float] | None:
+    """Return the position in beta of alpha's centre; None where beta does not see it."""
+    a, b = rig[alpha], rig[beta]
+    if not (isinstance(a, Camera) and isinstance(b, Camera) and a.central):
+        return None
+    seen = b.project(a.centre)
+    return rounded(seen.x) if bool(seen.valid & seen.x.isfinite().all()) else None
+
+
+def top_view(rig: Rig, alpha: str, report: PixelReport) -> list[dict[str, Any]]:
+    """List the cameras from above, in alpha's axes (right, forward), in the rig's unit.
 
     Returns:
-        Plain values; empty if alpha is not calibrated.
+        Plain values of each camera: `at`, its centre, `ahead`, its viewing direction, and `ray`, to
+        alpha's pixel or to the match (None without one); empty if alpha is not calibrated.
     """
     alpha_view = rig[alpha]
     if not isinstance(alpha_view, Camera):
@@ -241,9 +277,84 @@ def top_view(rig: Rig, alpha: str) -> list[dict[str, Any]]:
     shown = []
     for name, camera in rig.cameras.items():
         if isinstance(camera, Camera):
-            centre, ahead = alpha_view.R @ (camera.centre - alpha_view.centre), alpha_view.R @ camera.R[2]
-            shown.append({"name": name, "at": rounded(centre[[0, 2]], 5), "ahead": rounded(ahead[[0, 2]], 4)})
+            centre, axes = alpha_view.R @ (camera.centre - alpha_view.centre), alpha_view.R @ camera.R.T
+            beta = report.betas.get(name)
+            x = report.x if name == alpha else None if beta is None else beta.xy[int(beta.weight.argmax())]
+            ray, valid = (axes[:, 2], False) if x is None else camera.rays(x.to(axes))
+            shown.append(
+                {
+                    "name": name,
+                    "at": rounded(centre[[0, 2]], 5),
+                    "ahead": rounded(axes[[0, 2], 2], 4),
+                    "ray": rounded((axes @ (ray / ray.norm()))[[0, 2]], 4) if valid else None,
+                }
+            )
     return shown
+
+
+def grid_pixels(hw: HW, columns: int) -> tuple[int, list[list[float]]]:
+    """Return the number of rows of about square cells over an image, and the cells' middles, row by row."""
+    h, w = hw
+    rows = max(1, round(columns * h / w))
+    xs, ys = ([(i + 0.5) * side / n - 0.5 for i in range(n)] for side, n in ((w, columns), (h, rows)))
+    return rows, [[x, y] for y in ys for x in xs]
+
+
+def whole_map(scene: ExplorerScene, alpha: str, controls: Controls) -> dict[str, Any] | None:
+    """Compute the map that the controls choose, on a grid of alpha's pixels; kept until they change.
+
+    Returns:
+        Plain values: `columns`, `rows`, and `values` row by row (None where there is none); None for no map.
+    """
+    which = MAPS.index(controls["map"])
+    kept = {k: controls[k] for k in ("map", "field", "weights", "near", "far", "baseline", "errors")}
+    key = json.dumps(kept, sort_keys=True)
+    if which and key not in scene.maps:
+        rows, pixels = grid_pixels(scene.rig[alpha].hw, GRID)
+        states = [explorer_state(scene.rig, alpha, {**controls, "x": x}) for x in pixels]
+        rig = with_depths(scene.rig, states[0])
+        found = []
+        for name in (n for n in rig.betas(alpha) if n in scene.images):
+            with suppress(Exception):  # the reason is said in its picture
+                found.append(_mapped(scene, rig.pair(alpha, name), name, states, which))
+        values = torch.stack(found) if found else torch.full((1, len(states)), torch.nan)
+        values = values.nansum(0) if which == 2 else values.nanmean(0)
+        scene.maps.clear()
+        scene.maps[key] = {"columns": GRID, "rows": rows, "values": [number(v) for v in values.tolist()]}
+    return scene.maps[key] if which else None
+
+
+def _mapped(
+    scene: ExplorerScene, pair: Pair, name: str, states: list[ExplorerState], which: int
+) -> Float[Tensor, " n"]:
+    """Values of the map with a number in `MAPS` in one beta; NaN where there is none."""
+    if which == 4:
+        return torch.tensor([_entropy(beta_report(scene, pair, name, state)) for state in states]).double()
+    x = torch.cat([pixel_of(state) for state in states])
+    if which == 3:
+        near, far = (float(d) for d in pair.depth_range)
+        alpha, beta = pair.cameras
+        depth = 1 / torch.linspace(1 / near, 1 / far, DEPTHS, dtype=torch.float64).clamp(min=1e-9)
+        points = alpha.unproject(x.expand(DEPTHS, -1, -1), depth[:, None].expand(-1, len(x)))
+        there = beta.project(points)
+        return (there.valid & beta.contains(there.x)).double().mean(0)
+    locations = located(scene, pair, states[0].family, x)
+    if isinstance(locations, Segments):
+        seen, length = locations.valid, locations.length
+    else:
+        here, steps = locations.mask, locations.xy.diff(dim=-2).norm(dim=-1)
+        seen, length = here.any(-1), torch.where(here[:, 1:] & here[:, :-1], steps, 0.0).sum(-1)
+    return seen.double() if which == 2 else torch.where(seen, length, torch.nan).double()
+
+
+def _entropy(report: BetaReport) -> float:
+    """Entropy of the weights as a share of the largest; NaN without samples."""
+    count = int(report.valid.sum())
+    return float(torch.special.entr(report.weight).sum()) / math.log(max(count, 2)) if count else math.nan
+
+
+DEPTHS = 33
+"""Depths at which it is asked whether a beta sees a point, evenly spaced in inverse depth."""
 
 
 def rounded(values: Tensor, digits: int = 2) -> list[Any]:
@@ -299,6 +410,7 @@ def choices(scene: ExplorerScene, controls: Controls) -> list[list[Any]]:
         ["field", "field", [*fields, *unlisted]],
         ["second", "compared with", ["none", *fields, *unlisted]],
         ["weights", "weights by", weights],
+        ["map", "over alpha", list(MAPS)],
         [
             "camera",
             "sliders change",

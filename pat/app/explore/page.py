@@ -20,10 +20,12 @@ from arraygeom.uncertainty import Covariance
 from ...networks.paper import PAT
 from .answers import (
     DEFAULTS,
+    GRID,
     Controls,
     answer,
     choices,
     explorer_state,
+    grid_pixels,
     moved_rig,
     shown_cameras,
     slider_ranges,
@@ -31,8 +33,6 @@ from .answers import (
 from .pixel import WINDOWS, ExplorerScene, shipped_attention, with_depths
 
 MODULE, PINHOLE = (Path(__file__).with_name(name) for name in ("widget.js", "pinhole.js"))
-GRID = 24
-"""Columns of alpha's pixels whose answers are stored in a saved page that cannot compute them."""
 
 
 @dataclass
@@ -100,7 +100,7 @@ class Explorer:
         all_choices, values["choices"] = values["choices"], []
         if self.scene is not None and is_pinhole(self.scene.rig) and self.usual:
             values["ranges"] = [entry for entry in values["ranges"] if not entry[0].startswith("lens")]
-            values["choices"] = [choice for choice in all_choices if choice[0] == "camera"]
+            values["choices"] = [choice for choice in all_choices if choice[0] in ("camera", "map")]
             asks = f"asksPinholes({json.dumps(geometry(self.scene.rig, self.alpha))})"
         else:
             values["ranges"] = []
@@ -136,13 +136,10 @@ class Explorer:
         """
         if self.scene is None:
             return {"columns": 1, "rows": 1, "answers": {"0,0": {"error": self.error}}}
-        h, w = self.scene.rig[self.alpha].hw
-        rows = max(1, round(columns * h / w))
-        xs, ys = ([(i + 0.5) * side / n - 0.5 for i in range(n)] for side, n in ((w, columns), (h, rows)))
+        rows, pixels = grid_pixels(self.scene.rig[self.alpha].hw, columns)
+        controls = {**self.controls, "clicked": None, "map": "none"}
         answers = {
-            f"{i},{j}": self.answer({**self.controls, "x": [x, y], "clicked": None})
-            for i, x in enumerate(xs)
-            for j, y in enumerate(ys)
+            f"{i % columns},{i // columns}": self.answer({**controls, "x": x}) for i, x in enumerate(pixels)
         }
         return {"columns": columns, "rows": rows, "answers": answers}
 

@@ -37,7 +37,7 @@ const dot = (a, b) => a.reduce((sum, v, i) => sum + v * b[i], 0);
 const times = (M, v) => M.map((row) => dot(row, v));
 const product = (A, B) => A.map((row) => B[0].map((_, j) => dot(row, B.map((r) => r[j]))));
 const transposed = (M) => M[0].map((_, j) => M.map((row) => row[j]));
-const inverse = ([[a, b, c], [d, e, f], [g, h, i]]) => {
+const inverseOf = ([[a, b, c], [d, e, f], [g, h, i]]) => {
   const cofactors = [[e * i - f * h, c * h - b * i, b * f - c * e], [f * g - d * i, a * i - c * g, c * d - a * f],
     [d * h - e * g, b * g - a * h, a * e - b * d]];
   const det = a * cofactors[0][0] + b * cofactors[1][0] + c * cofactors[2][0];
@@ -98,7 +98,7 @@ function asksPinholes(rig) {
     return found;
   }
   function pairOf(a, b) { // a pixel x of a at depth z is at M x + p / z of b, homogeneous
-    const R = product(b.R, transposed(a.R)), Ki = inverse(a.K);
+    const R = product(b.R, transposed(a.R)), Ki = inverseOf(a.K);
     const p = times(b.K, times(b.R, a.centre.map((c, i) => c - b.centre[i])));
     return { M: product(b.K, product(R, Ki)), p };
   }
@@ -140,7 +140,8 @@ function asksPinholes(rig) {
     const top = Math.max(...scores), powers = scores.map((s) => Math.exp(s - top)), total = powers.reduce((a, b) => a + b);
     const weights = powers.map((p) => p / total), best = weights.indexOf(Math.max(...weights));
     const known = samples.map((sample) => depthOf(pair, x, sample));
-    return { samples, weights, depths: known, match: samples[best], depth: known[best], peak: weights[best] };
+    const epipole = pair.p[2] > 0 ? flat(pair.p) : null;
+    return { samples, weights, depths: known, match: samples[best], depth: known[best], peak: weights[best], epipole };
   }
   async function inspect(cameras, shown, alpha, x, depths) {
     const betas = {}, own = shown.find(({ name }) => name === alpha);
@@ -148,6 +149,33 @@ function asksPinholes(rig) {
       if (camera.name !== alpha)
         betas[camera.name] = await report(camera, own, pairOf(cameras[alpha], cameras[camera.name]), x, depths);
     return betas;
+  }
+  // The maps of answers.py, kept until what they depend on changes.
+  let kept = {};
+  const MAPS = {
+    "length, px": ({ samples: s }) => Math.hypot(...s[0].map((v, i) => v - s.at(-1)[i])),
+    "betas that see it": () => 1,
+    "entropy of weights": ({ weights: w }) => (w.length < 2 ? 0 : -w.reduce((sum, p) => sum + (p && p * Math.log(p)), 0) / Math.log(w.length)),
+  };
+  async function mapOf({ map, errors, baseline }, cameras, shown, depths) {
+    const key = JSON.stringify([map, errors, baseline, depths]), [h, w] = cameras[rig.alpha].hw;
+    if (map === "none" || kept.key === key) return map === "none" ? null : kept.map;
+    const columns = 24, rows = Math.max(1, Math.round(columns * h / w)), values = [];
+    for (let i = 0; i < columns * rows; i++) {
+      if (i % columns === 0) await new Promise((go) => setTimeout(go)); // lets the page draw
+      const x = [((i % columns) + 0.5) * w / columns - 0.5, (Math.floor(i / columns) + 0.5) * h / rows - 0.5].map(Math.round);
+      let found;
+      if (map === "depth range seen") found = shown.filter(({ name }) => name !== rig.alpha).map(({ name, hw }) => {
+        const pair = pairOf(cameras[rig.alpha], cameras[name]);
+        const seen = Array.from({ length: 33 }, (_, k) => transfer(pair, x, 1 / depths[0] + (1 / depths[1] - 1 / depths[0]) * k / 32));
+        return seen.filter((p) => p[2] > 0 && flat(p).every((v, a) => v >= -0.5 && v <= hw[1 - a] - 0.5)).length / 33;
+      });
+      else found = Object.values(await inspect(cameras, shown, rig.alpha, x, depths)).filter(({ problem }) => !problem).map(MAPS[map]);
+      const sum = found.reduce((a, b) => a + b, 0), count = map === "betas that see it";
+      values.push(count ? sum : found.length ? Number((sum / found.length).toPrecision(4)) : null);
+    }
+    kept = { key, map: { columns, rows, values } };
+    return kept.map;
   }
   return async (controls, { cameras: shown }) => {
     const cameras = moved(controls), own = cameras[rig.alpha], depths = [controls.near ?? rig.near, controls.far ?? rig.far];
@@ -171,10 +199,13 @@ function asksPinholes(rig) {
       const there = await inspect(cameras, shown, rig.alpha, inside(at, own.hw), depths);
       pins.push({ x: inside(at, own.hw), betas: Object.fromEntries(Object.entries(there).filter(([, one]) => !one.problem)) });
     }
-    const top = Object.entries(cameras).map(([name, { centre, R }]) => {
+    const top = Object.entries(cameras).map(([name, { centre, R, K }]) => {
       const at = times(own.R, centre.map((c, i) => c - own.centre[i])), ahead = times(own.R, R[2]);
-      return { name, at: [at[0], at[2]], ahead: [ahead[0], ahead[2]] };
+      const pixel = name === rig.alpha ? x : betas[name]?.match;
+      const ray = pixel && times(own.R, times(transposed(R), times(inverseOf(K), [...pixel, 1]))), long = ray && Math.hypot(...ray);
+      return { name, at: [at[0], at[2]], ahead: [ahead[0], ahead[2]], ray: ray ? [ray[0] / long, ray[2] / long] : null };
     });
-    return { x, depth: inverse > 0 ? Number((sum / inverse).toPrecision(4)) : null, betas, pins, backwards, top, rig: "" };
+    const map = await mapOf(controls, cameras, shown, depths);
+    return { map, x, depth: inverse > 0 ? Number((sum / inverse).toPrecision(4)) : null, betas, pins, backwards, top, rig: "" };
   };
 }

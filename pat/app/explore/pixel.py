@@ -14,7 +14,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -79,20 +79,6 @@ class ExplorerState:
         return dataclasses.replace(self, **changes)  # type: ignore[arg-type]
 
 
-class MatchOffset(NamedTuple):
-    """Best photometric match near the best sample, on the epipolar line or beside it.
-
-    Attributes:
-        position: position of the match, pixels of beta.
-        distance: distance of the match from the line, pixels.
-        correlation: correlation of the windows there, -1 to 1.
-    """
-
-    position: Float[Tensor, "2"]
-    distance: float
-    correlation: float
-
-
 class BetaReport(NamedTuple):
     """Samples of alpha's pixel in one beta, with their weights and the match.
 
@@ -102,9 +88,7 @@ class BetaReport(NamedTuple):
         ends: start and end of a segment; None for other fields.
         weight: weight of each sample, summing to 1.
         depth: depth of each sample in alpha, in the rig's unit; NaN where it has none.
-        value: weighted mean of beta's image.
-        peak: largest weight.
-        offset: best match of the images; None without a segment or a clear match.
+        offset: distance of the images' own match from the line, pixels; None without a segment or a match.
         band: corners of the band that holds the match by the calibration's uncertainty, pixels of beta; None
             without a covariance or a segment.
     """
@@ -114,9 +98,7 @@ class BetaReport(NamedTuple):
     ends: Float[Tensor, "2 2"] | None
     weight: Float[Tensor, " l"]
     depth: Float[Tensor, " l"]
-    value: Float[Tensor, " c"]
-    peak: float
-    offset: MatchOffset | None = None
+    offset: float | None = None
     band: Float[Tensor, "4 2"] | None = None
 
 
@@ -124,15 +106,15 @@ class PixelReport(NamedTuple):
     """Reports of one pixel of alpha in all betas.
 
     Attributes:
+        x: the pixel.
         betas: report by beta.
         problems: reason, in a sentence, by beta that has no report.
-        colour: fused colour, RGB or grey.
         depth: depth by all betas, in the rig's unit; NaN if unknown.
     """
 
+    x: Float[Tensor, "2"]
     betas: dict[str, BetaReport]
     problems: dict[str, str]
-    colour: Float[Tensor, " c"]
     depth: float
 
 
@@ -146,6 +128,7 @@ class ExplorerScene:
         fields: further fields by name.
         networks: further networks by name.
         covariance: covariance of the rig's parameters, which gives segments their bands; None for none.
+        maps: maps of the whole image, by the controls that gave them.
         guides: luminances (1, 1, h, w) that windows are cut from, by camera.
         features: computed features of networks.
 
@@ -158,6 +141,7 @@ class ExplorerScene:
     fields: Mapping[str, ReceptiveField] = field(default_factory=dict)
     networks: Mapping[str, PAT] = field(default_factory=dict)
     covariance: Covariance | None = None
+    maps: dict[str, Any] = field(default_factory=dict)
     guides: dict[str, Tensor] = field(default_factory=dict)
     features: dict[tuple[str, str, str | None], tuple[HW, QueryAndKey]] = field(default_factory=dict)
 
@@ -233,19 +217,19 @@ FAMILIES = ("auto", *FIELDS)
 """Names of the fields: `auto` is the default of `pat fuse`. A state takes MODULE:OBJECT, too."""
 
 
-def chosen_field(pair: Pair, family: str, x: Float[Tensor, "1 2"]) -> ReceptiveField:
-    """Make the field of a family for a pixel.
+def located(scene: ExplorerScene, pair: Pair, family: str, x: Float[Tensor, "n 2"]) -> Segments | Positions:
+    """Evaluate the field of a family, the scene's own or by name, at pixels of alpha.
 
     Raises:
-        ValueError: for an unknown family.
+        ValueError: for an unknown family, and if the field does not suit the pair.
     """
-    if family in SIZED:
-        return SIZED[family](pair, x)
-    return recorded_field(pair) if family == "auto" else named_field(family)
+    field = scene.fields.get(family) or (SIZED[family](pair, x) if family in SIZED else None)
+    field = field or (recorded_field(pair) if family == "auto" else named_field(family))
+    return sampling_locations(field, pair, x)
 
 
-def displacement(pair: Pair, x: Float[Tensor, "1 2"]) -> float:
-    """Return the displacement from H x that covers the depth range at a pixel, or else a share of beta's
+def displacement(pair: Pair, x: Float[Tensor, "n 2"]) -> float:
+    """Return the displacement from H x that covers the depth range at pixels, or else a share of beta's
     longer side; pixels."""
     if pair.link is None and pair.calibrated and pair.depth is not None:
         return max(1.0, float(covering_displacement(pair, x)))
@@ -287,13 +271,19 @@ def inspect_pixel(scene: ExplorerScene, state: ExplorerState) -> PixelReport:
             problems[name] = "no image given"
             continue
         try:
-            report = beta_report(scene, rig.pair(state.alpha, name), name, state)
-            betas[name] = report._replace(band=band_corners(scene, rig, name, state, report.ends))
+            pair = rig.pair(state.alpha, name)
+            report = beta_report(scene, pair, name, state)
+            guides = scene.guides[state.alpha], scene.guides[name]
+            betas[name] = report._replace(
+                offset=match_offset(guides, pair, pixel_of(state), (report.xy, report.weight), report.ends),
+                band=band_corners(scene, rig, name, state, report.ends),
+            )
         except (ValueError, FileNotFoundError) as error:
             problems[name] = str(error)
         except Exception as error:  # of a field of one's own
             problems[name] = f"the field '{state.family}' failed: {type(error).__name__}: {error}"
-    return PixelReport(betas, problems, fused_colour(scene, betas, state), joint_depth(betas))
+    x = pixel_of(state)[0]
+    return PixelReport(x, betas, problems, joint_depth(betas))
 
 
 def pixel_of(state: ExplorerState) -> Float[Tensor, "1 2"]:
@@ -308,8 +298,7 @@ def beta_report(scene: ExplorerScene, pair: Pair, name: str, state: ExplorerStat
         ValueError: if the field does not suit the pair.
     """
     x = pixel_of(state)
-    field = scene.fields.get(state.family) or chosen_field(pair, state.family, x)
-    locations = sampling_locations(field, pair, x)
+    locations = located(scene, pair, state.family, x)
     if isinstance(locations, Segments):  # about one sample a pixel of beta
         longest = float(torch.where(locations.valid, locations.length, 0.0).max())
         samples = locations.positions(math.ceil(longest) + 1)
@@ -324,10 +313,8 @@ def beta_report(scene: ExplorerScene, pair: Pair, name: str, state: ExplorerStat
         larger = xy.new_tensor([key.shape[-1] / pair.beta.hw[1], key.shape[-2] / pair.beta.hw[0]])
         scores = (query.T @ sampled(key, (xy + 0.5) * larger - 0.5))[0]
     weight = softmax(scores, valid)
-    value = sampled(scene.images[name][None], xy) @ weight
     depth, ends = depths(pair, x, xy, valid), ends_of(locations)
-    offset = match_offset((scene.guides[state.alpha], scene.guides[name]), pair, x, (xy, weight), ends)
-    return BetaReport(xy, valid, ends, weight, depth, value, float(weight.max()), offset)
+    return BetaReport(xy, valid, ends, weight, depth)
 
 
 def band_corners(
@@ -361,10 +348,10 @@ def match_offset(
     x: Float[Tensor, "1 2"],
     samples: tuple[Float[Tensor, "l 2"], Float[Tensor, " l"]],
     ends: Float[Tensor, "2 2"] | None,
-) -> MatchOffset | None:
-    """Find the photometric match near the segment, by the correlation of windows around both pixels.
+) -> float | None:
+    """Find how far beside the line the images' own match lies, by correlating windows around both pixels.
 
-    Unlike the samples it may lie beside the line, and does if the rig is off.
+    It lies on the line unless the rig is off.
 
     Args:
         guides: luminances of alpha and of beta.
@@ -374,7 +361,7 @@ def match_offset(
         ends: start and end of the segment; None for other fields.
 
     Returns:
-        The match; None without a segment, or if nothing matches clearly.
+        Its distance, pixels; None without a segment, or if nothing matches clearly.
     """
     xy, weight = samples
     if ends is None or not bool((weight > 0).any()) or float((ends[1] - ends[0]).norm()) < 1e-6:
@@ -390,16 +377,16 @@ def match_offset(
         scores = correlations(*guides, pair, x, points)
         return points[scores.argmax()], float(scores.max())
 
-    on_line, line_score = best(best(line)[0] + fine * along)
+    line_score = best(best(line)[0] + fine * along)[1]
     beside = best(line[:, None] + torch.arange(-ACROSS, ACROSS + 1).to(xy)[:, None] * across)[0]
     beside, beside_score = best(beside + fine[:, None] * across + fine * along)
     distance = abs(float((beside - ends[0]) @ across))
     if max(line_score, beside_score) < CLEAR:
         return None
     if beside_score < line_score + BETTER:
-        return MatchOffset(on_line, 0.0, line_score)
+        return 0.0
     # at the edge it would be better beyond
-    return MatchOffset(beside, distance, beside_score) if distance < ACROSS else None
+    return distance if distance < ACROSS else None
 
 
 def ends_of(locations: Segments | Positions) -> Float[Tensor, "2 2"] | None:
@@ -497,8 +484,9 @@ def joint_depth(betas: Mapping[str, BetaReport]) -> float:
     inverse, total = 0.0, 0.0
     for beta in betas.values():
         has_depth = beta.depth.isfinite()
-        inverse += beta.peak * float((beta.weight[has_depth] / beta.depth[has_depth]).sum())
-        total += beta.peak * float(beta.weight[has_depth].sum())
+        weight = beta.weight.max() * beta.weight[has_depth]
+        inverse += float((weight / beta.depth[has_depth]).sum())
+        total += float(weight.sum())
     return total / inverse if inverse > 0 else math.nan
 
 
@@ -507,24 +495,6 @@ def sampled(
 ) -> Float[Tensor, " c *l"]:
     """Sample an image at positions, in their precision, without copying it."""
     return sample(image, x[None].to(image), extended=extended).values[0].to(x)
-
-
-def fused_colour(
-    scene: ExplorerScene, betas: Mapping[str, BetaReport], state: ExplorerState
-) -> Float[Tensor, " c"]:
-    """Combine alpha's luminance with the colour differences of the betas in colour, each weighted by its
-    peak.
-
-    Returns:
-        RGB; alpha's luminance alone without such betas.
-    """
-    alpha_value = sampled(scene.guides[state.alpha], pixel_of(state))[:, 0]
-    coloured = [s for s in betas.values() if len(s.value) == 3 and s.peak > 0]
-    if not coloured:
-        return alpha_value
-    weights = sum(s.peak for s in coloured)
-    differences = [s.value - luminance(s.value[:, None, None]).reshape(1) for s in coloured]
-    return alpha_value + sum((s.peak / weights) * difference for s, difference in zip(coloured, differences))
 
 
 def image_pixel(x: float, y: float, hw: HW) -> tuple[float, float]:

@@ -14,6 +14,7 @@ const STYLE = `
 .pat button:disabled { opacity: .4 } .pat :focus-visible { outline: 2px solid #0a84ff; outline-offset: 1px } .pat kbd { font: inherit; opacity: .6 }`;
 const FIRST = "#e69f00", SECOND = "#cc79a7", MATCH = "#00bfff", BACK = "#ff6d3a", BAND = "#ffffff";
 const PINS = ["#f0e442", "#009e73", "#d55e00", "#56b4e9", "#ff8fd0", "#b8e986"];
+const MAP = [[68, 1, 84], [33, 145, 140], [253, 231, 37]];
 const depthText = (d, unit) => (d == null ? "no depth" : `depth ${d} ${unit}`);
 const make = (tag, properties = {}, ...children) => {
   const made = Object.assign(document.createElement(tag), properties);
@@ -55,11 +56,34 @@ function marks(camera, answer, unit = camera.hw[1] / 400) {
     if (answer.x) cross(answer.x, MATCH);
     return found;
   }
+  if (beta?.epipole) found.push({ line: Array.from({ length: 25 }, (_, i) => [Math.cos, Math.sin].map((f, k) =>
+    beta.epipole[k] + radius * f(i * Math.PI / 12))), colour: BACK });
   if (beta?.band) found.push({ line: [...beta.band, beta.band[0]], colour: BAND });
   field(beta?.second, SECOND);
   field(beta, FIRST);
   if (beta?.match) cross(beta.match, MATCH);
   return found;
+}
+
+// A map of the whole image over it, from its least value (violet) to its largest (yellow); each lighter than the last.
+function drawMap(context, [h, w], { columns, rows, values }) {
+  const known = values.filter((v) => v != null), low = Math.min(...known), span = Math.max(...known) - low || 1;
+  context.globalAlpha = 0.65;
+  values.forEach((v, i) => {
+    if (v == null) return;
+    const s = 2 * (v - low) / span, [from, to] = s < 1 ? MAP : MAP.slice(1), t = s - (s >= 1);
+    context.fillStyle = `rgb(${from.map((c, k) => c + t * (to[k] - c)).join()})`;
+    const [x, y] = [i % columns, Math.floor(i / columns)].map((k, a) => k * (a ? h / rows : w / columns) - 0.5);
+    context.fillRect(x, y, w / columns + 0.5, h / rows + 0.5);
+  });
+  context.globalAlpha = 1;
+}
+
+function mapText({ columns, rows, values }, name, [x, y], [h, w]) {
+  const known = values.filter((v) => v != null), at = Math.floor((y + 0.5) / h * rows) * columns + Math.floor((x + 0.5) / w * columns);
+  if (!known.length) return `; ${name}: none`;
+  const [low, high, here] = [Math.min(...known), Math.max(...known), values[at]].map((v) => (v == null ? "none" : Number(v.toFixed(2))));
+  return `; ${name}: ${low} to ${high}, here ${here}`;
 }
 
 function drawMarks(context, camera, answer, unit = camera.hw[1] / 400) {
@@ -142,7 +166,7 @@ function betaText(beta, unit) {
   const off = (beta.off == null ? "" : `, ${beta.off} px off the line`) + (side ? `, band ±${side.toFixed(2)} px` : "");
   const second = beta.second && (beta.second.problem ?? `${beta.second.samples.length} samples`);
   return `match (${beta.match.map((v) => v.toFixed(1)).join(", ")}), ${depthText(beta.depth, unit)}, ` +
-    `${beta.samples.length} samples${off}` + (second ? `; compared: ${second}` : "");
+    `${beta.samples.length} samples${off}` + (beta.epipole ? `, epipole (${beta.epipole.map((v) => v.toFixed(0)).join(", ")})` : "") + (second ? `; compared: ${second}` : "");
 }
 
 // Python that makes the same view, from the files if they are known.
@@ -201,6 +225,14 @@ function topView(canvas, model, change) {
         context.lineTo(x + 60 * Math.sin(angle + side), y - 60 * Math.cos(angle + side));
       }
       context.stroke();
+      if (camera.ray) { // of alpha's pixel, or of the match
+        context.beginPath();
+        context.setLineDash([9, 9]);
+        context.moveTo(x, y);
+        context.lineTo(x + 900 * camera.ray[0], y - 900 * camera.ray[1]);
+        context.stroke();
+        context.setLineDash([]);
+      }
       context.beginPath();
       context.arc(x, y, 9, 0, 7);
       context.fill();
@@ -268,17 +300,20 @@ function render({ model, el }) {
     const answer = model.get("answer");
     for (const part of parts) {
       const { camera, canvas, caption, profile, zoom, image } = part;
-      const context = canvas.getContext("2d"), { name, alpha, unit } = camera;
+      const context = canvas.getContext("2d"), { name, alpha, unit, hw } = camera;
       context.setTransform(1, 0, 0, 1, 0, 0);
       context.clearRect(0, 0, canvas.width, canvas.height);
       if (image.complete && image.naturalWidth) context.drawImage(image, 0, 0, canvas.width, canvas.height);
       const beta = answer.betas?.[name], problem = answer.error ?? beta?.problem;
       if (problem) write(context, problem);
       context.translate(0.5, 0.5); // the centre of the first pixel is (0, 0)
+      const map = alpha && !answer.error && answer.map;
+      if (map) drawMap(context, hw, map);
       if (!answer.error) drawMarks(context, camera, answer);
       if (!alpha) drawProfile(profile, beta, unit);
       if (!alpha && parts[0].camera.alpha) drawZoom(zoom, parts[0], part, answer);
-      const text = answer.error ?? (alpha ? `pixel (${answer.x}), ${depthText(answer.depth, unit)}` : betaText(beta, unit));
+      const text = answer.error ?? (alpha ? `pixel (${answer.x}), ${depthText(answer.depth, unit)}` : betaText(beta, unit)) +
+        (map ? mapText(map, model.get("controls").map, answer.x, hw) : "");
       caption.textContent = `${name}${alpha ? " (alpha)" : ""}: ${text}`;
     }
     drawTop();
@@ -296,7 +331,7 @@ function render({ model, el }) {
     const tell = (v) => { label.textContent = `${text}: ${Number(v.toPrecision(3))}`; };
     const show = (controls) => { input.value = value(controls, name, each) ?? usual; tell(value(controls, name, each) ?? usual); };
     input.addEventListener("input", () => {
-      const now = Number(input.value), { errors, camera } = waiting ?? model.get("controls");
+      const now = Number(Number(input.value).toPrecision(6)), { errors, camera } = waiting ?? model.get("controls");
       change(each ? { errors: { ...errors, [camera]: { ...errors[camera], [name]: now } } } : { [name]: now });
       tell(now);
     });

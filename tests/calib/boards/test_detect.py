@@ -160,6 +160,17 @@ def test_a_board_that_other_images_confirm_is_not_doubted():
         assert not {"size", "name"} & {*explain([grey], shown, confirmed=True).replace("?", " ").split()}
 
 
+def test_images_of_another_board_among_those_of_the_right_one_are_named():
+    grey, _ = image("charuco:8x6:30mm:22mm:5x5", turn=(8.0, -8.0, 0.0))
+    assert "another board" in explain([grey], parse_board("charuco:8x6:30mm"), confirmed=True)
+
+
+def test_two_boards_alike_are_named():
+    grey, board = image("charuco:8x6:30mm", turn=(8.0, -8.0, 0.0))
+    other, _ = image("charuco:8x6:30mm", turn=(-8.0, 4.0, 10.0))
+    assert "twice" in explain([np.hstack([grey, other])], board)
+
+
 def test_causes_in_the_image_are_named():
     grey, board = image("charuco:8x6:30mm")
     mirrored = np.ascontiguousarray(grey[:, ::-1])

@@ -13,6 +13,7 @@ from arraygeom import Camera, Distortion, Link, Pose, Rig, View, triangulate
 from arraygeom.lenses import PolynomialFisheye
 from arraygeom.runtime.text import UNSCALED
 from calib.images.doctor import diagnose, diagnose_matches
+from calib.images.evidence import DriftEvidence
 from calib.images.hypotheses import TRANSPOSE, hypotheses, on_cameras, swap
 from calib.images.least_squares import most_probable
 from calib.images.matches import PointMatches
@@ -21,7 +22,7 @@ from calib.images.residuals import sampson_of_pairs
 from pat.app.cli.main import main
 from pat.media.images import write_image
 from tests.benchmarks.bench_drift import drifted
-from tests.benchmarks.bench_names import OPENGL, negated, reordered, shifted, turned
+from tests.benchmarks.bench_names import OPENGL, cropped, negated, reordered, shifted, turned
 from tests.calib.scenes import rectified_images, rectified_pair, seen_points, texture, unlike_pair, vector
 from tests.calib.simulated import simulated_matches, simulated_rig
 
@@ -370,6 +371,52 @@ def test_what_lines_cannot_see_the_size_of_the_image_can(change, kind):
     found = diagnose_matches(each(lambda c: with_numbers(c, **change))(rig), sizes(rig), seen_points(rig))
     assert found.named.kind == kind
     assert not found.healthy
+
+
+@pytest.mark.parametrize("which", [one, each])
+def test_a_cropped_image_is_named(which):
+    """A fifth was cut off at the left and the top, and K is for the whole image."""
+    rig = same_size(unlike_pair())
+    offset = vector(0, 0, 1)
+    cut = which(lambda c: c.replace(K=c.K + 0.2 * vector(c.hw[1], c.hw[0], 0)[:, None] * offset))
+    found = diagnose_matches(cut(rig), sizes(rig), seen_points(rig))
+    assert found.named.kind == "cropped", found.verdict
+    off = found.named.rig["second"].K[:2, 2] - rig["second"].K[:2, 2]
+    assert off.norm() < 0.05 * max(rig["second"].hw)
+
+
+def test_a_drifted_principal_point_is_no_crop():
+    """It stays where those of whole images are."""
+    rig = same_size(unlike_pair())
+    drifted_rig = rig.perturbed({"second.centre": vector(-20, 10)})
+    found = diagnose_matches(drifted_rig, sizes(rig), seen_points(rig))
+    assert "cropped" not in {hypothesis.kind for hypothesis in found.tried}
+
+
+def test_evidence_is_that_of_the_best_drift_that_was_met():
+    """The first step overshoots; the cost was that of the start, and the drift another."""
+    rig = unlike_pair()
+    ((names, points),) = seen_points(rig).items()
+    used = torch.ones(len(points.alpha), dtype=torch.bool)
+    found = DriftEvidence.from_points(one(cropped)(rig), {names: points}, used, 0.1)
+    assert found.cost == pytest.approx(found._at(found.z, used))
+
+
+def test_an_odd_principal_point_that_points_confirm_is_healthy():
+    """A sensor that is off its lens's axis by a tenth of its side."""
+    rig = same_size(unlike_pair()).perturbed({"second.centre": vector(32, -16)})
+    found = diagnose_matches(rig, sizes(rig), seen_points(rig))
+    assert found.healthy, found.verdict
+
+
+def test_which_of_two_cameras_was_zoomed_is_left_open():
+    """Lines of a rectified pair tell the ratio of the focal lengths alone."""
+    rig = rectified_pair()
+    bad = on_cameras(rig, ["left"], lambda c: with_numbers(c, focal=0.7)).replace(depth=None)
+    found = diagnose_matches(bad, sizes(rig), seen_points(rig))
+    assert found.named.kind == "focal length", found.verdict
+    assert {"left", "right"} == set(re.findall("left|right", found.verdict))
+    assert not found.certain
 
 
 def test_a_factory_calibration_is_healthy():

@@ -3,11 +3,24 @@
 import pytest
 import torch
 
-from arraygeom import Camera, Distortion, Link, Pair, Pose, Rig, View, intrinsics, rotation_from_vector
+from arraygeom import (
+    Camera,
+    Distortion,
+    Link,
+    Pair,
+    Pose,
+    Rig,
+    View,
+    epipolar_lines,
+    intrinsics,
+    rotation_from_vector,
+)
 from arraygeom.runtime.text import ASSUMED, OPEN, UNSCALED
+from calib.images.doctor import diagnose_matches
 from calib.images.explanations import explain
 from calib.images.from_images import rig_from_images
 from calib.images.matches import PointMatches, fit_fundamental
+from calib.images.refinement import refine_matches
 from pat.app.cli.main import main
 from pat.fusion.frame import Frame
 from pat.fusion.results import save_frame, view_of
@@ -57,10 +70,34 @@ def test_points_of_one_homography_leave_lines_open(change, seed):
     assert not explained(points_of(**change, seed=seed)).has_lines
 
 
+@pytest.mark.parametrize(("depth", "t"), [(wall, -0.1), (room, 0.0), (lambda *x: 300 * room(*x), -0.1)])
+def test_doctor_and_refine_say_what_the_points_leave_open(depth, t):
+    """A wall, cameras at one place, a skyline: of a rig that is right, as of one that has turned."""
+    R, t = rotation_from_vector(vector(0, 0.05, 0.02)), vector(t, 0.0, 0.0)
+    camera = Camera(K=intrinsics(600.0, VGA).double(), cam_from_world=Pose.identity(), hw=VGA)
+    rig = Rig({"a": camera, "b": camera.replace(cam_from_world=Pose(R, t if float(t[0]) else t - 0.1))})
+    for points, open_ in ((points_of(depth, t=t), True), (points_of(room), False)):
+        pairs = {("a", "b"): points}
+        turned = rig.perturbed({"b.rotation": vector(0.005, 0, 0)})
+        diagnosis = diagnose_matches(turned, {"a": VGA, "b": VGA}, pairs)
+        for found in (diagnosis, refine_matches(turned, [pairs])):
+            assert bool(found.undetermined) == open_
+            assert ("homography" in found.as_text()) == open_
+
+
 @pytest.mark.parametrize("wrong", [2, 5])
 def test_a_few_wrong_matches_make_no_lines(wrong):
     matches = points_of(wall)
     matches.beta[:wrong] += vector(25.0, 3.0) * torch.linspace(-1, 1.5, wrong).double()[:, None]
+    assert not explained(matches).has_lines
+
+
+def test_wrong_matches_along_lines_make_no_lines():
+    """Fourteen of 3,000, which the search for points that agree with lines lets through."""
+    matches = points_of(wall, count=3000)
+    line = epipolar_lines(fit_fundamental(matches), matches.alpha[::200])
+    along = torch.stack([-line[:, 1], line[:, 0]], -1) / line[:, :2].norm(dim=-1, keepdim=True)
+    matches.beta[::200] += 5 * along
     assert not explained(matches).has_lines
 
 

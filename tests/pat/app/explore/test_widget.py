@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch.nn.functional import avg_pool2d
 
-from arraygeom import Distortion, Epipolar, ReceptiveField
+from arraygeom import Distortion, Epipolar, Pose, ReceptiveField
 from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.runtime.text import UNSCALED
 from pat.app.sample_array import load_sample
@@ -24,6 +24,7 @@ from tests.browser import CHROMIUM, DRIVER, browser
 
 pytest.importorskip("anywidget", reason="the extra 'explore' is not installed")
 from pat.app.explore import ExplorerScene, explore
+from pat.app.explore.answers import MAPS
 
 webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
 Keys = webdriver.Keys
@@ -91,6 +92,41 @@ def test_pinned_pixels_stay_and_a_covariance_draws_a_band():
     assert change(view, x=[5, 5])["pins"] == [first, second]
     band = torch.tensor(view.answer["betas"]["b"]["band"])
     assert float((band[0] - band[3]).norm()) / 2 == pytest.approx(1.96 * 0.01 * 90, rel=0.2)
+
+
+def test_maps_show_length_sight_depth_range_and_entropy():
+    """Of a beta 1 m to the right: f b (1 / near - 1 / far) = 78.75 px, all of which the left sees cut."""
+    view = explore(small_rig(baseline=1.0))
+    assert view.answer["map"] is None
+    found = {which: change(view, map=which)["map"] for which in MAPS[1:]}
+    values = {n: torch.tensor([torch.nan if v is None else v for v in m["values"]]) for n, m in found.items()}
+    length, seen, depths, entropy = (
+        v.reshape(found[n]["rows"], found[n]["columns"]) for n, v in values.items()
+    )
+    assert float(length.nan_to_num().max()) == pytest.approx(78.75, abs=1.0)
+    assert set(seen.unique().tolist()) == {0.0, 1.0}
+    assert torch.equal(seen == 0, length.isnan())
+    # a pixel x is at x - 90 / z in beta: seen from z = 90 / (x + .5) on
+    x = (torch.arange(24) + 0.5) * 5 - 0.5
+    share = (((x + 0.5) / 90 - 1 / 8) / (1 - 1 / 8)).clamp(0, 1)
+    torch.testing.assert_close(depths[8], share, rtol=0, atol=0.04)
+    assert 0 <= float(entropy.nan_to_num().min()) < float(entropy.nan_to_num().max()) <= 1
+    wider = change(view, map=MAPS[1], baseline=0.5)["map"]["values"]
+    assert max(v for v in wider if v is not None) < 40
+    assert "error" in change(view, map="depth")
+
+
+def test_epipole_and_rays_of_the_pixel():
+    """A camera ahead is seen where the line between both centres goes; rays meet in the matched point."""
+    rig = small_rig(baseline=0.5)
+    place = Pose.from_centre(torch.eye(3).double(), torch.tensor([0.05, 0.0, -0.5]).double())
+    ahead = rig.with_camera("b", rig["b"].replace(cam_from_world=place))
+    assert explore(ahead).answer["betas"]["b"]["epipole"] == pytest.approx([59.5 - 9.0, 39.5], abs=0.01)
+    answer = explore(rig, x=(70, 30)).answer
+    assert answer["betas"]["b"]["epipole"] is None
+    a, b = (right / forward for right, forward in (camera["ray"] for camera in answer["top"]))
+    assert a == pytest.approx(10.5 / 90, abs=1e-3)
+    assert 0.5 / (a - b) == pytest.approx(answer["betas"]["b"]["depth"], rel=0.02)
 
 
 class Stated(NamedTuple):
@@ -240,10 +276,10 @@ def slide(driver, name, value):
     driver.execute_script(script, name, value)
 
 
-def choose(driver, camera):
-    script = """const select = document.querySelector('select[data-control=camera]');
+def choose(driver, value, control="camera"):
+    script = """const select = document.querySelector(`select[data-control=${arguments[1]}]`);
         select.value = arguments[0]; select.dispatchEvent(new Event('change'));"""
-    driver.execute_script(script, camera)
+    driver.execute_script(script, value, control)
 
 
 def resources(driver):
@@ -284,6 +320,12 @@ def test_the_saved_page_gives_the_numbers_of_the_kernel(driver, tmp_path):
             u, v, count = re.search(r"match \((.*), (.*)\), .*, (\d+) samples", told[1]).groups()
             assert int(count) == len(beta["samples"])
             assert [float(u), float(v)] == pytest.approx(beta["match"], abs=0.11)
+    for which in MAPS[1:]:  # of the rig as moved
+        choose(driver, which, "map")
+        ours = [v for v in change(view, map=which)["map"]["values"] if v is not None]
+        until(driver, lambda told, which=which: which in told[0])
+        low, high = map(float, re.search(rf"{which}: (\S+) to ([^,]+),", captions(driver)[0]).groups())
+        assert [low, high] == pytest.approx([min(ours), max(ours)], abs=0.05)
     assert resources(driver) == []
 
 
