@@ -160,7 +160,7 @@ class Pair(Batched):
         """
         if self.depth is None:
             raise ValueError(
-                "this field needs a depth range: give the rig one, `depth: [near, far]` in its file or "
+                "the rig states no depth range: give it one, `depth: [near, far]` in its file or "
                 "`rig.replace(depth=(near, far))`, or `--depth NEAR FAR` to `pat fuse` and `pat align`; "
                 "`pat rig doctor` says between which depths it finds points"
             )

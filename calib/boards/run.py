@@ -135,7 +135,7 @@ def watch(
 
     The page is the calibration's report, with what is missing and the views that would help most; before
     there is one, it says where the board was found and what is wrong. Images that cannot be read are tried
-    again; those already read stay known when their files go.
+    again.
 
     Args:
         page: HTML file to write.
@@ -145,7 +145,8 @@ def watch(
         finished: function that returns True to stop.
 
     Returns:
-        Size and detections of each image, by camera and moment.
+        Size and detections of each image, by camera and moment; also of files that are gone, which the page
+        leaves out.
 
     Raises:
         OSError: if the page cannot be written, or the folder is missing.

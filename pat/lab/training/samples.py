@@ -264,7 +264,7 @@ def photographs(config: TrainConfig) -> tuple[PhotoBank, PhotoBank]:
         ValueError: if there are none, or too few to hold some out.
     """
     if not config.photos and not (config.cache and config.cache.exists()):
-        raise ValueError("photos: none are given: name one or more folders with images")
+        raise ValueError("photos: none are given: name folders with images, --photos FOLDER")
     n = config.held_out
 
     def bank(choose: Callable[[int], bool]) -> PhotoBank:
