@@ -55,7 +55,16 @@ def oddities(rig: Rig) -> tuple[str, ...]:
 
 
 def unit_oddity(rig: Rig) -> str | None:
-    """Return a sentence on baselines that suggest another unit than metres; None if they do not."""
+    """Return a sentence on a single rig's baselines that suggest another unit than metres.
+
+    Returns:
+        The sentence; None for usual baselines, a single camera, and a rig of unknown scale.
+
+    Raises:
+        ValueError: for a batch of rigs.
+    """
+    if rig.batch_shape:
+        raise ValueError(f"a batch of rigs {tuple(rig.batch_shape)}: give one of them, as rig[0]")
     centres = [camera.centre for camera in rig.cameras.values() if isinstance(camera, Camera)]
     if len(centres) < 2 or length_unit(rig) != "m":
         return None

@@ -50,13 +50,14 @@ class PairSummary(NamedTuple):
     Attributes:
         alpha: name of alpha.
         beta: name of beta.
-        baseline: distance of the optical centres, metres.
+        baseline: distance of the optical centres, in the rig's unit.
         rotation: angle between the orientations, degrees.
-        seen: share of alpha's pixels with a segment in beta.
-        length: (median, largest) length of the segments, pixels of beta; None without any.
-        depth_step: change of depth at (near, far) that moves a point by one pixel of beta, metres: the median
-            of alpha's pixels whose point beta sees, NaN if it sees none; None without depth range or
-            baseline.
+        seen: share of alpha's pixels with a segment in beta; None without a depth range.
+        length: (median, largest) length of the segments, pixels of beta; None without any, and without a
+            depth range.
+        depth_step: change of depth at (near, far) that moves a point by one pixel of beta, in the rig's unit:
+            the median of alpha's pixels whose point beta sees, NaN if it sees none; None without depth range
+            or baseline.
     """
 
     alpha: str

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -19,7 +20,9 @@ FLIP = {"opengl": (1.0, -1.0, -1.0), "pytorch3d": (-1.0, -1.0, 1.0)}
 
 
 class GSplatCamera(NamedTuple):
-    """Cameras as arguments of `gsplat.rasterization`, with height and width beside them.
+    """Cameras as arguments of `gsplat.rasterization`, which also takes `Camera.hw`'s width and height.
+
+    It needs an axis of cameras: `viewmats[None]` and `Ks[None]` of a single one.
 
     Attributes:
         viewmats: camera from world, axes as ours.
@@ -78,10 +81,10 @@ def to_opengl(camera: Camera, near: float, far: float) -> OpenGLCamera:
     """Convert a pinhole camera, or a batch, with clipping planes at `near` and `far`; differentiable.
 
     Raises:
-        ValueError: for a lens, and planes that are not 0 < near < far.
+        ValueError: for a lens, and planes that are not 0 < near < far < infinity.
     """
-    if not 0 < near < far:
-        raise ValueError(f"clipping planes must be 0 < near < far, got {near} and {far}")
+    if not 0 < near < far < math.inf:
+        raise ValueError(f"clipping planes must be 0 < near < far < infinity, got {near} and {far}")
     (h, w), K = camera.hw, _pinhole(camera).K
     scale = K.new_tensor([2 / w, 2 / h])
     projection = K.new_zeros(*K.shape[:-2], 4, 4)

@@ -164,7 +164,8 @@ def states_cameras(paths: Sequence[Path]) -> bool:
 def rig_of_images(files: Mapping[str, Path]) -> Rig:
     """Read the rig of one capture's images from their tags.
 
-    Missing tags give warnings; without translations all cameras are at one point.
+    Missing tags of rotation, translation or sensor give warnings. Without distortion a camera has no lens;
+    without translations all cameras are at one point.
 
     Args:
         files: image of each camera by name.
@@ -173,7 +174,9 @@ def rig_of_images(files: Mapping[str, Path]) -> Rig:
         The rig, of the images as their orientation tags rotate them; lengths in metres.
 
     Raises:
-        RigFileError: for images without tags, of several captures or bodies, and numbers that no camera has.
+        RigFileError: for images without tags, tags that lack the intrinsics, several captures or bodies,
+            mirrored images, and numbers that no camera has.
+        OSError: for a file that cannot be opened.
         ValueError: for no images.
     """
     if not files:

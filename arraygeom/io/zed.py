@@ -43,6 +43,8 @@ HEAD = r"(?i)\[LEFT_CAM_"
 def read(source: RigSource) -> Rig:
     """Read the cameras `left` and `right`, at the requested size, else at the largest.
 
+    A file without a right camera gives `left` alone.
+
     Raises:
         RigFileError: for a damaged file, no camera of a known or of the requested size, or missing numbers.
     """

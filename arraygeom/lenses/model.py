@@ -116,9 +116,10 @@ class CameraModel(LensModel):
     which `K` then takes to pixels.
 
     A model of your own is a frozen dataclass with `project` and `unproject`, inverse to each other, and
-    tensors for its numbers; if it is defined with a name, rig files hold it. It is used as
+    tensors for its numbers, with `item_axes = {"k": 1}` for a vector k: without, its first axis is a batch.
+    Rig files hold it if it is defined as `class Mine(CameraModel, name="mine")`. It is used as
     `Camera.distortion`. Resizing, cropping and rotating an image change `K` alone. Rays that do not start in
-    the camera's origin also need `origins`, and `central = False`.
+    the camera's origin also need `origins`, `central = False`, and `lengths`.
 
     Raises:
         ValueError: when a subclass is defined with the name of another one.

@@ -88,7 +88,7 @@ def calibrate(
         board: the board.
         lens: lens model of all cameras, or of each by name.
         start: rig known to within `deviations`; one image of each camera is then enough, and the start's
-            world and lenses are kept.
+            world and kinds of lenses are kept; a pinhole gets the model `lens`.
         deviations: standard deviations about the start; None for the defaults.
 
     Returns:

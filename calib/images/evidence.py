@@ -188,7 +188,8 @@ def _observations(pairs: Sequence[Pair], matches: PointMatches) -> PointObservat
 def _inliers(tried: Sequence[Hypothesis], off: Tensor, pairs: Pairs) -> tuple[Tensor, float]:
     """Select the points consistent with some pose of the cameras.
 
-    The pose is free, so only the lens matters: the best explanation that changes it is used.
+    An F is fitted robustly to the points under the rig's own lens ("nothing"), and without ("distortion"),
+    and the better fit is used: of the cameras only their lenses matter.
 
     Returns:
         A mask of the points, and their mean square distance then, square pixels.

@@ -188,7 +188,8 @@ def link_of_points(rig: Rig, pair: tuple[str, str], points: PointMatches) -> tup
         explanation taken.
 
     Raises:
-        ValueError: for points that no F fits, or fewer than `ENOUGH` that agree with it.
+        ValueError: for points that no F fits, or of which fewer than `ENOUGH` agree with it; where there are
+            fewer than `ENOUGH`, for points that no homography fits: under four, or all at one spot.
     """
     if len(points.alpha) < ENOUGH:
         explained = registration(fit_homography(points), points)

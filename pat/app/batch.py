@@ -414,11 +414,13 @@ def find_images(text: str | Path, *, name: str = "") -> list[Path]:
 
     Returns:
         Files in natural order, numbers in names counting as such; of a folder those with the suffix of an
-        image. Hidden ones are left out; a single file may have any other suffix than a video's.
+        image, of a pattern all that match. Hidden ones are left out; a single file may have any other suffix
+        than a video's.
 
     Raises:
         FileNotFoundError: if there is none.
-        ValueError: for a video, and two files whose names differ in the suffix alone.
+        ValueError: for a text that ends in a video's suffix, and two files whose names differ in the
+            suffix alone.
     """
     path = Path(text)
     label = f"{name}: " if name else ""

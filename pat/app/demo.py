@@ -51,7 +51,8 @@ def classical_methods(
         noise: noise level by camera; None for ideal cameras.
 
     Returns:
-        Fused images (3, h, w) by method; the plain one alone for ideal cameras (`noise` None).
+        Fused images (3, h, w) by method: "classical", "classical, corrected", "classical, denoised" and
+        "classical, denoised and corrected"; the first alone for ideal cameras (`noise` None).
     """
     rig, images, _ = array
     methods = {"classical": classical(rig, images, ALPHA, BETA)}

@@ -97,7 +97,8 @@ def measured_depth(
         corner: (x, y) of the inputs' first pixel in alpha.
 
     Returns:
-        Depth (h, w) in the rig's unit, NaN where unknown; the half-width (h, w) of the interval of its
+        Depth (h, w) along alpha's axis, or along its rays where a placement's `bounds` are distances, in the
+        rig's unit, NaN where unknown; the half-width (h, w) of the interval of its
         inverse, as in `Frame`; and the image's confidence (h, w), 0 to 1.
     """
 

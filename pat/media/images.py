@@ -113,12 +113,12 @@ def read_recorded(
     """Read an image file's values without scaling; files, options and errors as in `read_image`.
 
     Returns:
-        Values (c, h, w) in the file's own type, uint8, uint16 or float, RGB order; TIFF and PNM files with a
-        lower white hold the camera's counts.
+        Values (c, h, w) in the file's own type: uint8, uint16, float, or a TIFF's signed integers; RGB order;
+        TIFF and PNM files with a lower white hold the camera's counts.
 
     Raises:
         FileNotFoundError: for a missing file.
-        ValueError: as `read_image`; float values outside 0..1 are not refused here.
+        ValueError: as `read_image`; signed integers, NaN and values outside 0..1 are not refused here.
     """
     label = f"{name}: {path}" if name else f"{path}"
     return np.ascontiguousarray(_planes(Path(path), label, hw, orientation)[0])

@@ -137,7 +137,8 @@ def required(matches: Matches | None, inputs: Inputs) -> Matches:
         The matches.
 
     Raises:
-        ValueError: for None, or matches of other inputs.
+        ValueError: for None, and matches that `Matches.check` refuses: of another size or number of betas.
+            Matches of other images of the same size are not noticed.
     """
     if matches is None:
         raise ValueError("this network fuses by matches: call it as network(inputs, match(inputs))")

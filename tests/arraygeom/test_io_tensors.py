@@ -66,5 +66,6 @@ def test_what_they_cannot_hold_is_refused():
         tensors.to_gsplat(CAMERA.replace(distortion=BARREL))
     with pytest.raises(ValueError, match="skewed"):
         tensors.to_pytorch3d(SKEWED)
-    with pytest.raises(ValueError, match="near"):
-        tensors.to_opengl(CAMERA, 2.0, 1.0)
+    for far in (1.0, float("inf")):
+        with pytest.raises(ValueError, match="near"):
+            tensors.to_opengl(CAMERA, 2.0, far)

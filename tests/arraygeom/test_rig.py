@@ -342,3 +342,11 @@ def test_lengths_are_scaled_by_a_positive_factor(factor, tmp_path):
     for scaled in (rig.scaled, rig["b"].scaled, lambda factor: read_rig(tmp_path / "rig.yaml", scale=factor)):
         with pytest.raises(ValueError, match=r"factor|scale"):
             scaled(factor)
+
+
+def test_the_unit_of_a_batch_of_rigs_is_asked_for_one_of_them():
+    K = intrinsics(torch.tensor([90.0, 95.0]), (80, 100))
+    rig = Rig({n: Camera(K=K, cam_from_world=Pose.identity(), hw=(80, 100)) for n in "ab"})
+    with pytest.raises(ValueError, match="batch"):
+        rig_check.unit_oddity(rig)
+    assert rig_check.unit_oddity(rig[0]) is None

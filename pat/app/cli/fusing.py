@@ -119,8 +119,8 @@ class Fusing(Known):
             Images NAME=FILE of the rig's cameras, and True; or no images, and False without a rig.
 
         Raises:
-            ValueError: for arguments that contradict each other, and a format whose extra is not installed.
-            FileNotFoundError: for files that do not exist.
+            ValueError: as `named_images`, and for a format whose extra is not installed.
+            FileNotFoundError: as `named_images`.
         """
         if self.kind == "exr":
             from ...media.images import exr_writer
@@ -264,11 +264,14 @@ def named_images(paths: Sequence[Path], image: Sequence[str], command: str) -> t
         image: values of --image.
 
     Returns:
-        Images NAME=FILE, and True if the first argument is a rig; empty without a rig.
+        Images NAME=FILE, and True if the first argument is taken as a rig, as it always is with `image`;
+        empty without a rig.
 
     Raises:
-        ValueError: for arguments that contradict each other.
-        FileNotFoundError: for files that do not exist.
+        ValueError: for fewer than two images without a rig, a rig without images, `image` without a rig, and
+            text other than NAME=FILE.
+        FileNotFoundError: for a missing rig file, and without a rig for a missing image; a rig's images are
+            not looked for here.
     """
     if paths and (image or is_rig_file(paths[0])):
         named = (*image, *(f"{path}" if is_named(path) else f"{path.stem}={path}" for path in paths[1:]))

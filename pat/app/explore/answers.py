@@ -237,9 +237,10 @@ def drawn(beta: BetaReport) -> dict[str, Any]:
     """Convert a beta's report to plain values for JSON.
 
     Returns:
-        `samples` and `match` in beta's pixels, `weights`, `depths` and `depth` in the rig's unit (None where
-        unknown), `off`, the distance of the images' match from the line, pixels, and `band`, its corners in
-        beta's pixels (both None where there is none); or a `problem` if no sample is on the image.
+        `samples` on the image and `match`, the one of the largest weight, in beta's pixels; their `weights`;
+        `depths` and the match's `depth` in the rig's unit (None where unknown); `off`, the distance from the
+        line of what the images themselves show to match, pixels, and `band`, its corners in beta's pixels
+        (both None where there is none); or a `problem` if no sample is on the image.
     """
     if not bool(beta.valid.any()):
         return {"problem": "no part of the segment lies in this image: the views do not overlap here"}

@@ -72,7 +72,9 @@ class Studio:
             spectrum: "rgb" for colours, "nir" for near infrared.
 
         Returns:
-            Channels (h, w), float32, by Blender's names: colours, depth, object index.
+            Channels (h, w), float32: "Combined.R", ".G" and ".B", near infrared in all three; "Depth.Z",
+            metres along the optical axis, above `NOTHING` where a ray hit nothing; and by `index_name` the
+            object's number from 1, or 0.
 
         Raises:
             ValueError: for what Blender refuses, in one line.
