@@ -345,7 +345,7 @@ def test_lengths_are_scaled_by_a_positive_factor(factor, tmp_path):
 
 
 def test_the_unit_of_a_batch_of_rigs_is_asked_for_one_of_them():
-    K = intrinsics(torch.tensor([90.0, 95.0]), (80, 100))
+    K = torch.stack([intrinsics(focal, (80, 100)) for focal in (90.0, 95.0)])
     rig = Rig({n: Camera(K=K, cam_from_world=Pose.identity(), hw=(80, 100)) for n in "ab"})
     with pytest.raises(ValueError, match="batch"):
         rig_check.unit_oddity(rig)
