@@ -72,10 +72,12 @@ def test_differences_are_of_the_same_images():
 
 @pytest.mark.slow
 def test_every_arm_is_trained_and_scored(tmp_path):
+    photos = tmp_path / "photos"  # beside the runs, whose pictures would be photographs too
+    photos.mkdir()
     for i in range(24):
-        write_image(tmp_path / f"{i}.png", torch.rand(3, 64, 64, generator=torch.Generator().manual_seed(i)))
+        write_image(photos / f"{i}.png", torch.rand(3, 64, 64, generator=torch.Generator().manual_seed(i)))
     recipe = replace(
-        RECIPE, photos=(tmp_path,), out=tmp_path / "runs", hw=(32, 48), steps=2, validate=2, warmup=1
+        RECIPE, photos=(photos,), out=tmp_path / "runs", hw=(32, 48), steps=2, validate=2, warmup=1
     )
     rows, panels = compare_trained(recipe, [0], batches=1)
     assert {row.arm for row in rows} == {*ARMS}
