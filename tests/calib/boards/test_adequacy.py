@@ -122,10 +122,11 @@ def test_fisheyes_of_each_model_are_found(lens):
     boards = board_poses(12, depth=(0.4, 0.9), spread=0.7)
     found = calibrate(see(Rig({"a": true}), boards, noise=0.05), BOARD, lens=lens)
     assert found.rms == pytest.approx(0.05 * 2**0.5, rel=0.1)
-    if lens == "double-sphere":  # whose xi and focal length stand for one another: it is fixed at 0
+    if len(found.fit.names) < 4 + len(coefficients):
+        # Of a double sphere, xi and focal length stand for one another: where a fit ends short, xi is 0.
+        assert lens == "double-sphere"
         assert [note for note in found.notes if "xi" in note]
     else:
-        assert len(found.fit.names) == 4 + len(coefficients), "all of them are determined"
         deviations = np.sqrt(found.fit.covariance.diagonal())
         assert np.abs(errors_of(found.fit, Rig({"a": true})) / deviations).max() < 4
 
