@@ -149,7 +149,8 @@ def refine_matches(
             uncertain then, depth may change in any way, and nothing is refused, whatever `force` says.
 
     Returns:
-        The refined rig if accepted, else the given one, with changes and objections.
+        The refined rig if accepted, else the given one, with changes and objections; where nothing moved it
+        is not accepted, whatever was forced. The first camera keeps its pose.
 
     Raises:
         ValueError: for a rig that relates none of the pairs, points of which none are left to use, or nothing
