@@ -115,7 +115,7 @@ def test_true_is_no_number_in_json(entry, tmp_path):
 
 def test_half_a_character_is_refused(tmp_path):
     """A name with one cannot be printed."""
-    with pytest.raises(RigFileError, match="character") as caught:
+    with pytest.raises(RigFileError, match=r"character[^/]*$") as caught:
         read_rig(nerfstudio(tmp_path, FRAME | {"file_path": "a\ud800"}))
     str(caught.value).encode()
     assert read_rig(nerfstudio(tmp_path, FRAME | {"file_path": "\U0001f4f7"})).names == ("\U0001f4f7",)

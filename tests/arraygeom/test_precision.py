@@ -245,7 +245,7 @@ def test_intrinsics_keep_the_gradient():
 
 
 def test_a_batch_of_rigs_is_not_one_rig_file(tmp_path):
-    with pytest.raises(ValueError, match="batch"):
+    with pytest.raises(ValueError, match=r"batch[^/]*$"):
         stack([random_rig(0), random_rig(1)]).save(tmp_path / "rig.yaml")
     assert not list(tmp_path.iterdir())
 

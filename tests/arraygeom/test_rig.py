@@ -340,7 +340,7 @@ def test_lengths_are_scaled_by_a_positive_factor(factor, tmp_path):
     rig = parallel_rig(80.0, (48, 64), {"a": (), "b": (0.1,)}, (1.0, 50.0))
     rig.save(tmp_path / "rig.yaml")
     for scaled in (rig.scaled, rig["b"].scaled, lambda factor: read_rig(tmp_path / "rig.yaml", scale=factor)):
-        with pytest.raises(ValueError, match=r"factor|scale"):
+        with pytest.raises(ValueError, match=r"(factor|scale)[^/]*$"):
             scaled(factor)
 
 

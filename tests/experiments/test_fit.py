@@ -52,7 +52,7 @@ def test_a_run_of_another_recipe_is_refused_before_anything_is_done(tmp_path):
         (recipe.out / "pairs").mkdir()
     with replace(recipe, device="cuda", save=7).folder():
         assert (recipe.out / "pairs").exists()
-    with pytest.raises(ValueError, match="recipe"), replace(recipe, seed=1).folder():
+    with pytest.raises(ValueError, match=r"recipe[^/]*$"), replace(recipe, seed=1).folder():
         pytest.fail("not refused")
 
 

@@ -140,7 +140,7 @@ def test_checkpoints_with_wrong_facts_are_damaged(wrong, tmp_path):
     path = write_checkpoint(tmp_path, collect(*cases.training(), FACTS))
     assert newest_checkpoint(tmp_path).facts == FACTS
     write_tensors(path, {}, {"format": FORMAT, "facts": json.dumps(FACTS | wrong)})
-    with pytest.raises(ValueError, match="checkpoint"):
+    with pytest.raises(ValueError, match=r"checkpoint[^/]*$"):
         newest_checkpoint(tmp_path)
 
 

@@ -123,7 +123,7 @@ def test_fisheyes_of_each_model_are_found(lens):
     found = calibrate(see(Rig({"a": true}), boards, noise=0.05), BOARD, lens=lens)
     assert found.rms == pytest.approx(0.05 * 2**0.5, rel=0.1)
     if len(found.fit.names) < 4 + len(coefficients):
-        # Of a double sphere, xi and focal length stand for one another: where a fit ends short, xi is 0.
+        # A double sphere's xi and focal length stand for one another: where a fit ends short, xi is 0.
         assert lens == "double-sphere"
         assert [note for note in found.notes if "xi" in note]
     else:

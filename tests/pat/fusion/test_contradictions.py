@@ -89,7 +89,7 @@ def test_bits_that_the_counts_contradict_are_named(tmp_path):
 @pytest.mark.parametrize("text", ["RGB", "colour", "", 5])
 def test_a_response_is_a_name_that_is_known(text, tmp_path):
     """RGB, in capitals, is refused, not taken for one band."""
-    with pytest.raises((ValueError, TypeError), match="response"):
+    with pytest.raises((ValueError, TypeError), match=r"response[^/]*$"):
         Sensor(response=text)
     (tmp_path / "rig.yaml").write_text(
         f"format: arraygeom-rig 1\ncameras:\n  a: {{size: [4, 4], response: {text or repr('')}}}\n"

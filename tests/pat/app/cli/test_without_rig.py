@@ -243,7 +243,7 @@ def test_videos_are_read_as_they_were_written(tmp_path):
     assert video.rate == pytest.approx(10)
     assert [float(frame.mean()) for frame in found] == pytest.approx([0.2, 0.6], abs=0.02)
     (tmp_path / "no.mp4").write_text("no video")
-    with pytest.raises(ValueError, match="video"):
+    with pytest.raises(ValueError, match=r"video[^/]*$"):
         read_video(tmp_path / "no.mp4")
 
 

@@ -78,7 +78,7 @@ def test_too_few_photographs_to_hold_some_out_are_said_to_be(tmp_path, images):
     """The message counts photographs."""
     cv2.imwrite(str(tmp_path / "only.png"), images[0])
     assert PhotoBank.load(tmp_path, choose=lambda i: i % 20 == 0).photos == 1
-    with pytest.raises(ValueError, match="photographs"):
+    with pytest.raises(ValueError, match=r"photographs[^/]*$"):
         PhotoBank.load(tmp_path, choose=lambda i: i % 20 != 0)
 
 

@@ -35,7 +35,7 @@ def test_skew_is_refused_before_blender_starts(tmp_path):
 
 def test_a_folder_that_exists_is_refused(tmp_path):
     (tmp_path / "x").mkdir()
-    with pytest.raises(ValueError, match="exists"):
+    with pytest.raises(ValueError, match=r"exists[^/]*$"):
         render(room_scene(), RIG, tmp_path / "x", settings=SETTINGS)
 
 
