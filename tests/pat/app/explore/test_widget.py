@@ -95,7 +95,7 @@ def test_pinned_pixels_stay_and_a_covariance_draws_a_band():
 
 
 def test_maps_show_length_sight_depth_range_and_entropy():
-    """Segments of a beta 1 m to the right are f b (1 / near - 1 / far) long; the left columns see them cut."""
+    """Segments of a beta 1 m to the right are f b (1 / near - 1 / far); the left columns see them cut."""
     view = explore(small_rig(baseline=1.0))
     assert view.answer["map"] is None
     found = {which: change(view, map=which)["map"] for which in MAPS[1:]}
