@@ -28,6 +28,8 @@ UNITS: dict[str, tuple[str, float, int | None]] = {
 """Parameter of beta, unit and axis by name: degrees, tenths of the baseline, 1 % of the focal length, 1."""
 AT, STEP = 0.07, 1e-3
 """Position and step of the differences, in these units; the step of k1 is ten times as large."""
+POINTS = 8
+"""Points within the step at which gradients of the paper's network are averaged."""
 REACH = 10
 """Pixels of alpha within which a pixel of the paper's image depends on segments."""
 BORDER = 8.0
@@ -96,32 +98,43 @@ def regions(rig: Rig) -> dict[str, Tensor]:
 def gradient_rows(
     networks: dict[str, FusionNetwork], sample: SampleArray, parameters: Sequence[str]
 ) -> list[GradientRow]:
-    """Compare gradients of `fuse(differentiable=True)` with differences: by network, parameter and region."""
+    """Compare gradients of `fuse(differentiable=True)` with differences: by network, parameter and region.
+
+    A difference is a mean over its step. So are the gradients of the paper's network, in float64; others are
+    taken in the middle.
+    """
     rows, masks = [], regions(sample.rig)
     settings = FuseSettings(align=False, response="rec601")
 
     def errors(
         network: FusionNetwork, name: str, by: Tensor, *, differentiable: bool = False
     ) -> list[Tensor]:
-        rig = moved(sample.rig, {name: by})
+        rig, dtype = (
+            moved(sample.rig, {name: by}),
+            torch.float64 if isinstance(network, PAT) else torch.float32,
+        )
+        images = {camera: image.to(dtype) for camera, image in sample.images.items()}
         frame = fuse_frame(
-            sample.images, rig, alpha=ALPHA, network=network, settings=settings, differentiable=differentiable
+            images, rig, alpha=ALPHA, network=network, settings=settings, differentiable=differentiable
         )
         error = (frame.image - sample.ground_truth).double().square().mean(0)
         return [error[mask].mean() for mask in masks.values()]
 
+    def gradients(network: FusionNetwork, name: str, at: float) -> list[float]:
+        by = torch.tensor(at, dtype=torch.float64, requires_grad=True)
+        found = errors(network, name, by, differentiable=True)
+        return [float(torch.autograd.grad(error, by, retain_graph=True)[0]) for error in found]
+
     for title, network in networks.items():
+        network, points = (network.double(), POINTS) if isinstance(network, PAT) else (network, 1)
         for name in parameters:
-            by = torch.tensor(AT, dtype=torch.float64, requires_grad=True)
-            slopes = [
-                torch.autograd.grad(error, by, retain_graph=True)[0]
-                for error in errors(network, name, by, differentiable=True)
-            ]
             step = 10 * STEP if name == "k1" else STEP
-            ends = (errors(network, name, by.detach() + by_step) for by_step in (step, -step))
-            for region, slope, after, before in zip(masks, slopes, *ends):
+            offsets = [step * ((2 * i + 1) / points - 1) for i in range(points)]
+            each = [gradients(network, name, AT + offset) for offset in offsets]
+            ends = (errors(network, name, torch.tensor(AT + s, dtype=torch.float64)) for s in (step, -step))
+            for region, slopes, after, before in zip(masks, zip(*each), *ends):
                 difference = float(after - before) / (2 * step)
-                rows.append(GradientRow(title, name, region, float(slope), difference))
+                rows.append(GradientRow(title, name, region, sum(slopes) / points, difference))
     return rows
 
 

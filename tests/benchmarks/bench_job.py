@@ -61,7 +61,7 @@ CASES = (
     Case("640x400", (640, 400)),
     Case("1280x800", (1280, 800)),
     Case("1280x800, 3 betas", (1280, 800), betas=3),
-    *(Case(f"4024x3036, {cap}", (4024, 3036), cap=cap) for cap in ("2GiB", "4GiB", "8GiB")),
+    *(Case(f"4024x3036, {cap}", (4024, 3036), cap=cap) for cap in ("3GiB", "4GiB", "8GiB")),
     Case("4024x3036, 3 betas, 4GiB", (4024, 3036), 3, "4GiB"),
 )
 QUICK = CASES[1:2]
