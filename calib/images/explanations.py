@@ -38,7 +38,7 @@ class Explanation(NamedTuple):
     """The simplest explanation of a pair's points within their noise, with its evidence.
 
     Attributes:
-        H: homography nearest to most points, beta from alpha.
+        H: homography nearest to most points, beta from alpha, undistorted pixels.
         points: number of the points.
         beyond: number of points off H and smooth lenses, along the lines of F.
         wrong: number of points off these lines.
@@ -84,12 +84,14 @@ def explain(matches: PointMatches, pair: Pair) -> Explanation:
 
     Args:
         matches: undistorted points, of which F fits most.
+        pair: the pair, with F or cameras.
 
     Returns:
         The explanation; H is the identity if no homography fits.
 
     Raises:
         ValueError: for a pair without F or cameras.
+        cv2.error: for fewer than four points.
     """
     x, y = (points.double() for points in matches)
     H = _fit_to_most(x, y)
@@ -106,7 +108,11 @@ def undetermined(rig: Rig, pairs: Pairs) -> tuple[str, ...]:
     """Describe the pairs whose points determine no lines, with an F of their own instead of the rig's.
 
     Returns:
-        A sentence a pair, without a full stop; nothing for pairs whose points determine lines.
+        A sentence a pair, without a full stop; none for pairs whose points determine lines, or of which no F
+        fits `ENOUGH`.
+
+    Raises:
+        ValueError: for a camera that the rig lacks.
     """
     sentences = []
     for names, matches in pairs.items():

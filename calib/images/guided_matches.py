@@ -50,10 +50,12 @@ def guided_matches(
         alpha: image (C, H, W) in 0..1.
         beta: image (C, H, W) in 0..1.
         beta_from_alpha: homography of pixels.
-        shown: masks of the pixels that each camera recorded; patches with other pixels are not used.
+        window: largest distance in x and in y, pixels of beta.
+        shown: masks of the pixels that each camera recorded, of the images' sizes, on the CPU; patches with
+            other pixels are not used.
 
     Returns:
-        Whole pixels of alpha and positions in beta to a fraction of a pixel; possibly none.
+        Whole pixels of alpha and positions in beta to a fraction of a pixel, float64; possibly none.
     """
     alpha_image, beta_image = (contrast_equalised(image) for image in (alpha, beta))
     solid = np.ones((2 * PATCH + 1, 2 * PATCH + 1), np.uint8)

@@ -48,22 +48,25 @@ def centres_found(
 ) -> tuple[Rig, dict[str, tuple[int, float]]]:
     """Estimate translations of pinhole cameras, and refine their orientations, from one image of each.
 
-    Alpha is at the origin, and the baseline of the first beta is 1, unless the rig states translations, whose
-    scale is kept. Cameras that match with none are left out. Views should be of about equal scale and
-    orientation, and parallax a small share of the image (`WINDOW`).
+    Alpha is at the origin with the world's axes, and the baseline of the first beta is 1, unless the rig
+    states translations: then it is the stated length. Cameras that no pairs connect with alpha are left out.
+    Views should be of about equal scale and orientation, and parallax a small share of the image (`WINDOW`).
 
     Args:
         rig: pinhole cameras of known intrinsics and roughly known orientation.
-        images: one image (C, H, W) in 0..1 per camera, by name.
-        shown: masks of the pixels that each camera recorded, by name.
+        images: one image (C, H, W) in 0..1 for every camera of the rig, of its size, by name.
+        shown: masks (H, W) of the pixels that each camera recorded, by name.
         alpha: name of alpha.
 
     Returns:
-        The rig with its depth range, named `OPEN` if orientations alone explain the points as well;
-        and for each beta the number of its points and their median distance from their lines, pixels.
+        The rig with its depth range, named `OPEN` if orientations alone explain the points as well; and by
+        beta's name the number of its points, in all pairs, and their median distance from their lines,
+        pixels.
 
     Raises:
-        ValueError: if no camera matches with alpha, or no points have parallax.
+        ValueError: for an `alpha` that the rig lacks, if no camera matches with it, if points are all in one
+            spot, or none have parallax.
+        KeyError: for a camera without an image or mask.
     """
     known = rig
     stated = {name: float(rig.pair(alpha, name).beta_from_alpha.t.norm()) for name in rig.betas(alpha)}
