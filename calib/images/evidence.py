@@ -111,7 +111,7 @@ def fit_statistics(
     """Compute the statistics of every hypothesis: distances by the inliers, shares and depth by all points.
 
     Inliers, the same for all, are points near the lines of an F that is fitted anew to each pair, under the
-    lenses of the given rig ("nothing") or without those it ignores ("distortion"), whichever fits better.
+    lenses of the hypothesis of kind "nothing" or "distortion" that fits best then.
 
     Returns:
         Statistics by hypothesis; a mask of the inliers among all points of all pairs; and the standard

@@ -131,7 +131,7 @@ def shifts_left_out(
         parts: number of the part in which each residual is, as `parts_of` counts them.
 
     Returns:
-        One row per part, in prior deviations; about 0 for a part without residuals.
+        One row per part, in prior deviations; 0 for a part without residuals.
     """
     r, J = jacobian(residuals, z)
     weight = _weight(r)

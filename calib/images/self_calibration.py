@@ -79,8 +79,8 @@ class RefinedPair(NamedTuple):
 
     Attributes:
         rig: the two cameras, alpha at the origin, with the depth range of the points.
-        points: number of the points.
-        distance: their median distance from their lines, pixels of beta.
+        points: number of the points by which the depth range and `distance` are measured.
+        distance: their median distance from the rig's lines, pixels of the undistorted beta.
         exact: True if these lines fit as well as those of F alone; if False, the rig serves for rough depths,
             and the lines should be those of F.
     """
@@ -101,16 +101,17 @@ def self_calibrated(
     lenses of their views; the pair then is not `exact`.
 
     Args:
-        views: alpha's and beta's view, by name, alpha first.
-        link: F between the undistorted views.
-        matches: points of the images as recorded, distorted.
+        views: alpha's and beta's view, by name, alpha first; a lens must be a `Distortion`.
+        link: F between the undistorted views, and H if known: the ratio of focal lengths, and a rotation by
+            quarter turns.
+        matches: points of the images as recorded, distorted; of which several must be near their lines.
         focal: focal lengths in pixels by camera; missing ones are assumed.
 
     Returns:
         The pair, with the depth range of the points; None for points that no poses explain.
 
     Raises:
-        ValueError: for points that are all in one spot.
+        ValueError: for another number of views than two, and points that are all in one spot.
     """
     alpha, beta = views
     lenses = {
@@ -153,12 +154,18 @@ def refined_by_depth(
     squares.
 
     Args:
-        images: one image (C, H, W) in 0..1 per camera, of the pair's sizes.
+        pair: the pair, whose cameras have no lenses.
+        images: one image (C, H, W) in 0..1 per camera, of the pair's sizes, by name.
         depth: depth of alpha's pixels, in the pair's unit; NaN where unknown.
         confidence: confidence of alpha's pixels, 0..1.
 
     Returns:
-        The refined pair; the same pair if there are too few matches, or it has no parallax.
+        The refined pair, always marked `exact`; the same pair if there are fewer than 5 `ENOUGH` matches, or
+        it has no parallax.
+
+    Raises:
+        ValueError: for points that are all in one spot.
+        KeyError: for a camera without an image.
     """
     matches = dense_matches(pair.rig, images, depth, confidence)
     if len(matches.alpha) < 5 * ENOUGH:
@@ -171,11 +178,15 @@ def joined(pairs: Mapping[str, RefinedPair], scales: Mapping[str, float]) -> Rig
     """Join calibrated pairs with one alpha into one rig.
 
     Args:
-        pairs: pairs by beta's name.
-        scales: factor of each pair's lengths, by beta's name.
+        pairs: pairs by beta's name, with depth ranges, one at least.
+        scales: factor of each pair's lengths, by beta's name, for all of them.
 
     Returns:
-        The rig named `UNSCALED`, alpha first, with the depth range of all.
+        The rig named `UNSCALED`: alpha as in the first pair, then the betas, with a depth range that includes
+        theirs.
+
+    Raises:
+        KeyError: for a pair without a scale.
     """
     rigs = {name: pair.rig.scaled(scales[name]) for name, pair in pairs.items()}
     first = next(iter(rigs.values()))
@@ -198,7 +209,11 @@ def dense_matches(
         confidence: confidence of alpha's pixels; those up to `LEAST_CONFIDENCE` are left out.
 
     Returns:
-        The matches whose position is known to `WELL_LOCALISED` pixels.
+        The matches whose position is known to `WELL_LOCALISED` pixels, float64; possibly none.
+
+    Raises:
+        ValueError: for an uncalibrated rig.
+        KeyError: for a camera without an image.
     """
     alpha, beta = (camera.to(torch.float64) for camera in _pair(rig).cameras)
     alpha_image, beta_image = (contrast_equalised(images[name]) for name in rig.names)
@@ -267,13 +282,13 @@ def initial_poses(
     With parallel axes beta is to either side along the direction in which most points differ.
 
     Args:
-        matches: points of alpha and beta.
-        link: link of the two views, with F and H.
-        K: alpha's intrinsics.
-        K_beta: beta's intrinsics.
+        matches: points of alpha and beta, undistorted, float64.
+        link: link of the two views, F and, for a rotation by quarter turns, H.
+        K: alpha's intrinsics, float64.
+        K_beta: beta's intrinsics, float64.
 
     Returns:
-        Two to four poses, beta from alpha.
+        Two to four poses, beta from alpha, float64.
     """
     R, rays = _upright(link), [torch.linalg.inv(k) for k in (K, K_beta)]
     x, y = (map_homogeneous(inverse, points)[..., :2] for inverse, points in zip(rays, matches))
