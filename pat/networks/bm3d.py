@@ -125,7 +125,7 @@ def wiener_filtered(
     Beyond the edges images are mirrored. Computed in float32 on the CPU, on as many threads as torch may use.
 
     Args:
-        image: noisy image of any bands; values must be finite here and below.
+        image: noisy image of any bands. All values must be finite.
         expected: estimate of the image without noise.
         deviation: standard deviation of each value's noise.
         guide: image in which blocks are compared, of any bands and the same size.
@@ -240,7 +240,7 @@ def find_alike(guide, top, alike):
     differences.
 
     Args:
-        guide: image (bands, h, w), float32, in which blocks are compared; RADIUS pixels around all blocks.
+        guide: image (bands, h, w), float32, in which blocks are compared, with RADIUS pixels around them all.
         top: number of the first row of reference blocks.
         alike: displacements (y, x) to write, integers (rows, columns, ALIKE, 2), the most similar first, for
             reference block (r, k), which begins at row RADIUS + STEP (top + r) and column RADIUS + STEP k; it

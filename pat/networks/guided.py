@@ -28,7 +28,7 @@ from .recall import by_example, with_less_noise
 
 
 class GuidedPAT(nn.Module):
-    """Fusion network that gives a mono alpha the bands of its betas, found by matching.
+    """Fusion network, without weights, that gives a mono alpha the bands of its betas, found by matching.
 
     With `config.bands` the image has that many bands: three filtered cameras give one each, or any number of
     RGB cameras all three; other betas help to find depth only. With `config.bands` None the image has all

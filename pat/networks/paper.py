@@ -30,11 +30,11 @@ SURROUNDINGS, FLOOR = 9, 0.01
 
 
 class QueryAndKey(NamedTuple):
-    """Features of an image that attention compares.
+    """Features of one image that attention compares.
 
     Attributes:
-        query: features (B, D, H, W) of an alpha.
-        key: features (B, D, H, W) of a beta.
+        query: features (B, D, H, W) of the image as alpha.
+        key: features (B, D, H, W) of the image as a beta.
     """
 
     query: Tensor
@@ -172,8 +172,8 @@ class AttentionEngine(nn.Module):
     """Layers that make alpha's queries and each beta's keys and values, for attention along the segments.
 
     Args:
-        config: configuration of the network, for `betas`, `dim`, `interpolation` and whether a block has
-            biases.
+        config: configuration of the network, for `betas`, `dim`, `interpolation`, `block_bias` and
+            `values_after_block`.
     """
 
     def __init__(self, config: PATConfig) -> None:

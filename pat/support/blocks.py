@@ -97,12 +97,13 @@ def enlarge(x: Float[Tensor, "b d h w"], factor: int = 2) -> Float[Tensor, "b d 
 
 
 class UNet(nn.Module):
-    """U-Net of three scales, for inputs whose sides are multiples of 4.
+    """U-Net of three scales: called with (b, `inputs`, h, w), sides multiples of 4, it returns (b, `outputs`,
+    h, w).
 
     Args:
         inputs: number of channels of the input.
-        widths: channels at full, 1/2 and 1/4 size.
-        outputs: number of channels of the output, which has the input's size.
+        widths: channels at full, 1/2 and 1/4 size; three numbers.
+        outputs: number of channels of the output.
         blocks: residual blocks on the way down and again up at full and 1/2 size; 2 `blocks` at 1/4.
     """
 
@@ -119,8 +120,6 @@ class UNet(nn.Module):
 
     def forward(self, x: Float[Tensor, "b i h w"]) -> Float[Tensor, "b o h w"]:
         """Return features (b, outputs, h, w) for an input (b, inputs, h, w).
-
-        Without gradients the largest stages are computed `ROWS` rows at a time, to save memory.
 
         Raises:
             RuntimeError: by torch, for sides above 1 that are not multiples of 4; a side of 1 gives 4.

@@ -181,7 +181,8 @@ def run_tasks(
             stay.
         OSError: without `resume`, for a folder in the way, or a file that cannot be deleted.
         ImportError: for a scheduler where Dask is not installed.
-        ValueError: if no scheduler answers; TimeoutError if it has no worker within a minute.
+        ValueError: if no scheduler answers.
+        TimeoutError: if it has no worker within a minute.
         Exception: another error of a task in this process, as it is.
     """
     if not resume:

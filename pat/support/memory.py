@@ -99,15 +99,15 @@ networks that use matches (plans had from 151)."""
 
 
 def check_limit(pixels: int, limit: float | None = None, each: float = LEAST_BYTES) -> None:
-    """Check, before anything is read, that a frame of so many pixels can be fused within a memory limit.
+    """Refuse, before anything is read, a frame that certainly cannot be fused within a memory limit.
 
     Args:
         pixels: number of alpha's pixels.
         limit: bytes; None or 0 for that of `limited`, without which any frame fits.
-        each: bytes of working memory for each pixel, at least.
+        each: bytes of working memory for each pixel, at least; more may be needed than is checked.
 
     Raises:
-        ValueError: if it cannot.
+        ValueError: if so many pixels need more than the limit.
     """
     limit = limit or _LIMIT.get() or math.inf
     if (needed := SLACK * (LIBRARIES + each * pixels)) > limit:

@@ -19,8 +19,8 @@ class Score(NamedTuple):
     """Quality of an image against its ground truth.
 
     Attributes:
-        psnr: peak signal-to-noise ratio in dB for a peak of 1; infinite for equal images, NaN for NaN.
-        ssim: structural similarity; 1 for equal images, NaN for NaN.
+        psnr: peak signal-to-noise ratio in dB for a peak of 1; infinite for equal images.
+        ssim: structural similarity; 1 for equal images.
     """
 
     psnr: float
@@ -35,8 +35,8 @@ def score(image: Float[Tensor, "_ _ _"], ground_truth: Float[Tensor, "_ _ _"]) -
         ground_truth: image of the same shape.
 
     Returns:
-        PSNR in dB, and SSIM of Wang et al. 2004: Gaussian window of sigma 1.5 (11 x 11), K1 = 0.01, K2 =
-        0.03, population covariance. Numbers without a gradient.
+        PSNR in dB, infinite for equal images, and SSIM of Wang et al. 2004: Gaussian window of sigma 1.5 (11
+        x 11), K1 = 0.01, K2 = 0.03, population covariance. NaN values give NaN. No gradient.
 
     Raises:
         ValueError: if the shapes differ, or a side is under 11 pixels.
