@@ -77,7 +77,7 @@ def observed_depths(rig: Rig, pairs: Pairs) -> Float[Tensor, " n"]:
 
     Returns:
         Depths in the rig's unit (metres), the pairs' points one after the other, detached; NaN for points
-        behind a camera, with too little parallax or without rays, and for pairs without cameras or with F.
+        behind a camera, with too little parallax or without rays, and for pairs known by F.
 
     Raises:
         ValueError: for a camera that the rig lacks, and pairs with neither cameras nor F.
@@ -93,7 +93,7 @@ def share_outside(rig: Rig, pairs: Pairs) -> float:
     `BEYOND` at both ends.
 
     Returns:
-        A share in 0..1; 0 if no pair has cameras (without F), NaN for fewer than `FEW` such points.
+        A share in 0..1; 0 if all pairs are known by F, NaN for fewer than `FEW` such points.
 
     Raises:
         ValueError: as `observed_depths`.

@@ -40,10 +40,11 @@ class Explanation(NamedTuple):
     Attributes:
         H: homography nearest to most points, beta from alpha, undistorted pixels.
         points: number of the points.
-        beyond: number of points off H and smooth lenses, along the lines of F.
-        wrong: number of points off these lines.
-        noise: standard deviation of the distances from the lines, or for few points (`registration`) from
-            their places by H; pixels of beta.
+        beyond: number of points off H, even with smooth lenses, along the lines of F; of few points
+            (`registration`) of those off H.
+        wrong: number of points off these lines; of few points the same as `beyond`.
+        noise: standard deviation of the distances from the lines, or for few points from their places by H;
+            pixels of beta.
     """
 
     H: Float[Tensor, "3 3"]

@@ -76,11 +76,14 @@ def fit_focal_length(views: Mapping[str, View], link: Link, matches: PointMatche
     At most `POINTS` points are used, the same ones for the same number of matches.
 
     Args:
-        views: as `common_focal_length` takes them, which raises the same; so are `link` and `matches`.
+        views: the two views, as `common_focal_length` takes them; so are `link` and `matches`.
 
     Returns:
         The most probable fit; None for views of different sizes, a mirrored one, or points of which no pose
         has half in front of both cameras.
+
+    Raises:
+        ValueError: for another number of views than two.
     """
     hw, hw_beta = (view.hw for view in views.values())
     if hw != hw_beta or _is_mirrored(matches):

@@ -73,7 +73,7 @@ def hypotheses(rig: Rig, sizes: Mapping[str, HW]) -> list[Hypothesis]:
 
     Mistakes whose repair must be estimated from points are left out (`ignored_lens`, `zoomed`, `cropped`,
     `in_degrees`). Where images do not have the sizes that the rig states, only mistakes that explain the
-    sizes are listed. Cameras without a size are taken to be right.
+    sizes are listed.
 
     Returns:
         Hypotheses, "nothing" first, then likely ones before others.

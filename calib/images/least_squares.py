@@ -46,7 +46,7 @@ class Evaluated(NamedTuple):
 
     Attributes:
         z: parameters, requiring gradients.
-        parts: residuals as functions of z, in one tensor or several.
+        parts: residuals, computed from z, in one tensor or several.
     """
 
     z: Float[Tensor, " k"]

@@ -153,7 +153,7 @@ def detect_features(image: Float[Tensor, "_ h w"]) -> SiftFeatures:
 
 
 def contrast_equalised(image: Float[Tensor, "_ h w"]) -> UInt8[NDArray, "h w"]:
-    """Compute an image's luminance, or the mean of bands other than three, with equalised contrast (CLAHE).
+    """Compute an image's luminance (without three bands, their mean) with equalised contrast (CLAHE).
 
     Args:
         image: image (C, H, W); values are clipped to 0..1.

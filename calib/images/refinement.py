@@ -233,7 +233,8 @@ class RefinementProblem:
         frames: Sequence[Pairs],
         sigma: Mapping[str, float] | None = None,
     ) -> RefinementProblem:
-        """Split the frames' points into used and held-out ones, and list the free and considered parameters.
+        """Make the problem of a rig: split the frames' points into used and held-out ones, and list the free
+        and considered parameters.
 
         Args:
             free: free parameters: kinds or patterns.

@@ -41,7 +41,7 @@ class MatchDepths(NamedTuple):
 
     Attributes:
         depth: depth in alpha, in the rig's unit (metres), without meaning where not `observable`; NaN for
-            pairs without cameras or with F (`link`).
+            pairs known by F (a link), even if they have cameras.
         front: mask of the points in front of both cameras; False for such pairs.
         observable: mask of the points with rays and enough parallax; False for such pairs.
     """
@@ -221,7 +221,7 @@ def displacements(hw: HW, points: Float[Tensor, "n 2"]) -> Float[Tensor, "n 2 4"
 def lines_basis(pair: Pair, matches: PointMatches) -> Float[Tensor, "n 8"]:
     """Compute derivatives of the matches' line distances by the eight degrees of freedom of F up to scale.
 
-    For calibrated pairs the matrix is E, between rays.
+    For calibrated pairs without a link the matrix is E, between rays.
 
     Returns:
         Pixels per unit of each degree of freedom, one row a match, without gradient; 0 where a pixel has no

@@ -102,8 +102,8 @@ def self_calibrated(
 
     Args:
         views: alpha's and beta's view, by name, alpha first; a lens must be a `Distortion`.
-        link: F between the undistorted views, and H if known: the ratio of focal lengths, and a rotation by
-            quarter turns.
+        link: F between the undistorted views, not 0, and H if known: the ratio of focal lengths, and a
+            rotation by quarter turns.
         matches: points of the images as recorded, distorted; of which several must be near their lines.
         focal: focal lengths in pixels by camera; missing ones are assumed.
 
