@@ -298,19 +298,11 @@ def _by_evidence(
     mirrored: bool,
 ) -> tuple[Hypothesis, list[Hypothesis]]:
     """Choose the mistake that explains the points clearly better than a drift of the rig, or the rig as
-    given.
+    given; and all that are as good, best first.
 
     Points of one object, or wrong ones in one place, do not decide: the choice must hold without each part of
     them in turn. No drift mirrors an image; a drift of the principal point does what a small shift of pixels
     does.
-
-    Args:
-        misfit: pixels of each hypothesis, likely ones first.
-        table: the hypotheses, those with the least misfit first.
-        mirrored: True if the points are mirrored in the rig as given.
-
-    Returns:
-        The chosen hypothesis, and all that are as good as it, or as the drift, best first.
     """
     unchanged = next(iter(misfit))
     limit = LARGEST_REMAINDER[0] * misfit[unchanged]
@@ -350,8 +342,7 @@ def _off_sizes(rig: Rig, pairs: Pairs) -> float:
 
 
 def _same_rig(rig: Rig, other: Rig, pairs: Pairs) -> bool:
-    """Return True if no point distinguishes two rigs: by its depth or, if they are not calibrated, by its
-    line."""
+    """Return True if no point distinguishes two rigs: by its depth or, without calibration, by its line."""
     change = relative_change(rig, other, pairs)
     if not math.isnan(change):
         return change < SAME_DEPTH
@@ -366,11 +357,7 @@ def _thinned(matches: PointMatches) -> PointMatches:
 
 
 def _ignored_lens(rig: Rig, pairs: Pairs) -> list[Hypothesis]:
-    """Search for the distortion that best explains the points, for cameras that have none.
-
-    Returns:
-        One hypothesis, or none if every camera has a distortion.
-    """
+    """Search for the distortion that best explains the points, for the cameras that have none, if any."""
     bare = [name for name in cameras_of(rig, pairs) if isinstance(rig[name], Camera)]
     bare = [name for name in bare if rig[name].distortion is None]
     if not bare:
@@ -386,13 +373,7 @@ def _searched(
 ) -> tuple[Hypothesis, float]:
     """Search for the number of a mistake that leaves points nearest their lines, in the median.
 
-    Args:
-        make: function from the number to the hypothesis.
-        bounds: least and largest number.
-        prior: mean and standard deviation of the number without points.
-
-    Returns:
-        The hypothesis, and its number.
+    `bounds` are the least and largest number, `prior` its mean and standard deviation without points.
     """
     (low, high), (mean, deviation) = bounds, prior
     for _ in range(ROUNDS):
@@ -405,8 +386,7 @@ def _searched(
 
 
 def _zoomed(rig: Rig, pairs: Pairs) -> list[Hypothesis]:
-    """Search for the focal lengths that fit best: of one camera, or of all whose focal length is too short
-    for pixels."""
+    """Search for the focal lengths that fit best: of one camera, or of all with ones too short for pixels."""
     names = [name for name in cameras_of(rig, pairs) if isinstance(rig[name], Camera)]
     short = [name for name in names if is_short(rig[name])]
     zooms = []
@@ -440,11 +420,9 @@ def _cropped(rig: Rig, pairs: Pairs) -> Iterator[Hypothesis]:
 
 
 def _degrees(rig: Rig, pairs: Pairs) -> list[Hypothesis]:
-    """Search for rotation vectors in degrees that were taken for radians, with the lost whole turns that fit
-    best.
+    """Search for the lost whole turns of rotation vectors in degrees that were taken for radians.
 
-    Returns:
-        One hypothesis; none where a drift may have turned the cameras as far, or cameras are not calibrated.
+    No hypothesis where a drift may have turned the cameras as far, or cameras are not calibrated.
     """
     first, *others = dict.fromkeys(name for names in pairs for name in names)
     if any((first, other) not in pairs or not rig.pair(first, other).calibrated for other in others):

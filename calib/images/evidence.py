@@ -192,13 +192,9 @@ def _observations(pairs: Sequence[Pair], matches: PointMatches) -> PointObservat
 
 
 def _inliers(tried: Sequence[Hypothesis], off: Tensor, pairs: Pairs) -> tuple[Tensor, float]:
-    """Select the points consistent with some pose of the cameras.
+    """Select the points consistent with some pose of the cameras, by an F fitted robustly to each pair.
 
-    An F is fitted robustly to the points under the rig's own lens ("nothing"), and without ("distortion"),
-    and the better fit is used: of the cameras only their lenses matter.
-
-    Returns:
-        A mask of the points, and their mean square distance then, square pixels.
+    Of the cameras only their lenses matter. Returns a mask, and their mean square distance, square pixels.
     """
     lengths = [len(matches.alpha) for matches in pairs.values()]
     fits = []
@@ -223,10 +219,7 @@ def _beyond_pose(pair: Pair, matches: PointMatches, off: Tensor) -> Tensor:
 
 
 def _handedness(matches: PointMatches) -> float:
-    """Return the share of Delaunay triangles of the points in alpha that keep their orientation in beta.
-
-    1 for points that have no triangulation.
-    """
+    """Return the share of Delaunay triangles of alpha's points that keep their orientation; 1 without any."""
     try:
         corners = torch.from_numpy(Delaunay(matches.alpha.numpy()).simplices).long()
     except QhullError:
@@ -325,8 +318,7 @@ class DriftEvidence:
         return _drift(self.r[used], self.J[used], self.B[used], self.scale)[2]
 
     def _at(self, z: Tensor, used: Bool[Tensor, " n"]) -> float:
-        """Return the cost of a drift by the points' distances as they are then; infinite where there are
-        none."""
+        """Return the cost of a drift by the points' distances then; infinite where there are none."""
         r, J, B = Evaluated.at(z, self.distances).values[used], self.J[used], self.B[used]
         left = _drift(r.clamp(-self.clipped, self.clipped), J[:, :0], B, self.scale)[0]
         volume = _drift(r, J, B, self.scale)[1]
@@ -335,11 +327,9 @@ class DriftEvidence:
 
 
 def _drift(r: Tensor, J: Tensor, B: Tensor, scale: float) -> tuple[float, float, Tensor]:
-    """Compute -2 log evidence by residuals r + J z + B b with z normal, of deviation `scale`, and b; and the
-    best z.
+    """Compute -2 log evidence by residuals r + J z + B b with z normal, of deviation `scale`, and b.
 
-    Returns:
-        The part of the evidence left in the residuals, the log determinant, and the most probable z.
+    Returns the part left in the residuals, the log determinant, and the most probable z.
     """
     columns = torch.cat([scale * J, B], 1)
     information = columns.T @ columns + torch.eye(columns.shape[1], dtype=r.dtype)
@@ -350,10 +340,7 @@ def _drift(r: Tensor, J: Tensor, B: Tensor, scale: float) -> tuple[float, float,
 
 def _rotation_to_plausible_depth(rig: Rig, pairs: Pairs) -> float:
     """Return the rotation, in prior deviations, that brings half the points in front and into the depth
-    range.
-
-    0 without pairs that are related by poses.
-    """
+    range; 0 without poses."""
     near, far = (0.0, math.inf) if rig.depth is None else (float(bound) for bound in rig.depth)
     rotations = []
     for names, matches in pairs.items():

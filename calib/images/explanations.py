@@ -145,8 +145,7 @@ def _fit_to_most(x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"]) -> Float[Tens
 
 
 def _beyond(H: Tensor, x: Tensor, y: Tensor, pair: Pair) -> Float[Tensor, "n 2"]:
-    """Compute displacements of beta's points that no homography near H and no smooth lenses of the views
-    explain."""
+    """Compute displacements of beta's points that no homography near H and no smooth lenses explain."""
     moved = to_homogeneous(x) @ H.T
     there, w = moved[:, :2] / moved[:, 2:], moved[:, 2:, None]
     J = (H[:2, :2] - there[:, :, None] * H[2:, :2]) / w

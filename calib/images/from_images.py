@@ -213,8 +213,7 @@ def _fundamental(
 ) -> tuple[Tensor, float, bool]:
     """Fit F to all points, by focal lengths if held-out points are nearer then.
 
-    Returns:
-        F, the median distance of held-out points if fitted to the rest, and True if focal lengths were used.
+    Returns F, the median distance of held-out points from that of the rest, and True for focal lengths.
     """
     (used,), (held_out,) = (list(pairs.values()) for pairs in split([{("", ""): matches}]))
     fits: dict[bool, Callable[[PointMatches], Tensor]] = {False: fit_fundamental}

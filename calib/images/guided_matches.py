@@ -84,8 +84,7 @@ def _best_match(
     predicted: NDArray[np.float64],
     window: int,
 ) -> NDArray[np.float64] | None:
-    """Find the position in beta of the patch most similar to that around a pixel; None where none is clearly
-    so."""
+    """Find the position in beta of the patch most similar to that around a pixel; None if none clearly is."""
     (column, row), (left, top) = (np.rint(p).astype(int) for p in (x, predicted - window))
     patch = alpha[row - PATCH : row + PATCH + 1, column - PATCH : column + PATCH + 1]
     first, last = np.maximum([left, top], PATCH), np.array([left, top]) + 2 * window
@@ -108,8 +107,7 @@ def _best_match(
 
 
 def _vertex(values: NDArray[np.float32]) -> float:
-    """Return the offset from the middle of three values to the vertex of their parabola, within
-    half a step."""
+    """Return the offset from the middle of three values to their parabola's vertex, within half a step."""
     before, middle, after = map(float, values)
     curvature = before - 2 * middle + after
     return float(np.clip(0.5 * (before - after) / curvature, -0.5, 0.5)) if curvature < 0 else 0.0

@@ -108,8 +108,7 @@ def _is_plausible(rig: Rig, hypothesis: Hypothesis) -> bool:
 
 
 def _beyond_drift(K: Tensor, changed_K: Tensor) -> bool:
-    """Return True if a focal length or a principal point differs by more than `LARGEST_CHANGE` prior
-    deviations."""
+    """Return True if a focal length or principal point differs by `LARGEST_CHANGE` prior deviations."""
     focal = (changed_K / K - 1).diagonal()[:2].abs().max() / SIGMA["focal"]
     centre = (changed_K - K)[:2, 2].norm() / SIGMA["centre"]
     return bool(torch.maximum(focal, centre) > LARGEST_CHANGE)
@@ -137,8 +136,7 @@ def focal_length_of(view: LensView) -> float:
 
 
 def _centre_offset(view: LensView) -> float:
-    """Return the distance of the principal point from the middle of the image, as a share of its
-    longer side."""
+    """Return the principal point's distance from the image's middle, as a share of its longer side."""
     return float((view.K[:2, 2] - _middle(view)).norm()) / max(view.hw)
 
 

@@ -127,8 +127,7 @@ def _rays(
 
 
 def _consistent(rig: Rig, a: str, b: str, matches: PointMatches) -> PointMatches | None:
-    """Select the matches that one direction of the baseline explains; None if they are too few or no large
-    share."""
+    """Select the matches that one direction of the baseline explains; None if few, or a small share."""
     if len(matches.alpha) < ENOUGH:
         return None
     normals = _normals(rig, a, b, matches)
@@ -145,11 +144,7 @@ def _consistent(rig: Rig, a: str, b: str, matches: PointMatches) -> PointMatches
 def _matched(
     rig: Rig, alpha: str, pairs: dict[tuple[str, str], PointMatches]
 ) -> tuple[Rig, dict[tuple[str, str], PointMatches]]:
-    """Select the cameras that pairs connect with alpha, and their pairs.
-
-    Raises:
-        ValueError: if there are none.
-    """
+    """Select the cameras that pairs connect with alpha, and their pairs. Raises ValueError for none."""
     names = {alpha}
     for _ in pairs:
         names |= {name for pair in pairs if names & set(pair) for name in pair}
@@ -204,11 +199,7 @@ def _points_ahead(
 
 
 def _depths(rig: Rig, near: Mapping[tuple[str, str], PointMatches]) -> tuple[float, float]:
-    """Return the range of depths that all pairs' points have, extended.
-
-    Raises:
-        ValueError: without parallax.
-    """
+    """Return the range of all pairs' points' depths, extended. Raises ValueError without parallax."""
     every = [depth_bounds(Rig({name: rig[name] for name in pair}), m) for pair, m in near.items()]
     bounded = [bounds for bounds in every if bounds is not None]
     if not bounded:

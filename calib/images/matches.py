@@ -182,8 +182,7 @@ def _match(a: SiftFeatures, b: SiftFeatures) -> PointMatches:
 
 
 def _well_localised(deviation: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return a mask of the best localised points, by the first bound that leaves `WELL_LOCALISED` of them; or
-    all."""
+    """Return a mask of the best localised points, by the first bound that leaves `WELL_LOCALISED`; or all."""
     for bound in LOCALISATION_BOUNDS:
         if (kept := deviation < bound).sum() >= WELL_LOCALISED:
             return kept
@@ -345,11 +344,7 @@ def with_map(pair: Pair, matches: PointMatches) -> FittedLink:
 
 
 def _with_rough_map(matches: PointMatches, F: Tensor) -> FittedLink:
-    """Fit H by RANSAC to 30 px, then shift it along the mean direction of the lines into the points' middle.
-
-    Raises:
-        ValueError: for fewer than `ENOUGH` matches, or no similarity that fits them.
-    """
+    """Fit H by RANSAC to 30 px, then shift it along the lines' mean direction into the points' middle."""
     if len(matches.alpha) < ENOUGH:
         raise ValueError(
             f"only {len(matches.alpha)} points seen in both images agree with F: does it belong to them?"

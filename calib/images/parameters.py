@@ -198,8 +198,7 @@ def _free_parameter(rig: Rig, name: str, like: Tensor, sigma: Mapping[str, float
 
 
 def _perturbed_link(link: Link, value: Tensor | None, rig: Rig, names: tuple[str, str]) -> Link:
-    """Return F after seven small changes: rotations of both sets of singular vectors, the second singular
-    value."""
+    """Return F after seven small changes: rotations of the singular vectors, the second singular value."""
     if value is None:
         return link
     K, K_beta = (intrinsics(max(rig[name].hw) / 2, rig[name].hw).to(link.F) for name in names)

@@ -299,10 +299,7 @@ class RefinementProblem:
         return solve(lambda z: sampson_of_pairs(self.after(z), self.used), self.count)
 
     def _near_depth(self, solution: Solution, residuals: Residuals, log_depth: Residuals) -> Solution:
-        """Return the most probable parameters if the points' depth, as given, is known to `DEPTH_KEPT`.
-
-        From the solution that follows the lines: the noise that it leaves is that of the points.
-        """
+        """Return the most probable parameters if the points' depth, as given, is known to `DEPTH_KEPT`."""
         free = solution.active
         G = jacobian(log_depth, torch.zeros_like(solution.z))[1][:, free] / DEPTH_KEPT
         information = G.T @ G / len(G) + torch.eye(G.shape[1], dtype=G.dtype)
@@ -360,8 +357,7 @@ class RefinementProblem:
         )
 
     def _no_nearer(self, before: Tensor, solution: Solution) -> str:
-        """Return the objection that points are no nearer to their lines, and what else to free if that is the
-        reason."""
+        """Return the objection that points are no nearer to their lines, and what to free if that helps."""
         text = "held-out points are no nearer to their lines"
         kinds = dict.fromkeys(u.name.rpartition(".")[2] for u in self.considered)
         if not kinds.keys() & set(FREE):  # else all that can be freed was tried
@@ -372,8 +368,7 @@ class RefinementProblem:
         return f"{text} by what is free alone: free {', '.join(kinds)} too"
 
     def _depth_change(self, refined: Rig, solution: Solution) -> DepthChange | None:
-        """Return the change of depth; None for uncalibrated rigs and for too few points whose depth is
-        observable."""
+        """Return the change of depth; None without calibration or observable depths."""
         if solution.depth is None:
             return None
         return DepthChange(relative_change(self.rig, refined, self.used), solution.depth)

@@ -262,8 +262,7 @@ def depth_bounds(rig: Rig, matches: PointMatches) -> tuple[float, float] | None:
 
 
 def _focal_lengths(views: Mapping[str, View], link: Link, focal: Mapping[str, float]) -> dict[str, float]:
-    """Return focal lengths in pixels: as given, or by the ratio of the image scales to the other's, or
-    assumed."""
+    """Return focal lengths in pixels: given, or by the ratio of image scales to the other's, or assumed."""
     alpha, beta = views
     ratio = (
         1.0 if link.H is None else float(torch.linalg.det(link.H[:2, :2]).abs().sqrt() / link.H[2, 2].abs())
@@ -315,12 +314,8 @@ def _upright(link: Link) -> Float[Tensor, "3 3"]:
 def _refined_pair(
     rig: Rig, matches: PointMatches, near: PointMatches, *, fixed: Sequence[str] = ()
 ) -> RefinedPair | None:
-    """Refine a pair by matches, with distance and depths by `near`.
-
-    Returns:
-        The pair; None without parallax, or if the baseline, whose length matches do not determine, becomes
-        shorter than `SHORTEST`.
-    """
+    """Refine a pair by matches, with distance and depths by `near`; None without parallax, or if the
+    baseline, whose length matches do not determine, becomes shorter than `SHORTEST`."""
     alpha, beta = rig.names
     free = [f"{beta}.{kind}" for kind in (*SIGMA, "centre") if kind not in fixed]
     sigma = {**SIGMA, "centre": CENTRE_SHARE * max(rig[beta].hw)}

@@ -180,8 +180,7 @@ def other_camera_update(
 
 
 def _blur_and_spectrum(estimate: Float[Tensor, "1 h w"], other: Observation) -> tuple[np.ndarray, np.ndarray]:
-    """Estimate the share of each coefficient of a block that another camera shows, and the power of its
-    grain."""
+    """Estimate the share of each block coefficient that another camera shows, and its grain's power."""
     step = max(round((estimate.numel() / SETTINGS.blocks) ** 0.5), 1)
     planes = torch.stack([estimate, *other[:1], *other[2:]]).float()
     size = [max(SIDE - n, 0) for n in reversed(estimate.shape[-2:])]

@@ -260,10 +260,7 @@ TRIES = 3
 
 
 def _in_processes(tasks: Sequence[Task], workers: Workers) -> Iterator[TaskOutcome]:
-    """Yield outcomes as they arrive.
-
-    A thread waits for each process, so that the task is known with which it dies.
-    """
+    """Yield outcomes as they arrive. A thread waits for each process, to know the task with which it dies."""
     slots, before, others = threading.local(), dict(os.environ), {*active_children()}
     ended: list[JobError] = []
 
@@ -320,8 +317,7 @@ AHEAD = 4
 
 
 def _on_dask(tasks: Sequence[Task], workers: Workers) -> Iterator[TaskOutcome]:
-    """Yield outcomes as they arrive. Dask repeats the tasks of dead workers; a task that kills several
-    fails."""
+    """Yield outcomes as they arrive. Dask repeats dead workers' tasks; a task that kills several fails."""
     if not tasks:
         return
     with needs("cluster", "a scheduler"):

@@ -174,8 +174,7 @@ def _mapping(value: Any, entry: str) -> dict[Any, Any]:
 
 
 def _read_union(arguments: tuple[Any, ...], value: Any, entry: str) -> Any:
-    """Convert to the first fitting one of several types; otherwise raise the error of one of the
-    same form."""
+    """Convert to the first fitting one of several types, or raise the error of one of the same form."""
     if value is None and type(None) in arguments:
         return None
     errors = []
@@ -188,8 +187,7 @@ def _read_union(arguments: tuple[Any, ...], value: Any, entry: str) -> Any:
 
 
 def _read_plain(kind: Any, value: Any, entry: str) -> Any:
-    """Convert to a number, text or path; text like 1e3 is a number, 2.0 a whole one. Raises ValueError naming
-    the entry."""
+    """Convert to a number, text or path, or raise ValueError naming the entry."""
     if kind is Any:
         return value
     if kind in (int, float) and isinstance(value, str):
