@@ -239,6 +239,7 @@ def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnos
 
     Raises:
         ValueError: for no sizes, a camera that the rig lacks, or if it relates none of the pairs.
+        IndexError: for no points.
     """
     pairs = {names: _thinned(matches) for names, matches in related(rig, pairs).items()}
     fits = all(rig[name].hw == hw for name, hw in sizes.items())

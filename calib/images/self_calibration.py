@@ -104,7 +104,7 @@ def self_calibrated(
         views: alpha's and beta's view, by name, alpha first; a lens must be a `Distortion`.
         link: F between the undistorted views, not 0, and H if known: the ratio of focal lengths, and a
             rotation by quarter turns.
-        matches: points of the images as recorded, distorted; of which several must be near their lines.
+        matches: points of the images as recorded, distorted.
         focal: focal lengths in pixels by camera; missing ones are assumed.
 
     Returns:
@@ -112,6 +112,7 @@ def self_calibrated(
 
     Raises:
         ValueError: for another number of views than two, and points that are all in one spot.
+        IndexError: if no point is within `NEAR_LINE` pixels of its line.
     """
     alpha, beta = views
     lenses = {
@@ -288,6 +289,9 @@ def initial_poses(
 
     Returns:
         Two to four poses, beta from alpha, float64.
+
+    Raises:
+        IndexError: for no points.
     """
     R, rays = _upright(link), [torch.linalg.inv(k) for k in (K, K_beta)]
     x, y = (map_homogeneous(inverse, points)[..., :2] for inverse, points in zip(rays, matches))

@@ -122,7 +122,7 @@ class UNet(nn.Module):
         """Return features (b, outputs, h, w) for an input (b, inputs, h, w).
 
         Raises:
-            RuntimeError: by torch, for sides above 1 that are not multiples of 4; a side of 1 gives 4.
+            RuntimeError: by torch, for other sides; some give a result instead, without meaning.
         """
         first = self._in_rows(self.first, x)
         second = self.second(first)
