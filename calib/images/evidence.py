@@ -67,9 +67,9 @@ class FitStatistics(NamedTuple):
         front: share of the points in front of both cameras, of those whose depth is observable; NaN for few.
         inside: share of those in front whose depth is from half the rig's nearest to twice its farthest; NaN
             without a depth range or for few points.
-        handed: share of the triangles of neighbouring points whose orientation changes between the images, or
-            not, as the rig implies: mirrored images change it. The mean of the pairs; without triangles
-            points count as unmirrored.
+        handed: share of the triangles of neighbouring points whose orientation in both images (equal, or
+            opposite if one is mirrored) is as the rig implies. The mean of the pairs; points without
+            triangles count as unmirrored.
         depth: median depth, in the rig's unit, of those in front; NaN for few.
     """
 

@@ -119,7 +119,8 @@ class TwoViews:
 
     A change z has the log focal length, the log ratio of both, rotation (3), direction of the baseline (2),
     principal points (4), radial terms (their mean and half their difference) and displacements (8), all in
-    prior standard deviations. At z = 0 the focal length is the assumed one, and the pose is `pose`.
+    prior standard deviations. At z = 0 the focal length is the assumed one (`FOCAL_SHARE` of the longer
+    side), and the pose is `pose`.
 
     Attributes:
         hw: height and width of both images, pixels.

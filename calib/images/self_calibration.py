@@ -80,7 +80,7 @@ class RefinedPair(NamedTuple):
     Attributes:
         rig: the two cameras, alpha at the origin, with the depth range of the points.
         points: number of the points by which the depth range and `distance` are measured.
-        distance: their median distance from the rig's lines, pixels of the undistorted beta.
+        distance: their median distance from the rig's lines, pixels of beta.
         exact: True if these lines fit as well as those of F alone; if False, the rig serves for rough depths,
             and the lines should be those of F.
     """
@@ -155,7 +155,6 @@ def refined_by_depth(
     squares.
 
     Args:
-        pair: the pair, whose cameras have no lenses.
         images: one image (C, H, W) in 0..1 per camera, of the pair's sizes, by name.
         depth: depth of alpha's pixels, in the pair's unit; NaN where unknown.
         confidence: confidence of alpha's pixels, 0..1.

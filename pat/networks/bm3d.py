@@ -70,7 +70,7 @@ def without_noise(
         deviation: standard deviation of each value's noise.
 
     Returns:
-        The denoised images, as `refined`.
+        The denoised images, as `refined`, which raises the same.
     """
     return refined(network(recorded, deviation), recorded, deviation)
 

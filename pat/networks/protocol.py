@@ -23,8 +23,10 @@ class FusionOutput(NamedTuple):
         image: the fused image (B, C, s H, s W).
         position: by beta, (x, y) of alpha's pixels, (B, 2, H, W), beta's pixels; without meaning where the
             confidence is 0.
-        deviation: by beta, standard deviation of that position, (B, H, W), beta's pixels.
-        confidence: by beta, probability that it sees the point at that position, (B, H, W), 0 to 1.
+        deviation: by beta, standard deviation of that position, (B, H, W), beta's pixels; 1 where the network
+            does not estimate it.
+        confidence: by beta, confidence that it sees the point at that position, (B, H, W), 0 to 1: a trained
+            probability, PAT's largest weight of attention, or 1 for a consistent classical match.
         overall: confidence of the image, (B, H, W); None where the least of the betas' counts.
     """
 

@@ -41,8 +41,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Read a safetensors file.
 
     Returns:
-        Its tensors by name, on the CPU, and its metadata, texts by name (with the digest, if it has one);
-        empty for none.
+        Its tensors by name, on the CPU, and its metadata, texts by name (with the digest, if it has one).
 
     Raises:
         FileNotFoundError: if there is no file.
