@@ -58,14 +58,14 @@ class DepthChange(NamedTuple):
 
 
 def relative_change(original: Rig, refined: Rig, pairs: Pairs) -> float:
-    """Compute how much the depth of matched points differs between two rigs.
+    """Compute how much the depth of matched points differs between two rigs of the same cameras.
 
     Returns:
-        The median of |depth after / depth before - 1| over points observable in `original`; NaN for fewer
+        The median of |depth after / depth before - 1| over points with a depth in `original`; NaN for fewer
         than `FEW`. Points without depth afterwards (behind a camera, too far) count as 1.
 
     Raises:
-        ValueError: for pairs with neither cameras nor F.
+        ValueError: as `observed_depths`.
     """
     before, after = (observed_depths(rig, pairs) for rig in (original, refined))
     usable = (after / before - 1).abs()[~before.isnan()].nan_to_num(1.0)
@@ -73,14 +73,14 @@ def relative_change(original: Rig, refined: Rig, pairs: Pairs) -> float:
 
 
 def observed_depths(rig: Rig, pairs: Pairs) -> Float[Tensor, " n"]:
-    """Compute the depth in alpha of all points of all pairs.
+    """Compute the depth in alpha of all points of all pairs, of which there must be one at least.
 
     Returns:
         Depths in the rig's unit (metres), the pairs' points one after the other, detached; NaN for points
-        behind a camera, with too little parallax, or of uncalibrated pairs.
+        behind a camera, with too little parallax or without rays, and for pairs known by F.
 
     Raises:
-        ValueError: for pairs with neither cameras nor F.
+        ValueError: for a camera that the rig lacks, and pairs with neither cameras nor F.
     """
     depth, front, observable = match_depths(rig, pairs)
     return torch.where(front & observable, depth, torch.nan).detach()
@@ -89,13 +89,14 @@ def observed_depths(rig: Rig, pairs: Pairs) -> Float[Tensor, " n"]:
 def share_outside(rig: Rig, pairs: Pairs) -> float:
     """Compute the share of points behind the cameras or outside the rig's depth range.
 
-    Only points of observable depth count. The depth range, if the rig has one, is widened by `BEYOND`.
+    Only points of observable depth count. The depth range, if the rig has one, is widened by the factor
+    `BEYOND` at both ends.
 
     Returns:
-        A share in 0..1; 0 without a calibrated pair, NaN for fewer than `FEW` such points.
+        A share in 0..1; 0 if all pairs are known by F, NaN for fewer than `FEW` such points.
 
     Raises:
-        ValueError: for pairs with neither cameras nor F.
+        ValueError: as `observed_depths`.
     """
     depth, front, observable = match_depths(rig, pairs)
     if bool(depth.isnan().all()):
@@ -117,11 +118,12 @@ def log_depths(
         pairs: matched points by pair of cameras.
 
     Returns:
-        A function of z that returns a list of one tensor, the logarithms of the depths in alpha,
-        differentiable in z; None for fewer than `FEW` points.
+        A function of z that returns a list of one tensor, the logarithms of the depths in alpha (of the
+        least positive number for points that are then behind), differentiable in z; None for fewer than `FEW`
+        points.
 
     Raises:
-        ValueError: for pairs with neither cameras nor F.
+        ValueError: as `observed_depths`.
     """
     observable = ~torch.stack([observed_depths(rig, pairs) for rig in rigs]).isnan().any(0)
     if int(observable.sum()) < FEW:

@@ -98,15 +98,16 @@ class Diagnosis:
     """Result of a diagnosis.
 
     Attributes:
-        named: the mistake with its repaired rig; of kind "nothing" if no mistake explains the images clearly
-            better than a drift of the cameras.
-        equal: other kinds of mistakes that explain the images as well.
+        named: the mistake with its repaired rig; of kind "nothing", with the given rig, if none explains the
+            images clearly better than a drift of the cameras.
+        equal: mistakes that explain the images as well, or as well as a drift if none is named: the best of
+            each kind, and of the named kind one whose rig is another.
         before: statistics of the given rig.
-        after: statistics of the repaired rig.
-        tried: statistics of the hypotheses, the least misfit first; without the given rig where images are
-            not of its sizes.
-        matches: number of points used.
-        healthy: True if the given rig fits the images.
+        after: statistics of the rig of `named`.
+        tried: statistics of the hypotheses, the least `penalised_misfit` first; without the given rig where
+            images are not of its sizes.
+        matches: number of points used, of all pairs.
+        healthy: True if the given rig fits the images; False if they are not of its sizes.
         certain: True if a mistake is named, and all explanations as good lead to the same rig.
         depth: depth bounds (near, far) of the points by the named rig, in its unit; None if that rig states a
             depth range or too few points have depth.
@@ -128,7 +129,7 @@ class Diagnosis:
 
     @property
     def verdict(self) -> str:
-        """The diagnosis in one or two sentences."""
+        """The diagnosis as a sentence or two, without a full stop at the end."""
         others = "; or: ".join(hypothesis.words for hypothesis in self.equal)
         if self.named.kind != "nothing":
             return f"likely mistake: {self.named.words}" + (f"; or: {others}" if others else "")
@@ -152,7 +153,8 @@ class Diagnosis:
         ) + (f". As plausible as a drift, but not more: {others}" if others else "")
 
     def as_text(self) -> str:
-        """Return the verdict and the statistics before and after as lines of text, joined by line breaks."""
+        """Return the verdict, statistics (before, and after if a mistake is named), number of points, and
+        remarks as text: a line each."""
         unit = length_unit(self.named.rig)
         lines = [self.verdict, f"as given: {self.before.as_text(unit)}"]
         if self.beyond:
@@ -172,9 +174,12 @@ class Diagnosis:
         return "\n".join(lines)
 
     def as_json(self) -> str:
-        """Return the verdict, statistics and the ten best explanations as an indented JSON object.
+        """Return the diagnosis as an indented JSON object.
 
-        NaN is written as null, numbers to four digits after the point.
+        Its keys: `verdict`; `mistake` and `words`, those of the named hypothesis; `as_good` (`equal`, each
+        with `mistake` and `words`); `healthy`, `matches`, `beyond_lenses`, `undetermined`, `depth`; `before`
+        and `after`, with the names of `FitStatistics`; and `tried`, a list of the ten best hypotheses with
+        these, `kind` and `words`. Statistics have four digits after the point, and null for NaN.
         """
         tried = [{"kind": h.kind, "words": h.words, **_rounded(f)} for h, f in self.tried.items()][:10]
         document = {
@@ -203,6 +208,7 @@ def diagnose(rig: Rig, images: Images, matches: Pairs | None = None) -> Diagnosi
     """Find the usual mistake, if any, in a rig, by one image of each of two or more of its cameras.
 
     Args:
+        rig: rig of two cameras or more, not a batch.
         images: one image (C, H, W) in 0..1 per camera, by name; any size.
         matches: matched points by pair of cameras, used instead of matching the images; None to match them.
 
@@ -210,8 +216,8 @@ def diagnose(rig: Rig, images: Images, matches: Pairs | None = None) -> Diagnosi
         The mistake with its repaired rig, and what else was compared.
 
     Raises:
-        ValueError: in one line, for a camera that the rig lacks, fewer than two images, two equal images, too
-            few matching points, or a rig that does not relate its cameras.
+        ValueError: in one line, for a camera that the rig lacks, images that `match_cameras` refuses, given
+            points of which too few agree, or a rig that relates none of the matched cameras.
     """
     for name in images:
         rig.require(name)
@@ -222,17 +228,18 @@ def diagnose(rig: Rig, images: Images, matches: Pairs | None = None) -> Diagnosi
 def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnosis:
     """Find the usual mistake, if any, in a rig, by points matched between images of these sizes.
 
-    At most `MOST` points of a pair are used, evenly spaced in their list.
+    At most `MOST` points of a pair are used, evenly spaced in their list; few points are not refused.
 
     Args:
-        sizes: height and width of each camera's image, which the rig may state otherwise.
-        pairs: matched points by pair of cameras.
+        sizes: (height, width) of each camera's image, a tuple, which the rig may state otherwise.
+        pairs: matched points by pair of cameras; pairs that the rig does not relate are left out.
 
     Returns:
         The mistake with its repaired rig, and what else was compared.
 
     Raises:
-        ValueError: for a camera that the rig lacks, or if it relates none of the pairs.
+        ValueError: for no sizes, a camera that the rig lacks, or if it relates none of the pairs.
+        IndexError: for no points.
     """
     pairs = {names: _thinned(matches) for names, matches in related(rig, pairs).items()}
     fits = all(rig[name].hw == hw for name, hw in sizes.items())
@@ -292,19 +299,11 @@ def _by_evidence(
     mirrored: bool,
 ) -> tuple[Hypothesis, list[Hypothesis]]:
     """Choose the mistake that explains the points clearly better than a drift of the rig, or the rig as
-    given.
+    given; and all that are as good, best first.
 
     Points of one object, or wrong ones in one place, do not decide: the choice must hold without each part of
     them in turn. No drift mirrors an image; a drift of the principal point does what a small shift of pixels
     does.
-
-    Args:
-        misfit: pixels of each hypothesis, likely ones first.
-        table: the hypotheses, those with the least misfit first.
-        mirrored: True if the points are mirrored in the rig as given.
-
-    Returns:
-        The chosen hypothesis, and all that are as good as it, or as the drift, best first.
     """
     unchanged = next(iter(misfit))
     limit = LARGEST_REMAINDER[0] * misfit[unchanged]
@@ -344,8 +343,7 @@ def _off_sizes(rig: Rig, pairs: Pairs) -> float:
 
 
 def _same_rig(rig: Rig, other: Rig, pairs: Pairs) -> bool:
-    """Return True if no point distinguishes two rigs: by its depth or, if they are not calibrated, by its
-    line."""
+    """Return True if no point distinguishes two rigs: by its depth or, without calibration, by its line."""
     change = relative_change(rig, other, pairs)
     if not math.isnan(change):
         return change < SAME_DEPTH
@@ -360,11 +358,7 @@ def _thinned(matches: PointMatches) -> PointMatches:
 
 
 def _ignored_lens(rig: Rig, pairs: Pairs) -> list[Hypothesis]:
-    """Search for the distortion that best explains the points, for cameras that have none.
-
-    Returns:
-        One hypothesis, or none if every camera has a distortion.
-    """
+    """Search for the distortion that best explains the points, for the cameras that have none, if any."""
     bare = [name for name in cameras_of(rig, pairs) if isinstance(rig[name], Camera)]
     bare = [name for name in bare if rig[name].distortion is None]
     if not bare:
@@ -380,13 +374,7 @@ def _searched(
 ) -> tuple[Hypothesis, float]:
     """Search for the number of a mistake that leaves points nearest their lines, in the median.
 
-    Args:
-        make: function from the number to the hypothesis.
-        bounds: least and largest number.
-        prior: mean and standard deviation of the number without points.
-
-    Returns:
-        The hypothesis, and its number.
+    `bounds` are the least and largest number, `prior` its mean and standard deviation without points.
     """
     (low, high), (mean, deviation) = bounds, prior
     for _ in range(ROUNDS):
@@ -399,8 +387,7 @@ def _searched(
 
 
 def _zoomed(rig: Rig, pairs: Pairs) -> list[Hypothesis]:
-    """Search for the focal lengths that fit best: of one camera, or of all whose focal length is too short
-    for pixels."""
+    """Search for the focal lengths that fit best: of one camera, or of all with ones too short for pixels."""
     names = [name for name in cameras_of(rig, pairs) if isinstance(rig[name], Camera)]
     short = [name for name in names if is_short(rig[name])]
     zooms = []
@@ -434,11 +421,9 @@ def _cropped(rig: Rig, pairs: Pairs) -> Iterator[Hypothesis]:
 
 
 def _degrees(rig: Rig, pairs: Pairs) -> list[Hypothesis]:
-    """Search for rotation vectors in degrees that were taken for radians, with the lost whole turns that fit
-    best.
+    """Search for the lost whole turns of rotation vectors in degrees that were taken for radians.
 
-    Returns:
-        One hypothesis; none where a drift may have turned the cameras as far, or cameras are not calibrated.
+    No hypothesis where a drift may have turned the cameras as far, or cameras are not calibrated.
     """
     first, *others = dict.fromkeys(name for names in pairs for name in names)
     if any((first, other) not in pairs or not rig.pair(first, other).calibrated for other in others):

@@ -59,17 +59,18 @@ CLIPPED = 30.0
 
 
 class FitStatistics(NamedTuple):
-    """Statistics of matched points under a rig.
+    """Statistics of matched points under a rig, all pairs together; "few" is fewer than `FEW`.
 
     Attributes:
-        off: median distance of a point from its epipolar line, pixels of beta.
-        misfit: the part of it (root mean square, pixels) due to the rig and not to the matches' noise.
+        off: median distance of an inlier from its epipolar line, pixels of beta.
+        misfit: trimmed root mean square of these distances, pixels, beyond that of the matches' noise.
         front: share of the points in front of both cameras, of those whose depth is observable; NaN for few.
-        inside: share of those in front that lie in the rig's depth range, widened by 2; NaN without a range
-            or for few points.
-        handed: share of the triangles of neighbouring points whose orientation changes between the images, or
-            not, as the rig implies: mirrored images change it.
-        depth: median depth, in the rig's unit, of the points in front; NaN for few.
+        inside: share of those in front whose depth is from half the rig's nearest to twice its farthest; NaN
+            without a depth range or for few points.
+        handed: share of the triangles of neighbouring points whose orientation in both images (equal, or
+            opposite if one is mirrored) is as the rig implies. The mean of the pairs; points without
+            triangles count as unmirrored.
+        depth: median depth, in the rig's unit, of those in front; NaN for few.
     """
 
     off: float
@@ -87,7 +88,11 @@ class FitStatistics(NamedTuple):
         return self.misfit + WRONG_SIDE_PENALTY * wrong
 
     def as_text(self, unit: str = "m") -> str:
-        """Return the statistics in words, with depth in the unit of the rig's lengths."""
+        """Return the statistics in words, without those that are NaN.
+
+        Args:
+            unit: unit of the rig's lengths, for depth.
+        """
         parts = [f"{self.off:.2f} px from the lines, {self.misfit:.2f} px of it due to the rig"]
         if not math.isnan(self.front):
             parts.append(f"{self.front:.0%} in front")
@@ -103,17 +108,17 @@ class FitStatistics(NamedTuple):
 def fit_statistics(
     tried: Sequence[Hypothesis], pairs: Pairs
 ) -> tuple[dict[Hypothesis, FitStatistics], Bool[Tensor, " n"], float]:
-    """Compute the statistics of every hypothesis: distances by the inliers of the best of them, shares and
-    depth by all points.
+    """Compute the statistics of every hypothesis: distances by the inliers, shares and depth by all points.
 
-    `tried` must have "nothing" among its kinds.
+    Inliers, the same for all, are points near the lines of an F that is fitted anew to each pair, under the
+    lenses of the hypothesis of kind "nothing" or "distortion" that fits best then.
 
     Returns:
         Statistics by hypothesis; a mask of the inliers among all points of all pairs; and the standard
-        deviation of their distances, pixels, at least `LEAST_NOISE`.
+        deviation of their distances from the lines of that F, pixels, at least `LEAST_NOISE`.
 
     Raises:
-        ValueError: for pairs with neither cameras nor F.
+        ValueError: if `tried` has no "nothing" or "distortion", and as `observations`.
     """
     observed = observations([hypothesis.rig for hypothesis in tried], pairs)
     inliers, floor = _inliers(tried, observed.off, pairs)
@@ -138,12 +143,12 @@ def fit_statistics(
 
 
 class PointObservations(NamedTuple):
-    """All points of all pairs (n) under several rigs (k).
+    """All points of all pairs (n) under several rigs (k), float64.
 
     Attributes:
         off: signed distance from the epipolar line, pixels of beta, within +-`LARGEST_DISTANCE`, which is
             also that of pixels without a ray.
-        depth: depth in alpha, in the rig's unit; NaN where unobservable.
+        depth: depth in alpha, in the rig's unit, negative behind it; NaN where unobservable.
         front: mask of the points in front of both cameras.
     """
 
@@ -156,13 +161,14 @@ def observations(rigs: Sequence[Rig], pairs: Pairs) -> PointObservations:
     """Observe all points of all pairs under each rig, batched by lens model.
 
     Args:
-        rigs: rigs with the same cameras.
+        rigs: rigs with the same cameras, one at least.
+        pairs: matched points by pair of cameras, one pair at least.
 
     Returns:
         Distances, depths and masks, detached: one row a rig, the pairs' points one after the other.
 
     Raises:
-        ValueError: for pairs with neither cameras nor F.
+        ValueError: for a camera that a rig lacks, and pairs with neither cameras nor F.
     """
     parts = [_observations([rig.pair(*names) for rig in rigs], matches) for names, matches in pairs.items()]
     return PointObservations(*(torch.cat(tensors, 1) for tensors in zip(*parts)))
@@ -186,13 +192,9 @@ def _observations(pairs: Sequence[Pair], matches: PointMatches) -> PointObservat
 
 
 def _inliers(tried: Sequence[Hypothesis], off: Tensor, pairs: Pairs) -> tuple[Tensor, float]:
-    """Select the points consistent with some pose of the cameras.
+    """Select the points consistent with some pose of the cameras, by an F fitted robustly to each pair.
 
-    An F is fitted robustly to the points under the rig's own lens ("nothing"), and without ("distortion"),
-    and the better fit is used: of the cameras only their lenses matter.
-
-    Returns:
-        A mask of the points, and their mean square distance then, square pixels.
+    Of the cameras only their lenses matter. Returns a mask, and their mean square distance, square pixels.
     """
     lengths = [len(matches.alpha) for matches in pairs.values()]
     fits = []
@@ -217,10 +219,7 @@ def _beyond_pose(pair: Pair, matches: PointMatches, off: Tensor) -> Tensor:
 
 
 def _handedness(matches: PointMatches) -> float:
-    """Return the share of Delaunay triangles of the points in alpha that keep their orientation in beta.
-
-    1 for points that have no triangulation.
-    """
+    """Return the share of Delaunay triangles of alpha's points that keep their orientation; 1 without any."""
     try:
         corners = torch.from_numpy(Delaunay(matches.alpha.numpy()).simplices).long()
     except QhullError:
@@ -241,10 +240,11 @@ class DriftEvidence:
 
     Attributes:
         cost: -2 log evidence of the rig and that drift by the points used; smaller is better, and only
-            differences count.
-        distances: function from a drift to all points' distances, in standard deviations of their noise.
+            differences count; infinite where the drift leaves points without distances.
+        distances: function from a drift to all points' distances, one tensor a pair, in standard deviations
+            of their noise.
         z: the drift (k), in prior deviations.
-        r: distances (n) without drift, by the linear model about z.
+        r: distances (n) without drift, by the linear model about z, in the same unit, as are J and B.
         J: derivatives (n, k) of the distances by the drift.
         B: derivatives (n, s) of the distances by what lens models leave.
         scale: scale of the drift's prior deviations.
@@ -269,12 +269,17 @@ class DriftEvidence:
         """Fit the drift of a rig to some of its matched points.
 
         Args:
+            rig: the rig.
+            pairs: matched points by pair of cameras.
             used: mask of the points to use, among all points of all pairs.
             noise: standard deviation of the points' distances, pixels.
             prior: -2 log probability of the rig without any points.
 
         Returns:
             The rig's drift with its evidence.
+
+        Raises:
+            ValueError: for a camera that the rig lacks, and pairs with neither cameras nor F.
         """
         parameters = free_parameters(rig, cameras_of(rig, pairs), free=UNCERTAIN)
 
@@ -313,8 +318,7 @@ class DriftEvidence:
         return _drift(self.r[used], self.J[used], self.B[used], self.scale)[2]
 
     def _at(self, z: Tensor, used: Bool[Tensor, " n"]) -> float:
-        """Return the cost of a drift by the points' distances as they are then; infinite where there are
-        none."""
+        """Return the cost of a drift by the points' distances then; infinite where there are none."""
         r, J, B = Evaluated.at(z, self.distances).values[used], self.J[used], self.B[used]
         left = _drift(r.clamp(-self.clipped, self.clipped), J[:, :0], B, self.scale)[0]
         volume = _drift(r, J, B, self.scale)[1]
@@ -323,11 +327,9 @@ class DriftEvidence:
 
 
 def _drift(r: Tensor, J: Tensor, B: Tensor, scale: float) -> tuple[float, float, Tensor]:
-    """Compute -2 log evidence by residuals r + J z + B b with z normal, of deviation `scale`, and b; and the
-    best z.
+    """Compute -2 log evidence by residuals r + J z + B b with z normal, of deviation `scale`, and b.
 
-    Returns:
-        The part of the evidence left in the residuals, the log determinant, and the most probable z.
+    Returns the part left in the residuals, the log determinant, and the most probable z.
     """
     columns = torch.cat([scale * J, B], 1)
     information = columns.T @ columns + torch.eye(columns.shape[1], dtype=r.dtype)
@@ -338,10 +340,7 @@ def _drift(r: Tensor, J: Tensor, B: Tensor, scale: float) -> tuple[float, float,
 
 def _rotation_to_plausible_depth(rig: Rig, pairs: Pairs) -> float:
     """Return the rotation, in prior deviations, that brings half the points in front and into the depth
-    range.
-
-    0 without pairs that are related by poses.
-    """
+    range; 0 without poses."""
     near, far = (0.0, math.inf) if rig.depth is None else (float(bound) for bound in rig.depth)
     rotations = []
     for names, matches in pairs.items():

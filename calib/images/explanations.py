@@ -38,12 +38,13 @@ class Explanation(NamedTuple):
     """The simplest explanation of a pair's points within their noise, with its evidence.
 
     Attributes:
-        H: homography nearest to most points, beta from alpha.
+        H: homography nearest to most points, beta from alpha, undistorted pixels.
         points: number of the points.
-        beyond: number of points off H and smooth lenses, along the lines of F.
-        wrong: number of points off these lines.
-        noise: standard deviation of the distances from the lines, or for few points (`registration`) from
-            their places by H; pixels of beta.
+        beyond: number of points off H, even with smooth lenses, along the lines of F; of few points
+            (`registration`) of those off H.
+        wrong: number of points off these lines; of few points the same as `beyond`.
+        noise: standard deviation of the distances from the lines, or for few points from their places by H;
+            pixels of beta.
     """
 
     H: Float[Tensor, "3 3"]
@@ -84,12 +85,14 @@ def explain(matches: PointMatches, pair: Pair) -> Explanation:
 
     Args:
         matches: undistorted points, of which F fits most.
+        pair: the pair, with F or cameras.
 
     Returns:
         The explanation; H is the identity if no homography fits.
 
     Raises:
         ValueError: for a pair without F or cameras.
+        cv2.error: for fewer than four points.
     """
     x, y = (points.double() for points in matches)
     H = _fit_to_most(x, y)
@@ -106,7 +109,11 @@ def undetermined(rig: Rig, pairs: Pairs) -> tuple[str, ...]:
     """Describe the pairs whose points determine no lines, with an F of their own instead of the rig's.
 
     Returns:
-        A sentence a pair, without a full stop; nothing for pairs whose points determine lines.
+        A sentence a pair, without a full stop; none for pairs whose points determine lines, or of which no F
+        fits `ENOUGH`.
+
+    Raises:
+        ValueError: for a camera that the rig lacks.
     """
     sentences = []
     for names, matches in pairs.items():
@@ -138,8 +145,7 @@ def _fit_to_most(x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"]) -> Float[Tens
 
 
 def _beyond(H: Tensor, x: Tensor, y: Tensor, pair: Pair) -> Float[Tensor, "n 2"]:
-    """Compute displacements of beta's points that no homography near H and no smooth lenses of the views
-    explain."""
+    """Compute displacements of beta's points that no homography near H and no smooth lenses explain."""
     moved = to_homogeneous(x) @ H.T
     there, w = moved[:, :2] / moved[:, 2:], moved[:, 2:, None]
     J = (H[:2, :2] - there[:, :, None] * H[2:, :2]) / w

@@ -52,16 +52,19 @@ def common_focal_length(views: Mapping[str, View], link: Link, matches: PointMat
     """Estimate the focal length that two cameras (alpha, beta) of one image size share, if the points
     determine it.
 
-    Pixels are taken to be square.
+    Pixels are taken to be square. Lenses of the views are not applied: the fit has a radial term.
 
     Args:
         views: the two views by name, alpha first; only their sizes are used.
-        link: F between the views, from which poses start.
-        matches: matched points, pixels.
+        link: F between the views, and H if known, from which poses start.
+        matches: matched points, pixels; ten at least, which is not checked.
 
     Returns:
         The fit; None where the points do not distinguish it from the assumed focal length, or not well, and
-        for views of different sizes, a mirrored one, or points that no pose has in front of both cameras.
+        where `fit_focal_length` returns None.
+
+    Raises:
+        ValueError: for another number of views than two.
     """
     fit = fit_focal_length(views, link, matches)
     return fit if fit is not None and fit.found else None
@@ -72,9 +75,15 @@ def fit_focal_length(views: Mapping[str, View], link: Link, matches: PointMatche
 
     At most `POINTS` points are used, the same ones for the same number of matches.
 
+    Args:
+        views: the two views, as `common_focal_length` takes them; so are `link` and `matches`.
+
     Returns:
-        The most probable fit; None for views of different sizes, a mirrored one, or points that no pose has
-        in front of both cameras.
+        The most probable fit; None for views of different sizes, a mirrored one, or points of which no pose
+        has half in front of both cameras.
+
+    Raises:
+        ValueError: for another number of views than two.
     """
     hw, hw_beta = (view.hw for view in views.values())
     if hw != hw_beta or _is_mirrored(matches):
@@ -110,12 +119,13 @@ class TwoViews:
 
     A change z has the log focal length, the log ratio of both, rotation (3), direction of the baseline (2),
     principal points (4), radial terms (their mean and half their difference) and displacements (8), all in
-    prior standard deviations. At z = 0 the focal length is the assumed one, and the pose is `pose`.
+    prior standard deviations. At z = 0 the focal length is the assumed one (`FOCAL_SHARE` of the longer
+    side), and the pose is `pose`.
 
     Attributes:
         hw: height and width of both images, pixels.
         pose: pose at the start, beta from alpha, with a baseline of 1.
-        points: matched points, pixels.
+        points: matched points, pixels, float64.
     """
 
     hw: HW
@@ -205,8 +215,8 @@ class FocalFit:
     """The most probable change of two views, and the focal length that it implies.
 
     Attributes:
-        views: the two views.
-        z: the change, in prior deviations.
+        views: model of the two views.
+        z: the change, in prior deviations, as `TwoViews` lists it.
     """
 
     views: TwoViews
@@ -234,7 +244,7 @@ class FocalFit:
 
     def is_nearer(self) -> bool:
         """Return True if held-out points are significantly nearer their lines than with the assumed focal
-        length."""
+        length; each of `HELD_OUT` parts is held out once, and the rest fitted again."""
         points, fold = self.views.points, held_out_parts(self.views.points)
         distances = torch.zeros(2, len(fold), dtype=torch.float64)
         for held_out in range(HELD_OUT):

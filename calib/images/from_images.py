@@ -46,12 +46,13 @@ class UncalibratedRig(NamedTuple):
 
     Attributes:
         rig: views related by links; named `OPEN` if the points of some link leave its lines undetermined.
-        fits: links with the points that agree, and their reach along the lines from the rough map.
-        distance: median distance of held-out points from their lines, pixels of beta; empty for points too
-            few for lines.
-        by_focal: True where the given focal lengths were used.
+        fits: links with the points that agree (undistorted), and their reach along the lines from the rough
+            map; for points too few for lines all of them, with a reach of 0.
+        distance: median distance of held-out points from their lines, pixels of beta; an empty dict for
+            points too few for lines.
+        by_focal: True where F was fitted with the given focal lengths.
         explained: simplest explanation of the points, lines or one homography.
-        matches: all consistent matches, in pixels as recorded.
+        matches: the matches that were used, in pixels as recorded.
     """
 
     rig: Rig
@@ -104,15 +105,16 @@ def rig_from_images(
         images: one image (C, H, W) in 0..1 per camera, by name.
         focal: rough focal lengths in pixels by camera; None or missing ones are unknown.
         alpha: match only this camera with each other one; None for every two cameras.
-        matches: points by pair of images used instead of matching these, None to match them; from fewer than
-            20 points the rig has a homography alone (`fit_homography`).
+        matches: points by pair of images used instead of matching these, None to match them; if every pair
+            has fewer than `ENOUGH` (20), links have a homography alone (`fit_homography`).
 
     Returns:
-        The rig with statistics of its links.
+        The rig with statistics of its links; a camera that matches with none is a view without a link.
 
     Raises:
-        ValueError: in one line, for images that cannot be matched (too few, equal, without texture), too few
-            points, no image of `alpha`, or a focal length that is not positive or of no camera.
+        ValueError: in one line, for images that `match_cameras` refuses, points of which too few agree, all
+            in one spot, or of a camera without an image, and a focal length that is not positive or of no
+            camera.
     """
     focal = dict(focal or {})
     for name, length in focal.items():
@@ -155,13 +157,14 @@ def usable_matches(matches: Pairs, *, alpha: str | None = None) -> dict[tuple[st
 
     Args:
         matches: points by pair of cameras.
-        alpha: the camera whose pairs are wanted; None for all.
+        alpha: the camera whose pairs are wanted, turned so that it comes first; None for all as they are.
 
     Returns:
-        The matches, those of `alpha` first in their pairs.
+        By pair, the matches that agree, of pairs with `ENOUGH` of them; or if every pair has fewer than
+        `ENOUGH` in all, all matches.
 
     Raises:
-        ValueError: for no matches, and if no pair has enough that agree.
+        ValueError: for no (such) pairs, and if no pair has enough that agree.
     """
     if alpha is not None:
         turned = {(b, a): PointMatches(*points[::-1]) for (a, b), points in matches.items()}
@@ -181,11 +184,16 @@ def _registered(rig: Rig, matches: Pairs) -> UncalibratedRig:
 
 
 def link_of_points(rig: Rig, pair: tuple[str, str], points: PointMatches) -> tuple[Link, Explanation]:
-    """Fit F and a rough map of a pair to its points.
+    """Fit F and a rough map of a pair to its points, which are taken as undistorted.
+
+    Args:
+        rig: rig with the two views, whose sizes are used.
+        pair: names (alpha, beta).
+        points: matched points of the two.
 
     Returns:
-        The link, of the homography alone if that explains all points, and for few points; and the
-        explanation taken.
+        The link, of the homography alone if the points show no lines beside it, or are fewer than `ENOUGH`;
+        and the explanation taken.
 
     Raises:
         ValueError: for points that no F fits, or of which fewer than `ENOUGH` agree with it; where there are
@@ -205,8 +213,7 @@ def _fundamental(
 ) -> tuple[Tensor, float, bool]:
     """Fit F to all points, by focal lengths if held-out points are nearer then.
 
-    Returns:
-        F, the median distance of held-out points if fitted to the rest, and True if focal lengths were used.
+    Returns F, the median distance of held-out points from that of the rest, and True for focal lengths.
     """
     (used,), (held_out,) = (list(pairs.values()) for pairs in split([{("", ""): matches}]))
     fits: dict[bool, Callable[[PointMatches], Tensor]] = {False: fit_fundamental}

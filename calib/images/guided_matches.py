@@ -50,10 +50,12 @@ def guided_matches(
         alpha: image (C, H, W) in 0..1.
         beta: image (C, H, W) in 0..1.
         beta_from_alpha: homography of pixels.
-        shown: masks of the pixels that each camera recorded; patches with other pixels are not used.
+        window: largest distance in x and in y, pixels of beta.
+        shown: masks of the pixels that each camera recorded, of the images' sizes, on the CPU; patches with
+            other pixels are not used.
 
     Returns:
-        Whole pixels of alpha and positions in beta to a fraction of a pixel; possibly none.
+        Whole pixels of alpha and positions in beta to a fraction of a pixel, float64; possibly none.
     """
     alpha_image, beta_image = (contrast_equalised(image) for image in (alpha, beta))
     solid = np.ones((2 * PATCH + 1, 2 * PATCH + 1), np.uint8)
@@ -82,8 +84,7 @@ def _best_match(
     predicted: NDArray[np.float64],
     window: int,
 ) -> NDArray[np.float64] | None:
-    """Find the position in beta of the patch most similar to that around a pixel; None where none is clearly
-    so."""
+    """Find the position in beta of the patch most similar to that around a pixel; None if none clearly is."""
     (column, row), (left, top) = (np.rint(p).astype(int) for p in (x, predicted - window))
     patch = alpha[row - PATCH : row + PATCH + 1, column - PATCH : column + PATCH + 1]
     first, last = np.maximum([left, top], PATCH), np.array([left, top]) + 2 * window
@@ -106,8 +107,7 @@ def _best_match(
 
 
 def _vertex(values: NDArray[np.float32]) -> float:
-    """Return the offset from the middle of three values to the vertex of their parabola, within
-    half a step."""
+    """Return the offset from the middle of three values to their parabola's vertex, within half a step."""
     before, middle, after = map(float, values)
     curvature = before - 2 * middle + after
     return float(np.clip(0.5 * (before - after) / curvature, -0.5, 0.5)) if curvature < 0 else 0.0

@@ -72,8 +72,8 @@ def hypotheses(rig: Rig, sizes: Mapping[str, HW]) -> list[Hypothesis]:
     """List the rig as given, and the single mistakes plausible in a rig whose images have these sizes.
 
     Mistakes whose repair must be estimated from points are left out (`ignored_lens`, `zoomed`, `cropped`,
-    `in_degrees`).
-    Where images do not have the sizes that the rig states, only mistakes that explain the sizes are listed.
+    `in_degrees`). Where images do not have the sizes that the rig states, only mistakes that explain the
+    sizes are listed.
 
     Returns:
         Hypotheses, "nothing" first, then likely ones before others.
@@ -108,8 +108,7 @@ def _is_plausible(rig: Rig, hypothesis: Hypothesis) -> bool:
 
 
 def _beyond_drift(K: Tensor, changed_K: Tensor) -> bool:
-    """Return True if a focal length or a principal point differs by more than `LARGEST_CHANGE` prior
-    deviations."""
+    """Return True if a focal length or principal point differs by `LARGEST_CHANGE` prior deviations."""
     focal = (changed_K / K - 1).diagonal()[:2].abs().max() / SIGMA["focal"]
     centre = (changed_K - K)[:2, 2].norm() / SIGMA["centre"]
     return bool(torch.maximum(focal, centre) > LARGEST_CHANGE)
@@ -137,8 +136,7 @@ def focal_length_of(view: LensView) -> float:
 
 
 def _centre_offset(view: LensView) -> float:
-    """Return the distance of the principal point from the middle of the image, as a share of its
-    longer side."""
+    """Return the principal point's distance from the image's middle, as a share of its longer side."""
     return float((view.K[:2, 2] - _middle(view)).norm()) / max(view.hw)
 
 
@@ -149,15 +147,14 @@ def _middle(view: LensView) -> Tensor:
 def ignored_lens(rig: Rig, bare: Sequence[str], k1: float) -> Hypothesis:
     """Build the hypothesis that distortion of about `k1` was ignored in some cameras.
 
-    k2 is 1.5 k1^2, as lenses tend to have it (a fisheye's r = theta has 1.8, ordinary wide ones about 1.3):
-    one parameter, and one to one at any radius.
+    k2 is 1.5 k1^2, as lenses tend to have it: one parameter, and one to one at any radius.
 
     Args:
         bare: names of the cameras, which have no lens.
         k1: first radial coefficient of Brown-Conrady.
 
     Returns:
-        The hypothesis, with the rig whose cameras have that lens.
+        The hypothesis, with the rig in which the calibrated ones of these cameras have that lens.
     """
     words = f"distortion ignored: about k1 = {k1:.3f} in {', '.join(map(repr, bare))}"
     lens = Distortion("brown-conrady", torch.tensor([k1, 1.5 * k1**2, 0, 0], dtype=torch.float64))
@@ -173,7 +170,7 @@ def from_degrees(R: Float[Tensor, "3 3"], turns: Int[Tensor, "*b"]) -> Float[Ten
         turns: numbers of whole turns to add to its angle first, as a vector in degrees is longer than a turn.
 
     Returns:
-        The corrected rotation for each number of turns.
+        The corrected rotation for each number of turns, (*b, 3, 3).
     """
     vector = rotation_vector(R)
     angle = vector.norm()
@@ -187,10 +184,10 @@ def zoomed(rig: Rig, names: Sequence[str], factor: float) -> Hypothesis:
     They were stated in another unit, or the image was zoomed or cropped.
 
     Args:
-        names: names of the cameras.
+        names: names of the cameras, one at least, calibrated.
 
     Returns:
-        The hypothesis, with the rig whose focal lengths are multiplied.
+        The hypothesis, with the rig whose focal lengths are multiplied; principal points and links stay.
     """
     who = ", ".join(map(repr, names))
     short = all(is_short(rig[name]) for name in names)
@@ -223,10 +220,10 @@ def cropped(rig: Rig, names: Sequence[str]) -> Hypothesis:
 
     Args:
         rig: the rig with principal points of the images as they are.
-        names: names of the cameras.
+        names: names of the cameras, one at least, calibrated.
 
     Returns:
-        The hypothesis, with that rig.
+        The hypothesis, with that rig as it is.
     """
     u, v = (float(c) for c in rig[names[0]].K[:2, 2])
     words = f"image of {', '.join(map(repr, names))} cropped: principal point at about ({u:.0f}, {v:.0f})"
@@ -237,7 +234,7 @@ def in_degrees(rig: Rig, turns: Mapping[str, int]) -> Hypothesis:
     """Build the hypothesis that rotation vectors in degrees were taken for radians.
 
     Args:
-        turns: whole turns missing from the vector of each camera, by name; other cameras stay.
+        turns: whole turns missing from the vector of each camera, by name, calibrated; other cameras stay.
 
     Returns:
         The hypothesis, with the rig whose rotations are corrected.
@@ -269,7 +266,7 @@ def rotated_view(view: View, words: str) -> tuple[Float[Tensor, "3 3"], HW]:
         words: key of `ROTATIONS`, such as "rotated by 180 degrees".
 
     Returns:
-        A of x' ~ A x, and the new height and width.
+        A (3, 3) of x' ~ A x, float64, and the new height and width.
 
     Raises:
         KeyError: for `words` that are not in `ROTATIONS`.

@@ -48,22 +48,25 @@ def centres_found(
 ) -> tuple[Rig, dict[str, tuple[int, float]]]:
     """Estimate translations of pinhole cameras, and refine their orientations, from one image of each.
 
-    Alpha is at the origin, and the baseline of the first beta is 1, unless the rig states translations, whose
-    scale is kept. Cameras that match with none are left out. Views should be of about equal scale and
-    orientation, and parallax a small share of the image (`WINDOW`).
+    Alpha is at the origin with the world's axes, and the baseline of the first beta is 1, unless the rig
+    states translations: then it is the stated length. Cameras that no pairs connect with alpha are left out.
+    Views should be of about equal scale and orientation, and parallax a small share of the image (`WINDOW`).
 
     Args:
         rig: pinhole cameras of known intrinsics and roughly known orientation.
-        images: one image (C, H, W) in 0..1 per camera, by name.
-        shown: masks of the pixels that each camera recorded, by name.
+        images: one image (C, H, W) in 0..1 for every camera of the rig, of its size, by name.
+        shown: masks (H, W) of the pixels that each camera recorded, by name.
         alpha: name of alpha.
 
     Returns:
-        The rig with its depth range, named `OPEN` if orientations alone explain the points as well;
-        and for each beta the number of its points and their median distance from their lines, pixels.
+        The rig with its depth range, named `OPEN` if orientations alone explain the points as well; and by
+        beta's name the number of its points, in all pairs, and their median distance from their lines,
+        pixels.
 
     Raises:
-        ValueError: if no camera matches with alpha, or no points have parallax.
+        ValueError: for an `alpha` that the rig lacks, if no camera matches with it, if points are all in one
+            spot, or none have parallax.
+        KeyError: for a camera without an image or mask.
     """
     known = rig
     stated = {name: float(rig.pair(alpha, name).beta_from_alpha.t.norm()) for name in rig.betas(alpha)}
@@ -124,8 +127,7 @@ def _rays(
 
 
 def _consistent(rig: Rig, a: str, b: str, matches: PointMatches) -> PointMatches | None:
-    """Select the matches that one direction of the baseline explains; None if they are too few or no large
-    share."""
+    """Select the matches that one direction of the baseline explains; None if few, or a small share."""
     if len(matches.alpha) < ENOUGH:
         return None
     normals = _normals(rig, a, b, matches)
@@ -142,11 +144,7 @@ def _consistent(rig: Rig, a: str, b: str, matches: PointMatches) -> PointMatches
 def _matched(
     rig: Rig, alpha: str, pairs: dict[tuple[str, str], PointMatches]
 ) -> tuple[Rig, dict[tuple[str, str], PointMatches]]:
-    """Select the cameras that pairs connect with alpha, and their pairs.
-
-    Raises:
-        ValueError: if there are none.
-    """
+    """Select the cameras that pairs connect with alpha, and their pairs. Raises ValueError for none."""
     names = {alpha}
     for _ in pairs:
         names |= {name for pair in pairs if names & set(pair) for name in pair}
@@ -201,11 +199,7 @@ def _points_ahead(
 
 
 def _depths(rig: Rig, near: Mapping[tuple[str, str], PointMatches]) -> tuple[float, float]:
-    """Return the range of depths that all pairs' points have, extended.
-
-    Raises:
-        ValueError: without parallax.
-    """
+    """Return the range of all pairs' points' depths, extended. Raises ValueError without parallax."""
     every = [depth_bounds(Rig({name: rig[name] for name in pair}), m) for pair, m in near.items()]
     bounded = [bounds for bounds in every if bounds is not None]
     if not bounded:

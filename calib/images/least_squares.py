@@ -46,7 +46,7 @@ class Evaluated(NamedTuple):
 
     Attributes:
         z: parameters, requiring gradients.
-        parts: residuals as functions of z, in one tensor or several.
+        parts: residuals, computed from z, in one tensor or several.
     """
 
     z: Float[Tensor, " k"]
@@ -69,10 +69,12 @@ class Solution(NamedTuple):
 
     Attributes:
         z: the free parameters.
-        active: mask of the observable ones; the others are 0.
-        covariance: posterior covariance of the free parameters, the prior's for fixed ones.
-        full: most probable free and considered parameters without that restriction.
-        depth: relative change of depth that the points' lines suggest; None where depth does not count.
+        active: mask of the observable ones; the others are fixed at 0.
+        covariance: posterior covariance of the free parameters; for fixed ones the prior's, 1.
+        full: free and considered parameters that are most probable by the residuals alone, also where `z` has
+            been changed to keep depth.
+        depth: relative change of depth that the points' lines suggest; None where depth does not count, as
+            from `solve`.
     """
 
     z: Float[Tensor, " n"]
@@ -94,7 +96,10 @@ def solve(residuals: Residuals, count: int, considered: int = 0) -> Solution:
         considered: number of further parameters that are uncertain, but not changed.
 
     Returns:
-        The solution, detached; its `z` are the free parameters alone.
+        The solution, detached, float64.
+
+    Raises:
+        RuntimeError: as `jacobian`.
     """
     total = count + considered
     active = torch.ones(total, dtype=torch.bool)
@@ -123,10 +128,10 @@ def shifts_left_out(
     Args:
         residuals: function of the parameters.
         z: most probable parameters, in prior deviations.
-        parts: number of the part in which each residual is.
+        parts: number of the part in which each residual is, as `parts_of` counts them.
 
     Returns:
-        One row per part, in prior deviations.
+        One row per part, in prior deviations; 0 for a part without residuals.
     """
     r, J = jacobian(residuals, z)
     weight = _weight(r)
@@ -160,6 +165,9 @@ def most_probable(
 
     Returns:
         The parameters, detached, in prior deviations.
+
+    Raises:
+        RuntimeError: as `jacobian`.
     """
     numbers = itertools.count(1)
 
@@ -218,6 +226,9 @@ def jacobian(
 
     Returns:
         The residuals (m) and their Jacobian (m, n), detached.
+
+    Raises:
+        RuntimeError: by torch, for a part of the residuals that is not computed from z at all.
     """
     return _differentiated(Evaluated.at(z, residuals))
 

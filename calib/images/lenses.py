@@ -18,10 +18,10 @@ TERMS = 4
 
 
 def with_lenses(rig: Rig) -> Rig:
-    """Return the rig with a lens without distortion for those linked views that have no lens.
+    """Return the rig in which linked views without K (plain `View`s) have a lens without distortion.
 
-    Their lens is a `brown-conrady` of zeros, the focal length half the longer side; the same rig if none
-    lacks one.
+    They become `LensView`s with a `brown-conrady` of zeros, a focal length of half the longer side and the
+    centre in the middle; the same rig if there are none.
     """
     for name in dict.fromkeys(name for pair in rig.links for name in pair):
         if not isinstance(view := rig[name], LensView):

@@ -101,8 +101,8 @@ def image_sizes(images: Mapping[str, Tensor]) -> dict[str, tuple[int, int]]:
 def match_points(alpha: Float[Tensor, "_ h w"], beta: Float[Tensor, "_ hb wb"]) -> PointMatches:
     """Match mutually nearest SIFT features of both images' luminance that pass the ratio test.
 
-    Contrast is equalised (CLAHE). Where patches around them correlate, beta's points are refined by least
-    squares.
+    Images are compared as `contrast_equalised` makes them. Where patches around them correlate, beta's points
+    are refined by least squares; if that gives `WELL_LOCALISED` points, the others are left out.
 
     Args:
         alpha: image (C, H, W) in 0..1.
@@ -133,13 +133,13 @@ class SiftFeatures(NamedTuple):
 
 
 def detect_features(image: Float[Tensor, "_ h w"]) -> SiftFeatures:
-    """Detect SIFT features of an image's luminance, with equalised contrast.
+    """Detect SIFT features of an image as `contrast_equalised` makes it.
 
     Args:
         image: image (C, H, W) in 0..1.
 
     Returns:
-        At most `FEATURES` features, possibly none.
+        The strongest features, about `FEATURES` at most, possibly none.
     """
     even = contrast_equalised(image)
     sift = cv2.SIFT.create(FEATURES, enable_precise_upscale=True)
@@ -153,10 +153,10 @@ def detect_features(image: Float[Tensor, "_ h w"]) -> SiftFeatures:
 
 
 def contrast_equalised(image: Float[Tensor, "_ h w"]) -> UInt8[NDArray, "h w"]:
-    """Compute an image's luminance, or the mean of bands other than three, with equalised contrast (CLAHE).
+    """Compute an image's luminance (without three bands, their mean) with equalised contrast (CLAHE).
 
     Args:
-        image: image (C, H, W) in 0..1.
+        image: image (C, H, W); values are clipped to 0..1.
 
     Returns:
         Bytes (H, W), on the CPU.
@@ -182,8 +182,7 @@ def _match(a: SiftFeatures, b: SiftFeatures) -> PointMatches:
 
 
 def _well_localised(deviation: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return a mask of the best localised points, by the first bound that leaves `WELL_LOCALISED` of them; or
-    all."""
+    """Return a mask of the best localised points, by the first bound that leaves `WELL_LOCALISED`; or all."""
     for bound in LOCALISATION_BOUNDS:
         if (kept := deviation < bound).sum() >= WELL_LOCALISED:
             return kept
@@ -252,7 +251,7 @@ def agreeing(matches: PointMatches) -> PointMatches:
     """Select matches that some fundamental matrix puts within `AGREE` pixels of their lines.
 
     Returns:
-        The consistent matches; none if there are fewer than `ENOUGH` or no matrix fits.
+        The consistent matches, which may be few; none if fewer than `ENOUGH` are given or no matrix fits.
     """
     if len(matches.alpha) >= ENOUGH:
         with suppress(ValueError):
@@ -296,7 +295,7 @@ class FittedLink(NamedTuple):
     Attributes:
         link: F, and as H a similarity from which the matches lie as far to one side along their lines as to
             the other.
-        matches: the consistent matches.
+        matches: the consistent matches, of the undistorted images if there are lenses.
         displacement: pixels of beta along the lines, to either side of H x, within which 98 % of the matches
             lie.
     """
@@ -312,6 +311,7 @@ def fit_link(matches: PointMatches, F: Float[Tensor, "3 3"], *, within: float = 
     F is fitted by MAGSAC++ (Barath et al. 2020) to 1 px; the given one stays if fewer than `ENOUGH` are near.
 
     Args:
+        matches: undistorted points.
         F: fundamental matrix to start from, beta from alpha.
         within: pixels of beta from its line up to which a match is used.
 
@@ -319,7 +319,7 @@ def fit_link(matches: PointMatches, F: Float[Tensor, "3 3"], *, within: float = 
         The link with the matches within 3 px of its lines.
 
     Raises:
-        ValueError: for fewer than `ENOUGH` consistent matches, or no similarity that fits them.
+        ValueError: for fewer than `ENOUGH` consistent matches, or no F or no similarity that fits them.
     """
     near = near_lines(matches, F, within=within)
     fitted = fit_fundamental(near) if len(near.alpha) >= ENOUGH else F
@@ -344,11 +344,7 @@ def with_map(pair: Pair, matches: PointMatches) -> FittedLink:
 
 
 def _with_rough_map(matches: PointMatches, F: Tensor) -> FittedLink:
-    """Fit H by RANSAC to 30 px, then shift it along the mean direction of the lines into the points' middle.
-
-    Raises:
-        ValueError: for fewer than `ENOUGH` matches, or no similarity that fits them.
-    """
+    """Fit H by RANSAC to 30 px, then shift it along the lines' mean direction into the points' middle."""
     if len(matches.alpha) < ENOUGH:
         raise ValueError(
             f"only {len(matches.alpha)} points seen in both images agree with F: does it belong to them?"
@@ -380,9 +376,14 @@ def depths_near_lines(pair: Pair, matches: PointMatches, *, within: float) -> Fl
     """Triangulate the depths in alpha of those points that are within so many pixels of their lines and in
     front.
 
+    Args:
+        pair: calibrated pair.
+        matches: points of the images as recorded, distorted.
+        within: pixels of the undistorted beta.
+
     Returns:
-        Depths in the rig's unit, float64, of these points alone; points too far for their depth to be known
-        are left out.
+        Depths (m) in the rig's unit, float64, of these points alone, possibly none; points too far for their
+        depth to be known are left out.
 
     Raises:
         ValueError: for an uncalibrated pair.
@@ -400,8 +401,8 @@ def seen_depths(pair: Pair, matches: PointMatches) -> tuple[float, float]:
     Points within 3 px of their lines count, that are in front and near enough for their depth to be known.
 
     Returns:
-        0.9 of the nearest and 1.25 of the farthest depth, without the outermost 2 % of the points to either
-        side.
+        (near, far): 0.9 of the nearest and 1.25 of the farthest depth, without the outermost 2 % of the
+        points to either side.
 
     Raises:
         ValueError: for fewer than `ENOUGH` such points, or an uncalibrated pair.
@@ -421,8 +422,11 @@ def depth_seen(rig: Rig, pairs: Pairs) -> tuple[float, float] | None:
     Pairs with a link are left out.
 
     Returns:
-        Near and far along alpha's axis, in the rig's unit, with the margins of `seen_depths`; None if no pair
-        has enough points.
+        Near and far along the axis of each pair's alpha, in the rig's unit, with the margins of
+        `seen_depths`; None if no pair is calibrated and has enough points.
+
+    Raises:
+        ValueError: for a camera that the rig lacks.
     """
     depths = []
     for names, matches in pairs.items():

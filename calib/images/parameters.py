@@ -46,8 +46,9 @@ class FreeParameter:
 
     Attributes:
         name: name as in `Rig.parameters`, such as "left.rotation", or "alpha > beta" for an F.
-        sigma: prior standard deviation of each component, in the rig's units (radians, metres, pixels).
-        unit: unit for display.
+        sigma: prior standard deviation of each component, float64, in the rig's units (radians, metres,
+            pixels; a lens model's coefficients; for an F its seven degrees of freedom, without unit).
+        unit: unit for display, such as "degrees"; "F" for an F, empty for coefficients.
         factor: factor that converts to that unit.
         correlation: prior correlation between components, as fx and fy change together.
     """
@@ -80,15 +81,17 @@ def free_parameters(
     has its F free, and lenses of uncalibrated views are free.
 
     Args:
-        free: kinds ("rotation", "translation", "focal", "centre" or "principal_point", "distortion"), or
-            patterns over "camera.kind".
+        names: names of the cameras, one at least.
+        free: kinds ("rotation", "translation", "focal" or "focal_length", "centre" or "principal_point",
+            "distortion"), or patterns over "camera.kind"; without calibrated cameras they are not looked at.
         sigma: standard deviations by kind, in the units of `SIGMA`, instead of its values; None for these.
 
     Returns:
         One parameter vector per camera and kind, then one per link; possibly none.
 
     Raises:
-        ValueError: for a pattern that matches nothing, or a `sigma` of an unknown kind or not positive.
+        ValueError: for a camera that the rig lacks, a pattern that matches no calibrated camera of the rig,
+            or a `sigma` of an unknown kind or not positive.
     """
     stated = {ALIASES.get(k, k): v for k, v in (sigma or {}).items()}
     if wrong := [k for k, v in stated.items() if k not in SIGMA or not v > 0]:
@@ -118,15 +121,15 @@ def considered_parameters(
     Their uncertainty counts, but they are not changed.
 
     Args:
-        names: names of the cameras.
+        names: names of the cameras, one at least; the first one's pose is certain.
         free: free parameters.
         sigma: standard deviations by kind, in the units of `SIGMA`, instead of its values; None for these.
 
     Returns:
-        One parameter vector per camera and kind.
+        One parameter vector per calibrated camera and kind.
 
     Raises:
-        ValueError: for a `sigma` of an unknown kind or not positive.
+        ValueError: for a camera that the rig lacks, or a `sigma` of an unknown kind or not positive.
     """
     fixed = {f.name for f in free}
     parameters = free_parameters(rig, names, free=UNCERTAIN, sigma=sigma)
@@ -144,6 +147,10 @@ def apply_change(rig: Rig, parameters: Sequence[FreeParameter], z: Float[Tensor,
 
     Returns:
         The changed rig, differentiable in z.
+
+    Raises:
+        RuntimeError: by torch, for a z of another length.
+        ValueError: for a camera that the rig lacks.
     """
     parts = z.split([len(u.sigma) for u in parameters])
     values = {u.name: u.root.to(deviations) @ deviations for u, deviations in zip(parameters, parts)}
@@ -191,8 +198,7 @@ def _free_parameter(rig: Rig, name: str, like: Tensor, sigma: Mapping[str, float
 
 
 def _perturbed_link(link: Link, value: Tensor | None, rig: Rig, names: tuple[str, str]) -> Link:
-    """Return F after seven small changes: rotations of both sets of singular vectors, the second singular
-    value."""
+    """Return F after seven small changes: rotations of the singular vectors, the second singular value."""
     if value is None:
         return link
     K, K_beta = (intrinsics(max(rig[name].hw) / 2, rig[name].hw).to(link.F) for name in names)

@@ -42,7 +42,7 @@ class PatchWarps(NamedTuple):
 
     Attributes:
         values: samples of alpha's patches, one row a patch.
-        y: positions in beta, pixels.
+        y: positions (x, y) of the patches' middles in beta, pixels.
         A: affine maps, pixels of beta per step in the patch.
     """
 
@@ -60,12 +60,15 @@ def refine_points(
 ) -> RefinedPoints:
     """Refine positions in beta of points of alpha by least-squares matching of patches.
 
+    A position is rejected whose patches correlate too little in the end (`LEAST_CORRELATION`), or that moved
+    too far (`LARGEST_SHIFT`).
+
     Args:
         alpha: bytes (H, W).
         beta: bytes (H, W).
-        x: points of alpha, pixels.
-        y: rough positions in beta, pixels.
-        beta_from_alpha: rough affine maps between neighbourhoods of the points.
+        x: points (x, y) of alpha, pixels, finite.
+        y: rough positions in beta, pixels, finite.
+        beta_from_alpha: rough affine maps between neighbourhoods of the points, invertible.
 
     Returns:
         The positions, unchanged where rejected, with their deviations, infinite where rejected.

@@ -19,7 +19,8 @@ class ParameterChange:
         name: name of the parameter vector, such as "left.rotation".
         amount: change of each component, in `unit`.
         deviation: posterior standard deviation of each, in `unit`.
-        unit: unit for display; "F" for a fundamental matrix.
+        unit: unit for display, such as "degrees"; empty for coefficients of a lens; "F" for the seven degrees
+            of freedom of a fundamental matrix.
     """
 
     name: str
@@ -39,7 +40,7 @@ class LineStatistics(NamedTuple):
 
     Attributes:
         points: number of the points.
-        median: median distance, pixels of beta.
+        median: median distance, pixels of beta; NaN for no points.
     """
 
     points: int
@@ -54,13 +55,17 @@ class Refinement:
     """Result of a refinement.
 
     Attributes:
-        rig: the refined rig if `accepted`, else the given one.
+        rig: the refined rig if `accepted`, with rough maps for links that had none; else the given one, whose
+            views known by F alone may have got lenses without distortion.
         accepted: True if the refined rig is used.
-        changes: changes of the parameters; empty if not accepted.
-        unobservable: names of parameters that the images do not determine.
-        held_out: statistics of the held-out points, before and after.
-        depth: change of depth; None for uncalibrated rigs and too few points of observable depth.
-        objections: reasons not to accept the result, in words.
+        changes: changes of the observable parameters; empty if not accepted.
+        unobservable: names of parameters, or of components ("left.rotation x"), that the images do not
+            determine.
+        held_out: statistics of the held-out points by the rig before, and by the refined one, accepted or
+            not.
+        depth: change of depth; None for uncalibrated rigs, too few points of observable depth, or nothing
+            observable, and from `refine_matches` with `keep_depth` False.
+        objections: reasons not to accept the result, in words; if it was forced, in spite of these.
         undetermined: sentences on pairs whose points determine no lines.
     """
 
@@ -74,7 +79,8 @@ class Refinement:
     undetermined: tuple[str, ...] = ()
 
     def as_text(self) -> str:
-        """Return the changes, the distances of held-out points and the change of depth as lines of text."""
+        """Return the distances of held-out points, the change of depth, objections and changes as lines of
+        text."""
         original, refined = self.held_out
         verdict = "accepted all the same" if self.accepted else "not accepted"
         lines = [

@@ -93,24 +93,28 @@ def refine(
 ) -> Refinement:
     """Refine a rig by points matched in frames, each with images of two or more of its cameras.
 
-    The first camera that has images keeps its pose. F of links is always free, and views known by F alone are
-    given lenses if held-out points improve. With two frames or more, whole frames are held out, else parts of
-    the image.
+    The rig's first camera that has matched points keeps its pose. F of links is always free, and views known
+    by F alone are given lenses if held-out points improve. With two frames or more, whole frames are held
+    out, else parts of the image.
 
     Args:
+        rig: the rig, not a batch.
         frames: one image (C, H, W) in 0..1 per camera, by name, of the rig's sizes.
-        free: free parameters: kinds such as "rotation" or "focal", or patterns over "camera.kind".
+        free: free parameters, as `free_parameters` takes them: kinds such as "rotation" or "focal", or
+            patterns over "camera.kind".
         sigma: prior standard deviations by kind, in the units of `SIGMA` (radians, pixels, shares of the
             longest baseline and of the focal length); None for the usual ones.
-        force: True to follow the lines however depth changes, and accept the result in spite of objections.
-        matches: points of each frame used instead of matching its images; None to match them.
+        force: True to follow the lines however depth changes, and accept the result in spite of objections,
+            unless nothing moved.
+        matches: points used instead of matching images, for each frame; None to match them.
 
     Returns:
         The refined rig if accepted, else the given one, with changes and objections.
 
     Raises:
-        ValueError: in one line, for no frame, a camera that the rig lacks, an image of another size than the
-            rig states, equal images, too few points, or nothing free.
+        ValueError: in one line, for no frame, an image of another size than the rig states, images that
+            `match_cameras` refuses, given points of which too few agree, and as `refine_matches`.
+        IndexError: for `matches` of fewer frames.
     """
     if not frames:
         raise ValueError("no frame: give images of two cameras or more")
@@ -141,20 +145,23 @@ def refine_matches(
     """Refine a rig by matched points.
 
     Args:
-        frames: matched points of each frame, by pair of names.
+        frames: matched points of each frame, by pair of names; pairs that the rig does not relate are left
+            out.
         free: free parameters: kinds such as "rotation" or "focal", or patterns over "camera.kind".
         sigma: prior standard deviations by kind, as `refine` takes them; None for the usual ones.
         force: True to follow the lines however depth changes, and accept the result in spite of objections.
         keep_depth: False for a rig whose depths are only assumed: nothing but the free parameters is
-            uncertain then, depth may change in any way, and nothing is refused, whatever `force` says.
+            uncertain then, no view is given a lens, depth may change in any way, and nothing is refused,
+            whatever `force` says.
 
     Returns:
         The refined rig if accepted, else the given one, with changes and objections; where nothing moved it
         is not accepted, whatever was forced. The first camera keeps its pose.
 
     Raises:
-        ValueError: for a rig that relates none of the pairs, points of which none are left to use, or nothing
-            free.
+        ValueError: for no frames, a camera that the rig lacks, a frame of whose pairs it relates none, a
+            single frame's points all in one spot, nothing free, and `free` or `sigma` that `free_parameters`
+            refuses.
     """
     if not keep_depth:
         problem = RefinementProblem.from_frames(rig, free, frames=frames, sigma=sigma)
@@ -180,11 +187,10 @@ def fitted(
         near_depth: False to let depth change in any way.
 
     Returns:
-        The problem that was solved, and its solution.
+        The problem that was solved, whose `rig` may have got lenses without distortion, and its solution.
 
     Raises:
-        ValueError: for a rig that relates none of the pairs, points of which none are left to use, or nothing
-            free.
+        ValueError: as `refine_matches`.
     """
     free, best = tuple(free), None
     rigs = [rig] if (with_lens := with_lenses(rig)) is rig else [rig, with_lens]
@@ -208,7 +214,7 @@ class RefinementProblem:
         rig: the rig before.
         parameters: free parameters.
         used: points to fit, by pair.
-        held_out: points to judge by, by pair.
+        held_out: points to judge by, by pair; pairs with few points may lack.
         considered: parameters that are uncertain though not free.
     """
 
@@ -227,7 +233,8 @@ class RefinementProblem:
         frames: Sequence[Pairs],
         sigma: Mapping[str, float] | None = None,
     ) -> RefinementProblem:
-        """Split the frames' points into used and held-out ones, and list the free and considered parameters.
+        """Make the problem of a rig: split the frames' points into used and held-out ones, and list the free
+        and considered parameters.
 
         Args:
             free: free parameters: kinds or patterns.
@@ -235,7 +242,7 @@ class RefinementProblem:
             sigma: prior standard deviations by kind, as `refine` takes them; None for the usual ones.
 
         Raises:
-            ValueError: if nothing is free, no pair is related by the rig, or no points are left to use.
+            ValueError: as `refine_matches`.
         """
         used, held_out = split([related(rig, pairs) for pairs in frames])
         names = cameras_of(rig, (*used, *held_out))
@@ -267,7 +274,8 @@ class RefinementProblem:
         """Compute the posterior given the used points and, if `near_depth`, their depth by the given rig.
 
         Returns:
-            The solution, in prior deviations.
+            The solution, in prior deviations; its `depth` is None if fewer than `FEW` points have a depth, or
+            nothing is observable.
         """
         systematic = systematic_columns(self.rig, self.used)
         log_step(LOG, 0, "refining %d parameters by %d points", self.count, len(systematic))
@@ -291,10 +299,7 @@ class RefinementProblem:
         return solve(lambda z: sampson_of_pairs(self.after(z), self.used), self.count)
 
     def _near_depth(self, solution: Solution, residuals: Residuals, log_depth: Residuals) -> Solution:
-        """Return the most probable parameters if the points' depth, as given, is known to `DEPTH_KEPT`.
-
-        From the solution that follows the lines: the noise that it leaves is that of the points.
-        """
+        """Return the most probable parameters if the points' depth, as given, is known to `DEPTH_KEPT`."""
         free = solution.active
         G = jacobian(log_depth, torch.zeros_like(solution.z))[1][:, free] / DEPTH_KEPT
         information = G.T @ G / len(G) + torch.eye(G.shape[1], dtype=G.dtype)
@@ -314,10 +319,11 @@ class RefinementProblem:
         it.
 
         Args:
-            force: accept it in spite of objections, unless nothing moved.
+            solution: solution of this problem.
+            force: True to accept it in spite of objections, unless nothing moved.
 
         Returns:
-            The refinement; its rig is the given one unless accepted.
+            The refinement; its rig is that of the problem unless accepted.
         """
         refined = self.after(solution.z)
         before, after = (line_distances(rig, self.held_out) for rig in (self.rig, refined))
@@ -351,8 +357,7 @@ class RefinementProblem:
         )
 
     def _no_nearer(self, before: Tensor, solution: Solution) -> str:
-        """Return the objection that points are no nearer to their lines, and what else to free if that is the
-        reason."""
+        """Return the objection that points are no nearer to their lines, and what to free if that helps."""
         text = "held-out points are no nearer to their lines"
         kinds = dict.fromkeys(u.name.rpartition(".")[2] for u in self.considered)
         if not kinds.keys() & set(FREE):  # else all that can be freed was tried
@@ -363,8 +368,7 @@ class RefinementProblem:
         return f"{text} by what is free alone: free {', '.join(kinds)} too"
 
     def _depth_change(self, refined: Rig, solution: Solution) -> DepthChange | None:
-        """Return the change of depth; None for uncalibrated rigs and for too few points whose depth is
-        observable."""
+        """Return the change of depth; None without calibration or observable depths."""
         if solution.depth is None:
             return None
         return DepthChange(relative_change(self.rig, refined, self.used), solution.depth)
@@ -391,8 +395,12 @@ def systematic_columns(rig: Rig, pairs: Pairs) -> Float[Tensor, "m s"]:
     """Compute derivatives of all Sampson distances by the distortion that lens models leave uncorrected.
 
     Returns:
-        One row a point, four columns a camera, float64 without gradient, in pixels per prior deviation
-        (`SYSTEMATIC`); 0 for pairs known by F.
+        One row a point, the pairs' one after the other, and four columns a calibrated camera of the pairs in
+        the rig's order, float64 without gradient, in pixels per prior deviation (`SYSTEMATIC`); 0 for pairs
+        known by F.
+
+    Raises:
+        ValueError: for a camera that the rig lacks.
     """
     names = [name for name in cameras_of(rig, pairs) if isinstance(rig[name], Camera)]
     columns = {name: slice(4 * i, 4 * i + 4) for i, name in enumerate(names)}

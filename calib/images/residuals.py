@@ -40,9 +40,10 @@ class MatchDepths(NamedTuple):
     """Depth of matched points, one per match.
 
     Attributes:
-        depth: depth in alpha, in the rig's unit (metres); NaN for uncalibrated pairs.
-        front: mask of the points in front of both cameras.
-        observable: mask of the points with enough parallax; False for uncalibrated pairs.
+        depth: depth in alpha, in the rig's unit (metres), without meaning where not `observable`; NaN for
+            pairs known by F (a link), even if they have cameras.
+        front: mask of the points in front of both cameras; False for such pairs.
+        observable: mask of the points with rays and enough parallax; False for such pairs.
     """
 
     depth: Float[Tensor, "*b n"]
@@ -70,11 +71,11 @@ def epipolar_residuals(pair: Pair, matches: PointMatches) -> EpipolarResiduals:
     """Compute the signed distances of matches from the epipolar geometry: Sampson's, and that from the line.
 
     The algebraic error x_beta^T F x_alpha is divided by its gradient in the pixels, which is taken as
-    constant. With cameras, rays replace pixels and E replaces F, so that lenses are respected to first order
-    in the distance.
+    constant. With cameras and no link, rays replace pixels and E replaces F, so that lenses are respected to
+    first order in the distance.
 
     Returns:
-        Signed distances in pixels, differentiable in the rig, with their validity.
+        Signed distances in pixels, differentiable in the rig but not in the points, with their validity.
 
     Raises:
         ValueError: if neither cameras nor F are known.
@@ -115,7 +116,7 @@ def within_lenses(rig: Rig, pairs: Pairs) -> dict[tuple[str, str], PointMatches]
         Matches by pair; all of a pair with fewer than 2 `FEW` such ones.
 
     Raises:
-        ValueError: for pairs with neither cameras nor F.
+        ValueError: for a camera that the rig lacks, and pairs with neither cameras nor F.
     """
     kept = {}
     for names, matches in pairs.items():
@@ -128,23 +129,24 @@ def sampson_of_pairs(rig: Rig, pairs: Pairs) -> list[Float[Tensor, " n"]]:
     """Compute Sampson distances of the points of each pair, pixels; 0 where a pixel has no ray.
 
     Returns:
-        One tensor per pair, differentiable in the rig.
+        One tensor per pair, signed, differentiable in the rig.
 
     Raises:
-        ValueError: for pairs with neither cameras nor F.
+        ValueError: as `within_lenses`.
     """
     parts = [epipolar_residuals(rig.pair(*names), matches) for names, matches in pairs.items()]
     return [torch.where(of_pair.valid, of_pair.sampson, 0.0) for of_pair in parts]
 
 
 def match_depths(rig: Rig, pairs: Pairs) -> MatchDepths:
-    """Compute the depths of all points of all pairs, where rays are closest to each other.
+    """Compute the depths of all points of all pairs, one at least, where rays are closest to each other.
 
     Returns:
         Depths in alpha, in the rig's unit, the pairs' points one after the other; differentiable in the rig.
 
     Raises:
-        ValueError: for pairs with neither cameras nor F.
+        ValueError: as `within_lenses`.
+        TypeError: for no pairs.
     """
     depths = []
     for names, matches in pairs.items():
@@ -204,7 +206,7 @@ def displacements(hw: HW, points: Float[Tensor, "n 2"]) -> Float[Tensor, "n 2 4"
     """Compute the smooth displacements of `systematic_modes` at points (x, y) of an image of this size.
 
     Returns:
-        Pixels (x, y) of each of the four displacements.
+        Pixels (x, y) of each of the four displacements, (n, 2, 4).
     """
     h, w = hw
     p = (points - points.new_tensor([(w - 1) / 2, (h - 1) / 2])) / (0.5 * math.hypot(h, w))
@@ -219,7 +221,7 @@ def displacements(hw: HW, points: Float[Tensor, "n 2"]) -> Float[Tensor, "n 2 4"
 def lines_basis(pair: Pair, matches: PointMatches) -> Float[Tensor, "n 8"]:
     """Compute derivatives of the matches' line distances by the eight degrees of freedom of F up to scale.
 
-    For calibrated pairs the matrix is E, between rays.
+    For calibrated pairs without a link the matrix is E, between rays.
 
     Returns:
         Pixels per unit of each degree of freedom, one row a match, without gradient; 0 where a pixel has no
@@ -243,10 +245,10 @@ def related(rig: Rig, pairs: Pairs) -> dict[tuple[str, str], PointMatches]:
     """Select those of the pairs that the rig relates: calibrated ones and those with a link.
 
     Returns:
-        Matches by pair of names.
+        Matches by pair of names, as given.
 
     Raises:
-        ValueError: if there are none.
+        ValueError: if there are none, and for a camera that the rig lacks.
     """
     relations = {
         names: m
@@ -305,10 +307,14 @@ def _rays(pair: Pair, x: Tensor, y: Tensor) -> tuple[tuple[Tensor, Tensor], Tens
 
 
 def own_distance(rig: Rig, pairs: Pairs) -> float:
-    """Compute the median distance of points from the lines of an F fitted to them: about the least possible.
+    """Compute the median distance of points from the lines of an F fitted to each pair: about the least
+    possible.
 
     Returns:
-        Distance in undistorted pixels of beta; 0 if no F fits.
+        Distance in undistorted pixels of beta, without pairs that no F fits; 0 if none fits any.
+
+    Raises:
+        ValueError: for a camera that the rig lacks.
     """
     distances = []
     for names, matches in pairs.items():
@@ -335,13 +341,14 @@ def nearer(before: Float[Tensor, " n"], after: Float[Tensor, " n"]) -> bool:
 
 
 def line_distances(rig: Rig, pairs: Pairs) -> Float[Tensor, " n"]:
-    """Compute signed distances of all points from their lines, in beta's pixels, detached.
+    """Compute signed distances of all points of all pairs, one at least, from their lines in beta.
 
     Returns:
-        The pairs' points one after the other.
+        Distances in beta's pixels, the pairs' points one after the other, detached; without meaning where a
+        pixel has no ray.
 
     Raises:
-        ValueError: for pairs with neither cameras nor F.
+        ValueError: as `within_lenses`.
     """
     return torch.cat([epipolar_residuals(rig.pair(*n), m).line.detach() for n, m in pairs.items()])
 
@@ -363,11 +370,15 @@ def split(
 
     Of several frames the last are held out: one in `HELD_OUT`, rounded down, and at least one.
 
+    Args:
+        frames: matched points of each frame, by pair of names; one frame at least.
+
     Returns:
-        Matches to use and to hold out, by pair of names.
+        Matches to use and to hold out, by pair of names; a pair may lack in either, or have no points to use.
 
     Raises:
-        ValueError: for points of which none are left to use, as all are in one square.
+        ValueError: for no frames, and for a single one whose points are all held out, as they are in one
+            square.
     """
     if len(frames) > 1:
         held_out = max(1, len(frames) // HELD_OUT)

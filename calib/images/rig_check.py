@@ -35,9 +35,10 @@ class Misfit(NamedTuple):
 
     Attributes:
         off: median distance of the matched points from their lines, pixels of the reduced images.
-        outside: share of them behind the cameras or outside the depth range; NaN for few points.
+        outside: share of those of observable depth that are behind the cameras or outside the depth range
+            (`share_outside`, which says when it is 0 or NaN).
         mistaken: True if the doctor names a mistake, not a drift.
-        text: a sentence on all this, with the doctor's verdict.
+        text: a sentence on all this, with the doctor's verdict unless that is that the rig is healthy.
     """
 
     off: float
@@ -58,11 +59,12 @@ def find_misfit(rig: Rig, images: Images) -> Misfit | None:
     Only the first `MOST_CAMERAS` images are used.
 
     Returns:
-        The misfit if the rig fits badly; None if it fits, and where nothing can be said: too few matched
-        points, images of another size, cameras that are not related.
+        The misfit if the rig fits badly; None if it fits, and where nothing can be said: fewer than two
+        images, one of another size, images that `match_cameras` refuses, cameras that are not related, or at
+        one place.
 
     Raises:
-        ValueError: for a camera that the rig lacks.
+        ValueError: for a camera that the rig lacks, of two images or more.
     """
     chosen = {name: images[name] for name in list(images.keys())[:MOST_CAMERAS]}
     if len(chosen) < 2 or any(rig[name].hw != tuple(image.shape[1:]) for name, image in chosen.items()):
@@ -101,13 +103,20 @@ def share_unlike(
     """Compare a depth map with the depths of points matched between the images.
 
     Args:
-        images: one image (C, H, W) in 0..1 per camera, by name.
+        images: one image (C, H, W) in 0..1 per camera, by name; images of another size than the rig states
+            count as resized.
         alpha: camera at whose pixels the map is.
         depth: depth along alpha's axis, in the rig's unit; it may have another size than alpha's image.
+            Points where it is not finite are left out.
         tolerance: tolerance relative to depth.
 
     Returns:
         Share of the points, 0..1, at which the map is off by more than the tolerance; NaN for too few points.
+
+    Raises:
+        KeyError: without an image of alpha.
+        ValueError: for a camera that the rig lacks.
+        TypeError: if points match between other cameras, but none with alpha.
     """
     if (matched := _matched(rig, {alpha: images[alpha], **images}, LARGEST_SIDE)) is None:
         return math.nan

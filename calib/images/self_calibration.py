@@ -79,8 +79,8 @@ class RefinedPair(NamedTuple):
 
     Attributes:
         rig: the two cameras, alpha at the origin, with the depth range of the points.
-        points: number of the points.
-        distance: their median distance from their lines, pixels of beta.
+        points: number of the points by which the depth range and `distance` are measured.
+        distance: their median distance from the rig's lines, pixels of beta.
         exact: True if these lines fit as well as those of F alone; if False, the rig serves for rough depths,
             and the lines should be those of F.
     """
@@ -101,8 +101,9 @@ def self_calibrated(
     lenses of their views; the pair then is not `exact`.
 
     Args:
-        views: alpha's and beta's view, by name, alpha first.
-        link: F between the undistorted views.
+        views: alpha's and beta's view, by name, alpha first; a lens must be a `Distortion`.
+        link: F between the undistorted views, not 0, and H if known: the ratio of focal lengths, and a
+            rotation by quarter turns.
         matches: points of the images as recorded, distorted.
         focal: focal lengths in pixels by camera; missing ones are assumed.
 
@@ -110,7 +111,8 @@ def self_calibrated(
         The pair, with the depth range of the points; None for points that no poses explain.
 
     Raises:
-        ValueError: for points that are all in one spot.
+        ValueError: for another number of views than two, and points that are all in one spot.
+        IndexError: if no point is within `NEAR_LINE` pixels of its line.
     """
     alpha, beta = views
     lenses = {
@@ -153,12 +155,17 @@ def refined_by_depth(
     squares.
 
     Args:
-        images: one image (C, H, W) in 0..1 per camera, of the pair's sizes.
+        images: one image (C, H, W) in 0..1 per camera, of the pair's sizes, by name.
         depth: depth of alpha's pixels, in the pair's unit; NaN where unknown.
         confidence: confidence of alpha's pixels, 0..1.
 
     Returns:
-        The refined pair; the same pair if there are too few matches, or it has no parallax.
+        The refined pair, always marked `exact`; the same pair if there are fewer than 5 `ENOUGH` matches, or
+        it has no parallax.
+
+    Raises:
+        ValueError: for points that are all in one spot.
+        KeyError: for a camera without an image.
     """
     matches = dense_matches(pair.rig, images, depth, confidence)
     if len(matches.alpha) < 5 * ENOUGH:
@@ -171,11 +178,15 @@ def joined(pairs: Mapping[str, RefinedPair], scales: Mapping[str, float]) -> Rig
     """Join calibrated pairs with one alpha into one rig.
 
     Args:
-        pairs: pairs by beta's name.
-        scales: factor of each pair's lengths, by beta's name.
+        pairs: pairs by beta's name, with depth ranges, one at least.
+        scales: factor of each pair's lengths, by beta's name, for all of them.
 
     Returns:
-        The rig named `UNSCALED`, alpha first, with the depth range of all.
+        The rig named `UNSCALED`: alpha as in the first pair, then the betas, with a depth range that includes
+        theirs.
+
+    Raises:
+        KeyError: for a pair without a scale.
     """
     rigs = {name: pair.rig.scaled(scales[name]) for name, pair in pairs.items()}
     first = next(iter(rigs.values()))
@@ -198,7 +209,11 @@ def dense_matches(
         confidence: confidence of alpha's pixels; those up to `LEAST_CONFIDENCE` are left out.
 
     Returns:
-        The matches whose position is known to `WELL_LOCALISED` pixels.
+        The matches whose position is known to `WELL_LOCALISED` pixels, float64; possibly none.
+
+    Raises:
+        ValueError: for an uncalibrated rig.
+        KeyError: for a camera without an image.
     """
     alpha, beta = (camera.to(torch.float64) for camera in _pair(rig).cameras)
     alpha_image, beta_image = (contrast_equalised(images[name]) for name in rig.names)
@@ -247,8 +262,7 @@ def depth_bounds(rig: Rig, matches: PointMatches) -> tuple[float, float] | None:
 
 
 def _focal_lengths(views: Mapping[str, View], link: Link, focal: Mapping[str, float]) -> dict[str, float]:
-    """Return focal lengths in pixels: as given, or by the ratio of the image scales to the other's, or
-    assumed."""
+    """Return focal lengths in pixels: given, or by the ratio of image scales to the other's, or assumed."""
     alpha, beta = views
     ratio = (
         1.0 if link.H is None else float(torch.linalg.det(link.H[:2, :2]).abs().sqrt() / link.H[2, 2].abs())
@@ -267,13 +281,16 @@ def initial_poses(
     With parallel axes beta is to either side along the direction in which most points differ.
 
     Args:
-        matches: points of alpha and beta.
-        link: link of the two views, with F and H.
-        K: alpha's intrinsics.
-        K_beta: beta's intrinsics.
+        matches: points of alpha and beta, undistorted, float64.
+        link: link of the two views, F and, for a rotation by quarter turns, H.
+        K: alpha's intrinsics, float64.
+        K_beta: beta's intrinsics, float64.
 
     Returns:
-        Two to four poses, beta from alpha.
+        Two to four poses, beta from alpha, float64.
+
+    Raises:
+        IndexError: for no points.
     """
     R, rays = _upright(link), [torch.linalg.inv(k) for k in (K, K_beta)]
     x, y = (map_homogeneous(inverse, points)[..., :2] for inverse, points in zip(rays, matches))
@@ -300,12 +317,8 @@ def _upright(link: Link) -> Float[Tensor, "3 3"]:
 def _refined_pair(
     rig: Rig, matches: PointMatches, near: PointMatches, *, fixed: Sequence[str] = ()
 ) -> RefinedPair | None:
-    """Refine a pair by matches, with distance and depths by `near`.
-
-    Returns:
-        The pair; None without parallax, or if the baseline, whose length matches do not determine, becomes
-        shorter than `SHORTEST`.
-    """
+    """Refine a pair by matches, with distance and depths by `near`; None without parallax, or if the
+    baseline, whose length matches do not determine, becomes shorter than `SHORTEST`."""
     alpha, beta = rig.names
     free = [f"{beta}.{kind}" for kind in (*SIGMA, "centre") if kind not in fixed]
     sigma = {**SIGMA, "centre": CENTRE_SHARE * max(rig[beta].hw)}

@@ -30,8 +30,8 @@ class Authors(NamedTuple):
 
     Attributes:
         config: configuration of the network.
-        state: weights by the names of this package's network, float32.
-        facts: texts of the file by name: recipe, epoch and PSNR, where stated.
+        state: weights by the names of this package's network, on the CPU, float32.
+        facts: texts by name: "recipe", and "epoch" and "psnr" where the file states them.
     """
 
     config: PATConfig
@@ -47,8 +47,8 @@ def read_authors(path: str | Path) -> Authors:
 
     Raises:
         FileNotFoundError: for a missing file.
-        ValueError: for a file that would run code, is cut short, or holds another network; the text names the
-            first weight that does not fit.
+        ValueError: for a file that would run code, is cut short, or holds another network, naming the first
+            weight that does not fit.
     """
     content = _loaded(Path(path))
     state = content.get("state_dict", content) if isinstance(content, Mapping) else None
@@ -67,11 +67,11 @@ def load_authors(path: str | Path) -> PAT:
     """Load the network of an authors' checkpoint (best.pth.tar).
 
     Returns:
-        The network, for evaluation, its weights without gradients.
+        The network, on the CPU, for evaluation, its weights without gradients.
 
     Raises:
         FileNotFoundError: for a missing file.
-        ValueError: for a file that would run code, is cut short, or holds another network.
+        ValueError: as `read_authors`.
     """
     read = read_authors(path)
     network = PAT(read.config)
@@ -80,13 +80,15 @@ def load_authors(path: str | Path) -> PAT:
 
 
 def config_of(state: Mapping[str, Tensor]) -> PATConfig:
-    """Derive a network's configuration from its weights, by the names that the authors gave them.
+    """Derive a network's configuration from its weights, by the authors' names without "module.".
 
     Returns:
-        The configuration, from the weights' shapes.
+        The configuration: sizes from the weights' shapes, and the biases, values and resizing of betas as in
+        the authors' code.
 
     Raises:
-        ValueError: for missing weights, by name, and for sizes beyond 1 to 1024.
+        ValueError: if one of the three weights that show them is missing, or a size is beyond 1 to 1024.
+            `renamed` checks the others.
     """
     betas = sum(re.fullmatch(r"pam\.b2s\.\d+\.weight", name) is not None for name in state)
     for name in ("init_feature.0.weight", "upscale.4.weight", "upscale.7.weight"):
@@ -114,11 +116,11 @@ def renamed(weights: Mapping[str, Tensor], config: PATConfig) -> dict[str, Tenso
     The columns of the fusion's convolution are reordered too: the authors have alpha last, here it is first.
 
     Args:
-        weights: weights by the authors' names.
+        weights: weights by the authors' names, without "module.".
         config: configuration of the network that they must fit.
 
     Returns:
-        Weights by name, in float32.
+        Weights by name, in float32; tensors that are so already may be shared.
 
     Raises:
         ValueError: for the first weight that is missing, too many, of another shape, or not finite.

@@ -31,7 +31,8 @@ from .denoiser import opponent, opponent_deviation, rgb_of_opponent
 class BM3DSettings:
     """Settings of the filter of groups of similar blocks, BM3D (Dabov et al. 2007).
 
-    `pat lab settings` prints the value of each with its meaning and reason.
+    The filter reads those in `SETTINGS`, once, when it is imported. `pat lab settings` prints the value of
+    each with its meaning and reason.
     """
 
     side: int = size(8, "Side of a block, pixels")
@@ -64,12 +65,12 @@ def without_noise(
     """Denoise images of one band or of three (RGB) by a denoiser of `LowLightNetwork`, and refine its result.
 
     Args:
-        network: denoiser, called with the images and the deviations.
-        recorded: noisy images, values 0..1.
+        network: denoiser, called with the images and the deviations, both (b, c, h, w).
+        recorded: noisy images, values 0..1; one at least.
         deviation: standard deviation of each value's noise.
 
     Returns:
-        The denoised images, of the same shape, not clipped, detached.
+        The denoised images, as `refined`, which raises the same.
     """
     return refined(network(recorded, deviation), recorded, deviation)
 
@@ -81,15 +82,19 @@ def refined(
 ) -> Float[Tensor, "b c h w"]:
     """Refine a network's estimate of images of one band or of three (RGB) that were recorded with noise.
 
-    Brightness is a mean of the network's and the filtered one; colour is filtered twice.
+    Brightness (or the single band) is a mean of the network's and the filtered one; colour is filtered twice.
 
     Args:
-        estimate: the network's images without noise.
+        estimate: the network's images without noise; one at least.
         recorded: the noisy images, values 0..1.
         deviation: standard deviation of each value's white noise.
 
     Returns:
-        Images of the same shape, not clipped, detached.
+        Images of the same shape, not clipped. A gradient reaches the estimate only, through its share of
+        brightness.
+
+    Raises:
+        RuntimeError: by torch, for two bands or more than three.
     """
     return torch.stack([_refined(*parts) for parts in zip(estimate, recorded, deviation)])
 
@@ -120,12 +125,13 @@ def wiener_filtered(
     Beyond the edges images are mirrored. Computed in float32 on the CPU, on as many threads as torch may use.
 
     Args:
+        image: noisy image of any bands. All values must be finite.
         expected: estimate of the image without noise.
         deviation: standard deviation of each value's noise.
-        guide: image in which blocks are compared.
+        guide: image in which blocks are compared, of any bands and the same size.
 
     Returns:
-        The filtered image on the image's device, detached.
+        The filtered image (c, h, w) in the image's type and on its device, not clipped, detached.
     """
     return _of_groups(filter_groups, [image, expected, deviation.square()], guide, len(image))
 
@@ -162,10 +168,10 @@ def other_camera_update(
         estimate: image without noise.
         recorded: noisy image from which the estimate was made.
         deviation: standard deviation of the noise of `recorded`.
-        other: the other camera's recording.
+        other: the other camera's recording; values must be finite where its confidence is 0, too.
 
     Returns:
-        Values to add to the estimate, detached.
+        Values (1, h, w) to add to the estimate, detached.
     """
     taken = torch.lerp(estimate, other.recorded, other.confidence)
     planes = [estimate, taken, deviation.square(), other.deviation.square(), other.confidence]
@@ -174,8 +180,7 @@ def other_camera_update(
 
 
 def _blur_and_spectrum(estimate: Float[Tensor, "1 h w"], other: Observation) -> tuple[np.ndarray, np.ndarray]:
-    """Estimate the share of each coefficient of a block that another camera shows, and the power of its
-    grain."""
+    """Estimate the share of each block coefficient that another camera shows, and its grain's power."""
     step = max(round((estimate.numel() / SETTINGS.blocks) ** 0.5), 1)
     planes = torch.stack([estimate, *other[:1], *other[2:]]).float()
     size = [max(SIDE - n, 0) for n in reversed(estimate.shape[-2:])]
@@ -230,13 +235,15 @@ WINDOW = np.outer(np.kaiser(SIDE, 2.0), np.kaiser(SIDE, 2.0)).astype(np.float32)
 
 @compiled(nogil=True, cache=True, fastmath=True)
 def find_alike(guide, top, alike):
-    """Find the blocks most similar to each reference block, by the sum of squared differences.
+    """Find the blocks within RADIUS pixels most similar to each reference block, by the sum of squared
+    differences.
 
     Args:
-        guide: image (bands, h, w) in which blocks are compared, padded by RADIUS pixels.
+        guide: image (bands, h, w), float32, in which blocks are compared, with RADIUS pixels around them all.
         top: number of the first row of reference blocks.
-        alike: displacements (y, x) to write, (rows, columns, ALIKE, 2), for reference block (r, k), which
-            begins at pixel (RADIUS + STEP (top + r), RADIUS + STEP k); it is the first of its own group.
+        alike: displacements (y, x) to write, integers (rows, columns, ALIKE, 2), the most similar first, for
+            reference block (r, k), which begins at row RADIUS + STEP (top + r) and column RADIUS + STEP k; it
+            is the first of its own group.
     """
     rows, columns = alike.shape[:2]
     cells = np.zeros((rows + CELLS - 1, columns + CELLS - 1), np.float32)
@@ -300,7 +307,7 @@ def group_transform(blocks):
     """Apply the orthonormal Hadamard transform across a group's blocks, in place; it is its own inverse.
 
     Args:
-        blocks: coefficients (SIDE^2, ALIKE), the block's number last.
+        blocks: coefficients (SIDE^2, ALIKE), float32, the block's number last.
     """
     for i in range(SIDE * SIDE):
         width = 1
@@ -352,14 +359,14 @@ def filter_groups(image, expected, variance, top, alike, cosines, window, out):
     """Filter groups of similar blocks by Wiener's filter, and add up the blocks and their weights.
 
     Args:
-        image: noisy planes (c, h, w), float32, padded by RADIUS pixels.
+        image: noisy planes (c, h, w), float32, padded as the guide of `find_alike`.
         expected: the same without noise, approximately.
         variance: variance of the noise, of the same shape.
         top: number of the first row of reference blocks.
         alike: displacements of each group's blocks, as `find_alike` writes them.
         cosines: orthogonal cosine transform (SIDE, SIDE).
         window: weights of a block's pixels (SIDE, SIDE).
-        out: sums (2, c, rows, w) to add to: weighted blocks, and weights; row 0 is pixel row STEP top.
+        out: sums (2, c, rows, w) to add to: weighted blocks, and weights; row 0 is row STEP top of `image`.
     """
     rows, columns = alike.shape[:2]
     group = np.empty((SIDE * SIDE, ALIKE), np.float32)
@@ -394,8 +401,9 @@ def update_groups(
 
     Args:
         share: share of each coefficient (SIDE^2) that the other camera's blur leaves.
-        spectrum: power of each coefficient of the other camera's noise of unit deviation.
-        estimate: image without noise (1, h, w), float32, padded by RADIUS pixels; as are the next four.
+        spectrum: power of each coefficient (SIDE^2) of the other camera's noise of unit deviation.
+        estimate: image without noise (1, h, w), float32, padded as the guide of `find_alike`; as are the next
+            four.
         taken: the other camera's values; the estimate's where positions are not certain.
         variance: variance of the noise from which the estimate was made.
         other: variance of the other camera's noise.
@@ -404,7 +412,8 @@ def update_groups(
         alike: displacements of each group's blocks, as `find_alike` writes them.
         cosines: orthogonal cosine transform (SIDE, SIDE).
         window: weights of a block's pixels (SIDE, SIDE).
-        out: sums (2, 1, rows, w) to add to: weighted updates, and weights; row 0 is pixel row STEP top.
+        out: sums (2, 1, rows, w) to add to: weighted updates, and weights; row 0 is row STEP top of
+            `estimate`.
     """
     rows, columns = alike.shape[:2]
     group = np.empty((SIDE * SIDE, ALIKE), np.float32)

@@ -8,7 +8,7 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class PATConfig:
-    """Configuration of PAT; the default is the paper's network.
+    """Configuration of PAT; the default is the paper's network. Values are not checked here.
 
     Attributes:
         betas: number of betas.
@@ -16,8 +16,8 @@ class PATConfig:
         out_channels: number of bands of the fused image.
         dim: width D of the features.
         scale: enlargement s by pixel shuffle.
-        residual: True to add the network's output to alpha in place of replacing it, so that alpha's own
-            detail cannot be lost.
+        residual: True to add the network's output to alpha (of one channel or `out_channels`) in place of
+            replacing it, so that alpha's own detail cannot be lost.
         interpolation: interpolation of beta's samples.
         block_bias: True for biases in residual blocks, which the authors' code has not.
         fusion_bias: True for a bias of the 1x1 fusion, as the authors' code has.
@@ -43,13 +43,14 @@ class PATConfig:
 
 @dataclass(frozen=True)
 class GuidedPATConfig:
-    """Configuration of GuidedPAT.
+    """Configuration of GuidedPAT. Values are not checked here.
 
     Attributes:
         bands: number of bands of the fused image; None for all bands of the betas.
-        keep_luminance: True if the network adds colour to alpha but never luminance.
+        keep_luminance: True if the network adds colour to alpha but never luminance (Rec. 601 of the first
+            three bands; with fewer the network raises ValueError); without `bands` it has no effect.
         learned: True for matching with trained networks; False for classical matching, semi-global with a
-            left-right check, without a stated certainty.
+            left-right check, whose confidence is 0 or 1.
     """
 
     bands: int | None = 3

@@ -34,7 +34,7 @@ class DenoiserConfig:
 
     Attributes:
         widths: channels at 1/2, 1/4 and 1/8 size.
-        blocks: number of residual blocks at each size.
+        blocks: number of residual blocks at each size, as of `UNet`.
     """
 
     widths: tuple[int, int, int] = (48, 96, 128)
@@ -44,7 +44,7 @@ class DenoiserConfig:
 class Denoising(nn.Module):
     """Network that estimates noise in units of its standard deviation, and subtracts it.
 
-    Where the deviation is 0 an image stays as it is.
+    Made with random weights. Where the deviation is 0 an image stays as it is.
 
     Args:
         bands: number of channels of an image.
@@ -62,11 +62,11 @@ class Denoising(nn.Module):
         """Denoise images of any size.
 
         Args:
-            image: noisy images, values 0..1.
+            image: noisy images, values 0..1, of `bands` channels and the weights' type.
             deviation: standard deviation of each value's noise.
 
         Returns:
-            Images of the same shape, not clipped.
+            Images of the same shape, not clipped; differentiable.
         """
         h, w = image.shape[-2:]
         inputs = torch.cat([image - 0.5, SETTINGS.scale * deviation], 1)
@@ -91,12 +91,12 @@ def rgb_of_opponent(bands: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]
 
 
 class LowLightNetwork(nn.Module):
-    """Denoisers of images of one band and of three; it is not called itself.
+    """Denoisers of images of one band and of three, with random weights; it is not called itself.
 
     Attributes:
         config: size of the networks.
-        band: denoiser of each band by itself.
-        colour: denoiser of colour images.
+        band: `Denoising` of each band by itself, (b, 1, h, w).
+        colour: `Denoising` of RGB images.
     """
 
     def __init__(self, config: DenoiserConfig = DenoiserConfig()) -> None:

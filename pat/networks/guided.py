@@ -28,7 +28,7 @@ from .recall import by_example, with_less_noise
 
 
 class GuidedPAT(nn.Module):
-    """Fusion network that gives a mono alpha the bands of its betas, found by matching.
+    """Fusion network, without weights, that gives a mono alpha the bands of its betas, found by matching.
 
     With `config.bands` the image has that many bands: three filtered cameras give one each, or any number of
     RGB cameras all three; other betas help to find depth only. With `config.bands` None the image has all
@@ -60,11 +60,13 @@ class GuidedPAT(nn.Module):
             matches: result of `match(inputs)`; None raises.
 
         Returns:
-            The image (B, C, H, W) in the betas' bands, with position, deviation and confidence in each beta.
+            The image (B, C, H, W) in the betas' bands, not clipped. For each beta the position of the surface
+            that alpha sees, its confidence (0 off the beta), and a deviation of 1 everywhere. `overall` is
+            the largest confidence where several betas are taken that have all bands each, else None.
 
         Raises:
-            ValueError: without matches, for matches of other sizes or numbers of betas, and for betas whose
-                bands do not add up to the configured number, unless one of several has them all.
+            ValueError: as `required`; for matches without colours, fields that are not straight, and betas
+                whose bands do not add up to the configured number, unless one of several has them all.
         """
         matches = required(matches, inputs)
         carried = [_as_alpha(m.carried, inputs.alpha) for m in matches.betas]
@@ -115,7 +117,8 @@ def completed(alpha: Float[Tensor, "b 1 h w"], carried: Sequence[Colours]) -> Fl
     low.
 
     Args:
-        carried: bands minus alpha from the matches of each beta.
+        alpha: alpha's image; both sides even.
+        carried: bands minus alpha from the matches of each beta; one at least.
 
     Returns:
         Bands minus alpha, of all betas in order.
@@ -138,11 +141,11 @@ def _joined(bands: Sequence[Tensor]) -> Tensor:
 
 
 def combined(carried: Sequence[Colours]) -> Colours:
-    """Combine the colours of several betas of the same bands to those of one.
+    """Combine the colours of several betas of the same bands to colours of one.
 
     Returns:
-        Means of bands, likeness and fills, weighted by the odds of each beta's weight; the largest weight.
-        For a single beta its own.
+        Means of bands, likeness and fills (the same fills if all share one tensor), weighted by the odds of
+        each beta's weight; the largest weight. For a single beta its own.
     """
     if len(carried) == 1:
         return carried[0]
@@ -169,9 +172,14 @@ def where_certain(
 
     Args:
         residual: bands minus alpha.
+        inputs: inputs of the fusion, with straight fields.
+        matches: matches of all of their betas.
 
     Returns:
-        Bands minus alpha; unchanged if no beta has all of the bands and a trained certainty.
+        Bands minus alpha; `residual` itself if no beta has all of the bands and a trained certainty.
+
+    Raises:
+        ValueError: for a field that is not straight, and another number of matches than betas.
     """
     weights, shown = [], []
     for beta, matched in zip(inputs.betas, matches.betas, strict=True):

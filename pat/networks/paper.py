@@ -30,11 +30,11 @@ SURROUNDINGS, FLOOR = 9, 0.01
 
 
 class QueryAndKey(NamedTuple):
-    """Features of an image that attention compares.
+    """Features of one image that attention compares.
 
     Attributes:
-        query: features (B, D, H, W) of an alpha.
-        key: features (B, D, H, W) of a beta.
+        query: features (B, D, H, W) of the image as alpha.
+        key: features (B, D, H, W) of the image as a beta.
     """
 
     query: Tensor
@@ -44,7 +44,7 @@ class QueryAndKey(NamedTuple):
 class PAT(nn.Module):
     """The paper's network: features shared by all views, attention to each beta, fusion by convolutions.
 
-    Made of its configuration; weights are random.
+    Made of its configuration, with random weights.
 
     >>> PAT(PATConfig(betas=2, dim=8)).config.betas
     2
@@ -70,22 +70,22 @@ class PAT(nn.Module):
         """Fuse alpha with the betas, in the order for which the network was made; matches are not used.
 
         Returns:
-            The image (B, `config.out_channels`, s H, s W), enlarged by s = `config.scale`, with position,
-            deviation and confidence (the largest weight of attention) in each beta.
+            The image (B, `config.out_channels`, s H, s W), enlarged by s = `config.scale`, not clipped, with
+            position, deviation and confidence (the largest weight of attention) in each beta, all 0 where no
+            sample counts; `overall` None.
 
         Raises:
             ValueError: for another number of betas than configured, or channels that do not fit.
+            RuntimeError: by torch, with `config.residual`, for an alpha of neither one channel nor
+                `config.out_channels`.
         """
         return self.compare(inputs)[0]
 
     def compare(self, inputs: Inputs) -> tuple[FusionOutput, list[Compared]]:
-        """Fuse, and keep the features that attention compares in each beta.
+        """Fuse as `forward` (and raise as it), and keep the features that attention compares in each beta.
 
         Returns:
             The output of `forward`, and the compared features of each beta.
-
-        Raises:
-            ValueError: for another number of betas than configured, or channels that do not fit.
         """
         if len(inputs.betas) != self.config.betas:
             asked = f"this PAT is made for {self.config.betas} betas, got {len(inputs.betas)}"
@@ -104,13 +104,13 @@ class PAT(nn.Module):
         return FusionOutput(image, position, deviation, confidence), compared
 
     def with_border(self, pixels: float) -> PAT:
-        """Copy the network, with attention that fades within so many pixels of beta's border.
+        """Copy the network, with attention that fades within so many pixels of beta's border (0 for none).
 
-        The fused image then changes smoothly when a rig moves, and its gradient by the rig is whole at the
-        border too.
+        With bilinear interpolation the fused image then changes smoothly when a rig moves, and its gradient
+        by the rig is whole at the border too.
 
         Returns:
-            The copy.
+            The copy, with weights of its own.
         """
         faded = copy.deepcopy(self)
         faded.engine.border = pixels
@@ -151,7 +151,7 @@ def normalised(image: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b 1 h w"]:
 class Features(nn.Sequential):
     """Residual-ASPP features, with the same weights for every view (paper, section 3.1).
 
-    Called with images of `config.in_channels` channels, and one more if `config.normalised`, it returns
+    Called with images (b, c, h, w), c = `config.in_channels` and one more if `config.normalised`, it returns
     features (b, `config.dim`, h, w).
     """
 
@@ -172,8 +172,8 @@ class AttentionEngine(nn.Module):
     """Layers that make alpha's queries and each beta's keys and values, for attention along the segments.
 
     Args:
-        config: configuration of the network, for `betas`, `dim`, `interpolation` and whether a block has
-            biases.
+        config: configuration of the network, for `betas`, `dim`, `interpolation`, `block_bias` and
+            `values_after_block`.
     """
 
     def __init__(self, config: PATConfig) -> None:
@@ -197,11 +197,12 @@ class AttentionEngine(nn.Module):
 
         Args:
             alpha_features: features (b, d, h, w).
-            beta_features: features (b, d, h, w) of each beta.
-            fields: field of each beta.
+            beta_features: features (b, d, h, w) of each beta, of a size of its own.
+            fields: field of alpha's pixels in each beta.
 
         Returns:
-            The compared features of each beta, for `Compared.attended`.
+            The compared features of each beta, for `Compared.attended`; of the first ones only, where the
+            network or one of the lists has fewer betas.
         """
         query, how = self.query(self.before(alpha_features)), self.interpolation
         scores = []

@@ -21,10 +21,13 @@ class FusionOutput(NamedTuple):
 
     Attributes:
         image: the fused image (B, C, s H, s W).
-        position: position of alpha's pixels in each beta, (B, 2, H, W), beta's pixels.
-        deviation: standard deviation of that position in each beta, (B, H, W), beta's pixels.
-        confidence: probability that each beta sees the point at that position, (B, H, W), 0 to 1.
-        overall: confidence of the image, (B, H, W); None for the least of the betas'.
+        position: by beta, (x, y) of alpha's pixels, (B, 2, H, W), beta's pixels; without meaning where the
+            confidence is 0.
+        deviation: by beta, standard deviation of that position, (B, H, W), beta's pixels; 1 where the network
+            does not estimate it.
+        confidence: by beta, confidence that it sees the point at that position, (B, H, W), 0 to 1: a trained
+            probability, PAT's largest weight of attention, or 1 for a consistent classical match.
+        overall: confidence of the image, (B, H, W); None where the least of the betas' counts.
     """
 
     image: Tensor
@@ -46,16 +49,17 @@ JoinsBands = Literal["no", "neighbours", "all"]
 
 @runtime_checkable
 class FusionNetwork(Protocol):
-    """Interface of the networks that `fuse` can call.
+    """Interface of the networks that `fuse` can call: attributes, `working_bytes` and a call.
 
-    Attributes state the bands of the image, the use of matches, and the inputs that it needs; each is
-    described beside its name.
+    The attributes, each described beside its name, state the image (`bands`, `keeps_luminance`), matching
+    (`uses_matches`, `learned`), and inputs (`halo`, `beta_halo`, `multiple`, `equal_resolution`,
+    `joins_bands`). `isinstance` looks for these names only.
     """
 
     bands: int | None
     """Number of bands of its image; None for all bands of the betas."""
     uses_matches: bool
-    """True if it must be called with matches; its confidence is then a trained probability."""
+    """True if it must be called with matches; its confidence is then that of the matches."""
     learned: bool
     """True if matching's trained networks take part in its matches."""
     keeps_luminance: bool
@@ -94,10 +98,11 @@ class FusionNetwork(Protocol):
 
 @runtime_checkable
 class Comparing(Protocol):
-    """Interface of a network with attention along its inputs' segments, which known geometry can train."""
+    """Interface of a network with attention along its inputs' segments, which can be trained by true
+    positions: `betas` and `compare`."""
 
     betas: int
-    """Number of betas that it is made for: one in all bands, or several with a band each."""
+    """Number of betas that it is made for."""
 
     def compare(self, inputs: Inputs) -> tuple[FusionOutput, list[Compared]]:
         """Fuse, and keep the features that attention compares in each beta.
@@ -128,17 +133,17 @@ def fused_at_once(network: FusionNetwork, inputs: Inputs) -> FusionOutput:
 
 
 def required(matches: Matches | None, inputs: Inputs) -> Matches:
-    """Check that a network that needs matches was given those of its inputs.
+    """Check that a network that needs matches was given some that fit its inputs.
 
     Args:
         matches: matches that it was called with; None if it was called without.
 
     Returns:
-        The matches.
+        The same matches.
 
     Raises:
-        ValueError: for None, and matches that `Matches.check` refuses: of another size or number of betas.
-            Matches of other images of the same size are not noticed.
+        ValueError: for None, and matches that `Matches.check` refuses: of another size or number of betas, or
+            with planes of another shape, or NaN. Matches of other images of the same size are not noticed.
     """
     if matches is None:
         raise ValueError("this network fuses by matches: call it as network(inputs, match(inputs))")

@@ -30,7 +30,8 @@ from ..support.settings import size, tuned
 class RecallSettings:
     """Settings of filling in colour by example; pixels are of the half-size image, except for `last`.
 
-    `pat lab settings` prints the value of each with its meaning and reason.
+    The functions read those in `SETTINGS`. `pat lab settings` prints the value of each with its meaning and
+    reason.
     """
 
     scales: int = tuned(3, "Middlebury, tune half: sizes of what is around a pixel, radii 2, 4, 8")
@@ -58,15 +59,18 @@ def by_example(
 ) -> Float[Tensor, "b c h w"]:
     """Fill in colour from pixels of known colour that look similar in alpha.
 
-    Filled and known colour are smoothed together, guided by alpha.
+    Filled and known colour are smoothed together, guided by alpha: known colour is not kept as it is.
 
     Args:
         alpha: alpha's image; both sides even.
-        colour: colour of each pixel, such as bands minus alpha.
+        colour: colour of each pixel, such as bands minus alpha; finite everywhere.
         confidence: confidence of each band's colour, 0 to 1; colours with 0 do not count.
 
     Returns:
         Colour at all pixels, of the same shape.
+
+    Raises:
+        RuntimeError: by torch, for odd sides.
     """
     return fitted(recalled(alpha, colour, confidence), alpha, colour, confidence)
 
@@ -79,7 +83,8 @@ def with_less_noise(
     Args:
         alpha: alpha's image.
         colour: colour of each pixel, such as bands minus alpha.
-        confidence: confidence of each band's colour: 1 keeps it, 0 takes the mean.
+        confidence: confidence of each band's colour: 1 keeps it, 0 takes the mean, in which a pixel counts by
+            the least of its bands.
 
     Returns:
         Colour of the same shape.
@@ -101,7 +106,7 @@ def recalled(
         confidence: confidence of each band's colour, 0 to 1; a pixel counts by the least of its bands.
 
     Returns:
-        Colour at half the size.
+        Colour (B, C, H/2, W/2).
     """
     certain = confidence.amin(1, keepdim=True)
     weight, keys = avg_pool2d(certain, 2), surroundings(alpha)
@@ -128,7 +133,7 @@ def fitted(
         confidence: confidence of `colour`, (B, C or 1, H, W), 0 to 1.
 
     Returns:
-        Colour at full size.
+        Colour (B, C, H, W).
     """
     certain = avg_pool2d(confidence, 2)
     together = filled * (1 - certain) + avg_pool2d(colour * confidence, 2)
@@ -138,14 +143,16 @@ def fitted(
 def smoothed_within(
     alpha: Float[Tensor, "b 1 h w"], colour: Tensor, spacings: Sequence[int], confidence: Tensor | None = None
 ) -> Tensor:
-    """Smooth colour by means over 5 x 5 pixels, whose spacing is each of `spacings` in turn.
+    """Smooth colour by means over 5 x 5 samples, whose spacing is each of `spacings` in turn.
 
     A pixel counts the more, the more similar it is in alpha (Tomasi and Manduchi 1998) and the more certain.
 
     Args:
+        alpha: alpha's image (B, 1, H, W).
         colour: colour (B, C, H, W), or at half the size.
         spacings: pixels of `colour` between a window's samples, for each pass.
-        confidence: confidence at the size of `colour`, 0 to 1; None counts all alike.
+        confidence: confidence at the size of `colour`, 0 to 1, of which the least channel counts; None counts
+            all alike.
 
     Returns:
         Colour of the same shape.

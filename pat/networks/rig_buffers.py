@@ -16,8 +16,9 @@ from arraygeom.pixels import floating
 class RigBuffers(nn.Module):
     """Module that holds a rig, camera or pair as buffers: `.to` moves its numbers and `state_dict` has them.
 
-    Called, it returns the rig (or camera, or pair) with these numbers. `.half()` and `.bfloat16()` leave them
-    in float32, as half precision holds no pixel position.
+    Called, it returns the rig (or camera, or pair) with these numbers. Buffers are the given tensors until
+    they are moved: loading a `state_dict` writes into those. `.half()` and `.bfloat16()` make float32, as
+    half precision holds no pixel position.
 
     Args:
         rig: rig, camera or pair to hold.

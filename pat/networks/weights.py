@@ -40,10 +40,13 @@ Precision = Literal["float32", "bfloat16"]
 def save_weights(
     network: Network | LowLightNetwork, path: str | Path, *, facts: Mapping[str, str] | None = None
 ) -> None:
-    """Write a network's weights and configuration to a file, atomically.
+    """Write a network's weights and configuration to a safetensors file, atomically.
+
+    Missing folders are made.
 
     Args:
-        facts: texts by name (recipe, seed, figures) to store in the file too; None for none.
+        facts: texts by name (recipe, seed, figures) to store in the file too, other than "format", "network",
+            "config" and "digest"; None for none.
 
     Raises:
         OSError: naming the file, if it cannot be written.
@@ -60,9 +63,8 @@ def save_weights(
 def load_weights(name: str | Path, *, precision: Precision = "float32") -> Network:
     """Load the network of a weights file, or of a name that ships with the package.
 
-    With `precision` "bfloat16" its convolutions are computed in that (attention and matching never are): they
-    take less than half the time on processors that multiply it (AVX-512 BF16, AMX), and the image's PSNR
-    changes by 0.003 dB. Parts of a frame are then equal to the whole to 1e-3 only.
+    With `precision` "bfloat16" PAT's convolutions outside attention are computed in that, faster and less
+    exactly (`set_precision`); of GuidedPAT, which has none, nothing is. A shipped name comes before a file.
 
     Returns:
         The network on the CPU, for evaluation, its weights without gradients.
@@ -70,7 +72,7 @@ def load_weights(name: str | Path, *, precision: Precision = "float32") -> Netwo
     Raises:
         FileNotFoundError: for no such file or name.
         ValueError: for a file that is not of this format, is damaged or does not fit, another precision, or
-            bfloat16 where neither the processor has it nor CUDA is there.
+            bfloat16 where neither the processor has it (AVX-512 BF16) nor CUDA is there.
     """
     if precision not in get_args(Precision):
         raise ValueError(f"precision is {precision!r}; wanted one of {', '.join(get_args(Precision))}")
@@ -86,15 +88,16 @@ def new_network(config: Any, start: Path | None = None) -> Network:
     """Make a network of a configuration.
 
     Args:
-        config: `PATConfig` or `GuidedPATConfig`; others raise StopIteration.
+        config: `PATConfig` or `GuidedPATConfig`.
         start: weights file to start from; None for random weights.
 
     Returns:
-        The network; with `start`, a network for training with copied weights.
+        The network on the CPU, for training; with `start`, its weights are copied.
 
     Raises:
+        StopIteration: for a configuration of another class.
         FileNotFoundError: for a missing `start`.
-        ValueError: for weights of another network or configuration.
+        ValueError: for weights of another network or configuration, and as `load_weights`.
     """
     network: Network = next(made for made, of in NETWORKS.values() if type(config) is of)(config)
     if start is not None:
@@ -118,11 +121,11 @@ def set_precision(network: nn.Module, precision: Precision, *, compiled: bool = 
     """Set the precision of a network's convolutions in place, and optionally compile them by torch.compile.
 
     Weights and results stay float32: `forward` of the network's children is replaced by one under autocast.
-    Attention is left out, whose search segments are functions that torch.compile would break at.
+    An `AttentionEngine` with its convolutions, and a `ModuleList`, are left out.
 
     Args:
-        precision: "bfloat16", or "float32", which changes nothing: bfloat16 is not undone.
-        compiled: True to compile them.
+        precision: "bfloat16"; any other changes nothing, and "float32" does not undo bfloat16.
+        compiled: True to compile the same children.
     """
     for module in network.children():
         if isinstance(module, (AttentionEngine, nn.ModuleList)):
@@ -137,7 +140,7 @@ def load_denoiser(path: str | Path = DENOISER) -> LowLightNetwork:
     """Load the network that removes noise from a weights file; by default the shipped one.
 
     Returns:
-        The network for evaluation, its weights without gradients.
+        The network on the CPU, for evaluation, its weights without gradients.
 
     Raises:
         ValueError: for a file that is missing, not of this format, damaged, or does not fit.
@@ -205,7 +208,10 @@ def find_weights(name: str | Path) -> Path:
     """Find a weights file, shipped with the package or the user's own.
 
     Args:
-        name: name of shipped weights, such as "mono-colour", or a path.
+        name: name of shipped weights, such as "mono-colour", or else a path.
+
+    Returns:
+        The path; a given one as it is.
 
     Raises:
         FileNotFoundError: if neither exists.

@@ -39,8 +39,10 @@ class ResidualBlock(nn.Module):
 
 
 class ResidualASPP(nn.Module):
-    """Residual atrous pyramid: three groups of dilated 3x3 convolutions in turn, each fused by a 1x1
-    convolution and added to the input (Wang et al. 2019).
+    """Residual atrous pyramid (Wang et al. 2019) of x (b, dim, h, w), which keeps its shape.
+
+    Three groups of dilated 3x3 convolutions in turn, each fused by a 1x1 convolution; the three results are
+    added to the input. No biases.
 
     Args:
         dim: number of channels, in and out.
@@ -57,8 +59,8 @@ class ResidualASPP(nn.Module):
         self.act = nn.LeakyReLU(0.1, inplace=True)
 
     def forward(self, x: Float[Tensor, "b d h w"]) -> Float[Tensor, "b d h w"]:
-        """Return features (b, d, h, w) of the same shape as `x`; each group refines the result of the one
-        before."""
+        """Return features (b, d, h, w) of the same shape as `x`; each group starts from the result of the
+        one before."""
         total, y = x, x
         for group, fuse in zip(self.groups, self.fuse):
             assert isinstance(group, nn.ModuleList)
@@ -95,13 +97,14 @@ def enlarge(x: Float[Tensor, "b d h w"], factor: int = 2) -> Float[Tensor, "b d 
 
 
 class UNet(nn.Module):
-    """U-Net of three scales, for inputs whose sides are multiples of 4.
+    """U-Net of three scales: called with (b, `inputs`, h, w), sides multiples of 4, it returns (b, `outputs`,
+    h, w).
 
     Args:
         inputs: number of channels of the input.
-        widths: channels at full, 1/2 and 1/4 size.
-        outputs: number of channels of the output, which has the input's size.
-        blocks: residual blocks at each scale; twice as many at the smallest.
+        widths: channels at full, 1/2 and 1/4 size; three numbers.
+        outputs: number of channels of the output.
+        blocks: residual blocks on the way down and again up at full and 1/2 size; 2 `blocks` at 1/4.
     """
 
     def __init__(self, inputs: int, widths: tuple[int, ...], outputs: int, *, blocks: int = 1) -> None:
@@ -118,7 +121,8 @@ class UNet(nn.Module):
     def forward(self, x: Float[Tensor, "b i h w"]) -> Float[Tensor, "b o h w"]:
         """Return features (b, outputs, h, w) for an input (b, inputs, h, w).
 
-        Both sides must be multiples of 4; others fail inside torch.
+        Raises:
+            RuntimeError: by torch, for other sides; some give a result instead, without meaning.
         """
         first = self._in_rows(self.first, x)
         second = self.second(first)
@@ -129,8 +133,7 @@ class UNet(nn.Module):
         return self.last(self.back_a(first + more))
 
     def _in_rows(self, stage: Callable[..., Tensor], *images: Tensor) -> Tensor:
-        """Run a stage at the largest scale, which needs the most memory, on some rows at a time if no
-        gradient is wanted."""
+        """Run a stage at the largest scale on some rows at a time if no gradient is wanted."""
         if torch.is_grad_enabled():
             return stage(*images)
         return chunked(stage, *images, rows=ROWS, halo=self.halo)

@@ -13,11 +13,14 @@ def files_below(folder: str | Path, within: frozenset[str] = frozenset()) -> lis
     """List all regular files in a folder and its subfolders, through symbolic links too.
 
     Args:
-        folder: the folder; if it cannot be read, or is missing, the list is empty.
-        within: real paths of the folders above, which links may not lead back to.
+        folder: the folder; one that is missing or cannot be read counts as empty, at any depth.
+        within: real paths of the folders above, which links may not lead back to; callers leave it empty.
 
     Returns:
-        Paths, sorted.
+        Paths that begin with `folder`, sorted.
+
+    Raises:
+        PermissionError: for a folder whose names can be read but not its entries.
     """
     real = os.path.realpath(folder)
     if real in within:
@@ -42,8 +45,8 @@ def printable(text: str) -> str:
     """Make a text safe to print on one terminal line.
 
     Returns:
-        The text with control characters as escapes; of one longer than `MOST_SHOWN` characters the middle is
-        left out.
+        The text with characters that do not print (line ends, control codes, other spaces than " ") as
+        escapes such as "\\n"; of one longer than `MOST_SHOWN` characters the middle becomes " ... ".
     """
     if len(text) > MOST_SHOWN:
         text = f"{text[: MOST_SHOWN // 2]} ... {text[-MOST_SHOWN // 2 :]}"

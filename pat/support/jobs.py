@@ -50,8 +50,9 @@ class Task(NamedTuple):
     """One unit of work of a job.
 
     Attributes:
-        makes: file or folder that the task writes last; once it exists the task counts as done.
-        run: picklable function, called as `run(*given)`.
+        makes: file or folder that the task writes last, of no other task; once it exists the task counts as
+            done.
+        run: function, called as `run(*given)`; for other processes both must be picklable.
         given: arguments of `run`.
         about: name in messages; empty for the name of `makes`.
     """
@@ -66,8 +67,8 @@ class TaskOutcome(NamedTuple):
     """Result of one task.
 
     Attributes:
-        makes: the task's file.
-        error: the error in one line; None for success.
+        makes: file or folder of the task.
+        error: message of the error that ended the task; None for success, and if `makes` existed.
         warnings: warnings raised; the last one is the error itself where a filter turned a warning into it.
     """
 
@@ -81,10 +82,11 @@ class JobReport:
     """Result of a job.
 
     Attributes:
-        made: files made in this run.
-        kept: files that existed before, whose tasks did not run.
+        made: files or folders of the tasks that succeeded in this run, as they finished.
+        kept: those that existed before, whose tasks did not run.
         failed: error message by the file of the failed task.
-        warned: files whose tasks warned, by kind of warning (its class and text without numbers).
+        warned: files in `made` whose tasks warned, by kind of warning: its class and text without digits and
+            dots.
     """
 
     made: list[Path] = field(default_factory=list)
@@ -93,13 +95,14 @@ class JobReport:
     warned: dict[str, list[Path]] = field(default_factory=dict)
 
     def warn(self, outcome: TaskOutcome, about: str) -> None:
-        """Repeat a task's warnings in this process, once for each kind. Updates `warned`.
-
-        Warnings that differ in numbers alone are one kind.
+        """Repeat a task's warnings in this process, the first of each kind in the job. Updates `warned`.
 
         Args:
             outcome: outcome of the task.
             about: name of the task, put before the warning.
+
+        Raises:
+            Warning: the warning itself, where a filter of this process makes it an error.
         """
         for warning in outcome.warnings:
             kind = re.sub(r"[\d.]+", "", f"{type(warning).__name__}: {warning}")
@@ -125,12 +128,12 @@ class Workers:
 
     Attributes:
         count: processes on this machine; 1 runs tasks in this process unless `apart`.
-        scheduler: address of a Dask scheduler ("tcp://host:8786"), whose workers then run the tasks; None for
-            this machine.
-        threads: torch's threads in each process; results are bit-identical for the same number.
+        scheduler: address of a Dask scheduler ("tcp://host:8786"), whose workers then run the tasks, whatever
+            `count`, `apart` and `timeout` are; None for this machine.
+        threads: torch's threads in each process; another number may change results in their last bits.
         apart: True for a separate process even with `count` 1, for tasks that may crash or hang.
-        timeout: seconds a task may take in a separate process; None for no limit. A task in this process has
-            none.
+        timeout: seconds, above 0, that each of `TRIES` attempts may take in a separate process; None for no
+            limit. A task in this process has none.
 
     Raises:
         ValueError: for a `count` or `threads` below 1.
@@ -164,10 +167,9 @@ def run_tasks(
 
     Args:
         workers: processes to run them in; by default this one.
-        resume: True to skip tasks whose file or folder exists; otherwise files are deleted first, and a
-            folder in the way fails as an OSError.
-        on_error: "stop" raises at a task's first ValueError, OSError or Warning; "skip" prints it and goes
-            on.
+        resume: True to skip tasks whose file or folder exists; otherwise their files are deleted first.
+        on_error: "stop" raises at the first task that fails; "skip" prints its error and goes on. A task
+            fails by a ValueError, OSError or Warning; in another process by any error, its end or `timeout`.
         title: word before the progress bar.
         console: console for progress and messages; None for standard error.
 
@@ -177,8 +179,11 @@ def run_tasks(
     Raises:
         JobError: for a failed task with on_error="stop", and for a task's own JobError always; finished files
             stay.
+        OSError: without `resume`, for a folder in the way, or a file that cannot be deleted.
         ImportError: for a scheduler where Dask is not installed.
         ValueError: if no scheduler answers.
+        TimeoutError: if it has no worker within a minute.
+        Exception: another error of a task in this process, as it is.
     """
     if not resume:
         for task in tasks:
@@ -210,10 +215,11 @@ LINE_EVERY = 30.0
 
 
 def followed(outcomes: Iterable[T], *, title: str, total: int, done: int, console: Console) -> Iterator[T]:
-    """Show the progress of outcomes while they are consumed: a bar on a terminal, else a line now and then.
+    """Show the progress of outcomes while they are consumed: a bar on a terminal, else a line with an
+    outcome when `LINE_EVERY` seconds have passed since the last.
 
     Args:
-        title: word before the bar.
+        title: word before the bar, or in the line.
         total: number of tasks, those done before included.
         done: number of tasks done before.
 
@@ -254,10 +260,7 @@ TRIES = 3
 
 
 def _in_processes(tasks: Sequence[Task], workers: Workers) -> Iterator[TaskOutcome]:
-    """Yield outcomes as they arrive.
-
-    A thread waits for each process, so that the task is known with which it dies.
-    """
+    """Yield outcomes as they arrive. A thread waits for each process, to know the task with which it dies."""
     slots, before, others = threading.local(), dict(os.environ), {*active_children()}
     ended: list[JobError] = []
 
@@ -314,12 +317,7 @@ AHEAD = 4
 
 
 def _on_dask(tasks: Sequence[Task], workers: Workers) -> Iterator[TaskOutcome]:
-    """Yield outcomes as they arrive. Dask repeats the tasks of dead workers; a task that kills several fails.
-
-    Raises:
-        ImportError: without Dask.
-        ValueError: without a scheduler.
-    """
+    """Yield outcomes as they arrive. Dask repeats dead workers' tasks; a task that kills several fails."""
     if not tasks:
         return
     with needs("cluster", "a scheduler"):
@@ -361,17 +359,18 @@ def _failed(task: Task, future: Future) -> TaskOutcome:
 
 
 def attempt(task: Task, threads: int) -> TaskOutcome:
-    """Run a task in this process, unless its file exists, and catch ValueError, OSError and Warning; others
-    pass.
+    """Run a task in this process, unless its file or folder exists, and catch ValueError, OSError and
+    Warning.
 
     Args:
-        threads: torch's number of threads, which is set for the whole process.
+        threads: torch's number of threads, which stays set for the whole process.
 
     Returns:
-        The outcome, with the warnings that were raised.
+        The outcome, with the warnings that were raised; a success without any if the file existed.
 
     Raises:
         JobError: the task's own, for errors that every task would have.
+        Exception: another error of the task than those caught.
     """
     import torch
 
@@ -398,13 +397,14 @@ def attempt_on_worker(task: Task, threads: int, timeout: float | None = None) ->
 
     Args:
         threads: torch's number of threads in this process.
-        timeout: seconds after which the process ends itself; None for no limit.
+        timeout: seconds after which the process ends itself, with exit status 1; None for no limit.
 
     Returns:
-        The outcome; errors other than ValueError and OSError become outcomes too.
+        The outcome; any other error than JobError becomes one too, "TypeError: ..." for a TypeError.
 
     Raises:
         JobError: the task's own.
+        ValueError: for a timeout of 0 or less.
     """
     from .memory import keep_freed
 

@@ -24,11 +24,11 @@ def folder_lock(folder: Path) -> Iterator[None]:
     """Context manager that makes a folder and keeps other commands out of it.
 
     The lock is a file locked by the system; a file beside it names the process and the host. The lock of a
-    dead process on this host, or in a container on it, is ignored. Folders that it made are removed
-    again if they are empty.
+    dead process on this host, or in a container on it, is ignored; that of another host's holds until its
+    `OWNER` file is removed. Folders that the block leaves empty are removed again if this made them.
 
     Raises:
-        ValueError: if another command holds the folder, or it cannot be written.
+        ValueError: if a command (or this process already) holds the folder, or it cannot be written.
     """
     made = _make(folder)
     try:

@@ -24,14 +24,15 @@ EVERY = 0.005
 
 
 def parse_bytes(amount: float | str) -> float:
-    """Parse an amount of memory: a number of bytes, or text such as "4GiB" or "500 MB" (1000s), "MiB"
-    (1024s).
+    """Parse an amount of memory: a number of bytes, or text such as "4GiB" or "500 MB".
+
+    Units, in any case: none or B, KB, MB, GB (1000s), KiB, MiB, GiB (1024s).
 
     Returns:
         Bytes.
 
     Raises:
-        ValueError: for any other text, NaN, infinity, and less than any process takes.
+        ValueError: for any other text, NaN, infinity, and less than `LEAST` (1 MiB).
     """
     units = {"B": 1, "KB": 1e3, "MB": 1e6, "GB": 1e9, "KIB": 2**10, "MIB": 2**20, "GIB": 2**30}
     text = str(amount)
@@ -51,11 +52,10 @@ _keeps = False
 
 
 def keep_freed() -> None:
-    """Make glibc keep freed memory for later allocations in this process; does nothing elsewhere than on
-    Linux.
+    """Make glibc keep freed memory for later allocations in this process; does nothing without glibc.
 
-    An eighth of the time to fuse a frame goes into getting large blocks back from the system. It applies to
-    the whole process: meant for commands and workers, not for a library's user.
+    Fusing is faster, as large blocks need not come from the system again. It applies to the whole process and
+    cannot be undone: meant for commands and workers, not for a library's user.
     """
     options = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
     if options is not None:
@@ -69,14 +69,13 @@ def planned(limit: float | None, memory: float, *, large: bool) -> float | None:
     """Choose the memory limit to plan a task with.
 
     Args:
-        limit: limit that the user gave, bytes; None for no limit.
+        limit: limit that the user gave, bytes; None or 0 for no limit.
         memory: bytes that the task is expected to need.
-        large: True for a large task. After `keep_freed` a process also keeps what the task has freed: half as
-            much again for 12 megapixels.
+        large: True for a large task, of which a process after `keep_freed` also keeps what it frees.
 
     Returns:
         Bytes: the smaller of both (`memory` without a limit) for a large task after `keep_freed`; otherwise
-        `limit` unchanged.
+        `limit` unchanged, which may be None.
     """
     return min(memory, limit or memory) if large and _keeps else limit
 
@@ -100,15 +99,15 @@ networks that use matches (plans had from 151)."""
 
 
 def check_limit(pixels: int, limit: float | None = None, each: float = LEAST_BYTES) -> None:
-    """Check, before anything is read, that a frame of so many pixels can be fused within a memory limit.
+    """Refuse, before anything is read, a frame that certainly cannot be fused within a memory limit.
 
     Args:
         pixels: number of alpha's pixels.
-        limit: bytes; None for that of `limited`, without which any frame fits.
-        each: bytes of working memory for each pixel, at least.
+        limit: bytes; None or 0 for that of `limited`, without which any frame fits.
+        each: bytes of working memory for each pixel, at least; more may be needed than is checked.
 
     Raises:
-        ValueError: if it cannot.
+        ValueError: if so many pixels need more than the limit.
     """
     limit = limit or _LIMIT.get() or math.inf
     if (needed := SLACK * (LIBRARIES + each * pixels)) > limit:
@@ -125,12 +124,14 @@ _LIMIT: ContextVar[float | None] = ContextVar("limit", default=None)
 
 @contextmanager
 def limited(limit: float | None) -> Iterator[None]:
-    """Context manager that states how many bytes the process may take in all, for `how_many_fit`.
+    """Context manager that states how many bytes the process may take in all, for `how_many_fit` and
+    `check_limit`.
 
-    A thread returns freed memory to the system when the process comes near the limit. Nothing enforces it.
+    Only code of this thread sees the statement. A further thread returns freed memory to the system when the
+    process comes near the limit. Nothing enforces it.
 
     Args:
-        limit: bytes; None for no limit.
+        limit: bytes; None for no limit, also within a block that states one.
     """
     before, done = _LIMIT.get(), Event()
     token = _LIMIT.set(limit)
@@ -160,8 +161,10 @@ def resident() -> float:
 
 
 def how_many_fit(nbytes: float) -> int | None:
-    """Return how many tasks of `nbytes` bytes may run at once under `limited`, at least 1; None without a
-    limit."""
+    """Return how many tasks of `nbytes` bytes (above 0) fit beside what this process holds under `limited`.
+
+    At least 1, even if none fits; None without a limit. Returns freed memory to the system if room is short.
+    """
     limit = _LIMIT.get()
     if limit is None:
         return None

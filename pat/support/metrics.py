@@ -36,7 +36,7 @@ def score(image: Float[Tensor, "_ _ _"], ground_truth: Float[Tensor, "_ _ _"]) -
 
     Returns:
         PSNR in dB, infinite for equal images, and SSIM of Wang et al. 2004: Gaussian window of sigma 1.5 (11
-        x 11), K1 = 0.01, K2 = 0.03, population covariance. NaN values give NaN.
+        x 11), K1 = 0.01, K2 = 0.03, population covariance. NaN values give NaN. No gradient.
 
     Raises:
         ValueError: if the shapes differ, or a side is under 11 pixels.
@@ -58,7 +58,8 @@ def bootstrap_interval(values: Sequence[float]) -> tuple[float, float]:
     """Compute the 95 % percentile bootstrap interval of a mean (Efron & Tibshirani 1993, section 13.3).
 
     Returns:
-        Lower and upper bound from 10,000 resamples with a fixed seed; (nan, nan) for fewer than two values.
+        Lower and upper bound from 10,000 resamples with a fixed seed; (nan, nan) for fewer than two values,
+        or if one is NaN.
     """
     if len(values) < 2:
         return math.nan, math.nan

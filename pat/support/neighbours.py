@@ -17,13 +17,17 @@ def nearest_points(
     """Find the nearest points of each query by a k-d tree (OpenCV's FLANN).
 
     Args:
-        points: points to search, `count` at least.
+        points: points to search, `count` at least; rounded to float32, as are `queries`.
         queries: points whose neighbours are wanted.
         count: number of neighbours of each.
         error: share by which a neighbour may be farther away than the one it stands for; 0 searches exactly.
 
     Returns:
-        Rows of `points`, nearest first, and Euclidean distances, float32.
+        For each query (m, count), nearest first: row numbers of `points`, int32, and Euclidean distances,
+        float32.
+
+    Raises:
+        cv2.error: for fewer points than `count`; SystemError for none.
     """
     points, queries = (np.ascontiguousarray(x, np.float32) for x in (points, queries))
     tree = cv2.flann.Index(points, {"algorithm": KD_TREE, "leaf_max_size": 10})

@@ -19,13 +19,13 @@ T = TypeVar("T")
 
 
 def to_document(value: Any, *, defaults: bool = False) -> Any:
-    """Convert dataclasses to mappings, tuples to lists, paths to text, recursively; other values stay.
+    """Convert dataclasses to mappings, tuples to lists, paths to text, also within mappings and lists.
 
     Args:
-        defaults: True to include entries that equal their default.
+        defaults: True to include fields that equal their default, at any depth; otherwise they are left out.
 
     Returns:
-        The document, ready for YAML or JSON.
+        The document, ready for YAML or JSON if its other values are: they stay as they are.
     """
     plain = partial(to_document, defaults=defaults)
     if dataclasses.is_dataclass(value):
@@ -43,14 +43,16 @@ def from_document(kind: type[T], document: Any, entry: str = "") -> T:
 
     Args:
         kind: dataclass, or plain type, `Path`, `Literal`, tuple, mapping or union; not `list`.
-        document: mappings, lists and plain values; text such as "1e3" is accepted for a number.
-        entry: name of the document's place in messages.
+        document: mappings, lists and plain values; text such as "1e3" is accepted for a number, 2.0 for a
+            whole one, and a text alone for a tuple of any length.
+        entry: name of the document's place in messages; empty for the whole.
 
     Returns:
         An instance of `kind`.
 
     Raises:
-        ValueError: naming the entry, for an unknown key, a missing one, NaN, or a value of another type.
+        ValueError: naming the entry, for an unknown key, a missing one, NaN, a value of another type, or one
+            that a dataclass refuses.
     """
     return typing.cast(T, _read(kind, document, entry))
 
@@ -62,8 +64,9 @@ def read_yaml(path: str | Path) -> Any:
         Its content: mappings, lists and plain values; None for an empty file.
 
     Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: with name and line, if it is not YAML.
+        FileNotFoundError: if there is no such file, or it is a folder.
+        OSError: if it cannot be read.
+        ValueError: with the path, as `parse_yaml`.
     """
     path = Path(path)
     if not path.is_file():
@@ -78,7 +81,8 @@ def parse_yaml(text: str | bytes, name: str) -> Any:
         Its content: mappings, lists and plain values; None for an empty text.
 
     Raises:
-        ValueError: with `name` and the line, if it is not YAML.
+        ValueError: with `name`, and the line where known, for text that is not YAML or not UTF-8, repeated
+            keys, and what `safe_yaml` limits (size, nesting, aliases).
     """
     import yaml
 
@@ -170,8 +174,7 @@ def _mapping(value: Any, entry: str) -> dict[Any, Any]:
 
 
 def _read_union(arguments: tuple[Any, ...], value: Any, entry: str) -> Any:
-    """Convert to the first fitting one of several types; otherwise raise the error of one of the
-    same form."""
+    """Convert to the first fitting one of several types, or raise the error of one of the same form."""
     if value is None and type(None) in arguments:
         return None
     errors = []
@@ -184,8 +187,7 @@ def _read_union(arguments: tuple[Any, ...], value: Any, entry: str) -> Any:
 
 
 def _read_plain(kind: Any, value: Any, entry: str) -> Any:
-    """Convert to a number, text or path; text like 1e3 is a number, 2.0 a whole one. Raises ValueError naming
-    the entry."""
+    """Convert to a number, text or path, or raise ValueError naming the entry."""
     if kind is Any:
         return value
     if kind in (int, float) and isinstance(value, str):
@@ -214,13 +216,13 @@ def _below(entry: str, key: object) -> str:
 
 
 def check_fields(config: Any, names: str, least: float, most: float = math.inf, above: bool = False) -> None:
-    """Check that numbers of a dataclass are in a range.
+    """Check that numbers of a dataclass are in a range, both bounds included.
 
     Args:
         config: instance of the dataclass.
-        names: names of the fields, with spaces between.
+        names: names of the fields, which hold numbers, with spaces between.
         least: lower bound.
-        most: upper bound.
+        most: upper bound; by default infinity passes.
         above: True to exclude `least`.
 
     Raises:

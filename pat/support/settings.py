@@ -52,10 +52,13 @@ class SettingEntry(NamedTuple):
 
 
 def listed(settings: Any) -> Iterator[SettingEntry]:
-    """Yield the entries of an algorithm's settings, in their order.
+    """Yield the entries of an algorithm's settings, in the order of their fields.
+
+    Args:
+        settings: instance of a dataclass whose fields were made by `physics`, `size` or `tuned`.
 
     Raises:
-        ValueError: for a field without a kind.
+        ValueError: at the first field that was not.
     """
     algorithm = type(settings).__name__
     for entry in fields(settings):
@@ -65,10 +68,17 @@ def listed(settings: Any) -> Iterator[SettingEntry]:
 
 
 def all_settings(*rooms: str) -> list[SettingEntry]:
-    """Collect the entries of all settings in packages such as "pat.matching", in the order of their modules.
+    """Collect the entries of all settings in packages such as "pat.matching".
+
+    Settings are instances, at the top level of a package's modules, of dataclasses named "...Settings"; each
+    module is imported for it. Modules of subpackages are not looked at.
 
     Returns:
-        The entries; those that several settings of a package share appear once.
+        The entries by package, by name of the module, as `listed`; equal ones appear once.
+
+    Raises:
+        ImportError: for a package or module that cannot be imported.
+        ValueError: as `listed`.
     """
     entries: dict[SettingEntry, None] = {}
     for room in rooms:

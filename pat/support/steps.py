@@ -53,9 +53,10 @@ def about(seconds: float) -> str:
 
 @contextmanager
 def steps_shown(show: Callable[[str], None]) -> Iterator[None]:
-    """Context manager that calls `show` with a line of text for every step that these packages log.
+    """Context manager that calls `show` with a line of text for every step that these packages log (at INFO).
 
-    Steps of other threads are not shown, and of nested blocks only the innermost shows.
+    The line ends with the stage and the remaining time where they are known. Steps of other threads are not
+    shown, and of nested blocks only the innermost shows.
     """
     loggers = [logging.getLogger(name) for name in PACKAGES]
     before = [(logger.level, logger.handlers[:]) for logger in loggers]

@@ -20,12 +20,14 @@ Network = TypeVar("Network", bound=nn.Module)
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str] = {}) -> None:
     """Write tensors and metadata to a safetensors file, atomically, with a digest of the tensors.
 
+    Missing folders are made.
+
     Args:
-        metadata: texts by name to store beside the digest.
+        metadata: texts by name to store beside the digest, which takes the name "digest".
 
     Raises:
         RuntimeError: for tensors that share memory.
-        OSError: naming the file, if writing fails, for instance on a full disk.
+        OSError: naming the file, if writing fails (a full disk, a folder of that name).
     """
     whole = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     try:
@@ -39,12 +41,12 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Read a safetensors file.
 
     Returns:
-        Its tensors by name, on the CPU, and its metadata.
+        Its tensors by name, on the CPU, and its metadata, texts by name (with the digest, if it has one).
 
     Raises:
         FileNotFoundError: if there is no file.
-        ValueError: naming the path, if it is a folder or a pipe, no safetensors file, or damaged (see
-            `undamaged`).
+        ValueError: naming the path, if it is a folder or a pipe, cannot be read, is no safetensors file, or
+            is damaged (see `undamaged`).
     """
     if path.exists() and not path.is_file():  # a pipe would be waited for
         raise ValueError(f"{path}: no file, but a folder or a pipe")
@@ -69,7 +71,8 @@ def with_weights(network: Network, path: Path) -> Network:
 
     Raises:
         FileNotFoundError: if there is no file.
-        ValueError: naming the file, if it is damaged, or its names or shapes are not this network's.
+        ValueError: naming the file, as `read_tensors`; or if its names or shapes are not this network's,
+            which then may hold some of its weights.
     """
     try:
         network.load_state_dict(read_tensors(path)[0])
@@ -92,7 +95,7 @@ DIGEST = "digest"
 def digest(tensors: Mapping[str, Tensor]) -> str:
     """Return a digest of the names, types, shapes and bytes of tensors, as 32 hexadecimal digits.
 
-    A safetensors file with one changed bit is still valid; this finds it.
+    It does not depend on their order. A safetensors file with one changed bit is still valid; this finds it.
     """
     total = hashlib.blake2b(digest_size=16)
     for name, tensor in sorted(tensors.items()):
