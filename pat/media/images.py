@@ -76,17 +76,18 @@ def read_image(
 ) -> Float[Tensor, "c h w"]:
     """Read an image file: PNG, TIFF, JPEG, PNM, BMP, WebP, HEIC (extra `heic`) or camera raw (extra `raw`).
 
-    8-bit counts are divided by 255, 16-bit ones by 65535 or 2^bits - 1; TIFF files that pack 10, 12 or 14
-    bits, and PNM files, state their own white. Float files must hold 0..1. An opaque alpha channel is
-    dropped. HEIC is reduced to 8 bits and rotated as its header says; raw files are developed to sRGB by
-    LibRaw. An 8-bit image with another colour profile is converted to sRGB with a warning; profiles of 16-bit
-    images, and all with `orientation="ignore"`, are ignored.
+    Counts are divided by 2^bits - 1, or else by 255 or 65535; TIFF files that pack 10, 12 or 14 bits, and PNM
+    files, state their own white. Float files must hold 0..1. An opaque alpha channel is dropped. HEIC is
+    reduced to 8 bits and rotated as its header says; raw files are developed to sRGB by LibRaw. An 8-bit
+    image with another colour profile is converted to sRGB with a warning; other profiles, and all with
+    `orientation="ignore"`, are ignored. Of several images in a file the first is read.
 
     Args:
         name: prefix of messages, such as a camera's name.
         bits: bits that the camera counts in, for a 12-bit camera that stores 0..4095 in 16 bits; None for the
-            file's own.
-        hw: expected (height, width), compared before decoding; None accepts up to `MOST_PIXELS`.
+            file's own. Ignored for float files.
+        hw: expected (height, width) of the result, compared before decoding; None accepts up to
+            `MOST_PIXELS`.
         orientation: "apply" turns the image by its EXIF or TIFF tag, with a warning; "ignore" keeps pixels as
             stored.
 
@@ -95,8 +96,9 @@ def read_image(
 
     Raises:
         FileNotFoundError: for a missing file.
-        ValueError: for a file that is no usable image, is larger than `MOST_PIXELS` or not of size `hw`, or
-            whose extra is not installed.
+        ValueError: for a file that is no usable image (damaged, transparent, other channels or types), values
+            out of range, more than `bits` or the file's own bits allow, a size other than `hw` or over
+            `MOST_PIXELS`, or an extra that is not installed.
     """
     label = f"{name}: {path}" if name else f"{path}"
     planes, white = _planes(Path(path), label, hw, orientation)
@@ -110,15 +112,17 @@ def read_recorded(
     hw: HW | None = None,
     orientation: Literal["apply", "ignore"] = "apply",
 ) -> NDArray[Any]:
-    """Read an image file's values without scaling; files, options and errors as in `read_image`.
+    """Read an image file's values without scaling; files and options as in `read_image`.
+
+    Profiles of 8-bit images, HEIC and raw files are converted as there.
 
     Returns:
-        Values (c, h, w) in the file's own type: uint8, uint16, float, or a TIFF's signed integers; RGB order;
-        TIFF and PNM files with a lower white hold the camera's counts.
+        Values (1 or 3, h, w) in the file's own type: uint8, uint16, float32, float64, or a TIFF's signed
+        integers; RGB order; TIFF and PNM files with a lower white hold the camera's counts.
 
     Raises:
         FileNotFoundError: for a missing file.
-        ValueError: as `read_image`; signed integers, NaN and values outside 0..1 are not refused here.
+        ValueError: as `read_image`, but not for signed integers, NaN or values out of range.
     """
     label = f"{name}: {path}" if name else f"{path}"
     return np.ascontiguousarray(_planes(Path(path), label, hw, orientation)[0])
@@ -180,13 +184,14 @@ def write_image(
 
     Args:
         image: floats (1 or 3, h, w), in 0..1.
-        bits: 8 or 16: values are clipped to 0..1 and rounded; 32 (.tif and .exr only): floats as they are.
+        bits: 8, or 16 (not .jpg): values are clipped to 0..1 and rounded; 32 (.tif, and .exr, which takes no
+            other): float32 as they are.
         unknown: True allows NaN and infinity in 32-bit files.
         profile: True adds an sRGB profile to JPEG and PNG files in colour.
 
     Raises:
-        ValueError: for an image of integers, another number of channels, values that are not finite, or a
-            format that cannot hold it.
+        ValueError: for an image of integers, another number of channels, values that are not finite, other
+            bits, a format that cannot hold it, or an extra that is not installed.
         OSError: if it cannot be written.
     """
     path = Path(path)
@@ -284,15 +289,16 @@ def decoded_photograph(path: Path, flags: int, *, least: int = 1) -> NDArray | N
     """Decode an image file to 8 bits by OpenCV.
 
     Args:
-        flags: OpenCV's IMREAD flags without IMREAD_ANYDEPTH, such as IMREAD_GRAYSCALE.
+        flags: IMREAD_GRAYSCALE or IMREAD_COLOR, with IMREAD_IGNORE_ORIENTATION for pixels as stored.
         least: least pixels of a side.
 
     Returns:
-        Values (h, w) or (h, w, 3) by the flags, uint8, blue first; None if it is no image, is damaged, has a
-        side under `least`, or has more than `MOST_PIXELS`.
+        Values (h, w) or (h, w, 3) by the flags, uint8, blue first, turned by the file's orientation tag if
+        the flags let it; None if it is no image of `image_header`'s formats, is damaged, has a side under
+        `least`, or has more than `MOST_PIXELS`.
 
     Raises:
-        OSError: if the file cannot be read.
+        OSError: if the file is missing or cannot be read.
     """
     content = path.read_bytes()
     header = image_header(content)
@@ -452,8 +458,8 @@ def in_srgb(values: NDArray, content: bytes, label: str) -> NDArray:
         label: prefix of warnings.
 
     Returns:
-        Values in sRGB, of the same shape and type. Values of 16 bits, and values with a profile that cannot
-        be used, are returned unchanged with a warning.
+        Values in sRGB, of the same shape and type, with a warning; `values` itself without a profile or with
+        sRGB's, and, with a warning, if they are not uint8 or the profile cannot be used.
     """
     profile = _embedded(content)
     if profile is None:
@@ -497,10 +503,10 @@ def _converted(values: NDArray, profile: ImageCms.ImageCmsProfile) -> NDArray:
 
 
 def with_srgb_profile(content: bytes, suffix: str) -> bytes:
-    """Add an sRGB profile to the bytes of an image file in colour: in a grey one it is not valid.
+    """Add an sRGB profile to the bytes of an image file.
 
     Args:
-        content: bytes of the file.
+        content: bytes of a file in colour and without a profile; neither is checked.
         suffix: suffix of its name in small letters, such as ".png".
 
     Returns:
