@@ -253,6 +253,8 @@ class InitialRig(NamedTuple):
 class Solved:
     """Solution of a bundle adjustment, its noise estimated from the residuals.
 
+    `adjust` fills the first three fields; the functions around it add the others.
+
     Attributes:
         problem: the adjusted problem.
         covariance: covariance of the cameras' free parameters (`names`) in their own units; None if they are
@@ -260,7 +262,7 @@ class Solved:
         converged: True if the last iteration converged.
         notes: sentences on the solution.
         raised: largest factor by which `with_disagreement` raised a standard deviation; 1 for none.
-        views: detections used by camera; empty from `adjust`, as the two before and the next.
+        views: detections used by camera.
         left_out: images (camera, moment) that contradict other cameras' images or the start rig.
     """
 

@@ -61,7 +61,7 @@ class CalibratedViews:
 
     Attributes:
         name: name of the camera.
-        camera: the camera, at the origin.
+        camera: the camera, at the origin or, of a start rig, where that has it.
         views: detections by moment.
         poses: poses `cam_from_board` by moment, metres.
     """
@@ -73,17 +73,24 @@ class CalibratedViews:
 
 
 def initial_camera(name: str, views: BoardViews, board: Board, lens: Lens) -> CalibratedViews:
-    """Estimate a camera's intrinsics, lens and board poses from its own images, by OpenCV.
+    """Estimate a camera's intrinsics, lens and board poses from its own images, as initial values.
+
+    A pinhole and Brown and Conrady's models by OpenCV, with two radial terms at most; others by their rays.
 
     Args:
-        lens: name of the lens model.
+        name: name of the camera.
+        views: its detections.
+        board: the board.
+        lens: name of the lens model, one of `LENSES`.
 
     Returns:
-        The camera, with board poses and the detections without outlying points.
+        The camera at the origin, with board poses and the detections without outlying points.
 
     Raises:
+        KeyError: for another lens model.
         ValueError: for fewer than three images with a board (one, for points that are not coplanar), and if
-            OpenCV finds no camera.
+            no camera is found.
+        cv2.error: if OpenCV fails on a board's pose.
     """
     fewest = FEWEST_IMAGES if board.flat else 1
     if len(views.seen) < fewest:
@@ -106,10 +113,13 @@ def without_bad_images(views: BoardViews, initial: CalibratedViews, board: Board
 
     Args:
         views: all detections.
-        initial: camera and board poses that were estimated from them.
+        initial: result of `initial_camera` for them.
 
     Returns:
         The detections in the images whose error (RMS) is below 2 pixels or ten times the median, the larger.
+
+    Raises:
+        KeyError: for an image without a pose in `initial`.
     """
     rms = {}
     for key, pose in initial.poses.items():
@@ -130,13 +140,19 @@ def without_outliers(
     """Drop points farther than `OUTLIER` standard deviations from a camera's projections.
 
     Args:
+        views: detections.
+        camera: the camera; its own pose does not count.
         poses: `cam_from_board` by moment.
         points: the board's points, metres.
-        sigma: standard deviation along x or y, pixels; None estimates it from the median of all distances.
+        sigma: standard deviation along x or y, pixels, at least `LEAST_SIGMA`; None or 0 estimates it from
+            the median of all distances.
 
     Returns:
-        The views; images without a pose, or left with fewer than `FEWEST_POINTS` points or collinear ones,
-        keep all.
+        The views; images without a pose, or that would keep fewer than `FEWEST_POINTS` points or collinear
+        ones, keep all.
+
+    Raises:
+        ValueError: if no image has a pose, and there is no `sigma`.
     """
     off = {
         key: _projection_errors(camera, poses[key], d, points)
@@ -167,7 +183,8 @@ def near_homography(detection: Detection, board: Board) -> Detection:
     distortion.
 
     Returns:
-        The remaining points; all for boards that are not flat, or with few points.
+        The remaining points; all for a board that is not flat, fewer than `FEWEST_POINTS` points, or without
+        a homography.
     """
     if len(detection.ids) < FEWEST_POINTS or not board.flat:
         return detection
@@ -223,13 +240,15 @@ def _with_model(camera: Camera, model: str) -> Camera:
 
 
 def board_pose(camera: Camera, detection: Detection, board: Board) -> Pose:
-    """Estimate `cam_from_board` of one image for a camera of known intrinsics.
+    """Estimate `cam_from_board` of one image for a camera of known intrinsics; its own pose does not count.
 
     Returns:
         The pose, metres.
 
     Raises:
-        ValueError: if fewer than four points are in front of the camera, as by a lens far from the true one.
+        ValueError: if fewer than four points have a ray, within a half space about their mean, as by a lens
+            far from the true one.
+        cv2.error: if OpenCV fails on the points.
     """
     rays, valid = _unit_rays(camera, detection)
     try:

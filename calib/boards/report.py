@@ -92,10 +92,14 @@ def report_html(
         detected: all detections by camera; with `photos`, the images that fit worst are drawn. None to draw
             none.
         photos: images by camera and moment; None to draw none.
-        further: HTML for the page's head.
+        further: HTML for the page's head, not escaped.
 
     Returns:
         The page as HTML, figures embedded.
+
+    Raises:
+        ValueError: if an image to be drawn cannot be read.
+        OSError: if its file is gone.
     """
     covers, has_covariance = coverages(calibration), calibration.fit.covariance is not None
     near, far = _depths(covers.values())
@@ -167,7 +171,8 @@ def summary(calibration: Calibration) -> str:
     """Summarise a calibration: numbers of cameras, frames and points, reprojection and epipolar errors.
 
     Returns:
-        A sentence or two, errors in pixels.
+        Up to three sentences, errors in pixels: epipolar errors only of pairs, and once more on held-out
+        frames if there are enough.
     """
     points = sum(len(observed.x) for observed in calibration.fit.problem.seen.values())
     cameras, frames = len(calibration.views), len(calibration.frames)
@@ -185,9 +190,10 @@ def summary(calibration: Calibration) -> str:
 def verdict(calibration: Calibration) -> str:
     """Return a sentence on whether the rig is good enough to fuse, and between which depths.
 
-    It is if the positions predicted in every other camera for pixels of the first deviate by less than
-    `GOOD`, in the median over the image, and points of held-out frames lie no farther off their lines, in the
-    mean.
+    It is if points of held-out frames (not judged where they are too few) lie by `GOOD` pixels or less off
+    their lines, in the mean of each pair, and, at some of five depths from the nearest to the farthest board
+    point, the positions predicted in every other camera for pixels of the first have a standard deviation
+    below `GOOD`, in the median over the image. Without a covariance it is not.
 
     Returns:
         The sentence, with depths in metres and deviations in pixels; empty for a single camera.
@@ -249,10 +255,10 @@ def camera_table(calibration: Calibration, covers: Mapping[str, Coverage]) -> st
     """Format a table with one row for each camera: points, residuals, parameters with standard deviations.
 
     Args:
-        covers: coverage by camera.
+        covers: coverage by camera, of all cameras.
 
     Returns:
-        HTML.
+        HTML; deviations are nan without a covariance.
     """
     rows = []
     for name, camera in calibration.fit.problem.cameras.items():
@@ -275,10 +281,11 @@ def camera_table(calibration: Calibration, covers: Mapping[str, Coverage]) -> st
 
 
 def pair_table(calibration: Calibration) -> str:
-    """Format a table with one row for each pair: baseline, relative rotation, epipolar errors.
+    """Format a table with one row for each pair that saw common points: baseline, relative rotation, epipolar
+    errors (mean and 95 % quantile), these also on held-out frames if there are enough.
 
     Returns:
-        HTML; deviations only where the fit has a covariance.
+        HTML; millimetres, degrees, pixels. The baseline's deviation only where the fit has a covariance.
     """
     covariance = rig_covariance(calibration.fit)
     cameras = calibration.fit.problem.cameras
@@ -331,9 +338,10 @@ def _table(rows: Sequence[Mapping[str, str]]) -> str:
 
 
 def draw_scene(calibration: Calibration) -> Figure:
-    """Draw the rig alone, and the rig with the boards from above.
+    """Draw the rig alone in space, and the rig with the boards from above (x and z of the world, metres).
 
-    Lengths are in metres.
+    Returns:
+        The figure.
     """
     figure = draw_rig(Rig({escaped(n): c for n, c in calibration.rig.cameras.items()}))
     figure.set_size_inches(10.4, 4.6)
@@ -361,7 +369,11 @@ def draw_scene(calibration: Calibration) -> Figure:
 
 
 def draw_by_image(calibration: Calibration) -> Figure:
-    """Plot the root mean square residual of every image of every camera, by frame."""
+    """Plot the root mean square residual (pixels) of every image of every camera, by frame.
+
+    Returns:
+        The figure.
+    """
     frames = calibration.frames
     figure = Figure(figsize=(10.4, 2.8), layout="constrained")
     axes = figure.subplots()
@@ -384,6 +396,10 @@ def draw_camera(calibration: Calibration, name: str, covered: Coverage) -> Figur
     Args:
         name: name of the camera.
         covered: coverage of its image; cells without points are red.
+
+    Returns:
+        The figure; residuals are measured minus projected pixels, in the scatter clipped to four standard
+        deviations of the noise.
     """
     observed, r = calibration.fit.problem.seen[name], calibration.fit.problem.residuals[name]
     hw = calibration.views[name].hw
@@ -424,13 +440,17 @@ def _draw_field(axes: Any, x: np.ndarray, r: np.ndarray, hw: tuple[int, int]) ->
 
 def draw_uncertainty(calibration: Calibration, depths: tuple[float, float]) -> Figure:
     """Draw the standard deviation of predicted pixels over the first camera's image, by beta (rows) and
-    depth.
+    depth (columns).
 
     Args:
+        calibration: calibration of two cameras or more.
         depths: depths in metres.
 
     Returns:
-        The figure. The fit must have a covariance.
+        The figure.
+
+    Raises:
+        AssertionError: without a covariance.
     """
     covariance = rig_covariance(calibration.fit)
     assert covariance is not None
@@ -453,10 +473,14 @@ def _extent(hw: tuple[int, int]) -> tuple[float, float, float, float]:
 
 def draw_adequacy(calibration: Calibration, depths: tuple[float, float]) -> Figure:
     """Draw each camera's uncertainty of projection at two depths, and the difference between halves of the
-    frames.
+    frames at the mean depth.
+
+    Args:
+        calibration: calibration with a covariance; without one the uncertainty is drawn as none.
+        depths: both depths, metres.
 
     Returns:
-        The figure. The fit must have a covariance.
+        The figure, in pixels; a row for each camera.
     """
     names = list(calibration.views)
     figure = Figure(figsize=(10.4, 2.5 * len(names) + 0.3), layout="constrained")
@@ -505,9 +529,16 @@ def draw_images(
     """Draw images with used points (dots), left-out ones (red circles) and enlarged residuals.
 
     Args:
-        chosen: camera and moment of each image, at least one.
+        chosen: camera and moment of each image, at least one, each in `detected`.
         detected: all detections by camera.
-        photos: images by camera and moment.
+        photos: images by camera and moment; one that is missing leaves its points on an empty ground.
+
+    Returns:
+        The figure.
+
+    Raises:
+        ValueError: if an image cannot be read.
+        OSError: if its file is gone.
     """
     columns = min(3, len(chosen))
     rows = -(-len(chosen) // columns)

@@ -32,7 +32,8 @@ class Calibration:
         board: the board.
         fit: result of the bundle adjustment.
         single: reprojection error (RMS, pixels) of each camera calibrated alone; empty with a start.
-        epipolar: distances of matched points from their epipolar lines by pair, undistorted pixels.
+        epipolar: distances of common points from their epipolar lines by pair, undistorted pixels; pairs
+            without common points are missing.
         notes: sentences on the calibration.
     """
 
@@ -87,16 +88,20 @@ def calibrate(
         views: detections by camera.
         board: the board.
         lens: lens model of all cameras, or of each by name.
-        start: rig known to within `deviations`; one image of each camera is then enough, and the start's
-            world and kinds of lenses are kept; a pinhole gets the model `lens`.
-        deviations: standard deviations about the start; None for the defaults.
+        start: rig known to within `deviations`; one image of each camera, of a common moment, is then enough,
+            and the start's world and kinds of lenses are kept, their coefficients fitted; a pinhole gets the
+            model `lens`. None for cameras of which nothing is known.
+        deviations: standard deviations about the start; None for the defaults. Unused without a start.
 
     Returns:
-        The calibration; its world is the first camera's frame, or the start's.
+        The calibration of the cameras in `views`; its world is the first camera's frame, or the start's. The
+        rig has no depth range.
 
     Raises:
         ValueError: with advice, for no views, an unknown lens model, too few images, parallel boards, cameras
-            without common frames, frames that contradict each other, or a start that does not fit.
+            without common frames, frames that contradict each other, or a start that does not fit;
+            numpy.linalg.LinAlgError, which is one, if frames determine too little.
+        cv2.error: if OpenCV fails on a board's pose.
     """
     if not views:
         raise ValueError("there are no views: give those of one camera or more, by name")

@@ -46,10 +46,11 @@ class Difference(NamedTuple):
 
     Attributes:
         x: pixels of the first rig's camera, or of the pair's alpha.
-        depth: their depths, metres.
+        depth: their depths, metres or the rigs' own unit.
         change: of a camera, offset of the second rig's pixels (n, 2); of a pair, depth by the second rig over
             depth by the first, minus 1 (n).
-        sigma: standard deviation of the change (in the worst direction) by both calibrations; NaN if unknown.
+        sigma: standard deviation of the change (in the worst direction) by both calibrations, in the change's
+            unit; NaN without covariances.
     """
 
     x: Float[np.ndarray, "n 2"]
@@ -67,7 +68,7 @@ class Significance(NamedTuple):
         probability: probability of a larger chi-square by chance.
         camera: camera whose motion explains most of the difference.
         degrees: rotation of that camera, degrees.
-        metres: shift of that camera, metres.
+        metres: shift of that camera's centre, metres or the rigs' own unit.
         share: share of chi-square that this motion explains, 0..1.
     """
 
@@ -91,11 +92,13 @@ class RigDifference:
 
     Attributes:
         cameras: difference of pixels by camera.
-        depths: difference of depths by the other cameras that see alpha's points.
-        alpha: camera of the depths.
-        motion: rigid motion from the first rig's world to the second's that is taken out before comparing.
+        depths: difference of depths by alpha and another camera, by that camera's name; cameras that see none
+            of alpha's points are missing.
+        alpha: camera of the depths, the first of the first rig.
+        motion: rigid motion from the first rig's world to the second's that is taken out before comparing
+            pixels.
         significance: result of the test; None without covariances.
-        unit: unit of depths; "baselines" for rigs of unknown scale.
+        unit: unit of depths: "m", or "baselines" for rigs of unknown scale.
     """
 
     cameras: Mapping[str, Difference]
@@ -106,7 +109,8 @@ class RigDifference:
     unit: str = "m"
 
     def as_text(self) -> str:
-        """Format a line for each camera and pair, and the verdict."""
+        """Format RMS, maximum and, if known, standard deviation of each camera's pixels and each pair's depths
+        (percent), a line each, and the verdict."""
         lines = ["after the rigid motion of the whole rig that brings all pixels together best:"]
         for name, difference in self.cameras.items():
             off = np.linalg.norm(difference.change, axis=1)
@@ -151,13 +155,15 @@ def rig_difference(
         b: second rig.
         covariances: covariances of both; where one is None the other serves for both, without any nothing is
             tested.
-        depth: (near, far) along each camera's axis, metres, or the rigs' own unit.
+        depth: (near, far) along each camera's axis, metres, or the rigs' own unit; 0 < near <= far, which is
+            not checked. Far counts as `FARTHEST` times near at most, infinity too.
 
     Returns:
         Differences of pixels and depths, and the test's result.
 
     Raises:
-        ValueError: for rigs of other cameras, sizes or units, and cameras that are not calibrated.
+        ValueError: for rigs of other cameras, sizes or units, cameras that are not calibrated, and a
+            covariance of parameters that the first rig has not.
     """
     names = _same_cameras(a, b)
     a, b = (rig.replace(cameras={name: rig[name].to(torch.float64) for name in names}) for rig in (a, b))
@@ -359,7 +365,7 @@ def draw_difference(difference: RigDifference) -> Figure:
     """Draw differences of pixels by camera and of depths by pair, at the nearest and the farthest depth.
 
     Returns:
-        The figure; pixels in pixels, depths in percent.
+        The figure, a row for each camera and pair: lengths of offsets in pixels, depths in percent.
     """
     maps = [(f"{n}: pixels", c, np.linalg.norm(c.change, axis=1)) for n, c in difference.cameras.items()]
     maps += [
