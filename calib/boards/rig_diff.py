@@ -109,8 +109,10 @@ class RigDifference:
     unit: str = "m"
 
     def as_text(self) -> str:
-        """Format RMS, maximum and, if known, standard deviation of each camera's pixels and each pair's depths
-        (percent), a line each, and the verdict."""
+        """Format a line for each camera (pixels) and pair (depths, percent), and the verdict.
+
+        Each line has RMS, maximum and, where known, standard deviation of the differences.
+        """
         lines = ["after the rigid motion of the whole rig that brings all pixels together best:"]
         for name, difference in self.cameras.items():
             off = np.linalg.norm(difference.change, axis=1)

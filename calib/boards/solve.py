@@ -80,15 +80,17 @@ def calibrate_single(
     Args:
         name: name of the camera.
         views: its detections.
+        board: the board.
         lens: lens model.
         final: False accepts a poorly constrained focal length, as other cameras will add constraints.
 
     Returns:
-        The solution.
+        The solution, the camera at the origin; `views` has the images and points that were used.
 
     Raises:
-        ValueError: with advice, for too few images, parallel boards, or (`final`) an undetermined focal
-            length.
+        ValueError: with advice, for too few images, parallel boards, no camera that fits, or (`final`) an
+            undetermined focal length.
+        KeyError, cv2.error: as `initial_camera`.
     """
     first = initial_camera(name, views, board, lens)
     kept = without_bad_images(views, first, board)
@@ -120,9 +122,11 @@ def solve(initial: InitialRig, board: Board, *, final: bool = True) -> Solved:
     """Fit all observable parameters; unobservable ones are fixed at defaults.
 
     Parameters fixed before the fit, when the noise was overestimated, may return after it; boards that are
-    clearly neither flat nor printed true are deformed.
+    clearly not flat or not printed true are deformed.
 
     Args:
+        initial: initial values.
+        board: the board.
         final: False accepts a focal length that is not observable.
 
     Returns:
@@ -130,6 +134,7 @@ def solve(initial: InitialRig, board: Board, *, final: bool = True) -> Solved:
 
     Raises:
         ValueError: for a `final` fit without an observable focal length.
+        KeyError, TypeError: as `InitialRig.problem`.
     """
     problem, flat = initial.problem(board), initial.flat(board)
     full = problem.free
@@ -160,7 +165,8 @@ def solve_inliers(
 
     Args:
         initial: initial values, with the points of the first round.
-        detected: all detections by camera.
+        detected: all detections by camera, at the moments of `initial`; of these each round takes its points.
+        board: the board.
         final: False accepts a focal length that is not observable.
 
     Returns:
@@ -168,6 +174,8 @@ def solve_inliers(
 
     Raises:
         ValueError: for a `final` fit without an observable focal length.
+        KeyError: for a detection at a moment that `initial` has not.
+        TypeError: as `InitialRig.problem`.
     """
     solved = solve(initial, board, final=final)
     for _ in range(ROUNDS - 1):
@@ -188,9 +196,11 @@ def solve_inliers(
 def observable(problem: BundleProblem, *, final: bool) -> tuple[BundleProblem, list[str]]:
     """Fix unobservable parameters of lenses and principal points at their defaults, the worst first.
 
-    Observability follows from the pixels and the priors of a start rig, in units of typical sizes.
+    Observability follows from the pixels and the priors of a start rig, in units of typical sizes. Poses stay
+    free.
 
     Args:
+        problem: the problem, with its noise.
         final: False to leave an unobservable focal length free.
 
     Returns:
@@ -198,6 +208,7 @@ def observable(problem: BundleProblem, *, final: bool) -> tuple[BundleProblem, l
 
     Raises:
         ValueError: for an unobservable focal length if `final`.
+        KeyError: where `sigma` lacks a camera.
     """
     free = {name: mask.copy() for name, mask in problem.free.items()}
     cameras, notes = dict(problem.cameras), list[str]()
@@ -265,12 +276,13 @@ def adjust(problem: BundleProblem, *, rounds: int = 4, equal_noise: bool = False
     the camera that starts worst.)
 
     Args:
+        problem: the problem; its noise is not used.
         rounds: largest number of rounds with noise estimated from residuals.
         equal_noise: True for one noise of all cameras: where the board moves between exposures, a camera with
             a noise of its own would attract every board pose.
 
     Returns:
-        The solution; its covariance is None if the parameters are not observable.
+        The solution, without notes and views; its covariance is None if the parameters are not observable.
     """
     parameters = len(problem.names) + POSE * len(problem.frames)
     start = dict.fromkeys(problem.cameras, max(problem.rms(), LEAST_NOISE))
@@ -289,7 +301,6 @@ def adjust(problem: BundleProblem, *, rounds: int = 4, equal_noise: bool = False
 def readjusted(problem: BundleProblem) -> BundleProblem:
     """Adjust a problem again from the solution of nearly the same one, with its noise.
 
-
     Returns:
         The adjusted problem, after at most 10 steps; the given one stays as it is.
     """
@@ -297,13 +308,15 @@ def readjusted(problem: BundleProblem) -> BundleProblem:
 
 
 def noise(problem: BundleProblem, parameters: int) -> dict[str, float]:
-    """Estimate each camera's noise along x or y robustly, in pixels.
+    """Estimate each camera's noise along x or y robustly from its residuals.
 
     Args:
+        problem: problem in which each camera has points.
         parameters: number of fitted parameters, by which degrees of freedom are reduced.
 
     Returns:
-        Standard deviations by camera; those of few points are drawn towards the cameras' mean.
+        Standard deviations by camera, pixels, `LEAST_NOISE` or more; from few points they are drawn towards
+        the cameras' mean.
     """
     residuals = problem.residuals
     numbers = 2 * sum(len(r) for r in residuals.values())
@@ -364,8 +377,8 @@ class FrameMisfit(NamedTuple):
     Attributes:
         camera: name of the camera.
         frame: moment of the frame.
-        rms: root mean square length of the frame's residuals, pixels.
-        typical: root mean square of the camera's median frame, pixels.
+        rms: root mean square length of the frame's residuals in that camera, pixels.
+        typical: median of these over the camera's frames, pixels.
     """
 
     camera: str
@@ -425,13 +438,16 @@ def solve_together(initial: InitialRig, board: Board, singles: Mapping[str, Solv
 
     Args:
         initial: initial values of all cameras and boards.
+        board: the board.
         singles: solution of each camera alone, by name.
 
     Returns:
-        The solution; that of the single camera if there is only one.
+        The solution, the images that contradict the others in `left_out`; the single camera's own if there is
+        only one.
 
     Raises:
-        ValueError: if a camera contradicts the others altogether.
+        ValueError: if a camera contradicts the others altogether, or its focal length is not observable.
+        TypeError: for a camera without detections in `initial`.
     """
     if len(singles) == 1:
         return next(iter(singles.values()))

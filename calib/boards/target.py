@@ -91,10 +91,17 @@ BELOW = 14.0
 
 
 def parse_board(text: str) -> Board:
-    """Parse the text of a board, such as ``charuco:8x6:30mm``, or read a target file; see the module.
+    """Parse the text of a board, such as ``charuco:8x6:30mm``, or read a target file.
+
+    Forms (options: see the module), with counts of 3 (tags: 2) to 100 and lengths in mm, cm, m or in:
+    chessboard:9x6:25mm counts inner corners, charuco:8x6:30mm squares, circles:7x5:20mm, acircles:4x11:20mm,
+    aprilgrid:6x6:88mm:0.3 tags; Kalibr's target file (.yaml); points in a file (.csv, then :DICTIONARY).
+
+    Returns:
+        `Chessboard`, `Charuco`, `Circles`, `AprilGrid`, or `KnownPoints` of a .csv file.
 
     Raises:
-        ValueError: for text or a file that is no board.
+        ValueError: for text or a file that is no board, or numbers out of range.
         FileNotFoundError: for a missing file.
     """
     if text.lower().endswith((".yaml", ".yml")):
@@ -141,6 +148,7 @@ def parse_boards(texts: Sequence[str]) -> Board:
     Raises:
         ValueError: for text that is no board, and several boards without markers or with the same ones.
         FileNotFoundError: for a missing file.
+        IndexError: for no text.
     """
     boards = [parse_board(text) for text in texts]
     if len(boards) == 1:
@@ -311,7 +319,9 @@ def draw_board(board: Board, *, paper: str | None = None) -> Figure:
     """Draw a board at true size, with a white margin and a ruler below to check the print.
 
     Args:
-        paper: sheet such as "A4", in whose middle the board is drawn; None for a page of the board's size.
+        board: a single printed board, no points in space.
+        paper: sheet of `PAPERS` such as "A4", upright or across, in whose middle the board is drawn; None for
+            a page of the board's size.
 
     Returns:
         The figure; saved as PDF or SVG it prints at true size.
@@ -362,14 +372,16 @@ def write_board(board: str, out: Path, *, paper: str | None = None) -> Path:
     """Write a board as PDF or SVG at true size, atomically.
 
     Args:
-        board: text of the board.
-        paper: sheet such as "A4"; None for a page of the board's size.
+        board: text of the board, as `parse_board` reads it.
+        out: file to write; missing folders are made.
+        paper: sheet of `PAPERS` such as "A4"; None for a page of the board's size.
 
     Returns:
         The path `out`.
 
     Raises:
-        ValueError: for another suffix, text that is no board, and a board that does not fit on the sheet.
+        ValueError: for another suffix, text that is no board, points of a .csv file, an unknown sheet, and a
+            board that does not fit on it.
         FileNotFoundError: for a missing target file.
         OSError: if the file cannot be written.
     """
