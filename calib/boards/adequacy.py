@@ -62,12 +62,8 @@ def coverage(views: BoardViews, cam_from_board: Mapping[FrameKey, Pose], board: 
     """Compute a camera's coverage from its detections and the boards' poses in its frame.
 
     Args:
-        views: detections of `board`.
-        cam_from_board: pose of the board at the moment of each detection.
-
-    Raises:
-        KeyError: for a detection without a pose.
-        ValueError: for no detections.
+        views: detections of `board`; ValueError for none.
+        cam_from_board: pose of the board at the moment of each detection; KeyError for a missing one.
     """
     cells = point_counts([d.x for d in views.seen.values()], views.hw)
     poses = {key: cam_from_board[key] for key in views.seen}
@@ -192,8 +188,7 @@ def proposed_views(camera: Camera, board: Board) -> Mapping[str, Float[np.ndarra
 
 
 def _gain(intrinsics: Intrinsics, X: np.ndarray) -> np.ndarray | None:
-    """Information of a view on the free intrinsics, its pose unknown; None if hardly any of the board is
-    visible."""
+    """Information of a view, its pose unknown, on the free intrinsics; None if it hardly shows the board."""
     projected = intrinsics.camera.project_local(torch.from_numpy(X))
     inside = (projected.valid & intrinsics.camera.contains(projected.x)).numpy()
     if inside.sum() < 0.6 * len(X) or not inside.any():
@@ -225,9 +220,6 @@ def coverage_advice(calibration: Calibration, *, always: bool = False) -> Iterat
 
     Yields:
         Sentences "camera: advice".
-
-    Raises:
-        numpy.linalg.LinAlgError: for a singular covariance.
     """
     for name, covered in coverages(calibration).items():
         yield from (f"{name}: {text}" for text in covered.missing)

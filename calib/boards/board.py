@@ -26,8 +26,7 @@ ON_A_LINE = 0.01
 class Board:
     """Base class of calibration boards: a flat grid of points in the plane z = 0, x across, y down.
 
-    The kinds below say where they differ. `parse_board` makes boards from text and checks them; constructors
-    check nothing. Detection knows these kinds alone.
+    Subclasses say where they differ. Constructors check nothing: `parse_board` does.
 
     Attributes:
         columns: points in a row.
@@ -377,11 +376,7 @@ def apart(points: Float[np.ndarray, "n k"]) -> Float[np.ndarray, " n"]:
 
 
 def marker_dictionary(name: str) -> cv2.aruco.Dictionary:
-    """Return OpenCV's marker dictionary of a name such as "4x4_50".
-
-    Raises:
-        AttributeError: for a name that OpenCV does not have.
-    """
+    """Return OpenCV's marker dictionary of a name such as "4x4_50"; AttributeError for another name."""
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name.upper()}"))
 
 

@@ -106,8 +106,7 @@ class BundleProblem:
         return self.deformation.deformed(observed.p, self.deformation.part[observed.block])
 
     def rotated(self, name: str) -> Float[np.ndarray, "n 3"]:
-        """Return the points that a camera observed relative to their board's origin, in the world's axes,
-        metres."""
+        """Return the points that a camera observed less their board's origin, in the world's axes, metres."""
         return np.einsum("nij,nj->ni", self.boards.R.numpy()[self.seen[name].block], self.on_board(name))
 
     def world(self, name: str) -> Float[np.ndarray, "n 3"]:
@@ -223,7 +222,7 @@ class InitialRig(NamedTuple):
 
         Raises:
             KeyError: for a detection at a moment without a board pose, and a camera without views.
-            TypeError: for a camera without detections.
+            TypeError: for a camera whose views have no detection.
         """
         index, observations, free = {key: i for i, key in enumerate(self.boards)}, {}, {}
         for number, (name, camera) in enumerate(self.cameras.items()):
@@ -281,8 +280,7 @@ class Solved:
 
     @property
     def deviations(self) -> dict[str, float]:
-        """Standard deviation of each free parameter by name ("left.focal.0"), in its own unit; empty without
-        a covariance."""
+        """Standard deviation of each free parameter, in its unit, by name; empty without a covariance."""
         if self.covariance is None:
             return {}
         return dict(zip(self.names, np.sqrt(self.covariance.diagonal()).tolist()))
@@ -310,13 +308,10 @@ class Linearised(NamedTuple):
 
 
 def linearised(problem: BundleProblem) -> dict[str, Linearised]:
-    """Linearise a problem about its present values.
+    """Linearise a problem about its present values; KeyError where `sigma` lacks a camera.
 
     Returns:
         Residuals and derivatives by camera, weighted by robustness and noise.
-
-    Raises:
-        KeyError: where `sigma` lacks a camera.
     """
     shapes = 0 if problem.deformation is None else len(problem.deformation)
     first, rows = 0, {}
@@ -383,8 +378,7 @@ class NormalEquations:
         return change, boards
 
     def information(self) -> Array:
-        """Compute the inverse covariance (c, c) of the camera parameters, marginalised over boards and
-        deformations."""
+        """Compute the cameras' inverse covariance (c, c), marginalised over boards and deformations."""
         S, _, _ = self.reduced(0.0)
         c = len(S) - self.shapes
         return S[:c, :c] - S[:c, c:] @ np.linalg.solve(S[c:, c:], S[c:, :c])
@@ -406,13 +400,10 @@ def normal_equations(problem: BundleProblem, parts: Mapping[str, Linearised]) ->
     """Assemble the Gauss-Newton equations of free camera parameters, board shapes and board poses.
 
     Args:
-        parts: result of `linearised`.
+        parts: result of `linearised`; ValueError for a camera without points.
 
     Returns:
         The equations, with the priors of cameras and of board shapes.
-
-    Raises:
-        ValueError: for a camera without points.
     """
     shapes = 0 if problem.deformation is None else len(problem.deformation)
     b, c = len(problem.frames), len(problem.names) + shapes
@@ -466,8 +457,7 @@ def robust_weights(lengths: Array) -> Array:
 
 
 def parameter_sizes(camera: Camera) -> dict[str, int]:
-    """Return the length of each of a camera's parameter vectors, keyed as in a rig whose camera
-    is called ""."""
+    """Return the length of each of a camera's parameter vectors, by name: ".rotation" and so on."""
     lens = {} if camera.distortion is None else {".distortion": camera.distortion.coefficients.shape[-1]}
     return {".rotation": 3, ".translation": 3, ".focal": 2, ".centre": 2} | lens
 
@@ -508,12 +498,7 @@ def changed(camera: Camera, change: torch.Tensor) -> Camera:
 
 
 def camera_jacobian(camera: Camera, X: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 p"]:
-    """Compute the derivatives of world points' pixels by a camera's parameters, in the order of
-    `parameter_names`.
-
-    Returns:
-        Derivatives (n, 2, p).
-    """
+    """Compute the derivatives (n, 2, p) of world points' pixels by a camera's `parameter_names`."""
     return linear_projection(camera, X)[1]
 
 
@@ -540,13 +525,11 @@ def with_default(camera: Camera, entry: str) -> tuple[Camera, str]:
     """Reset one intrinsic parameter: a principal point to the centre, a lens term to no effect.
 
     Args:
-        entry: "centre.0" (x), "centre.1" (y), or a lens term such as "distortion.2"; no others.
+        entry: "centre.0" (x), "centre.1" (y), or a term such as "distortion.2" of the camera's lens; no
+            others.
 
     Returns:
         The camera, and a sentence on what was done.
-
-    Raises:
-        AssertionError: for a lens term of a camera without a lens.
     """
     kind, index = entry.split(".")[0], int(entry.split(".")[1])
     if kind == "centre":
@@ -579,8 +562,7 @@ class CameraPrior(NamedTuple):
     pose: Pose | None = None
 
     def equations(self, camera: Camera) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, " p"]]:
-        """Return the prior's part of the normal equations: inverse covariance (p, p) and negative gradient
-        (p)."""
+        """Return the prior's part of the equations: inverse covariance (p, p) and negative gradient (p)."""
         derivatives = np.eye(len(self.mean))
         if self.pose is not None:
             derivatives[3:6, :6] = camera.cam_from_world.centre_jacobian.numpy()

@@ -106,10 +106,8 @@ def smooth_map(p: Float[np.ndarray, "n 2"], x: Float[np.ndarray, "n 2"], good: B
         good: mask of the points to fit to, 4 or more.
 
     Returns:
-        Function from board positions (n, 2), in the unit of p, to pixels (n, 2).
-
-    Raises:
-        cv2.error: if no homography fits the points.
+        Function from board positions (n, 2), in the unit of p, to pixels (n, 2). cv2.error if no homography
+        fits the points.
     """
 
     def weigh(rest: torch.Tensor) -> torch.Tensor:
@@ -131,11 +129,7 @@ def smooth_map(p: Float[np.ndarray, "n 2"], x: Float[np.ndarray, "n 2"], good: B
 
 
 def monomials(q: Float[np.ndarray, "n 2"], degree: int) -> Float[np.ndarray, "n m"]:
-    """Compute all products of powers of u and v up to a total degree.
-
-    Returns:
-        Values (n, m).
-    """
+    """Compute all products (n, m) of powers of u and v up to a total degree."""
     u, v = q.T
     return np.stack([u**i * v**j for i in range(degree + 1) for j in range(degree + 1 - i)], 1)
 

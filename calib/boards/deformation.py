@@ -115,10 +115,7 @@ def is_significant(
 
     Returns:
         True if chance explains them with a probability below `SIGNIFICANCE`; False unless there are more
-        frames than values.
-
-    Raises:
-        numpy.linalg.LinAlgError: for a singular covariance.
+        frames than values. A singular covariance raises numpy.linalg.LinAlgError.
     """
     count = len(values)
     squared = float(values @ np.linalg.solve(covariance, values))
@@ -129,15 +126,13 @@ def is_significant(
 def described(
     shape: BoardDeformation, deviations: Float[np.ndarray, "k 4"], extents: list[tuple[float, float]]
 ) -> Iterator[str]:
-    """Yield sentences on boards whose stretch, or any of whose curvatures, exceeds three standard deviations.
+    """Yield a sentence for each board whose stretch exceeds three standard deviations, and for each of which
+    a curvature does.
 
     Args:
         shape: shapes of the boards.
         deviations: standard deviation of each of its values.
         extents: width and height of each board, metres.
-
-    Yields:
-        Up to two sentences a board, on its stretch and on its bend.
     """
     for k, (extent, deviation) in enumerate(zip(extents, deviations)):
         name = f"board {k + 1}" if len(extents) > 1 else "the board"

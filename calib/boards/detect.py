@@ -257,11 +257,7 @@ def _crossing(corners: np.ndarray) -> np.ndarray:
 
 
 def _tags(grey: Grey, dictionary: str, border: int) -> dict[int, np.ndarray]:
-    """Corners (4) of each visible marker, by number.
-
-    AprilTags touch other squares at their corners: OpenCV's method and that of their authors miss different
-    ones.
-    """
+    """Corners (4) of each visible marker, by number; of AprilTags by two methods that miss others."""
     tags: dict[int, np.ndarray] = {}
     april = [cv2.aruco.CORNER_REFINE_APRILTAG] if dictionary.startswith("april") else []
     for method in (cv2.aruco.CORNER_REFINE_SUBPIX, *april):
@@ -317,10 +313,7 @@ _FINDERS: dict[type[Board], Callable[[Grey, Any], Detection | None]] = {
 
 
 def _refined(grey: Grey, detection: Detection, board: Board) -> Detection:
-    """Refine corners to a hundredth of a pixel; boards that may be partly visible lose occluded ones.
-
-    If few fit the corner model, as in too small images, all are refined by gradients.
-    """
+    """Refine corners: by the corner model, with markers without occluded ones, or all by gradients."""
     if isinstance(board, Circles | KnownPoints):
         return detection
     clear = _clear(board)
@@ -333,8 +326,7 @@ def _refined(grey: Grey, detection: Detection, board: Board) -> Detection:
 
 
 def _clear(board: Board) -> float:
-    """Distance from a corner's edges that is free of anything but its own squares, as a share of
-    `spacing`."""
+    """Distance from a corner's edges, in `spacing`, within which there is nothing but its own squares."""
     if isinstance(board, Charuco):
         return (1 - board.marker / board.spacing) / 2
     if isinstance(board, AprilGrid):
@@ -344,8 +336,7 @@ def _clear(board: Board) -> float:
 
 
 def _by_gradients(grey: Grey, x: np.ndarray, share: float) -> np.ndarray:
-    """Refine corners by OpenCV's gradient criterion, in windows of `share` times the distance to the next
-    corner."""
+    """Refine corners by OpenCV's gradients, in windows of `share` of the distance to the next corner."""
     half = int(np.clip(share * np.quantile(apart(x), 0.1), 2, 11))
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
     refined = cv2.cornerSubPix(grey, x.astype(np.float32).reshape(-1, 1, 2), (half, half), (-1, -1), criteria)
@@ -353,10 +344,7 @@ def _by_gradients(grey: Grey, x: np.ndarray, share: float) -> np.ndarray:
 
 
 def _plausible(detection: Detection, board: Board) -> bool:
-    """True for enough points that are not collinear and lie on a smoothly distorted grid.
-
-    A homography plus a polynomial of degree 3 has to map the points on the board to the pixels.
-    """
+    """True for enough points, not collinear, that a homography plus a cubic polynomial maps to the pixels."""
     if isinstance(board, KnownPoints):
         return not on_a_line(board.points[detection.ids])
     p = board.points[detection.ids, :2]
@@ -523,8 +511,7 @@ def detected(photo: Photo, key: FrameKey, board: Board) -> DetectedImage:
         Size (h, w) of the image, and detections by key; a board that is not found has none.
 
     Raises:
-        ValueError: if the image cannot be read.
-        OSError: if its file is gone.
+        ValueError, OSError: if the image cannot be read.
     """
     grey, detections, before = photo.read(), dict[FrameKey, Detection](), 0
     for index, member in enumerate(board.members):

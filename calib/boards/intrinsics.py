@@ -78,16 +78,13 @@ def initial_camera(name: str, views: BoardViews, board: Board, lens: Lens) -> Ca
     A pinhole and Brown and Conrady's models by OpenCV, with two radial terms at most; others by their rays.
 
     Args:
-        name: name of the camera.
-        views: its detections.
-        board: the board.
-        lens: name of the lens model, one of `LENSES`.
+        name: name of the camera, for messages.
+        lens: lens model; KeyError for one that is not in `LENSES`.
 
     Returns:
         The camera at the origin, with board poses and the detections without outlying points.
 
     Raises:
-        KeyError: for another lens model.
         ValueError: for fewer than three images with a board (one, for points that are not coplanar), and if
             no camera is found.
         cv2.error: if OpenCV fails on a board's pose.
@@ -113,13 +110,10 @@ def without_bad_images(views: BoardViews, initial: CalibratedViews, board: Board
 
     Args:
         views: all detections.
-        initial: result of `initial_camera` for them.
+        initial: result of `initial_camera` for them; KeyError for an image that has no pose in it.
 
     Returns:
         The detections in the images whose error (RMS) is below 2 pixels or ten times the median, the larger.
-
-    Raises:
-        KeyError: for an image without a pose in `initial`.
     """
     rms = {}
     for key, pose in initial.poses.items():
@@ -140,7 +134,6 @@ def without_outliers(
     """Drop points farther than `OUTLIER` standard deviations from a camera's projections.
 
     Args:
-        views: detections.
         camera: the camera; its own pose does not count.
         poses: `cam_from_board` by moment.
         points: the board's points, metres.
@@ -289,8 +282,7 @@ def _pose_of_rays(board: Board, ids: Int[np.ndarray, " n"], rays: Float[np.ndarr
 def _pinhole(views: BoardViews, board: Board, count: int) -> OpenCVSolution:
     """Fit K and two radial terms, with rotations and translations, as initial values.
 
-    Few, small or similar boards determine neither these nor the aspect ratio, and a fit without a prior ends
-    anywhere. Where pixels become oblong, a camera with square ones, a central principal point and one radial
+    Where few boards make pixels oblong, a camera with square ones, a central principal point and one radial
     term is fitted instead: the rest is left to the adjustment and its prior.
     """
     initial = board.points * (1, 1, 0) if board.flat else board.points
@@ -317,8 +309,7 @@ def _pinhole(views: BoardViews, board: Board, count: int) -> OpenCVSolution:
 
 
 def _linear_intrinsics(view: tuple[np.ndarray, np.ndarray], hw: HW) -> np.ndarray:
-    """K with square pixels and central principal point, by a linear camera of one view (Hartley & Zisserman
-    7.1)."""
+    """K with square pixels and central principal point by one view (Hartley & Zisserman 7.1)."""
     X, x = view[0].astype(np.float64), view[1][:, 0].astype(np.float64)
     if len(X) < FEWEST_POINTS:
         return intrinsics(float(max(hw)), hw).numpy()
@@ -333,10 +324,7 @@ def _linear_intrinsics(view: tuple[np.ndarray, np.ndarray], hw: HW) -> np.ndarra
 
 
 def _fisheye(views: BoardViews, board: Board) -> tuple[Camera, dict[FrameKey, Pose]]:
-    """Fit the focal length and two terms of Kannala and Brandt's model, each board's pose by its own rays.
-
-    From the best of `FISHEYE_FOCALS`; the principal point is in the middle.
-    """
+    """Fit focal length (from the best of `FISHEYE_FOCALS`) and two terms of a fisheye, and boards' poses."""
 
     def changed(values: np.ndarray) -> Camera:
         lens = Distortion("kannala-brandt", torch.tensor([*values[1:], 0, 0], dtype=torch.float64))

@@ -49,8 +49,7 @@ class Photo:
         """Decode the image in grey, 8 bits (see `to_grey`).
 
         Raises:
-            ValueError: if it cannot be read.
-            OSError: if its file is gone.
+            ValueError, OSError: if it cannot be read.
         """
         return to_grey(self.decode())
 
@@ -202,10 +201,7 @@ def _moments(name: str, files: list[Path]) -> dict[FrameKey, Photo]:
 
 
 def _orientation(file: Path) -> int:
-    """EXIF orientation; 1 if there is none or the file is unreadable, which decoding reports.
-
-    Raises ValueError for a file that states more pixels than any camera has, before anything is decoded.
-    """
+    """EXIF orientation; 1 without, or if unreadable. ValueError for more pixels than a camera has."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)

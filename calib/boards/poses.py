@@ -178,11 +178,7 @@ def rig_near_start(
 
 
 def _start_camera(name: str, start: Rig, views: BoardViews, model_name: Lens) -> Camera:
-    """Camera of a start with its own lens, or else one of the wanted model without effect.
-
-    Brown and Conrady's model gets all wanted terms. Raises ValueError if the camera is missing or of another
-    size.
-    """
+    """Camera of a start, see `rig_near_start`; ValueError if it is missing or of another size."""
     camera = start.cameras.get(name)
     if not isinstance(camera, Camera):
         raise ValueError(f"{name}: the start has no calibrated camera called so; it has {list(start.names)}")
@@ -205,8 +201,7 @@ def _start_camera(name: str, start: Rig, views: BoardViews, model_name: Lens) ->
 def _aligned(cameras: Sequence[CalibratedViews], board: Board) -> dict[str, Pose]:
     """`cam_from_world` of all cameras, oriented by the frames that each shares with an earlier one.
 
-    The first is that with most images; then always those two that share most. Cameras that share none keep
-    their own.
+    First the camera with most images, then always the two that share most; without shared frames unchanged.
     """
     first, symmetries = max(cameras, key=lambda v: len(v.poses)), symmetry_poses(board)
     poses = {first.name: first.camera.cam_from_world}

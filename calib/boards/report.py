@@ -98,8 +98,7 @@ def report_html(
         The page as HTML, figures embedded.
 
     Raises:
-        ValueError: if an image to be drawn cannot be read.
-        OSError: if its file is gone.
+        ValueError, OSError: if an image to be drawn cannot be read.
     """
     covers, has_covariance = coverages(calibration), calibration.fit.covariance is not None
     near, far = _depths(covers.values())
@@ -285,7 +284,7 @@ def pair_table(calibration: Calibration) -> str:
     errors (mean and 95 % quantile), these also on held-out frames if there are enough.
 
     Returns:
-        HTML; millimetres, degrees, pixels. The baseline's deviation only where the fit has a covariance.
+        HTML, in mm, degrees and pixels; the baseline's deviation only where the fit has a covariance.
     """
     covariance = rig_covariance(calibration.fit)
     cameras = calibration.fit.problem.cameras
@@ -338,11 +337,7 @@ def _table(rows: Sequence[Mapping[str, str]]) -> str:
 
 
 def draw_scene(calibration: Calibration) -> Figure:
-    """Draw the rig alone in space, and the rig with the boards from above (x and z of the world, metres).
-
-    Returns:
-        The figure.
-    """
+    """Draw the rig alone in space, and the rig with the boards from above (x and z of the world, metres)."""
     figure = draw_rig(Rig({escaped(n): c for n, c in calibration.rig.cameras.items()}))
     figure.set_size_inches(10.4, 4.6)
     axes: Any = figure.axes[0]
@@ -369,11 +364,7 @@ def draw_scene(calibration: Calibration) -> Figure:
 
 
 def draw_by_image(calibration: Calibration) -> Figure:
-    """Plot the root mean square residual (pixels) of every image of every camera, by frame.
-
-    Returns:
-        The figure.
-    """
+    """Plot the root mean square residual (pixels) of every image of every camera, by frame."""
     frames = calibration.frames
     figure = Figure(figsize=(10.4, 2.8), layout="constrained")
     axes = figure.subplots()
@@ -393,13 +384,11 @@ def draw_by_image(calibration: Calibration) -> Figure:
 def draw_camera(calibration: Calibration, name: str, covered: Coverage) -> Figure:
     """Draw one camera's observed points, median residuals over the image (enlarged), and residuals' scatter.
 
+    Residuals are measured minus projected pixels; the scatter is clipped to four deviations of the noise.
+
     Args:
         name: name of the camera.
         covered: coverage of its image; cells without points are red.
-
-    Returns:
-        The figure; residuals are measured minus projected pixels, in the scatter clipped to four standard
-        deviations of the noise.
     """
     observed, r = calibration.fit.problem.seen[name], calibration.fit.problem.residuals[name]
     hw = calibration.views[name].hw
@@ -443,14 +432,8 @@ def draw_uncertainty(calibration: Calibration, depths: tuple[float, float]) -> F
     depth (columns).
 
     Args:
-        calibration: calibration of two cameras or more.
+        calibration: calibration of two cameras or more; AssertionError without a covariance.
         depths: depths in metres.
-
-    Returns:
-        The figure.
-
-    Raises:
-        AssertionError: without a covariance.
     """
     covariance = rig_covariance(calibration.fit)
     assert covariance is not None
@@ -472,15 +455,12 @@ def _extent(hw: tuple[int, int]) -> tuple[float, float, float, float]:
 
 
 def draw_adequacy(calibration: Calibration, depths: tuple[float, float]) -> Figure:
-    """Draw each camera's uncertainty of projection at two depths, and the difference between halves of the
-    frames at the mean depth.
+    """Draw each camera's (row's) uncertainty of projection at two depths, and the difference between halves
+    of the frames at their mean, in pixels.
 
     Args:
         calibration: calibration with a covariance; without one the uncertainty is drawn as none.
         depths: both depths, metres.
-
-    Returns:
-        The figure, in pixels; a row for each camera.
     """
     names = list(calibration.views)
     figure = Figure(figsize=(10.4, 2.5 * len(names) + 0.3), layout="constrained")
@@ -531,14 +511,10 @@ def draw_images(
     Args:
         chosen: camera and moment of each image, at least one, each in `detected`.
         detected: all detections by camera.
-        photos: images by camera and moment; one that is missing leaves its points on an empty ground.
-
-    Returns:
-        The figure.
+        photos: images by camera and moment; without one, its points are drawn alone.
 
     Raises:
-        ValueError: if an image cannot be read.
-        OSError: if its file is gone.
+        ValueError, OSError: if an image cannot be read.
     """
     columns = min(3, len(chosen))
     rows = -(-len(chosen) // columns)
@@ -588,10 +564,7 @@ def _draw_image(
 
 
 def _draw_arrows(axes: Any, x: np.ndarray, r: np.ndarray, length: float, colour: str) -> float:
-    """Draw residuals as arrows, the longest one of a given length in pixels.
-
-    Returns the longest residual, pixels.
-    """
+    """Draw residuals as arrows, the longest `length` pixels long; returns the longest residual."""
     longest = float(np.linalg.norm(r, axis=1).max())
     arrows = length / max(longest, 1e-9) * r
     axes.quiver(*x.T, *arrows.T, angles="xy", scale_units="xy", scale=1, width=0.004, color=colour)

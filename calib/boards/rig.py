@@ -61,15 +61,11 @@ class Calibration:
 
     @cached_property
     def held_out(self) -> dict[tuple[str, str], Float[np.ndarray, " _"]]:
-        """Epipolar errors (pixels) by pair, each frame's by a rig calibrated without it; empty for too few
-        frames."""
+        """Epipolar errors (pixels) by pair on held-out frames; empty for too few (see `held_out_errors`)."""
         return held_out_errors(self.fit, self.views)
 
     def deviations(self) -> dict[str, float]:
-        """Return the standard deviation of each free parameter by name ("left.focal.0"), in its own unit.
-
-        Empty if the parameters are not observable.
-        """
+        """Return the standard deviation of each free parameter by name, in its unit; empty if unknown."""
         return self.fit.deviations
 
 

@@ -199,10 +199,7 @@ def rig_difference(
 
 
 def _same_cameras(a: Rig, b: Rig) -> tuple[str, ...]:
-    """Names of the cameras.
-
-    Raises ValueError unless both rigs have the same calibrated cameras, sizes and unit.
-    """
+    """Names of the cameras; ValueError unless both rigs have the same ones, calibrated, sizes and unit."""
     if set(a.names) != set(b.names):
         listed = f"{', '.join(a.names)}; and {', '.join(b.names)}"
         raise ValueError(f"the rigs are of other cameras ({listed}): give two calibrations of the same")
@@ -239,8 +236,7 @@ def _points(camera: Camera, other: Camera, depth: tuple[float, float]) -> Grid:
 
 
 class _Part(NamedTuple):
-    """Differences of one camera (n, 2), derivatives by motion (2 n, 6), and by both cameras' parameters (n,
-    2, p)."""
+    """One camera's differences (n, 2), derivatives by motion (2 n, 6) and both rigs' camera (n, 2, p)."""
 
     name: str
     change: np.ndarray
@@ -249,8 +245,7 @@ class _Part(NamedTuple):
 
 
 def _projections(a: Rig, b: Rig, motion: Pose, name: str, X: np.ndarray) -> _Part:
-    """Changes of points' pixels from a to b, with derivatives by the rig's motion and each rig's
-    parameters."""
+    """Changes of points' pixels from a to b, with derivatives by the rig's motion and each rig's camera."""
     one, other, points = a[name], b[name], torch.from_numpy(X)
     moved = other.replace(cam_from_world=other.cam_from_world @ motion)
     J_a, J_b = camera_jacobian(one, X), camera_jacobian(moved, X)
@@ -301,8 +296,7 @@ def _rows(parts: list[_Part]) -> list[slice]:
 def _tested(
     change: np.ndarray, spread: np.ndarray, by_motion: np.ndarray, b: Rig, parts: list[_Part]
 ) -> Significance:
-    """Test the difference in the directions that calibration errors move pixels in, in standard
-    deviations."""
+    """Test the difference in the directions that calibration errors move pixels in."""
     U, s, _ = np.linalg.svd(spread, full_matrices=False)
     counts = s > LEAST * np.sqrt(len(change) / 2)
     U, s = U[:, counts], s[counts]

@@ -43,8 +43,6 @@ def simulate_photos(
 
     Args:
         rig: rig; cameras that are not calibrated get no images.
-        board: a single board that can be printed.
-        folder: folder to write to.
         count: number of poses, and of images of each camera.
         noise: standard deviation of the noise, in grey values of 255.
         seed: seed of poses and noise.
@@ -54,7 +52,7 @@ def simulate_photos(
 
     Raises:
         ValueError: for a rig without calibrated cameras, cameras that hardly see a board together, a board
-            that cannot be printed, a `count` below 1, and a `noise` that is negative or not finite.
+            that cannot be printed, a `count` below 1, and a negative `noise`.
         OSError: if files cannot be written.
     """
     if not 0 <= noise < math.inf:
@@ -122,14 +120,11 @@ def photograph(
     Args:
         camera: the camera; its own pose does not count.
         cam_from_board: pose of the board, float64.
-        board: a single board that can be printed.
+        board: a single board; ValueError for one that cannot be printed (`draw_board`).
         rays: result of `fine_rays(camera)`; None to compute it.
 
     Returns:
         Grey image (h, w), uint8, without noise; `WALL` around the print, and where the lens has no ray.
-
-    Raises:
-        ValueError: for a board that cannot be printed.
     """
     directions, valid = rays or fine_rays(camera)
     R, t = cam_from_board.R, cam_from_board.t
@@ -145,11 +140,7 @@ def photograph(
 
 
 def fine_rays(camera: Camera) -> Rays:
-    """Compute the rays of a camera's pixels at twice its resolution, row by row.
-
-    Returns:
-        Directions (4 h w, 3) in the camera's frame, and True where the lens has one.
-    """
+    """Compute rays (4 h w, 3) of twice a camera's pixels, in its frame, and True where the lens has one."""
     fine = camera.to(torch.float64).resize((2 * camera.hw[0], 2 * camera.hw[1]))
     return fine.rays(pixel_grid(fine.hw, dtype=torch.float64).reshape(-1, 2))
 
@@ -167,15 +158,12 @@ def printed(board: Board, dpi: float) -> tuple[UInt8[np.ndarray, "h w"], float, 
     """Draw the printed board, with its margin and ruler, as an image.
 
     Args:
-        board: a single board.
+        board: a single board; ValueError for one that cannot be printed (`draw_board`).
         dpi: pixels for each inch.
 
     Returns:
         Grey values (h, w), uint8, which are cached and must not be changed; pixels for each metre; and the
         pixel (x, y) of the board's first point.
-
-    Raises:
-        ValueError: for a board that cannot be printed.
     """
     figure = draw_board(board)
     canvas = FigureCanvasAgg(figure)

@@ -80,7 +80,6 @@ def calibrate_single(
     Args:
         name: name of the camera.
         views: its detections.
-        board: the board.
         lens: lens model.
         final: False accepts a poorly constrained focal length, as other cameras will add constraints.
 
@@ -104,8 +103,7 @@ def calibrate_single(
 
 
 def _check_tilts(name: str, poses: Mapping[FrameKey, Pose], board: Board) -> None:
-    """Raise ValueError if all (flat) boards are parallel, which leaves focal length and distance
-    ambiguous."""
+    """Raise ValueError if all (flat) boards are parallel: focal length and distance are then ambiguous."""
     if not board.flat:
         return
     normals = np.stack([pose.R[:, 2].numpy() for pose in poses.values()])
@@ -125,8 +123,7 @@ def solve(initial: InitialRig, board: Board, *, final: bool = True) -> Solved:
     clearly not flat or not printed true are deformed.
 
     Args:
-        initial: initial values.
-        board: the board.
+        initial: initial values, each camera with detections (as `InitialRig.problem` needs them).
         final: False accepts a focal length that is not observable.
 
     Returns:
@@ -134,7 +131,6 @@ def solve(initial: InitialRig, board: Board, *, final: bool = True) -> Solved:
 
     Raises:
         ValueError: for a `final` fit without an observable focal length.
-        KeyError, TypeError: as `InitialRig.problem`.
     """
     problem, flat = initial.problem(board), initial.flat(board)
     full = problem.free
@@ -165,8 +161,8 @@ def solve_inliers(
 
     Args:
         initial: initial values, with the points of the first round.
-        detected: all detections by camera, at the moments of `initial`; of these each round takes its points.
-        board: the board.
+        detected: all detections by camera, of which each round takes its points; KeyError for one at a moment
+            that `initial` has not.
         final: False accepts a focal length that is not observable.
 
     Returns:
@@ -174,8 +170,6 @@ def solve_inliers(
 
     Raises:
         ValueError: for a `final` fit without an observable focal length.
-        KeyError: for a detection at a moment that `initial` has not.
-        TypeError: as `InitialRig.problem`.
     """
     solved = solve(initial, board, final=final)
     for _ in range(ROUNDS - 1):
@@ -208,7 +202,6 @@ def observable(problem: BundleProblem, *, final: bool) -> tuple[BundleProblem, l
 
     Raises:
         ValueError: for an unobservable focal length if `final`.
-        KeyError: where `sigma` lacks a camera.
     """
     free = {name: mask.copy() for name, mask in problem.free.items()}
     cameras, notes = dict(problem.cameras), list[str]()
@@ -235,8 +228,7 @@ def observable(problem: BundleProblem, *, final: bool) -> tuple[BundleProblem, l
 
 
 def _worst(candidates: list[tuple[str, int]], information: np.ndarray) -> int | None:
-    """Index of the parameter with too large a deviation relative to its typical size; None if
-    there is none."""
+    """Index of the parameter with the largest deviation of those too large; None if there is none."""
     covariance = np.linalg.inv(information + np.eye(len(candidates)))
     shares = np.sqrt(np.maximum(covariance.diagonal(), 0))
     order = np.array([2 if i >= 8 else 1 if i >= 6 else 0 for _, i in candidates]) * (shares > UNOBSERVABLE)
@@ -245,10 +237,7 @@ def _worst(candidates: list[tuple[str, int]], information: np.ndarray) -> int | 
 
 
 def _with_deformation(solved: Solved, flat: BoardDeformation | None) -> Solved:
-    """Add the boards' deformations as unknowns if the points show them and frames agree on them.
-
-    If frames are too few to agree, the loss must fall by half.
-    """
+    """Deform boards if frames agree on it; with too few frames, if the loss falls by half."""
     if flat is None or solved.problem.deformation is not None:
         return solved
     trial, count = replace(solved.problem, deformation=flat), len(solved.problem.frames)
@@ -299,11 +288,7 @@ def adjust(problem: BundleProblem, *, rounds: int = 4, equal_noise: bool = False
 
 
 def readjusted(problem: BundleProblem) -> BundleProblem:
-    """Adjust a problem again from the solution of nearly the same one, with its noise.
-
-    Returns:
-        The adjusted problem, after at most 10 steps; the given one stays as it is.
-    """
+    """Return a problem adjusted again, with its noise, from a near solution, in 10 steps at most."""
     return _minimised(problem, iterations=10)[0]
 
 
@@ -438,7 +423,6 @@ def solve_together(initial: InitialRig, board: Board, singles: Mapping[str, Solv
 
     Args:
         initial: initial values of all cameras and boards.
-        board: the board.
         singles: solution of each camera alone, by name.
 
     Returns:
@@ -477,10 +461,7 @@ def solve_together(initial: InitialRig, board: Board, singles: Mapping[str, Solv
 def _wrong_images(
     solved: Solved, singles: Mapping[str, Solved], limit: Callable[[float], float]
 ) -> list[tuple[str, FrameKey]]:
-    """Images that fit their own camera and contradict the others, as of a board that moved between exposures.
-
-    One for each moment; none if they are too many of one camera's.
-    """
+    """Images that fit their own camera, not the others: one for each moment; none if too many."""
     reasons = dict[FrameKey, str]()
     alone = {name: frame_rms(single.problem)[name] for name, single in singles.items()}
     for misfit in misfits(solved):

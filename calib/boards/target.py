@@ -124,10 +124,7 @@ def parse_board(text: str) -> Board:
 
 
 def _options(text: str, options_text: Sequence[str], patterns: Mapping[str, str]) -> dict[str, str]:
-    """Options by the name of the pattern that each matches.
-
-    Raises ValueError for others, and for two of one kind.
-    """
+    """Options by the name of the pattern that each matches. ValueError for others, and two of one kind."""
     options: dict[str, str] = {}
     for option in options_text:
         name = next((n for n, p in patterns.items() if re.fullmatch(p, option)), None)
@@ -227,10 +224,7 @@ def _length(text: str, word: str) -> float:
 
 
 def _smallest_dictionary(text: str, name: str, markers: int) -> str:
-    """Smallest dictionary of a kind with enough markers; larger ones begin with the same markers.
-
-    Raises ValueError, naming the target's `text`, if there is none.
-    """
+    """Smallest dictionary of a kind with enough markers (all begin alike); ValueError without one."""
     names = [name.upper()] if "_" in name else [f"{name.upper()}_{n}" for n in (50, 100, 250, 1000)]
     for full in names:
         if hasattr(cv2.aruco, f"DICT_{full}") and len(marker_dictionary(full).bytesList) >= markers:
@@ -239,8 +233,7 @@ def _smallest_dictionary(text: str, name: str, markers: int) -> str:
 
 
 def _known_points(text: str) -> KnownPoints:
-    """Read points of a CSV file `targets.csv`, or `targets.csv:5x5_100` with their dictionary (4x4 by
-    default).
+    """Read points of a CSV file `targets.csv`, or `targets.csv:5x5_100` with their dictionary (or else 4x4).
 
     Columns id, x, y, z (metres) for markers' centres, or id, corner (0 to 3), x, y, z. Raises ValueError.
     """
@@ -297,11 +290,7 @@ def page_of(board: Board) -> tuple[float, float]:
 
 
 def smallest_paper(page: tuple[float, float]) -> str | None:
-    """Find the smallest sheet that a page (millimetres) fits on, upright or across.
-
-    Returns:
-        Name such as "A4"; None if no sheet is large enough.
-    """
+    """Return the smallest sheet that a page (millimetres) fits on, such as "A4"; None if none is."""
     fitting = [name for name, paper in PAPERS.items() if all(a <= b for a, b in zip(sorted(page), paper))]
     return fitting[0] if fitting else None
 

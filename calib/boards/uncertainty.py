@@ -67,8 +67,7 @@ class RigCovariance:
     matrix: Float[np.ndarray, "c c"]
 
     def selection(self, name: str, camera: Camera) -> Float[np.ndarray, "p c"]:
-        """Return the selection matrix (p, c) from these parameters to a camera's, in the order of
-        `parameter_names`."""
+        """Return the matrix (p, c) that selects a camera's `parameter_names` among these parameters."""
         entries = np.array([f"{name}.{entry}" for entry in parameter_names(camera)])
         return (entries[:, None] == np.array(self.names, dtype=str)).astype(np.float64)
 
@@ -85,9 +84,6 @@ class RigCovariance:
             path: JSON file.
             rig: rig to which the file must belong: all cameras equal, but for their sensors. None does not
                 check, nor is a file that states no rig.
-
-        Returns:
-            The covariance; it need not be positive.
 
         Raises:
             FileNotFoundError: for a missing file.
@@ -131,8 +127,6 @@ def beta_covariance(
     rig: Rig, covariance: RigCovariance, alpha: str, beta: str, x: Float[np.ndarray, "n 2"], depth: float
 ) -> Float[np.ndarray, "n 2 2"]:
     """Propagate a rig's covariance to the positions in beta of alpha's pixels at a depth.
-
-    To first order, by `arraygeom.uncertainty.position_covariance`.
 
     Args:
         x: pixels of alpha.
@@ -201,8 +195,7 @@ def in_own_frame(problem: BundleProblem, name: str) -> tuple[Camera, Float[np.nd
 
 
 def grid_points(camera: Camera, depth: float) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 3"]]:
-    """Return pixels over a camera's image, and their points at a depth in its frame, where the lens has a
-    ray."""
+    """Return a grid of pixels that have a ray, and their points at a depth in the camera's frame."""
     rows, columns = GRID
     h, w = camera.hw
     x = np.stack(np.meshgrid(np.linspace(0, w - 1, columns), np.linspace(0, h - 1, rows)), -1).reshape(-1, 2)
@@ -296,11 +289,10 @@ def jackknife(problem: BundleProblem) -> Jackknife:
     A plain jackknife's deviations are too large where few boards determine all parameters between them; Bell
     and McCaffrey's (2002) correction removes that.
 
-    Returns:
-        Covariances of the cameras' free parameters and of the boards' shapes, and the shapes after a step.
+    Args:
+        problem: a solution, with its noise.
 
     Raises:
-        KeyError: where `sigma` lacks a camera.
         numpy.linalg.LinAlgError: if parameters are not observable.
     """
     parts = linearised(problem)
@@ -347,9 +339,7 @@ def with_disagreement(solved: Solved, board: Board, *, unchecked: bool = False) 
 
     Args:
         solved: the solution; without a covariance it gets notes on boards alone.
-        board: the board.
-        unchecked: True to raise standard deviations by the factor `UNCHECKED` where frames are too few to
-            tell.
+        unchecked: True to raise deviations by the factor `UNCHECKED` where frames are too few to tell.
 
     Returns:
         The solution with that covariance, the largest factor in `raised` (1 for none), and notes added.

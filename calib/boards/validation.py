@@ -44,15 +44,12 @@ def epipolar_errors(
     """Compute epipolar errors by pair: distances of points from their lines, averaged over both directions.
 
     Args:
-        rig: rig that has the cameras in `views`.
+        rig: rig that has the cameras in `views`; ValueError without one.
         views: detections by camera; points of one moment and one index are common.
 
     Returns:
         Errors in undistorted pixels, one for each common point within both lens models; pairs without common
         points are absent.
-
-    Raises:
-        ValueError: for a camera that the rig has not.
     """
     errors = {}
     for a, b in combinations(views, 2):
@@ -105,7 +102,6 @@ def half_difference(fit: Solved, depth: float) -> dict[str, tuple[np.ndarray, np
     """Compare the fit to every other frame with the fit to the rest.
 
     Args:
-        fit: the fit to all frames.
         depth: depth at which projections are compared, metres.
 
     Returns:
@@ -157,8 +153,7 @@ class LensComparison:
 
     @property
     def advised(self) -> Lens:
-        """First model that predicts as well as the best, to a standard error or 1 %; brown-conrady without
-        errors."""
+        """First model as good as the best, to a standard error or 1 %; brown-conrady without errors."""
         if not self.errors:
             return "brown-conrady"
         best = min(self.errors, key=self.rms)
@@ -214,8 +209,7 @@ def _compared(name: str, views: BoardViews, board: Board) -> LensComparison:
 
 
 def _held_out(problem: BundleProblem, out: np.ndarray) -> Float[np.ndarray, " f"]:
-    """Mean square errors of the frames in `out` by a camera fitted to the others, with board poses fitted to
-    them."""
+    """Mean square errors of the frames in `out`, their boards' poses fitted, by a camera of the others."""
     fitted, judged = readjusted(problem.of_boards(~out)), problem.of_boards(out)
     (name,) = fitted.cameras
     if fitted.deformation is not None and judged.deformation is not None:
@@ -262,15 +256,12 @@ def start_notes(
 
     Args:
         detected: detections by camera before outliers were left out.
-        solved: solution of all cameras together, with priors about the start.
+        solved: solution with priors about the start; AssertionError for one without a covariance.
         deviations: standard deviations about the start.
         lens: lens model by camera that was asked for.
 
     Yields:
         Sentences on gains by the images, lenses, distance from the start, and images and points left out.
-
-    Raises:
-        AssertionError: for a solution without a covariance.
     """
     yield _gains(solved, deviations)
     for name, camera in solved.problem.cameras.items():

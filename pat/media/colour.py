@@ -65,17 +65,12 @@ def from_luma_chroma(
 
 
 def luminance_of(image: Float[Tensor, "_ h w"]) -> Float[Tensor, "_ h w"]:
-    """Return the luma (1, h, w) of an RGB image; an image of another number of channels is returned
-    unchanged."""
+    """Return the luma (1, h, w) of an RGB image; one of other channels is returned unchanged."""
     return luminance(image) if image.shape[0] == 3 else image
 
 
 def linear_from_srgb(values: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-    """Decode sRGB values to linear light (IEC 61966-2-1); the curve's linear part continues below zero.
-
-    Returns:
-        Linear light of the same shape, 1 at white.
-    """
+    """Decode sRGB values to linear light (IEC 61966-2-1), 1 at white; linear below zero."""
     toe = values <= 0.04045
     return torch.where(toe, values / 12.92, ((torch.where(toe, 0.5, values) + 0.055) / 1.055) ** 2.4)
 
@@ -122,11 +117,7 @@ def exposure_gain(image: Float[Tensor, "c h w"]) -> float:
 
 
 def exposed(image: Float[Tensor, "c h w"], gain: float) -> Float[Tensor, "c h w"]:
-    """Multiply an sRGB image's linear light by a factor.
-
-    Returns:
-        The sRGB image, not clipped; the same tensor for a gain of 1.
-    """
+    """Multiply an sRGB image's light by a factor, without clipping; the same tensor for a gain of 1."""
     if gain == 1:
         return image
     return chunked(lambda rows: srgb_from_linear(gain * linear_from_srgb(rows)), image)

@@ -79,8 +79,7 @@ def read_depth(path: str | Path, *, hw: HW | None = None, scale: float | None = 
 
 
 def _pfm(path: Path) -> NDArray[np.float32]:
-    """Read a grey PFM file: "Pf", width and height, scale (negative for little-endian), rows from the bottom
-    up."""
+    """Read a grey PFM file: "Pf", w, h, scale (negative for little-endian), rows from the bottom."""
     content = path.read_bytes()
     head = re.match(rb"Pf\s+(\d+)\s+(\d+)\s+([+-]?[0-9]*\.?[0-9]+(?:[eE][+-]?[0-9]+)?)(?:\r\n|\s)", content)
     if head is None:

@@ -82,7 +82,6 @@ def save_figure(figure: Figure, path: Path, *, dpi: int = 110) -> Path:
 
     Args:
         figure: figure; its canvas becomes Agg's.
-        path: file to write; missing folders are made.
         dpi: pixels for each inch of the figure's size.
 
     Returns:
@@ -116,10 +115,7 @@ def draw_panels(
         width: width of the figure, in units of 110 pixels.
 
     Returns:
-        One RGB image of Pillow.
-
-    Raises:
-        ValueError: for more columns than fit in the width.
+        One RGB image of Pillow. ValueError for more columns than fit in the width.
     """
     wide = round(110 * width) // columns - GAP
     h, w = next(iter(panels.values())).shape[-2:]

@@ -162,11 +162,7 @@ def _planes(
 
 
 def recorded_bands(values: Any, sensor: Sensor) -> Any:
-    """Reduce three equal bands to one for a camera that the rig declares grey.
-
-    Returns:
-        Values (1, h, w) in that case; otherwise `values` unchanged.
-    """
+    """Reduce three equal bands to one, (1, h, w), if the rig declares the camera grey; else unchanged."""
     grey = len(values) == 3 and sensor.response not in (None, "rgb")
     return values[:1] if grey and all((values[0] == band).all() for band in values[1:]) else values
 
@@ -214,8 +210,7 @@ def write_image(
 
 
 def has_many_bits(path: Path) -> bool:
-    """Return True for an image file with more than 8 bits a value, and for raw files; False if missing or
-    unreadable."""
+    """Return True for a file with more than 8 bits a value, and raw files; False if unreadable."""
     if path.suffix.lower() in RAW_SUFFIXES:
         return True
     header = image_header(path.read_bytes()) if path.is_file() else None
@@ -367,11 +362,7 @@ def _counts(planes: NDArray, label: str, bits: int | None, white: int) -> NDArra
 
 
 def exr_writer(path: Path) -> Any:
-    """Import the package OpenEXR, for writing to `path`.
-
-    Raises:
-        ValueError: naming the extra, if it is not installed.
-    """
+    """Import OpenEXR for writing to `path`; ValueError naming the extra if it is not installed."""
     return _of_extra("OpenEXR", "synthesis", f"{path}: writing EXR")
 
 
@@ -397,8 +388,7 @@ def _write_exr(path: Path, planes: NDArray, bits: int) -> None:
 
 
 def _encode(path: Path, colours: NDArray, bits: int) -> bytes:
-    """Encode an image in the format of the path's suffix. Raises ValueError for a format that
-    cannot hold it."""
+    """Encode an image in the format of the path's suffix; ValueError for one that cannot hold it."""
     suffix = path.suffix.lower()
     if suffix in (".jpg", ".jpeg") and bits != 8:
         raise ValueError(f"{path}: JPEG holds 8 bits, not {bits}: write .png or .tif")
@@ -443,8 +433,7 @@ def _quantised(colours: NDArray, bits: int) -> NDArray:
 
 @cache
 def srgb_profile() -> bytes:
-    """Return the bytes of an ICC profile of sRGB, with a fixed date (bytes 24 to 35) so that files are
-    reproducible."""
+    """Return the bytes of an sRGB profile, with a fixed date (bytes 24 to 35): files are reproducible."""
     made = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
     return made[:24] + struct.pack(">6H", 2000, 1, 1, 0, 0, 0) + made[36:]
 

@@ -36,10 +36,8 @@ def develop(
 
     Returns:
         sRGB values, 3 channels for a filter mosaic; at least 0 after a black level was subtracted, above 1
-        where light exceeds white; `image` itself where the sensor states nothing to be done.
-
-    Raises:
-        RuntimeError: for a mosaic that requires a gradient.
+        where light exceeds white; `image` itself where the sensor states nothing to be done. A mosaic that
+        requires a gradient raises RuntimeError.
     """
     factor = _light(sensor, like or sensor)
     if sensor.black_level:
@@ -84,7 +82,6 @@ def match_luminance(
     are shifted equally until luminance agrees.
 
     Args:
-        image: fused image, sRGB values.
         alpha: alpha's developed image, sRGB values.
         sensor: alpha's sensor as `developed` returns it.
 
@@ -97,8 +94,7 @@ def match_luminance(
 
 
 def _missing(image: Tensor, light: Tensor) -> Tensor:
-    """Shift of sRGB values that gives this luminance of light, by Newton's method on a convex function from
-    above."""
+    """Shift of sRGB values that gives this luminance of light, by Newton's method."""
     shift = torch.zeros_like(light)
     for _ in range(4):
         value = image + shift

@@ -59,10 +59,7 @@ class RecordedTags(NamedTuple):
         """Add the directories of EXIF and GPS to a TIFF file's first image; the file is rewritten in place.
 
         The file must be little-endian with offsets of 32 bits, as tifffile writes it, and have no such
-        directories yet; this is not checked.
-
-        Raises:
-            OSError: if the file is missing or cannot be written; it is not written atomically.
+        directories yet; this is not checked. OSError if it is missing or cannot be written.
         """
         content = bytearray(path.read_bytes())
         first = int.from_bytes(content[4:8], "little")

@@ -112,8 +112,7 @@ CONTRAST = 10.0
 
 
 def is_grey(image: Float[Tensor, "3 h w"]) -> bool:
-    """Return True for a decoded picture with contrast whose colours differ by no more than a codec's
-    rounding."""
+    """Return True for a decoded picture with contrast whose colours differ only by a codec's rounding."""
     differences = image.amax(0) - image.amin(0)
     low, high = image[1].aminmax()
     return float(differences.max()) < min(GREY_ROUNDED, float(high - low) / CONTRAST)

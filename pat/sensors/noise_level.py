@@ -125,12 +125,7 @@ class NoiseLevel:
         return srgb_from_linear(light.clamp(0, 1)) if linear else light.clamp(0, 1)
 
     def deviation(self, image: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
-        """Compute the standard deviation of a noisy sRGB image's values at the mean brightness around each
-        pixel.
-
-        Returns:
-            Deviations of values 0..1, of the image's shape.
-        """
+        """Compute the standard deviation of a noisy sRGB image's values by the brightness around each."""
         _, mean, deviation = self._curves(image)
         return _interpolated(_smoothed(image), mean, deviation)
 
@@ -160,8 +155,7 @@ class NoiseLevel:
 
 
 def _interpolated(x: Tensor, positions: Float[Tensor, "b n"], values: Float[Tensor, "b n"]) -> Tensor:
-    """Interpolate values given at increasing positions, at the entries of x (B, ...); constant beyond both
-    ends."""
+    """Interpolate values at increasing positions, at the entries of x (B, ...); constant beyond the ends."""
     flat = x.flatten(1).clamp(positions[:, :1], positions[:, -1:])
     i = torch.searchsorted(positions.contiguous(), flat.contiguous()).clamp(1, positions.shape[1] - 1)
     low, high = positions.gather(1, i - 1), positions.gather(1, i)

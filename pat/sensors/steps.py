@@ -238,11 +238,7 @@ def _separably(image: Tensor, kernel: Tensor) -> Tensor:
 
 
 def convolved(image: Tensor, kernel: Tensor) -> Tensor:
-    """Convolve each channel with an odd-sized kernel (kh, kw); the border is replicated.
-
-    Returns:
-        Images of the same shape. Even sides of the kernel are not supported and fail on the shape.
-    """
+    """Convolve each channel with a kernel (kh, kw) of odd sides (others fail); the border is replicated."""
     h, w = kernel.shape
     planes = pad(image.flatten(0, 1)[:, None], (w // 2, w // 2, h // 2, h // 2), mode="replicate")
     return conv2d(planes, kernel[None, None]).view(image.shape)
