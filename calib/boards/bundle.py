@@ -290,10 +290,10 @@ class Solved:
 
 
 class Linearised(NamedTuple):
-    """Weighted residuals and derivatives of one camera's pixels.
+    """Residuals and derivatives of one camera's pixels, both divided by the noise and weighted robustly.
 
     Attributes:
-        r: residuals (measured minus projected), in standard deviations, as the derivatives.
+        r: residuals, measured minus projected.
         by_shared: derivatives of projections by the camera's free parameters and all boards' deformations.
         by_board: derivatives by the pose of each point's board, rotation vector and translation.
         block: index of each point's board pose.

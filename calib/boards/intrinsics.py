@@ -172,8 +172,7 @@ def _projection_errors(
 
 
 def near_homography(detection: Detection, board: Board) -> Detection:
-    """Drop points that no homography of the board fits (least median of squares), with tolerance for
-    distortion.
+    """Drop points far from the board's homography (least median of squares); distortion is tolerated.
 
     Returns:
         The remaining points; all for a board that is not flat, fewer than `FEWEST_POINTS` points, or without

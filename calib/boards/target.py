@@ -308,7 +308,7 @@ def draw_board(board: Board, *, paper: str | None = None) -> Figure:
     """Draw a board at true size, with a white margin and a ruler below to check the print.
 
     Args:
-        board: a single printed board, no points in space.
+        board: a single board, no `KnownPoints`.
         paper: sheet of `PAPERS` such as "A4", upright or across, in whose middle the board is drawn; None for
             a page of the board's size.
 

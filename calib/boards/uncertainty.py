@@ -82,8 +82,8 @@ class RigCovariance:
 
         Args:
             path: JSON file.
-            rig: rig to which the file must belong: all cameras equal, but for their sensors. None does not
-                check, nor is a file that states no rig.
+            rig: rig to which the file must belong: all cameras equal, but for their sensors; a file that
+                states no rig passes. None does not check.
 
         Raises:
             FileNotFoundError: for a missing file.

@@ -44,7 +44,7 @@ def epipolar_errors(
     """Compute epipolar errors by pair: distances of points from their lines, averaged over both directions.
 
     Args:
-        rig: rig that has the cameras in `views`; ValueError without one.
+        rig: rig that has the cameras in `views`; ValueError if it lacks one.
         views: detections by camera; points of one moment and one index are common.
 
     Returns:

@@ -103,7 +103,7 @@ WANTED = 0.8
 def exposure_gain(image: Float[Tensor, "c h w"]) -> float:
     """Compute the gain that brings the brightest part of a dark or overexposed sRGB image to `WANTED`.
 
-    The brightest part is the quantile `BRIGHT` of linear light, of luma or of the mean of other channels.
+    The brightest part is the quantile `BRIGHT` of linear light, by RGB's luma or the mean of other channels.
 
     Returns:
         Factor of linear light; 1 if that quantile is within `ORDINARY` already, or black; NaN if NaN is among

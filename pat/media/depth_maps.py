@@ -42,7 +42,7 @@ def read_depth(path: str | Path, *, hw: HW | None = None, scale: float | None = 
     """Read a depth map from a PFM, TIFF or 16-bit PNG file.
 
     Args:
-        hw: expected (height, width); None accepts up to `MOST_PIXELS` (PFM: any).
+        hw: expected (height, width); None accepts any.
         scale: metres for each unit of the file; None takes 1 for float files, and for integers the scale that
             a depth_16.png of `pat fuse` states, or else `MILLIMETRE`.
 
@@ -52,7 +52,7 @@ def read_depth(path: str | Path, *, hw: HW | None = None, scale: float | None = 
     Raises:
         FileNotFoundError: for a missing file.
         ValueError: for a file that is no depth map (colour, 8 bits, no positive depth after scaling), has
-            another size, states no usable scale, or cannot be read (as `read_image`).
+            another size, states no usable scale, or cannot be read (as `read_image` without `hw`).
     """
     path = Path(path)
     if not path.is_file():

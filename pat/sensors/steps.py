@@ -205,7 +205,7 @@ class Quantise(Step):
 class Jitter(Step):
     """Random gain, gamma and white balance of sRGB values, drawn for each image of the batch.
 
-    A value v becomes gain · channel gain · v^gamma, clipped to 0..1; the logarithms' mean is 0.
+    A value v becomes gain · channel gain · v^gamma, clipped to 0..1; gains and gamma are log-normal about 1.
 
     Attributes:
         gain: standard deviation of the natural logarithm of the gain of all channels.
