@@ -154,7 +154,7 @@ class Charuco(MarkedBoard):
     """Chessboard with markers in its white squares; `columns` x `rows` counts inner corners, its points.
 
     The fields of `Board` (`spacing` is a square's side) and `MarkedBoard` come first. Values that do not fit
-    together raise cv2.error when the board is detected or drawn.
+    together fail in OpenCV when the board is detected or drawn.
 
     Attributes:
         marker: side of a marker, metres, less than `spacing`.

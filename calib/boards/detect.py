@@ -124,7 +124,7 @@ def explain(images: Iterable[Grey], board: Board, *, confirmed: bool = False) ->
         confirmed: True if other images show it, so that it is not another board.
 
     Returns:
-        A sentence: the reason of most images, or that there are none.
+        A sentence: the commonest reason, or that there are no images.
     """
     reasons = Counter(_reason(grey, board, confirmed=confirmed) for grey in images)
     return reasons.most_common(1)[0][0] if reasons else "there are no images"

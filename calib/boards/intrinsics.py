@@ -239,7 +239,7 @@ def board_pose(camera: Camera, detection: Detection, board: Board) -> Pose:
 
     Raises:
         ValueError: if fewer than four points have a ray, within a half space about their mean, as by a lens
-            far from the true one.
+            far from the true one, or all lie on a line.
         cv2.error: if OpenCV fails on the points.
     """
     rays, valid = _unit_rays(camera, detection)

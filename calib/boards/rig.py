@@ -95,8 +95,8 @@ def calibrate(
 
     Raises:
         ValueError: with advice, for no views, an unknown lens model, too few images, parallel boards, cameras
-            without common frames, frames that contradict each other, or a start that does not fit;
-            numpy.linalg.LinAlgError, which is one, if frames determine too little.
+            without common frames, frames that contradict each other or determine too little
+            (numpy.linalg.LinAlgError), or a start that does not fit.
         cv2.error: if OpenCV fails on a board's pose.
     """
     if not views:

@@ -143,11 +143,12 @@ def parse_boards(texts: Sequence[str]) -> Board:
         The board, or `Boards`.
 
     Raises:
-        ValueError: for text that is no board, and several boards without markers or with the same ones.
+        ValueError: for no text or one that is no board, and several boards without markers or with the same.
         FileNotFoundError: for a missing file.
-        IndexError: for no text.
     """
     boards = [parse_board(text) for text in texts]
+    if not boards:
+        raise ValueError(f"no board is given, and one is needed: write it like {FORMS}")
     if len(boards) == 1:
         return boards[0]
     used: dict[str, set[int]] = {}

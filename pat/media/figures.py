@@ -27,7 +27,7 @@ def colour_depth(depth: Float[Tensor, "h w"]) -> Float[Tensor, "3 h w"]:
     """Colour a depth map by inverse depth, from its 1st to its 99th percentile.
 
     Args:
-        depth: positive; NaN and infinity are unknown, 0 counts as infinitely near.
+        depth: positive; NaN and infinity are unknown. 0 is not refused, and spoils the colours of all.
 
     Returns:
         RGB image (3, h, w) 0..1, float32 on the CPU; near is red, far dark blue, unknown black.
@@ -78,7 +78,7 @@ def figure_file(path: Path) -> Path:
 
 
 def save_figure(figure: Figure, path: Path, *, dpi: int = 110) -> Path:
-    """Write a matplotlib figure atomically, in the format of the path's suffix (see `figure_file`).
+    """Write a matplotlib figure atomically, in the format of the path's suffix.
 
     Args:
         figure: figure; its canvas becomes Agg's.
@@ -88,11 +88,12 @@ def save_figure(figure: Figure, path: Path, *, dpi: int = 110) -> Path:
         The path.
 
     Raises:
-        ValueError: for a suffix that matplotlib does not write.
-        OSError: if it cannot be written, or has no suffix.
+        ValueError: as `figure_file`.
+        OSError: if it cannot be written.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
+    figure_file(path)
     FigureCanvasAgg(figure)
     with write_atomically(path) as temporary:
         figure.savefig(temporary, dpi=dpi)
