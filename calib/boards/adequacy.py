@@ -41,10 +41,10 @@ class Coverage(NamedTuple):
     """Coverage of one camera's image and depths by the boards that it saw.
 
     Attributes:
-        cells: number of points in each cell (row, column) of the image.
+        cells: number of points in each of the `CELLS` (rows, columns) of the image.
         depths: depth of the nearest and the farthest point, metres.
-        tilts: least and largest angle between a board's normal and the optical axis, degrees.
-        missing: advice, one sentence each.
+        tilts: least and largest angle between a board's normal and the optical axis, 0 to 90 degrees.
+        missing: advice on what is missing, one sentence each, without the camera's name; empty if nothing is.
     """
 
     cells: Int[np.ndarray, "r c"]
@@ -62,11 +62,8 @@ def coverage(views: BoardViews, cam_from_board: Mapping[FrameKey, Pose], board: 
     """Compute a camera's coverage from its detections and the boards' poses in its frame.
 
     Args:
-        views: detections, at least one.
-        cam_from_board: pose of the board at the moment of each detection; a missing one raises KeyError.
-
-    Returns:
-        Coverage, with advice on what is missing.
+        views: detections of `board`; ValueError for none.
+        cam_from_board: pose of the board at the moment of each detection; KeyError for a missing one.
     """
     cells = point_counts([d.x for d in views.seen.values()], views.hw)
     poses = {key: cam_from_board[key] for key in views.seen}
@@ -83,7 +80,7 @@ def point_counts(parts: Iterable[Float[np.ndarray, "_ 2"]], hw: HW) -> Int[np.nd
     """Count points (x, y) in each of the `CELLS` of an image of size `hw`.
 
     Returns:
-        Counts (rows, columns).
+        Counts (rows, columns), int64; points outside the image are not counted.
     """
     x = np.concatenate([np.zeros((0, 2)), *parts])
     counts, _, _ = np.histogram2d(
@@ -115,10 +112,12 @@ def _missing(coverage: Coverage, board: Board) -> Iterator[str]:
 class NextView(NamedTuple):
     """Proposed view of a board, which lowers a camera's uncertainty of projection.
 
+    Uncertainty is the standard deviation of a projection, its length, in the median over the image.
+
     Attributes:
-        text: the view in words.
-        before: median uncertainty of projection without it, pixels.
-        after: median uncertainty with it and the proposals before it, pixels.
+        text: the view in words: position, distance and tilt of the board.
+        before: uncertainty with the proposals before this one, pixels.
+        after: uncertainty with this one too, pixels.
     """
 
     text: str
@@ -130,12 +129,14 @@ def next_views(intrinsics: Intrinsics, board: Board, depth: float, *, count: int
     """Propose the views that lower a camera's uncertainty of projection most, one after the other.
 
     Args:
+        intrinsics: camera with the covariance of its free intrinsics, at least one.
+        board: the board; of several the first is proposed.
         depth: depth in metres at which uncertainty is evaluated.
         count: number of views; a view may be proposed again.
 
     Returns:
-        Up to `count` views; none for points in space, or if the image shows hardly any of the board in every
-        candidate (a strip).
+        `count` views; none for points in space, or if every candidate shows hardly any of the board (a
+        strip).
 
     Raises:
         numpy.linalg.LinAlgError: for a singular covariance.
@@ -162,8 +163,13 @@ def next_views(intrinsics: Intrinsics, board: Board, depth: float, *, count: int
 def proposed_views(camera: Camera, board: Board) -> Mapping[str, Float[np.ndarray, "n 3"]]:
     """List candidate views of a board: 9 positions, 2 distances, 4 tilts.
 
+    Args:
+        camera: camera at the origin.
+        board: a single board.
+
     Returns:
-        Board points (n, 3) in the camera's frame, metres, by description.
+        The board's points (n, 3) in the camera's frame, metres, by description; some may lie outside the
+        image. NaN where the lens has no ray to the board's middle.
     """
     proposals, (h, w) = {}, camera.hw
     middle = torch.from_numpy(board.middle)
@@ -182,8 +188,7 @@ def proposed_views(camera: Camera, board: Board) -> Mapping[str, Float[np.ndarra
 
 
 def _gain(intrinsics: Intrinsics, X: np.ndarray) -> np.ndarray | None:
-    """Information of a view on the free intrinsics, its pose unknown; None if hardly any of the board is
-    visible."""
+    """Information of a view, its pose unknown, on the free intrinsics; None if it hardly shows the board."""
     projected = intrinsics.camera.project_local(torch.from_numpy(X))
     inside = (projected.valid & intrinsics.camera.contains(projected.x)).numpy()
     if inside.sum() < 0.6 * len(X) or not inside.any():
@@ -207,6 +212,8 @@ def coverages(calibration: Calibration) -> dict[str, Coverage]:
 
 def coverage_advice(calibration: Calibration, *, always: bool = False) -> Iterator[str]:
     """Yield advice on each camera's coverage and, where something is missing, the views that would help most.
+
+    No views are proposed for a fit without a covariance, and where `next_views` has none.
 
     Args:
         always: True to propose views where nothing is missing too.

@@ -26,6 +26,8 @@ ON_A_LINE = 0.01
 class Board:
     """Base class of calibration boards: a flat grid of points in the plane z = 0, x across, y down.
 
+    Subclasses say where they differ. Constructors check nothing: `parse_board` does.
+
     Attributes:
         columns: points in a row.
         rows: number of rows.
@@ -55,11 +57,11 @@ class Board:
 
     @cached_property
     def symmetries(self) -> tuple[Int[np.ndarray, " n"], ...]:
-        """Renumberings of the points under rotations that map the board onto itself, the identity first.
+        """Renumberings of the points under quarter turns that map the board onto itself, the identity first.
 
         A detector may number the points in any of these ways: colours do not disambiguate them, as they are
-        inverted in some images (near infrared). Each is an array with the new number of every point. Boards
-        with markers have the identity only.
+        inverted in some images (near infrared). Each is an array (n) of integers, the new number of every
+        point. Boards with markers have the identity only.
         """
         if self.identified:
             return (np.arange(len(self.points)),)
@@ -102,9 +104,11 @@ class Board:
 class MarkedBoard(Board):
     """Board whose points are identified by markers: a part of it is enough, its orientation is unambiguous.
 
+    The fields of `Board` come first.
+
     Attributes:
         dictionary: name of OpenCV's dictionary of markers, such as "4x4_50".
-        markers: number in the dictionary of each marker of the board, in the board's order.
+        markers: number in the dictionary of each marker of the board, in the board's order; a tuple or range.
     """
 
     dictionary: str
@@ -147,12 +151,13 @@ class Chessboard(Board):
 
 @dataclass(frozen=True)
 class Charuco(MarkedBoard):
-    """Chessboard with markers in its white squares; `columns` x `rows` counts inner corners.
+    """Chessboard with markers in its white squares; `columns` x `rows` counts inner corners, its points.
 
-    Fields begin with those of `Board` (`spacing` is a square's side) and `MarkedBoard`.
+    The fields of `Board` (`spacing` is a square's side) and `MarkedBoard` come first. Values that do not fit
+    together fail in OpenCV when the board is detected or drawn.
 
     Attributes:
-        marker: side of a marker, metres.
+        marker: side of a marker, metres, less than `spacing`.
         legacy: True for the layout of OpenCV before 4.6.
     """
 
@@ -190,8 +195,9 @@ class Charuco(MarkedBoard):
 class AprilGrid(MarkedBoard):
     """Kalibr's grid of AprilTags. Its points are the corners of all tags, four each.
 
-    Fields begin with those of `Board` and `MarkedBoard`. Tags are numbered row by row from below. `columns`
-    and `rows` count points, two for each tag; `spacing` is twice the gap between two tags, metres.
+    The fields of `Board` and `MarkedBoard` come first. Tags are numbered row by row from below, points from
+    above. `columns` and `rows` count points, two for each tag; `spacing` is twice the gap between two tags,
+    metres.
 
     Attributes:
         tag: side of a tag, metres.
@@ -240,12 +246,13 @@ class AprilGrid(MarkedBoard):
 
 @dataclass(frozen=True)
 class Boards(Board):
-    """Several boards in view at once, each with its own pose; their points form one list.
+    """Several boards in view at once, each with its own pose; their points form one list, each in its own
+    board's frame.
 
-    `columns`, `rows` and `spacing` are the first board's.
+    `columns`, `rows` and `spacing` are the first board's. All count as flat, points in space too.
 
     Attributes:
-        boards: the single boards.
+        boards: the single boards, at least one.
     """
 
     boards: tuple[Board, ...] = ()
@@ -269,7 +276,8 @@ class Boards(Board):
 class Circles(Board):
     """Grid of black circles on white, `columns` x `rows`.
 
-    In an asymmetric one circles of a row are 2 `spacing` apart, and every other row is shifted by one.
+    The points are their centres. In an asymmetric grid circles of a row are 2 `spacing` apart, rows are
+    `spacing` apart, and every other row is shifted by one `spacing`.
 
     Attributes:
         asymmetric: True for OpenCV's asymmetric grid.
@@ -307,7 +315,10 @@ class Circles(Board):
 
 @dataclass(frozen=True)
 class KnownPoints(MarkedBoard):
-    """Points at surveyed positions: centres or corners of markers. `columns` is their number, `rows` 1.
+    """Points at surveyed positions: centres or corners of markers.
+
+    The fields of `Board` and `MarkedBoard` come first: `columns` is the number of points, `rows` 1, `spacing`
+    their median distance from the nearest other.
 
     Attributes:
         file: file that they were read from.
@@ -365,11 +376,7 @@ def apart(points: Float[np.ndarray, "n k"]) -> Float[np.ndarray, " n"]:
 
 
 def marker_dictionary(name: str) -> cv2.aruco.Dictionary:
-    """Return OpenCV's marker dictionary of a name such as "4x4_50".
-
-    Raises:
-        AttributeError: for a name that OpenCV does not have.
-    """
+    """Return OpenCV's marker dictionary of a name such as "4x4_50"; AttributeError for another name."""
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name.upper()}"))
 
 

@@ -49,9 +49,9 @@ class Observations(NamedTuple):
     """Board points that one camera observed, of all its images.
 
     Attributes:
-        block: index of each point's board pose.
-        p: position of each on the board, metres.
-        x: pixel of each.
+        block: index of each point's board pose in `BundleProblem.boards`.
+        p: position of each on the board before it is deformed, in the board's frame, metres.
+        x: pixel (x, y) of each.
     """
 
     block: Int[np.ndarray, " n"]
@@ -61,16 +61,16 @@ class Observations(NamedTuple):
 
 @dataclass(frozen=True)
 class BundleProblem:
-    """Bundle adjustment problem: cameras, board poses and observed points.
+    """Bundle adjustment problem: cameras, board poses and observed points. Tensors are float64 on the CPU.
 
     Attributes:
         cameras: cameras by name.
-        boards: poses `world_from_board`, a batch, one for each moment.
-        seen: observations by camera.
-        frames: moment of each board pose.
+        boards: poses `world_from_board`, a batch (b), all of them free.
+        seen: observations by camera, at least one point each.
+        frames: moment of each board pose, in the order of `boards`.
         free: mask by camera of the parameters that may change, in the order of `parameter_names`.
         sigma: standard deviation of the noise along x or y by camera, pixels; empty before it is estimated.
-        priors: priors of parameters by camera.
+        priors: priors of parameters by camera; cameras without one are missing.
         deformation: shapes of the boards, adjusted with the cameras; None for flat boards.
     """
 
@@ -106,8 +106,7 @@ class BundleProblem:
         return self.deformation.deformed(observed.p, self.deformation.part[observed.block])
 
     def rotated(self, name: str) -> Float[np.ndarray, "n 3"]:
-        """Return the points that a camera observed relative to their board's origin, in the world's axes,
-        metres."""
+        """Return the points that a camera observed less their board's origin, in the world's axes, metres."""
         return np.einsum("nij,nj->ni", self.boards.R.numpy()[self.seen[name].block], self.on_board(name))
 
     def world(self, name: str) -> Float[np.ndarray, "n 3"]:
@@ -130,13 +129,11 @@ class BundleProblem:
 
     @cached_property
     def loss(self) -> float:
-        """Compute the robust loss that the adjustment minimises; `sigma` must be known.
+        """Robust loss that the adjustment minimises, a number without unit.
 
         A residual of length s, in standard deviations, costs s^2 / 2 up to k = `ROBUST`, and
-        k^2 (1/2 + log(s / k)) beyond. Priors of cameras and of board shapes are added.
-
-        Returns:
-            The sum over all points.
+        k^2 (1/2 + log(s / k)) beyond. The loss is the sum over all points, plus the priors of cameras and of
+        board shapes. KeyError where `sigma` lacks a camera.
         """
         total = sum(prior.loss(self.cameras[name]) for name, prior in self.priors.items())
         if self.deformation is not None:
@@ -154,7 +151,7 @@ class BundleProblem:
             kept: mask of the board poses.
 
         Returns:
-            The smaller problem, with the same cameras.
+            The smaller problem, with the same cameras, of which some may have no points left.
         """
         index, observations = np.cumsum(kept) - 1, {}
         for name, s in self.seen.items():
@@ -172,11 +169,12 @@ class BundleProblem:
         """Change the free parameters and the boards' poses by a step.
 
         Args:
-            change: steps of the cameras' free parameters, then of the boards' shapes.
-            boards: steps of each board's pose: rotation vector in radians, translation in metres.
+            change: steps of the cameras' free parameters in the order of `names`, then of the boards' shapes.
+            boards: steps of each board's pose: rotation vector in radians about the world's axes, translation
+                in metres.
 
         Returns:
-            The problem after the step.
+            The problem after the step (see `changed` and `Pose.perturbed`).
         """
         cameras, offset = {}, 0
         for name, camera in self.cameras.items():
@@ -201,10 +199,10 @@ class InitialRig(NamedTuple):
         cameras: cameras by name.
         boards: `world_from_board` by moment.
         views: detections by camera, numbered consistently.
-        left_out: images (camera, moment) that contradict the others.
-        priors: priors of cameras whose poses are roughly known; None for priors of ordinary cameras, the
-            first of which is the world.
-        deformation: shapes of the boards; None for flat ones.
+        left_out: images (camera, moment) that contradict the others and are not in `views`.
+        priors: priors by camera, with their roughly known poses; None for priors of ordinary cameras, of
+            which the first keeps its pose.
+        deformation: shapes of the boards to begin with; None for flat boards.
     """
 
     cameras: Mapping[str, Camera]
@@ -221,6 +219,10 @@ class InitialRig(NamedTuple):
 
         Returns:
             The problem, without noise levels.
+
+        Raises:
+            KeyError: for a detection at a moment without a board pose, and a camera without views.
+            TypeError: for a camera whose views have no detection.
         """
         index, observations, free = {key: i for i, key in enumerate(self.boards)}, {}, {}
         for number, (name, camera) in enumerate(self.cameras.items()):
@@ -250,15 +252,17 @@ class InitialRig(NamedTuple):
 class Solved:
     """Solution of a bundle adjustment, its noise estimated from the residuals.
 
+    `adjust` fills the first three fields; the functions around it add the others.
+
     Attributes:
         problem: the adjusted problem.
-        covariance: covariance of the cameras' free parameters in their own units; None if they are not
-            observable.
-        converged: True if the iteration converged.
+        covariance: covariance of the cameras' free parameters (`names`) in their own units; None if they are
+            not observable.
+        converged: True if the last iteration converged.
         notes: sentences on the solution.
-        raised: largest factor by which a standard deviation was raised to that of the jackknife.
-        views: detections used.
-        left_out: images (camera, moment) that contradict other cameras' images.
+        raised: largest factor by which `with_disagreement` raised a standard deviation; 1 for none.
+        views: detections used by camera.
+        left_out: images (camera, moment) that contradict other cameras' images or the start rig.
     """
 
     problem: BundleProblem
@@ -276,8 +280,7 @@ class Solved:
 
     @property
     def deviations(self) -> dict[str, float]:
-        """Standard deviation of each free parameter by name ("left.focal.0"), in its own unit; empty without
-        a covariance."""
+        """Standard deviation of each free parameter, in its unit, by name; empty without a covariance."""
         if self.covariance is None:
             return {}
         return dict(zip(self.names, np.sqrt(self.covariance.diagonal()).tolist()))
@@ -287,14 +290,14 @@ class Solved:
 
 
 class Linearised(NamedTuple):
-    """Weighted residuals and derivatives of one camera's pixels.
+    """Residuals and derivatives of one camera's pixels, both divided by the noise and weighted robustly.
 
     Attributes:
-        r: residuals.
-        by_shared: derivatives by the camera's free parameters and the boards' deformations.
-        by_board: derivatives by the pose of each point's board.
-        block: index of each point's board.
-        columns: columns of `by_shared` among those of all cameras.
+        r: residuals, measured minus projected.
+        by_shared: derivatives of projections by the camera's free parameters and all boards' deformations.
+        by_board: derivatives by the pose of each point's board, rotation vector and translation.
+        block: index of each point's board pose.
+        columns: row and column of the normal equations' H for each column of `by_shared`.
     """
 
     r: Float[np.ndarray, "n 2"]
@@ -305,7 +308,7 @@ class Linearised(NamedTuple):
 
 
 def linearised(problem: BundleProblem) -> dict[str, Linearised]:
-    """Linearise a problem about its present values; `sigma` must be known.
+    """Linearise a problem about its present values; KeyError where `sigma` lacks a camera.
 
     Returns:
         Residuals and derivatives by camera, weighted by robustness and noise.
@@ -345,11 +348,11 @@ class NormalEquations:
     """Normal equations [H W; W^T B] [cameras; boards] = [g; h].
 
     Attributes:
-        H: block of the cameras and deformations.
-        W: coupling with each board (b, c, 6).
-        B: block of each board (b, 6, 6).
-        g: right-hand side of the cameras and deformations.
-        h: right-hand side of the boards.
+        H: block of the cameras' free parameters and then the deformations (c, c).
+        W: coupling with each board pose (b, c, 6).
+        B: block of each board pose (b, 6, 6).
+        g: right-hand side of the cameras and deformations (c).
+        h: right-hand side of the board poses (b, 6).
         shapes: number of the last rows of H that belong to deformations.
     """
 
@@ -361,10 +364,11 @@ class NormalEquations:
     shapes: int = 0
 
     def solve(self, damping: float) -> tuple[Array, Array]:
-        """Solve for a step of the cameras (c,) and boards (b, 6), with diagonals multiplied by 1 + damping.
+        """Solve for a step, with diagonals multiplied by 1 + damping.
 
         Returns:
-            Both steps.
+            Steps of the cameras and deformations (c), the shortest where they are not determined, and of the
+            board poses (b, 6), as `BundleProblem.stepped` takes them.
         """
         S, Y, inverse = self.reduced(damping)
         scale = 1 / np.sqrt(np.maximum(S.diagonal(), 1e-300))
@@ -374,8 +378,7 @@ class NormalEquations:
         return change, boards
 
     def information(self) -> Array:
-        """Compute the inverse covariance (c, c) of the camera parameters, marginalised over boards and
-        deformations."""
+        """Compute the cameras' inverse covariance (c, c), marginalised over boards and deformations."""
         S, _, _ = self.reduced(0.0)
         c = len(S) - self.shapes
         return S[:c, :c] - S[:c, c:] @ np.linalg.solve(S[c:, c:], S[c:, :c])
@@ -397,10 +400,10 @@ def normal_equations(problem: BundleProblem, parts: Mapping[str, Linearised]) ->
     """Assemble the Gauss-Newton equations of free camera parameters, board shapes and board poses.
 
     Args:
-        parts: result of `linearised`.
+        parts: result of `linearised`; ValueError for a camera without points.
 
     Returns:
-        The equations, priors included.
+        The equations, with the priors of cameras and of board shapes.
     """
     shapes = 0 if problem.deformation is None else len(problem.deformation)
     b, c = len(problem.frames), len(problem.names) + shapes
@@ -432,11 +435,14 @@ def block_sums(
 
     Args:
         block: block of each value, 0 to `count` - 1.
-        values: values (n, *k).
+        values: values (n, *k), n at least 1.
         count: number of blocks.
 
     Returns:
         Sums (count, *k); 0 for a block without values.
+
+    Raises:
+        ValueError: for no values, and a block out of range.
     """
     marks = csr_array((np.ones(len(block)), (block, np.arange(len(block)))), (count, len(block)))
     return np.asarray(marks @ values.reshape(len(values), -1)).reshape(count, *values.shape[1:])
@@ -451,8 +457,7 @@ def robust_weights(lengths: Array) -> Array:
 
 
 def parameter_sizes(camera: Camera) -> dict[str, int]:
-    """Return the length of each of a camera's parameter vectors, keyed as in a rig whose camera
-    is called ""."""
+    """Return the length of each of a camera's parameter vectors, by name: ".rotation" and so on."""
     lens = {} if camera.distortion is None else {".distortion": camera.distortion.coefficients.shape[-1]}
     return {".rotation": 3, ".translation": 3, ".focal": 2, ".centre": 2} | lens
 
@@ -476,7 +481,8 @@ def changed(camera: Camera, change: torch.Tensor) -> Camera:
     """Change a camera's parameters.
 
     Args:
-        change: changes of all parameters, in the order of `parameter_names`; rotations in radians.
+        change: changes of all parameters, float64, in the order of `parameter_names`; the rotation is a
+            vector in radians about the camera's axes, the others are added.
 
     Returns:
         The camera; lens coefficients stay within their model's bounds, such as 0 for unified's xi.
@@ -492,22 +498,18 @@ def changed(camera: Camera, change: torch.Tensor) -> Camera:
 
 
 def camera_jacobian(camera: Camera, X: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 p"]:
-    """Compute the derivatives of world points' pixels by a camera's parameters, in the order of
-    `parameter_names`.
-
-    Returns:
-        Derivatives (n, 2, p).
-    """
+    """Compute the derivatives (n, 2, p) of world points' pixels by a camera's `parameter_names`."""
     return linear_projection(camera, X)[1]
 
 
 def linear_projection(
     camera: Camera, X: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 p"]]:
-    """Project world points, and differentiate by the camera's parameters (`camera_jacobian`).
+    """Project world points, and differentiate by the camera's parameters.
 
     Returns:
-        Pixels (n, 2) and derivatives (n, 2, p). Validity is not checked.
+        Pixels (n, 2), and derivatives (n, 2, p) in the order of `parameter_names`. Validity is not checked:
+        points behind the camera get numbers that mean nothing.
     """
     local = camera.cam_from_world.apply(torch.from_numpy(X)).detach()
     plane, *slopes = lens_derivatives(camera.distortion, local)
@@ -523,10 +525,11 @@ def with_default(camera: Camera, entry: str) -> tuple[Camera, str]:
     """Reset one intrinsic parameter: a principal point to the centre, a lens term to no effect.
 
     Args:
-        entry: name such as "centre.0" or "distortion.2"; focal lengths are not supported.
+        entry: "centre.0" (x), "centre.1" (y), or a term such as "distortion.2" of the camera's lens; no
+            others.
 
     Returns:
-        The camera, and what was done in words.
+        The camera, and a sentence on what was done.
     """
     kind, index = entry.split(".")[0], int(entry.split(".")[1])
     if kind == "centre":
@@ -549,8 +552,8 @@ class CameraPrior(NamedTuple):
 
     Attributes:
         mean: mean in the order of `parameter_names`; 0 for the pose.
-        information: inverse covariance, the pose's part for a rotation vector about the camera's axes and the
-            optical centre in the world (not the translation), metres.
+        information: inverse covariance, 0 where nothing is known; the pose's part is for a rotation vector
+            about the camera's axes and the optical centre in the world (not the translation), metres.
         pose: mean of the pose; None for no prior of it.
     """
 
@@ -559,8 +562,7 @@ class CameraPrior(NamedTuple):
     pose: Pose | None = None
 
     def equations(self, camera: Camera) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, " p"]]:
-        """Return the prior's part of the normal equations: inverse covariance (p, p) and negative gradient
-        (p)."""
+        """Return the prior's part of the equations: inverse covariance (p, p) and negative gradient (p)."""
         derivatives = np.eye(len(self.mean))
         if self.pose is not None:
             derivatives[3:6, :6] = camera.cam_from_world.centre_jacobian.numpy()
@@ -585,7 +587,7 @@ def typical_sizes(camera: Camera) -> Float[np.ndarray, " p"]:
     """Return typical errors of a camera's parameters before any measurement.
 
     Returns:
-        Errors in the order of `parameter_names`: radians, metres, pixels, and numbers of the lens.
+        Errors in the order of `parameter_names`: radians, metres, pixels, and the lens's own units.
     """
     lens = camera.distortion
     coefficients = () if lens is None else typical_coefficients(lens)
@@ -604,7 +606,7 @@ def typical_prior(camera: Camera) -> CameraPrior:
     plausible.
 
     Returns:
-        The prior, without a pose.
+        The prior, without a pose; of the focal lengths only their equality is known.
     """
     h, w = camera.hw
     deviation = typical_sizes(camera)

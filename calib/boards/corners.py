@@ -51,11 +51,11 @@ Map = Callable[[Float[np.ndarray, "n 2"]], Float[np.ndarray, "n 2"]]
 
 
 class EdgeGeometry(NamedTuple):
-    """Geometry of the two edges through each chessboard corner.
+    """Geometry of the two edges through each chessboard corner: first along the board's y, then along x.
 
     Attributes:
-        along: tangent of each edge, pixels for each square.
-        normal: unit normal, towards the next square.
+        along: tangent of each edge (x, y), pixels for each square.
+        normal: unit normal (x, y), towards the next square.
         curvature: pixels along the normal by which the edge leaves its tangent, per squared pixel along it.
     """
 
@@ -75,13 +75,16 @@ def refine_corners(
 
     Args:
         grey: image, 8 bits.
-        x: approximate pixels.
+        x: approximate pixels, float64.
         p: positions on the board, in squares.
         clear: squares from a corner's edges within which there is nothing but its own four squares.
 
     Returns:
         Pixels, and True for corners that fit the model; the others keep `x`. Fewer than `FEWEST` corners are
         not fitted: all keep `x` and are True.
+
+    Raises:
+        cv2.error: if no homography fits the corners.
     """
     refined, good = x, np.ones(len(x), dtype=bool)
     for _ in range(PASSES):
@@ -98,10 +101,13 @@ def smooth_map(p: Float[np.ndarray, "n 2"], x: Float[np.ndarray, "n 2"], good: B
     robustly.
 
     Args:
-        good: points to fit to, 4 or more.
+        p: positions on the board, in any unit.
+        x: pixels of these.
+        good: mask of the points to fit to, 4 or more.
 
     Returns:
-        Function from board positions (n, 2), in the unit of p, to pixels (n, 2).
+        Function from board positions (n, 2), in the unit of p, to pixels (n, 2). cv2.error if no homography
+        fits the points.
     """
 
     def weigh(rest: torch.Tensor) -> torch.Tensor:
@@ -123,11 +129,7 @@ def smooth_map(p: Float[np.ndarray, "n 2"], x: Float[np.ndarray, "n 2"], good: B
 
 
 def monomials(q: Float[np.ndarray, "n 2"], degree: int) -> Float[np.ndarray, "n m"]:
-    """Compute all products of powers of u and v up to a total degree.
-
-    Returns:
-        Values (n, m).
-    """
+    """Compute all products (n, m) of powers of u and v up to a total degree."""
     u, v = q.T
     return np.stack([u**i * v**j for i in range(degree + 1) for j in range(degree + 1 - i)], 1)
 
@@ -162,12 +164,12 @@ def _fitted(grey: Array, start: Array, shape: EdgeGeometry, clear: float) -> tup
 
 
 class CornerModel(NamedTuple):
-    """Parameters of the corner model, one row for each corner.
+    """Parameters of the corner model a + b S S (see the module), one row for each corner.
 
     Attributes:
-        x: position, pixels.
-        level: mean grey.
-        contrast: signed contrast.
+        x: position (x, y), pixels.
+        level: a, the mean of black and white, in grey values.
+        contrast: b, half their difference, of either sign.
         blur: standard deviation of the blur, pixels.
     """
 

@@ -28,13 +28,13 @@ STEP = 1e-5
 
 @dataclass(frozen=True)
 class BoardDeformation:
-    """Shapes of boards that are not flat or not printed true.
+    """Shapes of boards that are not flat or not printed true; its length is the number of values, four each.
 
     Attributes:
         values: stretch (y / x - 1) and curvatures xx, xy, yy (1/m, positive where the middle lies in front)
             of each board.
         middle: middle (x, y) of each board, metres.
-        part: number of the board at each board pose.
+        part: index of the board, a row of `values`, at each board pose.
     """
 
     values: Float[np.ndarray, "k 4"]
@@ -54,10 +54,10 @@ class BoardDeformation:
 
         Args:
             p: points of flat boards, metres.
-            part: number of each point's board.
+            part: index of each point's board.
 
         Returns:
-            Points in their board's frame, metres.
+            Points (n, 3) in their board's frame, metres.
         """
         return _deformed(p, self.middle[part], self.values[part])
 
@@ -68,10 +68,10 @@ class BoardDeformation:
 
         Args:
             p: points of flat boards, metres.
-            part: number of each point's board.
+            part: index of each point's board.
 
         Returns:
-            Derivatives (n, 3, s) by all `values`, board by board; 0 for other boards.
+            Derivatives (n, 3, s) by all `values`, board by board; 0 by other boards' values.
         """
         jacobian = np.zeros((len(p), 3, *self.values.shape))
         rows, middle, values = np.arange(len(p)), self.middle[part], self.values[part]
@@ -111,10 +111,11 @@ def is_significant(
     Args:
         values: stretches and curvatures.
         covariance: covariance of these by a jackknife over frames.
-        frames: number of frames.
+        frames: number of frames, 2 or more.
 
     Returns:
-        True if chance explains them with a probability below `SIGNIFICANCE`.
+        True if chance explains them with a probability below `SIGNIFICANCE`; False unless there are more
+        frames than values. A singular covariance raises numpy.linalg.LinAlgError.
     """
     count = len(values)
     squared = float(values @ np.linalg.solve(covariance, values))
@@ -125,7 +126,8 @@ def is_significant(
 def described(
     shape: BoardDeformation, deviations: Float[np.ndarray, "k 4"], extents: list[tuple[float, float]]
 ) -> Iterator[str]:
-    """Yield sentences on boards whose estimated stretch or bend exceeds three standard deviations.
+    """Yield a sentence for each board whose stretch exceeds three standard deviations, and for each of which
+    a curvature does.
 
     Args:
         shape: shapes of the boards.

@@ -63,8 +63,8 @@ class Detection(NamedTuple):
     """Board points detected in one image.
 
     Attributes:
-        ids: indices of the points on the board.
-        x: pixels.
+        ids: index of each point among the board's `points`.
+        x: pixel (x, y) of each.
     """
 
     ids: Int[np.ndarray, " n"]
@@ -98,10 +98,14 @@ class BoardViews:
 
 
 def detect(grey: Grey, board: Board) -> Detection | None:
-    """Detect a board's points in a grey image (uint8).
+    """Detect a single board's points in a grey image (uint8).
 
     Returns:
-        The points, refined; None if the board is not found.
+        The points, corners refined: all of the board's, or of a board with markers `FEWEST` or more (of known
+        points `FEWEST_KNOWN`); None if the board is not found.
+
+    Raises:
+        KeyError: for several boards (`Boards`), and a kind of one's own.
     """
     for candidate in _versions(grey):
         detection = _FINDERS[type(board)](candidate, board)
@@ -116,11 +120,11 @@ def explain(images: Iterable[Grey], board: Board, *, confirmed: bool = False) ->
 
     Args:
         images: grey images, uint8.
-        board: the board.
+        board: a single board.
         confirmed: True if other images show it, so that it is not another board.
 
     Returns:
-        A sentence.
+        A sentence: the commonest reason, or that there are no images.
     """
     reasons = Counter(_reason(grey, board, confirmed=confirmed) for grey in images)
     return reasons.most_common(1)[0][0] if reasons else "there are no images"
@@ -134,7 +138,8 @@ def other_size(images: Iterable[Grey], board: Board, *, larger: bool = False) ->
             for smaller ones.
 
     Returns:
-        Size such as "9x6" if most images show it; None otherwise, and for other kinds of board.
+        The size that images show most often, as "9x6", the longer side first; None if that is `board`'s, if
+        only one of several images shows it, and for other kinds of board.
     """
     if not isinstance(board, Chessboard):
         return None
@@ -252,11 +257,7 @@ def _crossing(corners: np.ndarray) -> np.ndarray:
 
 
 def _tags(grey: Grey, dictionary: str, border: int) -> dict[int, np.ndarray]:
-    """Corners (4) of each visible marker, by number.
-
-    AprilTags touch other squares at their corners: OpenCV's method and that of their authors miss different
-    ones.
-    """
+    """Corners (4) of each visible marker, by number; of AprilTags by two methods that miss others."""
     tags: dict[int, np.ndarray] = {}
     april = [cv2.aruco.CORNER_REFINE_APRILTAG] if dictionary.startswith("april") else []
     for method in (cv2.aruco.CORNER_REFINE_SUBPIX, *april):
@@ -275,6 +276,9 @@ def homography_errors(p: Float[np.ndarray, "n 2"], x: Float[np.ndarray, "n 2"]) 
 
     Returns:
         Distances in pixels; infinite if there is no homography.
+
+    Raises:
+        cv2.error: for fewer than four points.
     """
     H, _ = cv2.findHomography(p, x, cv2.LMEDS)
     if H is None:
@@ -309,10 +313,7 @@ _FINDERS: dict[type[Board], Callable[[Grey, Any], Detection | None]] = {
 
 
 def _refined(grey: Grey, detection: Detection, board: Board) -> Detection:
-    """Refine corners to a hundredth of a pixel; boards that may be partly visible lose occluded ones.
-
-    If few fit the corner model, as in too small images, all are refined by gradients.
-    """
+    """Refine corners: by the corner model, with markers without occluded ones, or all by gradients."""
     if isinstance(board, Circles | KnownPoints):
         return detection
     clear = _clear(board)
@@ -325,8 +326,7 @@ def _refined(grey: Grey, detection: Detection, board: Board) -> Detection:
 
 
 def _clear(board: Board) -> float:
-    """Distance from a corner's edges that is free of anything but its own squares, as a share of
-    `spacing`."""
+    """Distance from a corner's edges, in `spacing`, within which there is nothing but its own squares."""
     if isinstance(board, Charuco):
         return (1 - board.marker / board.spacing) / 2
     if isinstance(board, AprilGrid):
@@ -336,8 +336,7 @@ def _clear(board: Board) -> float:
 
 
 def _by_gradients(grey: Grey, x: np.ndarray, share: float) -> np.ndarray:
-    """Refine corners by OpenCV's gradient criterion, in windows of `share` times the distance to the next
-    corner."""
+    """Refine corners by OpenCV's gradients, in windows of `share` of the distance to the next corner."""
     half = int(np.clip(share * np.quantile(apart(x), 0.1), 2, 11))
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
     refined = cv2.cornerSubPix(grey, x.astype(np.float32).reshape(-1, 1, 2), (half, half), (-1, -1), criteria)
@@ -345,10 +344,7 @@ def _by_gradients(grey: Grey, x: np.ndarray, share: float) -> np.ndarray:
 
 
 def _plausible(detection: Detection, board: Board) -> bool:
-    """True for enough points that are not collinear and lie on a smoothly distorted grid.
-
-    A homography plus a polynomial of degree 3 has to map the points on the board to the pixels.
-    """
+    """True for enough points, not collinear, that a homography plus a cubic polynomial maps to the pixels."""
     if isinstance(board, KnownPoints):
         return not on_a_line(board.points[detection.ids])
     p = board.points[detection.ids, :2]
@@ -453,9 +449,9 @@ class CollectedViews(NamedTuple):
     """Detections of a board in a folder of images.
 
     Attributes:
-        views: detections by camera.
-        photos: images by camera and moment.
-        notes: sentences on images without the board.
+        views: detections by camera, each with one image of the board or more.
+        photos: all images by camera and moment.
+        notes: sentences "camera: note" on images without the board.
     """
 
     views: dict[str, BoardViews]
@@ -477,13 +473,10 @@ def collect_folder(
         progress: function of the iterable of results and their number that yields them, to show progress;
             None for none.
 
-    Returns:
-        Detections, images and notes.
-
     Raises:
         FileNotFoundError: for a missing folder.
-        ValueError: for an image that cannot be read, a camera whose images differ in size or of which none
-            shows the board, and images that show a board of another size.
+        ValueError: as `find_photos`, for an image that cannot be read, a camera whose images differ in size
+            or of which none shows the board, and images that show a larger chessboard.
     """
     photos = find_photos(Path(folder), patterns=patterns)
     jobs = [job for moments in photos.values() for job in moments.items()]
@@ -509,14 +502,16 @@ def detected(photo: Photo, key: FrameKey, board: Board) -> DetectedImage:
     """Detect each board in an image; points are numbered as in the list of all boards.
 
     Args:
-        key: moment of the image, which the first board keeps; others get a key of their own, as they have
-            poses of their own.
+        photo: the image.
+        key: moment of the image, which the first board keeps; the second gets "KEY board 2" and so on, as
+            each has a pose of its own.
+        board: a board, or several.
 
     Returns:
-        Size of the image, and detections by key; empty if there is none.
+        Size (h, w) of the image, and detections by key; a board that is not found has none.
 
     Raises:
-        ValueError: if the image cannot be read.
+        ValueError, OSError: if the image cannot be read.
     """
     grey, detections, before = photo.read(), dict[FrameKey, Detection](), 0
     for index, member in enumerate(board.members):
@@ -536,7 +531,7 @@ def board_views(
     Args:
         name: name of the camera, for messages.
         moments: its images by moment.
-        images: size and detections of each, as `detected` returns them.
+        images: size and detections of some of them, at least one, as `detected` returns them.
 
     Returns:
         The detections by moment.

@@ -61,7 +61,7 @@ class CalibratedViews:
 
     Attributes:
         name: name of the camera.
-        camera: the camera, at the origin.
+        camera: the camera, at the origin or, of a start rig, where that has it.
         views: detections by moment.
         poses: poses `cam_from_board` by moment, metres.
     """
@@ -73,17 +73,21 @@ class CalibratedViews:
 
 
 def initial_camera(name: str, views: BoardViews, board: Board, lens: Lens) -> CalibratedViews:
-    """Estimate a camera's intrinsics, lens and board poses from its own images, by OpenCV.
+    """Estimate a camera's intrinsics, lens and board poses from its own images, as initial values.
+
+    A pinhole and Brown and Conrady's models by OpenCV, with two radial terms at most; others by their rays.
 
     Args:
-        lens: name of the lens model.
+        name: name of the camera, for messages.
+        lens: lens model; KeyError for one that is not in `LENSES`.
 
     Returns:
-        The camera, with board poses and the detections without outlying points.
+        The camera at the origin, with board poses and the detections without outlying points.
 
     Raises:
         ValueError: for fewer than three images with a board (one, for points that are not coplanar), and if
-            OpenCV finds no camera.
+            no camera is found.
+        cv2.error: if OpenCV fails on a board's pose.
     """
     fewest = FEWEST_IMAGES if board.flat else 1
     if len(views.seen) < fewest:
@@ -106,7 +110,7 @@ def without_bad_images(views: BoardViews, initial: CalibratedViews, board: Board
 
     Args:
         views: all detections.
-        initial: camera and board poses that were estimated from them.
+        initial: result of `initial_camera` for them; KeyError for an image that has no pose in it.
 
     Returns:
         The detections in the images whose error (RMS) is below 2 pixels or ten times the median, the larger.
@@ -130,13 +134,18 @@ def without_outliers(
     """Drop points farther than `OUTLIER` standard deviations from a camera's projections.
 
     Args:
+        camera: the camera; its own pose does not count.
         poses: `cam_from_board` by moment.
         points: the board's points, metres.
-        sigma: standard deviation along x or y, pixels; None estimates it from the median of all distances.
+        sigma: standard deviation along x or y, pixels, at least `LEAST_SIGMA`; None or 0 estimates it from
+            the median of all distances.
 
     Returns:
-        The views; images without a pose, or left with fewer than `FEWEST_POINTS` points or collinear ones,
-        keep all.
+        The views; images without a pose, or that would keep fewer than `FEWEST_POINTS` points or collinear
+        ones, keep all.
+
+    Raises:
+        ValueError: if no image has a pose, and there is no `sigma`.
     """
     off = {
         key: _projection_errors(camera, poses[key], d, points)
@@ -163,11 +172,11 @@ def _projection_errors(
 
 
 def near_homography(detection: Detection, board: Board) -> Detection:
-    """Drop points that no homography of the board fits (least median of squares), with tolerance for
-    distortion.
+    """Drop points far from the board's homography (least median of squares); distortion is tolerated.
 
     Returns:
-        The remaining points; all for boards that are not flat, or with few points.
+        The remaining points; all for a board that is not flat, fewer than `FEWEST_POINTS` points, or without
+        a homography.
     """
     if len(detection.ids) < FEWEST_POINTS or not board.flat:
         return detection
@@ -223,13 +232,15 @@ def _with_model(camera: Camera, model: str) -> Camera:
 
 
 def board_pose(camera: Camera, detection: Detection, board: Board) -> Pose:
-    """Estimate `cam_from_board` of one image for a camera of known intrinsics.
+    """Estimate `cam_from_board` of one image for a camera of known intrinsics; its own pose does not count.
 
     Returns:
         The pose, metres.
 
     Raises:
-        ValueError: if fewer than four points are in front of the camera, as by a lens far from the true one.
+        ValueError: if fewer than four points have a ray, within a half space about their mean, as by a lens
+            far from the true one, or all lie on a line.
+        cv2.error: if OpenCV fails on the points.
     """
     rays, valid = _unit_rays(camera, detection)
     try:
@@ -270,8 +281,7 @@ def _pose_of_rays(board: Board, ids: Int[np.ndarray, " n"], rays: Float[np.ndarr
 def _pinhole(views: BoardViews, board: Board, count: int) -> OpenCVSolution:
     """Fit K and two radial terms, with rotations and translations, as initial values.
 
-    Few, small or similar boards determine neither these nor the aspect ratio, and a fit without a prior ends
-    anywhere. Where pixels become oblong, a camera with square ones, a central principal point and one radial
+    Where few boards make pixels oblong, a camera with square ones, a central principal point and one radial
     term is fitted instead: the rest is left to the adjustment and its prior.
     """
     initial = board.points * (1, 1, 0) if board.flat else board.points
@@ -298,8 +308,7 @@ def _pinhole(views: BoardViews, board: Board, count: int) -> OpenCVSolution:
 
 
 def _linear_intrinsics(view: tuple[np.ndarray, np.ndarray], hw: HW) -> np.ndarray:
-    """K with square pixels and central principal point, by a linear camera of one view (Hartley & Zisserman
-    7.1)."""
+    """K with square pixels and central principal point by one view (Hartley & Zisserman 7.1)."""
     X, x = view[0].astype(np.float64), view[1][:, 0].astype(np.float64)
     if len(X) < FEWEST_POINTS:
         return intrinsics(float(max(hw)), hw).numpy()
@@ -314,10 +323,7 @@ def _linear_intrinsics(view: tuple[np.ndarray, np.ndarray], hw: HW) -> np.ndarra
 
 
 def _fisheye(views: BoardViews, board: Board) -> tuple[Camera, dict[FrameKey, Pose]]:
-    """Fit the focal length and two terms of Kannala and Brandt's model, each board's pose by its own rays.
-
-    From the best of `FISHEYE_FOCALS`; the principal point is in the middle.
-    """
+    """Fit focal length (from the best of `FISHEYE_FOCALS`) and two terms of a fisheye, and boards' poses."""
 
     def changed(values: np.ndarray) -> Camera:
         lens = Distortion("kannala-brandt", torch.tensor([*values[1:], 0, 0], dtype=torch.float64))

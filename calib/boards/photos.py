@@ -39,7 +39,7 @@ class Photo:
 
     Attributes:
         label: name in messages.
-        decode: function that decodes the image.
+        decode: function that decodes the image, to an array as `to_grey` takes it.
     """
 
     label: str
@@ -49,7 +49,7 @@ class Photo:
         """Decode the image in grey, 8 bits (see `to_grey`).
 
         Raises:
-            ValueError: if it cannot be read.
+            ValueError, OSError: if it cannot be read.
         """
         return to_grey(self.decode())
 
@@ -62,11 +62,11 @@ def to_grey(image: np.ndarray) -> Grey:
     """Convert an image (h, w) or (h, w, c) to grey, 8 bits; dim images and other types are stretched to
     0..255.
 
-    Of one or two channels the first is grey; of more, the first three are blue, green and red. NaN and
-    infinity become black.
+    Of one or two channels the first is grey; of more, the first three are blue, green and red. Stretching
+    clips half a percent at either end; NaN and infinity, and an image of one value, become black.
 
     Returns:
-        Grey image (h, w), uint8.
+        Grey image (h, w), uint8; it may share the memory of `image`.
     """
     image = np.atleast_3d(image if image.dtype in (np.uint8, np.uint16) else image.astype(np.float32))
     grey = image[..., 0] if image.shape[2] < 3 else cv2.cvtColor(image[..., :3], cv2.COLOR_BGR2GRAY)
@@ -90,12 +90,14 @@ def find_photos(folder: Path, *, patterns: Mapping[str, str] | None = None) -> P
             (left01.jpg, right01.jpg) or each video. If each camera has one image, these are of one moment.
 
     Returns:
-        Images by camera and moment, not decoded yet.
+        Images by camera and moment (see `frame_keys`; of a video the number of the frame, of which at most
+        `MOST_FRAMES` are taken), not decoded yet.
 
     Raises:
         FileNotFoundError: for a missing folder.
-        ValueError: for no images, images beside subfolders of images, patterns without a file or with a
-            shared one, and images that differ in orientation tags or repeat a number.
+        ValueError: for no images, images beside subfolders of images, patterns that are whole paths, without
+            a file or with a shared one, images of a camera that differ in orientation tags or repeat a
+            number, a video among other files or that cannot be read, and images of too many pixels.
     """
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder: give one with a subfolder for each camera")
@@ -116,8 +118,12 @@ def frame_keys(stems: list[str]) -> list[FrameKey]:
     >>> frame_keys(["cam01_08_int", "cam01_09_int", "cam01_10_int"])
     [8, 9, 10]
 
+    Args:
+        stems: names of the image files without suffix, at least one.
+
     Returns:
-        One key for each name, in order; equal keys are not refused.
+        One key for each name, in order; equal keys are not refused. For a single name its last number, or the
+        name itself.
     """
     pieces = [re.split(r"(\d+)", stem) for stem in stems]
     if len(stems) == 1:
@@ -195,10 +201,7 @@ def _moments(name: str, files: list[Path]) -> dict[FrameKey, Photo]:
 
 
 def _orientation(file: Path) -> int:
-    """EXIF orientation; 1 if there is none or the file is unreadable, which decoding reports.
-
-    Raises ValueError for a file that states more pixels than any camera has, before anything is decoded.
-    """
+    """EXIF orientation; 1 without, or if unreadable. ValueError for more pixels than a camera has."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)

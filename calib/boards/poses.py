@@ -38,9 +38,10 @@ class RelativePose(NamedTuple):
 
     Attributes:
         a_from_b: pose of the first camera from the second, metres.
-        agreeing: shared frames that agree with it.
+        agreeing: shared frames that agree with it; may be empty.
         shared: all shared frames.
-        score: number of agreeing frames, then minus their total error in pixels; larger is better.
+        score: number of agreeing frames, then minus the sum of their errors in the first camera's pixels;
+            larger is better.
     """
 
     a_from_b: Pose
@@ -93,14 +94,13 @@ class StartDeviations:
 def start_prior(camera: Camera, deviations: StartDeviations) -> CameraPrior:
     """Make the prior of a camera whose parameters are roughly known from a start rig.
 
-    Lens and aspect ratio have the prior of an ordinary camera.
-
     Args:
         camera: camera of the start rig.
         deviations: standard deviations about it.
 
     Returns:
-        The prior, with the start's pose as mean.
+        The prior: the mean is the camera, its pose and lens coefficients too; deviations of the lens and of
+        the aspect ratio are an ordinary camera's (`typical_prior`).
     """
     information = typical_prior(camera).information.copy()
     information[:3, :3] = np.eye(3) / np.radians(deviations.rotation) ** 2
@@ -115,14 +115,14 @@ def initial_rig(singles: Mapping[str, Solved], board: Board) -> InitialRig:
     """Estimate the poses of all cameras and boards from pairs, along the spanning tree of most corners.
 
     Args:
-        singles: each camera's own calibration.
+        singles: each camera's own calibration by name, at least one.
 
     Returns:
-        Initial values; the first camera is the world.
+        Initial values as `consistent_boards` makes them; the first camera is the world.
 
     Raises:
-        ValueError: if cameras share no frames, or a pair's frames contradict each other (mirrored images,
-            different moments).
+        ValueError: if a camera shares no frame with those joined before, or most frames of its pairs
+            contradict each other (mirrored images, different moments).
     """
     cameras = [
         CalibratedViews(name, single.problem.cameras[name], single.views[name], single.problem.board_poses)
@@ -141,20 +141,22 @@ def rig_near_start(
 ) -> InitialRig:
     """Initialise cameras at a start rig's positions, rotated so that they agree on the boards.
 
-    The camera with most images keeps its orientation.
+    The camera with most images keeps its orientation. Cameras keep the start's intrinsics and lens; Brown and
+    Conrady's gets the terms that `lens` has more, as zeros, and a pinhole the model `lens` without effect.
 
     Args:
-        start: roughly known rig.
-        views: detections by camera.
-        lens: name of the lens model by camera.
+        start: roughly known rig; cameras without `views` are ignored.
+        views: detections by camera, at least one camera.
+        lens: name of the lens model by camera, one of `LENSES`.
         deviations: standard deviations about the start.
 
     Returns:
-        Initial values, with priors about the start.
+        Initial values as `consistent_boards` makes them, with priors about the start.
 
     Raises:
+        KeyError: for a camera without a lens model, or an unknown one.
         ValueError: if the start lacks a camera or has it in another size, a camera shares no moment with
-            another, or none of its images fits the start.
+            another, none of its images fits the start, or as `board_pose`.
     """
     cameras = []
     for name, v in views.items():
@@ -176,11 +178,7 @@ def rig_near_start(
 
 
 def _start_camera(name: str, start: Rig, views: BoardViews, model_name: Lens) -> Camera:
-    """Camera of a start with its own lens, or else one of the wanted model without effect.
-
-    Brown and Conrady's model gets all wanted terms. Raises ValueError if the camera is missing or of another
-    size.
-    """
+    """Camera of a start, see `rig_near_start`; ValueError if it is missing or of another size."""
     camera = start.cameras.get(name)
     if not isinstance(camera, Camera):
         raise ValueError(f"{name}: the start has no calibrated camera called so; it has {list(start.names)}")
@@ -203,8 +201,7 @@ def _start_camera(name: str, start: Rig, views: BoardViews, model_name: Lens) ->
 def _aligned(cameras: Sequence[CalibratedViews], board: Board) -> dict[str, Pose]:
     """`cam_from_world` of all cameras, oriented by the frames that each shares with an earlier one.
 
-    The first is that with most images; then always those two that share most. Cameras that share none keep
-    their own.
+    First the camera with most images, then always the two that share most; without shared frames unchanged.
     """
     first, symmetries = max(cameras, key=lambda v: len(v.poses)), symmetry_poses(board)
     poses = {first.name: first.camera.cam_from_world}
@@ -225,7 +222,7 @@ def pair_pose(a: CalibratedViews, b: CalibratedViews, board: Board) -> RelativeP
     """Find the relative pose of two cameras with which most shared frames agree.
 
     Returns:
-        The pose; None without shared frames.
+        The pose, even if few frames agree or none; None without shared frames.
     """
     shared = tuple(key for key in a.views.seen if key in b.views.seen)
     if not shared:
@@ -328,10 +325,12 @@ def consistent_boards(cameras: Sequence[CalibratedViews], poses: dict[str, Pose]
     """Choose board poses that most cameras agree with, and number all cameras' points consistently.
 
     Args:
-        poses: `cam_from_world` by camera.
+        cameras: cameras with their own board poses.
+        poses: `cam_from_world` by camera, of all cameras.
 
     Returns:
-        Initial values; images that contradict the chosen poses are in `left_out`.
+        Initial values, with a board pose for each moment; images that contradict it are in `left_out` and not
+        in `views`, in which a camera may keep none.
     """
     boards: dict[FrameKey, Pose] = {}
     detections: dict[str, dict[FrameKey, Detection]] = {c.name: {} for c in cameras}

@@ -92,10 +92,13 @@ def report_html(
         detected: all detections by camera; with `photos`, the images that fit worst are drawn. None to draw
             none.
         photos: images by camera and moment; None to draw none.
-        further: HTML for the page's head.
+        further: HTML for the page's head, not escaped.
 
     Returns:
         The page as HTML, figures embedded.
+
+    Raises:
+        ValueError, OSError: if an image to be drawn cannot be read.
     """
     covers, has_covariance = coverages(calibration), calibration.fit.covariance is not None
     near, far = _depths(covers.values())
@@ -167,7 +170,8 @@ def summary(calibration: Calibration) -> str:
     """Summarise a calibration: numbers of cameras, frames and points, reprojection and epipolar errors.
 
     Returns:
-        A sentence or two, errors in pixels.
+        Up to three sentences, errors in pixels: epipolar errors only of pairs, and once more on held-out
+        frames if there are enough.
     """
     points = sum(len(observed.x) for observed in calibration.fit.problem.seen.values())
     cameras, frames = len(calibration.views), len(calibration.frames)
@@ -185,9 +189,10 @@ def summary(calibration: Calibration) -> str:
 def verdict(calibration: Calibration) -> str:
     """Return a sentence on whether the rig is good enough to fuse, and between which depths.
 
-    It is if the positions predicted in every other camera for pixels of the first deviate by less than
-    `GOOD`, in the median over the image, and points of held-out frames lie no farther off their lines, in the
-    mean.
+    It is if points of held-out frames (not judged where they are too few) lie by `GOOD` pixels or less off
+    their lines, in the mean of each pair, and, at some of five depths from the nearest to the farthest board
+    point, the positions predicted in every other camera for pixels of the first have a standard deviation
+    below `GOOD`, in the median over the image. Without a covariance it is not.
 
     Returns:
         The sentence, with depths in metres and deviations in pixels; empty for a single camera.
@@ -249,10 +254,10 @@ def camera_table(calibration: Calibration, covers: Mapping[str, Coverage]) -> st
     """Format a table with one row for each camera: points, residuals, parameters with standard deviations.
 
     Args:
-        covers: coverage by camera.
+        covers: coverage by camera, of all cameras.
 
     Returns:
-        HTML.
+        HTML; deviations are nan without a covariance.
     """
     rows = []
     for name, camera in calibration.fit.problem.cameras.items():
@@ -275,10 +280,11 @@ def camera_table(calibration: Calibration, covers: Mapping[str, Coverage]) -> st
 
 
 def pair_table(calibration: Calibration) -> str:
-    """Format a table with one row for each pair: baseline, relative rotation, epipolar errors.
+    """Format a table with one row for each pair that saw common points: baseline, relative rotation, epipolar
+    errors (mean and 95 % quantile), these also on held-out frames if there are enough.
 
     Returns:
-        HTML; deviations only where the fit has a covariance.
+        HTML, in mm, degrees and pixels; the baseline's deviation only where the fit has a covariance.
     """
     covariance = rig_covariance(calibration.fit)
     cameras = calibration.fit.problem.cameras
@@ -331,10 +337,7 @@ def _table(rows: Sequence[Mapping[str, str]]) -> str:
 
 
 def draw_scene(calibration: Calibration) -> Figure:
-    """Draw the rig alone, and the rig with the boards from above.
-
-    Lengths are in metres.
-    """
+    """Draw the rig alone in space, and the rig with the boards from above (x and z of the world, metres)."""
     figure = draw_rig(Rig({escaped(n): c for n, c in calibration.rig.cameras.items()}))
     figure.set_size_inches(10.4, 4.6)
     axes: Any = figure.axes[0]
@@ -361,7 +364,7 @@ def draw_scene(calibration: Calibration) -> Figure:
 
 
 def draw_by_image(calibration: Calibration) -> Figure:
-    """Plot the root mean square residual of every image of every camera, by frame."""
+    """Plot the root mean square residual (pixels) of every image of every camera, by frame."""
     frames = calibration.frames
     figure = Figure(figsize=(10.4, 2.8), layout="constrained")
     axes = figure.subplots()
@@ -380,6 +383,8 @@ def draw_by_image(calibration: Calibration) -> Figure:
 
 def draw_camera(calibration: Calibration, name: str, covered: Coverage) -> Figure:
     """Draw one camera's observed points, median residuals over the image (enlarged), and residuals' scatter.
+
+    Residuals are measured minus projected pixels; the scatter is clipped to four deviations of the noise.
 
     Args:
         name: name of the camera.
@@ -424,13 +429,11 @@ def _draw_field(axes: Any, x: np.ndarray, r: np.ndarray, hw: tuple[int, int]) ->
 
 def draw_uncertainty(calibration: Calibration, depths: tuple[float, float]) -> Figure:
     """Draw the standard deviation of predicted pixels over the first camera's image, by beta (rows) and
-    depth.
+    depth (columns).
 
     Args:
+        calibration: calibration of two cameras or more; AssertionError without a covariance.
         depths: depths in metres.
-
-    Returns:
-        The figure. The fit must have a covariance.
     """
     covariance = rig_covariance(calibration.fit)
     assert covariance is not None
@@ -452,11 +455,12 @@ def _extent(hw: tuple[int, int]) -> tuple[float, float, float, float]:
 
 
 def draw_adequacy(calibration: Calibration, depths: tuple[float, float]) -> Figure:
-    """Draw each camera's uncertainty of projection at two depths, and the difference between halves of the
-    frames.
+    """Draw each camera's (row's) uncertainty of projection at two depths, and the difference between halves
+    of the frames at their mean, in pixels.
 
-    Returns:
-        The figure. The fit must have a covariance.
+    Args:
+        calibration: calibration with a covariance; without one the uncertainty is drawn as none.
+        depths: both depths, metres.
     """
     names = list(calibration.views)
     figure = Figure(figsize=(10.4, 2.5 * len(names) + 0.3), layout="constrained")
@@ -505,9 +509,12 @@ def draw_images(
     """Draw images with used points (dots), left-out ones (red circles) and enlarged residuals.
 
     Args:
-        chosen: camera and moment of each image, at least one.
+        chosen: camera and moment of each image, at least one, each in `detected`.
         detected: all detections by camera.
-        photos: images by camera and moment.
+        photos: images by camera and moment; without one, its points are drawn alone.
+
+    Raises:
+        ValueError, OSError: if an image cannot be read.
     """
     columns = min(3, len(chosen))
     rows = -(-len(chosen) // columns)
@@ -557,10 +564,7 @@ def _draw_image(
 
 
 def _draw_arrows(axes: Any, x: np.ndarray, r: np.ndarray, length: float, colour: str) -> float:
-    """Draw residuals as arrows, the longest one of a given length in pixels.
-
-    Returns the longest residual, pixels.
-    """
+    """Draw residuals as arrows, the longest `length` pixels long; returns the longest residual."""
     longest = float(np.linalg.norm(r, axis=1).max())
     arrows = length / max(longest, 1e-9) * r
     axes.quiver(*x.T, *arrows.T, angles="xy", scale_units="xy", scale=1, width=0.004, color=colour)

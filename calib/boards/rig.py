@@ -32,7 +32,8 @@ class Calibration:
         board: the board.
         fit: result of the bundle adjustment.
         single: reprojection error (RMS, pixels) of each camera calibrated alone; empty with a start.
-        epipolar: distances of matched points from their epipolar lines by pair, undistorted pixels.
+        epipolar: distances of common points from their epipolar lines by pair, undistorted pixels; pairs
+            without common points are missing.
         notes: sentences on the calibration.
     """
 
@@ -60,15 +61,11 @@ class Calibration:
 
     @cached_property
     def held_out(self) -> dict[tuple[str, str], Float[np.ndarray, " _"]]:
-        """Epipolar errors (pixels) by pair, each frame's by a rig calibrated without it; empty for too few
-        frames."""
+        """Epipolar errors (pixels) by pair on held-out frames; empty for too few (see `held_out_errors`)."""
         return held_out_errors(self.fit, self.views)
 
     def deviations(self) -> dict[str, float]:
-        """Return the standard deviation of each free parameter by name ("left.focal.0"), in its own unit.
-
-        Empty if the parameters are not observable.
-        """
+        """Return the standard deviation of each free parameter by name, in its unit; empty if unknown."""
         return self.fit.deviations
 
 
@@ -87,16 +84,20 @@ def calibrate(
         views: detections by camera.
         board: the board.
         lens: lens model of all cameras, or of each by name.
-        start: rig known to within `deviations`; one image of each camera is then enough, and the start's
-            world and kinds of lenses are kept; a pinhole gets the model `lens`.
-        deviations: standard deviations about the start; None for the defaults.
+        start: rig known to within `deviations`; one image of each camera, of a common moment, is then enough,
+            and the start's world and kinds of lenses are kept, their coefficients fitted; a pinhole gets the
+            model `lens`. None for cameras of which nothing is known.
+        deviations: standard deviations about the start; None for the defaults. Unused without a start.
 
     Returns:
-        The calibration; its world is the first camera's frame, or the start's.
+        The calibration of the cameras in `views`; its world is the first camera's frame, or the start's. The
+        rig has no depth range.
 
     Raises:
         ValueError: with advice, for no views, an unknown lens model, too few images, parallel boards, cameras
-            without common frames, frames that contradict each other, or a start that does not fit.
+            without common frames, frames that contradict each other or determine too little
+            (numpy.linalg.LinAlgError), or a start that does not fit.
+        cv2.error: if OpenCV fails on a board's pose.
     """
     if not views:
         raise ValueError("there are no views: give those of one camera or more, by name")

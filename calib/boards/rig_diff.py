@@ -46,10 +46,11 @@ class Difference(NamedTuple):
 
     Attributes:
         x: pixels of the first rig's camera, or of the pair's alpha.
-        depth: their depths, metres.
+        depth: their depths, metres or the rigs' own unit.
         change: of a camera, offset of the second rig's pixels (n, 2); of a pair, depth by the second rig over
             depth by the first, minus 1 (n).
-        sigma: standard deviation of the change (in the worst direction) by both calibrations; NaN if unknown.
+        sigma: standard deviation of the change (in the worst direction) by both calibrations, in the change's
+            unit; NaN without covariances.
     """
 
     x: Float[np.ndarray, "n 2"]
@@ -67,7 +68,7 @@ class Significance(NamedTuple):
         probability: probability of a larger chi-square by chance.
         camera: camera whose motion explains most of the difference.
         degrees: rotation of that camera, degrees.
-        metres: shift of that camera, metres.
+        metres: shift of that camera's centre, metres or the rigs' own unit.
         share: share of chi-square that this motion explains, 0..1.
     """
 
@@ -91,11 +92,13 @@ class RigDifference:
 
     Attributes:
         cameras: difference of pixels by camera.
-        depths: difference of depths by the other cameras that see alpha's points.
-        alpha: camera of the depths.
-        motion: rigid motion from the first rig's world to the second's that is taken out before comparing.
+        depths: difference of depths by alpha and another camera, by that camera's name; cameras that see none
+            of alpha's points are missing.
+        alpha: camera of the depths, the first of the first rig.
+        motion: rigid motion from the first rig's world to the second's that is taken out before comparing
+            pixels.
         significance: result of the test; None without covariances.
-        unit: unit of depths; "baselines" for rigs of unknown scale.
+        unit: unit of depths: "m", or "baselines" for rigs of unknown scale.
     """
 
     cameras: Mapping[str, Difference]
@@ -106,7 +109,10 @@ class RigDifference:
     unit: str = "m"
 
     def as_text(self) -> str:
-        """Format a line for each camera and pair, and the verdict."""
+        """Format a line for each camera (pixels) and pair (depths, percent), and the verdict.
+
+        Each line has RMS, maximum and, where known, standard deviation of the differences.
+        """
         lines = ["after the rigid motion of the whole rig that brings all pixels together best:"]
         for name, difference in self.cameras.items():
             off = np.linalg.norm(difference.change, axis=1)
@@ -151,13 +157,15 @@ def rig_difference(
         b: second rig.
         covariances: covariances of both; where one is None the other serves for both, without any nothing is
             tested.
-        depth: (near, far) along each camera's axis, metres, or the rigs' own unit.
+        depth: (near, far) along each camera's axis, metres, or the rigs' own unit; 0 < near <= far, which is
+            not checked. Far counts as `FARTHEST` times near at most, infinity too.
 
     Returns:
         Differences of pixels and depths, and the test's result.
 
     Raises:
-        ValueError: for rigs of other cameras, sizes or units, and cameras that are not calibrated.
+        ValueError: for rigs of other cameras, sizes or units, cameras that are not calibrated, and a
+            covariance of parameters that the first rig has not.
     """
     names = _same_cameras(a, b)
     a, b = (rig.replace(cameras={name: rig[name].to(torch.float64) for name in names}) for rig in (a, b))
@@ -191,10 +199,7 @@ def rig_difference(
 
 
 def _same_cameras(a: Rig, b: Rig) -> tuple[str, ...]:
-    """Names of the cameras.
-
-    Raises ValueError unless both rigs have the same calibrated cameras, sizes and unit.
-    """
+    """Names of the cameras; ValueError unless both rigs have the same ones, calibrated, sizes and unit."""
     if set(a.names) != set(b.names):
         listed = f"{', '.join(a.names)}; and {', '.join(b.names)}"
         raise ValueError(f"the rigs are of other cameras ({listed}): give two calibrations of the same")
@@ -231,8 +236,7 @@ def _points(camera: Camera, other: Camera, depth: tuple[float, float]) -> Grid:
 
 
 class _Part(NamedTuple):
-    """Differences of one camera (n, 2), derivatives by motion (2 n, 6), and by both cameras' parameters (n,
-    2, p)."""
+    """One camera's differences (n, 2), derivatives by motion (2 n, 6) and both rigs' camera (n, 2, p)."""
 
     name: str
     change: np.ndarray
@@ -241,8 +245,7 @@ class _Part(NamedTuple):
 
 
 def _projections(a: Rig, b: Rig, motion: Pose, name: str, X: np.ndarray) -> _Part:
-    """Changes of points' pixels from a to b, with derivatives by the rig's motion and each rig's
-    parameters."""
+    """Changes of points' pixels from a to b, with derivatives by the rig's motion and each rig's camera."""
     one, other, points = a[name], b[name], torch.from_numpy(X)
     moved = other.replace(cam_from_world=other.cam_from_world @ motion)
     J_a, J_b = camera_jacobian(one, X), camera_jacobian(moved, X)
@@ -293,8 +296,7 @@ def _rows(parts: list[_Part]) -> list[slice]:
 def _tested(
     change: np.ndarray, spread: np.ndarray, by_motion: np.ndarray, b: Rig, parts: list[_Part]
 ) -> Significance:
-    """Test the difference in the directions that calibration errors move pixels in, in standard
-    deviations."""
+    """Test the difference in the directions that calibration errors move pixels in."""
     U, s, _ = np.linalg.svd(spread, full_matrices=False)
     counts = s > LEAST * np.sqrt(len(change) / 2)
     U, s = U[:, counts], s[counts]
@@ -359,7 +361,7 @@ def draw_difference(difference: RigDifference) -> Figure:
     """Draw differences of pixels by camera and of depths by pair, at the nearest and the farthest depth.
 
     Returns:
-        The figure; pixels in pixels, depths in percent.
+        The figure, a row for each camera and pair: lengths of offsets in pixels, depths in percent.
     """
     maps = [(f"{n}: pixels", c, np.linalg.norm(c.change, axis=1)) for n, c in difference.cameras.items()]
     maps += [

@@ -34,8 +34,8 @@ class CalibrationOutput(NamedTuple):
     """Output of a calibration from a folder of images.
 
     Attributes:
-        messages: sentences: verdict, summary and notes.
-        written: paths of the files written.
+        messages: verdict (of two cameras and more), summary, and notes, which name their cameras.
+        written: paths of the files written: report, covariance if there is one, rig.
     """
 
     messages: list[str]
@@ -60,7 +60,7 @@ def calibrate_photos(
 
     Args:
         photos: folder of images; see `find_photos`.
-        board: board, or several that may be in the images at once, as text.
+        board: board as text (see `parse_board`), or several that may be in the images at once.
         out: rig file (.yaml); the others get its name with other suffixes. All appear together.
         patterns: file name patterns by camera; None derives cameras from folders or names.
         lens: lens model; "auto" chooses for each camera the model that its images support.
@@ -76,7 +76,9 @@ def calibrate_photos(
 
     Raises:
         FileNotFoundError: for a missing folder, start or board file.
-        ValueError: for unusable images, boards and options; nothing is written.
+        ValueError: for unusable images, boards, start and options, and as `calibrate`; nothing is written.
+        cv2.error: as `calibrate`.
+        FileExistsError: for a report or covariance in the way that no run wrote, or that changed since.
         OSError: if files cannot be written.
     """
     if out.suffix.lower() not in (".yaml", ".yml"):
@@ -145,11 +147,12 @@ def watch(
         finished: function that returns True to stop.
 
     Returns:
-        Size and detections of each image, by camera and moment; also of files that are gone, which the page
-        leaves out.
+        Size and detections of each image, by camera and moment, once `finished`; also of files that are gone,
+        which the page leaves out.
 
     Raises:
-        OSError: if the page cannot be written, or the folder is missing.
+        OSError: if the page cannot be written, the folder is missing, or a file goes before it is read.
+        cv2.error: as `calibrate`.
         KeyboardInterrupt: for Ctrl-C.
     """
     seen: dict[tuple[str, FrameKey], DetectedImage] = {}

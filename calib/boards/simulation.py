@@ -42,6 +42,7 @@ def simulate_photos(
     Grey images of 8 bits; folders are made, and files of these names replaced.
 
     Args:
+        rig: rig; cameras that are not calibrated get no images.
         count: number of poses, and of images of each camera.
         noise: standard deviation of the noise, in grey values of 255.
         seed: seed of poses and noise.
@@ -50,8 +51,8 @@ def simulate_photos(
         The true `world_from_board`, a batch (count).
 
     Raises:
-        ValueError: for a rig without calibrated cameras, cameras that nowhere see a board together, a `count`
-            below 1, and a negative `noise`.
+        ValueError: for a rig without calibrated cameras, cameras that hardly see a board together, a board
+            that cannot be printed, a `count` below 1, and a negative `noise`.
         OSError: if files cannot be written.
     """
     if not 0 <= noise < math.inf:
@@ -72,19 +73,20 @@ def simulate_photos(
 
 @torch.no_grad()
 def board_poses(rig: Rig, board: Board, count: int, *, seed: int = 0) -> Pose:
-    """Draw random board poses whose centres all cameras see, at several depths and tilts.
+    """Draw random board poses whose middles all calibrated cameras see, at several depths and tilts.
 
     Args:
-        rig: calibrated cameras that see the board.
+        rig: rig; cameras that are not calibrated are ignored.
         board: the board.
         count: number of poses, 1 or more.
         seed: random seed.
 
     Returns:
-        `world_from_board`, a batch (count).
+        `world_from_board`, a batch (count), float64.
 
     Raises:
-        ValueError: if there are too few such poses, and for a `count` below 1.
+        ValueError: if too few such poses are found, for a rig without calibrated cameras, and for a `count`
+            below 1.
     """
     if count < 1:
         raise ValueError(f"count is a number of images, 1 or more; got {count}")
@@ -116,10 +118,13 @@ def photograph(
     """Render the image of a printed board by a camera, through its lens, as the mean of four samples a pixel.
 
     Args:
+        camera: the camera; its own pose does not count.
+        cam_from_board: pose of the board, float64.
+        board: a single board; ValueError for one that cannot be printed (`draw_board`).
         rays: result of `fine_rays(camera)`; None to compute it.
 
     Returns:
-        Grey image (h, w), uint8, without noise; `WALL` around the print.
+        Grey image (h, w), uint8, without noise; `WALL` around the print, and where the lens has no ray.
     """
     directions, valid = rays or fine_rays(camera)
     R, t = cam_from_board.R, cam_from_board.t
@@ -135,11 +140,7 @@ def photograph(
 
 
 def fine_rays(camera: Camera) -> Rays:
-    """Compute the rays of a camera's pixels at twice its resolution, row by row.
-
-    Returns:
-        Directions (4 h w, 3) in the camera's frame, and True where the lens has one.
-    """
+    """Compute rays (4 h w, 3) of twice a camera's pixels, in its frame, and True where the lens has one."""
     fine = camera.to(torch.float64).resize((2 * camera.hw[0], 2 * camera.hw[1]))
     return fine.rays(pixel_grid(fine.hw, dtype=torch.float64).reshape(-1, 2))
 
@@ -154,13 +155,15 @@ def _resolution(camera: Camera, cam_from_board: Pose, board: Board) -> float:
 
 @lru_cache(maxsize=32)
 def printed(board: Board, dpi: float) -> tuple[UInt8[np.ndarray, "h w"], float, Float[np.ndarray, "2"]]:
-    """Draw the printed board as an image.
+    """Draw the printed board, with its margin and ruler, as an image.
 
     Args:
+        board: a single board; ValueError for one that cannot be printed (`draw_board`).
         dpi: pixels for each inch.
 
     Returns:
-        Grey values (uint8), pixels for each metre, and the pixel (x, y) of the board's first point.
+        Grey values (h, w), uint8, which are cached and must not be changed; pixels for each metre; and the
+        pixel (x, y) of the board's first point.
     """
     figure = draw_board(board)
     canvas = FigureCanvasAgg(figure)

@@ -84,11 +84,12 @@ def calibrate_single(
         final: False accepts a poorly constrained focal length, as other cameras will add constraints.
 
     Returns:
-        The solution.
+        The solution, the camera at the origin; `views` has the images and points that were used.
 
     Raises:
-        ValueError: with advice, for too few images, parallel boards, or (`final`) an undetermined focal
-            length.
+        ValueError: with advice, for too few images, parallel boards, no camera that fits, or (`final`) an
+            undetermined focal length.
+        KeyError, cv2.error: as `initial_camera`.
     """
     first = initial_camera(name, views, board, lens)
     kept = without_bad_images(views, first, board)
@@ -102,8 +103,7 @@ def calibrate_single(
 
 
 def _check_tilts(name: str, poses: Mapping[FrameKey, Pose], board: Board) -> None:
-    """Raise ValueError if all (flat) boards are parallel, which leaves focal length and distance
-    ambiguous."""
+    """Raise ValueError if all (flat) boards are parallel: focal length and distance are then ambiguous."""
     if not board.flat:
         return
     normals = np.stack([pose.R[:, 2].numpy() for pose in poses.values()])
@@ -120,9 +120,10 @@ def solve(initial: InitialRig, board: Board, *, final: bool = True) -> Solved:
     """Fit all observable parameters; unobservable ones are fixed at defaults.
 
     Parameters fixed before the fit, when the noise was overestimated, may return after it; boards that are
-    clearly neither flat nor printed true are deformed.
+    clearly not flat or not printed true are deformed.
 
     Args:
+        initial: initial values, each camera with detections (as `InitialRig.problem` needs them).
         final: False accepts a focal length that is not observable.
 
     Returns:
@@ -160,7 +161,8 @@ def solve_inliers(
 
     Args:
         initial: initial values, with the points of the first round.
-        detected: all detections by camera.
+        detected: all detections by camera, of which each round takes its points; KeyError for one at a moment
+            that `initial` has not.
         final: False accepts a focal length that is not observable.
 
     Returns:
@@ -188,9 +190,11 @@ def solve_inliers(
 def observable(problem: BundleProblem, *, final: bool) -> tuple[BundleProblem, list[str]]:
     """Fix unobservable parameters of lenses and principal points at their defaults, the worst first.
 
-    Observability follows from the pixels and the priors of a start rig, in units of typical sizes.
+    Observability follows from the pixels and the priors of a start rig, in units of typical sizes. Poses stay
+    free.
 
     Args:
+        problem: the problem, with its noise.
         final: False to leave an unobservable focal length free.
 
     Returns:
@@ -224,8 +228,7 @@ def observable(problem: BundleProblem, *, final: bool) -> tuple[BundleProblem, l
 
 
 def _worst(candidates: list[tuple[str, int]], information: np.ndarray) -> int | None:
-    """Index of the parameter with too large a deviation relative to its typical size; None if
-    there is none."""
+    """Index of the parameter with the largest deviation of those too large; None if there is none."""
     covariance = np.linalg.inv(information + np.eye(len(candidates)))
     shares = np.sqrt(np.maximum(covariance.diagonal(), 0))
     order = np.array([2 if i >= 8 else 1 if i >= 6 else 0 for _, i in candidates]) * (shares > UNOBSERVABLE)
@@ -234,10 +237,7 @@ def _worst(candidates: list[tuple[str, int]], information: np.ndarray) -> int | 
 
 
 def _with_deformation(solved: Solved, flat: BoardDeformation | None) -> Solved:
-    """Add the boards' deformations as unknowns if the points show them and frames agree on them.
-
-    If frames are too few to agree, the loss must fall by half.
-    """
+    """Deform boards if frames agree on it; with too few frames, if the loss falls by half."""
     if flat is None or solved.problem.deformation is not None:
         return solved
     trial, count = replace(solved.problem, deformation=flat), len(solved.problem.frames)
@@ -265,12 +265,13 @@ def adjust(problem: BundleProblem, *, rounds: int = 4, equal_noise: bool = False
     the camera that starts worst.)
 
     Args:
+        problem: the problem; its noise is not used.
         rounds: largest number of rounds with noise estimated from residuals.
         equal_noise: True for one noise of all cameras: where the board moves between exposures, a camera with
             a noise of its own would attract every board pose.
 
     Returns:
-        The solution; its covariance is None if the parameters are not observable.
+        The solution, without notes and views; its covariance is None if the parameters are not observable.
     """
     parameters = len(problem.names) + POSE * len(problem.frames)
     start = dict.fromkeys(problem.cameras, max(problem.rms(), LEAST_NOISE))
@@ -287,23 +288,20 @@ def adjust(problem: BundleProblem, *, rounds: int = 4, equal_noise: bool = False
 
 
 def readjusted(problem: BundleProblem) -> BundleProblem:
-    """Adjust a problem again from the solution of nearly the same one, with its noise.
-
-
-    Returns:
-        The adjusted problem, after at most 10 steps; the given one stays as it is.
-    """
+    """Return a problem adjusted again, with its noise, from a near solution, in 10 steps at most."""
     return _minimised(problem, iterations=10)[0]
 
 
 def noise(problem: BundleProblem, parameters: int) -> dict[str, float]:
-    """Estimate each camera's noise along x or y robustly, in pixels.
+    """Estimate each camera's noise along x or y robustly from its residuals.
 
     Args:
+        problem: problem in which each camera has points.
         parameters: number of fitted parameters, by which degrees of freedom are reduced.
 
     Returns:
-        Standard deviations by camera; those of few points are drawn towards the cameras' mean.
+        Standard deviations by camera, pixels, `LEAST_NOISE` or more; from few points they are drawn towards
+        the cameras' mean.
     """
     residuals = problem.residuals
     numbers = 2 * sum(len(r) for r in residuals.values())
@@ -364,8 +362,8 @@ class FrameMisfit(NamedTuple):
     Attributes:
         camera: name of the camera.
         frame: moment of the frame.
-        rms: root mean square length of the frame's residuals, pixels.
-        typical: root mean square of the camera's median frame, pixels.
+        rms: root mean square length of the frame's residuals in that camera, pixels.
+        typical: median of these over the camera's frames, pixels.
     """
 
     camera: str
@@ -428,10 +426,12 @@ def solve_together(initial: InitialRig, board: Board, singles: Mapping[str, Solv
         singles: solution of each camera alone, by name.
 
     Returns:
-        The solution; that of the single camera if there is only one.
+        The solution, the images that contradict the others in `left_out`; the single camera's own if there is
+        only one.
 
     Raises:
-        ValueError: if a camera contradicts the others altogether.
+        ValueError: if a camera contradicts the others altogether, or its focal length is not observable.
+        TypeError: for a camera without detections in `initial`.
     """
     if len(singles) == 1:
         return next(iter(singles.values()))
@@ -461,10 +461,7 @@ def solve_together(initial: InitialRig, board: Board, singles: Mapping[str, Solv
 def _wrong_images(
     solved: Solved, singles: Mapping[str, Solved], limit: Callable[[float], float]
 ) -> list[tuple[str, FrameKey]]:
-    """Images that fit their own camera and contradict the others, as of a board that moved between exposures.
-
-    One for each moment; none if they are too many of one camera's.
-    """
+    """Images that fit their own camera, not the others: one for each moment; none if too many."""
     reasons = dict[FrameKey, str]()
     alone = {name: frame_rms(single.problem)[name] for name, single in singles.items()}
     for misfit in misfits(solved):

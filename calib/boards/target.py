@@ -91,10 +91,17 @@ BELOW = 14.0
 
 
 def parse_board(text: str) -> Board:
-    """Parse the text of a board, such as ``charuco:8x6:30mm``, or read a target file; see the module.
+    """Parse the text of a board, such as ``charuco:8x6:30mm``, or read a target file.
+
+    Forms (options: see the module), with counts of 3 (tags: 2) to 100 and lengths in mm, cm, m or in:
+    chessboard:9x6:25mm counts inner corners, charuco:8x6:30mm squares, circles:7x5:20mm, acircles:4x11:20mm,
+    aprilgrid:6x6:88mm:0.3 tags; Kalibr's target file (.yaml); points in a file (.csv, then :DICTIONARY).
+
+    Returns:
+        `Chessboard`, `Charuco`, `Circles`, `AprilGrid`, or `KnownPoints` of a .csv file.
 
     Raises:
-        ValueError: for text or a file that is no board.
+        ValueError: for text or a file that is no board, or numbers out of range.
         FileNotFoundError: for a missing file.
     """
     if text.lower().endswith((".yaml", ".yml")):
@@ -117,10 +124,7 @@ def parse_board(text: str) -> Board:
 
 
 def _options(text: str, options_text: Sequence[str], patterns: Mapping[str, str]) -> dict[str, str]:
-    """Options by the name of the pattern that each matches.
-
-    Raises ValueError for others, and for two of one kind.
-    """
+    """Options by the name of the pattern that each matches. ValueError for others, and two of one kind."""
     options: dict[str, str] = {}
     for option in options_text:
         name = next((n for n, p in patterns.items() if re.fullmatch(p, option)), None)
@@ -139,10 +143,12 @@ def parse_boards(texts: Sequence[str]) -> Board:
         The board, or `Boards`.
 
     Raises:
-        ValueError: for text that is no board, and several boards without markers or with the same ones.
+        ValueError: for no text or one that is no board, and several boards without markers or with the same.
         FileNotFoundError: for a missing file.
     """
     boards = [parse_board(text) for text in texts]
+    if not boards:
+        raise ValueError(f"no board is given, and one is needed: write it like {FORMS}")
     if len(boards) == 1:
         return boards[0]
     used: dict[str, set[int]] = {}
@@ -219,10 +225,7 @@ def _length(text: str, word: str) -> float:
 
 
 def _smallest_dictionary(text: str, name: str, markers: int) -> str:
-    """Smallest dictionary of a kind with enough markers; larger ones begin with the same markers.
-
-    Raises ValueError, naming the target's `text`, if there is none.
-    """
+    """Smallest dictionary of a kind with enough markers (all begin alike); ValueError without one."""
     names = [name.upper()] if "_" in name else [f"{name.upper()}_{n}" for n in (50, 100, 250, 1000)]
     for full in names:
         if hasattr(cv2.aruco, f"DICT_{full}") and len(marker_dictionary(full).bytesList) >= markers:
@@ -231,8 +234,7 @@ def _smallest_dictionary(text: str, name: str, markers: int) -> str:
 
 
 def _known_points(text: str) -> KnownPoints:
-    """Read points of a CSV file `targets.csv`, or `targets.csv:5x5_100` with their dictionary (4x4 by
-    default).
+    """Read points of a CSV file `targets.csv`, or `targets.csv:5x5_100` with their dictionary (or else 4x4).
 
     Columns id, x, y, z (metres) for markers' centres, or id, corner (0 to 3), x, y, z. Raises ValueError.
     """
@@ -289,11 +291,7 @@ def page_of(board: Board) -> tuple[float, float]:
 
 
 def smallest_paper(page: tuple[float, float]) -> str | None:
-    """Find the smallest sheet that a page (millimetres) fits on, upright or across.
-
-    Returns:
-        Name such as "A4"; None if no sheet is large enough.
-    """
+    """Return the smallest sheet that a page (millimetres) fits on, such as "A4"; None if none is."""
     fitting = [name for name, paper in PAPERS.items() if all(a <= b for a, b in zip(sorted(page), paper))]
     return fitting[0] if fitting else None
 
@@ -311,7 +309,9 @@ def draw_board(board: Board, *, paper: str | None = None) -> Figure:
     """Draw a board at true size, with a white margin and a ruler below to check the print.
 
     Args:
-        paper: sheet such as "A4", in whose middle the board is drawn; None for a page of the board's size.
+        board: a single board, no `KnownPoints`.
+        paper: sheet of `PAPERS` such as "A4", upright or across, in whose middle the board is drawn; None for
+            a page of the board's size.
 
     Returns:
         The figure; saved as PDF or SVG it prints at true size.
@@ -362,14 +362,16 @@ def write_board(board: str, out: Path, *, paper: str | None = None) -> Path:
     """Write a board as PDF or SVG at true size, atomically.
 
     Args:
-        board: text of the board.
-        paper: sheet such as "A4"; None for a page of the board's size.
+        board: text of the board, as `parse_board` reads it.
+        out: file to write; missing folders are made.
+        paper: sheet of `PAPERS` such as "A4"; None for a page of the board's size.
 
     Returns:
         The path `out`.
 
     Raises:
-        ValueError: for another suffix, text that is no board, and a board that does not fit on the sheet.
+        ValueError: for another suffix, text that is no board, points of a .csv file, an unknown sheet, and a
+            board that does not fit on it.
         FileNotFoundError: for a missing target file.
         OSError: if the file cannot be written.
     """

@@ -58,8 +58,8 @@ class RigCovariance:
 
     Attributes:
         names: parameters as in `Rig.parameters` with the index of a component, "left.rotation.0",
-            "left.focal.1": rotation vectors in radians about the camera's axes, metres, pixels, distortion
-            coefficients.
+            "left.focal.1": rotation vectors in radians about the camera's axes, translations in metres,
+            pixels, distortion coefficients.
         matrix: covariance of these, in their units.
     """
 
@@ -67,8 +67,7 @@ class RigCovariance:
     matrix: Float[np.ndarray, "c c"]
 
     def selection(self, name: str, camera: Camera) -> Float[np.ndarray, "p c"]:
-        """Return the selection matrix (p, c) from these parameters to a camera's, in the order of
-        `parameter_names`."""
+        """Return the matrix (p, c) that selects a camera's `parameter_names` among these parameters."""
         entries = np.array([f"{name}.{entry}" for entry in parameter_names(camera)])
         return (entries[:, None] == np.array(self.names, dtype=str)).astype(np.float64)
 
@@ -83,7 +82,8 @@ class RigCovariance:
 
         Args:
             path: JSON file.
-            rig: rig to which the file must belong; None does not check.
+            rig: rig to which the file must belong: all cameras equal, but for their sensors; a file that
+                states no rig passes. None does not check.
 
         Raises:
             FileNotFoundError: for a missing file.
@@ -128,14 +128,16 @@ def beta_covariance(
 ) -> Float[np.ndarray, "n 2 2"]:
     """Propagate a rig's covariance to the positions in beta of alpha's pixels at a depth.
 
-    To first order, of points at a depth in alpha, by `arraygeom.uncertainty.position_covariance`.
-
     Args:
-        depth: metres.
+        x: pixels of alpha.
+        depth: depth in alpha, metres or the rig's own unit.
 
     Returns:
-        Covariances (n, 2, 2) in pixels² of beta; NaN where alpha's lens has no ray or beta does not see the
-        point.
+        Covariances (n, 2, 2) in pixels² of beta; NaN where alpha's lens has no ray or beta's does not project
+        the point.
+
+    Raises:
+        ValueError: for an unknown camera, and a covariance of parameters that the rig has not.
     """
     found = position_covariance(rig, covariance, alpha, beta, torch.from_numpy(x), depth)
     return found.numpy()
@@ -160,7 +162,8 @@ class Intrinsics(NamedTuple):
 
     Attributes:
         camera: the camera, at the origin.
-        covariance: covariance of the free intrinsics, in their units (pixels, lens coefficients).
+        covariance: covariance of the free intrinsics, in their units (pixels, lens coefficients); (0, 0) if
+            none is free.
         free: mask of the free intrinsics among all parameters, in the order of `parameter_names`.
         sigma: standard deviation of the noise along x or y, pixels.
         seen: some board points that the camera observed, in its frame, metres.
@@ -192,8 +195,7 @@ def in_own_frame(problem: BundleProblem, name: str) -> tuple[Camera, Float[np.nd
 
 
 def grid_points(camera: Camera, depth: float) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 3"]]:
-    """Return pixels over a camera's image, and their points at a depth in its frame, where the lens has a
-    ray."""
+    """Return a grid of pixels that have a ray, and their points at a depth in the camera's frame."""
     rows, columns = GRID
     h, w = camera.hw
     x = np.stack(np.meshgrid(np.linspace(0, w - 1, columns), np.linspace(0, h - 1, rows)), -1).reshape(-1, 2)
@@ -207,8 +209,11 @@ def uncertainty(
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
     """Compute the standard deviation of projections at a depth (metres) over the image.
 
+    It is after the motion of the camera that keeps the boards where they were seen (see `moved_pixels`).
+
     Returns:
-        Pixels (n, 2), and deviations in the worst direction (n), pixels.
+        Pixels (n, 2) of a grid, where the lens has a ray, and deviations in the worst direction (n), pixels;
+        0 where no intrinsics are free.
     """
     x, change = moved_pixels(intrinsics, depth)
     return x, worst_deviation(change @ intrinsics.covariance @ change.swapaxes(-1, -2))
@@ -226,7 +231,7 @@ def moved_pixels(intrinsics: Intrinsics, depth: float) -> tuple[np.ndarray, np.n
     boards move more.
 
     Returns:
-        Pixels (n, 2) and derivatives (n, 2, f).
+        Pixels (n, 2) of a grid (`grid_points`) and derivatives (n, 2, f), in the order of the free ones.
     """
     x, X = grid_points(intrinsics.camera, depth)
     J, at_boards = camera_jacobian(intrinsics.camera, X), camera_jacobian(intrinsics.camera, intrinsics.seen)
@@ -267,8 +272,8 @@ class Jackknife(NamedTuple):
     Attributes:
         covariance: covariance of the cameras' free parameters, by the corrected estimate.
         left_out: covariance of these by a plain jackknife, which leaves out each frame in turn.
-        deformations: covariance of the boards' shapes.
-        step: boards' shapes after a Gauss-Newton step.
+        deformations: covariance of the boards' shapes, by the corrected estimate; (0, 0) for flat boards.
+        step: boards' shapes, board by board, after a Gauss-Newton step; empty for flat boards.
     """
 
     covariance: Float[np.ndarray, "c c"]
@@ -281,11 +286,11 @@ def jackknife(problem: BundleProblem) -> Jackknife:
     """Estimate covariances from the disagreement of frames, to first order.
 
     They include common errors of a frame beyond its points' noise: a bent board, blur, wrong exposure times.
-    A plain jackknife's deviations are too large by 15 to 40 % with a dozen boards that determine all
-    parameters between them; Bell and McCaffrey's (2002) correction removes that.
+    A plain jackknife's deviations are too large where few boards determine all parameters between them; Bell
+    and McCaffrey's (2002) correction removes that.
 
-    Returns:
-        Covariances of the cameras' free parameters and of the boards' shapes, and the shapes after a step.
+    Args:
+        problem: a solution, with its noise.
 
     Raises:
         numpy.linalg.LinAlgError: if parameters are not observable.
@@ -328,16 +333,16 @@ def _clustered(total: Array, H: Array, g: Array) -> Array:
 def with_disagreement(solved: Solved, board: Board, *, unchecked: bool = False) -> Solved:
     """Raise a solution's covariance where frames disagree considerably, and add notes on that and on boards.
 
-    The raised covariance is the mean of the jackknife's, which few frames make noisy, and that of the points'
-    noise scaled to the jackknife's level: the median over the parameters, as frames that disagree about a
-    focal length say nothing of the lens.
+    The raised covariance is the mean of a plain jackknife's, which few frames make noisy, and the solution's
+    own scaled to the jackknife's level: the median over the parameters, as frames that disagree about a focal
+    length say nothing of the lens.
 
     Args:
-        unchecked: True to raise standard deviations by the factor `UNCHECKED` where frames are too few to
-            tell.
+        solved: the solution; without a covariance it gets notes on boards alone.
+        unchecked: True to raise deviations by the factor `UNCHECKED` where frames are too few to tell.
 
     Returns:
-        The solution with that covariance, the factor in `raised`, and notes.
+        The solution with that covariance, the largest factor in `raised` (1 for none), and notes added.
 
     Raises:
         numpy.linalg.LinAlgError: if parameters are not observable by the frames.

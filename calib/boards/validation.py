@@ -43,6 +43,10 @@ def epipolar_errors(
 ) -> dict[tuple[str, str], Float[np.ndarray, " _"]]:
     """Compute epipolar errors by pair: distances of points from their lines, averaged over both directions.
 
+    Args:
+        rig: rig that has the cameras in `views`; ValueError if it lacks one.
+        views: detections by camera; points of one moment and one index are common.
+
     Returns:
         Errors in undistorted pixels, one for each common point within both lens models; pairs without common
         points are absent.
@@ -72,10 +76,11 @@ def epipolar_errors(
 def held_out_errors(
     fit: Solved, views: Mapping[str, BoardViews]
 ) -> dict[tuple[str, str], Float[np.ndarray, " _"]]:
-    """Compute epipolar errors of all frames, each by a rig calibrated without it (in five parts).
+    """Compute epipolar errors of shared frames, each by a rig calibrated without it (in `FOLDS` parts).
 
     Returns:
-        Errors by pair, undistorted pixels; empty for too few frames.
+        Errors by pair, undistorted pixels; empty for fewer than `FEWEST_TO_HOLD_OUT` frames that two cameras
+        share, or if a camera would keep fewer than `FEWEST_LEFT`.
     """
     frames = fit.problem.frames
     shared = [key for key in frames if sum(key in v.seen for v in views.values()) > 1]
@@ -101,7 +106,8 @@ def half_difference(fit: Solved, depth: float) -> dict[str, tuple[np.ndarray, np
 
     Returns:
         By camera, pixels (n, 2) near points of both halves and differences (n, 2) of projections there,
-        pixels; empty for too few frames, or a camera that sees no board in one half.
+        pixels, after the motion of the camera that keeps its boards where they were; empty for fewer than
+        `FEWEST_TO_HALVE` frames, a camera that sees no board in one half, or a half that cannot be fitted.
     """
     count = len(fit.problem.frames)
     even = np.arange(count) % 2 == 0
@@ -135,7 +141,8 @@ class LensComparison:
     """Errors of several lens models of one camera on held-out frames.
 
     Attributes:
-        errors: mean square error of a coordinate (pixels²) of each frame, by model; empty for too few frames.
+        errors: mean square error of a coordinate (pixels²) of each frame, with the board's pose fitted and
+            its freedom allowed for, by model; models that do not fit are missing. Empty for too few frames.
     """
 
     errors: Mapping[Lens, Float[np.ndarray, " f"]]
@@ -146,8 +153,7 @@ class LensComparison:
 
     @property
     def advised(self) -> Lens:
-        """First model that predicts as well as the best, to a standard error or 1 %; brown-conrady without
-        errors."""
+        """First model as good as the best, to a standard error or 1 %; brown-conrady without errors."""
         if not self.errors:
             return "brown-conrady"
         best = min(self.errors, key=self.rms)
@@ -173,10 +179,11 @@ def compare_lenses(views: Mapping[str, BoardViews], board: Board) -> dict[str, L
     Models that contradict frames which others fit are left out.
 
     Returns:
-        Comparisons by camera, without errors for too few frames.
+        Comparisons by camera, without errors for fewer than `FEWEST_TO_COMPARE` frames.
 
     Raises:
-        ValueError: if a camera with enough frames cannot be calibrated with the usual model.
+        ValueError: if a camera with enough frames cannot be calibrated with the usual model, brown-conrady.
+        cv2.error: if OpenCV fails on a board's pose.
     """
     return {name: _compared(name, v, board) for name, v in views.items()}
 
@@ -202,8 +209,7 @@ def _compared(name: str, views: BoardViews, board: Board) -> LensComparison:
 
 
 def _held_out(problem: BundleProblem, out: np.ndarray) -> Float[np.ndarray, " f"]:
-    """Mean square errors of the frames in `out` by a camera fitted to the others, with board poses fitted to
-    them."""
+    """Mean square errors of the frames in `out`, their boards' poses fitted, by a camera of the others."""
     fitted, judged = readjusted(problem.of_boards(~out)), problem.of_boards(out)
     (name,) = fitted.cameras
     if fitted.deformation is not None and judged.deformation is not None:
@@ -228,7 +234,7 @@ def left_out_notes(
 
     Args:
         detected: all detections by camera.
-        singles: solution of each camera alone.
+        singles: solution of each camera alone, of all in `detected`.
         solved: solution of all cameras together.
 
     Yields:
@@ -249,13 +255,13 @@ def start_notes(
     """Yield notes on a calibration from a start rig.
 
     Args:
-        detected: all detections by camera.
-        solved: solution of all cameras together.
+        detected: detections by camera before outliers were left out.
+        solved: solution with priors about the start; AssertionError for one without a covariance.
         deviations: standard deviations about the start.
         lens: lens model by camera that was asked for.
 
     Yields:
-        Sentences on gains by the images, distance from the start, lenses, and points left out.
+        Sentences on gains by the images, lenses, distance from the start, and images and points left out.
     """
     yield _gains(solved, deviations)
     for name, camera in solved.problem.cameras.items():

@@ -26,7 +26,10 @@ def luminance(
     Default: .299 R + .587 G + .114 B, as in MATLAB's rgb2gray and OpenCV; `REC709` weights suit linear light.
 
     Returns:
-        One channel of the same size.
+        One channel (*b, 1, h, w). Channels after the third are ignored.
+
+    Raises:
+        ValueError: for fewer than three channels.
     """
     red, green, blue = (weight * plane for weight, plane in zip(weights, rgb.split(1, -3)))
     return red + green + blue
@@ -38,7 +41,10 @@ def to_luma_chroma(
     """Split sRGB values into luma and colour differences.
 
     Returns:
-        Rec. 601 luma Y (one channel), and (R - Y, B - Y), not scaled, which are zero for grey.
+        Rec. 601 luma Y (*b, 1, h, w), and (R - Y, B - Y) (*b, 2, h, w), not scaled, zero for grey.
+
+    Raises:
+        ValueError: for fewer than three channels.
     """
     luma = luminance(rgb)
     return luma, torch.cat([rgb[..., 0:1, :, :], rgb[..., 2:3, :, :]], -3) - luma
@@ -50,7 +56,7 @@ def from_luma_chroma(
     """Compose RGB from luma and colour differences: the inverse of `to_luma_chroma`.
 
     Returns:
-        RGB, not clipped to 0..1; its luma is `luma` for any chroma.
+        RGB (*b, 3, h, w), not clipped to 0..1; its luma is `luma` for any chroma.
     """
     red_weight, green_weight, blue_weight = REC601
     red, blue = chroma[..., 0:1, :, :], chroma[..., 1:2, :, :]
@@ -59,17 +65,12 @@ def from_luma_chroma(
 
 
 def luminance_of(image: Float[Tensor, "_ h w"]) -> Float[Tensor, "_ h w"]:
-    """Return the luma (1, h, w) of an RGB image; an image of another number of channels is returned
-    unchanged."""
+    """Return the luma (1, h, w) of an RGB image; one of other channels is returned unchanged."""
     return luminance(image) if image.shape[0] == 3 else image
 
 
 def linear_from_srgb(values: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-    """Decode sRGB values to linear light (IEC 61966-2-1); the curve's linear part continues below zero.
-
-    Returns:
-        Linear light of the same shape, 1 at white.
-    """
+    """Decode sRGB values to linear light (IEC 61966-2-1), 1 at white; linear below zero."""
     toe = values <= 0.04045
     return torch.where(toe, values / 12.92, ((torch.where(toe, 0.5, values) + 0.055) / 1.055) ** 2.4)
 
@@ -102,8 +103,11 @@ WANTED = 0.8
 def exposure_gain(image: Float[Tensor, "c h w"]) -> float:
     """Compute the gain that brings the brightest part of a dark or overexposed sRGB image to `WANTED`.
 
+    The brightest part is the quantile `BRIGHT` of linear light, by RGB's luma or the mean of other channels.
+
     Returns:
-        Factor of linear light; 1 if that part is within `ORDINARY` already, and for a black image.
+        Factor of linear light; 1 if that quantile is within `ORDINARY` already, or black; NaN if NaN is among
+        the pixels sampled.
     """
     light = linear_from_srgb(luminance_of(image).mean(0)).flatten()
     brightest = float(light[:: max(light.numel() // 100_000, 1)].quantile(BRIGHT))
@@ -113,11 +117,7 @@ def exposure_gain(image: Float[Tensor, "c h w"]) -> float:
 
 
 def exposed(image: Float[Tensor, "c h w"], gain: float) -> Float[Tensor, "c h w"]:
-    """Multiply an sRGB image's linear light by a factor.
-
-    Returns:
-        The sRGB image, not clipped; the same tensor for a gain of 1.
-    """
+    """Multiply an sRGB image's light by a factor, without clipping; the same tensor for a gain of 1."""
     if gain == 1:
         return image
     return chunked(lambda rows: srgb_from_linear(gain * linear_from_srgb(rows)), image)

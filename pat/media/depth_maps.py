@@ -51,8 +51,8 @@ def read_depth(path: str | Path, *, hw: HW | None = None, scale: float | None = 
 
     Raises:
         FileNotFoundError: for a missing file.
-        ValueError: for a file that is no depth map (several channels, 8 bits, no positive value), or has
-            another size.
+        ValueError: for a file that is no depth map (colour, 8 bits, no positive depth after scaling), has
+            another size, states no usable scale, or cannot be read (as `read_image` without `hw`).
     """
     path = Path(path)
     if not path.is_file():
@@ -79,8 +79,7 @@ def read_depth(path: str | Path, *, hw: HW | None = None, scale: float | None = 
 
 
 def _pfm(path: Path) -> NDArray[np.float32]:
-    """Read a grey PFM file: "Pf", width and height, scale (negative for little-endian), rows from the bottom
-    up."""
+    """Read a grey PFM file: "Pf", w, h, scale (negative for little-endian), rows from the bottom."""
     content = path.read_bytes()
     head = re.match(rb"Pf\s+(\d+)\s+(\d+)\s+([+-]?[0-9]*\.?[0-9]+(?:[eE][+-]?[0-9]+)?)(?:\r\n|\s)", content)
     if head is None:
@@ -114,11 +113,14 @@ def write_points(
 ) -> int:
     """Write the pixels of known depth as a coloured point cloud (binary PLY), atomically.
 
+    Camera, depth and image are on the CPU, of one size, and need no gradient.
+
     Args:
-        path: file to write.
-        camera: camera of the image, on the CPU.
-        depth: metres; pixels that are not finite, or without a ray, are left out.
-        image: values 0..1; grey for one channel, otherwise the first three are colours.
+        path: file to write; missing folders are made.
+        camera: camera of the image.
+        depth: metres, positive, which is not checked; pixels that are not finite, or without a ray, are left
+            out.
+        image: values 0..1; grey for one channel, or three and more, of which the first are RGB.
         along: "depth" for z along the optical axis, "distance" for the length of the ray.
 
     Returns:

@@ -26,8 +26,11 @@ if TYPE_CHECKING:
 def colour_depth(depth: Float[Tensor, "h w"]) -> Float[Tensor, "3 h w"]:
     """Colour a depth map by inverse depth, from its 1st to its 99th percentile.
 
+    Args:
+        depth: positive; NaN and infinity are unknown. 0 is not refused, and spoils the colours of all.
+
     Returns:
-        RGB image 0..1, float32 on the CPU; near is red, far dark blue, unknown (not finite) black.
+        RGB image (3, h, w) 0..1, float32 on the CPU; near is red, far dark blue, unknown black.
     """
     depth = depth.detach().cpu()
     has_depth = depth.isfinite()
@@ -64,7 +67,8 @@ def figure_file(path: Path) -> Path:
         The path.
 
     Raises:
-        ValueError: for another suffix.
+        ImportError: without matplotlib.
+        ValueError: for another suffix, or none.
     """
     from matplotlib.backend_bases import FigureCanvasBase
 
@@ -77,16 +81,19 @@ def save_figure(figure: Figure, path: Path, *, dpi: int = 110) -> Path:
     """Write a matplotlib figure atomically, in the format of the path's suffix.
 
     Args:
+        figure: figure; its canvas becomes Agg's.
         dpi: pixels for each inch of the figure's size.
 
     Returns:
         The path.
 
     Raises:
+        ValueError: as `figure_file`.
         OSError: if it cannot be written.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
+    figure_file(path)
     FigureCanvasAgg(figure)
     with write_atomically(path) as temporary:
         figure.savefig(temporary, dpi=dpi)
@@ -103,13 +110,13 @@ def draw_panels(
     """Draw images side by side with titles, row by row, each scaled to its cell.
 
     Args:
-        panels: images (1 or 3, h, w), values 0..1, by title; a title may have several lines, and the font
-            shrinks until the longest fits. The first image sets the cells' shape.
+        panels: images (1 or 3, h, w), values 0..1, by title, at least one; a title may have several lines,
+            and the font shrinks until the longest fits. The first image sets the cells' shape.
         columns: panels in a row.
         width: width of the figure, in units of 110 pixels.
 
     Returns:
-        One RGB image. Drawn by Pillow, as matplotlib takes a second and a half.
+        One RGB image of Pillow. ValueError for more columns than fit in the width.
     """
     wide = round(110 * width) // columns - GAP
     h, w = next(iter(panels.values())).shape[-2:]

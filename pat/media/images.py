@@ -76,17 +76,18 @@ def read_image(
 ) -> Float[Tensor, "c h w"]:
     """Read an image file: PNG, TIFF, JPEG, PNM, BMP, WebP, HEIC (extra `heic`) or camera raw (extra `raw`).
 
-    8-bit counts are divided by 255, 16-bit ones by 65535 or 2^bits - 1; TIFF files that pack 10, 12 or 14
-    bits, and PNM files, state their own white. Float files must hold 0..1. An opaque alpha channel is
-    dropped. HEIC is reduced to 8 bits and rotated as its header says; raw files are developed to sRGB by
-    LibRaw. An 8-bit image with another colour profile is converted to sRGB with a warning; profiles of 16-bit
-    images, and all with `orientation="ignore"`, are ignored.
+    Counts are divided by 2^bits - 1, or else by 255 or 65535; TIFF files that pack 10, 12 or 14 bits, and PNM
+    files, state their own white. Float files must hold 0..1. An opaque alpha channel is dropped. HEIC is
+    reduced to 8 bits and rotated as its header says; raw files are developed to sRGB by LibRaw. An 8-bit
+    image with another colour profile is converted to sRGB with a warning; other profiles, and all with
+    `orientation="ignore"`, are ignored. Of several images in a file the first is read.
 
     Args:
         name: prefix of messages, such as a camera's name.
         bits: bits that the camera counts in, for a 12-bit camera that stores 0..4095 in 16 bits; None for the
-            file's own.
-        hw: expected (height, width), compared before decoding; None accepts up to `MOST_PIXELS`.
+            file's own. Ignored for float files.
+        hw: expected (height, width) of the result, compared before decoding; None accepts up to
+            `MOST_PIXELS`.
         orientation: "apply" turns the image by its EXIF or TIFF tag, with a warning; "ignore" keeps pixels as
             stored.
 
@@ -95,8 +96,9 @@ def read_image(
 
     Raises:
         FileNotFoundError: for a missing file.
-        ValueError: for a file that is no usable image, is larger than `MOST_PIXELS` or not of size `hw`, or
-            whose extra is not installed.
+        ValueError: for a file that is no usable image (damaged, transparent, other channels or types), values
+            out of range, more than `bits` or the file's own bits allow, a size other than `hw` or over
+            `MOST_PIXELS`, or an extra that is not installed.
     """
     label = f"{name}: {path}" if name else f"{path}"
     planes, white = _planes(Path(path), label, hw, orientation)
@@ -110,15 +112,17 @@ def read_recorded(
     hw: HW | None = None,
     orientation: Literal["apply", "ignore"] = "apply",
 ) -> NDArray[Any]:
-    """Read an image file's values without scaling; files, options and errors as in `read_image`.
+    """Read an image file's values without scaling; files and options as in `read_image`.
+
+    Profiles of 8-bit images, HEIC and raw files are converted as there.
 
     Returns:
-        Values (c, h, w) in the file's own type: uint8, uint16, float, or a TIFF's signed integers; RGB order;
-        TIFF and PNM files with a lower white hold the camera's counts.
+        Values (1 or 3, h, w) in the file's own type: uint8, uint16, float32, float64, or a TIFF's signed
+        integers; RGB order; TIFF and PNM files with a lower white hold the camera's counts.
 
     Raises:
         FileNotFoundError: for a missing file.
-        ValueError: as `read_image`; signed integers, NaN and values outside 0..1 are not refused here.
+        ValueError: as `read_image`, but not for signed integers, NaN or values out of range.
     """
     label = f"{name}: {path}" if name else f"{path}"
     return np.ascontiguousarray(_planes(Path(path), label, hw, orientation)[0])
@@ -158,11 +162,7 @@ def _planes(
 
 
 def recorded_bands(values: Any, sensor: Sensor) -> Any:
-    """Reduce three equal bands to one for a camera that the rig declares grey.
-
-    Returns:
-        Values (1, h, w) in that case; otherwise `values` unchanged.
-    """
+    """Reduce three equal bands to one, (1, h, w), if the rig declares the camera grey; else unchanged."""
     grey = len(values) == 3 and sensor.response not in (None, "rgb")
     return values[:1] if grey and all((values[0] == band).all() for band in values[1:]) else values
 
@@ -180,13 +180,14 @@ def write_image(
 
     Args:
         image: floats (1 or 3, h, w), in 0..1.
-        bits: 8 or 16: values are clipped to 0..1 and rounded; 32 (.tif and .exr only): floats as they are.
+        bits: 8, or 16 (not .jpg): values are clipped to 0..1 and rounded; 32 (.tif, and .exr, which takes no
+            other): float32 as they are.
         unknown: True allows NaN and infinity in 32-bit files.
         profile: True adds an sRGB profile to JPEG and PNG files in colour.
 
     Raises:
-        ValueError: for an image of integers, another number of channels, values that are not finite, or a
-            format that cannot hold it.
+        ValueError: for an image of integers, another number of channels, values that are not finite, other
+            bits, a format that cannot hold it, or an extra that is not installed.
         OSError: if it cannot be written.
     """
     path = Path(path)
@@ -209,8 +210,7 @@ def write_image(
 
 
 def has_many_bits(path: Path) -> bool:
-    """Return True for an image file with more than 8 bits a value, and for raw files; False if missing or
-    unreadable."""
+    """Return True for a file with more than 8 bits a value, and raw files; False if unreadable."""
     if path.suffix.lower() in RAW_SUFFIXES:
         return True
     header = image_header(path.read_bytes()) if path.is_file() else None
@@ -284,15 +284,16 @@ def decoded_photograph(path: Path, flags: int, *, least: int = 1) -> NDArray | N
     """Decode an image file to 8 bits by OpenCV.
 
     Args:
-        flags: OpenCV's IMREAD flags without IMREAD_ANYDEPTH, such as IMREAD_GRAYSCALE.
+        flags: IMREAD_GRAYSCALE or IMREAD_COLOR, with IMREAD_IGNORE_ORIENTATION for pixels as stored.
         least: least pixels of a side.
 
     Returns:
-        Values (h, w) or (h, w, 3) by the flags, uint8, blue first; None if it is no image, is damaged, has a
-        side under `least`, or has more than `MOST_PIXELS`.
+        Values (h, w) or (h, w, 3) by the flags, uint8, blue first, turned by the file's orientation tag if
+        the flags let it; None if it is no image of `image_header`'s formats, is damaged, has a side under
+        `least`, or has more than `MOST_PIXELS`.
 
     Raises:
-        OSError: if the file cannot be read.
+        OSError: if the file is missing or cannot be read.
     """
     content = path.read_bytes()
     header = image_header(content)
@@ -361,11 +362,7 @@ def _counts(planes: NDArray, label: str, bits: int | None, white: int) -> NDArra
 
 
 def exr_writer(path: Path) -> Any:
-    """Import the package OpenEXR, for writing to `path`.
-
-    Raises:
-        ValueError: naming the extra, if it is not installed.
-    """
+    """Import OpenEXR for writing to `path`; ValueError naming the extra if it is not installed."""
     return _of_extra("OpenEXR", "synthesis", f"{path}: writing EXR")
 
 
@@ -391,8 +388,7 @@ def _write_exr(path: Path, planes: NDArray, bits: int) -> None:
 
 
 def _encode(path: Path, colours: NDArray, bits: int) -> bytes:
-    """Encode an image in the format of the path's suffix. Raises ValueError for a format that
-    cannot hold it."""
+    """Encode an image in the format of the path's suffix; ValueError for one that cannot hold it."""
     suffix = path.suffix.lower()
     if suffix in (".jpg", ".jpeg") and bits != 8:
         raise ValueError(f"{path}: JPEG holds 8 bits, not {bits}: write .png or .tif")
@@ -437,8 +433,7 @@ def _quantised(colours: NDArray, bits: int) -> NDArray:
 
 @cache
 def srgb_profile() -> bytes:
-    """Return the bytes of an ICC profile of sRGB, with a fixed date (bytes 24 to 35) so that files are
-    reproducible."""
+    """Return the bytes of an sRGB profile, with a fixed date (bytes 24 to 35): files are reproducible."""
     made = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
     return made[:24] + struct.pack(">6H", 2000, 1, 1, 0, 0, 0) + made[36:]
 
@@ -452,8 +447,8 @@ def in_srgb(values: NDArray, content: bytes, label: str) -> NDArray:
         label: prefix of warnings.
 
     Returns:
-        Values in sRGB, of the same shape and type. Values of 16 bits, and values with a profile that cannot
-        be used, are returned unchanged with a warning.
+        Values in sRGB, of the same shape and type, with a warning; `values` itself without a profile or with
+        sRGB's, and, with a warning, if they are not uint8 or the profile cannot be used.
     """
     profile = _embedded(content)
     if profile is None:
@@ -497,10 +492,10 @@ def _converted(values: NDArray, profile: ImageCms.ImageCmsProfile) -> NDArray:
 
 
 def with_srgb_profile(content: bytes, suffix: str) -> bytes:
-    """Add an sRGB profile to the bytes of an image file in colour: in a grey one it is not valid.
+    """Add an sRGB profile to the bytes of an image file.
 
     Args:
-        content: bytes of the file.
+        content: bytes of a file in colour and without a profile; neither is checked.
         suffix: suffix of its name in small letters, such as ".png".
 
     Returns:

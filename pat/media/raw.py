@@ -27,14 +27,17 @@ def develop(
     """Develop an image to sRGB: subtract the black level, demosaic, scale light to another camera's exposure.
 
     Args:
-        image: counts over 2^bits - 1; sRGB values unless `sensor.coding` is "linear".
-        sensor: the camera that recorded it; a black level without `bits` is in counts of 16 bits.
-        like: sensor whose scale of light (exposure, gain) is wanted; None for its own. Exposures count only
-            if both are known.
+        image: counts over 2^bits - 1; sRGB values unless `sensor.coding` is "linear". A mosaic is its first
+            channel.
+        sensor: the camera that recorded it; a black level without `bits` is in counts of 16 bits, and is
+            under white, which is not checked.
+        like: sensor whose scale of light (exposure, gain in green) is wanted; None for its own. Exposures
+            count only if both are known.
 
     Returns:
         sRGB values, 3 channels for a filter mosaic; at least 0 after a black level was subtracted, above 1
-        where light exceeds white.
+        where light exceeds white; `image` itself where the sensor states nothing to be done. A mosaic that
+        requires a gradient raises RuntimeError.
     """
     factor = _light(sensor, like or sensor)
     if sensor.black_level:
@@ -75,8 +78,12 @@ def match_luminance(
 ) -> Float[Tensor, "3 h w"]:
     """Shift a fused image so that the luminance of its light is alpha's, if alpha's camera measured light.
 
-    Fusion gives sRGB values whose luma is alpha's. Where `sensor.response` is `LIGHT`, all three values of a
-    pixel are shifted equally until luminance agrees: by 0.045 for saturated purple of middle brightness.
+    Fusion gives sRGB values whose luma is alpha's. Where the response is `LIGHT`, all three values of a pixel
+    are shifted equally until luminance agrees.
+
+    Args:
+        alpha: alpha's developed image, sRGB values.
+        sensor: alpha's sensor as `developed` returns it.
 
     Returns:
         The shifted RGB image, not clipped; `image` itself for another response.
@@ -87,8 +94,7 @@ def match_luminance(
 
 
 def _missing(image: Tensor, light: Tensor) -> Tensor:
-    """Shift of sRGB values that gives this luminance of light, by Newton's method on a convex function from
-    above."""
+    """Shift of sRGB values that gives this luminance of light, by Newton's method."""
     shift = torch.zeros_like(light)
     for _ in range(4):
         value = image + shift
@@ -105,14 +111,14 @@ def demosaiced(raw: Float[Tensor, "1 h w"], pattern: str) -> Float[Tensor, "3 h 
     which removes false-colour fringes.
 
     Args:
-        raw: values of the mosaic, 0..1; others are clipped.
+        raw: values of the mosaic, 0..1; others are clipped; channels after the first are ignored.
         pattern: colours of the first two pixels of the first row, then of the second, such as "RGGB".
 
     Returns:
-        RGB image of the same size, clipped to 0..1.
+        RGB image of the same size, clipped to 0..1, of the type and on the device of `raw`.
 
     Raises:
-        AttributeError: for another pattern.
+        AttributeError: for another pattern; OpenCV's own of two letters pass, and name other pixels.
         RuntimeError: for values that require a gradient.
     """
     code = getattr(cv2, f"COLOR_Bayer{pattern}2RGB_EA")

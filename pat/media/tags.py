@@ -36,11 +36,12 @@ OF_ONE = re.compile(
 
 
 class RecordedTags(NamedTuple):
-    """Tags of an image file.
+    """Tags of an image file that results keep.
 
     Attributes:
-        texts: make, model and time, by the number of the tag.
-        directories: values by the number of the tag, for the directories of EXIF and GPS, by their number.
+        texts: make, model and time, by the number of the tag (`TEXTS`); only those that the file has.
+        directories: tags of EXIF and GPS as Pillow reads them, by the directory's number (`EXIF`, `GPS`) and
+            the tag's (`KEPT`); an empty directory is left out.
         xmp: the XMP packet; empty without.
     """
 
@@ -55,9 +56,10 @@ class RecordedTags(NamedTuple):
         return [*tags, (XMP, "B", len(packet), packet, True)] if packet else tags
 
     def write_directories(self, path: Path) -> None:
-        """Add the directories of EXIF and GPS to a TIFF file, which is rewritten in place.
+        """Add the directories of EXIF and GPS to a TIFF file's first image; the file is rewritten in place.
 
-        The file must be little-endian with offsets of 32 bits, as tifffile writes it; this is not checked.
+        The file must be little-endian with offsets of 32 bits, as tifffile writes it, and have no such
+        directories yet; this is not checked. OSError if it is missing or cannot be written.
         """
         content = bytearray(path.read_bytes())
         first = int.from_bytes(content[4:8], "little")
@@ -81,7 +83,8 @@ def recorded_tags(path: Path) -> RecordedTags | None:
     """Read the tags of an image file that results keep: make, model, time, EXIF, GPS and XMP.
 
     Returns:
-        The tags; None if it has none of these, or is damaged or missing.
+        The tags; None if it has none of these, or Pillow cannot read it: damaged, missing, of another format,
+        or beyond Pillow's limit of pixels.
     """
     try:
         with Image.open(path) as image:
@@ -100,8 +103,9 @@ def recorded_tags(path: Path) -> RecordedTags | None:
 def packet_of_bands(packet: bytes, bands: Sequence[str], wavelengths: Sequence[float | None]) -> bytes:
     """Adjust one camera's XMP packet for an image of several bands at that camera's pixels.
 
-    Tags of its own band are left out (vignetting, radiometry); the camera, its pose and its flight stay.
-    Bands and wavelengths replace Pix4D's tags of them; a packet without such tags gets none.
+    Tags of its own band and of its place in the rig are left out (vignetting, radiometry); the camera, its
+    pose and its flight stay. Bands and wavelengths replace Pix4D's tags of them; a packet without such tags
+    gets none.
 
     Args:
         packet: XMP packet of the camera's file.
@@ -109,7 +113,7 @@ def packet_of_bands(packet: bytes, bands: Sequence[str], wavelengths: Sequence[f
         wavelengths: their central wavelengths in nanometres; none are written if one is None.
 
     Returns:
-        The packet; empty for a damaged one.
+        The packet; empty for an empty or damaged one.
     """
     for prefix, uri in re.findall(r'xmlns:(\w+)="([^"]+)"', packet.decode(errors="replace")):
         if not re.fullmatch(r"ns\d+", prefix):
@@ -148,11 +152,12 @@ def focal_length(path: str | Path, hw: HW) -> float | None:
     """Read a photograph's focal length from its EXIF tags.
 
     Args:
-        hw: size of the image that the focal length is wanted for; the file's first image may be a thumbnail.
+        hw: size of the image that the focal length is wanted for, the whole picture at any scale; the file's
+            first image may be a thumbnail.
 
     Returns:
-        Focal length in pixels, from the sensor's resolution or else the 35 mm equivalent; None if the tags do
-        not state it or the file cannot be read.
+        Focal length in pixels of that image, from the sensor's resolution or else the 35 mm equivalent; None
+        if the tags do not state it, or the file is missing or cannot be read by Pillow.
     """
     try:
         with Image.open(path) as image:

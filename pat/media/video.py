@@ -23,14 +23,15 @@ def write_video(path: str | Path, frames: Iterable[Float[Tensor, "c h w"]], *, r
     """Write images as an H.264 video (.mp4, .mkv), atomically.
 
     Args:
-        frames: grey or RGB images, sRGB values, clipped to 0..1; an odd last row or column is left out, as
-            4:2:0 needs even sides.
+        frames: images (1 or 3, h, w), grey or RGB, sRGB values, clipped to 0..1, taken one at a time; an odd
+            last row or column is left out, as 4:2:0 needs even sides.
         rate: frames for each second.
 
     Raises:
         ImportError: without the extra `video`.
         ValueError: for no frames, frames of different sizes or under 2 x 2, another suffix, or a rate outside
             .001 to 1000.
+        RuntimeError: for another number of channels.
         OSError: if it cannot be written.
     """
     path = Path(path)
@@ -75,8 +76,8 @@ class Video(NamedTuple):
     """Frames of a video file, read as they are asked for.
 
     Attributes:
-        frames: iterator, to be read once, of images 0..1, RGB (3, h, w), or grey (1, h, w) if the first is
-            grey (`is_grey`).
+        frames: iterator, to be read once, of sRGB images 0..1, float32: RGB (3, h, w), or all of them grey
+            (1, h, w) if the first is grey (`is_grey`).
         rate: frames for each second.
     """
 
@@ -88,11 +89,11 @@ def read_video(path: str | Path) -> Video:
     """Open a video file of any format that OpenCV reads.
 
     Returns:
-        Its frames, decoded on demand, and their rate. A file damaged further on ends early without an error.
+        Its frames, decoded on demand, and their rate. Frames end without an error where the file is damaged.
 
     Raises:
         FileNotFoundError: for a missing file.
-        ValueError: for a file that is no readable video.
+        ValueError: for a file that OpenCV does not open, or that states no rate.
     """
     path = Path(path)
     if not path.is_file():
@@ -111,8 +112,7 @@ CONTRAST = 10.0
 
 
 def is_grey(image: Float[Tensor, "3 h w"]) -> bool:
-    """Return True for a decoded picture with contrast whose colours differ by no more than a codec's
-    rounding."""
+    """Return True for a decoded picture with contrast whose colours differ only by a codec's rounding."""
     differences = image.amax(0) - image.amin(0)
     low, high = image[1].aminmax()
     return float(differences.max()) < min(GREY_ROUNDED, float(high - low) / CONTRAST)

@@ -33,13 +33,13 @@ class NoiseLevel:
     """Noise model of a camera: the variance of a pixel of value v is shot · v + read².
 
     Attributes:
-        shot: variance for each unit of signal, values 0..1; a number, or (B, 1, 1, 1) for a batch.
-        read: standard deviation of the read noise, values 0..1; as `shot`.
-        added_to: "light" for noise in linear light, sRGB-encoded afterwards; "values" for noise in the
-            values.
+        shot: variance for each unit of v, which is 1 at white; a number, or (B, 1, 1, 1) for a batch.
+        read: standard deviation of the read noise, in the unit of v; number or batch as `shot`.
+        added_to: "light" where v is linear light, sRGB-encoded afterwards; "values" where v is the image's
+            value itself.
 
     Raises:
-        ValueError: for a negative or infinite `shot` or `read`, or another `added_to`.
+        ValueError: for a `shot` or `read` that is negative, infinite or NaN, or another `added_to`.
     """
 
     shot: float | Tensor = 0.0
@@ -64,10 +64,10 @@ class NoiseLevel:
             added_to: "light" or "values", as for the class.
 
         Returns:
-            The noise level in values 0..1.
+            The noise level: shot 1 / `electrons`, read `read` / `electrons`.
 
         Raises:
-            ValueError: for fewer than 1 electron at white, or a negative read noise.
+            ValueError: for fewer than 1 electron at white, and as the class raises it.
         """
         if not electrons >= 1:
             raise ValueError(
@@ -90,12 +90,12 @@ class NoiseLevel:
         underestimated; fine texture all over the image is taken for noise.
 
         Args:
-            image: image, values 0..1, which is not checked; where it is black, or brighter than .95, nothing
-                is estimated.
+            image: image on the CPU, values 0..1, which is not checked; blocks with several black pixels, or
+                brighter than .95, are left out.
 
         Returns:
-            The noise level; zero for an image with sides under 14 pixels, or one that is all clipped or
-            without variation.
+            The noise level, one for all channels; zero if a side is under 14 pixels, no block is left, or the
+            smoothest blocks have no variation.
         """
         if min(image.shape[-2:]) < SIDE + 2:
             return cls()
@@ -108,9 +108,13 @@ class NoiseLevel:
     def recorded(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
         """Add this noise to an ideal sRGB image: Poisson counts plus normal read noise, clipped to 0..1.
 
+        Args:
+            image: sRGB values without NaN.
+            generator: random generator on the image's device.
+
         Returns:
-            The noisy image, sRGB-encoded, of the same shape. No gradient reaches `image` where `shot` is
-            above 1e-7.
+            The noisy sRGB image, of the same shape. Up to a `shot` of 1e-7 there is read noise alone; above,
+            no gradient reaches `image`.
         """
         linear = self.added_to == "light"
         light = linear_from_srgb(image) if linear else image
@@ -121,20 +125,16 @@ class NoiseLevel:
         return srgb_from_linear(light.clamp(0, 1)) if linear else light.clamp(0, 1)
 
     def deviation(self, image: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
-        """Compute the standard deviation of a noisy sRGB image's values at the mean brightness around each
-        pixel.
-
-        Returns:
-            Deviations of values 0..1, of the image's shape.
-        """
+        """Compute the standard deviation of a noisy sRGB image's values by the brightness around each."""
         _, mean, deviation = self._curves(image)
         return _interpolated(_smoothed(image), mean, deviation)
 
     def unbiased(self, image: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
-        """Correct the bias of a noisy image, so that local means come near the ideal image's.
+        """Correct the bias of a noisy sRGB image, so that local means come near the ideal image's.
 
         Clipping at black makes the mean too bright, the more so with read noise; sRGB encoding makes it too
-        dark. Denoisers that average values keep this bias.
+        dark. Denoisers that average values keep this bias. The noise is taken as normal: dark parts keep some
+        bias where pixels count few electrons.
 
         Returns:
             The corrected sRGB image, of the same shape; not clipped.
@@ -155,8 +155,7 @@ class NoiseLevel:
 
 
 def _interpolated(x: Tensor, positions: Float[Tensor, "b n"], values: Float[Tensor, "b n"]) -> Tensor:
-    """Interpolate values given at increasing positions, at the entries of x (B, ...); constant beyond both
-    ends."""
+    """Interpolate values at increasing positions, at the entries of x (B, ...); constant beyond the ends."""
     flat = x.flatten(1).clamp(positions[:, :1], positions[:, -1:])
     i = torch.searchsorted(positions.contiguous(), flat.contiguous()).clamp(1, positions.shape[1] - 1)
     low, high = positions.gather(1, i - 1), positions.gather(1, i)

@@ -39,7 +39,8 @@ class Step(ABC):
             hw: height and width before the step.
 
         Returns:
-            A with x_after ~ A x_before, float64; the identity for a step that keeps the pixel grid.
+            A (3, 3) with (x, y, 1) after the step ~ A (x, y, 1) before it, float64 on the CPU; the identity
+            for a step that keeps the pixel grid.
         """
         return torch.eye(3, dtype=torch.float64)
 
@@ -80,7 +81,8 @@ class GaussianBlur(Step):
     """Uniform Gaussian defocus with replicated border, differentiable in sigma.
 
     Attributes:
-        sigma: standard deviation in pixels; a negative or infinite one raises ValueError.
+        sigma: standard deviation in pixels, a number or a tensor of one; ValueError if it is negative,
+            infinite or NaN. 0 changes nothing, and has no gradient in sigma.
     """
 
     sigma: float | Tensor
@@ -101,8 +103,9 @@ class Resample(Step):
     """Change of the number of pixels for the same field of view: c' = (c + 0.5) s - 0.5.
 
     Attributes:
-        to: a factor (sizes are rounded, which changes the factor along each axis), or (height, width).
-        method: "area" models a sensor with larger pixels and keeps the image's mean exactly; "bicubic" is the
+        to: a factor (sizes are rounded, to 1 pixel at least, which changes the factor along each axis), or a
+            tuple (height, width).
+        method: "area" models a sensor with larger pixels and keeps each channel's mean; "bicubic" is the
             usual antialiased resize with a = -0.5, which may leave 0..1.
 
     Raises:
@@ -146,11 +149,12 @@ def _area_weights(old: int, new: int) -> Tensor:
 class Noise(Step):
     """Shot and read noise on linear values, from a normal distribution of variance signal + read^2.
 
-    The result is not clipped, and differentiable.
+    The signal is in electrons, 0 for negative values. The result is not clipped, and differentiable.
 
     Attributes:
-        full_well: electrons at value 1, more than 0.
+        full_well: electrons at value 1, more than 0; infinity is not refused and gives NaN.
         read: standard deviation of the read noise in electrons, 0 or more.
+
     Raises:
         ValueError: for numbers outside these ranges or NaN.
     """
@@ -179,7 +183,7 @@ class Clip(Step):
 
 @dataclass(frozen=True)
 class Quantise(Step):
-    """Clipping to 0..1 and rounding to 2^bits levels; gradients pass as if nothing were rounded.
+    """Clipping to 0..1 and rounding to 2^bits levels; gradients pass as if only clipped.
 
     Attributes:
         bits: bits of a value, 1 or more; fewer raise ValueError.
@@ -201,11 +205,11 @@ class Quantise(Step):
 class Jitter(Step):
     """Random gain, gamma and white balance of sRGB values, drawn for each image of the batch.
 
-    A value v becomes gain · channel gain · v^gamma, clipped to 0..1.
+    A value v becomes gain · channel gain · v^gamma, clipped to 0..1; gains and gamma are log-normal about 1.
 
     Attributes:
         gain: standard deviation of the natural logarithm of the gain of all channels.
-        gamma: standard deviation of the natural logarithm of gamma.
+        gamma: standard deviation of the natural logarithm of gamma, one for all channels.
         normalisation: standard deviation of the natural logarithm of each channel's own gain.
 
     Raises:
@@ -234,11 +238,7 @@ def _separably(image: Tensor, kernel: Tensor) -> Tensor:
 
 
 def convolved(image: Tensor, kernel: Tensor) -> Tensor:
-    """Convolve each channel with an odd-sized kernel (kh, kw); the border is replicated.
-
-    Returns:
-        Images of the same shape. Even sides of the kernel are not supported and fail on the shape.
-    """
+    """Convolve each channel with a kernel (kh, kw) of odd sides (others fail); the border is replicated."""
     h, w = kernel.shape
     planes = pad(image.flatten(0, 1)[:, None], (w // 2, w // 2, h // 2, h // 2), mode="replicate")
     return conv2d(planes, kernel[None, None]).view(image.shape)
@@ -268,12 +268,12 @@ def normal(shape: Sequence[int], like: Tensor, generator: Generator) -> Tensor:
 
 
 class Pairs(NamedTuple):
-    """Degraded images of both cameras.
+    """Images of both cameras degraded by `augment`.
 
     Attributes:
-        alpha: alpha's images, values 0..1.
-        beta: beta's images, values 0..1.
-        case: number of each pair's case, int64, on the generator's device.
+        alpha: alpha's images.
+        beta: beta's images.
+        case: case of each pair, 0 to 3 as `augment` numbers them, int64, on the generator's device.
     """
 
     alpha: Float[Tensor, "b ca ha wa"]
@@ -286,16 +286,16 @@ def augment(
 ) -> Pairs:
     """Degrade each pair of a batch by one of the paper's four cases, drawn at random, all equally likely.
 
-    0: alpha blurred; 1: beta blurred; 2: beta reduced to half the size and back; 3: both. The paper does not
-    state the blur; here it is a box of 5 pixels.
+    0: alpha blurred; 1: beta blurred; 2: beta reduced to half the size and back (bicubic, clipped to 0..1);
+    3: beta blurred, then reduced and back. The paper does not state the blur; here it is a box of 5 pixels.
 
     Args:
         alpha: alpha's images.
-        beta: beta's images, with even sides.
+        beta: beta's images, as many, with even sides: odd ones fail in cases 2 and 3 with RuntimeError.
         generator: random generator.
 
     Returns:
-        Copies of the images, of the same shapes, with the case of each pair; those given stay.
+        New images of the same shapes, with the case of each pair.
     """
     blur: tuple[Step, ...] = (BoxBlur(5),)
     reduced: tuple[Step, ...] = (Resample(0.5, "bicubic"), Resample(2.0, "bicubic"), Clip())

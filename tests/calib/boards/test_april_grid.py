@@ -105,6 +105,8 @@ def test_boards_that_share_markers_are_refused():
         parse_boards(["charuco:6x5:40mm", "charuco:6x5:30mm"])
     with pytest.raises(ValueError, match="chessboard:6x5:30mm"):
         parse_boards(["charuco:6x5:40mm", "chessboard:6x5:30mm"])
+    with pytest.raises(ValueError, match="board"):
+        parse_boards([])
 
 
 def test_paper():

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 import torch
+from matplotlib.figure import Figure
 
-from pat.media.figures import GAP, TITLE, draw_panels
+from pat.media.figures import GAP, TITLE, draw_panels, save_figure
 
 
 @pytest.mark.parametrize("factor", [0.5, 4.0], ids=["reduced", "enlarged"])
@@ -34,3 +35,10 @@ def test_long_titles_of_two_lines_stay_above_their_panels():
     rows, columns = (np.flatnonzero(dark.any(axis)) for axis in (1, 0))
     assert rows.max() < 2 * TITLE
     assert columns.max() < drawn.width // 2
+
+
+@pytest.mark.parametrize("name", ["figure", "figure.xyz"])
+def test_a_figure_of_no_format_is_refused_and_leaves_nothing(name, tmp_path):
+    with pytest.raises(ValueError, match=name):
+        save_figure(Figure(), tmp_path / name)
+    assert not list(tmp_path.iterdir())
