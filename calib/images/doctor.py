@@ -44,6 +44,7 @@ from .hypotheses import (
 )
 from .least_squares import most_probable
 from .matches import (
+    ENOUGH,
     Images,
     Pairs,
     PointMatches,
@@ -228,7 +229,7 @@ def diagnose(rig: Rig, images: Images, matches: Pairs | None = None) -> Diagnosi
 def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnosis:
     """Find the usual mistake, if any, in a rig, by points matched between images of these sizes.
 
-    At most `MOST` points of a pair are used, evenly spaced in their list; few points are not refused.
+    At most `MOST` points of a pair are used, evenly spaced in their list.
 
     Args:
         sizes: (height, width) of each camera's image, a tuple, which the rig may state otherwise.
@@ -238,12 +239,14 @@ def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnos
         The mistake with its repaired rig, and what else was compared.
 
     Raises:
-        ValueError: for no sizes, a camera that the rig lacks, or if it relates none of the pairs.
-        IndexError: for no points.
+        ValueError: for no sizes, a camera that the rig lacks, if it relates none of the pairs, or for pairs
+            without `ENOUGH` points.
     """
     pairs = {names: _thinned(matches) for names, matches in related(rig, pairs).items()}
     fits = all(rig[name].hw == hw for name, hw in sizes.items())
     points = sum(len(matches.alpha) for matches in pairs.values())
+    if points < ENOUGH:
+        raise ValueError(f"{points} matched points: {ENOUGH} or more are needed")
     pairs = within_lenses(rig, pairs) if fits else pairs
     tried = hypotheses(rig, sizes)
     if fits:

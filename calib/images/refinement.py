@@ -14,6 +14,7 @@ accepted.
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -113,11 +114,13 @@ def refine(
 
     Raises:
         ValueError: in one line, for no frame, an image of another size than the rig states, images that
-            `match_cameras` refuses, given points of which too few agree, and as `refine_matches`.
-        IndexError: for `matches` of fewer frames.
+            `match_cameras` refuses, given points of which too few agree, `matches` of another number of
+            frames, and as `refine_matches`.
     """
     if not frames:
         raise ValueError("no frame: give images of two cameras or more")
+    if matches is not None and len(matches) != len(frames):
+        raise ValueError(f"matches of {len(matches)} frames for images of {len(frames)}: give them for each")
     for name, (height, width) in (item for frame in frames for item in image_sizes(frame).items()):
         h, w = rig[name].hw
         if (height, width) != (h, w):
@@ -167,7 +170,8 @@ def refine_matches(
         problem = RefinementProblem.from_frames(rig, free, frames=frames, sigma=sigma)
         return problem.report(problem.solve_freely(), force=True)
     fit, solution = fitted(rig, frames, free=free, sigma=sigma, near_depth=not force)
-    return fit.report(solution, force=force)
+    found = fit.report(solution, force=force)
+    return found if found.accepted else dataclasses.replace(found, rig=rig)
 
 
 def fitted(

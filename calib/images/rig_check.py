@@ -111,17 +111,18 @@ def share_unlike(
         tolerance: tolerance relative to depth.
 
     Returns:
-        Share of the points, 0..1, at which the map is off by more than the tolerance; NaN for too few points.
+        Share of the points, 0..1, at which the map is off by more than the tolerance; NaN for too few points,
+        or none that match with alpha.
 
     Raises:
         KeyError: without an image of alpha.
         ValueError: for a camera that the rig lacks.
-        TypeError: if points match between other cameras, but none with alpha.
     """
     if (matched := _matched(rig, {alpha: images[alpha], **images}, LARGEST_SIDE)) is None:
         return math.nan
     rig, pairs = matched
-    pairs = {names: points for names, points in pairs.items() if names[0] == alpha}
+    if not (pairs := {names: points for names, points in pairs.items() if names[0] == alpha}):
+        return math.nan
     depths = match_depths(rig, pairs)
     (h, w), x = depth.shape, torch.cat([points.alpha for points in pairs.values()]).double()
     scale = x.new_tensor([w / rig[alpha].hw[1], h / rig[alpha].hw[0]])

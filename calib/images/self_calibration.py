@@ -108,11 +108,11 @@ def self_calibrated(
         focal: focal lengths in pixels by camera; missing ones are assumed.
 
     Returns:
-        The pair, with the depth range of the points; None for points that no poses explain.
+        The pair, with the depth range of the points; None for points that no poses explain, and fewer than
+        `ENOUGH` within `NEAR_LINE` pixels of their lines.
 
     Raises:
         ValueError: for another number of views than two, and points that are all in one spot.
-        IndexError: if no point is within `NEAR_LINE` pixels of its line.
     """
     alpha, beta = views
     lenses = {
@@ -122,6 +122,8 @@ def self_calibrated(
     lengths = _focal_lengths(views, link, focal)
     K = {name: intrinsics(length, views[name].hw) for name, length in lengths.items()}
     near = near_lines(matches, link.F, within=NEAR_LINE)
+    if len(near.alpha) < ENOUGH:
+        return None
     best = AS_GOOD * float(line_distance(near, link.F).median()) + SLACK
     trials: list[RefinedPair] = []
     for beta_from_alpha in initial_poses(near, link, K[alpha], K[beta]):

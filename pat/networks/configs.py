@@ -47,8 +47,8 @@ class GuidedPATConfig:
 
     Attributes:
         bands: number of bands of the fused image; None for all bands of the betas.
-        keep_luminance: True if the network adds colour to alpha but never luminance (Rec. 601 of the first
-            three bands; with fewer the network raises ValueError); without `bands` it has no effect.
+        keep_luminance: True if the network adds colour to alpha but never luminance (Rec. 601), which needs
+            three bands; without `bands` it has no effect.
         learned: True for matching with trained networks; False for classical matching, semi-global with a
             left-right check, whose confidence is 0 or 1.
     """

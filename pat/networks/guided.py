@@ -33,6 +33,9 @@ class GuidedPAT(nn.Module):
     With `config.bands` the image has that many bands: three filtered cameras give one each, or any number of
     RGB cameras all three; other betas help to find depth only. With `config.bands` None the image has all
     bands of all betas, in order, whatever their spectra; permuting betas permutes its bands.
+
+    Raises:
+        ValueError: for `keep_luminance` with another number of bands than three.
     """
 
     multiple = 16
@@ -47,6 +50,8 @@ class GuidedPAT(nn.Module):
         self.config = config
         self.bands, self.learned = config.bands, config.learned
         self.keeps_luminance = config.bands is not None and config.keep_luminance
+        if self.keeps_luminance and self.bands != 3:
+            raise ValueError(f"keep_luminance: {self.bands} bands have no Rec. 601 luminance: wanted bands 3")
         self.joins_bands: JoinsBands = "all" if config.bands is None else "neighbours"
 
     def working_bytes(self, alpha: int, betas: Sequence[int]) -> float:

@@ -95,11 +95,15 @@ def new_network(config: Any, start: Path | None = None) -> Network:
         The network on the CPU, for training; with `start`, its weights are copied.
 
     Raises:
-        StopIteration: for a configuration of another class.
+        TypeError: for a configuration of another class.
         FileNotFoundError: for a missing `start`.
         ValueError: for weights of another network or configuration, and as `load_weights`.
     """
-    network: Network = next(made for made, of in NETWORKS.values() if type(config) is of)(config)
+    makers = {of: made for made, of in NETWORKS.values()}
+    if type(config) not in makers:
+        wanted = " or ".join(of.__name__ for of in makers)
+        raise TypeError(f"config is a {type(config).__name__}: wanted a {wanted}")
+    network: Network = makers[type(config)](config)
     if start is not None:
         weights = load_weights(start)
         if type(weights) is not type(network) or weights.config != config:

@@ -259,6 +259,10 @@ def test_bad_input_is_one_clear_line():
         diagnose(rig, images | {"right": texture(seed=5)})
     with pytest.raises(ValueError, match="'right'"):
         diagnose(rig, {"left": images["left"], "rihgt": images["right"]})
+    for count in (0, 3):
+        few = {("left", "right"): PointMatches(*torch.rand(2, count, 2).double())}
+        with pytest.raises(ValueError, match="points"):
+            diagnose_matches(rig, sizes(rig), few)
 
 
 def test_depths_of_a_rig_of_unknown_scale_are_not_in_metres():

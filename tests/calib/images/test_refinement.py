@@ -317,6 +317,8 @@ def test_bad_input_is_one_clear_line():
         refine(rig, [images], sigma={"center": 3})
     with pytest.raises(ValueError, match="frame"):
         refine(rig, [])
+    with pytest.raises(ValueError, match="frames"):
+        refine(rig, [images, images], matches=[match_cameras(images)])
 
 
 @pytest.mark.parametrize(

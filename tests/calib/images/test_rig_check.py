@@ -12,7 +12,7 @@ from arraygeom import Pose, Rig
 from calib.images import rig_check
 from calib.images.depth_change import share_outside
 from calib.images.matches import PointMatches, match_cameras
-from calib.images.rig_check import find_misfit, misfit_warning
+from calib.images.rig_check import find_misfit, misfit_warning, share_unlike
 from pat.app.cli.main import main
 from pat.media.images import write_image
 from tests.calib.scenes import rectified_images, rectified_pair, texture, vector
@@ -136,3 +136,11 @@ print(*sys.modules)
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     ).stdout.split()
     assert {"scipy.stats", "scipy.spatial", "kornia", "sympy"}.isdisjoint(modules)
+
+
+def test_a_depth_map_whose_pixels_match_nothing_is_not_judged():
+    """Two betas have points in common, alpha has none with either."""
+    rig, images = rectified_pair(), rectified_images()
+    rig = rig.with_camera("third", rig["left"])
+    images["third"] = texture(tuple(images["left"].shape[-2:]), seed=5)
+    assert math.isnan(share_unlike(rig, images, "third", torch.ones(images["left"].shape[-2:]), 0.1))

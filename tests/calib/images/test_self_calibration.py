@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from arraygeom import Distortion, LensView, Pose, Rig, intrinsics
+from arraygeom import Distortion, LensView, Link, Pose, Rig, intrinsics
 from arraygeom.pixels import coarse_grid
 from calib.images import self_calibration
 from calib.images.matches import PointMatches, with_map
@@ -136,3 +136,10 @@ def test_pairs_are_joined_at_their_scales():
     assert rig.names == ("left", "right", "up")
     assert torch.allclose(rig["up"].t, 0.5 * rig["right"].t)
     assert [float(bound) for bound in rig.depth] == [1.5, 8.0]
+
+
+def test_points_off_their_lines_calibrate_nothing():
+    rig = rectified_pair()
+    matches = PointMatches(torch.zeros(30, 2).double(), torch.tensor([0.0, 50.0]).double().expand(30, 2))
+    link = Link(F=rig.pair(*rig.names).fundamental)
+    assert self_calibrated(rig.cameras, link, matches, focal={}) is None

@@ -10,9 +10,10 @@ import torch
 from safetensors.torch import save_file
 
 from pat.networks.configs import GuidedPATConfig, PATConfig
+from pat.networks.denoiser import DenoiserConfig
 from pat.networks.guided import GuidedPAT
 from pat.networks.paper import PAT
-from pat.networks.weights import FORMAT, SHIPPED, load_weights, save_weights, shipped
+from pat.networks.weights import FORMAT, SHIPPED, load_weights, new_network, save_weights, shipped
 
 NETWORKS = [
     PAT(PATConfig(betas=2, dim=8)),
@@ -137,3 +138,10 @@ def test_weights_of_integers_are_refused(tmp_path):
     weights_file(tmp_path / "w.safetensors", dataclasses.asdict(network.config), "PAT", state)
     with pytest.raises(ValueError, match="numbers"):
         load_weights(tmp_path / "w.safetensors")
+
+
+def test_configurations_of_no_network_are_named():
+    with pytest.raises(TypeError, match="DenoiserConfig"):
+        new_network(DenoiserConfig())
+    with pytest.raises(ValueError, match="keep_luminance.*1 band"):
+        new_network(GuidedPATConfig(bands=1))

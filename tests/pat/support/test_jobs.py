@@ -182,3 +182,8 @@ def test_the_time_left_is_right_within_half_once_two_tasks_are_done(seconds, mon
     for done, line in [*enumerate(lines, 1)][1:-1]:
         left = sum(seconds[done:])
         assert left / 1.5 <= float(re.search(r"about (\d+) s left", line)[1]) <= 1.5 * left
+
+
+def test_a_time_limit_leaves_some_time():
+    with pytest.raises(ValueError, match="timeout"):
+        Workers(timeout=0)

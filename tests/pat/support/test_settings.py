@@ -7,6 +7,7 @@ import pytest
 from pat.lab.commands import Settings
 from pat.matching.semi_global import HALF_SIZE
 from pat.matching.subpixel import FULL_SIZE
+from pat.support.schema import entries_of
 from pat.support.settings import all_settings, listed, physics, size, tuned
 
 
@@ -47,3 +48,8 @@ def test_of_settings_that_a_room_has_twice_what_differs_is_counted():
     steps = [s.value for s in all_settings("pat.matching") if s.name == "step" and s.kind == "tuned"]
     assert sorted(steps) == [HALF_SIZE.step, FULL_SIZE.step]
     assert found.count(HALF_SIZE.consistent) == 1
+
+
+def test_json_too_deep_to_read_has_no_entries(tmp_path):
+    (tmp_path / "deep.json").write_text("[" * 100_000)
+    assert entries_of(tmp_path / "deep.json") == {}
