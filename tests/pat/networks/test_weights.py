@@ -143,5 +143,5 @@ def test_weights_of_integers_are_refused(tmp_path):
 def test_configurations_of_no_network_are_named():
     with pytest.raises(TypeError, match="DenoiserConfig"):
         new_network(DenoiserConfig())
-    with pytest.raises(ValueError, match="keep_luminance.*1 band"):
+    with pytest.raises(ValueError, match=r"keep_luminance.*1 band"):
         new_network(GuidedPATConfig(bands=1))
