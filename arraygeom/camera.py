@@ -45,9 +45,9 @@ class Projected(NamedTuple):
 
     Attributes:
         x: pixels (x, y); without meaning where not `valid`.
-        depth: z in the camera's frame, metres.
-        valid: True for points that the model sees: in front of a pinhole, within a lens model's range; the
-            image's borders are not considered.
+        depth: z in the camera's frame, metres; at most 0 for points behind it.
+        valid: True for points that the model sees: in front of a pinhole (X and Y may be NaN), within a lens
+            model's range; the image's borders are not considered.
     """
 
     x: Float[Tensor, "*n 2"]
@@ -133,7 +133,8 @@ class LensView(View):
     """View with a lens model, whose focal length and pose need not be known.
 
     Without a calibration K is only the scale and the centre to which `distortion` refers: `rays` then follow
-    the lens but their angles mean nothing. Links of such views relate undistorted pixels.
+    the lens but their angles mean nothing. Links of such views relate undistorted pixels. A subclass must not
+    override `rays` or `project_local`: models of one's own are a `CameraModel`.
 
     >>> lens = Distortion("brown-conrady", torch.tensor([-0.1, 0, 0, 0], dtype=torch.float64))
     >>> view = LensView(hw=(61, 101), K=intrinsics(50.0, (61, 101)), distortion=lens)
@@ -141,12 +142,13 @@ class LensView(View):
     [95.0, 30.0]
 
     Attributes:
-        K: map from the plane z = 1 (after the lens) to pixels.
+        K: map from the plane z = 1 (after the lens) to pixels, last row (0, 0, 1), not singular.
         distortion: lens model; None for a pinhole.
 
     Raises:
-        ValueError: for an invalid K, or batch axes that do not broadcast.
-        TypeError: for a `distortion` that is no lens model.
+        ValueError: for an invalid size or K, NaN in a lens, or batch axes that do not broadcast.
+        TypeError: for fields of other types, a `CameraModel` that `check_model` refuses, and such a subclass.
+        NotImplementedError: for a `CameraModel` without one of its methods.
     """
 
     item_axes: ClassVar = {"K": 2}
@@ -200,10 +202,11 @@ class LensView(View):
 
         Returns:
             Directions (z = 1 for pinholes, unit length with a `Distortion`, any length by other models), and
-            True where the lens model has one; elsewhere the direction means nothing.
+            True where the lens model has one, for pinholes everywhere, NaN pixels included; elsewhere the
+            direction means nothing.
 
         Raises:
-            ValueError: for points without the axes of a batch of cameras.
+            ValueError: for pixels without the axes of a batched K: wanted (*b, ..., 2).
         """
         normalised = map_homogeneous(torch.linalg.inv(self.K)[..., :2, :], x)
         if self.distortion is None:
@@ -261,7 +264,8 @@ class LensView(View):
         A may be that of kornia's augmentations (`transform_matrix`), mirrored too, one for each of a batch.
 
         Raises:
-            ValueError: for a perspective A, whose images no K describes.
+            ValueError: for a last row of A other than (0, 0, 1) (no K describes a perspective), a singular A,
+                an invalid size, or batch axes that do not broadcast.
         """
         if checking() and not bool(((A[..., 2, :] - A.new_tensor([0, 0, 1])).abs() < 1e-6).all()):
             raise ValueError("A is a perspective, which no K follows: crop, resize, mirror, rotate or shear")
@@ -314,11 +318,11 @@ class Camera(LensView):
             check_batches("K, lens and cam_from_world", *shapes)
 
     def scaled(self, factor: float) -> Camera:
-        """Return the camera with all lengths multiplied by a positive factor, as for another unit.
+        """Return the camera with all lengths multiplied by a factor, as for another unit.
 
         Raises:
-            ValueError: for a factor that is not positive, and a lens that is not central and does not state
-                which of its numbers are lengths.
+            ValueError: for a factor that is not positive and finite, and a lens that is not central and does
+                not state which of its numbers are lengths.
         """
         check_above(0, itself=False, factor=factor)
         K, lens = self.K, self.distortion
@@ -354,11 +358,13 @@ class Camera(LensView):
         """Compute the world points of pixels at depth z (metres).
 
         Returns:
-            World points (metres); NaN for pixels outside the lens's range (see `rays`), and for depths that
-            their rays do not reach: below 0 for rays ahead, above 0 for rays at 90 degrees and more off axis.
+            World points (metres); NaN for pixels outside the lens's range (see `rays`), rays at 90 degrees
+            off axis, and depths that rays do not reach: NaN, below 0 for rays ahead, above 0 for rays farther
+            off axis than that. Infinite depths give infinity and NaN.
 
         Raises:
-            ValueError: if pixels and depths, broadcast, are more than either, as (n, 2) beside (n, 1).
+            ValueError: if pixels and depths do not broadcast or are then more than either, as (n, 2) beside
+                (n, 1), and for pixels without the axes of a batch of cameras.
         """
         rays, valid = self.rays(x)
         z = rays[..., 2]
@@ -372,14 +378,15 @@ class Camera(LensView):
         return torch.where(valid[..., None], X, torch.nan)
 
     def to_kornia(self) -> PinholeCamera | CameraModel:
-        """Convert to kornia: a `PinholeCamera`, batched (B, 4, 4), or a `CameraModel` with a distorting lens.
+        """Convert to kornia: a `PinholeCamera`, or a `CameraModel` for a lens that distorts or takes gradients.
 
-        Kornia's camera models (`kornia.sensors.camera`) have no pose: keep `cam_from_world`. Pixels and axes
-        agree. `PinholeCamera.scale` moves the principal point differently: `resize` first.
+        Matrices of the former are (B, 4, 4), B = 1 for one camera; several batch axes become one. Kornia's
+        camera models (`kornia.sensors.camera`) have no pose: keep `cam_from_world`. Pixels and axes agree.
+        `PinholeCamera.scale` moves the principal point differently: `resize` first.
 
         Raises:
-            ValueError: for a lens, or prism or tilt terms, that kornia does not have, and with a lens for a K
-                that is skewed or rotated.
+            ValueError: for a lens, or prism or tilt terms, that kornia does not have, with a lens for a K
+                that is skewed or rotated, and without one for a batch of K or of poses alone.
         """
         if self.distortion is not None and not self.distortion.harmless:
             return to_kornia_model(self.K, self.hw, self.distortion)
@@ -393,10 +400,10 @@ class Camera(LensView):
 
         Args:
             batched: True keeps a batch of one as a batch; a `CameraModel` keeps its axes as they are.
-            cam_from_world: pose for a `CameraModel`, which has none; None for the identity.
+            cam_from_world: pose for a `CameraModel`, which has none; None for the identity. Else unused.
 
         Raises:
-            ValueError: if the images of a batch differ in size.
+            ValueError: if the images of a batch differ in size, and as the constructor.
             TypeError: for another kind of camera.
         """
         from kornia.geometry.camera import PinholeCamera
@@ -446,14 +453,16 @@ def intrinsics(
 
     Args:
         focal: one number, or (fx, fy); tensors keep their gradient.
+        hw: height and width of the image, for the middle alone; not checked.
         centre: principal point (cx, cy); None for the image's middle, ((W - 1) / 2, (H - 1) / 2).
 
     Returns:
-        K in float64.
+        K in float64, of one camera: a batch is made with `stack`.
 
     Raises:
-        ValueError: for more than two numbers.
+        ValueError: for other than one or two numbers.
         TypeError: for values that are no numbers.
+        RuntimeError: for a pair of tensors of several numbers.
     """
     fx, fy = _two(focal, "focal")
     cx, cy = _two(((hw[1] - 1) / 2, (hw[0] - 1) / 2) if centre is None else centre, "centre")

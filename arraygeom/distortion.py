@@ -71,16 +71,19 @@ class Distortion(LensModel):
     """Lens with coefficients, or a batch of lenses of one model.
 
     The batch axes of `coefficients` meet the *leading* axes of the points: coefficients (5, 8) go with points
-    (5, 2), (5, 100, 2), (5, 20, 30, 2). Points are independent of each other; all maps are differentiable,
-    twice, in the points and the coefficients.
+    (5, 2), (5, 100, 2), (5, 20, 30, 2); methods raise RuntimeError for others. Points are independent of each
+    other; all maps are differentiable, twice, in the points and the coefficients. No point is valid for
+    coefficients out of a model's bounds, which are not refused.
 
     Attributes:
-        model: name of the model, see the module.
-        coefficients: its coefficients, in the module's order.
+        model: name of the model, a key of `LENS_TERMS` such as "brown-conrady" (OpenCV's).
+        coefficients: its coefficients (*b, n), in the order of `LENS_TERMS`; for "brown-conrady" the first 4,
+            5, 8, 12 or all 14.
 
     Raises:
         ValueError: for an unknown model, a number of coefficients that it does not have, NaN or infinity.
         TypeError: for coefficients that are no floating-point tensor.
+        IndexError: for a tensor without axes.
     """
 
     item_axes: ClassVar = {"coefficients": 1}
@@ -128,7 +131,8 @@ class Distortion(LensModel):
         """Distort normalised pinhole points.
 
         Returns:
-            Distorted points, and True inside the model's range.
+            Distorted points, and True inside the model's range; elsewhere, and for NaN, a point without
+            meaning.
         """
         xy, finite = finite_points(xy)
         if self.model == BROWN_CONRADY:
@@ -141,8 +145,8 @@ class Distortion(LensModel):
         """Undistort points to normalised pinhole points: the inverse of `distort`, iterated to convergence.
 
         Returns:
-            Pinhole points, and True inside the model's range. A fisheye ray at 90 degrees or more has no
-            pinhole point and is not valid: see `unproject`.
+            Pinhole points, and True inside the model's range; others mean nothing. A fisheye ray at 90
+            degrees or more has no pinhole point and is not valid: see `unproject`.
         """
         xy_d, finite = finite_points(xy_d)
         if self.model == BROWN_CONRADY:
@@ -157,9 +161,9 @@ class Distortion(LensModel):
         """Project points in the camera's frame (any unit).
 
         Returns:
-            Distorted normalised points, and validity. Brown-Conrady and the field-of-view model: only points
-            ahead (z > 0) are valid. The others: every direction that the model reaches, also at and beyond 90
-            degrees off axis; (0, 0, 0) is not.
+            Distorted normalised points, and True where the model reaches the direction: ahead (z > 0) for
+            Brown-Conrady and the field-of-view model, for the others also at and beyond 90 degrees off axis.
+            (0, 0, 0) and NaN are not valid.
         """
         X, finite = finite_points(X)
         if self.model != BROWN_CONRADY:
@@ -173,7 +177,7 @@ class Distortion(LensModel):
         """Compute the directions of distorted normalised points: the inverse of `project`.
 
         Returns:
-            Unit directions in the camera's frame, and True inside the model's range.
+            Unit directions in the camera's frame, and True inside the model's range; others mean nothing.
         """
         if self.model != BROWN_CONRADY:
             xy_d, finite = finite_points(xy_d)
@@ -219,16 +223,16 @@ def lens_derivatives(
 ) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2 3"], Float[Tensor, "n 2 k"]]:
     """Project finite points through one lens, with derivatives, as constants without gradient.
 
-    In closed form for Brown-Conrady without a tilted sensor; otherwise by two reverse passes, with a copy of
-    the coefficients for each point.
+    In closed form for Brown-Conrady of fewer than 14 coefficients; otherwise by two reverse passes, with a
+    copy of the coefficients for each point.
 
     Args:
-        lens: one lens, not a batch; None for a pinhole.
+        lens: one lens with coefficients, not a batch; None for a pinhole.
         X: points in the camera's frame, in any unit.
 
     Returns:
         Distorted normalised points (n, 2), derivatives by the points (n, 2, 3), and by the coefficients (n,
-        2, k). Validity is not checked.
+        2, k), k = 0 for None. Validity is not checked: points that the lens does not see give finite numbers.
     """
     X, c = X.detach(), X.new_zeros(0) if lens is None else lens.coefficients.detach()
     if lens is None or (lens.model == BROWN_CONRADY and len(c) < COEFFICIENT_COUNTS[BROWN_CONRADY][-1]):

@@ -28,12 +28,15 @@ def essential_matrix(beta_from_alpha: Pose) -> Float[Tensor, "*b 3 3"]:
 def fundamental_matrix(
     K_alpha: Float[Tensor, "*b 3 3"], K_beta: Float[Tensor, "*b 3 3"], beta_from_alpha: Pose
 ) -> Float[Tensor, "*b 3 3"]:
-    """Compute F = K_beta^-T E K_alpha^-1, so that x_beta^T F x_alpha = 0; kornia's, in float64.
+    """Compute F = K_beta^-T E K_alpha^-1, so that x_beta^T F x_alpha = 0, in float64.
 
-    Along (l1, -l0) of a line l points are farther away: the sign is kornia's unless K_beta mirrors.
+    Along (l1, -l0) of a line l = F x_alpha points are farther away: the sign is kornia's unless K_beta mirrors.
 
     Returns:
-        F, zero without a baseline.
+        F in the widest type of all, not scaled; zero without a baseline.
+
+    Raises:
+        ValueError: for batch axes that do not broadcast.
     """
     from kornia.geometry.epipolar import fundamental_from_essential
 
@@ -58,8 +61,11 @@ def epipolar_lines(F: Float[Tensor, "*b 3 3"], x: Real[Tensor, "*n 2"]) -> Float
     """Compute the lines l_beta = F x_alpha, scaled so that l . (x, y, 1) is a distance in pixels.
 
     Returns:
-        Lines (*m, 3); all zeros where there is none: at alpha's epipole, to the rounding of x's type, and
-        where F is zero. Batched F as in `map_homogeneous`.
+        Lines (*m, 3) in x's type (float32 at least); all zeros where there is none: at alpha's epipole, to
+        rounding, and where F is zero. NaN for NaN pixels.
+
+    Raises:
+        ValueError: for pixels without the axes of a batched F: wanted (*b, ..., 2).
     """
     size = F.abs().amax((-2, -1), keepdim=True)
     line = map_homogeneous(F / torch.where(size > 0, size, 1.0), x)
@@ -82,12 +88,13 @@ def epipoles(F: Float[Tensor, "*b 3 3"]) -> tuple[Float[Tensor, "*b 3"], Float[T
     """Compute the epipoles of F.
 
     Returns:
-        (e_alpha, e_beta), homogeneous unit vectors with F e_alpha = 0 and F^T e_beta = 0; their third entry
-        is 0 at infinity.
+        (e_alpha, e_beta), homogeneous unit vectors of either sign with F e_alpha = 0 and F^T e_beta = 0, or
+        least if F is not of rank two; arbitrary for F = 0. Their third entry is 0 at infinity.
 
     Raises:
         ValueError: for another shape.
-        TypeError: for a value that is no tensor.
+        TypeError: for a value that is no floating-point tensor.
+        RuntimeError: for NaN or infinity.
     """
     U, _, Vh = torch.linalg.svd(F)
     return Vh[..., 2, :], U[..., :, 2]
@@ -134,15 +141,19 @@ def track(
 ) -> Track:
     """Compute the track in beta of each alpha pixel of a pinhole pair.
 
-    Batched rigs (*b, 3, 3) take pixels (*b, ..., 2).
-
     Matrices are composed in their own precision, pixels computed in that of `x`.
 
     Args:
         K_alpha: alpha's K.
         K_beta: beta's K.
         beta_from_alpha: pose of alpha's frame in beta's.
-        x: pixels of alpha.
+        x: pixels of alpha; (*b, ..., 2) for a batch.
+
+    Returns:
+        The tracks (*n).
+
+    Raises:
+        ValueError: for pixels without the axes of a batch.
     """
     a = map_homogeneous(infinite_homography(K_alpha, K_beta, beta_from_alpha.R), x)
     b = matvec(K_beta, beta_from_alpha.t).to(a.dtype)
@@ -155,13 +166,14 @@ def segments_between(
     """Compute the part of each track between two depths and inside beta's image, in closed form (`clipped`).
 
     Args:
+        track: tracks in pixels of beta.
         near: depth in alpha, metres, above 0; not checked.
         far: depth in alpha, metres, at least `near`; may be infinite.
         beta_hw: height and width of beta.
 
     Returns:
-        Segments (*n) from near to far, pixels of beta, also clipped to the front of beta; invalid where
-        nothing is left.
+        Segments (*n) from near to far, pixels of beta, also clipped to the front of beta (`FRONT`); zero and
+        invalid where nothing is left.
     """
     h, w = beta_hw
     visible = clipped(track, near, far, (-0.5, -0.5, w - 0.5, h - 0.5))
@@ -180,7 +192,7 @@ class Clipped(NamedTuple):
         D: their change to s = 1 (near).
         low: least s, at least 0.
         high: largest s, at most 1.
-        valid: False where nothing is left.
+        valid: False where nothing is left; `low` and `high` then mean nothing.
     """
 
     P: Float[Tensor, "*n 3"]
@@ -275,11 +287,11 @@ A ray that meets beta's centre (alpha's epipole) tends to 0/0 there; at 1e-3 flo
 
 
 class Depth(NamedTuple):
-    """Depth of alpha's pixels.
+    """Depth of alpha's pixels, metres (the unit of the cameras' poses).
 
     Attributes:
-        depth: z in alpha, metres; 0 where not valid.
-        deviation: its standard deviation, metres.
+        depth: z in alpha's frame; 0 where not valid.
+        deviation: its standard deviation; 0 where not valid, and if that of the pixels was not given.
         valid: True where there is a depth.
     """
 
@@ -294,12 +306,14 @@ def depth_from_track(
     """Compute the depth in alpha of the point of a track nearest to beta's pixels `x`.
 
     Args:
+        track: track of each alpha pixel.
+        x: the pixel of beta for each.
         deviation: standard deviation of x along the track, pixels; None for 0. It is propagated to first
             order, d depth = depth^2 / |dx/dw|.
 
     Returns:
-        Depth in metres, with its deviation; invalid where the baseline gives none, the depth is not positive,
-        or the point is not in front of beta.
+        Depth with its deviation; invalid where the baseline gives none, it would not be positive and finite,
+        the point is not in front of beta (`FRONT`), or x is not finite.
     """
     a, b = track
     x = floating(x)

@@ -33,9 +33,12 @@ def to_kornia_model(K: Float[Tensor, "*b 3 3"], hw: HW, lens: LensModel | None) 
         hw: height and width of the image.
         lens: the lens; None for a pinhole.
 
+    Returns:
+        The model, with parameters (n) or (B, n): several batch axes become one.
+
     Raises:
-        ValueError: for a skewed or rotated K, and for lenses, or prism or tilt terms, that kornia does not
-            have.
+        ValueError: for a skewed or rotated K, lenses, or prism or tilt terms, that kornia does not have, and
+            batch axes that do not broadcast.
     """
     from kornia.image import ImageSize
     from kornia.sensors.camera import CameraModel, CameraModelType
@@ -107,12 +110,16 @@ def pinholes_by_name(
     """Name kornia's cameras; the cameras of a batch are "camera0" and so on, of a pair "left" and "right".
 
     Args:
-        cameras: pinholes by name, which stay; a batch of pinholes; or a `StereoCamera`.
-        hw: height and width of the images of a `StereoCamera`, whose left camera is at the world's origin.
+        cameras: pinholes by name, returned as given; a batch of pinholes; or a `StereoCamera`.
+        hw: height and width of the images of a `StereoCamera`, whose left camera is at the world's origin;
+            else unused.
+
+    Returns:
+        Cameras by name, in order: batches of 1 of a batch, as long as the pair's of a `StereoCamera`.
 
     Raises:
         ValueError: for a `StereoCamera` without `hw`.
-        TypeError: for anything else.
+        TypeError: for anything else; values of a mapping are not checked.
     """
     from kornia.geometry.camera import PinholeCamera, StereoCamera
 
