@@ -378,7 +378,7 @@ class Camera(LensView):
         return torch.where(valid[..., None], X, torch.nan)
 
     def to_kornia(self) -> PinholeCamera | CameraModel:
-        """Convert to kornia: a `PinholeCamera`, or a `CameraModel` for a lens that distorts or takes gradients.
+        """Convert to kornia: a `PinholeCamera`, or a `CameraModel` for a lens with effect or gradient.
 
         Matrices of the former are (B, 4, 4), B = 1 for one camera; several batch axes become one. Kornia's
         camera models (`kornia.sensors.camera`) have no pose: keep `cam_from_world`. Pixels and axes agree.

@@ -83,7 +83,6 @@ class Distortion(LensModel):
     Raises:
         ValueError: for an unknown model, a number of coefficients that it does not have, NaN or infinity.
         TypeError: for coefficients that are no floating-point tensor.
-        IndexError: for a tensor without axes.
     """
 
     item_axes: ClassVar = {"coefficients": 1}
@@ -99,9 +98,9 @@ class Distortion(LensModel):
         if self.model not in COEFFICIENT_COUNTS:
             raise ValueError(f"unknown lens model {self.model!r}: use one of {', '.join(COEFFICIENT_COUNTS)}")
         counts = COEFFICIENT_COUNTS[self.model]
-        if self.coefficients.shape[-1] not in counts:
-            count, wanted = self.coefficients.shape[-1], " or ".join(map(str, counts))
-            raise ValueError(f"{self.model} takes {wanted} coefficients, got {count}: pad with zeros")
+        if self.coefficients.shape[-1:] not in [(count,) for count in counts]:
+            shape, wanted = tuple(self.coefficients.shape), " or ".join(map(str, counts))
+            raise ValueError(f"{self.model} takes (..., {wanted}) coefficients, got {shape}: pad with zeros")
         if checking():
             check_numbers(self.coefficients, self.coefficients.shape[-1:], f"a lens ({self.model})")
 

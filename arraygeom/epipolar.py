@@ -30,7 +30,7 @@ def fundamental_matrix(
 ) -> Float[Tensor, "*b 3 3"]:
     """Compute F = K_beta^-T E K_alpha^-1, so that x_beta^T F x_alpha = 0, in float64.
 
-    Along (l1, -l0) of a line l = F x_alpha points are farther away: the sign is kornia's unless K_beta mirrors.
+    Along (l1, -l0) of a line l = F x_alpha points are farther away: kornia's sign, unless K_beta mirrors.
 
     Returns:
         F in the widest type of all, not scaled; zero without a baseline.

@@ -70,8 +70,8 @@ def apply_homography(H: Float[Tensor, "*b 3 3"], x: Real[Tensor, "*n 2"]) -> Tra
     positive in front of both cameras; a fitted H is fixed only up to sign and has to be oriented first.
 
     Returns:
-        Points, valid where finite and of a homogeneous scale above `SMALLEST_SCALE`; elsewhere zero, with zero
-        gradient.
+        Points, valid where finite and of a homogeneous scale above `SMALLEST_SCALE`; elsewhere zero, with
+        zero gradient.
 
     Raises:
         ValueError: for points without the axes of a batched H.

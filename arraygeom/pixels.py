@@ -57,7 +57,7 @@ def shift_matrix(left: float, top: float) -> Float[Tensor, "3 3"]:
 def rot90_matrix(hw: HW, quarter_turns: int) -> Float[Tensor, "3 3"]:
     """Return the matrix from an image's pixels to those after `torch.rot90(image, quarter_turns, (-2, -1))`.
 
-    The rotation is counter-clockwise; `hw` is the size before it.
+    Float64. The rotation is counter-clockwise, for negative turns clockwise; `hw` is the size before it.
 
     >>> (rot90_matrix((2, 3), 1) @ torch.tensor([2.0, 0.0, 1.0], dtype=torch.float64)).tolist()
     [0.0, 0.0, 1.0]
@@ -91,8 +91,8 @@ def within(x: Real[Tensor, "*n 2"], hw: HW, slack: float = 0.0) -> Bool[Tensor, 
 def product(A: Float[Tensor, "*b i j"], B: Float[Tensor, "*c j k"]) -> Float[Tensor, "*d i k"]:
     """Multiply small matrices in the wider of their types, float32 or float64.
 
-    Float32 products are computed by explicit multiplications and additions: TF32 and autocast lower `matmul`
-    to ten or eight bits.
+    Float32 products (half precision's too) are computed by explicit multiplications and additions: TF32 and
+    autocast lower `matmul` to ten or eight bits.
 
     Returns:
         The product A B, with the batch axes of both broadcast.
@@ -130,8 +130,7 @@ def map_homogeneous(M: Float[Tensor, "*b k 3"], x: Real[Tensor, "*n 2"]) -> Floa
     """Compute M (x, y, 1) for every point, in the precision of `x` (`floating`).
 
     A batch of matrices (*b, k, 3) takes points (*b, ..., 2), or with axes of length 1 in place of *b.
-    Explicit multiplications and additions are used, as TF32 and autocast lower the precision of `matmul` to
-    ten or eight bits.
+    By explicit multiplications and additions, as `product`, in float64 too.
 
     Returns:
         Homogeneous coordinates (*m, k), not divided; *m are the points' axes, broadcast with the batch's.

@@ -29,11 +29,12 @@ class Pose(Batched):
     Poses compose where the inner words meet: `b_from_a @ a_from_world` is `b_from_world`.
 
     Attributes:
-        R: rotation.
+        R: rotation, to rounding (`ROUNDED` of `arraygeom.checks`); it is kept as given.
         t: translation, metres.
 
     Raises:
-        ValueError: for an R that is not a rotation, NaN or infinity, and batch axes that do not broadcast.
+        ValueError: for an R that is not a rotation, other shapes, NaN or infinity, and batch axes that do not
+            broadcast.
         TypeError: for values that are no floating-point tensors.
     """
 
@@ -66,7 +67,7 @@ class Pose(Batched):
         *,
         down: Float[Tensor, "*b 3"] | None = None,
     ) -> Pose:
-        """Make `cam_from_world` of a camera at `centre` that looks at `target`, with y towards `down`.
+        """Make `cam_from_world` of a camera at `centre` that looks at `target`, with y nearest to `down`.
 
         >>> Pose.look_at(torch.tensor([0.0, 0.0, -2.0]), torch.zeros(3)).t.tolist()
         [-0.0, -0.0, 2.0]
@@ -77,7 +78,8 @@ class Pose(Batched):
             down: direction in the world; None for (0, 1, 0). For a world with z upwards it is (0, 0, -1).
 
         Raises:
-            ValueError: if down is along the axis, or the target at the centre.
+            ValueError: if down is along the axis, the target at the centre, or for NaN; not while torch
+                compiles.
         """
         down = centre.new_tensor([0.0, 1.0, 0.0]) if down is None else down
         z = target - centre
@@ -104,13 +106,10 @@ class Pose(Batched):
 
     @classmethod
     def from_quaternion(cls, q: Float[Tensor, "*b 4"], t: Float[Tensor, "*b 3"]) -> Pose:
-        """Make a pose of quaternions (w, x, y, z), of any length but zero.
-
-        Returns:
-            The pose.
+        """Make a pose of quaternions (w, x, y, z), of any length but zero, and translations (metres).
 
         Raises:
-            ValueError: for a quaternion of length zero.
+            ValueError: for a quaternion of length zero (below 1e-12), and as the constructor.
         """
         from kornia.geometry.conversions import quaternion_to_rotation_matrix
 
@@ -159,7 +158,7 @@ class Pose(Batched):
         """Transform points (*n, 3) to R X + t. With batched poses (*b), points are (*b, ..., 3).
 
         Returns:
-            Points, whose leading axes of length 1 become the batch's.
+            Points in the wider type of both, whose leading axes of length 1 become the batch's.
 
         Raises:
             ValueError: for points of other than three numbers, or without the batch's axes.
@@ -196,11 +195,11 @@ class Pose(Batched):
         Rounding of the product is removed, so that steps do not add up to a drift.
 
         Args:
-            rotation: rotation vector in radians, about the axes of `to`; None for none.
-            translation: metres; None for none.
+            rotation: rotation vector in radians, about the axes of `to`; None keeps R as it is.
+            translation: metres; None keeps t.
 
         Returns:
-            The pose.
+            The pose, unchecked: NaN passes.
         """
         R = self.R if rotation is None else nearest_rotation(product(rotation_from_vector(rotation), self.R))
         return derived(Pose, R, self.t if translation is None else self.t + translation)
@@ -260,6 +259,9 @@ def in_float64(function: Callable[..., Tensor], *tensors: Tensor) -> Tensor:
 
     Returns:
         The function's result, in the widest type of the matrices, float32 at least.
+
+    Raises:
+        ValueError: for batch axes that do not broadcast.
     """
     batch = broadcast_shapes(*(t.shape[:-2] for t in tensors))
     dtype = torch.promote_types(torch.float32, reduce(torch.promote_types, (t.dtype for t in tensors)))

@@ -59,20 +59,22 @@ def relative_pose(
     x: Real[Tensor, "*b n 2"],
     x_beta: Real[Tensor, "*b n 2"],
 ) -> TwoViewPose:
-    """Choose the pose of F that puts most matches in front of both pinhole cameras.
+    """Return the pose of F that puts most matches in front of both pinhole cameras.
 
     F is used as given, noise included; E = K_beta^T F K_alpha is F itself for normalised points. Undistort
     matches through lenses first (`LensView.undistort`).
 
     Args:
-        x: matches in alpha, pixels.
-        x_beta: matches in beta, pixels.
+        x: matches in alpha, pixels; with the axes *b of F.
+        x_beta: matches in beta, pixels; NaN counts as not in front.
 
     Returns:
-        The pose; scale is unknown, so the baseline has length 1.
+        The pose; scale is unknown, so the baseline has length 1. `in_front` is all False if no pose has any
+        match in front.
 
     Raises:
-        ValueError: for no matches, or another number of them in the two images.
+        ValueError: for no matches, another number of them in the two images, and an F that is zero or not
+            finite.
     """
     if x.shape != x_beta.shape or not x.numel():
         raise ValueError(

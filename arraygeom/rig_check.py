@@ -58,7 +58,8 @@ def unit_oddity(rig: Rig) -> str | None:
     """Return a sentence on a single rig's baselines that suggest another unit than metres.
 
     Returns:
-        The sentence; None for usual baselines, a single camera, and a rig of unknown scale.
+        The sentence without its subject ("has cameras 80 m apart: ..."); None for usual baselines, all
+        cameras at one place, fewer than two calibrated ones, and a rig of unknown scale.
 
     Raises:
         ValueError: for a batch of rigs.
@@ -104,10 +105,13 @@ def _spread(items: Sequence[T], most: int) -> list[T]:
 
 
 def lens_ends(lenses: Iterable[tuple[Sequence[str], LensView]]) -> Iterator[str]:
-    """Yield a sentence on each lens model that ends within its image, with the names of its cameras.
+    """Yield a sentence on lens models that end within their images, with the names of their cameras.
 
-    Camera models state themselves where they end (a pole, the rim of a fisheye's circle), which is no mistake
-    unless they cover nothing.
+    Lenses that end alike share a sentence. A `CameraModel` states itself where it ends (a pole, the rim of a
+    fisheye's circle), which is no mistake unless it covers nothing.
+
+    Args:
+        lenses: for each lens the names of its cameras, and one of these, single.
     """
     ending: dict[tuple[str, str, str], list[str]] = {}
     for names, camera in lenses:

@@ -21,7 +21,8 @@ def first_root(coefficients: Tensor) -> Tensor:
         coefficients: (*b, n + 1), starting with the 1.
 
     Returns:
-        Roots (*b); infinity if there is none, 0 if a coefficient is not finite.
+        Roots (*b); infinity if there is none, 0 if a coefficient is not finite. A double root may count as
+        none, as rounding makes it a complex pair.
     """
     a = coefficients[..., 1:]
     n = a.shape[-1]
@@ -59,7 +60,7 @@ def invert_increasing(
         iterations: largest number of iterations.
 
     Returns:
-        r (*n); `high` where f never reaches y.
+        r (*n), as exact as `iterations` make it; `high` where f never exceeds y, and for NaN.
     """
     reached = f(high)[0] > y
     y = torch.where(reached, y, 0.0)
@@ -104,7 +105,7 @@ def solve_in_plane(
 ) -> Tensor:
     """Find the points (*n, 2) whose images are `target` (*n, 2), by Newton's method.
 
-    Steps are halved where a whole one leaves the allowed region or does not help.
+    Steps are halved where a whole one leaves the allowed region or comes no nearer.
 
     Args:
         f: function from points to their images, and its Jacobian.
@@ -142,7 +143,7 @@ def newton_step(value: Tensor, jacobian: Sequence[Tensor], target: Tensor) -> Te
         target: wanted images (*n, 2).
 
     Returns:
-        Steps (*n, 2) to subtract from the points.
+        Steps (*n, 2) to subtract from the points, finite: small determinants count as 1e-12.
     """
     xx, xy, yx, yy = jacobian
     ex, ey = (value - target).unbind(-1)

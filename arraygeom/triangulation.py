@@ -26,8 +26,9 @@ class Triangulated(NamedTuple):
     Attributes:
         X: world points (*n, 3), metres; 0 where not valid.
         covariance: covariance (*n, 3, 3) of the points, m²; without meaning where not valid.
-        valid: True for usable points.
-        residual: largest distance between a match and the point's image over the views that count, pixels.
+        valid: True for usable points, as `triangulate` says.
+        residual: largest distance between a match and the point's image over the views that count, pixels;
+            without meaning where fewer than two do.
     """
 
     X: Float[Tensor, "*n 3"]
@@ -61,12 +62,12 @@ def triangulate(
     Returns:
         Points with exact derivatives. The covariance is to first order across the ray; along it, three
         deviations extend to where the inverse distance is three deviations less: the error stays within them
-        as often as a normal distribution's. Valid where that is still finite, all views that see the point
-        have it in front, and no residual is too large.
+        as often as a normal distribution's. Valid where that is still finite, two or more views see the point
+        and have it in front, and no residual is too large.
 
     Raises:
-        ValueError: for fewer than two cameras, another number of views in `x`, no deviation, or `seen` of
-            another shape.
+        ValueError: for fewer than two cameras, another number of views in `x`, a deviation that is not above
+            0 and finite, `seen` of another shape, or pixels without the axes of batched cameras.
         TypeError: for pixels that are no tensor.
     """
     if len(cameras) != len(x) or len(cameras) < 2:
@@ -117,10 +118,12 @@ def depth_of(
             first order.
 
     Returns:
-        Depth z in metres, its deviation, and validity.
+        Depth z in metres, its deviation, and validity: as `depth_from_track`, and within both lenses' ranges
+        and less than 90 degrees off axis.
 
     Raises:
-        ValueError: for uncalibrated pairs, and lenses whose rays do not meet in a point.
+        ValueError: for uncalibrated pairs, lenses whose rays do not meet in a point, and pixels without the
+            axes of a batch.
     """
     alpha, beta = pair.cameras
     x, x_beta = floating(x), floating(x_beta)

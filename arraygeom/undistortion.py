@@ -64,11 +64,12 @@ def pixels_between(
     Views that are not calibrated count as having the same orientation.
 
     Args:
-        x: pixels of target; None for all.
+        source: one view, not a batch, as `target`; rays of either that do not meet in a point are taken to.
+        x: pixels of target, float64; None for all.
 
     Returns:
         Positions in source's image, float64, and True where both lenses are valid and the position is on the
-        image.
+        image; others mean nothing.
     """
     if x is None:
         return _by_rows(lambda x: pixels_between(source, target, x), target.hw, axis=0)
@@ -93,7 +94,8 @@ def recorded_pixels(
 ) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
     """Map pixels of a view that was cropped, resized, rotated or undistorted to the image as recorded.
 
-    K of both views says how pixels were changed: x ~ K_now K_recorded^-1 x_recorded, apart from the lens.
+    K of both views says how pixels were changed: x ~ K_now K_recorded^-1 x_recorded, apart from the lens; a
+    view `now` with a lens was not undistorted, and no lens is applied.
 
     Returns:
         Pixels of the recorded image, and True within the lens model's range.
@@ -152,10 +154,11 @@ def resampled(
             valid.
 
     Returns:
-        Values (1, C, H, W), 0 where source sees nothing unless `extended`, and validity.
+        Values (1, C, H, W) of target's size, 0 where source sees nothing unless `extended`, and validity (1,
+        H, W).
 
     Raises:
-        ValueError: for an image of another size than source's.
+        ValueError: for an image of another size than source's, a batch of cameras, and as `sample`.
     """
     if tuple(image.shape[-2:]) != tuple(source.hw):
         raise ValueError(f"the image is {tuple(image.shape[-2:])}, its camera {tuple(source.hw)}: resize one")
@@ -184,7 +187,10 @@ def sampled_between(
         extended: True to fill pixels that source does not see from its nearest pixel.
 
     Returns:
-        Values (1, C, H, W), and validity.
+        Values (1, C, Ht, Wt), 0 where not valid unless `extended`, and validity (1, Ht, Wt).
+
+    Raises:
+        ValueError: as `sample`.
     """
     x, defined = pixels
     h, w = source.hw
