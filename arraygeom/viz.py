@@ -277,8 +277,8 @@ def draw_matches(
     in pixels. Matches lie on their lines only if the rig is right.
 
     Args:
-        matches: points (x, y) of alpha and of the beta, by beta, in pixels as recorded; at least one beta, and
-            one match of each.
+        matches: points (x, y) of alpha and of the beta, by beta, in pixels as recorded; at least one, and one
+            match of each.
         images: images by camera, as `show_image` takes them; none of a camera for an empty frame.
 
     Raises:
