@@ -75,14 +75,13 @@ class Batched:
         return map_tensors(self, chosen)
 
     def to(self: T, *args: Any, **kwargs: Any) -> T:
-        """Apply `Tensor.to` to every tensor; a change of dtype leaves masks and whole numbers alone.
+        """Apply `Tensor.to` to every tensor, whose errors pass; masks and whole numbers keep their dtype.
 
         Returns:
             A copy; it shares the tensors that `Tensor.to` returns unchanged.
 
         Raises:
             TypeError: for another dtype than float32 and float64; half precision holds no pixel position.
-                Errors of `Tensor.to` pass, as for a missing device.
         """
 
         def moved(t: Tensor, axes: int) -> Tensor:

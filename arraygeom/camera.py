@@ -45,7 +45,7 @@ class Projected(NamedTuple):
 
     Attributes:
         x: pixels (x, y); without meaning where not `valid`.
-        depth: z in the camera's frame, metres; at most 0 for points behind it.
+        depth: z in the camera's frame, metres, of any sign.
         valid: True for points that the model sees: in front of a pinhole (X and Y may be NaN), within a lens
             model's range; the image's borders are not considered.
     """
@@ -202,8 +202,7 @@ class LensView(View):
 
         Returns:
             Directions (z = 1 for pinholes, unit length with a `Distortion`, any length by other models), and
-            True where the lens model has one, for pinholes everywhere, NaN pixels included; elsewhere the
-            direction means nothing.
+            True where there is one; others mean nothing. A pinhole says True for NaN pixels too.
 
         Raises:
             ValueError: for pixels without the axes of a batched K: wanted (*b, ..., 2).
@@ -214,8 +213,7 @@ class LensView(View):
         return self.distortion.unproject(normalised)
 
     def ray_origins(self, x: Real[Tensor, "*n 2"]) -> Float[Tensor, "*m 3"]:
-        """Return the start of each pixel's ray in the camera's frame, metres: the origin unless the camera is
-        not central."""
+        """Return the start of each pixel's ray in the camera's frame, metres: 0 if the camera is central."""
         normalised = map_homogeneous(torch.linalg.inv(self.K)[..., :2, :], x)
         if self.distortion is None:
             return torch.zeros_like(to_homogeneous(normalised))
@@ -223,8 +221,7 @@ class LensView(View):
 
     @property
     def has_pinhole_view(self) -> bool:
-        """True for no lens, a `Distortion`, or a central model with all of the image within 75 degrees of the
-        axis."""
+        """True for no lens, a `Distortion`, or a central model whose image is within 75 degrees off axis."""
         if isinstance(self.distortion, Distortion | None):
             return True
         if not self.distortion.central or traced():
@@ -488,8 +485,7 @@ def _two(value: Any, name: str) -> tuple[Any, Any]:
 
 
 def view_facts(view: Any) -> tuple[str, str, str, str]:
-    """Describe a view in words: size, focal length (pixels; empty if not calibrated), lens model, and
-    response."""
+    """Describe a view in words: size, focal length (pixels; empty if not calibrated), lens, response."""
     lens, focal = getattr(view, "distortion", None), ""
     if hasattr(view, "cam_from_world"):
         focal = "f=" + range_text(view.K.detach()[..., :2, :2].det().abs().sqrt(), ".4g")

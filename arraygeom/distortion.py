@@ -71,9 +71,9 @@ class Distortion(LensModel):
     """Lens with coefficients, or a batch of lenses of one model.
 
     The batch axes of `coefficients` meet the *leading* axes of the points: coefficients (5, 8) go with points
-    (5, 2), (5, 100, 2), (5, 20, 30, 2); methods raise RuntimeError for others. Points are independent of each
-    other; all maps are differentiable, twice, in the points and the coefficients. No point is valid for
-    coefficients out of a model's bounds, which are not refused.
+    (5, 2), (5, 100, 2), (5, 20, 30, 2); others that do not broadcast raise RuntimeError. Points are
+    independent of each other; all maps are differentiable, twice, in the points and the coefficients.
+    Coefficients out of a model's bounds, such as alpha above 1, are not refused: no point is valid then.
 
     Attributes:
         model: name of the model, a key of `LENS_TERMS` such as "brown-conrady" (OpenCV's).
@@ -130,8 +130,7 @@ class Distortion(LensModel):
         """Distort normalised pinhole points.
 
         Returns:
-            Distorted points, and True inside the model's range; elsewhere, and for NaN, a point without
-            meaning.
+            Distorted points, and True inside the model's range, False for NaN; others mean nothing.
         """
         xy, finite = finite_points(xy)
         if self.model == BROWN_CONRADY:

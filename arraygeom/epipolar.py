@@ -28,7 +28,7 @@ def essential_matrix(beta_from_alpha: Pose) -> Float[Tensor, "*b 3 3"]:
 def fundamental_matrix(
     K_alpha: Float[Tensor, "*b 3 3"], K_beta: Float[Tensor, "*b 3 3"], beta_from_alpha: Pose
 ) -> Float[Tensor, "*b 3 3"]:
-    """Compute F = K_beta^-T E K_alpha^-1, so that x_beta^T F x_alpha = 0, in float64.
+    """Compute F = K_beta^-T E K_alpha^-1 in float64: x_beta^T F x_alpha = 0.
 
     Along (l1, -l0) of a line l = F x_alpha points are farther away: kornia's sign, unless K_beta mirrors.
 
@@ -61,8 +61,8 @@ def epipolar_lines(F: Float[Tensor, "*b 3 3"], x: Real[Tensor, "*n 2"]) -> Float
     """Compute the lines l_beta = F x_alpha, scaled so that l . (x, y, 1) is a distance in pixels.
 
     Returns:
-        Lines (*m, 3) in x's type (float32 at least); all zeros where there is none: at alpha's epipole, to
-        rounding, and where F is zero. NaN for NaN pixels.
+        Lines (*m, 3); all zeros where there is none: at alpha's epipole, to the rounding of x's type, and
+        where F is zero. NaN for NaN pixels.
 
     Raises:
         ValueError: for pixels without the axes of a batched F: wanted (*b, ..., 2).
@@ -80,8 +80,7 @@ def epipolar_lines(F: Float[Tensor, "*b 3 3"], x: Real[Tensor, "*n 2"]) -> Float
 
 
 SMALLEST_SQUARE = 1e-30
-"""Squared norm of a line's (x, y) part, for F scaled to a largest entry of 1, below which there
-is no line."""
+"""Squared norm of a line's (x, y) part, for F of largest entry 1, below which there is no line."""
 
 
 def epipoles(F: Float[Tensor, "*b 3 3"]) -> tuple[Float[Tensor, "*b 3"], Float[Tensor, "*b 3"]]:
@@ -126,8 +125,7 @@ class Track(NamedTuple):
     b: Float[Tensor, "*m 3"]
 
     def at(self, w: Float[Tensor, "*n"]) -> Float[Tensor, "*n 2"]:
-        """Return beta's pixels at inverse depths; where a point is not in front of beta the value is only
-        finite."""
+        """Return beta's pixels at inverse depths; finite, without meaning for points not in front of beta."""
         P = self.a + w[..., None] * self.b
         z = P[..., 2:]
         return P[..., :2] / torch.where(z > FRONT, z, 1.0)
@@ -247,8 +245,7 @@ HIGHEST = 1e30
 def _limited(
     low: Tensor, high: Tensor, valid: Tensor, g: Tensor, slope: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Limit the range [low, high] of s to where g + s slope >= 0; `slope` holds one number for
-    many pixels."""
+    """Limit the range [low, high] of s to where g + s slope >= 0; a `slope` is of many pixels."""
     rising, falling = slope > FLAT, slope < -FLAT
     flat = ~(rising | falling)
     crossing = g * (-1 / torch.where(flat, 1.0, slope))

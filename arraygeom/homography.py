@@ -58,8 +58,7 @@ def plane_homography(
 def infinite_homography(
     K_alpha: Float[Tensor, "*#b 3 3"], K_beta: Float[Tensor, "*#b 3 3"], R: Float[Tensor, "*#b 3 3"]
 ) -> Float[Tensor, "*b 3 3"]:
-    """Compute H = K_beta R K_alpha^-1, which maps points at infinite depth (Hartley & Zisserman, section
-    13.4)."""
+    """Compute H = K_beta R K_alpha^-1, which maps points at infinite depth (H & Z, section 13.4)."""
     return product(product(K_beta, R), torch.linalg.inv(K_alpha))
 
 
@@ -70,8 +69,7 @@ def apply_homography(H: Float[Tensor, "*b 3 3"], x: Real[Tensor, "*n 2"]) -> Tra
     positive in front of both cameras; a fitted H is fixed only up to sign and has to be oriented first.
 
     Returns:
-        Points, valid where finite and of a homogeneous scale above `SMALLEST_SCALE`; elsewhere zero, with
-        zero gradient.
+        Points, valid where finite and of a scale above `SMALLEST_SCALE`; elsewhere zero, with zero gradient.
 
     Raises:
         ValueError: for points without the axes of a batched H.

@@ -1,5 +1,4 @@
-"""Conversion to and from kornia's camera models (`kornia.sensors.camera`), which have no pose, its batches of
-pinholes and its stereo cameras."""
+"""Conversion to and from kornia's camera models (without pose), batches of pinholes and stereo cameras."""
 
 from __future__ import annotations
 

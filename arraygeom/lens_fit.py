@@ -163,8 +163,7 @@ def _normalised(camera: LensView, x: Tensor) -> Tensor:
 
 
 def _terms(xy: Tensor) -> Tensor:
-    """Displacement of points by a unit of each of k1 k2 p1 p2 k3, (n, 2, 5): Brown's polynomials are linear
-    in them."""
+    """Displacement of points by a unit of each of k1 k2 p1 p2 k3, (n, 2, 5), in which it is linear."""
     x, y = xy.unbind(-1)
     u = xy.square().sum(-1)
     p1, p2 = torch.stack([2 * x * y, u + 2 * y * y], -1), torch.stack([u + 2 * x * x, 2 * x * y], -1)

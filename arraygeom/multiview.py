@@ -121,8 +121,7 @@ def _check_size(what: str, plane: Tensor, hw: HW) -> None:
 
 
 def _in_beta(pair: Pair, depth: Tensor, x: Tensor | None = None) -> Projected:
-    """Projection into beta of alpha's pixels (all, or x (*n, 2)) at depths (*b, *d, *n); a batch's axes
-    first."""
+    """Projection into beta of alpha's pixels (all, or x (*n, 2)) at depths (*b, *d, *n)."""
     alpha, beta = pair.cameras
     depth = floating(depth)
     x = pixel_grid(alpha.hw, dtype=depth.dtype, device=depth.device) if x is None else x

@@ -55,8 +55,7 @@ class Pose(Batched):
 
     @classmethod
     def from_centre(cls, R: Float[Tensor, "*b 3 3"], centre: Float[Tensor, "*b 3"]) -> Pose:
-        """Make `cam_from_world` of a camera with rotation R and optical centre `centre` in the
-        world, metres."""
+        """Make `cam_from_world` of a camera with rotation R and optical centre in the world, metres."""
         return cls(R, -matvec(R, centre))
 
     @classmethod
@@ -245,8 +244,7 @@ def rotation_from_vector(w: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
 
 
 def rotation_vector(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
-    """Convert a rotation to axis times angle, radians: the inverse of `rotation_from_vector` up to 180
-    degrees."""
+    """Convert a rotation to axis times angle, radians, up to pi: the inverse of `rotation_from_vector`."""
     from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 
     return rotation_matrix_to_axis_angle(R)
@@ -269,14 +267,12 @@ def in_float64(function: Callable[..., Tensor], *tensors: Tensor) -> Tensor:
 
 
 def nearest_rotation(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3 3"]:
-    """Correct a matrix that is nearly a rotation by one Newton step, which squares its error: R (3 I - R^T R)
-    / 2."""
+    """Correct a near rotation by one Newton step, which squares its error: R (3 I - R^T R) / 2."""
     return 1.5 * R - product(0.5 * R, product(R.mT, R))
 
 
 def rotation_error(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
-    """Measure the distance of R from a rotation: the largest entry of |R R^T - I|, at least 2 for a
-    reflection."""
+    """Measure R's distance from a rotation: the largest entry of |R R^T - I|, 2 or more for a reflection."""
     eye = torch.eye(3, dtype=R.dtype, device=R.device)
     error = (product(R, R.mT) - eye).abs().amax((-1, -2))
     return torch.where(torch.linalg.det(R) > 0, error, error.clamp(min=2.0))

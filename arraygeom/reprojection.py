@@ -138,8 +138,7 @@ def bundle_adjusted(
 
 
 ROUNDED = 1e-9
-"""Relative rise of the cost, or pixels for each number, below which a step is still made: at the optimum
-gradients need it."""
+"""Relative rise of the cost, or pixels for each number, up to which a step is made, for gradients."""
 
 
 def _cost(rig: Rig, X: Tensor, x: Tensor, seen: Tensor | None) -> Tensor:

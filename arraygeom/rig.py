@@ -386,8 +386,7 @@ def _view(name: str, camera: Any) -> View:
 
 
 def with_pixels(rig: Rig) -> Rig:
-    """Return the rig whose views all have a K, the identity if not calibrated, so that it follows all changes
-    of pixels."""
+    """Return the rig whose views all have a K to follow changes of pixels, the identity if not known."""
     for name, view in rig.cameras.items():
         if not isinstance(view, LensView):
             eye = torch.eye(3, dtype=torch.float64)

@@ -135,8 +135,7 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def file_oddities(rig: Rig) -> list[str]:
-    """List the sentences that reading a rig's file warns of: its unit, and lenses that fold within their
-    images."""
+    """List the sentences that reading a rig's file warns of: its unit, lenses that fold in their images."""
     ends = lens_ends(
         one for one in _lenses(rig) if getattr(one[1].distortion, "model", None) == BROWN_CONRADY
     )

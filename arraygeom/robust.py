@@ -43,8 +43,7 @@ class RobustFit(NamedTuple):
 
 
 def normal_deviation(rest: Float[Tensor, " n"], least: float) -> float:
-    """Estimate the standard deviation of residuals from their median absolute value, robust to outliers; at
-    least `least`."""
+    """Estimate the standard deviation of residuals from their median absolute value; at least `least`."""
     return max(NORMAL_DEVIATION * float(rest.abs().median()), least)
 
 

@@ -90,8 +90,7 @@ PATIENCE = 12
 
 
 PlaneMap = Callable[[Tensor], tuple[Tensor, Sequence[Tensor]]]
-"""Function from points (*n, 2) to their images and the Jacobian (dx'/dx, dx'/dy, dy'/dx, dy'/dy),
-each (*n)."""
+"""Function from points (*n, 2) to images and Jacobian (dx'/dx, dx'/dy, dy'/dx, dy'/dy), each (*n)."""
 
 
 def solve_in_plane(
@@ -153,8 +152,7 @@ def newton_step(value: Tensor, jacobian: Sequence[Tensor], target: Tensor) -> Te
 
 
 def keeps_orientation(jacobian: Sequence[Tensor]) -> Tensor:
-    """Return True (*n) where a `PlaneMap` keeps orientation: past a fold it mirrors, past two it is half
-    turned."""
+    """Return True (*n) where a `PlaneMap` keeps orientation: a fold mirrors it, two turn it by half."""
     xx, xy, yx, yy = jacobian
     return (xx * yy - xy * yx > 0) & (xx + yy > 0)
 

@@ -111,8 +111,7 @@ def sample(
 def _looked_up(
     image: Float[Tensor, "b c h w"], grid: Float[Tensor, "b 1 n 2"], interpolation: Interpolation
 ) -> Float[Tensor, "b c 1 n"]:
-    """Look up by torch; many positions without gradients on all threads, where torch takes one for each
-    image."""
+    """Look up by torch; many positions without gradients on all threads: torch takes one an image."""
     look_up = partial(grid_sample, mode=interpolation, padding_mode="border", align_corners=False)
     gradients = torch.is_grad_enabled() and (image.requires_grad or grid.requires_grad)
     if gradients or followed() or image.device.type != "cpu" or grid.shape[2] < 2 * PIECE:

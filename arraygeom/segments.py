@@ -69,8 +69,7 @@ class Segments(Batched):
         return self.start + fraction[..., None] * (self.end - self.start)
 
     def fraction(self, xy: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n"]:
-        """Return the fraction of the line's point nearest to `xy`, not clamped to 0..1; 0.5 on a segment of
-        no length."""
+        """Return the fraction of the line's point nearest to `xy`, not clamped to 0..1; 0.5 without length."""
         along = self.end - self.start
         squared = along.square().sum(-1)
         positive = squared > 0
@@ -93,8 +92,7 @@ class Segments(Batched):
         return Positions(xy, self.valid[..., None].expand(xy.shape[:-1]))
 
     def distance(self, xy: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n"]:
-        """Compute the distance in pixels from points to their segments, beyond an end to that end; infinite
-        where not valid."""
+        """Compute the distance in pixels from points to their segments; infinite where not valid."""
         u = self.fraction(xy).clamp(0, 1)
         squared = (xy - self.at(u)).square().sum(-1)
         distance = torch.where(squared > 0, torch.where(squared > 0, squared, 1.0).sqrt(), 0.0)

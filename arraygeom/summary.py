@@ -157,8 +157,7 @@ def _pair(alpha: str, beta: str, pair: Pair) -> PairSummary:
 
 
 def _segments(pair: Pair) -> tuple[float, tuple[float, float] | None]:
-    """Share of alpha's pixels with a segment, and its (median, largest) length, on each fourth pixel or
-    fewer."""
+    """Share of alpha's pixels with a segment, and (median, largest) length, on each fourth or fewer."""
     h, w = pair.alpha.hw
     field, most = (Curved(64), MOST_PIXELS // 16) if pair.has_lens else (Epipolar(), MOST_PIXELS)
     step = max(4, math.ceil(math.sqrt(h * w / most)))

@@ -99,8 +99,7 @@ def triangulate(
 STEPS = 5
 """Number of Gauss-Newton steps."""
 FOLLOWED = 3
-"""Steps that derivatives go through: each reduces the difference to those of the least error by about
-residual / disparity."""
+"""Steps that derivatives go through: each reduces their error by about residual / disparity."""
 SMALLEST_PARALLAX = 1e-9
 """Least angle between two rays, radians: float64 pixels do not show less."""
 
@@ -163,8 +162,7 @@ class _Sight(NamedTuple):
 
 
 class _Chart(NamedTuple):
-    """Chart of points p = (a, b, w): `origin` + `scale` (a u + b v + d) / w; `axes` (*n, 3, 3) has columns u,
-    v, d."""
+    """Chart of points p = (a, b, w): `origin` + `scale` (a u + b v + d) / w; `axes` are columns u, v, d."""
 
     origin: Tensor
     axes: Tensor
@@ -196,8 +194,7 @@ class _NormalEquations(NamedTuple):
 def _sighted(
     cameras: Sequence[Camera], x: Tensor, seen: Tensor | None
 ) -> tuple[list[_Sight], _Chart, Tensor]:
-    """Sights of each point, its first view's chart, and the point in it where the rays meet in
-    least squares."""
+    """Sights of each point, its first view's chart, and the point where rays meet in least squares."""
     finite = x.isfinite().all(-1)
     x = torch.where(finite[..., None], x, 0.0)
     centres, directions, usable = (

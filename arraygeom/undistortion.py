@@ -17,8 +17,7 @@ from .runtime.tracing import needs_numbers
 from .sampling import Interpolation, Sampled, sample
 
 WIDEST = math.radians(62)
-"""Largest angle off axis of a pinhole view: there it stretches outwards 4.5 times as much as in
-the middle."""
+"""Largest angle off axis of a pinhole view, where it stretches outwards 4.5 times as in the middle."""
 AT_ONCE = 1 << 18
 """Pixels that are resampled at once."""
 
@@ -82,8 +81,7 @@ def pixels_between(
 
 
 def _by_rows(function: Callable[[Tensor], Any], hw: HW, *, axis: int) -> Any:
-    """Apply a function to an image's pixels (h, w, 2), some rows at a time: it takes some 300
-    bytes a pixel."""
+    """Apply a function to an image's pixels (h, w, 2), some rows at a time: 300 bytes a pixel."""
     x, y = pixel_coordinates(hw, dtype=torch.float64)
     rows = max(AT_ONCE // hw[1], 1)
     return chunked(lambda x, y: function(torch.stack([x, y], -1)), x, y, rows=rows, axis=axis)

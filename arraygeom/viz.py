@@ -136,9 +136,7 @@ def depth_outline(rig: Rig, cameras: Mapping[str, Camera], alpha: str | None) ->
 
 
 def image_border(hw: HW) -> Float[Tensor, "n 2"]:
-    """Return float64 points around the image's area, from its first corner back to it, 16 on each side, in
-    pixels.
-    """
+    """Return points around an image's area from its first corner back to it, 16 a side, float64 pixels."""
     h, w = hw
     corners = torch.tensor([[0.0, 0], [w, 0], [w, h], [0, h], [0, 0]], dtype=torch.float64) - 0.5
     steps = torch.arange(16, dtype=torch.float64)[:, None] / 16
