@@ -298,8 +298,8 @@ class Camera(LensView):
         cam_from_world: pose, X_cam = R X_world + t in metres, x right, y down, z forward.
 
     Raises:
-        ValueError: for an invalid size or K, or batch axes that do not broadcast.
-        TypeError: for fields of other types.
+        ValueError: for a pose whose batch axes do not broadcast, and as `LensView`.
+        TypeError: for a pose that is no Pose, and as `LensView`, which raises NotImplementedError too.
     """
 
     cam_from_world: Pose

@@ -77,7 +77,7 @@ def from_kornia_model(model: CameraModel) -> tuple[Float[Tensor, "*b 3 3"], HW, 
     """Extract intrinsics and lens from a camera model of kornia, one or a batch.
 
     Returns:
-        K, the image's (height, width), and the lens; None for kornia's pinhole with its affine "distortion".
+        K, the image's (height, width), and the lens; None for kornia's pinhole, whose "distortion" is affine.
     """
     from kornia.sensors.camera.distortion_model import BrownConradyTransform, KannalaBrandtK3Transform
     from kornia.sensors.camera.projection_model import OrthographicProjection

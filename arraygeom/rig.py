@@ -227,7 +227,7 @@ class Rig(Batched):
         return self.transformed(name, A, self[name].rot90(quarter_turns).hw)
 
     def transformed(self, name: str, A: Float[Tensor, "*b 3 3"], hw: HW) -> Rig:
-        """Change the pixels of one camera's image, as a crop, resize, rotation or mirror does.
+        """Return the rig after a change of one camera's pixels: a crop, resize, rotation, mirror or shear.
 
         Args:
             name: name of the camera.
@@ -235,7 +235,7 @@ class Rig(Batched):
             hw: height and width after.
 
         Returns:
-            The rig, in which the camera's size, K (if it has one) and links have changed.
+            The rig with the camera's new size, K (if it has one) and links.
 
         Raises:
             ValueError: for an unknown name, and as `LensView.transformed`.

@@ -69,7 +69,7 @@ class Segments(Batched):
         return self.start + fraction[..., None] * (self.end - self.start)
 
     def fraction(self, xy: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n"]:
-        """Return the fraction of the line's point nearest to `xy`, not clamped to 0..1; 0.5 without length."""
+        """Return the fraction of the line's point nearest to `xy`, not clamped to 0..1; 0.5 if no length."""
         along = self.end - self.start
         squared = along.square().sum(-1)
         positive = squared > 0

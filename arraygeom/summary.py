@@ -53,7 +53,8 @@ class PairSummary(NamedTuple):
         beta: name of beta.
         baseline: distance of the optical centres, in the rig's unit.
         rotation: angle between the orientations, degrees.
-        seen: share of alpha's pixels with a segment in beta; None without a depth range.
+        seen: share of alpha's pixels, of some evenly spread, with a segment in beta; None without a depth
+            range.
         length: (median, largest) length of the segments, pixels of beta; None without any, and without a
             depth range.
         depth_step: change of depth at (near, far) that moves a point by one pixel of beta, in the rig's unit:

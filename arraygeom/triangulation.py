@@ -62,8 +62,8 @@ def triangulate(
     Returns:
         Points with exact derivatives. The covariance is to first order across the ray; along it, three
         deviations extend to where the inverse distance is three deviations less: the error stays within them
-        as often as a normal distribution's. Valid where that is still finite, two or more views see the point
-        and have it in front, and no residual is too large.
+        as often as a normal distribution's. Valid where that is still finite, two views or more see the
+        point, all that do have it in front, and no residual is too large.
 
     Raises:
         ValueError: for fewer than two cameras, another number of views in `x`, a deviation that is not above

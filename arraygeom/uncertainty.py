@@ -45,7 +45,7 @@ def position_covariance(
 
     Returns:
         Covariances in pixels² of beta, float64; NaN where alpha's lens has no ray, the depth is infinite, or
-        the point is not in front of beta or within its lens's range (its image may end before).
+        the point is not in front of beta or within its lens's range (its image's border does not count).
 
     Raises:
         ValueError: for a camera that is unknown or not calibrated, and a covariance of parameters that the

@@ -336,7 +336,7 @@ def draw_residuals(
 ) -> Figure:
     """Draw measured matches against the geometry: distances from beta's points to their epipolar lines.
 
-    Left, each distance across its line, enlarged so that the median is 2 % of the width at least; right,
+    Left, each distance across its line, enlarged if need be so that the median is 2 % of the width; right,
     their histogram.
 
     Args:
