@@ -120,9 +120,7 @@ class Batched:
         return map_tensors(self, lambda t, axes: t.pin_memory())
 
     def requires_grad_(self: T, requires_grad: bool = True) -> T:
-        """Let autograd record operations on its numbers, or not (`requires_grad` False), in place.
-
-        Other instances that share its tensors change with it.
+        """Let autograd record operations on its numbers, or not, in place: in all that share its tensors.
 
         Returns:
             Itself.

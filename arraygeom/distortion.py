@@ -7,8 +7,7 @@ give pixels.
 Models, with their coefficients:
 
 - ``brown-conrady``: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tx ty]]]], 4, 5, 8, 12 or 14 numbers in OpenCV's
-  order: rational radial, tangential, thin-prism and tilted-sensor terms (its ``projectPoints``; Brown 1966,
-      Conrady 1919).
+  order: rational radial, tangential, thin-prism and tilted-sensor terms (Brown 1966, Conrady 1919).
 - ``kannala-brandt``: k1 k2 k3 k4, the angle theta from the optical axis goes to the radius
   theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) (Kannala and Brandt 2006; OpenCV's
   ``fisheye``, Kalibr's ``equidistant``, COLMAP's ``OPENCV_FISHEYE``).
@@ -115,10 +114,7 @@ class Distortion(LensModel):
 
     @property
     def harmless(self) -> bool:
-        """True if the lens can be left out: it distorts nothing, and needs no gradient.
-
-        False while values are not available (`traced`).
-        """
+        """True if the lens can be left out: without effect or gradient; False while torch traces."""
         return not self.coefficients.requires_grad and not traced() and self.is_identity
 
     @property
@@ -203,10 +199,7 @@ class Distortion(LensModel):
 
     @property
     def squared_limit(self) -> float:
-        """Limit of its range: squared normalised radius (Brown-Conrady) or squared angle (Kannala-Brandt).
-
-        Meaningful for these two models and a single lens only.
-        """
+        """Limit of one lens's range: squared radius (Brown-Conrady) or squared angle (Kannala-Brandt)."""
         c = self.coefficients.detach()
         return float(once(fisheye_limit if self.model == KANNALA_BRANDT else brown_limit, c))
 

@@ -139,8 +139,6 @@ def track(
 ) -> Track:
     """Compute the track in beta of each alpha pixel of a pinhole pair.
 
-    Matrices are composed in their own precision, pixels computed in that of `x`.
-
     Args:
         K_alpha: alpha's K.
         K_beta: beta's K.
@@ -148,7 +146,7 @@ def track(
         x: pixels of alpha; (*b, ..., 2) for a batch.
 
     Returns:
-        The tracks (*n).
+        The tracks (*n), in the precision of `x`.
 
     Raises:
         ValueError: for pixels without the axes of a batch.
@@ -210,12 +208,9 @@ def clipped(
 ) -> Clipped:
     """Clip each track to depths, to limits in the image and to the front of beta.
 
-    With s going from 0 at far to 1 at near in proportion to inverse depth, every limit is linear in s with a
-    slope that is one number for the whole image.
-
     Args:
-        near: depth in alpha, metres.
-        far: depth in alpha, metres, may be infinite.
+        near: depth in alpha, metres; s = 1.
+        far: depth in alpha, metres, may be infinite; s = 0. In between s is linear in inverse depth.
         limits: x low, y low, x high, y high, in the unit of the track's points; None for no limits.
         in_front: False to keep points behind beta.
 

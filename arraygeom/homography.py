@@ -41,9 +41,9 @@ def plane_homography(
 ) -> Float[Tensor, "*b 3 3"]:
     """Compute H with x_beta ~ H x_alpha for points of the plane normal^T X + d = 0 in alpha's frame.
 
-    H = K_beta (R - t normal^T / d) K_alpha^-1 (Hartley & Zisserman, equation 13.2). The plane Z = 2 m is
-    normal = (0, 0, 1), d = -2. The normal need not have unit length. Scaled as written, H (x_alpha, 1) equals
-    (Z_beta / Z_alpha) (x_beta, 1), so its third entry is positive for points in front of both cameras.
+    H = K_beta (R - t normal^T / d) K_alpha^-1 (Hartley & Zisserman, equation 13.2); normals have any length.
+    The plane Z = 2 m is normal = (0, 0, 1), d = -2. H (x_alpha, 1) equals (Z_beta / Z_alpha) (x_beta, 1), so
+    its third entry is positive for points in front of both cameras.
 
     Returns:
         H; not finite for a plane through alpha's centre (d = 0), which has no homography.

@@ -105,10 +105,10 @@ class Pose(Batched):
 
     @classmethod
     def from_quaternion(cls, q: Float[Tensor, "*b 4"], t: Float[Tensor, "*b 3"]) -> Pose:
-        """Make a pose of quaternions (w, x, y, z), of any length but zero, and translations (metres).
+        """Make a pose of quaternions (w, x, y, z), of any length above 1e-12, and translations (metres).
 
         Raises:
-            ValueError: for a quaternion of length zero (below 1e-12), and as the constructor.
+            ValueError: for a quaternion of zeros, and as the constructor.
         """
         from kornia.geometry.conversions import quaternion_to_rotation_matrix
 
@@ -134,10 +134,7 @@ class Pose(Batched):
         return cls.from_matrix(given.matrix())
 
     def to_kornia(self) -> Se3:
-        """Convert to kornia's `Se3`, which stores a quaternion: R comes back except for rounding.
-
-        `kornia.geometry.pose.NamedPose(pose.to_kornia(), "world", "mono")` gives its frames their names.
-        """
+        """Convert to kornia's `Se3`, which stores a quaternion: R comes back except for rounding."""
         from kornia.geometry.liegroup import Se3, So3
         from kornia.geometry.quaternion import Quaternion
 
@@ -226,7 +223,6 @@ def rotation_from_vector(w: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
     """Convert a rotation vector (axis times angle, radians) to a matrix, by kornia's Rodrigues formula.
 
     Exact to rounding in float32 too, and differentiable any number of times, at angle zero as elsewhere.
-    (`torch.linalg.matrix_exp` is off by 2e-14 a step in float64.)
 
     >>> rotation_from_vector(torch.tensor([0.0, 0.0, torch.pi / 2])).round(decimals=6)[0, 1].item()
     -1.0

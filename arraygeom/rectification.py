@@ -120,8 +120,7 @@ def middle_intrinsics(
         hw: height and width of the rectified images.
 
     Returns:
-        K with the smaller of the focal lengths, and the middles of both old images, on average, at the middle
-        of the new ones.
+        K with the smaller focal length, which takes the old images' middles, on average, to the new middle.
     """
     focal = torch.stack([(c.K[:2, :2].det().abs()).sqrt() for c in cameras]).min()
     rays = [_middle_ray(camera, R) for camera, R in zip(cameras, rotations)]

@@ -69,12 +69,10 @@ def relative_pose(
         x_beta: matches in beta, pixels; NaN counts as not in front.
 
     Returns:
-        The pose; scale is unknown, so the baseline has length 1. `in_front` is all False if no pose has any
-        match in front.
+        The pose; the baseline has length 1. `in_front` is all False if no pose has any match in front.
 
     Raises:
-        ValueError: for no matches, another number of them in the two images, and an F that is zero or not
-            finite.
+        ValueError: for no matches, unequal numbers of them, and an F that is zero or not finite.
     """
     if x.shape != x_beta.shape or not x.numel():
         raise ValueError(

@@ -92,8 +92,7 @@ class Rig(Batched):
     ) -> Rig:
         """Make a rig of kornia's cameras.
 
-        Kornia's cameras are always batched; `Rig(cameras)` takes pinholes by name as well, for batches of one
-        or more as they come.
+        Kornia's cameras are always batched. `Rig(cameras)` takes pinholes by name as well.
 
         Args:
             cameras: pinholes by name; a batch of pinholes, which are the rig's cameras "camera0", "camera1"
@@ -215,10 +214,7 @@ class Rig(Batched):
         return self.transformed(name, resize_matrix(self[name].hw, hw), hw)
 
     def crop(self, name: str, top: int, left: int, hw: HW) -> Rig:
-        """Return the rig whose camera `name` keeps a window of its image; see `Camera.crop`.
-
-        Its links follow.
-        """
+        """Return the rig whose camera `name` keeps a window of its image (`Camera.crop`); links follow."""
         return self.transformed(name, shift_matrix(left, top), hw)
 
     def rot90(self, name: str, quarter_turns: int) -> Rig:

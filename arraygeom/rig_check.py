@@ -24,12 +24,11 @@ T = TypeVar("T")
 SMALLEST_BASELINE, LARGEST_BASELINE = 1e-4, 50.0
 """Bounds of a baseline in metres: outside, a mistaken unit is more likely than a camera array."""
 NARROWEST, WIDEST = 0.5, 140.0
-"""Bounds of a pinhole's angle of view in degrees: outside, its focal length is more likely in another unit
-than pixels. A 1 m telephoto lens on an inch of sensor has 1.5, the widest rectilinear lenses have 130."""
+"""Bounds of a pinhole's angle of view in degrees: outside, its focal length is hardly in pixels. (A 1 m lens
+on an inch of sensor has 1.5, the widest rectilinear lenses have 130.)"""
 DECENTRED = 0.1
 """Distance of a principal point from the image's middle, as a share of its longer side, above which it is
-more likely of another image: exchanging the sides of a 4:3 image moves the middle by 0.18, halving the image
-by 0.3."""
+more likely of another image: exchanging the sides of a 4:3 image moves it by 0.18, halving by 0.3."""
 LEAST_DISPARITY = 0.5
 """Pixels of disparity between near and far below which depth is not seen."""
 COVERED = 0.995

@@ -13,9 +13,8 @@ from .runtime.tracing import followed, traced
 def first_root(coefficients: Tensor) -> Tensor:
     """Find the smallest positive root of 1 + a_1 u + ... + a_n u^n.
 
-    The roots are the inverses of those of the reversed polynomial, which is monic, so a leading coefficient
-    of 0 needs no care: eigenvalues of its companion matrix. Huge coefficients, with which LAPACK crashes, are
-    scaled down first (u = s w, with s a power of 2).
+    The roots are the inverse eigenvalues of the reversed polynomial's companion matrix: leading coefficients
+    may be 0. Huge coefficients, with which LAPACK crashes, are scaled down first.
 
     Args:
         coefficients: (*b, n + 1), starting with the 1.

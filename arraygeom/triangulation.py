@@ -49,8 +49,7 @@ def triangulate(
     lens.
 
     Gauss-Newton in float64 on direction and inverse distance from the first view that sees the point (Civera,
-    Davison and Montiel 2008), in which the error is nearly linear however far the point is; from the inverse
-    distance at which rays meet in least squares.
+    Davison and Montiel 2008), from where rays meet in least squares.
 
     Args:
         cameras: two cameras or more; batched cameras (*b) take pixels (views, *b, ..., 2).

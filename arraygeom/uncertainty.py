@@ -20,7 +20,7 @@ from .triangulation import triangulate
 class Covariance(Protocol):
     """Covariance of some parameters of a rig, such as `calib.boards.uncertainty.RigCovariance`.
 
-    Rows and columns of `matrix` are in the order of `names`, in the units of `Rig.parameters`.
+    It has `names` ("left.rotation.0"), and a `matrix` in their order, in the units of `Rig.parameters`.
     """
 
     @property

@@ -24,8 +24,7 @@ def rectify_spherical(pair: Pair, *, focal: float | None = None) -> Pair:
     the left and right ends. Images follow by `resampled(image, old_camera, new_camera)`.
 
     Args:
-        focal: pixels for each radian, above 0; None for the lower of the two cameras' in the middle of their
-            images.
+        focal: pixels for each radian, above 0; None for the lower of the cameras' in their images' middle.
 
     Returns:
         The pair of the new cameras (their lens is `Equirectangular`), alike in K, size and orientation, just
@@ -112,8 +111,7 @@ def cube_faces(camera: Camera, *, overlap: float = 5.0) -> dict[str, Camera]:
         of which the lens sees something, with its resolution in the middle.
 
     Raises:
-        ValueError: for a batch, lenses whose rays do not meet in a point, and faces larger than `check_hw`
-            allows.
+        ValueError: for a batch, lenses whose rays do not meet in a point, and an overlap of 45 or more.
     """
     if camera.K.ndim > 2 or not camera.central:
         raise ValueError("faces are of one camera at a time, whose rays meet in a point")
