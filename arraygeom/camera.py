@@ -357,7 +357,7 @@ class Camera(LensView):
         Returns:
             World points (metres); NaN for pixels outside the lens's range (see `rays`), rays at 90 degrees
             off axis, and depths that rays do not reach: NaN, below 0 for rays ahead, above 0 for rays farther
-            off axis than that. Infinite depths give infinity and NaN.
+            off axis than that. Infinite depths give NaN or infinity.
 
         Raises:
             ValueError: if pixels and depths do not broadcast or are then more than either, as (n, 2) beside
@@ -450,14 +450,14 @@ def intrinsics(
 
     Args:
         focal: one number, or (fx, fy); tensors keep their gradient.
-        hw: height and width of the image, for the middle alone; not checked.
+        hw: height and width of the image, for the middle alone.
         centre: principal point (cx, cy); None for the image's middle, ((W - 1) / 2, (H - 1) / 2).
 
     Returns:
         K in float64, of one camera: a batch is made with `stack`.
 
     Raises:
-        ValueError: for other than one or two numbers.
+        ValueError: for other than one or two numbers, or an invalid size.
         TypeError: for values that are no numbers.
         RuntimeError: for a pair of tensors of several numbers.
     """

@@ -218,12 +218,15 @@ def lens_derivatives(
     copy of the coefficients for each point.
 
     Args:
-        lens: one lens with coefficients, not a batch; None for a pinhole.
+        lens: one lens, not a batch; None for a pinhole.
         X: points in the camera's frame, in any unit.
 
     Returns:
         Distorted normalised points (n, 2), derivatives by the points (n, 2, 3), and by the coefficients (n,
         2, k), k = 0 for None. Validity is not checked: points that the lens does not see give finite numbers.
+
+    Raises:
+        RuntimeError: for a lens without coefficients.
     """
     X, c = X.detach(), X.new_zeros(0) if lens is None else lens.coefficients.detach()
     if lens is None or (lens.model == BROWN_CONRADY and len(c) < COEFFICIENT_COUNTS[BROWN_CONRADY][-1]):

@@ -94,9 +94,11 @@ def fit_similarity(x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"]) -> Float[Te
         Matrix (3, 3) of the points' wider type, differentiable; NaN if y is not finite.
 
     Raises:
-        ValueError: if all points of x coincide, or some are not finite; not while torch compiles.
-        RuntimeError: for unequal numbers of points.
+        ValueError: for unequal numbers of points, and, unless torch compiles, if all of x coincide or some
+            are not finite.
     """
+    if x.shape != y.shape:
+        raise ValueError(f"wanted pairs of points, (n, 2) each, got {tuple(x.shape)}, {tuple(y.shape)}")
     dtype = torch.promote_types(x.dtype, y.dtype)
     x, y = x.double(), y.double()
     x_mean, y_mean = x.mean(0), y.mean(0)

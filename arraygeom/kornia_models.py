@@ -118,11 +118,14 @@ def pinholes_by_name(
 
     Raises:
         ValueError: for a `StereoCamera` without `hw`.
-        TypeError: for anything else; values of a mapping are not checked.
+        TypeError: for anything else, also in a mapping.
     """
     from kornia.geometry.camera import PinholeCamera, StereoCamera
 
     if isinstance(cameras, Mapping):
+        for name, camera in cameras.items():
+            if not isinstance(camera, PinholeCamera):
+                raise TypeError(f"camera '{name}' is a {type(camera).__name__}: give a kornia PinholeCamera")
         return cameras
     if isinstance(cameras, PinholeCamera):
         parts = cameras.intrinsics, cameras.extrinsics, cameras.height, cameras.width

@@ -79,11 +79,7 @@ def once_a_lens(function: Callable[[V], T]) -> Callable[[V], T]:
 
 @once_a_lens
 def coverage(camera: LensView) -> LensCoverage:
-    """Measure the share of a camera's pixels with a ray, and their widest angle, on a coarse grid.
-
-    Raises:
-        ValueError: for a batch of cameras with a lens.
-    """
+    """Measure the share of one camera's pixels with a ray, and their widest angle, on a coarse grid."""
     with torch.no_grad():
         grid = coarse_grid(camera.hw, max(8, max(camera.hw) // 128)).to(camera.K)
         if camera.distortion is None:
@@ -106,8 +102,7 @@ def refit_lens(camera: Camera) -> Refit:
         The camera with the new lens, and the differences.
 
     Raises:
-        ValueError: for no lens, another model, a tilted sensor, and if no such lens covers the image.
-        RuntimeError: if the old lens covers nothing.
+        ValueError: for no lens, another model, a tilted sensor, a batch, or if no such lens covers the image.
     """
     lens = camera.distortion
     if not isinstance(lens, Distortion) or lens.model != BROWN_CONRADY or lens.coefficients[12:].any():

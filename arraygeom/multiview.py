@@ -83,8 +83,7 @@ def warp(
 
     Raises:
         ValueError: for an image or depth of another size than its camera's, uncalibrated cameras, and as
-            `sample`.
-        RuntimeError: for batches of unequal length, neither of 1.
+            `sample`. Batches of unequal length, neither of 1, give ValueError or RuntimeError.
     """
     for what, plane, view in (("image", image, pair.beta), ("depth", depth, pair.alpha)):
         _check_size(f"the {what} given", plane, view.hw)

@@ -23,7 +23,7 @@ def poses_from_essential(E: Float[Tensor, "*b 3 3"]) -> Pose:
         `beta_from_alpha`, a batch (*b, 4).
 
     Raises:
-        ValueError: if any E of the batch is zero or not finite.
+        ValueError: if any E of the batch is zero, of rank one (or nearly), or not finite.
     """
     from kornia.geometry.epipolar import decompose_essential_matrix_no_svd
 
@@ -72,7 +72,7 @@ def relative_pose(
         The pose; the baseline has length 1. `in_front` is all False if no pose has any match in front.
 
     Raises:
-        ValueError: for no matches, unequal numbers of them, and an F that is zero or not finite.
+        ValueError: for no matches, unequal numbers of them, and as `poses_from_essential`, as for F = 0.
     """
     if x.shape != x_beta.shape or not x.numel():
         raise ValueError(

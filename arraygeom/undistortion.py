@@ -143,7 +143,7 @@ def resampled(
     interpolation: Interpolation = "bicubic",
     extended: bool = False,
 ) -> Sampled:
-    """Resample an image of `source` to a co-located `target`.
+    """Resample an image of one view, `source`, to a co-located `target`, neither of them a batch.
 
     The baseline between the two is ignored; uncalibrated views count as having the same orientation.
 
@@ -156,7 +156,7 @@ def resampled(
         H, W).
 
     Raises:
-        ValueError: for an image of another size than source's, a batch of cameras, and as `sample`.
+        ValueError: for an image of another size than source's, and as `sample`.
     """
     if tuple(image.shape[-2:]) != tuple(source.hw):
         raise ValueError(f"the image is {tuple(image.shape[-2:])}, its camera {tuple(source.hw)}: resize one")

@@ -401,6 +401,7 @@ def show_image(axes: Axes, hw: HW, image: Any = None) -> None:
 
     Raises:
         ValueError: for an image of bools.
+        TypeError: for one of another shape.
     """
     h, w = hw
     if image is not None:

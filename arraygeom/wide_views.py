@@ -111,7 +111,7 @@ def cube_faces(camera: Camera, *, overlap: float = 5.0) -> dict[str, Camera]:
         of which the lens sees something, with its resolution in the middle.
 
     Raises:
-        ValueError: for a batch, lenses whose rays do not meet in a point, and an overlap of 45 or more.
+        ValueError: for a batch of K, lenses whose rays do not meet in a point, and an overlap near 45.
     """
     if camera.K.ndim > 2 or not camera.central:
         raise ValueError("faces are of one camera at a time, whose rays meet in a point")

@@ -298,6 +298,7 @@ WRONG: dict[str, Callable[[], Any]] = {
     "t before R": lambda: plane_homography(K, K, ASIDE, EYE, normal=ZERO, d=torch.tensor(-2.0)),
     "a similarity of one point": lambda: fit_similarity(X, X),
     "a similarity of other counts": lambda: fit_similarity(X.expand(3, 2), X.expand(4, 2)),
+    "a similarity to one point": lambda: fit_similarity(EYE[:, :2], X),
     "a similarity of three numbers": lambda: fit_similarity(ZERO.expand(3, 3), ZERO.expand(3, 3)),
     "a track of a pair": lambda: track(pair(), X, X, X),
     "a track's depth of three numbers": lambda: depth_from_track(Track(ZERO[None], ZERO), ZERO[None]),
