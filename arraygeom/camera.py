@@ -240,7 +240,7 @@ class LensView(View):
         return self.distortion is not None and self.distortion.even == "distance"
 
     def undistort(self, x: Real[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
-        """Map pixels of the image to those of a pinhole with the same K.
+        """Map pixels of the image to pixels of a pinhole with the same K.
 
         Returns:
             Undistorted pixels, and True within the lens model's range.

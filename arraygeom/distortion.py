@@ -246,7 +246,7 @@ def lens_derivatives(
 
 
 def typical_coefficients(lens: LensModel) -> tuple[float, ...]:
-    """Return usual sizes of a lens's coefficients; 1 for those of a camera model."""
+    """Return usual sizes of a lens's coefficients; 1 for a camera model's."""
     count = lens.coefficients.shape[-1]
     return tuple(LENS_TERMS[lens.model].values())[:count] if lens.model in LENS_TERMS else (1.0,) * count
 

@@ -160,7 +160,7 @@ def consistent_depth(
     pixels: float = 1.0,
     relative: float = 0.01,
 ) -> ConsistentDepth:
-    """Fuse alpha's depth map with those of other cameras that agree with it, through any lenses.
+    """Fuse alpha's depth map with other cameras' maps where they agree with it, through any lenses.
 
     A view agrees if alpha's point, replaced by the depth in the view's own map, returns to within `pixels` of
     its place in alpha and within `relative` of its depth (Yao et al. 2018, MVSNet).

@@ -42,8 +42,8 @@ class Rectification(NamedTuple):
 def rectify(pair: Pair, *, K: Float[Tensor, "3 3"] | None = None, hw: HW | None = None) -> Rectification:
     """Compute the rectifying homographies of a pinhole pair (Bouguet's: each camera is rotated half way).
 
-    R_alpha and R_beta are those of OpenCV's `stereoRectify` for a horizontal pair; a vertical one is rotated
-    by 90 degrees, so that lines are rows here too.
+    R_alpha and R_beta are as OpenCV's `stereoRectify` gives them for a horizontal pair; a vertical one is
+    rotated by 90 degrees, so that lines are rows here too.
 
     Args:
         K: intrinsics of the new images; None for the smaller focal length, with the centres of the old images

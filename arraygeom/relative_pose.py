@@ -17,7 +17,7 @@ def poses_from_essential(E: Float[Tensor, "*b 3 3"]) -> Pose:
 
     Kornia's decomposition without a singular value decomposition (Horn 1990): differentiable, where E's two
     equal singular values give SVD no gradient. Where noise makes them differ, the rotations are those nearest
-    to Horn's matrices, which are those of the SVD.
+    to Horn's matrices, which the SVD gives too.
 
     Returns:
         `beta_from_alpha`, a batch (*b, 4).

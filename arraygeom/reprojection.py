@@ -110,8 +110,8 @@ def bundle_adjusted(
         damping: factor of the information's diagonal that is added to it at the first step.
 
     Returns:
-        Rig and points. Gradients follow the steps made: at the optimum those of the least error, in
-        everything given.
+        Rig and points. Gradients, in everything given, follow the steps made: at the optimum they are the
+        least error's.
 
     Raises:
         ValueError: for a batch, uncalibrated cameras, pixels of another shape, and a pattern in `free` that

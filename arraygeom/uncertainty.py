@@ -76,8 +76,8 @@ def triangulation_covariance(
         seen: as of `triangulate`.
 
     Returns:
-        Covariances, m², float64, zero where a point is not valid: add them to those of `triangulate`, which
-        are by the pixels. All points move together: errors of two points are not independent.
+        Covariances, m², float64, zero where a point is not valid; `triangulate` gives the pixels' part, to be
+        added. All points move together: errors of two points are not independent.
 
     Raises:
         ValueError: as `triangulate`, for a camera that is not calibrated, and for a covariance of parameters

@@ -1,7 +1,7 @@
 """Drawings of rigs, fields and residuals. Functions return a figure and show nothing.
 
-Matplotlib figures are made without pyplot, so there is no global state: `figure.savefig("rig.png")`, or leave
-the figure as the last line of a notebook's cell. Matplotlib is imported when something is drawn.
+Figures are made without pyplot, so there is no global state: `figure.savefig("rig.png")`, or leave the figure
+as the last line of a notebook's cell.
 """
 
 from __future__ import annotations
@@ -99,8 +99,7 @@ def extent_of(cameras: Mapping[str, Camera]) -> float:
 
 
 def frustum(camera: Camera, length: float) -> list[np.ndarray]:
-    """Return the lines of a camera's frustum: from its centre to the image's corners, and the border at depth
-    `length`.
+    """Return a camera's frustum: lines from its centre to the image's corners, and the border at `length`.
 
     Returns:
         Four arrays (2, 3) and the border's (65, 3) of world points, metres; see `seen_at` for wide lenses.
@@ -206,7 +205,7 @@ def draw_fields(
 def draw_sampling_locations(axes: Axes, field: ReceptiveField, pair: Pair, x: Float[Tensor, "n 2"]) -> None:
     """Draw the sampling locations in beta of some alpha pixels into `axes`, each in its own colour.
 
-    Segments are lines with a dot at their near end; positions are dots; what is not valid is not drawn.
+    Segments are lines with a dot at their near end; positions are dots; invalid ones are left out.
 
     Raises:
         ValueError: as the field raises it for this pair.
@@ -242,10 +241,8 @@ class NearLine(NamedTuple):
 def near_line(pair: Pair, x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"], half: float) -> NearLine:
     """Compute the lines of alpha's points x where they pass beta's points y, `half` pixels to each side.
 
-    Pixels are those of images as recorded.
-
     Returns:
-        Curves, and distances to the nearest point of the line.
+        Curves, and distances to the line's nearest point; all pixels are of images as recorded.
 
     Raises:
         ValueError: as `Pair.fundamental`.
@@ -270,9 +267,8 @@ def draw_matches(
 ) -> Figure:
     """Draw patches around points matched between alpha and each beta, with the lines that the rig gives.
 
-    Seven matches of each beta at most are drawn, spread over the image. Above, alpha's patch, 18 pixels to
-    either side of the point; below, beta's around the match, with the line of alpha's point and the distance
-    in pixels. Matches lie on their lines only if the rig is right.
+    Seven matches of each beta at most, spread over the image: above, alpha's patch, 18 pixels to either side
+    of the point; below, beta's around the match, with the line of alpha's point and the distance in pixels.
 
     Args:
         matches: points (x, y) of alpha and of the beta, by beta, in pixels as recorded; at least one, and one
