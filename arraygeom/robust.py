@@ -48,7 +48,7 @@ def normal_deviation(rest: Float[Tensor, " n"], least: float) -> float:
 
 
 def cauchy(rest: Float[Tensor, " n"], scale: float) -> Float[Tensor, " n"]:
-    """Compute the weights of Cauchy's loss: 1/2 at `scale`, falling as the square of large residuals."""
+    """Compute the weights of Cauchy's loss: 1/2 at `scale`, falling with the square of large residuals."""
     return 1 / (1 + (rest / scale).square())
 
 

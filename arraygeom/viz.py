@@ -99,7 +99,7 @@ def extent_of(cameras: Mapping[str, Camera]) -> float:
 
 
 def frustum(camera: Camera, length: float) -> list[np.ndarray]:
-    """Return a camera's frustum: lines from its centre to the image's corners, and the border at `length`.
+    """Return a camera's frustum to a depth: lines from its centre to the image's corners, and the border.
 
     Returns:
         Four arrays (2, 3) and the border's (65, 3) of world points, metres; see `seen_at` for wide lenses.
