@@ -22,11 +22,15 @@ LABELS = ("name", "sensor")
 class Batched:
     """Base of frozen dataclasses whose tensors have leading batch axes: `[i]`, `len`, `to` and `==`.
 
-    A tensor without batch axes is shared by all items of a batch. Instances are not hashable: they are equal
-    if their tensors are.
+    A tensor without batch axes is shared by all items of a batch. Instances are equal if their types and
+    fields are (tensors in dtype and device too), and not hashable. Subclasses are declared with
+    `@dataclass(frozen=True, eq=False, repr=False)`, and define `_text`, their part of `repr`.
 
     Attributes:
-        item_axes: by field, the number of a tensor's last axes that belong to one item.
+        item_axes: by field, the number of a tensor's last axes that belong to one item; 0 for other fields.
+
+    Raises:
+        TypeError: by `[i]` and `len` of a single item.
     """
 
     item_axes: ClassVar[Mapping[str, int]] = {}
@@ -71,10 +75,10 @@ class Batched:
         return map_tensors(self, chosen)
 
     def to(self: T, *args: Any, **kwargs: Any) -> T:
-        """Apply `Tensor.to` to every tensor; a change of dtype leaves masks alone.
+        """Apply `Tensor.to` to every tensor, whose errors pass; masks and whole numbers keep their dtype.
 
         Returns:
-            A copy; tensors that need no change are shared.
+            A copy; it shares the tensors that `Tensor.to` returns unchanged.
 
         Raises:
             TypeError: for another dtype than float32 and float64; half precision holds no pixel position.
@@ -116,10 +120,13 @@ class Batched:
         return map_tensors(self, lambda t, axes: t.pin_memory())
 
     def requires_grad_(self: T, requires_grad: bool = True) -> T:
-        """Let autograd record operations on its numbers, or not (`requires_grad` False), in place.
+        """Let autograd record operations on its numbers, or not, in place: in all that share its tensors.
 
         Returns:
             Itself.
+
+        Raises:
+            RuntimeError: for False where a tensor was computed from others that require grad.
         """
         for t, _ in tensors_of(self):
             if t.is_floating_point():
@@ -158,11 +165,12 @@ class Batched:
 def stack(items: Sequence[T]) -> T:
     """Stack items of one kind into a batch, along a new first axis.
 
-    Everything but tensors must be equal in all (sizes, lens models, names of a rig's cameras), except for
-    names and sensors, which are the first item's.
+    Everything but tensors must be equal in all (sizes, lens models, a rig's cameras by name), except for the
+    fields `name` and `sensor`, which are the first item's.
 
     Raises:
-        ValueError: for no items, and items that differ in kind, shapes or anything else.
+        ValueError: for no items, and items that differ in kind, shapes or such a field.
+        RuntimeError: for items on several devices.
     """
     if not items:
         raise ValueError("nothing to stack: give one item or more")
@@ -172,8 +180,12 @@ def stack(items: Sequence[T]) -> T:
 def map_tensors(value: Any, f: Callable[[Tensor, int], Tensor], axes: int = 0) -> Any:
     """Replace each tensor of a value by f(tensor, number of item axes), in nested mappings and tuples too.
 
+    Args:
+        value: tensor, `Batched`, mapping or tuple; anything else is returned itself, lists included.
+        axes: number of item axes of tensors outside a `Batched`, which has its own.
+
     Returns:
-        The new value.
+        The new value, not checked; mappings become dictionaries, named tuples plain ones.
     """
     if isinstance(value, Tensor):
         return f(value, axes)
@@ -189,7 +201,7 @@ def map_tensors(value: Any, f: Callable[[Tensor, int], Tensor], axes: int = 0) -
 
 
 def tensors_of(value: Any, axes: int = 0) -> Iterator[tuple[Tensor, int]]:
-    """Yield every tensor of a value with the number of its item axes."""
+    """Yield every tensor that `map_tensors` replaces, with the number of its item axes."""
     if isinstance(value, Tensor):
         yield value, axes
     elif isinstance(value, Batched):
@@ -201,8 +213,7 @@ def tensors_of(value: Any, axes: int = 0) -> Iterator[tuple[Tensor, int]]:
 
 
 class _Layout(NamedTuple):
-    """Flattened value without its tensors: its kind, the names of fields with tensors, and the
-    other fields."""
+    """Flattened value without its tensors: its kind, names of fields with tensors, and the others."""
 
     kind: type
     names: tuple[str, ...]

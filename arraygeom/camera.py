@@ -45,9 +45,9 @@ class Projected(NamedTuple):
 
     Attributes:
         x: pixels (x, y); without meaning where not `valid`.
-        depth: z in the camera's frame, metres.
-        valid: True for points that the model sees: in front of a pinhole, within a lens model's range; the
-            image's borders are not considered.
+        depth: z in the camera's frame, metres, of any sign.
+        valid: True for points that the model sees: in front of a pinhole (X and Y may be NaN), within a lens
+            model's range; the image's borders are not considered.
     """
 
     x: Float[Tensor, "*n 2"]
@@ -133,7 +133,8 @@ class LensView(View):
     """View with a lens model, whose focal length and pose need not be known.
 
     Without a calibration K is only the scale and the centre to which `distortion` refers: `rays` then follow
-    the lens but their angles mean nothing. Links of such views relate undistorted pixels.
+    the lens but their angles mean nothing. Links of such views relate undistorted pixels. A subclass must not
+    override `rays` or `project_local`: models of one's own are a `CameraModel`.
 
     >>> lens = Distortion("brown-conrady", torch.tensor([-0.1, 0, 0, 0], dtype=torch.float64))
     >>> view = LensView(hw=(61, 101), K=intrinsics(50.0, (61, 101)), distortion=lens)
@@ -141,12 +142,13 @@ class LensView(View):
     [95.0, 30.0]
 
     Attributes:
-        K: map from the plane z = 1 (after the lens) to pixels.
+        K: map from the plane z = 1 (after the lens) to pixels, last row (0, 0, 1), not singular.
         distortion: lens model; None for a pinhole.
 
     Raises:
-        ValueError: for an invalid K, or batch axes that do not broadcast.
-        TypeError: for a `distortion` that is no lens model.
+        ValueError: for an invalid size or K, NaN in a lens, or batch axes that do not broadcast.
+        TypeError: for fields of other types, a `CameraModel` that `check_model` refuses, and such a subclass.
+        NotImplementedError: for a `CameraModel` without one of its methods.
     """
 
     item_axes: ClassVar = {"K": 2}
@@ -200,10 +202,10 @@ class LensView(View):
 
         Returns:
             Directions (z = 1 for pinholes, unit length with a `Distortion`, any length by other models), and
-            True where the lens model has one; elsewhere the direction means nothing.
+            True where there is one; others mean nothing. A pinhole says True for NaN pixels too.
 
         Raises:
-            ValueError: for points without the axes of a batch of cameras.
+            ValueError: for pixels without the axes of a batched K: wanted (*b, ..., 2).
         """
         normalised = map_homogeneous(torch.linalg.inv(self.K)[..., :2, :], x)
         if self.distortion is None:
@@ -211,8 +213,7 @@ class LensView(View):
         return self.distortion.unproject(normalised)
 
     def ray_origins(self, x: Real[Tensor, "*n 2"]) -> Float[Tensor, "*m 3"]:
-        """Return the start of each pixel's ray in the camera's frame, metres: the origin unless the camera is
-        not central."""
+        """Return the start of each pixel's ray in the camera's frame, metres: 0 if the camera is central."""
         normalised = map_homogeneous(torch.linalg.inv(self.K)[..., :2, :], x)
         if self.distortion is None:
             return torch.zeros_like(to_homogeneous(normalised))
@@ -220,8 +221,7 @@ class LensView(View):
 
     @property
     def has_pinhole_view(self) -> bool:
-        """True for no lens, a `Distortion`, or a central model with all of the image within 75 degrees of the
-        axis."""
+        """True for no lens, a `Distortion`, or a central model whose image is within 75 degrees off axis."""
         if isinstance(self.distortion, Distortion | None):
             return True
         if not self.distortion.central or traced():
@@ -240,7 +240,7 @@ class LensView(View):
         return self.distortion is not None and self.distortion.even == "distance"
 
     def undistort(self, x: Real[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
-        """Map pixels of the image to those of a pinhole with the same K.
+        """Map pixels of the image to pixels of a pinhole with the same K.
 
         Returns:
             Undistorted pixels, and True within the lens model's range.
@@ -261,7 +261,8 @@ class LensView(View):
         A may be that of kornia's augmentations (`transform_matrix`), mirrored too, one for each of a batch.
 
         Raises:
-            ValueError: for a perspective A, whose images no K describes.
+            ValueError: for a last row of A other than (0, 0, 1) (no K describes a perspective), a singular A,
+                an invalid size, or batch axes that do not broadcast.
         """
         if checking() and not bool(((A[..., 2, :] - A.new_tensor([0, 0, 1])).abs() < 1e-6).all()):
             raise ValueError("A is a perspective, which no K follows: crop, resize, mirror, rotate or shear")
@@ -297,8 +298,8 @@ class Camera(LensView):
         cam_from_world: pose, X_cam = R X_world + t in metres, x right, y down, z forward.
 
     Raises:
-        ValueError: for an invalid size or K, or batch axes that do not broadcast.
-        TypeError: for fields of other types.
+        ValueError: for a pose whose batch axes do not broadcast, and as `LensView`.
+        TypeError: for a pose that is no Pose, and as `LensView`, which raises NotImplementedError too.
     """
 
     cam_from_world: Pose
@@ -314,11 +315,11 @@ class Camera(LensView):
             check_batches("K, lens and cam_from_world", *shapes)
 
     def scaled(self, factor: float) -> Camera:
-        """Return the camera with all lengths multiplied by a positive factor, as for another unit.
+        """Return the camera with all lengths multiplied by a factor, as for another unit.
 
         Raises:
-            ValueError: for a factor that is not positive, and a lens that is not central and does not state
-                which of its numbers are lengths.
+            ValueError: for a factor that is not positive and finite, and a lens that is not central and does
+                not state which of its numbers are lengths.
         """
         check_above(0, itself=False, factor=factor)
         K, lens = self.K, self.distortion
@@ -354,11 +355,13 @@ class Camera(LensView):
         """Compute the world points of pixels at depth z (metres).
 
         Returns:
-            World points (metres); NaN for pixels outside the lens's range (see `rays`), and for depths that
-            their rays do not reach: below 0 for rays ahead, above 0 for rays at 90 degrees and more off axis.
+            World points (metres); NaN for pixels outside the lens's range (see `rays`), rays at 90 degrees
+            off axis, and depths that rays do not reach: NaN, below 0 for rays ahead, above 0 for rays farther
+            off axis than that. Infinite depths give NaN or infinity.
 
         Raises:
-            ValueError: if pixels and depths, broadcast, are more than either, as (n, 2) beside (n, 1).
+            ValueError: if pixels and depths do not broadcast or are then more than either, as (n, 2) beside
+                (n, 1), and for pixels without the axes of a batch of cameras.
         """
         rays, valid = self.rays(x)
         z = rays[..., 2]
@@ -372,14 +375,15 @@ class Camera(LensView):
         return torch.where(valid[..., None], X, torch.nan)
 
     def to_kornia(self) -> PinholeCamera | CameraModel:
-        """Convert to kornia: a `PinholeCamera`, batched (B, 4, 4), or a `CameraModel` with a distorting lens.
+        """Convert to kornia: a `PinholeCamera`, or a `CameraModel` for a lens with effect or gradient.
 
-        Kornia's camera models (`kornia.sensors.camera`) have no pose: keep `cam_from_world`. Pixels and axes
-        agree. `PinholeCamera.scale` moves the principal point differently: `resize` first.
+        Matrices of the former are (B, 4, 4), B = 1 for one camera; several batch axes become one. Kornia's
+        camera models (`kornia.sensors.camera`) have no pose: keep `cam_from_world`. Pixels and axes agree.
+        `PinholeCamera.scale` moves the principal point differently: `resize` first.
 
         Raises:
-            ValueError: for a lens, or prism or tilt terms, that kornia does not have, and with a lens for a K
-                that is skewed or rotated.
+            ValueError: for a lens, or prism or tilt terms, that kornia does not have, with a lens for a K
+                that is skewed or rotated, and without one for a batch of K or of poses alone.
         """
         if self.distortion is not None and not self.distortion.harmless:
             return to_kornia_model(self.K, self.hw, self.distortion)
@@ -393,10 +397,10 @@ class Camera(LensView):
 
         Args:
             batched: True keeps a batch of one as a batch; a `CameraModel` keeps its axes as they are.
-            cam_from_world: pose for a `CameraModel`, which has none; None for the identity.
+            cam_from_world: pose for a `CameraModel`, which has none; None for the identity. Else unused.
 
         Raises:
-            ValueError: if the images of a batch differ in size.
+            ValueError: if the images of a batch differ in size, and as the constructor.
             TypeError: for another kind of camera.
         """
         from kornia.geometry.camera import PinholeCamera
@@ -446,14 +450,16 @@ def intrinsics(
 
     Args:
         focal: one number, or (fx, fy); tensors keep their gradient.
+        hw: height and width of the image, for the middle alone.
         centre: principal point (cx, cy); None for the image's middle, ((W - 1) / 2, (H - 1) / 2).
 
     Returns:
-        K in float64.
+        K in float64, of one camera: a batch is made with `stack`.
 
     Raises:
-        ValueError: for more than two numbers.
+        ValueError: for other than one or two numbers, or an invalid size.
         TypeError: for values that are no numbers.
+        RuntimeError: for a pair of tensors of several numbers.
     """
     fx, fy = _two(focal, "focal")
     cx, cy = _two(((hw[1] - 1) / 2, (hw[0] - 1) / 2) if centre is None else centre, "centre")
@@ -479,8 +485,7 @@ def _two(value: Any, name: str) -> tuple[Any, Any]:
 
 
 def view_facts(view: Any) -> tuple[str, str, str, str]:
-    """Describe a view in words: size, focal length (pixels; empty if not calibrated), lens model, and
-    response."""
+    """Describe a view in words: size, focal length (pixels; empty if not calibrated), lens, response."""
     lens, focal = getattr(view, "distortion", None), ""
     if hasattr(view, "cam_from_world"):
         focal = "f=" + range_text(view.K.detach()[..., :2, :2].det().abs().sqrt(), ".4g")

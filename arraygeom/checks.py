@@ -48,10 +48,10 @@ def unchecked() -> Iterator[None]:
 
 
 def derived(make: Callable[..., T], *args: Any, **kwargs: Any) -> T:
-    """Call `make` with the checks of cameras, poses and lenses left out, for results made of checked numbers.
+    """Call `make` with the checks of constructors and of `checked` left out, for results of checked numbers.
 
     Args:
-        make: function or class to call.
+        make: function or class to call; its own errors pass.
         args: its arguments.
         kwargs: its named arguments.
 
@@ -76,7 +76,7 @@ def check_numbers(value: Any, shape: tuple[int, ...], what: str) -> Tensor:
         what: name of the value in messages.
 
     Returns:
-        The tensor, detached.
+        The tensor, detached. A tensor of the meta device has no numbers to check.
 
     Raises:
         TypeError: for another type, or integers.
@@ -97,10 +97,10 @@ def check_numbers(value: Any, shape: tuple[int, ...], what: str) -> Tensor:
 def check_origin(near: Tensor, *translations: Tensor, unit: str) -> None:
     """Check that float32 translations (\\*b, 3) are not visibly rounded for a scene at `near` (\\*b).
 
-    `unit` names their unit of length in the message.
+    `unit` names their unit of length in the message. Other types are not checked.
 
     Raises:
-        ValueError: if they are.
+        ValueError: if rounding is more than `ROUNDED` of near.
     """
     for t in translations:
         if t.dtype != torch.float32 or t.is_meta or near.is_meta or not t.numel():
@@ -115,7 +115,7 @@ def check_origin(near: Tensor, *translations: Tensor, unit: str) -> None:
 
 
 def check_rotation(R: Any) -> None:
-    """Check that R (\\*b, 3, 3) is a rotation, except for rounding.
+    """Check that R (\\*b, 3, 3) is a rotation, except for rounding (`ROUNDED`).
 
     Raises:
         ValueError: if it is a reflection, singular, or not orthonormal, or as `check_numbers`.
@@ -153,10 +153,10 @@ def check_K(K: Any) -> None:
 
 
 def check_hw(hw: Any) -> None:
-    """Check that `hw` is the (height, width) of an image, in whole pixels.
+    """Check that `hw` is (height, width) of an image: whole pixels, at least 1, at most `LARGEST_SIDE` each.
 
     Raises:
-        ValueError: if it is not.
+        ValueError: if it is not, or for more than `MOST_PIXELS` in all.
     """
     try:
         h, w = map(operator.index, () if isinstance(hw, Tensor) else hw)  # a tensor would be one of a batch
@@ -195,7 +195,7 @@ def check_above(least: float, *, whole: bool = False, itself: bool = True, **val
 
     Raises:
         ValueError: for another number, infinity or NaN.
-        TypeError: for a value that is no number.
+        TypeError: for a value that is no number; for `whole` also one that is no integer, such as 2.0.
     """
     bound = f"of {least:g} or more" if itself else f"above {least:g}"
     wanted = f"wanted a {'whole' if whole else 'finite'} number {bound}"
@@ -211,10 +211,10 @@ def check_above(least: float, *, whole: bool = False, itself: bool = True, **val
 
 
 def check_bounds(near: Any, far: Any) -> None:
-    """Check depth bounds: 0 < near <= far, metres. None and tensors are not checked.
+    """Check depth bounds: 0 < near <= far, metres, perhaps infinite. None and tensors are not checked.
 
     Raises:
-        ValueError: for other numbers.
+        ValueError: for other numbers, NaN included.
         TypeError: for values that are no numbers.
     """
     for name, value in (("near", near), ("far", far)):
@@ -259,16 +259,14 @@ def check_field(field: Any) -> None:
 
 
 def checked(function: Callable[..., T]) -> Callable[..., T]:
-    """Decorator that checks a public function's arguments by their annotations, each kind in one sentence.
+    """Decorate a function or method to check its arguments by their annotations before it runs.
 
-    Tensors are checked for their type, last axes and device, sizes as `check_hw`; numbers, cameras, poses,
-    pairs, rigs and fields for their type. Nothing is checked while torch compiles or transforms.
-
-    Args:
-        function: function or method; what its annotations leave open is not checked.
+    Tensors are checked for dtype, number of axes, last axes of fixed size, and a common device; an `HW` as
+    `check_hw`; numbers, texts, lists, mappings, fields and this package's classes for their type. Defaults
+    and other annotations are not checked, and nothing is unless `checking`.
 
     Returns:
-        The function, which raises TypeError or ValueError before it does anything.
+        The function, which raises TypeError for a wrong type or dtype, else ValueError, in one sentence.
     """
 
     @wraps(function)

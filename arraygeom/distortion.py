@@ -7,8 +7,7 @@ give pixels.
 Models, with their coefficients:
 
 - ``brown-conrady``: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tx ty]]]], 4, 5, 8, 12 or 14 numbers in OpenCV's
-  order: rational radial, tangential, thin-prism and tilted-sensor terms (its ``projectPoints``; Brown 1966,
-      Conrady 1919).
+  order: rational radial, tangential, thin-prism and tilted-sensor terms (Brown 1966, Conrady 1919).
 - ``kannala-brandt``: k1 k2 k3 k4, the angle theta from the optical axis goes to the radius
   theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) (Kannala and Brandt 2006; OpenCV's
   ``fisheye``, Kalibr's ``equidistant``, COLMAP's ``OPENCV_FISHEYE``).
@@ -71,12 +70,14 @@ class Distortion(LensModel):
     """Lens with coefficients, or a batch of lenses of one model.
 
     The batch axes of `coefficients` meet the *leading* axes of the points: coefficients (5, 8) go with points
-    (5, 2), (5, 100, 2), (5, 20, 30, 2). Points are independent of each other; all maps are differentiable,
-    twice, in the points and the coefficients.
+    (5, 2), (5, 100, 2), (5, 20, 30, 2); others that do not broadcast raise RuntimeError. Points are
+    independent of each other; all maps are differentiable, twice, in the points and the coefficients.
+    Coefficients out of a model's bounds, such as alpha above 1, are not refused: no point is valid then.
 
     Attributes:
-        model: name of the model, see the module.
-        coefficients: its coefficients, in the module's order.
+        model: name of the model, a key of `LENS_TERMS` such as "brown-conrady" (OpenCV's).
+        coefficients: its coefficients (*b, n), in the order of `LENS_TERMS`; for "brown-conrady" the first 4,
+            5, 8, 12 or all 14.
 
     Raises:
         ValueError: for an unknown model, a number of coefficients that it does not have, NaN or infinity.
@@ -96,9 +97,9 @@ class Distortion(LensModel):
         if self.model not in COEFFICIENT_COUNTS:
             raise ValueError(f"unknown lens model {self.model!r}: use one of {', '.join(COEFFICIENT_COUNTS)}")
         counts = COEFFICIENT_COUNTS[self.model]
-        if self.coefficients.shape[-1] not in counts:
-            count, wanted = self.coefficients.shape[-1], " or ".join(map(str, counts))
-            raise ValueError(f"{self.model} takes {wanted} coefficients, got {count}: pad with zeros")
+        if self.coefficients.shape[-1:] not in [(count,) for count in counts]:
+            shape, wanted = tuple(self.coefficients.shape), " or ".join(map(str, counts))
+            raise ValueError(f"{self.model} takes (..., {wanted}) coefficients, got {shape}: pad with zeros")
         if checking():
             check_numbers(self.coefficients, self.coefficients.shape[-1:], f"a lens ({self.model})")
 
@@ -113,10 +114,7 @@ class Distortion(LensModel):
 
     @property
     def harmless(self) -> bool:
-        """True if the lens can be left out: it distorts nothing, and needs no gradient.
-
-        False while values are not available (`traced`).
-        """
+        """True if the lens can be left out: without effect or gradient; False while torch traces."""
         return not self.coefficients.requires_grad and not traced() and self.is_identity
 
     @property
@@ -128,7 +126,7 @@ class Distortion(LensModel):
         """Distort normalised pinhole points.
 
         Returns:
-            Distorted points, and True inside the model's range.
+            Distorted points, and True inside the model's range, False for NaN; others mean nothing.
         """
         xy, finite = finite_points(xy)
         if self.model == BROWN_CONRADY:
@@ -141,8 +139,8 @@ class Distortion(LensModel):
         """Undistort points to normalised pinhole points: the inverse of `distort`, iterated to convergence.
 
         Returns:
-            Pinhole points, and True inside the model's range. A fisheye ray at 90 degrees or more has no
-            pinhole point and is not valid: see `unproject`.
+            Pinhole points, and True inside the model's range; others mean nothing. A fisheye ray at 90
+            degrees or more has no pinhole point and is not valid: see `unproject`.
         """
         xy_d, finite = finite_points(xy_d)
         if self.model == BROWN_CONRADY:
@@ -157,9 +155,9 @@ class Distortion(LensModel):
         """Project points in the camera's frame (any unit).
 
         Returns:
-            Distorted normalised points, and validity. Brown-Conrady and the field-of-view model: only points
-            ahead (z > 0) are valid. The others: every direction that the model reaches, also at and beyond 90
-            degrees off axis; (0, 0, 0) is not.
+            Distorted normalised points, and True where the model reaches the direction: ahead (z > 0) for
+            Brown-Conrady and the field-of-view model, for the others also at and beyond 90 degrees off axis.
+            (0, 0, 0) and NaN are not valid.
         """
         X, finite = finite_points(X)
         if self.model != BROWN_CONRADY:
@@ -173,7 +171,7 @@ class Distortion(LensModel):
         """Compute the directions of distorted normalised points: the inverse of `project`.
 
         Returns:
-            Unit directions in the camera's frame, and True inside the model's range.
+            Unit directions in the camera's frame, and True inside the model's range; others mean nothing.
         """
         if self.model != BROWN_CONRADY:
             xy_d, finite = finite_points(xy_d)
@@ -201,10 +199,7 @@ class Distortion(LensModel):
 
     @property
     def squared_limit(self) -> float:
-        """Limit of its range: squared normalised radius (Brown-Conrady) or squared angle (Kannala-Brandt).
-
-        Meaningful for these two models and a single lens only.
-        """
+        """Limit of one lens's range: squared radius (Brown-Conrady) or squared angle (Kannala-Brandt)."""
         c = self.coefficients.detach()
         return float(once(fisheye_limit if self.model == KANNALA_BRANDT else brown_limit, c))
 
@@ -219,8 +214,8 @@ def lens_derivatives(
 ) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2 3"], Float[Tensor, "n 2 k"]]:
     """Project finite points through one lens, with derivatives, as constants without gradient.
 
-    In closed form for Brown-Conrady without a tilted sensor; otherwise by two reverse passes, with a copy of
-    the coefficients for each point.
+    In closed form for Brown-Conrady of fewer than 14 coefficients; otherwise by two reverse passes, with a
+    copy of the coefficients for each point.
 
     Args:
         lens: one lens, not a batch; None for a pinhole.
@@ -228,7 +223,10 @@ def lens_derivatives(
 
     Returns:
         Distorted normalised points (n, 2), derivatives by the points (n, 2, 3), and by the coefficients (n,
-        2, k). Validity is not checked.
+        2, k), k = 0 for None. Validity is not checked: points that the lens does not see give finite numbers.
+
+    Raises:
+        RuntimeError: for a lens without coefficients.
     """
     X, c = X.detach(), X.new_zeros(0) if lens is None else lens.coefficients.detach()
     if lens is None or (lens.model == BROWN_CONRADY and len(c) < COEFFICIENT_COUNTS[BROWN_CONRADY][-1]):
@@ -248,7 +246,7 @@ def lens_derivatives(
 
 
 def typical_coefficients(lens: LensModel) -> tuple[float, ...]:
-    """Return usual sizes of a lens's coefficients; 1 for those of a camera model."""
+    """Return usual sizes of a lens's coefficients; 1 for a camera model's."""
     count = lens.coefficients.shape[-1]
     return tuple(LENS_TERMS[lens.model].values())[:count] if lens.model in LENS_TERMS else (1.0,) * count
 

@@ -28,12 +28,15 @@ def essential_matrix(beta_from_alpha: Pose) -> Float[Tensor, "*b 3 3"]:
 def fundamental_matrix(
     K_alpha: Float[Tensor, "*b 3 3"], K_beta: Float[Tensor, "*b 3 3"], beta_from_alpha: Pose
 ) -> Float[Tensor, "*b 3 3"]:
-    """Compute F = K_beta^-T E K_alpha^-1, so that x_beta^T F x_alpha = 0; kornia's, in float64.
+    """Compute F = K_beta^-T E K_alpha^-1 in float64: x_beta^T F x_alpha = 0.
 
-    Along (l1, -l0) of a line l points are farther away: the sign is kornia's unless K_beta mirrors.
+    Along (l1, -l0) of a line l = F x_alpha points are farther away: kornia's sign, unless K_beta mirrors.
 
     Returns:
-        F, zero without a baseline.
+        F in the widest type of all, not scaled; zero without a baseline.
+
+    Raises:
+        ValueError: for batch axes that do not broadcast.
     """
     from kornia.geometry.epipolar import fundamental_from_essential
 
@@ -59,7 +62,10 @@ def epipolar_lines(F: Float[Tensor, "*b 3 3"], x: Real[Tensor, "*n 2"]) -> Float
 
     Returns:
         Lines (*m, 3); all zeros where there is none: at alpha's epipole, to the rounding of x's type, and
-        where F is zero. Batched F as in `map_homogeneous`.
+        where F is zero. NaN for NaN pixels.
+
+    Raises:
+        ValueError: for pixels without the axes of a batched F: wanted (*b, ..., 2).
     """
     size = F.abs().amax((-2, -1), keepdim=True)
     line = map_homogeneous(F / torch.where(size > 0, size, 1.0), x)
@@ -74,20 +80,20 @@ def epipolar_lines(F: Float[Tensor, "*b 3 3"], x: Real[Tensor, "*n 2"]) -> Float
 
 
 SMALLEST_SQUARE = 1e-30
-"""Squared norm of a line's (x, y) part, for F scaled to a largest entry of 1, below which there
-is no line."""
+"""Squared norm of a line's (x, y) part, for F of largest entry 1, below which there is no line."""
 
 
 def epipoles(F: Float[Tensor, "*b 3 3"]) -> tuple[Float[Tensor, "*b 3"], Float[Tensor, "*b 3"]]:
     """Compute the epipoles of F.
 
     Returns:
-        (e_alpha, e_beta), homogeneous unit vectors with F e_alpha = 0 and F^T e_beta = 0; their third entry
-        is 0 at infinity.
+        (e_alpha, e_beta), homogeneous unit vectors of either sign with F e_alpha = 0 and F^T e_beta = 0, or
+        least if F is not of rank two; arbitrary for F = 0. Their third entry is 0 at infinity.
 
     Raises:
         ValueError: for another shape.
-        TypeError: for a value that is no tensor.
+        TypeError: for a value that is no floating-point tensor.
+        RuntimeError: for NaN or infinity.
     """
     U, _, Vh = torch.linalg.svd(F)
     return Vh[..., 2, :], U[..., :, 2]
@@ -119,8 +125,7 @@ class Track(NamedTuple):
     b: Float[Tensor, "*m 3"]
 
     def at(self, w: Float[Tensor, "*n"]) -> Float[Tensor, "*n 2"]:
-        """Return beta's pixels at inverse depths; where a point is not in front of beta the value is only
-        finite."""
+        """Return beta's pixels at inverse depths; finite, without meaning for points not in front of beta."""
         P = self.a + w[..., None] * self.b
         z = P[..., 2:]
         return P[..., :2] / torch.where(z > FRONT, z, 1.0)
@@ -134,15 +139,17 @@ def track(
 ) -> Track:
     """Compute the track in beta of each alpha pixel of a pinhole pair.
 
-    Batched rigs (*b, 3, 3) take pixels (*b, ..., 2).
-
-    Matrices are composed in their own precision, pixels computed in that of `x`.
-
     Args:
         K_alpha: alpha's K.
         K_beta: beta's K.
         beta_from_alpha: pose of alpha's frame in beta's.
-        x: pixels of alpha.
+        x: pixels of alpha; (*b, ..., 2) for a batch.
+
+    Returns:
+        The tracks (*n), in the precision of `x`.
+
+    Raises:
+        ValueError: for pixels without the axes of a batch.
     """
     a = map_homogeneous(infinite_homography(K_alpha, K_beta, beta_from_alpha.R), x)
     b = matvec(K_beta, beta_from_alpha.t).to(a.dtype)
@@ -155,13 +162,14 @@ def segments_between(
     """Compute the part of each track between two depths and inside beta's image, in closed form (`clipped`).
 
     Args:
+        track: tracks in pixels of beta.
         near: depth in alpha, metres, above 0; not checked.
         far: depth in alpha, metres, at least `near`; may be infinite.
         beta_hw: height and width of beta.
 
     Returns:
-        Segments (*n) from near to far, pixels of beta, also clipped to the front of beta; invalid where
-        nothing is left.
+        Segments (*n) from near to far, pixels of beta, also clipped to the front of beta (`FRONT`); zero and
+        invalid where nothing is left.
     """
     h, w = beta_hw
     visible = clipped(track, near, far, (-0.5, -0.5, w - 0.5, h - 0.5))
@@ -180,7 +188,7 @@ class Clipped(NamedTuple):
         D: their change to s = 1 (near).
         low: least s, at least 0.
         high: largest s, at most 1.
-        valid: False where nothing is left.
+        valid: False where nothing is left; `low` and `high` then mean nothing.
     """
 
     P: Float[Tensor, "*n 3"]
@@ -200,12 +208,9 @@ def clipped(
 ) -> Clipped:
     """Clip each track to depths, to limits in the image and to the front of beta.
 
-    With s going from 0 at far to 1 at near in proportion to inverse depth, every limit is linear in s with a
-    slope that is one number for the whole image.
-
     Args:
-        near: depth in alpha, metres.
-        far: depth in alpha, metres, may be infinite.
+        near: depth in alpha, metres; s = 1.
+        far: depth in alpha, metres, may be infinite; s = 0. In between s is linear in inverse depth.
         limits: x low, y low, x high, y high, in the unit of the track's points; None for no limits.
         in_front: False to keep points behind beta.
 
@@ -235,8 +240,7 @@ HIGHEST = 1e30
 def _limited(
     low: Tensor, high: Tensor, valid: Tensor, g: Tensor, slope: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Limit the range [low, high] of s to where g + s slope >= 0; `slope` holds one number for
-    many pixels."""
+    """Limit the range [low, high] of s to where g + s slope >= 0; a `slope` is of many pixels."""
     rising, falling = slope > FLAT, slope < -FLAT
     flat = ~(rising | falling)
     crossing = g * (-1 / torch.where(flat, 1.0, slope))
@@ -275,11 +279,11 @@ A ray that meets beta's centre (alpha's epipole) tends to 0/0 there; at 1e-3 flo
 
 
 class Depth(NamedTuple):
-    """Depth of alpha's pixels.
+    """Depth of alpha's pixels, metres (the unit of the cameras' poses).
 
     Attributes:
-        depth: z in alpha, metres; 0 where not valid.
-        deviation: its standard deviation, metres.
+        depth: z in alpha's frame; 0 where not valid.
+        deviation: its standard deviation; 0 where not valid, and if that of the pixels was not given.
         valid: True where there is a depth.
     """
 
@@ -294,12 +298,14 @@ def depth_from_track(
     """Compute the depth in alpha of the point of a track nearest to beta's pixels `x`.
 
     Args:
+        track: track of each alpha pixel.
+        x: the pixel of beta for each.
         deviation: standard deviation of x along the track, pixels; None for 0. It is propagated to first
             order, d depth = depth^2 / |dx/dw|.
 
     Returns:
-        Depth in metres, with its deviation; invalid where the baseline gives none, the depth is not positive,
-        or the point is not in front of beta.
+        Depth with its deviation; invalid where the baseline gives none, it would not be positive and finite,
+        the point is not in front of beta (`FRONT`), or x is not finite.
     """
     a, b = track
     x = floating(x)

@@ -22,8 +22,8 @@ class TransformedPoints(NamedTuple):
     """Points after a homography.
 
     Attributes:
-        x: pixels; zero where not valid.
-        valid: True where the point exists.
+        x: pixels of the second image; zero where not valid.
+        valid: True where x is finite and the homogeneous scale positive.
     """
 
     x: Float[Tensor, "*n 2"]
@@ -41,12 +41,15 @@ def plane_homography(
 ) -> Float[Tensor, "*b 3 3"]:
     """Compute H with x_beta ~ H x_alpha for points of the plane normal^T X + d = 0 in alpha's frame.
 
-    H = K_beta (R - t normal^T / d) K_alpha^-1 (Hartley & Zisserman, equation 13.2). The plane Z = 2 m is
-    normal = (0, 0, 1), d = -2. The normal need not have unit length. Scaled as written, H (x_alpha, 1) equals
-    (Z_beta / Z_alpha) (x_beta, 1), so its third entry is positive for points in front of both cameras.
+    H = K_beta (R - t normal^T / d) K_alpha^-1 (Hartley & Zisserman, equation 13.2); normals have any length.
+    The plane Z = 2 m is normal = (0, 0, 1), d = -2. H (x_alpha, 1) equals (Z_beta / Z_alpha) (x_beta, 1), so
+    its third entry is positive for points in front of both cameras.
 
     Returns:
         H; not finite for a plane through alpha's centre (d = 0), which has no homography.
+
+    Raises:
+        RuntimeError: for a singular K_alpha, or batch axes that do not broadcast.
     """
     plane = R - t[..., :, None] * (normal / d[..., None])[..., None, :]
     return product(product(K_beta, plane), torch.linalg.inv(K_alpha))
@@ -55,8 +58,7 @@ def plane_homography(
 def infinite_homography(
     K_alpha: Float[Tensor, "*#b 3 3"], K_beta: Float[Tensor, "*#b 3 3"], R: Float[Tensor, "*#b 3 3"]
 ) -> Float[Tensor, "*b 3 3"]:
-    """Compute H = K_beta R K_alpha^-1, which maps points at infinite depth (Hartley & Zisserman, section
-    13.4)."""
+    """Compute H = K_beta R K_alpha^-1, which maps points at infinite depth (H & Z, section 13.4)."""
     return product(product(K_beta, R), torch.linalg.inv(K_alpha))
 
 
@@ -67,7 +69,7 @@ def apply_homography(H: Float[Tensor, "*b 3 3"], x: Real[Tensor, "*n 2"]) -> Tra
     positive in front of both cameras; a fitted H is fixed only up to sign and has to be oriented first.
 
     Returns:
-        Points, valid where finite and the homogeneous scale is positive; elsewhere zero, with zero gradient.
+        Points, valid where finite and of a scale above `SMALLEST_SCALE`; elsewhere zero, with zero gradient.
 
     Raises:
         ValueError: for points without the axes of a batched H.
@@ -89,11 +91,14 @@ def fit_similarity(x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"]) -> Float[Te
     Umeyama 1991 in two dimensions, in closed form: as complex numbers y = a x + b.
 
     Returns:
-        Matrix (3, 3) of the points' type, differentiable.
+        Matrix (3, 3) of the points' wider type, differentiable; NaN if y is not finite.
 
     Raises:
-        ValueError: if all points of x coincide.
+        ValueError: for unequal numbers of points, and, unless torch compiles, if all of x coincide or some
+            are not finite.
     """
+    if x.shape != y.shape:
+        raise ValueError(f"wanted pairs of points, (n, 2) each, got {tuple(x.shape)}, {tuple(y.shape)}")
     dtype = torch.promote_types(x.dtype, y.dtype)
     x, y = x.double(), y.double()
     x_mean, y_mean = x.mean(0), y.mean(0)
@@ -114,13 +119,13 @@ def fit_homography(x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"]) -> Float[Te
     4.2), on points centred and scaled (section 4.4), in float64. Outliers are not down-weighted.
 
     Returns:
-        Matrix (3, 3) of the points' type, oriented so that the scale is positive at the points;
+        Matrix (3, 3) of the points' wider type, oriented so that the scale is positive at the points;
         differentiable, through ten Gauss-Newton steps at the end.
 
     Raises:
-        ValueError: for fewer points, NaN, and if there is no such homography, as some points would be behind.
-            Points on a line are not told: any of many homographies comes back.
-        TypeError: for points that are no tensors.
+        ValueError: for fewer points, unequal numbers, NaN or infinity, and if there is no such homography, as
+            some points would be behind. Points on a line are not told: any of many comes back.
+        TypeError: for points that are no floating-point tensors.
         NotImplementedError: within `torch.func.vmap`.
     """
     check_tensors((2,), x=x, y=y)

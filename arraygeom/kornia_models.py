@@ -1,5 +1,4 @@
-"""Conversion to and from kornia's camera models (`kornia.sensors.camera`), which have no pose, its batches of
-pinholes and its stereo cameras."""
+"""Conversion to and from kornia's camera models (without pose), batches of pinholes and stereo cameras."""
 
 from __future__ import annotations
 
@@ -33,9 +32,12 @@ def to_kornia_model(K: Float[Tensor, "*b 3 3"], hw: HW, lens: LensModel | None) 
         hw: height and width of the image.
         lens: the lens; None for a pinhole.
 
+    Returns:
+        The model, with parameters (n) or (B, n): several batch axes become one.
+
     Raises:
-        ValueError: for a skewed or rotated K, and for lenses, or prism or tilt terms, that kornia does not
-            have.
+        ValueError: for a skewed or rotated K, lenses, or prism or tilt terms, that kornia does not have, and
+            batch axes that do not broadcast.
     """
     from kornia.image import ImageSize
     from kornia.sensors.camera import CameraModel, CameraModelType
@@ -75,7 +77,7 @@ def from_kornia_model(model: CameraModel) -> tuple[Float[Tensor, "*b 3 3"], HW, 
     """Extract intrinsics and lens from a camera model of kornia, one or a batch.
 
     Returns:
-        K, the image's (height, width), and the lens; None for kornia's pinhole with its affine "distortion".
+        K, the image's (height, width), and the lens; None for kornia's pinhole, whose "distortion" is affine.
     """
     from kornia.sensors.camera.distortion_model import BrownConradyTransform, KannalaBrandtK3Transform
     from kornia.sensors.camera.projection_model import OrthographicProjection
@@ -107,16 +109,23 @@ def pinholes_by_name(
     """Name kornia's cameras; the cameras of a batch are "camera0" and so on, of a pair "left" and "right".
 
     Args:
-        cameras: pinholes by name, which stay; a batch of pinholes; or a `StereoCamera`.
-        hw: height and width of the images of a `StereoCamera`, whose left camera is at the world's origin.
+        cameras: pinholes by name, returned as given; a batch of pinholes; or a `StereoCamera`.
+        hw: height and width of the images of a `StereoCamera`, whose left camera is at the world's origin;
+            else unused.
+
+    Returns:
+        Cameras by name, in order: batches of 1 of a batch, as long as the pair's of a `StereoCamera`.
 
     Raises:
         ValueError: for a `StereoCamera` without `hw`.
-        TypeError: for anything else.
+        TypeError: for anything else, also in a mapping.
     """
     from kornia.geometry.camera import PinholeCamera, StereoCamera
 
     if isinstance(cameras, Mapping):
+        for name, camera in cameras.items():
+            if not isinstance(camera, PinholeCamera):
+                raise TypeError(f"camera '{name}' is a {type(camera).__name__}: give a kornia PinholeCamera")
         return cameras
     if isinstance(cameras, PinholeCamera):
         parts = cameras.intrinsics, cameras.extrinsics, cameras.height, cameras.width

@@ -27,8 +27,8 @@ class LensCoverage(NamedTuple):
     """Coverage of an image by its lens model.
 
     Attributes:
-        share: share of pixels with a ray, 0..1.
-        degrees: largest valid angle off axis; NaN for a pinhole, or without any ray.
+        share: share of the pixels of a coarse grid with a ray, 0..1; 1 for a pinhole.
+        degrees: largest angle off axis of these rays; NaN for a pinhole, or without any ray.
     """
 
     share: float
@@ -40,7 +40,7 @@ class Refit(NamedTuple):
 
     Attributes:
         camera: camera with the new lens.
-        largest: largest difference to the old lens, pixels.
+        largest: largest difference to the old lens, pixels, on a coarse grid where that has rays.
         usual: 95th percentile of the difference, pixels.
     """
 
@@ -50,7 +50,10 @@ class Refit(NamedTuple):
 
 
 class LensKey:
-    """Key of a camera: equal for equal images, K and lenses, wherever the cameras are."""
+    """Hashable key of a camera: equal for equal image size, K (and its dtype) and lens, whatever its pose.
+
+    A `Distortion` counts by its numbers, another lens by identity.
+    """
 
     def __init__(self, camera: Any) -> None:
         self.camera, lens = camera, camera.distortion
@@ -76,7 +79,7 @@ def once_a_lens(function: Callable[[V], T]) -> Callable[[V], T]:
 
 @once_a_lens
 def coverage(camera: LensView) -> LensCoverage:
-    """Measure the share of a camera's pixels with a ray, and their widest angle, on a coarse grid."""
+    """Measure the share of one camera's pixels with a ray, and their widest angle, on a coarse grid."""
     with torch.no_grad():
         grid = coarse_grid(camera.hw, max(8, max(camera.hw) // 128)).to(camera.K)
         if camera.distortion is None:
@@ -91,7 +94,7 @@ def coverage(camera: LensView) -> LensCoverage:
 
 
 def refit_lens(camera: Camera) -> Refit:
-    """Fit Brown-Conrady's k1 k2 p1 p2 k3, which have no pole, to a lens's own formula.
+    """Fit Brown-Conrady's k1 k2 p1 p2 k3, which have no pole, to the formula of one camera's lens.
 
     Points beyond a pole take part where the formula is smooth again.
 
@@ -99,7 +102,7 @@ def refit_lens(camera: Camera) -> Refit:
         The camera with the new lens, and the differences.
 
     Raises:
-        ValueError: for a lens of another model or with a tilted sensor, and if no such lens covers the image.
+        ValueError: for no lens, another model, a tilted sensor, a batch, or if no such lens covers the image.
     """
     lens = camera.distortion
     if not isinstance(lens, Distortion) or lens.model != BROWN_CONRADY or lens.coefficients[12:].any():
@@ -130,14 +133,13 @@ def refit_lens(camera: Camera) -> Refit:
 
 
 def refit_rig(rig: Rig) -> tuple[Rig, list[str]]:
-    """Refit the lenses that end within their images.
+    """Refit the lenses of calibrated cameras that end within their images (`coverage`).
 
     Returns:
-        The rig, and a sentence on each refitted lens.
+        The rig, and a sentence on each refitted lens; none if all cover their images.
 
     Raises:
-        ValueError: for a lens of another model than Brown-Conrady, or with a tilted sensor, and if no new one
-            covers the image.
+        ValueError: as `refit_lens` for the first that cannot be refitted, and for a batch.
     """
     cameras, said = dict(rig.cameras), []
     for name, camera in rig.cameras.items():
@@ -156,8 +158,7 @@ def _normalised(camera: LensView, x: Tensor) -> Tensor:
 
 
 def _terms(xy: Tensor) -> Tensor:
-    """Displacement of points by a unit of each of k1 k2 p1 p2 k3, (n, 2, 5): Brown's polynomials are linear
-    in them."""
+    """Displacement of points by a unit of each of k1 k2 p1 p2 k3, (n, 2, 5), in which it is linear."""
     x, y = xy.unbind(-1)
     u = xy.square().sum(-1)
     p1, p2 = torch.stack([2 * x * y, u + 2 * y * y], -1), torch.stack([u + 2 * x * x, 2 * x * y], -1)

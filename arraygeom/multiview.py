@@ -22,9 +22,9 @@ class WorldRays(NamedTuple):
     """Rays of pixels in the world.
 
     Attributes:
-        origin: start, metres.
-        direction: unit direction; zero where not valid.
-        valid: True for pixels that have a ray.
+        origin: start, metres in the world.
+        direction: unit direction in the world; zero where not valid.
+        valid: True for pixels that have a ray, as `Camera.rays` says.
     """
 
     origin: Float[Tensor, "*n 3"]
@@ -47,6 +47,9 @@ def world_rays(camera: Camera, x: Real[Tensor, "*n 2"] | None = None) -> WorldRa
 
     Args:
         x: pixels; None for all of the image, (*b, H, W).
+
+    Raises:
+        ValueError: for pixels without the axes of a batch of cameras.
     """
     batch = camera.batch_shape
     if x is None:
@@ -74,11 +77,13 @@ def warp(
     detected.
 
     Returns:
-        Values (B, C, *d, Ha, Wa), 0 where not valid, and validity: depth is finite and positive, and the
-        point is in front of beta and on its image. Differentiable in image, depth and cameras.
+        Values (B, C, *d, Ha, Wa), 0 where not valid, and validity (B, *d, Ha, Wa): depth is finite and
+        positive, alpha's lens has a ray, and the point is in front of beta and on its image. Differentiable
+        in image, depth and cameras.
 
     Raises:
-        ValueError: for an image or depth of another size than its camera's, and uncalibrated cameras.
+        ValueError: for an image or depth of another size than its camera's, uncalibrated cameras, and as
+            `sample`. Batches of unequal length, neither of 1, give ValueError or RuntimeError.
     """
     for what, plane, view in (("image", image, pair.beta), ("depth", depth, pair.alpha)):
         _check_size(f"the {what} given", plane, view.hw)
@@ -95,13 +100,14 @@ def plane_sweep(pair: Pair, image: Float[Tensor, "b c h w"], depths: Float[Tenso
     For any cameras, through lenses too, where planes are no homographies.
 
     Args:
-        depths: metres.
+        depths: metres, one or more; planes that are not at a finite, positive depth give nothing valid.
 
     Returns:
         Values (B, C, D, Ha, Wa), and validity (B, D, Ha, Wa).
 
     Raises:
         ValueError: for an image of another size than beta's, and uncalibrated cameras.
+        RuntimeError: for no depths, and as `warp`.
     """
     planes = depths[:, None, None, None].expand(-1, len(image), *pair.alpha.hw)
     swept = [warp(pair, image, plane) for plane in planes]
@@ -114,8 +120,7 @@ def _check_size(what: str, plane: Tensor, hw: HW) -> None:
 
 
 def _in_beta(pair: Pair, depth: Tensor, x: Tensor | None = None) -> Projected:
-    """Projection into beta of alpha's pixels (all, or x (*n, 2)) at depths (*b, *d, *n); a batch's axes
-    first."""
+    """Projection into beta of alpha's pixels (all, or x (*n, 2)) at depths (*b, *d, *n)."""
     alpha, beta = pair.cameras
     depth = floating(depth)
     x = pixel_grid(alpha.hw, dtype=depth.dtype, device=depth.device) if x is None else x
@@ -136,7 +141,7 @@ class ConsistentDepth(NamedTuple):
     """Depth map confirmed by other views.
 
     Attributes:
-        depth: mean of alpha's depth and that of the agreeing views, metres; 0 where not valid.
+        depth: mean of alpha's depth and the agreeing views' in alpha's frame, metres; 0 where not valid.
         views: number of agreeing other views.
         valid: True where enough views agree.
     """
@@ -155,23 +160,23 @@ def consistent_depth(
     pixels: float = 1.0,
     relative: float = 0.01,
 ) -> ConsistentDepth:
-    """Fuse alpha's depth map with those of other cameras that agree with it, through any lenses.
+    """Fuse alpha's depth map with other cameras' maps where they agree with it, through any lenses.
 
     A view agrees if alpha's point, replaced by the depth in the view's own map, returns to within `pixels` of
     its place in alpha and within `relative` of its depth (Yao et al. 2018, MVSNet).
 
     Args:
         depths: depth maps in metres, by camera; values that are not finite and positive are unknown.
-        views: least number of agreeing other views.
+        views: least number of agreeing other views; 0 keeps all of alpha's depth.
         pixels: largest distance in alpha, pixels.
-        relative: largest difference of depth, as a share of it.
+        relative: largest difference of depth, as a share of alpha's.
 
     Returns:
         The fused map, differentiable in depths and cameras.
 
     Raises:
-        ValueError: if alpha has no map, a map has another size than its camera, or a camera is not
-            calibrated.
+        ValueError: if alpha has no map, the rig lacks a camera, a map has another size than its camera, one
+            of two cameras is not calibrated, or for a batch of rigs.
     """
     if rig.require(alpha) not in depths:
         raise ValueError(f"there is no depth map of '{alpha}', only of {', '.join(depths)}")

@@ -86,11 +86,13 @@ def _enlargement(H: Tensor) -> float:
 class Pair(Batched):
     """Alpha and one beta with their relation: two calibrated cameras, or a link, or only sizes.
 
+    Nothing is checked here: `Rig.pair` makes pairs.
+
     Attributes:
         alpha: view whose pixels are matched.
         beta: view in which their matches are searched.
         depth: (near, far) along alpha's axis, in `unit`; None if unknown.
-        link: F and H of an uncalibrated pair; None if there is none.
+        link: F and H measured between the two, which count before a calibration; None if there is none.
         unit: unit of lengths; "baselines" for rigs of unknown scale.
         memo: cache of what fields compute once for a pair; never copied.
     """
@@ -123,7 +125,7 @@ class Pair(Batched):
 
     @property
     def cameras(self) -> tuple[Camera, Camera]:
-        """Both cameras.
+        """Both cameras, (alpha, beta).
 
         Raises:
             ValueError: unless both are calibrated.
@@ -137,10 +139,11 @@ class Pair(Batched):
 
     @property
     def beta_from_alpha(self) -> Pose:
-        """Pose X_beta = R X_alpha + t; t is 0 where it is only rounding of the cameras' poses.
+        """Pose X_beta = R X_alpha + t, in `unit`; t is 0 where it is only rounding of the cameras' poses.
 
         Raises:
-            ValueError: unless both cameras are calibrated, and for float32 poses too far from the origin.
+            ValueError: unless both cameras are calibrated, and, with a depth range, for float32 poses too far
+                from the origin (`check_origin`).
         """
         alpha, beta = self.cameras
         if checking() and self.depth is not None:
@@ -153,7 +156,7 @@ class Pair(Batched):
 
     @property
     def depth_range(self) -> Depths:
-        """Depth range (near, far) along alpha's axis, metres.
+        """Depth range (near, far) along alpha's axis, in `unit`.
 
         Raises:
             ValueError: if the rig states none.
@@ -170,12 +173,11 @@ class Pair(Batched):
     def fundamental(self) -> Float[Tensor, "*b 3 3"]:
         """Fundamental matrix F with x_beta^T F x_alpha = 0: the link's, else that of the cameras.
 
-        For views with lenses it relates undistorted pixels.
-
-        Zero without a baseline.
+        It relates undistorted pixels. Zero without a baseline, and for a link of H alone.
 
         Raises:
-            ValueError: if neither calibration nor F is known, or a camera is not central.
+            ValueError: if neither calibration nor F is known, or, without a link, for a camera that is not
+                central, and as `beta_from_alpha`.
         """
         if self.link is not None:
             return self.link.F
@@ -191,11 +193,11 @@ class Pair(Batched):
         """Homography H with x_beta ~ H x_alpha, roughly: the link's, else of the plane at the middle inverse
         depth.
 
-        Calibrated cameras without a depth range give the plane at infinity; a pair known only by sizes, or by
-        F alone, is assumed to have the same field of view.
+        Undistorted pixels, for views with lenses. Calibrated cameras without a depth range give the plane at
+        infinity; other pairs known only by sizes, or by F alone, are assumed to have one field of view.
 
         Raises:
-            ValueError: if a camera is not central.
+            ValueError: as `homography_at`, where it is a plane's.
         """
         if self.link is not None and self.link.H is not None:
             return self.link.H
@@ -223,7 +225,8 @@ class Pair(Batched):
             in front of both cameras.
 
         Raises:
-            ValueError: unless both cameras are calibrated and central, and for depths that are not positive.
+            ValueError: unless both cameras are calibrated and central, for depths that are not positive, and
+                as `beta_from_alpha`.
         """
         alpha, beta = self._central("homography")
         depth = torch.as_tensor(depth).to(alpha.K)
@@ -256,13 +259,14 @@ ROUNDED = 8
 
 
 def depth_range(near: Any, far: Any) -> Depths:
-    """Convert depth bounds to tensors, numbers to float64.
+    """Convert depth bounds to tensors: numbers to float64, tensors as they are.
 
     Returns:
         (near, far).
 
     Raises:
-        ValueError: unless 0 < near <= far; not checked while torch traces.
+        ValueError: unless 0 < near <= far and near is finite; not checked while torch traces.
+        TypeError: for a bound that is no number.
     """
     bounds = [
         d if isinstance(d, Tensor) else torch.tensor(float(d), dtype=torch.float64) for d in (near, far)

@@ -32,8 +32,7 @@ def pixel_grid(
 def pixel_coordinates(
     hw: HW, *, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None
 ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
-    """Return x and y of the centres of all pixels: expanded views of a row and a column, which take no
-    memory."""
+    """Return x and y of the centres of all pixels: expanded views of a row and a column, without memory."""
     rows, columns = (torch.arange(n, dtype=dtype, device=device) for n in hw)
     x, y = torch.meshgrid(columns, rows, indexing="xy")
     return x, y
@@ -57,7 +56,7 @@ def shift_matrix(left: float, top: float) -> Float[Tensor, "3 3"]:
 def rot90_matrix(hw: HW, quarter_turns: int) -> Float[Tensor, "3 3"]:
     """Return the matrix from an image's pixels to those after `torch.rot90(image, quarter_turns, (-2, -1))`.
 
-    The rotation is counter-clockwise; `hw` is the size before it.
+    The rotation is counter-clockwise, for negative turns clockwise; `hw` is the size before it. In float64.
 
     >>> (rot90_matrix((2, 3), 1) @ torch.tensor([2.0, 0.0, 1.0], dtype=torch.float64)).tolist()
     [0.0, 0.0, 1.0]
@@ -82,8 +81,7 @@ def floating(x: Real[Tensor, "*n"]) -> Float[Tensor, "*n"]:
 
 
 def within(x: Real[Tensor, "*n 2"], hw: HW, slack: float = 0.0) -> Bool[Tensor, "*n"]:
-    """Return True for points on the image's area, [-0.5, W - 0.5] x [-0.5, H - 0.5], widened by `slack`
-    pixels."""
+    """Return True for points on the image's area, [-0.5, W - 0.5] x [-0.5, H - 0.5], and `slack` around."""
     (column, row), (h, w), low = x.unbind(-1), hw, -0.5 - slack  # faster than an axis of length 2
     return (column >= low) & (column <= w + slack - 0.5) & (row >= low) & (row <= h + slack - 0.5)
 
@@ -91,8 +89,8 @@ def within(x: Real[Tensor, "*n 2"], hw: HW, slack: float = 0.0) -> Bool[Tensor, 
 def product(A: Float[Tensor, "*b i j"], B: Float[Tensor, "*c j k"]) -> Float[Tensor, "*d i k"]:
     """Multiply small matrices in the wider of their types, float32 or float64.
 
-    Float32 products are computed by explicit multiplications and additions: TF32 and autocast lower `matmul`
-    to ten or eight bits.
+    Float32 products (half precision's too) are computed by explicit multiplications and additions: TF32 and
+    autocast lower `matmul` to ten or eight bits.
 
     Returns:
         The product A B, with the batch axes of both broadcast.
@@ -108,8 +106,7 @@ def product(A: Float[Tensor, "*b i j"], B: Float[Tensor, "*c j k"]) -> Float[Ten
 
 
 def broadcasts(batch: Sequence[int], points: Sequence[int]) -> bool:
-    """Return True if the axes of points begin with a batch's, or with axes of length 1 (on either side) in
-    their place."""
+    """Return True if the axes of points begin with a batch's; an axis of length 1 of either fits any."""
     return len(points) >= len(batch) and all(a == b or 1 in (a, b) for a, b in zip(batch, points))
 
 
@@ -130,8 +127,7 @@ def map_homogeneous(M: Float[Tensor, "*b k 3"], x: Real[Tensor, "*n 2"]) -> Floa
     """Compute M (x, y, 1) for every point, in the precision of `x` (`floating`).
 
     A batch of matrices (*b, k, 3) takes points (*b, ..., 2), or with axes of length 1 in place of *b.
-    Explicit multiplications and additions are used, as TF32 and autocast lower the precision of `matmul` to
-    ten or eight bits.
+    By explicit multiplications and additions, as `product`, in float64 too.
 
     Returns:
         Homogeneous coordinates (*m, k), not divided; *m are the points' axes, broadcast with the batch's.

@@ -29,11 +29,12 @@ class Pose(Batched):
     Poses compose where the inner words meet: `b_from_a @ a_from_world` is `b_from_world`.
 
     Attributes:
-        R: rotation.
+        R: rotation, to rounding (`ROUNDED` of `arraygeom.checks`); it is kept as given.
         t: translation, metres.
 
     Raises:
-        ValueError: for an R that is not a rotation, NaN or infinity, and batch axes that do not broadcast.
+        ValueError: for an R that is not a rotation, other shapes, NaN or infinity, and batch axes that do not
+            broadcast.
         TypeError: for values that are no floating-point tensors.
     """
 
@@ -54,8 +55,7 @@ class Pose(Batched):
 
     @classmethod
     def from_centre(cls, R: Float[Tensor, "*b 3 3"], centre: Float[Tensor, "*b 3"]) -> Pose:
-        """Make `cam_from_world` of a camera with rotation R and optical centre `centre` in the
-        world, metres."""
+        """Make `cam_from_world` of a camera with rotation R and optical centre in the world, metres."""
         return cls(R, -matvec(R, centre))
 
     @classmethod
@@ -66,7 +66,7 @@ class Pose(Batched):
         *,
         down: Float[Tensor, "*b 3"] | None = None,
     ) -> Pose:
-        """Make `cam_from_world` of a camera at `centre` that looks at `target`, with y towards `down`.
+        """Make `cam_from_world` of a camera at `centre` that looks at `target`, with y nearest to `down`.
 
         >>> Pose.look_at(torch.tensor([0.0, 0.0, -2.0]), torch.zeros(3)).t.tolist()
         [-0.0, -0.0, 2.0]
@@ -77,7 +77,8 @@ class Pose(Batched):
             down: direction in the world; None for (0, 1, 0). For a world with z upwards it is (0, 0, -1).
 
         Raises:
-            ValueError: if down is along the axis, or the target at the centre.
+            ValueError: if down is along the axis, the target at the centre, or for NaN; not while torch
+                compiles.
         """
         down = centre.new_tensor([0.0, 1.0, 0.0]) if down is None else down
         z = target - centre
@@ -104,13 +105,10 @@ class Pose(Batched):
 
     @classmethod
     def from_quaternion(cls, q: Float[Tensor, "*b 4"], t: Float[Tensor, "*b 3"]) -> Pose:
-        """Make a pose of quaternions (w, x, y, z), of any length but zero.
-
-        Returns:
-            The pose.
+        """Make a pose of quaternions (w, x, y, z), of any length above 1e-12, and translations (metres).
 
         Raises:
-            ValueError: for a quaternion of length zero.
+            ValueError: for a quaternion of zeros, and as the constructor.
         """
         from kornia.geometry.conversions import quaternion_to_rotation_matrix
 
@@ -136,10 +134,7 @@ class Pose(Batched):
         return cls.from_matrix(given.matrix())
 
     def to_kornia(self) -> Se3:
-        """Convert to kornia's `Se3`, which stores a quaternion: R comes back except for rounding.
-
-        `kornia.geometry.pose.NamedPose(pose.to_kornia(), "world", "mono")` gives its frames their names.
-        """
+        """Convert to kornia's `Se3`, which stores a quaternion: R comes back except for rounding."""
         from kornia.geometry.liegroup import Se3, So3
         from kornia.geometry.quaternion import Quaternion
 
@@ -159,7 +154,7 @@ class Pose(Batched):
         """Transform points (*n, 3) to R X + t. With batched poses (*b), points are (*b, ..., 3).
 
         Returns:
-            Points, whose leading axes of length 1 become the batch's.
+            Points in the wider type of both, whose leading axes of length 1 become the batch's.
 
         Raises:
             ValueError: for points of other than three numbers, or without the batch's axes.
@@ -196,11 +191,11 @@ class Pose(Batched):
         Rounding of the product is removed, so that steps do not add up to a drift.
 
         Args:
-            rotation: rotation vector in radians, about the axes of `to`; None for none.
-            translation: metres; None for none.
+            rotation: rotation vector in radians, about the axes of `to`; None keeps R as it is.
+            translation: metres; None keeps t.
 
         Returns:
-            The pose.
+            The pose, unchecked: NaN passes.
         """
         R = self.R if rotation is None else nearest_rotation(product(rotation_from_vector(rotation), self.R))
         return derived(Pose, R, self.t if translation is None else self.t + translation)
@@ -228,7 +223,6 @@ def rotation_from_vector(w: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
     """Convert a rotation vector (axis times angle, radians) to a matrix, by kornia's Rodrigues formula.
 
     Exact to rounding in float32 too, and differentiable any number of times, at angle zero as elsewhere.
-    (`torch.linalg.matrix_exp` is off by 2e-14 a step in float64.)
 
     >>> rotation_from_vector(torch.tensor([0.0, 0.0, torch.pi / 2])).round(decimals=6)[0, 1].item()
     -1.0
@@ -246,8 +240,7 @@ def rotation_from_vector(w: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
 
 
 def rotation_vector(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
-    """Convert a rotation to axis times angle, radians: the inverse of `rotation_from_vector` up to 180
-    degrees."""
+    """Convert a rotation to axis times angle, radians, up to pi: the inverse of `rotation_from_vector`."""
     from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 
     return rotation_matrix_to_axis_angle(R)
@@ -260,6 +253,9 @@ def in_float64(function: Callable[..., Tensor], *tensors: Tensor) -> Tensor:
 
     Returns:
         The function's result, in the widest type of the matrices, float32 at least.
+
+    Raises:
+        ValueError: for batch axes that do not broadcast.
     """
     batch = broadcast_shapes(*(t.shape[:-2] for t in tensors))
     dtype = torch.promote_types(torch.float32, reduce(torch.promote_types, (t.dtype for t in tensors)))
@@ -267,14 +263,12 @@ def in_float64(function: Callable[..., Tensor], *tensors: Tensor) -> Tensor:
 
 
 def nearest_rotation(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3 3"]:
-    """Correct a matrix that is nearly a rotation by one Newton step, which squares its error: R (3 I - R^T R)
-    / 2."""
+    """Correct a near rotation by one Newton step, which squares its error: R (3 I - R^T R) / 2."""
     return 1.5 * R - product(0.5 * R, product(R.mT, R))
 
 
 def rotation_error(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
-    """Measure the distance of R from a rotation: the largest entry of |R R^T - I|, at least 2 for a
-    reflection."""
+    """Measure R's distance from a rotation: the largest entry of |R R^T - I|, 2 or more for a reflection."""
     eye = torch.eye(3, dtype=R.dtype, device=R.device)
     error = (product(R, R.mT) - eye).abs().amax((-1, -2))
     return torch.where(torch.linalg.det(R) > 0, error, error.clamp(min=2.0))

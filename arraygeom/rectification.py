@@ -28,8 +28,8 @@ class Rectification(NamedTuple):
         R_beta: rotation from beta's frame to its rectified frame.
         H_alpha: map from alpha's old pixels to new ones.
         H_beta: map from beta's old pixels to new ones.
-        pair: rectified cameras: same K and orientation, baseline along x. Its depth range has the old
-            numbers, now along the rotated axis: widen it where that matters.
+        pair: rectified cameras: same K, size and orientation, baseline along x, beta on either side; no link.
+            Its depth range has the old numbers, now along the rotated axis: widen it where that matters.
     """
 
     R_alpha: Float[Tensor, "3 3"]
@@ -42,8 +42,8 @@ class Rectification(NamedTuple):
 def rectify(pair: Pair, *, K: Float[Tensor, "3 3"] | None = None, hw: HW | None = None) -> Rectification:
     """Compute the rectifying homographies of a pinhole pair (Bouguet's: each camera is rotated half way).
 
-    R_alpha and R_beta are those of OpenCV's `stereoRectify` for a horizontal pair; a vertical one is rotated
-    by 90 degrees, so that lines are rows here too.
+    R_alpha and R_beta are as OpenCV's `stereoRectify` gives them for a horizontal pair; a vertical one is
+    rotated by 90 degrees, so that lines are rows here too.
 
     Args:
         K: intrinsics of the new images; None for the smaller focal length, with the centres of the old images
@@ -54,14 +54,14 @@ def rectify(pair: Pair, *, K: Float[Tensor, "3 3"] | None = None, hw: HW | None 
         The rectification, differentiable in everything.
 
     Raises:
-        ValueError: for uncalibrated pairs, lenses, batches, no baseline, and a baseline so near an optical
-            axis (motion forwards) that the new images would lie beside the old ones.
+        ValueError: for uncalibrated pairs, lenses, batches, no baseline, a baseline so near an optical axis
+            (motion forwards) that the new images would lie beside the old ones, and an invalid K or hw.
         NotImplementedError: within `torch.func.vmap`.
     """
     alpha, beta = pair.cameras
     if pair.has_lens:
         raise ValueError("rectification by homographies needs pinhole cameras: undistort the images first")
-    if alpha.K.ndim > 2 or beta.K.ndim > 2:
+    if alpha.batch_shape or beta.batch_shape:
         raise ValueError("rectification works on one pair at a time: take one of the batch")
     pose = pair.beta_from_alpha
     needs_numbers("whether a pair can be rectified", alpha.K, beta.K, pose.R, pose.t)
@@ -89,8 +89,10 @@ def rectify(pair: Pair, *, K: Float[Tensor, "3 3"] | None = None, hw: HW | None 
 def rectifying_rotations(beta_from_alpha: Pose) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3 3"]]:
     """Compute the rotations that bring both frames half way to one another and the baseline along x.
 
+    The baseline is turned to +x or -x, whichever is nearer. Not for a batch.
+
     Returns:
-        (R_alpha, R_beta).
+        (R_alpha, R_beta), each from that camera's frame to the rectified one; NaN without a baseline.
     """
     half = rotation_from_vector(0.5 * rotation_vector(beta_from_alpha.R))
     t = matvec(half.T, beta_from_alpha.t)
@@ -118,8 +120,7 @@ def middle_intrinsics(
         hw: height and width of the rectified images.
 
     Returns:
-        K with the smaller of the focal lengths, and the middles of both old images, on average, at the middle
-        of the new ones.
+        K with the smaller focal length, which takes the old images' middles, on average, to the new middle.
     """
     focal = torch.stack([(c.K[:2, :2].det().abs()).sqrt() for c in cameras]).min()
     rays = [_middle_ray(camera, R) for camera, R in zip(cameras, rotations)]
@@ -141,10 +142,14 @@ def _middle_ray(camera: Camera, R: Tensor) -> Tensor:
 
 
 def to_stereo_camera(pair: Pair) -> StereoCamera:
-    """Convert a rectified pair, alpha on the left, as `arraygeom.rectify` makes it (`.pair`).
+    """Convert a rectified pair, alpha on the left, as `arraygeom.rectify` makes it (`.pair`), to kornia's.
+
+    Returns:
+        The stereo camera, a batch (of one for a single pair); it has no sizes, world poses or depth range.
 
     Raises:
-        ValueError: for a pair that is not rectified, or whose beta is not to the right of alpha.
+        ValueError: for a pair that is not calibrated or not rectified, or whose beta is not to the right of
+            alpha.
     """
     from kornia.geometry.camera import StereoCamera
 

@@ -17,13 +17,13 @@ def poses_from_essential(E: Float[Tensor, "*b 3 3"]) -> Pose:
 
     Kornia's decomposition without a singular value decomposition (Horn 1990): differentiable, where E's two
     equal singular values give SVD no gradient. Where noise makes them differ, the rotations are those nearest
-    to Horn's matrices, which are those of the SVD.
+    to Horn's matrices, which the SVD gives too.
 
     Returns:
         `beta_from_alpha`, a batch (*b, 4).
 
     Raises:
-        ValueError: if any E of the batch is zero or not finite.
+        ValueError: if any E of the batch is zero, of rank one (or nearly), or not finite.
     """
     from kornia.geometry.epipolar import decompose_essential_matrix_no_svd
 
@@ -59,20 +59,20 @@ def relative_pose(
     x: Real[Tensor, "*b n 2"],
     x_beta: Real[Tensor, "*b n 2"],
 ) -> TwoViewPose:
-    """Choose the pose of F that puts most matches in front of both pinhole cameras.
+    """Return the pose of F that puts most matches in front of both pinhole cameras.
 
     F is used as given, noise included; E = K_beta^T F K_alpha is F itself for normalised points. Undistort
     matches through lenses first (`LensView.undistort`).
 
     Args:
-        x: matches in alpha, pixels.
-        x_beta: matches in beta, pixels.
+        x: matches in alpha, pixels; with the axes *b of F.
+        x_beta: matches in beta, pixels; NaN counts as not in front.
 
     Returns:
-        The pose; scale is unknown, so the baseline has length 1.
+        The pose; the baseline has length 1. `in_front` is all False if no pose has any match in front.
 
     Raises:
-        ValueError: for no matches, or another number of them in the two images.
+        ValueError: for no matches, unequal numbers of them, and as `poses_from_essential`, as for F = 0.
     """
     if x.shape != x_beta.shape or not x.numel():
         raise ValueError(

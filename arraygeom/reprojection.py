@@ -24,11 +24,12 @@ def projection_slopes(
     """Project world points by a float64 camera, with slopes dx / dX by central differences; any lens.
 
     Args:
-        distance: distance of the points from the camera, metres.
+        X: world points, metres, float64: in float32 differences are mostly rounding.
+        distance: distance of the points from the camera, metres, above 0.
 
     Returns:
-        The projection, and slopes (*n, 2, 3), pixels for each metre. Differentiable as often as
-        `Camera.project` is.
+        The projection, and slopes (*n, 2, 3), pixels for each metre, without meaning where it is not valid.
+        Differentiable as often as `Camera.project` is.
     """
     step = STEP * distance[..., None, None]
     offsets = torch.eye(3).to(X) * step
@@ -56,7 +57,7 @@ def reprojection_residuals(
         Residuals (v, *n, 2), pixels; zero where a point is not seen, or not valid in the camera.
 
     Raises:
-        ValueError: for pixels of another number of views.
+        ValueError: for pixels of another number of views, and points without the axes of batched cameras.
     """
     projected = [camera.project(X) for camera in cameras]
     if len(x) != len(cameras):
@@ -74,8 +75,8 @@ class Bundle(NamedTuple):
     """Result of a bundle adjustment.
 
     Attributes:
-        rig: the adjusted rig, float64.
-        X: the adjusted world points (n, 3), metres.
+        rig: the adjusted rig, float64; all but the free parameters is as given.
+        X: the adjusted world points (n, 3), metres, float64.
         cost: sums of squared residuals (steps + 1): before the first and after each step, pixels².
     """
 
@@ -97,20 +98,20 @@ def bundle_adjusted(
     """Adjust a rig and points to least reprojection error: Levenberg-Marquardt in float64, points eliminated
     (Schur).
 
-    A step that does not lower the cost is not made, and the next is damped tenfold. The damping holds what
-    images do not determine, such as scale. Memory: points times free numbers.
+    A step that raises the cost, beyond rounding, is not made, and the next is damped tenfold. The damping
+    holds what images do not determine, such as scale. Memory: points times free numbers.
 
     Args:
         X: world points to start from, metres.
-        x: their pixels in the rig's cameras, in its order.
-        free: free parameters, as for `Rig.parameters`.
+        x: their pixels in the rig's cameras, in its order; NaN where not seen.
+        free: patterns of free parameters, as for `Rig.parameters`.
         seen: True where a camera sees a point; None for all.
-        steps: number of steps.
+        steps: number of steps, all of which are tried.
         damping: factor of the information's diagonal that is added to it at the first step.
 
     Returns:
-        Rig and points. Gradients follow the steps made: at the optimum those of the least error, in
-        everything given.
+        Rig and points. Gradients, in everything given, follow the steps made: at the optimum they are the
+        least error's.
 
     Raises:
         ValueError: for a batch, uncalibrated cameras, pixels of another shape, and a pattern in `free` that
@@ -137,8 +138,7 @@ def bundle_adjusted(
 
 
 ROUNDED = 1e-9
-"""Relative rise of the cost, or pixels for each number, below which a step is still made: at the optimum
-gradients need it."""
+"""Relative rise of the cost, or pixels for each number, up to which a step is made, for gradients."""
 
 
 def _cost(rig: Rig, X: Tensor, x: Tensor, seen: Tensor | None) -> Tensor:

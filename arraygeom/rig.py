@@ -33,19 +33,20 @@ SERVICES: dict[str, Callable[..., Any]] = {}
 class Rig(Batched):
     """Ordered, named cameras of different sizes, lenses and spectral responses.
 
-    Every number may have leading batch axes, the same for all: a batch of rigs. A rig never changes: methods
-    return new ones.
+    Every number may have leading batch axes, the same for all (not checked without a depth range): a batch of
+    rigs. A rig never changes, except by `requires_grad_`: methods return new ones.
 
     Attributes:
-        cameras: views by name; kornia's pinholes are converted.
+        cameras: views by name; kornia's pinholes are converted, batches of one to single cameras.
         depth: (near, far) in metres along the optical axis of whichever camera is alpha, far may be infinite;
             None if unknown. Without batch axes it applies to each rig of a batch.
-        links: relations of cameras that are not calibrated, by (alpha, beta).
-        name: name of the rig.
+        links: relations of cameras, measured between their images, by (alpha, beta).
+        name: name of the rig; `runtime.text.UNSCALED` and `ASSUMED` say that lengths are not in metres.
 
     Raises:
-        ValueError: for invalid depth bounds, names that cannot be printed, and links to unknown cameras.
-        TypeError: for cameras, links or a depth of other types.
+        ValueError: for invalid depth bounds, names that cannot be printed, and links to unknown cameras or
+            from a camera to itself.
+        TypeError: for cameras, links or a depth of other types, or bounds that are not two.
     """
 
     cameras: Mapping[str, Any]  # View once made; kornia pinholes serve as well
@@ -61,7 +62,7 @@ class Rig(Batched):
         object.__setattr__(
             self, "cameras", {name: _view(name, camera) for name, camera in self.cameras.items()}
         )
-        if odd := [name for name in self.cameras if not name.isprintable()]:
+        if odd := [name for name in self.cameras if not (isinstance(name, str) and name.isprintable())]:
             raise ValueError(f"the camera {odd[0]!a} has a name that cannot be printed: rename it")
         if self.depth is not None:
             if not isinstance(self.depth, Sequence | Tensor) or len(self.depth) != 2:
@@ -91,8 +92,7 @@ class Rig(Batched):
     ) -> Rig:
         """Make a rig of kornia's cameras.
 
-        Kornia's cameras are always batched; `Rig(cameras)` takes pinholes by name as well, for batches of one
-        or more as they come.
+        Kornia's cameras are always batched. `Rig(cameras)` takes pinholes by name as well.
 
         Args:
             cameras: pinholes by name; a batch of pinholes, which are the rig's cameras "camera0", "camera1"
@@ -102,8 +102,8 @@ class Rig(Batched):
             fields: further fields of the rig, such as `depth`.
 
         Raises:
-            ValueError: for batches of unequal length, and a `StereoCamera` without `hw`.
-            TypeError: for other cameras.
+            ValueError: for batches of unequal length, a `StereoCamera` without `hw`, and as `Rig`.
+            TypeError: for other cameras, or a field that `Rig` has not.
         """
         named = pinholes_by_name(cameras, hw)
         made = {name: Camera.from_kornia(camera, batched=True) for name, camera in named.items()}
@@ -121,7 +121,8 @@ class Rig(Batched):
         """Convert to kornia's pinholes.
 
         Returns:
-            Cameras by name, each a batch as long as the rig's (of one for a single rig).
+            Cameras by name, each a batch as long as the rig's (of one for a single rig); several batch axes
+            become one.
 
         Raises:
             ValueError: for cameras with lenses, and cameras that are not calibrated.
@@ -190,11 +191,12 @@ class Rig(Batched):
         """Return the pair of two cameras.
 
         Returns:
-            The pair, with the rig's depth range, and the cameras' link (reversed if stated the other way
-            round) if there is one.
+            The pair, with the rig's depth range and unit, and the cameras' link (reversed if stated the other
+            way round) if there is one.
 
         Raises:
             ValueError: for an unknown name, and one camera given twice.
+            RuntimeError: for a singular H to be reversed.
         """
         if self.require(alpha) == self.require(beta):
             raise ValueError(f"a pair is of two cameras, and both are '{alpha}': name another beta")
@@ -212,10 +214,7 @@ class Rig(Batched):
         return self.transformed(name, resize_matrix(self[name].hw, hw), hw)
 
     def crop(self, name: str, top: int, left: int, hw: HW) -> Rig:
-        """Return the rig whose camera `name` keeps a window of its image; see `Camera.crop`.
-
-        Its links follow.
-        """
+        """Return the rig whose camera `name` keeps a window of its image (`Camera.crop`); links follow."""
         return self.transformed(name, shift_matrix(left, top), hw)
 
     def rot90(self, name: str, quarter_turns: int) -> Rig:
@@ -224,7 +223,7 @@ class Rig(Batched):
         return self.transformed(name, A, self[name].rot90(quarter_turns).hw)
 
     def transformed(self, name: str, A: Float[Tensor, "*b 3 3"], hw: HW) -> Rig:
-        """Change the pixels of one camera's image, as a crop, resize, rotation or mirror does.
+        """Return the rig after a change of one camera's pixels: a crop, resize, rotation, mirror or shear.
 
         Args:
             name: name of the camera.
@@ -232,7 +231,11 @@ class Rig(Batched):
             hw: height and width after.
 
         Returns:
-            The rig, in which the camera's K and its links have changed.
+            The rig with the camera's new size, K (if it has one) and links.
+
+        Raises:
+            ValueError: for an unknown name, and as `LensView.transformed`.
+            RuntimeError: for a singular A where the camera has links.
         """
         eye = torch.eye(3, dtype=torch.float64)
         links = {
@@ -247,8 +250,8 @@ class Rig(Batched):
         """Return the rig with all lengths (cameras, depth range) multiplied by a factor, as for another unit.
 
         Raises:
-            ValueError: for a camera model that does not say which of its numbers are lengths, and for a
-                factor that is not positive.
+            ValueError: for a factor that is not positive and finite, and a camera model that is not central
+                and does not say which of its numbers are lengths.
         """
         check_above(0, itself=False, factor=factor)
         cameras = {
@@ -266,13 +269,13 @@ class Rig(Batched):
             free: patterns over "camera.rotation" (rotation vector, radians), "camera.translation" (metres),
                 "camera.focal" (fx, fy in pixels), "camera.centre" (cx, cy in pixels), "camera.distortion",
                 "depth.near" and "depth.far" (metres), for instance ["colour.*", "depth.near"]. An
-                uncalibrated view has only its lens's.
+                uncalibrated view has only its lens's, a rig without a depth range no bounds.
 
         Returns:
-            Tensors by name.
+            Tensors by name, (*b, n) each, (*b) for bounds; none for no patterns.
 
         Raises:
-            ValueError: for a pattern that matches nothing.
+            ValueError: for a pattern that matches nothing, such as each letter of a text given for a list.
         """
         shapes = self._parameter_shapes()
         chosen: dict[str, Tensor] = {}
@@ -289,17 +292,19 @@ class Rig(Batched):
         Rotations step on the manifold, exp(change) R, so that they remain rotations. Other changes are added.
 
         Returns:
-            The rig; everything without a change is bit-identical.
+            The rig; everything without a change is bit-identical. Cameras are not checked: NaN passes.
 
         Raises:
-            ValueError: for an unknown name, or a change of another size.
+            ValueError: for an unknown name, a change of another size, and bounds that `Rig` refuses.
             TypeError: for a change that is no tensor.
         """
-        unknown = set(changes) - set(self._parameter_shapes())
+        shapes = self._parameter_shapes()
+        unknown = set(changes) - set(shapes)
         if unknown:
             raise ValueError(f"no such rig parameter: {', '.join(sorted(unknown))}")
         for name, change in changes.items():
-            check_tensors((3,) if name.endswith((".rotation", ".translation")) else (), **{name: change})
+            last = () if name in ("depth.near", "depth.far") else tuple(shapes[name].shape[-1:])
+            check_tensors(last, **{name: change})
         cameras = {
             name: derived(_perturbed_camera, name, camera, changes) for name, camera in self.cameras.items()
         }
@@ -377,8 +382,7 @@ def _view(name: str, camera: Any) -> View:
 
 
 def with_pixels(rig: Rig) -> Rig:
-    """Return the rig whose views all have a K, the identity if not calibrated, so that it follows all changes
-    of pixels."""
+    """Return the rig whose views all have a K to follow changes of pixels, the identity if not known."""
     for name, view in rig.cameras.items():
         if not isinstance(view, LensView):
             eye = torch.eye(3, dtype=torch.float64)

@@ -24,12 +24,11 @@ T = TypeVar("T")
 SMALLEST_BASELINE, LARGEST_BASELINE = 1e-4, 50.0
 """Bounds of a baseline in metres: outside, a mistaken unit is more likely than a camera array."""
 NARROWEST, WIDEST = 0.5, 140.0
-"""Bounds of a pinhole's angle of view in degrees: outside, its focal length is more likely in another unit
-than pixels. A 1 m telephoto lens on an inch of sensor has 1.5, the widest rectilinear lenses have 130."""
+"""Bounds of a pinhole's angle of view in degrees: outside, its focal length is hardly in pixels. (A 1 m lens
+on an inch of sensor has 1.5, the widest rectilinear lenses have 130.)"""
 DECENTRED = 0.1
 """Distance of a principal point from the image's middle, as a share of its longer side, above which it is
-more likely of another image: exchanging the sides of a 4:3 image moves the middle by 0.18, halving the image
-by 0.3."""
+more likely of another image: exchanging the sides of a 4:3 image moves it by 0.18, halving by 0.3."""
 LEAST_DISPARITY = 0.5
 """Pixels of disparity between near and far below which depth is not seen."""
 COVERED = 0.995
@@ -58,7 +57,8 @@ def unit_oddity(rig: Rig) -> str | None:
     """Return a sentence on a single rig's baselines that suggest another unit than metres.
 
     Returns:
-        The sentence; None for usual baselines, a single camera, and a rig of unknown scale.
+        The sentence without its subject ("has cameras 80 m apart: ..."); None for usual baselines, all
+        cameras at one place, fewer than two calibrated ones, and a rig of unknown scale.
 
     Raises:
         ValueError: for a batch of rigs.
@@ -104,10 +104,13 @@ def _spread(items: Sequence[T], most: int) -> list[T]:
 
 
 def lens_ends(lenses: Iterable[tuple[Sequence[str], LensView]]) -> Iterator[str]:
-    """Yield a sentence on each lens model that ends within its image, with the names of its cameras.
+    """Yield a sentence on lens models that end within their images, with the names of their cameras.
 
-    Camera models state themselves where they end (a pole, the rim of a fisheye's circle), which is no mistake
-    unless they cover nothing.
+    Lenses that end alike share a sentence. A `CameraModel` states itself where it ends (a pole, the rim of a
+    fisheye's circle), which is no mistake unless it covers nothing.
+
+    Args:
+        lenses: for each lens the names of its cameras, and one of these, single.
     """
     ending: dict[tuple[str, str, str], list[str]] = {}
     for names, camera in lenses:
@@ -131,8 +134,7 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def file_oddities(rig: Rig) -> list[str]:
-    """List the sentences that reading a rig's file warns of: its unit, and lenses that fold within their
-    images."""
+    """List the sentences that reading a rig's file warns of: its unit, lenses that fold in their images."""
     ends = lens_ends(
         one for one in _lenses(rig) if getattr(one[1].distortion, "model", None) == BROWN_CONRADY
     )

@@ -32,9 +32,9 @@ class RobustFit(NamedTuple):
     """Result of a robust fit.
 
     Attributes:
-        coefficients: fitted coefficients.
-        rest: residuals: values minus coefficients times terms.
-        weight: weights of the values in the last step, from the residuals before it.
+        coefficients: fitted coefficients (k, *m).
+        rest: residuals (n, *m): values minus coefficients times terms.
+        weight: weights (n) of the values in the last step, from the residuals before it.
     """
 
     coefficients: Float[Tensor, " k *m"]
@@ -43,13 +43,12 @@ class RobustFit(NamedTuple):
 
 
 def normal_deviation(rest: Float[Tensor, " n"], least: float) -> float:
-    """Estimate the standard deviation of residuals from their median absolute value, robust to outliers; at
-    least `least`."""
+    """Estimate the standard deviation of residuals from their median absolute value; at least `least`."""
     return max(NORMAL_DEVIATION * float(rest.abs().median()), least)
 
 
 def cauchy(rest: Float[Tensor, " n"], scale: float) -> Float[Tensor, " n"]:
-    """Compute the weights of Cauchy's loss: 1/2 at `scale`; those of large residuals fall as their square."""
+    """Compute the weights of Cauchy's loss: 1/2 at `scale`, falling with the square of large residuals."""
     return 1 / (1 + (rest / scale).square())
 
 
@@ -78,11 +77,14 @@ def least_squares(
         terms: k explaining terms of each of n values.
         values: values to explain; axes *m are solved at once.
         weight: weight of each value, at least 0.
-        precision: inverse covariance of a prior of zero mean; None for no prior: terms may then be dependent,
-            and must be on the CPU.
+        precision: inverse covariance (k, k) of a prior of zero mean; None for no prior: terms may then be
+            dependent, and must be on the CPU.
 
     Returns:
         Coefficients c (k, *m); without a prior the shortest of all solutions.
+
+    Raises:
+        RuntimeError: for a prior with which the equations are still singular.
     """
     if precision is not None:
         information, slope = normal_equations(terms, values, weight)
@@ -110,10 +112,13 @@ def robust_least_squares(
         weigh: function from residuals (n, *m) to weights (n).
         precision: inverse covariance of a prior of zero mean, or a function of the coefficients that returns
             it; None for no prior.
-        steps: number of steps, at least 1.
+        steps: number of steps, at least 1 (not checked): each makes weights, and a fit with them.
 
     Returns:
-        The fit after `steps` steps; with 0 steps there are no weights, which fails.
+        The fit after the last step.
+
+    Raises:
+        RuntimeError: as `least_squares`.
     """
     coefficients = start
     for _ in range(steps):
@@ -129,8 +134,8 @@ class LocalModel(NamedTuple, Generic[State]):
     Attributes:
         cost: cost of the state.
         cost_of: function that returns the cost of any state.
-        step: function from a damping to the state after a Gauss-Newton step: the information matrix's
-            diagonal is multiplied by 1 + damping.
+        step: function from a damping to the state after a Gauss-Newton step with it, usually with the
+            information matrix's diagonal times 1 + damping.
     """
 
     cost: float
@@ -153,12 +158,13 @@ def levenberg_marquardt(
     Args:
         state: state to start from, of any type.
         model: function that returns the local model of a state.
-        is_converged: function of the states before and after a step, and their costs.
-        steps: largest number of steps.
+        is_converged: function of the states before and after a step, and their costs; True ends with the
+            state after it.
+        steps: largest number of steps; 0 returns `state`.
         damping: damping of the first step.
 
     Returns:
-        The state, and True if it converged, or if no step lowers the cost.
+        The state, and True if it converged, or if every step up to `MOST_DAMPING` raises the cost.
     """
     for _ in range(steps):
         before = model(state)

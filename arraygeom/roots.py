@@ -13,15 +13,15 @@ from .runtime.tracing import followed, traced
 def first_root(coefficients: Tensor) -> Tensor:
     """Find the smallest positive root of 1 + a_1 u + ... + a_n u^n.
 
-    The roots are the inverses of those of the reversed polynomial, which is monic, so a leading coefficient
-    of 0 needs no care: eigenvalues of its companion matrix. Huge coefficients, with which LAPACK crashes, are
-    scaled down first (u = s w, with s a power of 2).
+    The roots are the inverse eigenvalues of the reversed polynomial's companion matrix: leading coefficients
+    may be 0. Huge coefficients, with which LAPACK crashes, are scaled down first.
 
     Args:
         coefficients: (*b, n + 1), starting with the 1.
 
     Returns:
-        Roots (*b); infinity if there is none, 0 if a coefficient is not finite.
+        Roots (*b); infinity if there is none, 0 if a coefficient is not finite. A double root may count as
+        none, as rounding makes it a complex pair.
     """
     a = coefficients[..., 1:]
     n = a.shape[-1]
@@ -59,7 +59,7 @@ def invert_increasing(
         iterations: largest number of iterations.
 
     Returns:
-        r (*n); `high` where f never reaches y.
+        r (*n), as exact as `iterations` make it; `high` where f never exceeds y, and for NaN.
     """
     reached = f(high)[0] > y
     y = torch.where(reached, y, 0.0)
@@ -89,8 +89,7 @@ PATIENCE = 12
 
 
 PlaneMap = Callable[[Tensor], tuple[Tensor, Sequence[Tensor]]]
-"""Function from points (*n, 2) to their images and the Jacobian (dx'/dx, dx'/dy, dy'/dx, dy'/dy),
-each (*n)."""
+"""Function from points (*n, 2) to images and Jacobian (dx'/dx, dx'/dy, dy'/dx, dy'/dy), each (*n)."""
 
 
 def solve_in_plane(
@@ -104,7 +103,7 @@ def solve_in_plane(
 ) -> Tensor:
     """Find the points (*n, 2) whose images are `target` (*n, 2), by Newton's method.
 
-    Steps are halved where a whole one leaves the allowed region or does not help.
+    Steps are halved where a whole one leaves the allowed region or comes no nearer.
 
     Args:
         f: function from points to their images, and its Jacobian.
@@ -142,7 +141,7 @@ def newton_step(value: Tensor, jacobian: Sequence[Tensor], target: Tensor) -> Te
         target: wanted images (*n, 2).
 
     Returns:
-        Steps (*n, 2) to subtract from the points.
+        Steps (*n, 2) to subtract from the points, finite: small determinants count as 1e-12.
     """
     xx, xy, yx, yy = jacobian
     ex, ey = (value - target).unbind(-1)
@@ -152,8 +151,7 @@ def newton_step(value: Tensor, jacobian: Sequence[Tensor], target: Tensor) -> Te
 
 
 def keeps_orientation(jacobian: Sequence[Tensor]) -> Tensor:
-    """Return True (*n) where a `PlaneMap` keeps orientation: past a fold it mirrors, past two it is half
-    turned."""
+    """Return True (*n) where a `PlaneMap` keeps orientation: a fold mirrors it, two turn it by half."""
     xx, xy, yx, yy = jacobian
     return (xx * yy - xy * yx > 0) & (xx + yy > 0)
 

@@ -21,8 +21,8 @@ class Sampled(NamedTuple):
     """Values of images at positions.
 
     Attributes:
-        values: sampled values (b, c, *n).
-        valid: mask (b, *n), True for positions on the image's area.
+        values: sampled values (b, c, *n); 0 where not valid, unless the function extends them.
+        valid: mask (b, *n), True for positions on the image's area that meet the function's conditions.
     """
 
     values: Float[Tensor, "b c *n"]
@@ -61,7 +61,7 @@ def sample(
     """Sample images at positions.
 
     On the outer half pixel of the area the nearest pixels count; "nearest" takes the pixel whose area
-    contains the position, halves upwards.
+    contains the position, halves upwards; "bicubic" may overshoot.
 
     Args:
         image: (B, C, H, W).
@@ -69,12 +69,12 @@ def sample(
         extended: True to give positions outside the area the value of the nearest pixel, as valid.
 
     Returns:
-        Values (B, C, *n) in the images' type, and validity; outside values are 0 and not valid unless
-        `extended`. Differentiable in image and positions.
-        in image and positions.
+        Values (B, C, *n) in the images' type, and validity; outside (by more than `SLACK`) values are 0 and
+        not valid unless `extended`, at NaN always. Differentiable in image and, unless "nearest", positions.
 
     Raises:
-        ValueError: for images or pixels of other shapes, whole numbers, or another interpolation.
+        ValueError: for pixels of other shapes, images of other shapes, whole numbers or no pixel, or another
+            interpolation.
         TypeError: for values that are no tensors.
         NotImplementedError: in forward mode (jvp, jacfwd, hessian).
     """
@@ -111,8 +111,7 @@ def sample(
 def _looked_up(
     image: Float[Tensor, "b c h w"], grid: Float[Tensor, "b 1 n 2"], interpolation: Interpolation
 ) -> Float[Tensor, "b c 1 n"]:
-    """Look up by torch; many positions without gradients on all threads, where torch takes one for each
-    image."""
+    """Look up by torch; many positions without gradients on all threads: torch takes one an image."""
     look_up = partial(grid_sample, mode=interpolation, padding_mode="border", align_corners=False)
     gradients = torch.is_grad_enabled() and (image.requires_grad or grid.requires_grad)
     if gradients or followed() or image.device.type != "cpu" or grid.shape[2] < 2 * PIECE:

@@ -25,7 +25,7 @@ class Positions(Batched):
     """Explicit sample positions, L for each alpha pixel.
 
     Attributes:
-        xy: positions, pixels of beta.
+        xy: positions, pixels of beta; without meaning where `mask` is False.
         mask: True for samples that count; without any, beta does not see the alpha pixel.
     """
 
@@ -69,8 +69,7 @@ class Segments(Batched):
         return self.start + fraction[..., None] * (self.end - self.start)
 
     def fraction(self, xy: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n"]:
-        """Return the fraction of the line's point nearest to `xy`, not clamped to 0..1; 0.5 on a segment of
-        no length."""
+        """Return the fraction of the line's point nearest to `xy`, not clamped to 0..1; 0.5 if no length."""
         along = self.end - self.start
         squared = along.square().sum(-1)
         positive = squared > 0
@@ -79,7 +78,7 @@ class Segments(Batched):
 
     def positions(self, samples: int) -> Positions:
         """Return `samples` evenly spaced positions, the first at start, the last at end (one sample: the
-        middle).
+        middle); all of a segment count, or none if it is not valid.
 
         >>> s = Segments(torch.tensor([0.0, 4.0]), torch.tensor([6.0, 4.0]), torch.tensor(True))
         >>> s.positions(3).xy[:, 0].tolist()
@@ -93,8 +92,7 @@ class Segments(Batched):
         return Positions(xy, self.valid[..., None].expand(xy.shape[:-1]))
 
     def distance(self, xy: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n"]:
-        """Compute the distance in pixels from points to their segments, beyond an end to that end; infinite
-        where not valid."""
+        """Compute the distance in pixels from points to their segments; infinite where not valid."""
         u = self.fraction(xy).clamp(0, 1)
         squared = (xy - self.at(u)).square().sum(-1)
         distance = torch.where(squared > 0, torch.where(squared > 0, squared, 1.0).sqrt(), 0.0)
@@ -108,7 +106,7 @@ class Segments(Batched):
         ones.
 
         Returns:
-            Mask (*n, H W), beta's pixels row by row.
+            Mask (*n, H W), beta's pixels row by row; all False for an invalid segment.
         """
         axes = (*self.valid.shape, hw[0] * hw[1])
         xy = pixel_grid(hw, dtype=self.start.dtype, device=self.start.device).reshape(-1, 2).expand(*axes, 2)
@@ -126,7 +124,7 @@ def clip_to_image(start: Float[Tensor, "*n 2"], end: Float[Tensor, "*n 2"], hw: 
     Barsky 1984).
 
     Returns:
-        Segments, invalid where nothing is left.
+        Segments, from `start`'s side to `end`'s; zero and invalid where nothing is left, and for NaN.
     """
     low, high = fractions_on_image(start, end, hw)
     valid = low <= high
@@ -140,7 +138,7 @@ def fractions_on_image(
     """Compute the fractions (0 start, 1 end) between which each segment is on the image.
 
     Returns:
-        (low, high), low > high where it is nowhere.
+        (low, high), low > high where it is nowhere; NaN for NaN.
     """
     low, high = torch.zeros_like(start[..., 0]), torch.ones_like(start[..., 0])
     for a, b, limit in zip(start.unbind(-1), end.unbind(-1), (hw[1] - 0.5, hw[0] - 0.5)):

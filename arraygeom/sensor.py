@@ -20,7 +20,7 @@ class Band:
 
     Raises:
         ValueError: for other numbers.
-        TypeError: for values that are no numbers.
+        TypeError: for values that are no numbers; None and tensors are not refused.
     """
 
     centre: float
@@ -36,10 +36,10 @@ class Curve:
 
     Attributes:
         wavelength: wavelengths, nanometres.
-        response: response at each wavelength.
+        response: response at each wavelength, in any unit.
 
     Raises:
-        ValueError: for no samples, or unequal numbers of wavelengths and responses; the values are not
+        ValueError: for no samples, or unequal numbers of wavelengths and responses; values and order are not
             checked.
     """
 
@@ -74,15 +74,15 @@ class Sensor:
         frame_rate: frames for each second; None if unknown.
         time_offset: seconds after the rig's clock.
         coding: relation of pixel values to light, "srgb" or "linear".
-        bayer: colour filter pattern from the top left ("RGGB") of raw images; None for none.
+        bayer: colour filter pattern (of `PATTERNS`) from the top left of raw images; None for none.
         bits: bits of a count: a file's values are 0 to 2^bits - 1; None for the file's own 8 or 16 bits.
         black_level: count that stands for no light.
         exposure: seconds; None if unknown.
         gain: factor of the value; three numbers for red, green and blue.
 
     Raises:
-        ValueError: for numbers out of range, another coding, pattern or name of a response.
-        TypeError: for values that are no numbers.
+        ValueError: for numbers out of range, another coding, pattern or response.
+        TypeError: for values that are no numbers. None and the number of gains are not checked.
     """
 
     response: str | Band | Curve | None = None

@@ -26,12 +26,13 @@ class CameraSummary(NamedTuple):
     Attributes:
         name: name of the camera.
         wh: image size (width, height).
-        field_of_view: angles (across, down), degrees.
+        field_of_view: angles (across, down), degrees; NaN as `field_of_view` says.
         focal: focal lengths (x, y), pixels.
-        footprint: width that a pixel covers at the near and the far bound, millimetres.
-        lens: name of the lens model; None for a pinhole.
-        coefficients: coefficients of a `Distortion`; empty for other models.
-        covered: share of the image whose pixels have a ray.
+        footprint: width that a pixel covers at the near and the far bound, thousandths of the rig's unit
+            (millimetres); infinite for an infinite bound.
+        lens: name of the lens model; None for a pinhole, and a view without one.
+        coefficients: coefficients of a `Distortion`; empty for other models, and without a lens.
+        covered: share of the image whose pixels have a ray, on a coarse grid; 1 without a lens.
     """
 
     name: str
@@ -52,12 +53,13 @@ class PairSummary(NamedTuple):
         beta: name of beta.
         baseline: distance of the optical centres, in the rig's unit.
         rotation: angle between the orientations, degrees.
-        seen: share of alpha's pixels with a segment in beta; None without a depth range.
+        seen: share of alpha's pixels, of some evenly spread, with a segment in beta; None without a depth
+            range.
         length: (median, largest) length of the segments, pixels of beta; None without any, and without a
             depth range.
         depth_step: change of depth at (near, far) that moves a point by one pixel of beta, in the rig's unit:
-            the median of alpha's pixels whose point beta sees, NaN if it sees none; None without depth range
-            or baseline.
+            the median of alpha's pixels whose point beta sees, NaN if it sees none, infinite for an infinite
+            bound; None without depth range or baseline.
     """
 
     alpha: str
@@ -88,17 +90,23 @@ def summarise_pairs(rig: Rig, alpha: str | None = None) -> list[PairSummary]:
     """Summarise each ordered pair of calibrated cameras, or one alpha with its `MOST_BETAS` nearest betas.
 
     Args:
+        rig: a single rig.
         alpha: name of the one alpha; None for all.
 
     Returns:
         Summaries; none if alpha is not calibrated.
+
+    Raises:
+        ValueError: for an unknown alpha, and as `Pair.beta_from_alpha`.
     """
     cameras = {n: c for n, c in rig.cameras.items() if isinstance(c, Camera)}
     if alpha is None:
         return [_pair(a, b, rig.pair(a, b)) for a in cameras for b in cameras if a != b]
+    if rig.require(alpha) not in cameras:
+        return []
     centres = {n: c.centre.detach() for n, c in cameras.items()}
     nearest = sorted(centres.keys() - {alpha}, key=lambda n: (float((centres[n] - centres[alpha]).norm()), n))
-    return [_pair(alpha, b, rig.pair(alpha, b)) for b in nearest[:MOST_BETAS]] if alpha in cameras else []
+    return [_pair(alpha, b, rig.pair(alpha, b)) for b in nearest[:MOST_BETAS]]
 
 
 def _camera(name: str, rig: Rig) -> CameraSummary:
@@ -120,11 +128,11 @@ def _camera(name: str, rig: Rig) -> CameraSummary:
 
 @once_a_lens
 def field_of_view(camera: Camera) -> tuple[float, float]:
-    """Compute the angles between the rays at the middles of opposite edges, through the lens.
+    """Compute the angles of view of one camera: from the middle's ray to opposite edges' middles, added up.
 
     Returns:
-        Angles (across, down) in degrees; of an edge outside the lens model's range to where that ends, NaN if
-        the middle is outside too.
+        Angles (across, down) in degrees, through the lens; of an edge outside the lens model's range to where
+        that ends, NaN if the middle is outside too.
     """
     h, w = camera.hw
     middle = camera.K.new_tensor([(w - 1) / 2, (h - 1) / 2])
@@ -150,8 +158,7 @@ def _pair(alpha: str, beta: str, pair: Pair) -> PairSummary:
 
 
 def _segments(pair: Pair) -> tuple[float, tuple[float, float] | None]:
-    """Share of alpha's pixels with a segment, and its (median, largest) length, on each fourth pixel or
-    fewer."""
+    """Share of alpha's pixels with a segment, and (median, largest) length, on each fourth or fewer."""
     h, w = pair.alpha.hw
     field, most = (Curved(64), MOST_PIXELS // 16) if pair.has_lens else (Epipolar(), MOST_PIXELS)
     step = max(4, math.ceil(math.sqrt(h * w / most)))

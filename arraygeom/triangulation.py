@@ -26,8 +26,9 @@ class Triangulated(NamedTuple):
     Attributes:
         X: world points (*n, 3), metres; 0 where not valid.
         covariance: covariance (*n, 3, 3) of the points, m²; without meaning where not valid.
-        valid: True for usable points.
-        residual: largest distance between a match and the point's image over the views that count, pixels.
+        valid: True for usable points, as `triangulate` says.
+        residual: largest distance between a match and the point's image over the views that count, pixels;
+            without meaning where fewer than two do.
     """
 
     X: Float[Tensor, "*n 3"]
@@ -48,8 +49,7 @@ def triangulate(
     lens.
 
     Gauss-Newton in float64 on direction and inverse distance from the first view that sees the point (Civera,
-    Davison and Montiel 2008), in which the error is nearly linear however far the point is; from the inverse
-    distance at which rays meet in least squares.
+    Davison and Montiel 2008), from where rays meet in least squares.
 
     Args:
         cameras: two cameras or more; batched cameras (*b) take pixels (views, *b, ..., 2).
@@ -61,12 +61,12 @@ def triangulate(
     Returns:
         Points with exact derivatives. The covariance is to first order across the ray; along it, three
         deviations extend to where the inverse distance is three deviations less: the error stays within them
-        as often as a normal distribution's. Valid where that is still finite, all views that see the point
-        have it in front, and no residual is too large.
+        as often as a normal distribution's. Valid where that is still finite, two views or more see the
+        point, all that do have it in front, and no residual is too large.
 
     Raises:
-        ValueError: for fewer than two cameras, another number of views in `x`, no deviation, or `seen` of
-            another shape.
+        ValueError: for fewer than two cameras, another number of views in `x`, a deviation that is not above
+            0 and finite, `seen` of another shape, or pixels without the axes of batched cameras.
         TypeError: for pixels that are no tensor.
     """
     if len(cameras) != len(x) or len(cameras) < 2:
@@ -98,8 +98,7 @@ def triangulate(
 STEPS = 5
 """Number of Gauss-Newton steps."""
 FOLLOWED = 3
-"""Steps that derivatives go through: each reduces the difference to those of the least error by about
-residual / disparity."""
+"""Steps that derivatives go through: each reduces their error by about residual / disparity."""
 SMALLEST_PARALLAX = 1e-9
 """Least angle between two rays, radians: float64 pixels do not show less."""
 
@@ -117,10 +116,12 @@ def depth_of(
             first order.
 
     Returns:
-        Depth z in metres, its deviation, and validity.
+        Depth z in metres, its deviation, and validity: as `depth_from_track`, and within both lenses' ranges
+        and less than 90 degrees off axis.
 
     Raises:
-        ValueError: for uncalibrated pairs, and lenses whose rays do not meet in a point.
+        ValueError: for uncalibrated pairs, lenses whose rays do not meet in a point, and pixels without the
+            axes of a batch.
     """
     alpha, beta = pair.cameras
     x, x_beta = floating(x), floating(x_beta)
@@ -160,8 +161,7 @@ class _Sight(NamedTuple):
 
 
 class _Chart(NamedTuple):
-    """Chart of points p = (a, b, w): `origin` + `scale` (a u + b v + d) / w; `axes` (*n, 3, 3) has columns u,
-    v, d."""
+    """Chart of points p = (a, b, w): `origin` + `scale` (a u + b v + d) / w; `axes` are columns u, v, d."""
 
     origin: Tensor
     axes: Tensor
@@ -193,8 +193,7 @@ class _NormalEquations(NamedTuple):
 def _sighted(
     cameras: Sequence[Camera], x: Tensor, seen: Tensor | None
 ) -> tuple[list[_Sight], _Chart, Tensor]:
-    """Sights of each point, its first view's chart, and the point in it where the rays meet in
-    least squares."""
+    """Sights of each point, its first view's chart, and the point where rays meet in least squares."""
     finite = x.isfinite().all(-1)
     x = torch.where(finite[..., None], x, 0.0)
     centres, directions, usable = (

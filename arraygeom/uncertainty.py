@@ -18,7 +18,10 @@ from .triangulation import triangulate
 
 @runtime_checkable
 class Covariance(Protocol):
-    """Covariance of some parameters of a rig, such as `calib.boards.uncertainty.RigCovariance`."""
+    """Covariance of some parameters of a rig, such as `calib.boards.uncertainty.RigCovariance`.
+
+    It has `names` ("left.rotation.0"), and a `matrix` in their order, in the units of `Rig.parameters`.
+    """
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -41,11 +44,13 @@ def position_covariance(
         depth: depth in alpha, in the rig's unit, one for all or one for each.
 
     Returns:
-        Covariances in pixels² of beta, float64; NaN where alpha's lens has no ray or beta does not see the
-        point.
+        Covariances in pixels² of beta, float64; NaN where alpha's lens has no ray, the depth is infinite, or
+        the point is not in front of beta or within its lens's range (its image's border does not count).
 
     Raises:
-        ValueError: for an unknown camera, and for a covariance of parameters that the rig has not.
+        ValueError: for a camera that is unknown or not calibrated, and a covariance of parameters that the
+            rig has not, or whose matrix does not fit its names.
+        RuntimeError: for another number of depths.
     """
     x = floating(x).double()
     depth = torch.as_tensor(depth, dtype=torch.float64).expand(len(x))
@@ -71,11 +76,12 @@ def triangulation_covariance(
         seen: as of `triangulate`.
 
     Returns:
-        Covariances, m², float64: add them to those of `triangulate`, which are by the pixels. All points move
-        together: errors of two points are not independent.
+        Covariances, m², float64, zero where a point is not valid; `triangulate` gives the pixels' part, to be
+        added. All points move together: errors of two points are not independent.
 
     Raises:
-        ValueError: as `triangulate`, and for a covariance of parameters that the rig has not.
+        ValueError: as `triangulate`, for a camera that is not calibrated, and for a covariance of parameters
+            that the rig has not.
     """
 
     def points(rig: Rig) -> Tensor:
@@ -111,8 +117,9 @@ def bands(
         confidence: probability that the point is within them, in each direction by itself, for normal errors.
 
     Returns:
-        Half-widths at the rig's near and far bounds; in between they are interpolated. NaN where a point
-        at a bound is not in front of beta.
+        Half-widths at the rig's near and far bounds (`FARTHEST` for an infinite one); in between they are
+        interpolated. NaN at a bound where `position_covariance` is. A segment shorter than `SHORTEST` has
+        both directions' uncertainty in either.
 
     Raises:
         ValueError: for a rig without a depth range, a confidence that is not between 0 and 1, and as

@@ -17,8 +17,7 @@ from .runtime.tracing import needs_numbers
 from .sampling import Interpolation, Sampled, sample
 
 WIDEST = math.radians(62)
-"""Largest angle off axis of a pinhole view: there it stretches outwards 4.5 times as much as in
-the middle."""
+"""Largest angle off axis of a pinhole view, where it stretches outwards 4.5 times as in the middle."""
 AT_ONCE = 1 << 18
 """Pixels that are resampled at once."""
 
@@ -64,11 +63,12 @@ def pixels_between(
     Views that are not calibrated count as having the same orientation.
 
     Args:
-        x: pixels of target; None for all.
+        source: one view, not a batch, as `target`; rays of either that do not meet in a point are taken to.
+        x: pixels of target, float64; None for all.
 
     Returns:
         Positions in source's image, float64, and True where both lenses are valid and the position is on the
-        image.
+        image; others mean nothing.
     """
     if x is None:
         return _by_rows(lambda x: pixels_between(source, target, x), target.hw, axis=0)
@@ -81,8 +81,7 @@ def pixels_between(
 
 
 def _by_rows(function: Callable[[Tensor], Any], hw: HW, *, axis: int) -> Any:
-    """Apply a function to an image's pixels (h, w, 2), some rows at a time: it takes some 300
-    bytes a pixel."""
+    """Apply a function to an image's pixels (h, w, 2), some rows at a time: 300 bytes a pixel."""
     x, y = pixel_coordinates(hw, dtype=torch.float64)
     rows = max(AT_ONCE // hw[1], 1)
     return chunked(lambda x, y: function(torch.stack([x, y], -1)), x, y, rows=rows, axis=axis)
@@ -93,7 +92,8 @@ def recorded_pixels(
 ) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
     """Map pixels of a view that was cropped, resized, rotated or undistorted to the image as recorded.
 
-    K of both views says how pixels were changed: x ~ K_now K_recorded^-1 x_recorded, apart from the lens.
+    K of both views says how pixels were changed: x ~ K_now K_recorded^-1 x_recorded, apart from the lens; a
+    view `now` with a lens was not undistorted, and no lens is applied.
 
     Returns:
         Pixels of the recorded image, and True within the lens model's range.
@@ -143,7 +143,7 @@ def resampled(
     interpolation: Interpolation = "bicubic",
     extended: bool = False,
 ) -> Sampled:
-    """Resample an image of `source` to a co-located `target`.
+    """Resample an image of one view, `source`, to a co-located `target`, neither of them a batch.
 
     The baseline between the two is ignored; uncalibrated views count as having the same orientation.
 
@@ -152,10 +152,11 @@ def resampled(
             valid.
 
     Returns:
-        Values (1, C, H, W), 0 where source sees nothing unless `extended`, and validity.
+        Values (1, C, H, W) of target's size, 0 where source sees nothing unless `extended`, and validity (1,
+        H, W).
 
     Raises:
-        ValueError: for an image of another size than source's.
+        ValueError: for an image of another size than source's, and as `sample`.
     """
     if tuple(image.shape[-2:]) != tuple(source.hw):
         raise ValueError(f"the image is {tuple(image.shape[-2:])}, its camera {tuple(source.hw)}: resize one")
@@ -184,7 +185,10 @@ def sampled_between(
         extended: True to fill pixels that source does not see from its nearest pixel.
 
     Returns:
-        Values (1, C, H, W), and validity.
+        Values (1, C, Ht, Wt), 0 where not valid unless `extended`, and validity (1, Ht, Wt).
+
+    Raises:
+        ValueError: as `sample`.
     """
     x, defined = pixels
     h, w = source.hw

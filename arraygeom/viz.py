@@ -1,7 +1,7 @@
 """Drawings of rigs, fields and residuals. Functions return a figure and show nothing.
 
-Matplotlib figures are made without pyplot, so there is no global state: `figure.savefig("rig.png")`, or leave
-the figure as the last line of a notebook's cell. Matplotlib is imported when something is drawn.
+Figures are made without pyplot, so there is no global state: `figure.savefig("rig.png")`, or leave the figure
+as the last line of a notebook's cell.
 """
 
 from __future__ import annotations
@@ -40,16 +40,16 @@ COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8
 
 
 def draw_rig(rig: Rig, *, alpha: str | None = None) -> Figure:
-    """Draw a rig in three dimensions: each camera's frustum and name, and alpha's view from near to far.
+    """Draw a single rig in three dimensions: calibrated cameras' frusta and names, and alpha's depth range.
 
     Up in the figure is -y of the world.
 
     Args:
-        alpha: camera whose depth range is drawn; None for the first calibrated one. Bounds that would dwarf
-            the rig (beyond 6 times its extent, or infinite) are left out.
+        alpha: camera whose view from near to far is drawn, if it is calibrated; None for the first that is.
+            Bounds that would dwarf the rig (beyond 6 times its extent, or infinite) are left out.
 
     Raises:
-        ValueError: if no camera is calibrated.
+        ValueError: if no camera is calibrated, and, in a rig with a depth range, for an unknown alpha.
         ImportError: without matplotlib.
     """
     cameras = calibrated(rig)
@@ -99,11 +99,10 @@ def extent_of(cameras: Mapping[str, Camera]) -> float:
 
 
 def frustum(camera: Camera, length: float) -> list[np.ndarray]:
-    """Return the lines of a camera's frustum: from its centre to the image's corners, and the border at depth
-    `length`.
+    """Return a camera's frustum to a depth: lines from its centre to the image's corners, and the border.
 
     Returns:
-        Arrays (n, 3) of world points, metres.
+        Four arrays (2, 3) and the border's (65, 3) of world points, metres; see `seen_at` for wide lenses.
     """
     border = seen_at(camera, image_border(camera.hw), length)
     centre = numpy(camera.centre)
@@ -116,13 +115,16 @@ def depth_outline(rig: Rig, cameras: Mapping[str, Camera], alpha: str | None) ->
 
     Args:
         cameras: calibrated cameras of the rig.
-        alpha: name of alpha; None for the first camera.
+        alpha: name of alpha; None for the first of `cameras`.
 
     Returns:
-        Arrays (n, 3) of world points; empty without a depth range. A bound beyond 6 times the rig's extent is
-        left out.
+        Arrays (n, 3) of world points, as `seen_at` gives them; none without a depth range, or if alpha is not
+        calibrated. A bound beyond 6 times the rig's extent is left out, and the edges then.
+
+    Raises:
+        ValueError: for an unknown alpha, if the rig has a depth range.
     """
-    if rig.depth is None:
+    if rig.depth is None or (alpha and rig.require(alpha) not in cameras):
         return []
     camera = cameras[alpha or next(iter(cameras))]
     limit = 6 * (extent_of(cameras) or 0.05)
@@ -133,9 +135,7 @@ def depth_outline(rig: Rig, cameras: Mapping[str, Camera], alpha: str | None) ->
 
 
 def image_border(hw: HW) -> Float[Tensor, "n 2"]:
-    """Return float64 points around the image's area, from its first corner back to it, 16 on each side, in
-    pixels.
-    """
+    """Return points around an image's area from its first corner back to it, 16 a side, float64 pixels."""
     h, w = hw
     corners = torch.tensor([[0.0, 0], [w, 0], [w, h], [0, h], [0, 0]], dtype=torch.float64) - 0.5
     steps = torch.arange(16, dtype=torch.float64)[:, None] / 16
@@ -146,11 +146,11 @@ def image_border(hw: HW) -> Float[Tensor, "n 2"]:
 def seen_at(camera: Camera, x: Float[Tensor, "n 2"], depth: float) -> np.ndarray:
     """Compute world points of pixels at a depth.
 
-    Pixels outside the lens model's range are moved towards the middle until they are inside, and rays more
-    than 53 degrees off axis are cut at 1 / 0.6 of the depth: a fisheye's border would be at infinity.
+    Pixels outside the lens model's range are moved towards the mean of all until they are inside, and rays
+    more than 53 degrees off axis are cut at 1 / 0.6 of the depth: a fisheye's border would be at infinity.
 
     Returns:
-        Points (n, 3), metres; NaN where the lens has no ray.
+        Points (n, 3), metres; NaN where the lens has no ray on four fifths of that way.
     """
     camera = camera.to(torch.float64)
     middle = x.mean(0)
@@ -178,11 +178,12 @@ def draw_fields(
     Segments are lines with a dot at their near end, positions are dots.
 
     Args:
+        x: pixels of alpha, as the fields take them: by default as recorded.
         field: field of all betas, or fields by name; None, or no field of a beta, for `recorded_field`.
-        images: images (H, W), (H, W, 3) or (3, H, W) by camera; None for empty frames.
+        images: images by camera, as `show_image` takes them; None, or none of a camera, for an empty frame.
 
     Raises:
-        ValueError: for an unknown camera.
+        ValueError: for an unknown camera, and as `recorded_field` or the field raises it for a pair.
         ImportError: without matplotlib.
     """
     names = (alpha, *rig.betas(alpha))
@@ -204,7 +205,11 @@ def draw_fields(
 def draw_sampling_locations(axes: Axes, field: ReceptiveField, pair: Pair, x: Float[Tensor, "n 2"]) -> None:
     """Draw the sampling locations in beta of some alpha pixels into `axes`, each in its own colour.
 
-    Segments are lines with a dot at their near end; positions are dots.
+    Segments are lines with a dot at their near end; positions are dots; invalid ones are left out.
+
+    Raises:
+        ValueError: as the field raises it for this pair.
+        TypeError: for an object that is no field.
     """
     locations = sampling_locations(field, pair, x)
     for i, colour in enumerate(_colours(len(x))):
@@ -225,8 +230,8 @@ class NearLine(NamedTuple):
     """Parts of epipolar lines next to points of beta.
 
     Attributes:
-        curve: points along the line (a curve, for lenses), pixels; NaN where a lens has no ray.
-        distance: distance of the point from its line, pixels.
+        curve: 65 points along the line (a curve, for lenses), pixels of beta; NaN where its lens ends.
+        distance: distance of the point from its line, pixels of beta; 0 where there is no line.
     """
 
     curve: Float[Tensor, "n p 2"]
@@ -236,13 +241,11 @@ class NearLine(NamedTuple):
 def near_line(pair: Pair, x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"], half: float) -> NearLine:
     """Compute the lines of alpha's points x where they pass beta's points y, `half` pixels to each side.
 
-    Pixels are those of images as recorded.
-
     Returns:
-        Curves, and distances to the nearest point of the line.
+        Curves, and distances to the line's nearest point; all pixels are of images as recorded.
 
     Raises:
-        ValueError: if neither calibration nor F is known.
+        ValueError: as `Pair.fundamental`.
     """
     F = pair.fundamental.to(torch.float64)
     (x_pinhole, _), (y_pinhole, _) = pair.alpha.undistort(x.double()), pair.beta.undistort(y.double())
@@ -264,16 +267,17 @@ def draw_matches(
 ) -> Figure:
     """Draw patches around points matched between alpha and each beta, with the lines that the rig gives.
 
-    Seven matches of each beta at most are drawn, spread over the image. Above, alpha's patch, 18 pixels to
-    either side of the point; below, beta's around the match, with the line of alpha's point and the distance
-    in pixels. Matches lie on their lines only if the rig is right.
+    Seven matches of each beta at most, spread over the image: above, alpha's patch, 18 pixels to either side
+    of the point; below, beta's around the match, with the line of alpha's point and the distance in pixels.
 
     Args:
-        matches: points (x, y) of alpha and of the beta, by beta, in pixels as recorded.
+        matches: points (x, y) of alpha and of the beta, by beta, in pixels as recorded; at least one, and one
+            match of each.
+        images: images by camera, as `show_image` takes them; none of a camera for an empty frame.
 
     Raises:
         ImportError: without matplotlib.
-        ValueError: if neither calibration nor F is known.
+        ValueError: for an unknown camera, and as `Pair.fundamental`.
     """
     count, half = 7, 18
     figure = new_figure(figsize=(1.55 * count, 3.7 * len(matches)), layout="constrained")
@@ -328,16 +332,16 @@ def draw_residuals(
 ) -> Figure:
     """Draw measured matches against the geometry: distances from beta's points to their epipolar lines.
 
-    Left, each distance across its line, enlarged so that the median is 2 % of the width; right, their
-    histogram.
+    Left, each distance across its line, enlarged if need be so that the median is 2 % of the width; right,
+    their histogram.
 
     Args:
-        x_alpha: matches in alpha, undistorted pixels.
+        x_alpha: matches in alpha, one or more, undistorted pixels.
         x_beta: matches in beta, undistorted pixels.
-        image: beta's image.
+        image: beta's undistorted image, as `show_image` takes it; None for an empty frame.
 
     Raises:
-        ValueError: if neither calibration nor F is known.
+        ValueError: as `Pair.fundamental`.
         ImportError: without matplotlib.
     """
     with needs("plots", "drawing"):
@@ -384,7 +388,17 @@ def new_figure(**options: Any) -> Figure:
 
 
 def show_image(axes: Axes, hw: HW, image: Any = None) -> None:
-    """Show an image, or an empty frame of its size, in `axes`, with pixel centres at whole numbers."""
+    """Show an image, or an empty frame of its size, in `axes`, with pixel centres at whole numbers.
+
+    Args:
+        hw: height and width of the frame; an image of another size is not refused.
+        image: tensor or array (H, W), (H, W, 1 or 3) or (1 or 3, H, W); None for the frame alone. Floats are
+            0 to 1; grey integers up to their type's largest, coloured ones up to 255.
+
+    Raises:
+        ValueError: for an image of bools.
+        TypeError: for one of another shape.
+    """
     h, w = hw
     if image is not None:
         pixels = np.asarray(image.detach().cpu() if isinstance(image, Tensor) else image)

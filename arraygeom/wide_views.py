@@ -24,17 +24,18 @@ def rectify_spherical(pair: Pair, *, focal: float | None = None) -> Pair:
     the left and right ends. Images follow by `resampled(image, old_camera, new_camera)`.
 
     Args:
-        focal: pixels for each radian; None for the lower of the two cameras' in the middle of their images.
+        focal: pixels for each radian, above 0; None for the lower of the cameras' in their images' middle.
 
     Returns:
-        The pair of the new cameras, alike in K and orientation, just large enough for both images. Depth is
-        then along the rotated axis.
+        The pair of the new cameras (their lens is `Equirectangular`), alike in K, size and orientation, just
+        large enough for both images, without a link. Its depth range has the old numbers, along the new axis.
 
     Raises:
-        ValueError: for uncalibrated pairs, batches, no baseline, lenses whose rays do not meet in a point.
+        ValueError: for uncalibrated pairs, batches, no baseline, lenses whose rays do not meet in a point,
+            and new images larger than `check_hw` allows.
     """
     cameras = pair.cameras
-    if any(c.K.ndim > 2 for c in cameras) or not all(c.central for c in cameras):
+    if any(c.batch_shape for c in cameras) or not all(c.central for c in cameras):
         raise ValueError("spherical rectification is of one pair at a time, whose rays meet in a point each")
     if not pair.beta_from_alpha.t.norm() > 0:
         raise ValueError("two co-located cameras cannot be rectified: there is no baseline")
@@ -103,13 +104,14 @@ def cube_faces(camera: Camera, *, overlap: float = 5.0) -> dict[str, Camera]:
     Images follow by `resampled(image, camera, face)`. Each face is fused or matched as any pinhole camera.
 
     Args:
-        overlap: degrees by which faces reach beyond their edges.
+        overlap: degrees by which faces reach beyond their edges, well below 45.
 
     Returns:
-        Cameras by face, front first, those alone of which the lens sees something, with about its resolution.
+        Cameras in the place of `camera` by face, in the order of `FACES` ("front", "left", ...), those alone
+        of which the lens sees something, with its resolution in the middle.
 
     Raises:
-        ValueError: for a batch, and lenses whose rays do not meet in a point.
+        ValueError: for a batch of K, lenses whose rays do not meet in a point, and an overlap near 45.
     """
     if camera.K.ndim > 2 or not camera.central:
         raise ValueError("faces are of one camera at a time, whose rays meet in a point")

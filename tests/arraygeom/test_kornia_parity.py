@@ -316,7 +316,10 @@ def test_lenses_that_kornia_lacks_are_named():
         ALPHA.replace(distortion=Distortion("brown-conrady", LENS)).rot90(1).to_kornia()
 
 
-@pytest.mark.parametrize("cameras", [3, [None], {"left": None}])
+MODEL = ALPHA.replace(distortion=Distortion("brown-conrady", LENS)).to_kornia()
+
+
+@pytest.mark.parametrize("cameras", [3, [None], {"left": None}, {"left": MODEL}])
 def test_other_things_than_kornias_pinholes_by_name_are_refused(cameras):
     with pytest.raises(TypeError, match="PinholeCamera"):
         Rig.from_kornia(cameras)

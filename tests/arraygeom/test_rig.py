@@ -344,6 +344,14 @@ def test_lengths_are_scaled_by_a_positive_factor(factor, tmp_path):
             scaled(factor)
 
 
+def test_an_uncalibrated_alpha_has_no_summaries_and_an_unknown_one_is_refused():
+    rig = parallel_rig(80.0, (48, 64), {"a": (), "b": (0.1,)}, (1.0, 50.0))
+    rig = rig.with_camera("c", View(hw=(48, 64)))
+    assert summarise_pairs(rig, "c") == []
+    with pytest.raises(ValueError, match="'d'"):
+        summarise_pairs(rig, "d")
+
+
 def test_the_unit_of_a_batch_of_rigs_is_asked_for_one_of_them():
     K = torch.stack([intrinsics(focal, (80, 100)) for focal in (90.0, 95.0)])
     rig = Rig({n: Camera(K=K, cam_from_world=Pose.identity(), hw=(80, 100)) for n in "ab"})

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from arraygeom import Distortion, Epipolar, Local, Rig, Segments, Widened, sampling_locations, viz
+from arraygeom import Distortion, Epipolar, Local, Rig, Segments, View, Widened, sampling_locations, viz
 from arraygeom.runtime.text import UNSCALED
 from tests.arraygeom.rigs import known_by_f, random_rig, scene_points, two_cameras
 
@@ -31,6 +31,14 @@ def test_rigs_are_drawn(rig):
     figure = viz.draw_rig(rig)
     assert len(png(figure)) > 1000
     assert {t.get_text().strip() for t in figure.axes[0].texts} == {"alpha", "beta"}
+
+
+def test_the_depth_range_of_an_uncalibrated_alpha_is_not_drawn():
+    rig = random_rig(0)
+    rig = rig.with_camera("sketch", View(hw=(48, 64)))
+    assert len(viz.draw_rig(rig, alpha="sketch").axes[0].lines) < len(viz.draw_rig(rig).axes[0].lines)
+    with pytest.raises(ValueError, match="'gamma'"):
+        viz.draw_rig(rig, alpha="gamma")
 
 
 @pytest.mark.parametrize(("name", "unit"), [("", "m"), (UNSCALED, "baselines")])

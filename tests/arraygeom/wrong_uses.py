@@ -74,6 +74,7 @@ from arraygeom import (
     warp,
     world_rays,
 )
+from arraygeom.wide_views import rectify_spherical
 
 HW = (48, 64)
 K = intrinsics(60.0, HW)
@@ -225,6 +226,9 @@ WRONG: dict[str, Callable[[], Any]] = {
     "a rotation of four numbers": lambda: rotation_from_vector(torch.zeros(4)),
     "a change a list": lambda: rig().perturbed({"beta.rotation": [0.0, 0, 0]}),
     "a change of two numbers": lambda: rig().perturbed({"beta.rotation": torch.zeros(2)}),
+    "a change of one focal length of two": lambda: rig().perturbed({"beta.focal": torch.ones(1)}),
+    "a lens of a number": lambda: lens("fov", 0.9),
+    "cameras by number": lambda: Rig({0: camera(), 1: moved()}),
     "three points for a homography": lambda: fit_homography(X.expand(3, 2), X.expand(3, 2)),
     "points of other counts": lambda: fit_homography(X.expand(5, 2), X.expand(4, 2)),
     "points of NaN": lambda: fit_homography(X.expand(5, 2) * math.nan, X.expand(5, 2)),
@@ -294,6 +298,7 @@ WRONG: dict[str, Callable[[], Any]] = {
     "t before R": lambda: plane_homography(K, K, ASIDE, EYE, normal=ZERO, d=torch.tensor(-2.0)),
     "a similarity of one point": lambda: fit_similarity(X, X),
     "a similarity of other counts": lambda: fit_similarity(X.expand(3, 2), X.expand(4, 2)),
+    "a similarity to one point": lambda: fit_similarity(EYE[:, :2], X),
     "a similarity of three numbers": lambda: fit_similarity(ZERO.expand(3, 3), ZERO.expand(3, 3)),
     "a track of a pair": lambda: track(pair(), X, X, X),
     "a track's depth of three numbers": lambda: depth_from_track(Track(ZERO[None], ZERO), ZERO[None]),
@@ -328,6 +333,10 @@ WRONG: dict[str, Callable[[], Any]] = {
     "resampled, an image of another size": lambda: resampled(IMAGE[0, :, :8], camera(), camera()),
     "rectified to no size": lambda: rectify(pair(), hw=(0, 64)),
     "rectified by fx": lambda: rectify(pair(), K=60.0),
+    "rectified, a batch of poses": lambda: rectify(posed(EYE, ASIDE.expand(2, 3)).pair("alpha", "beta")),
+    "rectified on the sphere, a batch of poses": lambda: rectify_spherical(
+        posed(EYE, ASIDE.expand(2, 3)).pair("alpha", "beta")
+    ),
     "rectified along the baseline": lambda: rectify(
         Pair(camera(), camera(cam_from_world=Pose(EYE, EYE[2] / 10)), None)
     ),
