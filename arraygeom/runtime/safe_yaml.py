@@ -29,11 +29,13 @@ def load_yaml(text: str) -> Any:
     """Load the document of a YAML text.
 
     Returns:
-        Plain values; None for an empty text.
+        Plain values: dicts, lists, texts, numbers, booleans, None, and YAML's dates, sets and bytes; None for
+        an empty text or document.
 
     Raises:
-        yaml.YAMLError: with the line where known, for text that is not YAML, repeated keys (1 and "1" are the
-            same key, and so are 1 and true), and documents beyond this module's limits.
+        yaml.YAMLError: with the line where known, for text that is not YAML, several documents, tags of other
+            types, repeated keys (1 and "1" are the same key, and so are 1 and true), and documents beyond
+            this module's limits.
     """
     if len(text) > LARGEST_TEXT:
         raise _refused(f"has {len(text):,} characters; at most {LARGEST_TEXT:,} are read")
@@ -129,7 +131,11 @@ class _SafeLoader(_Base):  # type: ignore[misc]
     """YAML loader in which a repeated key is an error."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """Build the mapping as the parent does, after a check: a repeated key raises yaml.YAMLError."""
+        """Build a mapping as PyYAML does, but refuse repeated keys; those merged in by << do not count.
+
+        Raises:
+            yaml.YAMLError: for two keys that are equal or read alike (1 and "1"), or one that cannot be a key.
+        """
         lines: dict[Any, int] = {}
         for key_node, _ in node.value:
             if key_node.tag == "tag:yaml.org,2002:merge":

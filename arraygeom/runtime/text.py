@@ -25,11 +25,11 @@ def length_unit(rig: Any) -> str:
 
 
 def baseline_text(cameras: Mapping[str, Any], unit: str = "m") -> str:
-    """Describe the distances between cameras of known pose, such as "baselines 10-20 mm".
+    """Describe the least and largest distance between cameras of known pose, such as "baselines 10-20 mm".
 
     Args:
-        cameras: cameras by name; those without a pose do not count.
-        unit: unit of their lengths. Metres are converted to a suitable unit; others are named as they are.
+        cameras: cameras by name, of any batch shapes that broadcast; those without a pose do not count.
+        unit: unit of their lengths. For "m" the text names m, cm or mm; for others numbers alone.
 
     Returns:
         The text; empty for fewer than two cameras of known pose.
