@@ -29,10 +29,11 @@ SOLVED = 64
 
 
 def angle_over_radius(u: Tensor, z: Tensor) -> Tensor:
-    """Compute the ratio of a direction's angle off axis (radians) to its radius r, by a series near the axis.
+    """Compute the ratio of a direction's angle off axis theta (radians) to its radius r, by a series near the
+    axis.
 
     Args:
-        u: squared radius r^2 = x^2 + y^2 (*n).
+        u: squared radius r^2 = x^2 + y^2 (*n) of directions of any length.
         z: depth along the axis (*n).
 
     Returns:
@@ -118,7 +119,11 @@ def finite_points(points: Tensor) -> tuple[Tensor, Tensor]:
     Huge float32 points are brought nearer along their direction, as their squares would be infinite.
 
     Returns:
-        The points, and True (*n) for those that were finite.
+        The points in float32 or float64 (integers and half precision in float32), and True (*n) for those
+        that were finite.
+
+    Raises:
+        TypeError: for points that are no tensor.
     """
     points = floating(points)
     finite = points.isfinite().all(-1)

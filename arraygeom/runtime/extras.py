@@ -30,7 +30,7 @@ def needs(extra: str, purpose: str) -> Iterator[None]:
         purpose: purpose of the import, which begins the message, such as "writing video".
 
     Raises:
-        ImportError: in one line that names the module and how to install it, for any ImportError in the block.
+        ImportError: in one line that names the module and how to install it, for any ImportError inside.
     """
     try:
         yield

@@ -134,7 +134,7 @@ class _SafeLoader(_Base):  # type: ignore[misc]
         """Build a mapping as PyYAML does, but refuse repeated keys; those merged in by << do not count.
 
         Raises:
-            yaml.YAMLError: for two keys that are equal or read alike (1 and "1"), or one that cannot be a key.
+            yaml.YAMLError: for keys that are equal or read alike (1 and "1"), or one that cannot be a key.
         """
         lines: dict[Any, int] = {}
         for key_node, _ in node.value:
