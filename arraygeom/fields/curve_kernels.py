@@ -21,7 +21,7 @@ SERIES = 1e-3
 
 @compiled(nogil=True, cache=True, error_model="numpy")
 def curved_positions(begin, end, first, last, valid, lens, even, fractions, hw, xy, mask):
-    """Write the positions `xy` and the `mask` of the samples of some of alpha's pixels, on beta's image.
+    """Write the positions `xy` and the `mask` of the samples of alpha's pixels `begin` to `end`.
 
     Args:
         begin: first pixel of alpha.
@@ -33,8 +33,8 @@ def curved_positions(begin, end, first, last, valid, lens, even, fractions, hw, 
         even: fractions of the nodes along the curve, 0..1.
         fractions: fractions of the samples along the visible part, 0..1.
         hw: height and width of beta.
-        xy: positions (n, samples, 2) to write, pixels of beta; 0 where masked.
-        mask: mask (n, samples) to write.
+        xy: positions (n, samples, 2) to write, pixels of beta, on its image; 0 where masked.
+        mask: mask (n, samples) to write, True for samples that count.
     """
     nodes, samples = len(even), len(fractions)
     s, x, y, visible = np.empty(nodes), np.empty(nodes), np.empty(nodes), np.empty(nodes, np.bool_)

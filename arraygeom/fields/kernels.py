@@ -26,7 +26,7 @@ def nearest_pixels(first, last, line, centre, usable, window, tie, hw, xy, mask)
         tie: distance by which a pixel counts as farther than the one before it in the image.
         hw: height and width of beta.
         xy: pixels (n, count, 2) to write, the nearest first; 0 where masked.
-        mask: mask (n, count) to write.
+        mask: mask (n, count) to write, True where there is a pixel.
     """
     count, most = mask.shape[1], (2 * window + 1) ** 2
     keys, pixels = np.empty(most, line.dtype), np.empty((most, 2), np.int32)
