@@ -73,12 +73,14 @@ def recognises(path: Path, head: str) -> bool:
 
 
 def read(source: RigSource) -> Rig:
-    """Read the cameras of a model's rig, or one for each image.
+    """Read the cameras of a model's rig, or one for each image, named as the image is.
 
-    The path is that of the folder or of any file in it.
+    The path is that of the folder, a project's with `sparse` in it, or the model's file of cameras, images,
+    rigs or frames. The scale is the model's, taken as metres.
 
     Raises:
-        RigFileError: for missing or damaged files, unknown models, or several rigs.
+        RigFileError: for missing or damaged files, unknown models, equal names, or several rigs of several
+            cameras.
     """
     folder = _folder(source.path)
     if folder is None:
@@ -104,11 +106,14 @@ def read(source: RigSource) -> Rig:
 def write(rig: Rig) -> dict[str, str]:
     """Format a text model: every camera of the rig as one camera and one image, no points.
 
+    Depth range, links and sensors are left out.
+
     Returns:
-        Texts by file name.
+        Texts of cameras.txt, points3D.txt and images.txt by file name.
 
     Raises:
-        ValueError: for names of several lines, and what the format cannot hold.
+        ValueError: for names of several lines or with spaces at an end, a rig without cameras, cameras that
+            are uncalibrated or batches, and a K with skew or a lens that the format cannot hold.
     """
     cameras = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
     images = ["# IMAGE_ID, QW..QZ, TX..TZ, CAMERA_ID, NAME"]
@@ -323,7 +328,7 @@ class _Bytes:
         self.source, self.data, self.at = source, source.content(), 0
 
     def take(self, layout: str) -> tuple[Any, ...]:
-        """Return the next values of a `struct` layout.
+        """Return the next values of a `struct` layout, and go past them.
 
         Raises:
             RigFileError: if the file ends before.
@@ -336,10 +341,10 @@ class _Bytes:
         return values
 
     def count(self) -> int:
-        """Return the next count of entries.
+        """Return the next count of entries (8 bytes), and go past it.
 
         Raises:
-            RigFileError: if the file cannot hold so many.
+            RigFileError: if the file ends before, or has fewer bytes than that.
         """
         (n,) = self.take("<Q")
         if n > len(self.data):
@@ -349,7 +354,7 @@ class _Bytes:
         return int(n)
 
     def string(self) -> str:
-        """Return the next zero-terminated text.
+        """Return the next zero-terminated text, and go past it; bytes that are no UTF-8 are replaced.
 
         Raises:
             RigFileError: if the file ends before.

@@ -28,7 +28,8 @@ HEAD = r'(?s)"cameraData"|(?=.*"boardRev").*"boardName"'
 def read(source: RigSource) -> Rig:
     """Read the calibrated cameras by their sockets: "CAM_A" (colour on most), "CAM_B", "CAM_C", ...
 
-    The first of them is at the origin. Cameras whose K is zeros are left out, with a warning.
+    The first of them is the world; lengths are metres. Cameras without a size are left out, and those whose
+    K is zeros, with a warning.
 
     Raises:
         RigFileError: for a damaged file, no calibrated camera, other units, or extrinsics that are circular

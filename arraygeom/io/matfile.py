@@ -38,10 +38,11 @@ def load_variables(source: RigSource) -> dict[str, Any]:
     out.
 
     Returns:
-        Values by name: structs as mappings, numbers as arrays or scalars.
+        Values by name as scipy simplifies them: structs as mappings, text as str, numbers as arrays without
+        axes of length 1, or scalars.
 
     Raises:
-        RigFileError: for an empty or damaged file, or one of another version.
+        RigFileError: for a file that is missing, empty, too large, damaged, or not of version 5 to 7.
         ImportError: without scipy.
     """
     data = source.content()
@@ -60,13 +61,13 @@ def load_variables(source: RigSource) -> dict[str, Any]:
 
 
 def readable_variables(content: bytes) -> list[str]:
-    """List the variables of a MAT-file's bytes that consist of structs, cells, text and numbers only.
+    """List the variables of a MAT-file's bytes that `load_variables` loads: of structs, cells, text, numbers.
 
     Returns:
         Their names, in the file's order.
 
     Raises:
-        ValueError: for a file that is not a MAT-file of version 5, too large, or damaged.
+        ValueError: for a file that is no MAT-file of version 5 to 7, too large, or damaged.
     """
     if len(content) > LARGEST:
         raise ValueError(f"it has {len(content)} bytes; at most {LARGEST} are read")

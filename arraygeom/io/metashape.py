@@ -34,7 +34,8 @@ HEAD = "<chunk"
 def read(source: RigSource) -> Rig:
     """Read all aligned cameras of the file's one chunk, by label; others are left out with a warning.
 
-    Lengths are in metres by the stated scale; without one they are in the chunk's own unit.
+    Of equal labels the file of the image, or the camera's number with the label, is the name. Lengths are in
+    metres by the stated scale; without one they are in the chunk's own unit.
 
     Raises:
         RigFileError: for a damaged file, several chunks, no aligned camera, or lens terms that are not read.

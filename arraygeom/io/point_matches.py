@@ -36,16 +36,21 @@ def read_matches(path: str | Path, files: Mapping[str, str | Path], sizes: Mappi
     """Read the matches between the images of cameras from a file.
 
     Args:
-        files: image file of each camera; only names are used, the images are not opened.
-        sizes: height and width of each image, pixels.
+        path: CSV file, whose lines are x0 y0 x1 y1, or COLMAP's database.
+        files: image file of each camera, for a CSV file in the order of its columns; only names are used, the
+            images are not opened.
+        sizes: height and width of each camera's image, pixels.
 
     Returns:
-        Points by pair of camera names, with pixel centres at whole numbers.
+        By pair of camera names, in the database's order, points (n, 2) of either, float64, with pixel centres
+        at whole numbers; pairs without matches are left out.
 
     Raises:
         FileNotFoundError: for a missing file.
         ValueError: for files of another kind, more or fewer than two images with a CSV file, a database
-            without these images, and points outside the images.
+            without one of these images or without matches between them, and points outside the images (NaN in
+            a database is not refused).
+        KeyError: for a camera with matches that has no size.
     """
     path = Path(path)
     if not path.is_file():

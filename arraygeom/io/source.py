@@ -95,10 +95,10 @@ def decoded(content: bytes, errors: str = "replace") -> str:
 
 
 class RigFileError(ValueError):
-    """A rig file that cannot be read: in one line, the file, its entry, and what to do.
+    """Error of a rig file that cannot be read: its text is one line of the file, its entry, and what to do.
 
     Attributes:
-        path: the file.
+        path: the file, a Path.
         entry: name of the entry; None for the file as a whole.
     """
 
@@ -116,7 +116,7 @@ class RigFileWarning(UserWarning):
 
 
 class RigSource:
-    """One rig file while it is read.
+    """One rig file while it is read; opened only by the methods that read it.
 
     Attributes:
         path: the file or folder.
@@ -136,8 +136,8 @@ class RigSource:
         return source
 
     def warn_of_unread(self) -> None:
-        """Warn of entries that no reader has looked up, if they look like a lens, a model, a flag
-        or a unit."""
+        """Give a RigFileWarning for each file with entries that no reader has looked up and that are
+        `suspicious`."""
         unread: dict[Path, list[str]] = {}
         for entry, used in self.lookups.values():
             left = [
@@ -170,8 +170,8 @@ class RigSource:
         """Return the file's bytes.
 
         Raises:
-            RigFileError: for a file that cannot be read, and for a pipe, on which reading would wait for
-                ever.
+            RigFileError: for a file that is missing or cannot be read, a folder, and a pipe, on which reading
+                would wait for ever.
         """
         try:
             if not self.path.is_file() and self.path.exists():
@@ -187,7 +187,8 @@ class RigSource:
             most: largest number of characters; None for any.
 
         Raises:
-            RigFileError: for a file that cannot be read, is empty, too long, or no text.
+            RigFileError: for a file that cannot be read, is empty or blank, too long, or no text in UTF-8 (or
+                UTF-16 with a byte order mark).
         """
         try:
             text = decoded(self.content(), "strict")
@@ -236,7 +237,10 @@ class RigSource:
         return self._parsed("YAML", load_yaml, self.text() if text is None else text)
 
     def xml(self) -> ET.Element:
-        """Return the root of an XML file.
+        """Parse the file as XML.
+
+        Returns:
+            The root element.
 
         Raises:
             RigFileError: for a file that is too large, defines entities, or is no XML.
@@ -250,9 +254,12 @@ class RigSource:
             raise self.fail(f"line {error.position[0]}", "is not XML; is the file whole?") from None
 
     def document(self) -> Entry:
-        """Return the mapping of a file in JSON, TOML, XML or YAML, OpenCV's dialects and messages included.
+        """Parse a file in JSON, TOML (by its suffix), XML or YAML, OpenCV's dialects and printed ROS messages
+        included.
 
-        Of several YAML documents the first, and of OpenCV's data what is no picture or map.
+        Returns:
+            The entry of the whole document, whose value is a mapping that is not empty; of several YAML
+            documents the first, with large pictures and maps emptied.
 
         Raises:
             RigFileError: for any other file.
@@ -292,11 +299,12 @@ class RigSource:
                 brackets, with commas and semicolons.
 
         Returns:
-            The entry of a mapping: for names that the pattern matches lists of numbers, for others the text.
-            Lines without the separator are left out.
+            The entry of a mapping: for names that the pattern matches vectors of numbers, float64, for others
+            the text of the last such line. Lines without the separator are left out.
 
         Raises:
-            RigFileError: for such a name that occurs twice, or whose values are no numbers.
+            RigFileError: for such a name that occurs twice, or whose values are no finite numbers, and as
+                `text`.
         """
         entries: dict[str, Tensor | str] = {}
         for line in self.text().splitlines():
@@ -349,6 +357,7 @@ class RigSource:
 
         Raises:
             RigFileError: for no camera, or a name that occurs twice.
+            ValueError: also as `Rig` raises it.
         """
         named: dict[str, Camera] = {}
         for name, camera in cameras:
@@ -444,7 +453,8 @@ class Entry:
     def find(self, name: str, side: str = "") -> Entry:
         """Find the entry of a mapping whose name matches a pattern.
 
-        Names are compared in lower case without punctuation, as `plain` returns them.
+        Names are compared in lower case without punctuation, as `plain` returns them. Entries that are None
+        do not count, nor single numbers named as one coefficient of a lens, such as k1.
 
         Args:
             name: regular expression of such a name.
@@ -455,7 +465,7 @@ class Entry:
             The entry; its value is None if no name matches.
 
         Raises:
-            RigFileError: if two names match whose values differ.
+            RigFileError: if two names match whose values differ, and unless this is a mapping.
         """
         ends = {"1": ("left|l", "1"), "2": ("right|r", "2")}.get(side)
         name = f"({name})"
@@ -481,10 +491,10 @@ class Entry:
             side: camera of a stereo pair, as for `find`; names without a side are taken where none has it.
 
         Returns:
-            The entry; its value is None if no entry names a model.
+            The entry, a word or a flag of fisheyes; its value is None if there is none.
 
         Raises:
-            RigFileError: if two names match whose values differ.
+            RigFileError: as `find`.
         """
         for name in MODEL_NAMES:
             for which in dict.fromkeys((side, "")):
@@ -506,7 +516,8 @@ class Entry:
             Height and width in pixels.
 
         Raises:
-            RigFileError: for a size that is not positive and whole, or too large.
+            RigFileError: for a size that is not positive and whole, or too large; as `find` and
+                `size_unstated`.
         """
         usual = (
             [] if keys else [(names, which) for which in (side, "") for names in (SIZE_NAMES, [SIZE_NAME])]
@@ -518,12 +529,17 @@ class Entry:
         return self.source.size_unstated(K)
 
     def K(self, side: str = "") -> Tensor:
-        """Return the intrinsic matrix under a usual name, of one side of a pair or of none.
+        """Return the intrinsic matrix under a usual name: of a matrix, or of focal lengths and centre as four
+        numbers or one by one.
 
-        A matrix, or focal lengths and centre as four numbers or one by one.
+        Args:
+            side: as of `find`.
+
+        Returns:
+            K (3, 3), float64, of pixels as the file counts them.
 
         Raises:
-            RigFileError: if there is none, and as `intrinsics`.
+            RigFileError: if there is none, and as `find` and `intrinsics`.
         """
         entry, parts = self.find(K_NAME, side), [self.find(name, side) for name in PINHOLE_NAMES]
         if entry.value is not None:
@@ -535,8 +551,14 @@ class Entry:
     def usual_lens(self, side: str = "") -> Distortion | None:
         """Return the lens of coefficients under a usual name, or of k1, k2, p1, p2 ... one by one.
 
+        Args:
+            side: as of `find`; one by one they are found for "" alone.
+
+        Returns:
+            The lens; None for a pinhole, with a warning if the file states no coefficients.
+
         Raises:
-            RigFileError: as `of_model`.
+            RigFileError: as `find` and `of_model`.
         """
         entry, word = self.find(LENS_NAME, side), self.model(side)
         fields = entry if entry.is_table else self
@@ -561,7 +583,8 @@ class Entry:
             stated: K, hw, distortion or sensor as of `Camera`.
 
         Raises:
-            RigFileError: for a camera without K, or without a pose; for numbers that no camera has.
+            RigFileError: for a camera without K, or without a pose, and as the methods that find its parts.
+            ValueError: also as `Camera` raises it.
         """
         if "K" not in stated and (inner := self.find(K_NAME, side)).is_table:
             self.use()
@@ -576,10 +599,16 @@ class Entry:
         return Camera(K=K, cam_from_world=pose, hw=hw, distortion=lens, **stated)
 
     def pose(self, side: str = "") -> Pose | None:
-        """Return the pose by R and t, or a matrix, under usual names; None if neither is there.
+        """Return the pose by R and t, or by a matrix from the world into the camera, under usual names.
+
+        Args:
+            side: as of `find`.
+
+        Returns:
+            The pose X' = R X + t in the file's unit; None if neither is there.
 
         Raises:
-            RigFileError: for one of R and t without the other, and as `pose_of`.
+            RigFileError: for one of R and t without the other, and as `find`, `pose_of` and `pose_matrix`.
         """
         R, t, both = (self.find(name, side) for name in (R_NAME, T_NAME, POSE_NAME))
         if both.value is not None and R.value is None:
@@ -629,7 +658,8 @@ class Entry:
             also: end of the message for other values.
 
         Returns:
-            Tensor of the list's shape; of no axes for one number.
+            Tensor of the list's shape; of no axes for one number, a vector for text with numbers and for the
+            `data` of OpenCV's and ROS' matrices.
 
         Raises:
             RigFileError: for NaN, infinity unless accepted, and values that are no numbers.
@@ -647,14 +677,11 @@ class Entry:
         return tensor
 
     def numbers(self, shape: tuple[int, ...] | None = None, *, infinite: bool = False) -> Tensor:
-        """Return the numbers as a tensor of a shape (from any nesting that has as many), or as a vector.
+        """Return the numbers, float64, as a tensor of a shape (from any nesting of as many), or as a vector.
 
         Args:
             shape: wanted shape; None for a vector of any length.
             infinite: True to accept infinite numbers.
-
-        Returns:
-            The numbers, float64.
 
         Raises:
             RigFileError: for another number of numbers, and as `tensor`.
@@ -682,10 +709,10 @@ class Entry:
         return Entry(self.source, self.numbers((side, side)).T, self.name)
 
     def size(self) -> HW:
-        """Return height and width from a width and a height, in pixels.
+        """Return (height, width) from two numbers, width first, in pixels.
 
         Raises:
-            RigFileError: for a size that is not positive and whole, or too large.
+            RigFileError: for other numbers than two, not positive, not whole, or too large.
         """
         w, h = self.numbers((2,)).tolist()
         if min(w, h) < 1 or w != int(w) or h != int(h):
@@ -707,7 +734,7 @@ class Entry:
             K (3, 3), float64.
 
         Raises:
-            RigFileError: for another last row, or focal lengths that are not positive.
+            RigFileError: for another last row or focal lengths that are not positive, and as `numbers`.
         """
         K = self.numbers((3, 3))
         if K[2].tolist() != [0.0, 0.0, 1.0]:
@@ -735,8 +762,8 @@ class Entry:
             Matrix (3, 3), float64.
 
         Raises:
-            RigFileError: for other matrices, vectors longer than `LARGEST_ANGLE`, and another number of
-                numbers.
+            RigFileError: for other matrices, vectors with a number above `LARGEST_ANGLE`, and another number
+                of numbers.
         """
         numbers = self.numbers()
         if numbers.numel() == 3:
@@ -755,7 +782,7 @@ class Entry:
         return R if error < 1e-12 else U @ Vh
 
     def pose_matrix(self, metres: float = 1.0) -> Pose:
-        """Return a pose from a 4 x 4 or 3 x 4 matrix.
+        """Return the pose of a 4 x 4 or 3 x 4 matrix (R, t).
 
         Args:
             metres: metres of the file's unit of length.
@@ -778,7 +805,7 @@ class Entry:
             The lens; None if all coefficients are 0, or none are stated.
 
         Raises:
-            RigFileError: for more than 14.
+            RigFileError: for more than 14, and as `numbers`.
         """
         c = torch.zeros(0) if self.value is None else self.numbers()
         if not c.any():
@@ -792,7 +819,7 @@ class Entry:
         """Return a Kannala-Brandt fisheye from one to four coefficients, zero-padded to four.
 
         Raises:
-            RigFileError: for another number of them.
+            RigFileError: for another number of them, or none, and as `numbers`.
         """
         c = self.numbers()
         if not 1 <= c.numel() <= 4:
@@ -800,20 +827,21 @@ class Entry:
         return Distortion(KANNALA_BRANDT, torch.nn.functional.pad(c, (0, 4 - c.numel())))
 
     def of_model(self, word: Entry) -> Distortion | None:
-        """Return the lens of the model that an entry names, by a word or a flag of fisheyes.
+        """Return the lens of this entry's coefficients and of the model that another one names.
 
-        Where it names none: of the model that the user states, else of OpenCV's that fits, with a warning if
-        there are four numbers, which both have.
+        Where it names none, the model is the one that the user states, else Brown-Conrady, but for four
+        numbers, which a fisheye has too, the one that fits, with a warning unless all are 0.
 
         Args:
-            word: entry with the model's name or flag; its value is None if there is none.
+            word: entry with the model's name or a flag of fisheyes; its value is None if there is none.
 
         Returns:
-            The lens; None for a pinhole, with a warning if the file states no coefficients.
+            The lens; None for a pinhole: the model "none", no coefficients (with a warning if they are not
+            stated), and Brown-Conrady's that are all 0.
 
         Raises:
-            RigFileError: for an unknown model, one that contradicts the user's, or a fisheye without
-                coefficients.
+            RigFileError: for an unknown model, one that contradicts the user's, a fisheye without
+                coefficients, the model "none" with some, and as `lens`.
         """
         said = _said(word)
         wanted, none = self.source.lens, said in ("", "none")
@@ -864,6 +892,7 @@ class Entry:
 
         Raises:
             RigFileError: for another number of coefficients, or values that no lens has.
+            KeyError: for another model.
         """
         if model in (BROWN_CONRADY, KANNALA_BRANDT):
             return self.brown_conrady() if model == BROWN_CONRADY else self.kannala_brandt()
@@ -885,7 +914,11 @@ def single(value: Any) -> bool:
 
 
 def suspicious(key: Any, value: Any) -> bool:
-    """Return True if an entry may be a lens, a model, a flag or a unit, and states something."""
+    """Return True if an entry may be a lens, a model, a flag or a unit by its name, and is not 0, False or
+    empty.
+
+    A text counts if it names a lens model, or under a name of a unit.
+    """
     name = plain(key)
     if value is None or HARMLESS.fullmatch(name):
         return False
