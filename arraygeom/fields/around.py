@@ -200,11 +200,8 @@ def _check_size(plane: Tensor, view: View | None) -> None:
 
 
 def _at_nearest(plane: Tensor, x: Float[Tensor, "*n 2"], now: View, recorded: LensView | None) -> Tensor:
-    """Look up values (H, W, ...) of the recorded pixels nearest to pixels `x` of alpha as it is now; no
-    gradients.
-
-    Values are not interpolated: between two pixels of different depth there is no depth.
-    """
+    """Look up values (H, W, ...) of the recorded pixels nearest to pixels `x` of alpha, without gradient."""
+    # Not interpolated: between two pixels of different depth there is no depth.
     with torch.no_grad():
         if recorded is not None:
             x, _ = recorded_pixels(x.double(), now, recorded)

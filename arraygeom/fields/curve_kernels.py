@@ -63,8 +63,7 @@ def curved_positions(begin, end, first, last, valid, lens, even, fractions, hw, 
 
 @compiled(inline="always")
 def _shares(first, last, wide, u, s):
-    """Write to s the share of `last` in the points at fractions u: evenly in undistorted pixels,
-    or in angle."""
+    """Write to s the share of `last` in points at fractions u: even in undistorted pixels, or in angle."""
     if not wide:
         z0, z1 = first[2], last[2]
         for i in range(len(u)):
@@ -146,8 +145,7 @@ def _brown(c, limit, x, y, visible):
 
 @compiled(inline="always")
 def _fisheye(c, limit, x, y, z):
-    """Return the normalised distorted point of a point in the camera's frame;
-    `distortion._fisheye_project`."""
+    """Return the normalised distorted point of a point in the camera's frame (`fisheye_project`)."""
     u = x * x + y * y
     if z > 0 and u < SERIES * z * z:
         t = u / (z * z)
@@ -167,11 +165,9 @@ def _fisheye(c, limit, x, y, z):
 
 @compiled(inline="always")
 def _pieces(x, y, visible, hw, out):
-    """Write each piece's visible fractions (from, to), its visible length, and the sum of lengths up to its
-    end.
+    """Write each piece's visible fractions (from, to) and length, and the sum of lengths; return the whole.
 
-    Returns:
-        The whole visible length; `curved.visible_pieces` in its readable form.
+    `curved.visible_pieces` is its readable form.
     """
     total = 0.0
     for i in range(out.shape[1]):

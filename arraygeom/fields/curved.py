@@ -164,14 +164,12 @@ class _Straight(NamedTuple):
         return cls(view, pinhole, product(pinhole.K, torch.linalg.inv(view.K)))
 
     def undistort(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the pinhole's pixels of pixels (*n, 2) of the view, and a mask of those that the lens model
-        covers."""
+        """Return the pinhole's pixels of pixels (*n, 2) of the view, True where the lens model has them."""
         straight, valid = self.view.to(x.dtype).undistort(x)
         return map_homogeneous(self.A[:2].to(x.device), straight), valid
 
     def distort(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the view's pixels of pixels (*n, 2) of the pinhole, and a mask of those that the lens model
-        covers."""
+        """Return the view's pixels of pixels (*n, 2) of the pinhole, True where the lens model has them."""
         return self.view.to(x.dtype).distort(map_homogeneous(torch.linalg.inv(self.A)[:2].to(x.device), x))
 
 
@@ -378,10 +376,9 @@ class RayCurve(NamedTuple):
         return torch.linspace(0, 1, count, dtype=self.first.dtype, device=self.first.device)
 
     def _ends_on_image(self) -> tuple[Tensor, Tensor]:
-        """Find the inverse depths between which an image larger by `MARGIN` shows the curve: constants.
+        """Find the inverse depths between which an image larger by `MARGIN` shows the curve, if not central.
 
-        A camera whose rays do not meet bounds no directions by its image, and what it has of a curve may be
-        a small part. An end that the image shows stays, with its gradient.
+        They are constants, but for an end that the image shows.
         """
         with torch.no_grad():
             fractions = self._fractions(self._even(NODES))
@@ -444,8 +441,7 @@ class RayCurve(NamedTuple):
         return torch.lerp(first, last, s)
 
     def _weights(self, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Return shares of first and of last in the point that is a fraction u along, in the curve's own
-        measure."""
+        """Return shares of first and last in the point at fraction u, in the curve's own measure."""
         if self.wide is False:
             return self._weights_in_pixels(u)
         first, last = _either(
@@ -454,15 +450,13 @@ class RayCurve(NamedTuple):
         return first, last
 
     def _weights_in_pixels(self, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Return shares of first and of last in the point whose pixel, without the lens, is a fraction u
-        along."""
+        """Return shares of first and last in the point whose pixel, without the lens, is at fraction u."""
         ends = self.inverse if self.beta.parallel else (self.first[..., 2], self.last[..., 2])
         z0, z1 = (torch.where(self.valid, z, 1.0)[..., None] for z in ends)
         return (1 - u) * z1, u * z0
 
     def _weights_in_angle(self, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the same for the direction that has gone a fraction u of the angle between first
-        and last."""
+        """Return shares of first and last in the direction at fraction u of the angle between them."""
         squared = torch.linalg.cross(self.first, self.last).square().sum(-1)
         opens = squared > TINY
         sine = torch.where(opens, torch.where(opens, squared, 1.0).sqrt(), 0.0)
@@ -489,11 +483,8 @@ there a point is not only a direction."""
 
 
 def _lines(alpha: Camera, x: Tensor, bounds: str) -> tuple[Tensor | None, Tensor, Tensor]:
-    """Return starts and directions, at a depth (or a distance) of 1 m, of pixels' rays, and a mask of those
-    that exist.
-
-    The start is in the plane of depth 0, and None if it is alpha's origin.
-    """
+    """Return starts of pixels' rays (in the plane of depth 0; None for the origin), directions at a depth (or
+    distance) of 1, and a mask of those that exist."""
     rays, valid = alpha.rays(x)
     start = None if alpha.central else alpha.ray_origins(x)
     if bounds == "distance":

@@ -101,11 +101,7 @@ class NearestVoxels:
         return xy, mask
 
     def _choose(self, xy: Tensor, line: Tensor, centre: Tensor, pair: Pair) -> tuple[Tensor, Tensor, Tensor]:
-        """Choose the nearest `count` of some candidates.
-
-        Returns:
-            Pixels, a mask of those that count, and distances.
-        """
+        """Choose the nearest `count` of some candidates: pixels, a mask of those that count, distances."""
         h, w = pair.beta.hw
         inside = pair.beta.contains(xy) & ((xy - centre[:, None]).abs() <= self.window).all(-1)
         at_centre = (centre * line[:, :2]).sum(-1, keepdim=True) + line[:, 2:]
@@ -121,8 +117,7 @@ class NearestVoxels:
         return xy.gather(-2, nearest.indices[..., None].expand(*mask.shape, 2)), mask, nearest.values
 
     def _candidates(self, line: Tensor, centre: Tensor, beside: int) -> Tensor:
-        """List whole pixels (n, k, 2): in every column of the window (or row, if steep) those nearest the
-        line."""
+        """List whole pixels (n, k, 2) nearest the line in every column of the window (or row, if steep)."""
         steps, across = (torch.arange(-n, n + 1).to(line) for n in (self.window, beside))
         steep = line[:, 0].abs() > line[:, 1].abs()
         u = torch.where(steep, centre[:, 1], centre[:, 0])[:, None] + steps

@@ -140,8 +140,7 @@ class FieldOnGrid:
         return replace(self, at=lambda x: moved(self.at(x), x), pixels=grid(self.straight, 1), blocks=blocks)
 
     def any_valid(self, hw: HW) -> bool:
-        """Return True if any of alpha's h x w pixels may see into beta; every eighth row and
-        column counts."""
+        """Return True if any of alpha's h x w pixels, in every eighth row and column, may see into beta."""
         h, w = hw
         if self.pixels is not None:
             return bool(self.pixels.valid[..., :h:8, :w:8].any())

@@ -45,11 +45,7 @@ def nearest_pixels(first, last, line, centre, usable, window, tie, hw, xy, mask)
 
 @compiled(inline="always")
 def _within(line, centre, window, tie, hw, count, keys, pixels):
-    """Collect the pixels up to some distance: at least `count`, or all of the window.
-
-    Returns:
-        Their number and that distance.
-    """
+    """Collect at least `count` pixels up to some distance, or all; return their number and the distance."""
     x, y, a, b = int(centre[0]), int(centre[1]), line[0], line[1]
     at_centre = centre[0] * a + centre[1] * b + line[2]
     spans = window * (abs(a) + abs(b))

@@ -139,8 +139,7 @@ def all_pixels(pair: Pair) -> Float[Tensor, "*b h w 2"]:
 
 
 def compilable(x: Tensor) -> bool:
-    """Return True if compiled loops can take a tensor: plain numbers on the CPU that neither a gradient nor a
-    trace follows."""
+    """Return True if compiled loops can take a tensor: plain numbers on the CPU that no trace follows."""
     plain = type(x) is Tensor and x.device.type == "cpu" and x.dtype in (torch.float32, torch.float64)
     return plain and not followed() and can_compile()
 
@@ -152,8 +151,7 @@ PIECE = 1 << 12
 
 
 def segments_by_rows(f: Callable[[Tensor], Segments], pair: Pair, x: Float[Tensor, "*n 2"]) -> Segments:
-    """Apply f to pixels, some rows of the first axis after the batch's at once; f must take each
-    pixel alone."""
+    """Apply f, which takes each pixel alone, to some rows of the first axis after the batch's at once."""
     axis = len(pair.batch_shape)
     if x.ndim <= axis + 1:
         return f(x)

@@ -125,7 +125,6 @@ def rough_transfer(pair: Pair, x: Real[Tensor, "n 2"]) -> TransformedPoints:
 def _apart(
     curve: RayCurve, fraction: Float[Tensor, "n l"], x_beta: Float[Tensor, "n 2"]
 ) -> Float[Tensor, "n l"]:
-    """Return squared pixels from positions to the points at fractions; infinite where beta does not see
-    these."""
+    """Return squared pixels from positions to the points at fractions; infinite where beta sees none."""
     xy, visible = curve.at(fraction)
     return torch.where(visible, (xy - x_beta[:, None].to(xy)).square().sum(-1), torch.inf)

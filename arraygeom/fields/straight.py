@@ -215,8 +215,7 @@ def covering_displacement(pair: Pair, x: Real[Tensor, "*n 2"] | None = None) -> 
 
 
 def _squared_reach(pair: Pair, x: Tensor) -> Tensor:
-    """Return the squared distance from the foot of H x to the farther end of the segment, 0 where there is
-    none."""
+    """Return the squared distance from the foot of H x to the segment's farther end; 0 without a segment."""
     exact = Epipolar()(pair, x)
     centre, placed = apply_homography(pair.homography, x)
     foot = foot_on_line(epipolar_lines(pair.fundamental, x), centre)
@@ -225,11 +224,8 @@ def _squared_reach(pair: Pair, x: Tensor) -> Tensor:
 
 
 def _widest(pair: Pair) -> Tensor:
-    """Return the alpha pixel (*b, 1, 2) of the largest displacement, searched once per pair and again when it
-    changes.
-
-    Nothing is kept of a trace, nor as a tensor of inference mode, which no gradient could use later.
-    """
+    """Return the alpha pixel (*b, 1, 2) of the largest displacement, searched again when the pair changes."""
+    # Nothing is kept of a trace, nor as a tensor of inference mode, which no gradient could use later.
     if followed():
         return _searched_widest(pair)
     versions = tuple(None if t.is_inference() else t._version for t, _ in tensors_of(pair))
@@ -363,8 +359,7 @@ def require_straight(pair: Pair) -> None:
 
 
 def foot_on_line(line: Float[Tensor, "*#n 3"], point: Float[Tensor, "*#n 2"]) -> Float[Tensor, "*n 2"]:
-    """Return the point of a line (scaled as `epipolar_lines` does) nearest to a point; without a line, the
-    point."""
+    """Return the point of a line (scaled by `epipolar_lines`) nearest to a point; the point without one."""
     l0, l1, l2 = line.unbind(-1)
     u, v = point.unbind(-1)
     off = l2 + l0 * u + l1 * v

@@ -209,8 +209,7 @@ class Widened:
         return 2 * math.ceil(self._most[0]) + 1
 
     def _evaluated(self, pair: Pair, x: Tensor, margin: int) -> SamplingLocations:
-        """Evaluate the field around beta's image too, as far as widening may bring in; by sizes alone on
-        the image."""
+        """Evaluate the field around beta's image too, as far as widening may bring in, unless by sizes."""
         if margin == 0 or not _follows_beta(self.field, pair):
             return answered(self.field, pair, x)
         h, w = pair.beta.hw
@@ -276,8 +275,7 @@ def _between(first: Tensor, last: Tensor, like: Tensor) -> Tensor:
 
 
 def _follows_beta(field: ReceptiveField, pair: Pair) -> bool:
-    """Return True if the field of a padded beta is the same in its pixels: by F or calibration it is, by
-    sizes not."""
+    """Return True if the field of a padded beta is the same in its pixels: by F or calibration, not sizes."""
     if isinstance(field, ThroughLenses | Moved):
         return _follows_beta(field.field, pair)
     if isinstance(field, HomographyDisplacement):

@@ -134,8 +134,7 @@ def write(rig: Rig) -> dict[str, str]:
 
 
 def _folder(path: Path) -> Path | None:
-    """Return the folder with the model, from itself, one of its files, or the project folder;
-    None for none."""
+    """Return the model's folder, from itself, one of its files, or the project folder; None for none."""
     files = {
         f"{stem}{suffix}" for stem in ("cameras", "images", "rigs", "frames") for suffix in (".txt", ".bin")
     }
@@ -216,8 +215,7 @@ def _cameras_text(source: RigSource) -> Iterator[tuple[Entry, int, str]]:
 
 
 def _images_text(source: RigSource) -> Iterator[Posed]:
-    """Yield the images of every other line; those between hold the points, X Y POINT3D_ID each, and may be
-    blank."""
+    """Yield the images of every other line; those between hold the points, and may be blank."""
     for entry in _lines(source, "images", every=2):
         fields = entry.value.split(maxsplit=9)
         if len(fields) != 10:
@@ -252,8 +250,7 @@ def _sensors(entry: Entry) -> Iterator[Posed]:
 
 
 def _lines(source: RigSource, what: str, every: int = 1) -> list[Entry]:
-    """Return the lines that are no comments, nor blank (of an image's two the second may be); as many as
-    stated."""
+    """Return the lines that are no comments, nor blank (of an image's two the first); as many as stated."""
     lines = [(n, line) for n, line in enumerate(source.text().splitlines(), 1) if not line.startswith("#")]
     first = next((i for i, (_, line) in enumerate(lines) if line.strip()), 0)
     content = [source.at(line, f"line {n}") for n, line in lines[first::every] if line.strip()]

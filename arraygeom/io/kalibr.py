@@ -135,8 +135,7 @@ def _camera(fields: Entry, pose: Pose) -> Camera:
 
 
 def _lens(camera: str, before: list[float], fields: Entry) -> Distortion | None:
-    """Read the lens of a camera model and a distortion model; `before` are the numbers before
-    focal lengths."""
+    """Read the lens of a camera model, by the numbers `before` focal lengths, and a distortion model."""
     lens, _, supported = MODELS[camera]
     model = fields.get("distortion_model")
     coefficients = fields.find(LENS_NAME)

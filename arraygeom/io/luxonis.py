@@ -70,8 +70,7 @@ def _name(socket: int) -> str:
 
 
 def _to_root(entries: dict[int, Entry], socket: int) -> tuple[int, Pose]:
-    """Return the camera at which a chain of extrinsics ends, and the pose that takes points of this one into
-    it."""
+    """Return the camera at which a chain of extrinsics ends, and the pose from this one into it."""
     pose, passed = Pose.identity(), [socket]
     while True:
         extrinsics = entries[passed[-1]].get("extrinsics")

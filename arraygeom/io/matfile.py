@@ -100,11 +100,7 @@ def _unpacked(data: memoryview) -> memoryview:
 
 
 def _elements(data: memoryview, order: str) -> Iterator[_Element]:
-    """Yield the elements one after the other.
-
-    Raises:
-        ValueError: for one that is not whole.
-    """
+    """Yield the elements one after the other; ValueError for one that is not whole."""
     offset = 0
     while offset < len(data):
         if offset + 8 > len(data):
@@ -124,11 +120,7 @@ def _elements(data: memoryview, order: str) -> Iterator[_Element]:
 
 
 def _check_matrix(data: memoryview, order: str, depth: int) -> str | None:
-    """Return the name of a matrix; None for one of a class that is not read.
-
-    Raises:
-        ValueError: for a damaged one.
-    """
+    """Return the name of a matrix; None for one of a class that is not read; ValueError for a damaged one."""
     if depth > DEEPEST:
         raise ValueError(f"it is nested more than {DEEPEST} deep")
     parts = _elements(data, order)
@@ -149,11 +141,7 @@ def _check_matrix(data: memoryview, order: str, depth: int) -> str | None:
 
 
 def _check_contents(parts: Iterator[_Element], order: str, depth: int, what: tuple[int, int, bool]) -> bool:
-    """Return True if a matrix, and those in it, can be read.
-
-    Raises:
-        ValueError: for other sizes than it states.
-    """
+    """Return True if a matrix, and those in it, can be read; ValueError for other sizes than it states."""
     kind, count, is_complex = what
     if kind in (CELL, STRUCT):
         wanted = count * (_fields(parts, order) if kind == STRUCT else 1)
@@ -176,11 +164,7 @@ def _check_contents(parts: Iterator[_Element], order: str, depth: int, what: tup
 
 
 def _fields(parts: Iterator[_Element], order: str) -> int:
-    """Return the number of a struct's fields.
-
-    Raises:
-        ValueError: if their names are damaged.
-    """
+    """Return the number of a struct's fields; ValueError if their names are damaged."""
     length, names = (next(parts, _Element(0, memoryview(b""))) for _ in range(2))
     if length.kind != 5 or len(length.data) != 4 or names.kind != 1:
         raise ValueError("a struct has no field names")

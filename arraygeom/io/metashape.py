@@ -78,8 +78,7 @@ def read(source: RigSource) -> Rig:
 
 
 def _name(camera: ET.Element, labels: Counter[str | None]) -> str:
-    """Return an image's label; of several with one label with its folder, where that is stated, else its
-    number."""
+    """Return an image's label; of several with one label its file, where that is stated, else its number."""
     label, photo = camera.get("label"), camera.find(".//photo")
     if label is None or labels[label] == 1:
         return label or f"camera{camera.get('id')}"

@@ -361,11 +361,7 @@ def _camera_entry(camera: View) -> dict[str, Any]:
 
 
 def _model_entry(lens: LensModel) -> dict[str, Any]:
-    """Return a lens or a camera model with its numbers.
-
-    Raises:
-        ValueError: for one without a name, or with values that no file holds.
-    """
+    """Return a lens or a camera model with its numbers; ValueError for one that no file can hold."""
     if isinstance(lens, Distortion):
         return {"model": lens.model, "coefficients": lens.coefficients.tolist()}
     if not isinstance(lens, CameraModel) or not lens.registered:

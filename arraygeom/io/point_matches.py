@@ -72,11 +72,7 @@ def read_matches(path: str | Path, files: Mapping[str, str | Path], sizes: Mappi
 
 
 def _csv(path: Path, files: Mapping[str, Path]) -> PointPairs:
-    """Read the points of two images, x0,y0,x1,y1 a line.
-
-    Raises:
-        ValueError: for a line that is not of numbers, by its text.
-    """
+    """Read the points of two images, x0,y0,x1,y1 a line; ValueError for another line, by its text."""
     if len(files) != 2:
         raise ValueError(
             f"{path}: x0 y0 x1 y1 relate two images, and {len(files)} are given: give two, or a database"
@@ -104,8 +100,7 @@ def _words(line: str) -> list[str]:
 
 
 def _named_columns(line: str) -> Sequence[int] | None:
-    """Return the columns of x0, y0, x1, y1 by a header; the first four if it has none such; None for a line
-    of numbers."""
+    """Return the columns of x0, y0, x1, y1 by a header, else the first four; None for a line of numbers."""
     words = [word.strip("\"'").lower() for word in _words(line)]
     if any(map(_is_number, words)):
         return None
@@ -153,11 +148,7 @@ def _colmap(database: sqlite3.Connection, path: Path, files: Mapping[str, Path])
 
 
 def _image(path: Path, file: Path, images: Sequence[tuple[Path, int]]) -> int:
-    """Return the number of the image named like a file; by its folder too, where several have one name.
-
-    Raises:
-        ValueError: for no or several such images.
-    """
+    """Return the number of the image named like a file, of several by its folder; ValueError unless one."""
     alike = [(name, number) for name, number in images if name.name == file.name]
     end = file.absolute().parts
     below = [(len(name.parts), number) for name, number in alike if end[-len(name.parts) :] == name.parts]

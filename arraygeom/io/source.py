@@ -390,21 +390,13 @@ class Entry:
         return Entry(self.source, value, f"{self.name}.{name}" if self.name else name)
 
     def mapping(self) -> Entry:
-        """Return this entry.
-
-        Raises:
-            RigFileError: unless it is a mapping that is not empty.
-        """
+        """Return this entry; RigFileError unless it is a mapping that is not empty."""
         if not self._named():
             raise self.fail(NO_MAPPING)
         return self
 
     def _named(self) -> Mapping[Any, Any]:
-        """Return the value.
-
-        Raises:
-            RigFileError: unless it is a mapping.
-        """
+        """Return the value; RigFileError unless it is a mapping."""
         if not isinstance(self.value, Mapping):
             raise self.fail(NO_MAPPING)
         return self.value
@@ -413,11 +405,7 @@ class Entry:
         return key in self._named()
 
     def __getitem__(self, keys: str | tuple[str, ...]) -> Entry:
-        """Return the entry under the first of the keys that is there and not None.
-
-        Raises:
-            RigFileError: if there is none.
-        """
+        """Return the entry under the first of the keys that is there and not None; RigFileError for none."""
         keys = (keys,) if isinstance(keys, str) else keys
         for key in keys:
             self.use(key)
@@ -426,11 +414,7 @@ class Entry:
         raise self.fail(f"has no {' or '.join(keys)}")
 
     def get(self, key: str, default: Any = None) -> Entry:
-        """Return the entry under a key, or the default.
-
-        Raises:
-            RigFileError: unless this is a mapping.
-        """
+        """Return the entry under a key, or the default; RigFileError unless this is a mapping."""
         self.use(key)
         return self.at(self._named().get(key, default), key)
 
@@ -442,11 +426,7 @@ class Entry:
             self.source.lookups.setdefault(id(mapping), (entry, set()))[1].update(map(str, keys))
 
     def items(self) -> list[tuple[str, Entry]]:
-        """Return all names and entries of a mapping.
-
-        Raises:
-            RigFileError: unless this is a mapping.
-        """
+        """Return all names and entries of a mapping; RigFileError unless this is one."""
         self.use()
         return [(str(key), self.at(value, str(key))) for key, value in self._named().items()]
 
@@ -628,21 +608,13 @@ class Entry:
         return isinstance(self.value, Mapping) and "data" not in self.value
 
     def each(self) -> list[Entry]:
-        """Return the parts of a list.
-
-        Raises:
-            RigFileError: unless this is a list that is not empty.
-        """
+        """Return the parts of a list; RigFileError unless this is one that is not empty."""
         if not isinstance(self.value, list) or not self.value:
             raise self.fail("is no list, or an empty one; is the file whole?")
         return [Entry(self.source, value, f"{self.name}[{i}]") for i, value in enumerate(self.value)]
 
     def listed(self, *keys: str) -> Entry:
-        """Return the values of a mapping under these keys, as one list.
-
-        Raises:
-            RigFileError: if one is missing.
-        """
+        """Return the values of a mapping under these keys, as one list; RigFileError if one is missing."""
         return self.joined([self[key] for key in keys])
 
     def joined(self, entries: Sequence[Entry]) -> Entry:
@@ -693,19 +665,11 @@ class Entry:
         return tensor.reshape(shape or (-1,))
 
     def number(self) -> float:
-        """Return one finite number.
-
-        Raises:
-            RigFileError: for anything else.
-        """
+        """Return one finite number; RigFileError for anything else."""
         return float(self.numbers((1,)))
 
     def transposed(self, side: int) -> Entry:
-        """Return a square matrix column by column.
-
-        Raises:
-            RigFileError: for another number of numbers.
-        """
+        """Return a square matrix column by column; RigFileError for another number of numbers."""
         return Entry(self.source, self.numbers((side, side)).T, self.name)
 
     def size(self) -> HW:
@@ -947,8 +911,7 @@ def pose_of(R: Entry, t: Entry, metres: float = 1.0) -> Pose:
 
 
 def float64_of(value: Any) -> Tensor | None:
-    """Return numbers, nested in lists or not, as a float64 tensor; None for anything else, such as true or
-    text."""
+    """Return numbers, nested in lists or not, as a float64 tensor; None for others, such as true or text."""
     if _has_truth(value):
         return None
     try:

@@ -270,8 +270,7 @@ def _brown_inverse(c: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _reach(lens: Brown, limit: Tensor) -> Tensor:
-    """Largest distorted radius of any point within the range: radial, tangential and prism terms at the
-    limit."""
+    """Largest distorted radius of any point within the range: all terms at the limit."""
     radial = limit.sqrt() * _radial_factor(lens, limit)[0].abs()
     constant, squared = _prism_sizes(lens)
     tangential, prism = 3 * torch.hypot(*lens.p), constant + limit * squared
@@ -291,8 +290,7 @@ FEW = 8
 
 
 def _attempts(lens: Brown, limit: Tensor, start: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    """Solve with two further attempts from further in: near the turn the slope is nearly 0 and
-    leads nowhere."""
+    """Solve with two further attempts from further in: near the turn a slope of nearly 0 leads nowhere."""
     solved, valid = start, torch.zeros_like(target[..., 0], dtype=torch.bool)
     for begin in (start, _pulled_in(start, 0.9 * limit), _pulled_in(target, 0.5 * limit)):
         begun = torch.where(valid[..., None], solved, begin)

@@ -119,8 +119,7 @@ def _sound(kind: _Model, c: Tensor) -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def _border(kind: _Model, c: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Squared radius at the end of the model's range, and its angle's sine and cosine: float64, CPU (*b,
-    1..)."""
+    """Squared radius at the end of the range, and its angle's sine and cosine (*b, 1..): float64, CPU."""
     c = c.detach().to("cpu", torch.float64)
     limit = kind.limit(c).clamp(max=WIDEST**2) * (1 - MARGIN)
     ray = unit(kind.unproject(c, torch.stack([limit.sqrt(), torch.zeros_like(limit)], -1)))

@@ -99,11 +99,7 @@ def unit(ray: Tensor) -> Tensor:
 
 
 def on_plane(X: Tensor) -> tuple[Tensor, Tensor]:
-    """Intersect rays (*n, 3) with the plane z = 1.
-
-    Returns:
-        Points (*n, 2), and True for rays ahead (z > 0).
-    """
+    """Intersect rays (*n, 3) with the plane z = 1: points (*n, 2), and True for rays ahead (z > 0)."""
     ahead = X[..., 2] > 0
     return X[..., :2] / torch.where(ahead, X[..., 2], 1.0)[..., None], ahead
 

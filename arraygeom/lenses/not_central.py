@@ -300,8 +300,7 @@ class FlatPort(BehindModel, name="flat-port"):
         return beside_points(self.distance, points), beside_points(self.thickness, points)
 
     def _step(self, share: Tensor, squared: Tensor, depths: tuple[Tensor, Tensor]) -> Tensor:
-        """Newton step of the tangent in air over the radius, for the ray that reaches the
-        (squared) radius."""
+        """Newton step of the tangent in air over the radius, for the ray that reaches a squared radius."""
         across = squared * share.square()
         reached = slope = self._layers(share[..., None])[0]
         for depth, number in zip(depths, (self.glass, self.water)):

@@ -125,16 +125,12 @@ class Splined(CameraModel, name="splined"):
         return solve_in_plane(self._displaced, start, xy, within, rounding=SOLVED / 8, steps=steps)
 
     def _off(self, u: Tensor, xy: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
-        """True for stereographic points that do not solve for the image plane's, with their projections and
-        the Jacobian."""
+        """True for stereographic points that do not solve for `xy`, their projections, and the Jacobian."""
         reached, jacobian = self._displaced(u)
         return norm(reached - xy) >= SOLVED * torch.finfo(xy.dtype).eps * (1 + norm(xy)), reached, jacobian
 
     def _within(self, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Clamp stereographic points to the border of knots and base.
-
-        Returns them, and True for points inside.
-        """
+        """Clamp stereographic points to the border of knots and base; also True for points inside."""
         spacing = beside_points(self.spacing, u, 1).detach()
         ny, nx = self.knots.shape[-3:-1]
         margin = 0.5 * (self.order - 1) + NEARLY

@@ -50,11 +50,7 @@ def whole(lengths: Sequence[int]) -> Tile:
 
 
 def spans(length: int, step: int) -> list[tuple[int, int]]:
-    """Split a length into parts of `step`; the last part may be shorter.
-
-    Returns:
-        (first index, index after the last) of each part; one empty part for length 0.
-    """
+    """Split a length into (first, last + 1) of parts of `step`, the last perhaps shorter; one empty for 0."""
     return [(first, min(first + step, length)) for first in range(0, max(length, 1), step)]
 
 

@@ -239,11 +239,7 @@ def _is_undamaged(content: bytes, chunk: tuple[bytes, int, int]) -> bool:
 
 
 def _tiff_colours(content: bytes) -> Any:
-    """Read the values of a TIFF file's first image, which has several bands, by tifffile.
-
-    Returns:
-        Array (h, w, c) of the file's type; None for a damaged file, and a compression that needs imagecodecs.
-    """
+    """Values (h, w, c) of a TIFF file's first image by tifffile; None if damaged, or compressed otherwise."""
     try:
         with _quiet_tiff(content) as file:
             page = file.pages.first
@@ -331,13 +327,9 @@ def _is_sound(content: bytes) -> bool:
 
 
 def _jpeg_colours(content: bytes) -> Any:
-    """Decode the bytes of a JPEG file by libjpeg-turbo, to the same values as OpenCV.
+    """Decode a JPEG to uint8 (h, w, 1 or 3), red first, with OpenCV's values; None for other colours (CMYK).
 
-    Returns:
-        Array (h, w, 1 or 3), uint8, red first; None for other colours than RGB and grey, such as CMYK.
-
-    Raises:
-        Exception: where libjpeg warns; OpenCV would print the warning, and return the pixels that it has.
+    Raises Exception where libjpeg warns; OpenCV would print the warning, and return the pixels that it has.
     """
     from kornia_rs import io
     from PIL.JpegImagePlugin import JpegImageFile

@@ -84,8 +84,7 @@ def _without_repeated_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def text_problem(error: Exception) -> tuple[int | None, str]:
-    """Return the line of an error of YAML, JSON or TOML (from 1; None if unknown) and its problem, for
-    messages."""
+    """Return the line (from 1; None if unknown) and the problem of an error of YAML, JSON or TOML."""
     mark = getattr(error, "problem_mark", None)
     line = mark.line + 1 if mark else getattr(error, "lineno", None)
     return line, getattr(error, "problem", None) or getattr(error, "msg", None) or str(error) or "not text"
@@ -152,8 +151,7 @@ class _SafeLoader(_Base):  # type: ignore[misc]
 
 
 class SafeDumper(yaml.SafeDumper):
-    """YAML dumper whose text `load_yaml` reads back the same: a text such as 1e3, which is a number there, is
-    quoted."""
+    """YAML dumper whose text `load_yaml` reads back the same: it quotes texts that are numbers there (1e3)."""
 
 
 for _kind in (

@@ -59,8 +59,7 @@ def depth_text(depth: tuple[Tensor, Tensor] | None, unit: str = "m") -> str:
 
 
 def angle(R: Tensor) -> Tensor:
-    """Compute the angle (*b) of rotations (*b, 3, 3) in radians, without gradient; exact for small angles
-    too."""
+    """Compute the angle (*b) of rotations (*b, 3, 3), radians, without gradient; exact for small ones too."""
     R = R.detach()
     skew = torch.stack(
         [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], -1
