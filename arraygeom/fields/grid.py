@@ -176,8 +176,8 @@ class FieldOnGrid:
         """Return the field of a window of alpha, for a beta cut at `shift`.
 
         Args:
-            box: window of alpha: top, bottom, left, right (the last two numbers of each axis exclusive); all
-                even, which is not checked.
+            box: window of alpha: top, bottom, left, right, with bottom and right exclusive; all even, which
+                is not checked.
             shift: pixel (x, y) of beta that becomes (0, 0).
 
         Returns:

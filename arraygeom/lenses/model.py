@@ -21,8 +21,8 @@ CAMERA_MODELS: dict[str, type[CameraModel]] = {}
 
 
 class LensModel(Batched):
-    """Base class of the lens of a camera (`Camera.distortion`): a `Distortion` or a `CameraModel`, of which
-    models of your own are subclasses.
+    """Base class of the lens of a camera (`Camera.distortion`): a `Distortion` or a `CameraModel`, from which
+    models of your own derive.
 
     Attributes:
         central: True if all rays start in the camera's origin.

@@ -41,19 +41,19 @@ class Orthographic(CameraModel, name="orthographic"):
         return False
 
     def project(self, X: Tensor) -> tuple[Tensor, Tensor]:
-        """Project points along the axis.
+        """Project points (*n, 3), metres, along the axis.
 
         Returns:
-            (x, y) in metres, and True for z > 0.
+            (x, y) in metres (*n, 2), and True (*n) for z > 0; NaN and infinity are not valid.
         """
         X, finite = finite_points(X)
         return X[..., :2], finite & (X[..., 2] > 0)
 
     def unproject(self, xy: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the axis for each point.
+        """Return the axis for each point (*n, 2) of the image plane.
 
         Returns:
-            Directions (0, 0, 1), and True for finite points.
+            Directions (0, 0, 1) (*n, 3) of rays that start at `origins`, and True (*n) for finite points.
         """
         xy, finite = finite_points(xy)
         return torch.zeros_like(to_homogeneous(xy)) + xy.new_tensor([0.0, 0.0, 1.0]), finite
@@ -158,10 +158,10 @@ class RollingShutter(BehindModel, name="rolling-shutter"):
         return row, slope
 
     def unproject(self, xy: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute unit directions in the frame of time 0.
+        """Compute the unit directions of points of the image plane (*n, 2), in the frame of time 0.
 
         Returns:
-            Directions, and validity.
+            Directions (*n, 3) of rays that start at `origins`, and True (*n) where the lens has one.
         """
         ray, valid = self._ray(xy)
         return _rotated(ray, self.rotation, self._time(ray, xy[..., 1])), valid

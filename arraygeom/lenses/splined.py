@@ -31,8 +31,8 @@ class Splined(CameraModel, name="splined"):
     """Camera model of a simple projection plus a displacement, given by a surface of B-splines.
 
     The surface is over the stereographic projection of directions, points u of length 2 tan(theta / 2).
-    Directions are not valid from half a spacing (quadratic; cubic: a whole one) inside the outermost knots
-    outwards, nor past a fold.
+    Valid are directions at least half a spacing (cubic: a whole one) within the outermost knots, and before
+    any fold.
 
     Attributes:
         knots: displacements (*b, ny, nx, 2) along x and y of the image plane, the middle knot at u = 0.

@@ -137,7 +137,7 @@ def sides_by_work(hw: Sequence[int], halo: int, multiple: int, most: float) -> l
 
     Args:
         hw: height and width of the frame.
-        halo: pixels around each tile, as far as the frame goes; they count in both numbers.
+        halo: pixels around each tile, as far as the frame goes, which count in the work and in `most`.
         multiple: number that sides are multiples of, unless they are 64, the least.
         most: largest number of pixels of a tile.
 

@@ -151,7 +151,7 @@ class _SafeLoader(_Base):  # type: ignore[misc]
 
 
 class SafeDumper(yaml.SafeDumper):
-    """YAML dumper whose text `load_yaml` reads back the same: it quotes texts that are numbers there (1e3)."""
+    """YAML dumper whose text `load_yaml` reads back the same: texts such as 1e3, numbers there, are quoted."""
 
 
 for _kind in (
