@@ -37,7 +37,7 @@ def recognises(path: Path, head: str) -> bool:
 def read(source: RigSource) -> Rig:
     """Read the pair "left" (the world) and "right" in metres, or one camera "camera" at the origin.
 
-    A size that is not stated is guessed, with a warning.
+    A size that is not stated is the requested one, else guessed, with a warning.
 
     Raises:
         RigFileError: for a damaged file, or missing variables.

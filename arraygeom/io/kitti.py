@@ -64,7 +64,7 @@ class Raw:
     def read(source: RigSource) -> Rig:
         """Read the unrectified cameras cam0, cam1 ... from S, K, D, R and T, in metres from camera 0.
 
-        A size that is not stated is guessed, with a warning.
+        A size that is not stated is the requested one, else guessed, with a warning.
 
         Raises:
             RigFileError: for a damaged file, or one without such a camera.

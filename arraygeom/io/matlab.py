@@ -64,7 +64,7 @@ def recognises(path: Path, head: str) -> bool:
 def read(source: RigSource) -> Rig:
     """Read the pair "camera1" and "camera2" in metres from the first, or a single "camera1" at the origin.
 
-    A size that is not stated is guessed, with a warning.
+    A size that is not stated is the requested one, else guessed, with a warning.
 
     Raises:
         RigFileError: for a damaged file, a MATLAB object in place of a struct, unknown units, or a

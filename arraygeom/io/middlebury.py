@@ -27,7 +27,8 @@ def read(source: RigSource) -> Rig:
 
     Returns:
         The rig, with the depth range of the stated disparities, to infinity if they reach 0; without one if
-        they are not stated or give no depth. A size that is not stated is guessed, with a warning.
+        they are not stated or give no depth. A size that is not stated is the requested one, else guessed,
+        with a warning.
 
     Raises:
         RigFileError: for a damaged file, a baseline that is not positive, or a contradictory `doffs`.

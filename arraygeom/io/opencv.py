@@ -41,8 +41,8 @@ def recognises(path: Path, head: str) -> bool:
 def read(source: RigSource) -> Rig:
     """Read one camera "camera", a stereo pair "left" (the world) and "right", or cameras named in the file.
 
-    One camera without a stated pose is at the origin. An image size that is not stated is guessed, with a
-    warning. Lengths are taken as metres.
+    One camera without a stated pose is at the origin. A size that is not stated is the requested one, else
+    guessed, with a warning. Lengths are taken as metres.
 
     Raises:
         RigFileError: for a damaged file, half a pair, or cameras without a common frame.

@@ -95,7 +95,7 @@ def decoded(content: bytes, errors: str = "replace") -> str:
 
 
 class RigFileError(ValueError):
-    """Error of a rig file that cannot be read: its text is one line of the file, its entry, and what to do.
+    """Error of a rig file that cannot be read; its text names file, entry and what to do, in one line.
 
     Attributes:
         path: the file, a Path.

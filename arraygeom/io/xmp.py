@@ -180,10 +180,10 @@ def rig_of_images(files: Mapping[str, Path]) -> Rig:
         The rig, of the images as their orientation tags rotate them; lengths in metres.
 
     Raises:
-        RigFileError: for images without tags, tags that lack the intrinsics, several captures or bodies,
-            mirrored or cropped images, and numbers that no camera has.
+        RigFileError: for images without tags, tags that lack the intrinsics, several captures or bodies, and
+            mirrored or cropped images.
         OSError: for a file that cannot be opened.
-        ValueError: for no images.
+        ValueError: for no images, and numbers that no camera or sensor has.
         ImportError: without Pillow.
     """
     if not files:
@@ -373,6 +373,10 @@ class _Image(NamedTuple):
             Its response: "rgb", a Band, or None if unstated. Of raw bands (no colour, no JPEG) also linear
             coding, 16 bits, black level, exposure (None if unstated), and gain (ISO / 100, or SensorGain).
             Other tags that are missing give warnings.
+
+        Raises:
+            RigFileError: for tags that are no numbers.
+            ValueError: also as `Sensor` and `Band` raise it.
         """
         fields = self.tags.fields
         colour = len((self.text("BandName") or "").split(",")) == 3

@@ -46,8 +46,8 @@ def read(source: RigSource) -> Rig:
     A file without a right camera gives `left` alone.
 
     Raises:
-        RigFileError: for a damaged file, no left camera, no size that is known and of both cameras, none of
-            the requested size, or missing numbers.
+        RigFileError: for a damaged file, no left camera, no known size that both cameras have, none of the
+            requested size, or missing numbers.
     """
     parser = configparser.ConfigParser(interpolation=None, inline_comment_prefixes=("#", ";"))
     try:

@@ -151,7 +151,7 @@ class _SafeLoader(_Base):  # type: ignore[misc]
 
 
 class SafeDumper(yaml.SafeDumper):
-    """YAML dumper whose text `load_yaml` reads back the same: texts such as 1e3, numbers there, are quoted."""
+    """YAML dumper that quotes texts such as 1e3, which `load_yaml` would read as numbers."""
 
 
 for _kind in (
