@@ -102,8 +102,8 @@ minute."""
 
 @dataclass(frozen=True)
 class ThroughLenses:
-    """A field of pinhole pairs, used through lenses: for pairs known by F, and fields other than `Epipolar`,
-    which `Curved` replaces.
+    """Field that applies a field of pinhole pairs through lenses: for pairs known by F, and fields other than
+    `Epipolar`, which `Curved` replaces.
 
     The field is evaluated for the pair without its lenses (`pinhole_view`) and the result is distorted by
     beta's lens. Rays of cameras that are not central are taken to meet in a point.

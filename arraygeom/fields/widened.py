@@ -27,8 +27,8 @@ from .straight import Epipolar, EpipolarLine, HomographyDisplacement
 
 @dataclass(frozen=True, eq=False)
 class Moved:
-    """Field of another field for cameras that are not synchronised, evaluated where alpha's pixels are when
-    beta records.
+    """Field that evaluates another one where alpha's pixels are when beta records, for cameras that are not
+    synchronised.
 
     The displacement is interpolated bilinearly (with gradient), and extended by the nearest pixel outside
     alpha's image. `Widened` allows for its error.
@@ -85,7 +85,7 @@ class Moved:
 
 @dataclass(frozen=True)
 class Widened:
-    """Field of another field with `across` pixels to either side of it and `along` more at either end.
+    """Field that widens another one by `across` pixels to either side and `along` at either end.
 
     Uncertain calibration moves lines sideways: `across` alone. Motion between cameras that are not
     synchronised moves points anywhere: `across` and `along`. Segments that are only longer stay segments.

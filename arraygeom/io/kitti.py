@@ -56,7 +56,7 @@ def _rectified(entries: Entry, name: str) -> Camera:
 
 
 class Raw:
-    """Reader of the cameras before rectification, in `calib_cam_to_cam.txt`, in place of a module."""
+    """Reader of the cameras before rectification, in `calib_cam_to_cam.txt`; in `READERS` as a module is."""
 
     HEAD = r"(?m)^K_0\d:"
 

@@ -152,8 +152,8 @@ def stored_values(content: bytes, header: ImageHeader) -> Any:
         header: their `image_header`; a TIFF file has 1, 3 or 4 bands (not checked).
 
     Returns:
-        Values (h, w), or (h, w, channels) with blue first and alpha last, type as stored; None for a damaged
-        file, and one that OpenCV cannot decode.
+        Values (h, w), or (h, w, channels) with blue first and alpha last, type as stored; zeros for a text
+        bitmap (P1); None for a damaged file, and one that OpenCV cannot decode.
     """
     page, original = header.page, content
     if page is not None and header.orientation != 1:
