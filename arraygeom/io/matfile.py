@@ -77,7 +77,7 @@ def readable_variables(content: bytes) -> list[str]:
     names = []
     for element in _elements(memoryview(content)[128:], order):
         if element.kind == COMPRESSED:
-            element = next(_elements(_unpacked(element.data), order))
+            element = next(_elements(_unpacked(element.data), order), element)
         if element.kind != MATRIX:
             raise ValueError("a variable is no matrix")
         name = _check_matrix(element.data, order, 0)

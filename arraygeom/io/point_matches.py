@@ -48,8 +48,8 @@ def read_matches(path: str | Path, files: Mapping[str, str | Path], sizes: Mappi
     Raises:
         FileNotFoundError: for a missing file.
         ValueError: for files of another kind, more or fewer than two images with a CSV file, a database
-            without one of these images or without matches between them, and points outside the images (NaN in
-            a database is not refused).
+            without one of these images or without matches between them, and points that are outside the
+            images or not finite.
         KeyError: for a camera with matches that has no size.
     """
     path = Path(path)
@@ -62,7 +62,7 @@ def read_matches(path: str | Path, files: Mapping[str, str | Path], sizes: Mappi
     for names, points in matches.items():
         for name, x in zip(names, points):
             h, w = sizes[name]
-            outside = ((x < -0.5) | (x > x.new_tensor([w, h]) - 0.5)).any(-1)
+            outside = ~((x >= -0.5) & (x <= x.new_tensor([w, h]) - 0.5)).all(-1)
             if outside.any():
                 raise ValueError(
                     f"{path}: {int(outside.sum())} of {len(x)} points are outside the image of '{name}', "

@@ -277,7 +277,7 @@ class RigSource:
     def _parsed(self, kind: str, load: Callable[[str], Any], text: str) -> Entry:
         try:
             document = load(text)
-        except (ValueError, yaml.YAMLError) as error:
+        except (ValueError, RecursionError, yaml.YAMLError) as error:
             line, problem = text_problem(error)
             raise self.fail(
                 f"line {line}" if line else None, f"is not {kind} ({problem}); is the file whole?"

@@ -37,8 +37,8 @@ class OpenGLCamera(NamedTuple):
     """Matrices of OpenGL: x right, y up, z backward; multiplied from the left.
 
     Attributes:
-        view: camera from world, lengths as the camera's.
-        projection: clip coordinates from camera, y up: the image's first row is at the top.
+        view: camera from world, lengths as the camera's, with the batch axes of the pose.
+        projection: clip coordinates from camera, y up (the image's first row is at the top), with those of K.
     """
 
     view: Float[Tensor, "*b 4 4"]
@@ -49,7 +49,7 @@ class PyTorch3DCamera(NamedTuple):
     """Arguments of `pytorch3d.renderer.PerspectiveCameras` with `in_ndc=False`: x left, y up, rows times R.
 
     Attributes:
-        R: rotation, X_camera = X_world R + T.
+        R: rotation, X_camera = X_world R + T, with the batch axes of the pose; the others have those of K.
         T: translation, lengths as the camera's.
         focal_length: (fx, fy), pixels.
         principal_point: (cx, cy), with the first pixel's centre at (0.5, 0.5).

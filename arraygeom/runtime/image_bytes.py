@@ -152,8 +152,8 @@ def stored_values(content: bytes, header: ImageHeader) -> Any:
         header: their `image_header`; a TIFF file has 1, 3 or 4 bands (not checked).
 
     Returns:
-        Values (h, w), or (h, w, channels) with blue first and alpha last, type as stored; zeros for a text
-        bitmap (P1); None for a damaged file, and one that OpenCV cannot decode.
+        Values (h, w), or (h, w, channels) with blue first and alpha last, type as stored, 0 and 255 for
+        bitmaps; None for a damaged file, and one that OpenCV cannot decode.
     """
     page, original = header.page, content
     if page is not None and header.orientation != 1:
@@ -170,7 +170,7 @@ def stored_values(content: bytes, header: ImageHeader) -> Any:
             values = 65535 - values
         if header.white and values is not None and values.dtype == np.uint16:
             values = values >> (16 - header.bits)
-    if content[:2] in PNM_OF_TEXT and values is not None and values.dtype == np.uint8:
+    if content[:2] in PNM_OF_TEXT and header.white and values is not None and values.dtype == np.uint8:
         values = ((values.astype(np.uint16) * header.white + 254) // 255).astype(np.uint8)
     return values
 
