@@ -640,7 +640,7 @@ def along_pieces(
         nodes: number at each of the k nodes, such as its fraction of a curve.
 
     Returns:
-        Numbers (*n, l); those of an invisible polyline mean nothing.
+        Numbers (*n, l), without meaning for an invisible polyline.
     """
     first, last, length = pieces
     ends = length.cumsum(-1)

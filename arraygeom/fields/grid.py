@@ -31,8 +31,8 @@ class FieldOnGrid:
     """Receptive field of a pair, evaluated on every pixel of alpha.
 
     Segments are float64: the rounding of float32 is enough to change which of two equally good matches is
-    taken. Those of a large grid are stored as float32 nevertheless, without blocks, and converted to float64
-    when they are cut: the rounding is the same whatever the parts.
+    taken. A large grid's are stored as float32 nevertheless, without blocks, and converted to float64 when
+    they are cut: the rounding is the same whatever the parts.
 
     Attributes:
         at: function from any pixels of alpha (n, 2) to segments or positions, (n) or for a batch of rigs
@@ -61,8 +61,8 @@ class FieldOnGrid:
 
         Returns:
             The field; segments that are NaN or infinite are not valid, and all are clipped to beta's image if
-            one is longer than its diagonal. Explicit positions are not evaluated: those of a whole frame may
-            not fit into memory.
+            one is longer than its diagonal. Explicit positions are not evaluated: a whole frame's may not fit
+            into memory.
 
         Raises:
             ValueError: for an invalid result of the field, or whatever the field raises for this pair.
@@ -99,7 +99,7 @@ class FieldOnGrid:
 
         Returns:
             Segments (B or 1, H / side, W / side) in beta's pixels, rounded down where `side` is no divisor;
-            for side 2 those of `blocks` themselves, if there are any.
+            for side 2 `blocks` itself, if there is one.
 
         Raises:
             ValueError: for a field of explicit positions.

@@ -34,8 +34,8 @@ class ReceptiveField(Protocol):
         """Compute sampling locations in beta of alpha's pixels x.
 
         Returns:
-            Segments (*n) or positions (*n, L) in beta's pixels; all but whole pixels and those of sizes are
-            differentiable in the pair's numbers.
+            Segments (*n) or positions (*n, L) in beta's pixels, differentiable in the pair's numbers unless
+            they are whole pixels or made from sizes.
         """
         ...
 

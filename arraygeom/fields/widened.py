@@ -236,7 +236,7 @@ GRID = 12, 16
 
 
 class Margins(NamedTuple):
-    """Half-widths of each pixel's own, interpolated between those of a grid over alpha's image.
+    """Half-widths for each pixel, interpolated between the nodes of a grid over alpha's image.
 
     Attributes:
         alpha: the camera to whose pixels the grid belongs.

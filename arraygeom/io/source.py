@@ -375,7 +375,7 @@ class Entry:
     Attributes:
         source: the file.
         value: the value as parsed; None for an entry that is missing.
-        name: name in the file, with those of the mappings around it.
+        name: name in the file, after the names of the mappings around it; empty for the whole document.
     """
 
     def __init__(self, source: RigSource, value: Any, name: str) -> None:

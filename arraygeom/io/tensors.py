@@ -38,7 +38,7 @@ class OpenGLCamera(NamedTuple):
 
     Attributes:
         view: camera from world, lengths as the camera's, with the batch axes of the pose.
-        projection: clip coordinates from camera, y up (the image's first row is at the top), with those of K.
+        projection: clip coordinates from camera, y up (the image's first row is at the top), with K's axes.
     """
 
     view: Float[Tensor, "*b 4 4"]
@@ -49,7 +49,7 @@ class PyTorch3DCamera(NamedTuple):
     """Arguments of `pytorch3d.renderer.PerspectiveCameras` with `in_ndc=False`: x left, y up, rows times R.
 
     Attributes:
-        R: rotation, X_camera = X_world R + T, with the batch axes of the pose; the others have those of K.
+        R: rotation, X_camera = X_world R + T, with the batch axes of the pose, and the rest with K's.
         T: translation, lengths as the camera's.
         focal_length: (fx, fy), pixels.
         principal_point: (cx, cy), with the first pixel's centre at (0.5, 0.5).

@@ -110,7 +110,7 @@ def by_capture(paths: Sequence[Path]) -> dict[str, list[Path]]:
     Captures with other bands than the largest are left out, with a RigFileWarning.
 
     Args:
-        paths: files of one band each, in any order; those of a capture differ after the last "_" of the name.
+        paths: files of one band each, in any order; names in a capture differ after the last "_".
 
     Returns:
         Files of whole captures by band, in the captures' order; empty for a single whole capture, a single

@@ -32,7 +32,7 @@ def compiled(function=None, **options):
         The compiled function; without `function` a decorator.
 
     Raises:
-        ImportError: without numba; numba's own errors pass, those of the code at its first call.
+        ImportError: without numba. numba's own errors pass, at the first call where the code causes them.
     """
     from numba import njit
 

@@ -39,10 +39,10 @@ def write_together(
 ) -> Iterator[Path]:
     """Context manager that yields a temporary folder inside `folder` for files that belong together.
 
-    If the block succeeds they replace the group's former files, those of other names too unless changed
-    since: the former last file goes first and the new one comes last, so where it is, the others are of the
-    same run. After an error (such as a full disk) all former files are as they were; after a kill they are so
-    again once `recover` has run, which the next call does. Missing folders are made.
+    If the block succeeds they replace the group's former files, even of other names unless changed since: the
+    former last file goes first and the new one comes last, so where it is, the others are of the same run.
+    After an error (such as a full disk) all former files are as they were; after a kill they are so again
+    once `recover` has run, which the next call does. Missing folders are made.
 
     Args:
         folder: folder that the files are moved to; the block makes files only, no folders.
