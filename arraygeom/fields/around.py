@@ -24,18 +24,20 @@ from .straight import pinhole_track, require_pinholes
 
 @dataclass(frozen=True, eq=False)
 class AroundDepth:
-    """Segments from depth / (1 + tolerance) to depth * (1 + tolerance) of a known depth map.
+    """Field of the segments from depth / (1 + tolerance) to depth * (1 + tolerance) of a known depth map.
 
-    Needs a calibrated pair without lenses. Where the depth is not positive and finite, the segment is that
-    between the pair's depth bounds, which are needed only if there is such a pixel.
+    Needs a calibrated pair without lenses. Where the depth is known the pair's own depth bounds do not count;
+    where it is not positive and finite, the segment is that between them, and they are needed.
 
     Attributes:
         depth: map (H, W) of depth z in the rig's unit (metres), at the pixels of `view`.
         tolerance: relative tolerance of the depth, at least 0.
-        view: alpha as it was recorded; None for the pair's alpha.
+        view: alpha as it was recorded, before it was undistorted, resized or cropped to the pair's alpha;
+            None for the pair's alpha itself.
 
     Raises:
-        ValueError: for a negative or infinite tolerance, or a depth map of another size than `view`.
+        ValueError: for a tolerance that is negative, infinite or NaN, or a depth map of another size than
+            `view`.
         TypeError: for a tolerance that is no number.
     """
 
@@ -50,8 +52,10 @@ class AroundDepth:
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Segments:
         """Compute the segments of alpha's pixels from near to far, inside beta's image and in front of it.
 
+        The depth is that of the map's pixel nearest to each of x, not interpolated.
+
         Returns:
-            Segments in beta's pixels; no gradients reach the depth map.
+            Segments in beta's pixels, differentiable in the pair's numbers but not in the depth map.
 
         Raises:
             ValueError: for a pair that is not calibrated or has lenses, a depth map of another size, or a
@@ -80,20 +84,21 @@ seldom better."""
 
 @dataclass(frozen=True, eq=False)
 class AroundMatches:
-    """Parts of another field's segments within `tolerance` pixels of known matches.
+    """Field of the parts of another field's segments within `tolerance` pixels of known matches.
 
     Where no match is known, or it is off its segment by more than `tolerance` and a pixel, the segment is the
     whole one of `field`.
 
     Attributes:
-        positions: (H, W, 2), positions (x, y) in beta of alpha's pixels; NaN where unknown.
+        positions: (H, W, 2), positions (x, y) in beta of alpha's pixels; NaN or infinite where unknown.
         tolerance: pixels of beta, at least 0.
         views: alpha and beta as they were recorded, to whose pixels `positions` refers; None for the pair's
             views.
         field: field of straight segments; None for the pair's default field without lenses.
 
     Raises:
-        ValueError: for a negative or infinite tolerance, or positions of another size than the first view.
+        ValueError: for a tolerance that is negative, infinite or NaN, or positions of another size than the
+            first view.
         TypeError: for a tolerance that is no number, or an object that is no field.
     """
 
@@ -120,10 +125,11 @@ class AroundMatches:
     ) -> AroundMatches:
         """Build the field from matched points (x, y) of an alpha of size `hw` and of beta.
 
-        Each match is taken for 3 x 3 pixels of alpha, as far as no other is nearer.
+        The displacement of each match is taken for the 3 x 3 pixels of alpha around it, as far as no other
+        match is nearer.
 
         Args:
-            alpha: points of alpha, pixels; those outside `hw` are left out.
+            alpha: points of alpha, pixels; of one by the border the pixels within `hw` count.
             beta: their matches in beta, pixels.
             hw: height and width of alpha.
             tolerance: pixels of beta, at least 0.
@@ -131,7 +137,7 @@ class AroundMatches:
             field: field of straight segments; None for the pair's default field without lenses.
 
         Returns:
-            The field, on alpha's device; elsewhere its segments are whole.
+            The field, its positions in float32 on alpha's device; elsewhere its segments are whole.
 
         Raises:
             ValueError: as the class.
@@ -155,7 +161,8 @@ class AroundMatches:
             Segments in beta's pixels; no gradients reach `positions`.
 
         Raises:
-            ValueError: for positions of another size than alpha, or a field that gives no straight segments.
+            ValueError: for positions of another size than alpha, a field that gives no straight segments, and
+                `views` of a pair whose views have no K; the field's own errors pass, such as for lenses.
         """
         x = floating(x)
         _check_size(self.positions, pair.alpha if self.views is None else self.views[0])
@@ -193,11 +200,8 @@ def _check_size(plane: Tensor, view: View | None) -> None:
 
 
 def _at_nearest(plane: Tensor, x: Float[Tensor, "*n 2"], now: View, recorded: LensView | None) -> Tensor:
-    """Look up values (H, W, ...) of the recorded pixels nearest to pixels `x` of alpha as it is now; no
-    gradients.
-
-    Values are not interpolated: between two pixels of different depth there is no depth.
-    """
+    """Look up values (H, W, ...) of the recorded pixels nearest to pixels `x` of alpha, without gradient."""
+    # Not interpolated: between two pixels of different depth there is no depth.
     with torch.no_grad():
         if recorded is not None:
             x, _ = recorded_pixels(x.double(), now, recorded)

@@ -21,7 +21,7 @@ SERIES = 1e-3
 
 @compiled(nogil=True, cache=True, error_model="numpy")
 def curved_positions(begin, end, first, last, valid, lens, even, fractions, hw, xy, mask):
-    """Write the positions `xy` and the `mask` of the samples of some of alpha's pixels, on beta's image.
+    """Write the positions `xy` and the `mask` of the samples of alpha's pixels `begin` to `end`.
 
     Args:
         begin: first pixel of alpha.
@@ -33,8 +33,8 @@ def curved_positions(begin, end, first, last, valid, lens, even, fractions, hw, 
         even: fractions of the nodes along the curve, 0..1.
         fractions: fractions of the samples along the visible part, 0..1.
         hw: height and width of beta.
-        xy: positions (n, samples, 2) to write, pixels of beta; 0 where masked.
-        mask: mask (n, samples) to write.
+        xy: positions (n, samples, 2) to write, pixels of beta, on its image; 0 where masked.
+        mask: mask (n, samples) to write, True for samples that count.
     """
     nodes, samples = len(even), len(fractions)
     s, x, y, visible = np.empty(nodes), np.empty(nodes), np.empty(nodes), np.empty(nodes, np.bool_)
@@ -63,8 +63,7 @@ def curved_positions(begin, end, first, last, valid, lens, even, fractions, hw, 
 
 @compiled(inline="always")
 def _shares(first, last, wide, u, s):
-    """Write to s the share of `last` in the points at fractions u: evenly in undistorted pixels,
-    or in angle."""
+    """Write to s the share of `last` in points at fractions u: even in undistorted pixels, or in angle."""
     if not wide:
         z0, z1 = first[2], last[2]
         for i in range(len(u)):
@@ -146,8 +145,7 @@ def _brown(c, limit, x, y, visible):
 
 @compiled(inline="always")
 def _fisheye(c, limit, x, y, z):
-    """Return the normalised distorted point of a point in the camera's frame;
-    `distortion._fisheye_project`."""
+    """Return the normalised distorted point of a point in the camera's frame (`fisheye_project`)."""
     u = x * x + y * y
     if z > 0 and u < SERIES * z * z:
         t = u / (z * z)
@@ -167,11 +165,9 @@ def _fisheye(c, limit, x, y, z):
 
 @compiled(inline="always")
 def _pieces(x, y, visible, hw, out):
-    """Write each piece's visible fractions (from, to), its visible length, and the sum of lengths up to its
-    end.
+    """Write each piece's visible fractions (from, to) and length, and the sum of lengths; return the whole.
 
-    Returns:
-        The whole visible length; `curved.visible_pieces` in its readable form.
+    `curved.visible_pieces` is its readable form.
     """
     total = 0.0
     for i in range(out.shape[1]):

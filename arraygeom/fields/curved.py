@@ -32,7 +32,7 @@ from .straight import Epipolar
 
 @dataclass(frozen=True)
 class Curved:
-    """Depth samples through lens models: positions near to far, evenly spaced in beta's pixels.
+    """Field of depth samples through lens models: positions near to far, evenly spaced in beta's pixels.
 
     Needs a calibrated pair; without lenses it is `Epipolar` sampled. The part of each ray that can be on
     beta's image is clipped in closed form, followed at nodes (even in undistorted pixels, or in angle where
@@ -47,11 +47,12 @@ class Curved:
         near: near bound in the rig's unit (metres); None for the pair's own.
         far: far bound in the rig's unit, possibly infinite; None for the pair's own.
         nodes: number of points at which a curve is followed, at least 2.
-        bounds: quantity that near and far bound: "depth" along alpha's axis or "distance" along the ray.
+        bounds: quantity that near and far (the pair's too) bound: "depth" along alpha's axis or "distance"
+            along the ray.
 
     Raises:
         ValueError: for other `bounds`, under 1 sample or 2 nodes, and depths unless 0 < near <= far.
-        TypeError: for values that are no numbers.
+        TypeError: for values that are no numbers, or no whole ones.
     """
 
     samples: int = 96
@@ -75,7 +76,9 @@ class Curved:
             rig, lenses included; masked ones are 0.
 
         Raises:
-            ValueError: for an uncalibrated pair, or one without the bounds that the field leaves open.
+            ValueError: for an uncalibrated pair, one without the bounds that the field leaves open, and a
+                near bound beyond the far one.
+            NotImplementedError: within `torch.func.vmap`, for a beta that is not central.
         """
         pair.cameras  # noqa: B018  (raises for an uncalibrated pair, before the depth range is asked for)
         near, far = Epipolar(self.near, self.far).bounds(pair)
@@ -99,14 +102,16 @@ minute."""
 
 @dataclass(frozen=True)
 class ThroughLenses:
-    """A straight field seen through lenses: for pairs known by F, or any field other than `Epipolar`.
+    """Field that applies a field of pinhole pairs through lenses: for pairs known by F, and fields other than
+    `Epipolar`, which `Curved` replaces.
 
     The field is evaluated for the pair without its lenses (`pinhole_view`) and the result is distorted by
-    beta's lens.
+    beta's lens. Rays of cameras that are not central are taken to meet in a point.
 
     Attributes:
         field: field of the pair without lenses.
-        samples: number of positions per segment, evenly spaced before distortion.
+        samples: number of positions per segment, evenly spaced before distortion; a field of explicit
+            positions keeps its own.
 
     Raises:
         ValueError: for under 1 sample.
@@ -127,8 +132,9 @@ class ThroughLenses:
             Positions (*n, samples, 2) in beta's pixels; masked ones are 0.
 
         Raises:
-            ValueError: for a batch of rigs with lenses, views without a pinhole equivalent, or an invalid
-                result of the field.
+            ValueError: for a batch of rigs with lenses, an image without a pixel within its lens's range, an
+                invalid result of the field, or whatever the field raises for the pair without lenses.
+            NotImplementedError: within `torch.func.vmap`.
         """
         alpha, beta = (_Straight.from_view(view) for view in (pair.alpha, pair.beta))
         link = None if pair.link is None else pair.link.transformed(alpha.A, beta.A)
@@ -158,14 +164,12 @@ class _Straight(NamedTuple):
         return cls(view, pinhole, product(pinhole.K, torch.linalg.inv(view.K)))
 
     def undistort(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the pinhole's pixels of pixels (*n, 2) of the view, and a mask of those that the lens model
-        covers."""
+        """Return the pinhole's pixels of pixels (*n, 2) of the view, True where the lens model has them."""
         straight, valid = self.view.to(x.dtype).undistort(x)
         return map_homogeneous(self.A[:2].to(x.device), straight), valid
 
     def distort(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the view's pixels of pixels (*n, 2) of the pinhole, and a mask of those that the lens model
-        covers."""
+        """Return the view's pixels of pixels (*n, 2) of the pinhole, True where the lens model has them."""
         return self.view.to(x.dtype).distort(map_homogeneous(torch.linalg.inv(self.A)[:2].to(x.device), x))
 
 
@@ -195,10 +199,10 @@ class RayCurve(NamedTuple):
     Attributes:
         first: end towards near, in beta's frame.
         last: end towards far, in beta's frame.
-        valid: mask of the pixels whose ray beta may see.
+        valid: mask of the pixels whose ray beta may see; the ends of others mean nothing.
         beta: the camera whose image holds the curve.
         wide: True if fractions are even in angle, as in cameras that are not central, parallel rays apart.
-        inverse: inverse depths (or distances) in alpha of both ends (*n), 1 / metres.
+        inverse: inverse depths (or distances) in alpha (*n) of `first` and of `last`, 1 / metres.
     """
 
     first: Float[Tensor, "*n 3"]
@@ -213,15 +217,17 @@ class RayCurve(NamedTuple):
         """Build the curves of alpha's pixels x (*n, 2), near to far, as far as beta's image may show them.
 
         Args:
-            near: near bound, metres.
-            far: far bound, metres, possibly infinite.
+            pair: calibrated pair.
+            near: near bound (*b), in the rig's unit (metres), above 0; not checked.
+            far: far bound (*b), possibly infinite.
             bounds: "depth" along alpha's axis, or "distance" along the ray.
 
         Returns:
-            The curves, in the precision of x; not valid where nothing is on beta's image.
+            The curves, in the precision of x; valid ones may yet be off the image where beta has a lens.
 
         Raises:
-            NotImplementedError: within `torch.func.vmap`.
+            ValueError: for a pair that is not calibrated.
+            NotImplementedError: within `torch.func.vmap`, for a beta that is not central.
         """
         pose = pair.beta_from_alpha.to(x.dtype)
         alpha, beta = (c.to(x.dtype) for c in pair.cameras)
@@ -272,7 +278,14 @@ class RayCurve(NamedTuple):
         beta: Camera,
         wide: Tensor | bool,
     ) -> RayCurve:
-        """Make the curve of a track of points in beta's frame between two inverse depths."""
+        """Make the curves of points in beta's frame between two inverse depths.
+
+        Args:
+            points: points (*n, 3) by inverse depth (or distance) in alpha, divided by that depth.
+            near_end: inverse depths (*n) of the curves' first ends, 1 / metres.
+            far_end: inverse depths (*n) of their last ends.
+            valid: mask (*n), kept as it is, and so are `beta` and `wide`.
+        """
         first, last = (points.a + v[..., None] * points.b for v in (near_end, far_end))
         return cls(first, last, valid, beta, wide, (near_end, far_end))
 
@@ -286,7 +299,8 @@ class RayCurve(NamedTuple):
 
     @property
     def compilable(self) -> bool:
-        """True if a compiled loop can follow the curve: on the CPU, of one pair, without gradients."""
+        """True if a compiled loop can follow the curves: on the CPU, of one pair, without gradients, and with
+        no lens or one of `COMPILED_LENSES` without a tilted sensor."""
         lens = self.beta.distortion
         numbers = [self.first, self.last, self.beta.K, *([] if lens is None else [lens.coefficients])]
         free = torch.is_grad_enabled() and any(t.requires_grad for t in numbers)
@@ -301,11 +315,12 @@ class RayCurve(NamedTuple):
         """Compute the positions of `Curved` by a compiled loop in float64; the curve must be `compilable`.
 
         Args:
-            nodes: number of points at which each curve is followed.
+            nodes: number of points at which each curve is followed, at least 2; not checked.
             samples: number of positions per pixel.
 
         Returns:
-            Positions (*n, samples, 2) in beta's pixels, in the precision of `first`, without gradient.
+            Positions (*n, samples, 2) in beta's pixels, in the precision of `first`, without gradient; masked
+            ones are 0.
 
         Raises:
             ValueError: for fewer than 1 sample.
@@ -334,13 +349,13 @@ class RayCurve(NamedTuple):
         """Compute the fractions of the way from `first` to `last`, 0..1, at which to follow the curve.
 
         They are even in the curve's own measure. In a beta that is not central, or whose image repeats
-        itself (near its pole columns lie far apart), they are moved until they are even in pixels.
+        itself (near its pole columns lie far apart), two passes move them towards even in pixels.
 
         Args:
-            count: number of fractions.
+            count: number of fractions, at least 2.
 
         Returns:
-            Fractions (*n, count), rising.
+            Fractions (*n, count), rising from 0 to 1, or within where they were moved to the image.
         """
         even = self._even(count)
         fractions = self._fractions(even)
@@ -361,10 +376,9 @@ class RayCurve(NamedTuple):
         return torch.linspace(0, 1, count, dtype=self.first.dtype, device=self.first.device)
 
     def _ends_on_image(self) -> tuple[Tensor, Tensor]:
-        """Find the inverse depths between which an image larger by `MARGIN` shows the curve: constants.
+        """Find the inverse depths between which an image larger by `MARGIN` shows the curve, if not central.
 
-        A camera whose rays do not meet bounds no directions by its image, and what it has of a curve may be
-        a small part. An end that the image shows stays, with its gradient.
+        They are constants, but for an end that the image shows.
         """
         with torch.no_grad():
             fractions = self._fractions(self._even(NODES))
@@ -405,8 +419,8 @@ class RayCurve(NamedTuple):
         """Compute beta's pixels at fractions (*n, l) of the way from `first` to `last`.
 
         Returns:
-            Pixels (*n, l, 2), and True (*n, l) where the lens model sees the point; whether it is on the
-            image is not checked.
+            Pixels (*n, l, 2), and True (*n, l) where the lens model sees the point and it is not at beta's
+            centre; whether it is on the image, or the curve valid, is not checked.
         """
         weights = self._weights(fraction)
         s = (weights[1] / (weights[0] + weights[1]))[..., None]
@@ -427,8 +441,7 @@ class RayCurve(NamedTuple):
         return torch.lerp(first, last, s)
 
     def _weights(self, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Return shares of first and of last in the point that is a fraction u along, in the curve's own
-        measure."""
+        """Return shares of first and last in the point at fraction u, in the curve's own measure."""
         if self.wide is False:
             return self._weights_in_pixels(u)
         first, last = _either(
@@ -437,15 +450,13 @@ class RayCurve(NamedTuple):
         return first, last
 
     def _weights_in_pixels(self, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Return shares of first and of last in the point whose pixel, without the lens, is a fraction u
-        along."""
+        """Return shares of first and last in the point whose pixel, without the lens, is at fraction u."""
         ends = self.inverse if self.beta.parallel else (self.first[..., 2], self.last[..., 2])
         z0, z1 = (torch.where(self.valid, z, 1.0)[..., None] for z in ends)
         return (1 - u) * z1, u * z0
 
     def _weights_in_angle(self, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the same for the direction that has gone a fraction u of the angle between first
-        and last."""
+        """Return shares of first and last in the direction at fraction u of the angle between them."""
         squared = torch.linalg.cross(self.first, self.last).square().sum(-1)
         opens = squared > TINY
         sine = torch.where(opens, torch.where(opens, squared, 1.0).sqrt(), 0.0)
@@ -472,11 +483,8 @@ there a point is not only a direction."""
 
 
 def _lines(alpha: Camera, x: Tensor, bounds: str) -> tuple[Tensor | None, Tensor, Tensor]:
-    """Return starts and directions, at a depth (or a distance) of 1 m, of pixels' rays, and a mask of those
-    that exist.
-
-    The start is in the plane of depth 0, and None if it is alpha's origin.
-    """
+    """Return starts of pixels' rays (in the plane of depth 0; None for the origin), directions at a depth (or
+    distance) of 1, and a mask of those that exist."""
     rays, valid = alpha.rays(x)
     start = None if alpha.central else alpha.ray_origins(x)
     if bounds == "distance":
@@ -495,10 +503,10 @@ class LensNumbers(NamedTuple):
 
     Attributes:
         model: 0 for a pinhole, else a number of `COMPILED_LENSES`.
-        c: coefficients (14), padded with zeros.
+        c: coefficients (14), padded with zeros; zeros for a pinhole.
         limit: squared limit of the lens model's domain (`Distortion.squared_limit`); 0 for a pinhole.
         K: intrinsics (3, 3).
-        wide: True if fractions are even in angle.
+        wide: True if fractions of a curve (`RayCurve`) are even in angle.
     """
 
     model: int
@@ -509,10 +517,16 @@ class LensNumbers(NamedTuple):
 
     @classmethod
     def from_camera(cls, camera: Camera, *, wide: bool) -> LensNumbers:
-        """Read the numbers of one camera, not a batch, with a lens of `COMPILED_LENSES` or none.
+        """Read the numbers of one camera on the CPU, with a lens of `COMPILED_LENSES` or none; not a batch.
+
+        Args:
+            wide: True if fractions of a curve are even in angle.
 
         Returns:
             The numbers, without gradient.
+
+        Raises:
+            KeyError: for a `Distortion` of another model.
         """
         K, lens = camera.K.detach().double().numpy(), camera.distortion
         if lens is None:
@@ -529,11 +543,12 @@ TINY = 1e-24
 
 
 def undistorted_limits(camera: Camera) -> tuple[Tensor, tuple[Tensor, ...]]:
-    """Compute the bounds of a lens's image in normalised undistorted points, 2 % wider.
+    """Compute the bounds of a camera's image in normalised undistorted points, 2 % wider, by its border.
 
     Returns:
-        True if they bound it, False if the image reaches 75 degrees off axis, or over the domain of its lens
-        model; and x low, y low, x high, y high, (*b) each.
+        One bool for all of a batch, True if they bound the image, False (and bounds without meaning) if it
+        reaches 75 degrees off axis or over the domain of its lens model; and x low, y low, x high, y high,
+        (*b) each.
     """
     h, w = camera.hw
     along = torch.linspace(0, 1, 17).to(camera.K)
@@ -585,18 +600,19 @@ class Pieces(NamedTuple):
 def visible_pieces(
     nodes: Float[Tensor, "*n k 2"], visible: Tensor, hw: HW, turn: Tensor | None = None
 ) -> Pieces:
-    """Compute the parts of a polyline that lie on the image, of pieces with a node that is `visible`.
+    """Compute the parts of polylines that lie on the image, of pieces with a node that is `visible`.
 
     A visible piece of no length counts as 1e-3 pixels, so that a curve that is a point has a position.
 
     Args:
-        nodes: pixels of the polyline.
+        nodes: pixels of the k nodes of each polyline.
         visible: mask (*n, k) of the nodes.
         hw: height and width of the image.
-        turn: pixels (2) after which the image repeats itself; None if it does not.
+        turn: pixels (2) after which the image repeats itself, or of each rig (*b, 1.., 2); None if it does
+            not.
 
     Returns:
-        The k - 1 pieces; with `turn` two for each, as a piece leaves across the seam and as it returns.
+        The k - 1 pieces in order; with `turn` two for each, as it leaves across the seam and as it returns.
     """
     start, end = nodes[..., :-1, :], nodes[..., 1:, :]
     visible = visible[..., :-1] | visible[..., 1:]
@@ -619,12 +635,12 @@ def along_pieces(
     """Interpolate numbers given at a polyline's nodes at fractions of its visible length.
 
     Args:
-        pieces: visible parts of the polyline (`visible_pieces`).
+        pieces: visible parts of the polyline (`visible_pieces`), one or two for each piece.
         u: fractions of the visible length, 0..1, rising.
         nodes: number at each of the k nodes, such as its fraction of a curve.
 
     Returns:
-        Numbers (*n, l); those of an invisible polyline mean nothing.
+        Numbers (*n, l), without meaning for an invisible polyline.
     """
     first, last, length = pieces
     ends = length.cumsum(-1)

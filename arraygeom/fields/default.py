@@ -39,7 +39,8 @@ def named_field(name: str) -> ReceptiveField:
         The field, to be called with a pair and pixels of alpha.
 
     Raises:
-        ValueError: for a name that is neither, or an object that is no field.
+        ValueError: for a name that is neither, a module or object that cannot be imported (`imported`), or an
+            object that is no field, such as a class that needs arguments. Other errors of the module pass.
     """
     if ":" not in name:
         if name in FIELDS:
@@ -69,16 +70,17 @@ def default_field(pair: Pair) -> ReceptiveField:
     """Return the field that fusion uses for a pair; through lenses where a view has one.
 
     Returns:
-        `AroundHomography` for cameras at one place, and for a pair whose link has H alone.
+        `AroundHomography` for cameras at one place, and for a pair whose link has H alone (F of zeros).
         `HomographyDisplacement` for a pair with another link, calibrated or not (a link was measured between
         these very images). `Epipolar` for another calibrated pair; called, it raises ValueError without a
         depth range: a search of the whole line must be requested (`EpipolarLine`). `Rectified` with alpha on
-        either side where only sizes are known. With lenses `Curved` in place of `Epipolar`, with the bounds
-        of `natural_bounds`, and `ThroughLenses` of any other; `Curved` always where a view has no pinhole
-        view.
+        either side where only sizes are known. With a lens in either view `Curved` in place of `Epipolar`,
+        with the bounds of `natural_bounds`, and `ThroughLenses` of any other; `Curved` always where a view
+        has no pinhole view.
 
     Raises:
-        ValueError: for an uncalibrated pair with a view without a pinhole view.
+        ValueError: for an uncalibrated pair with a view without a pinhole view, and float32 poses too far
+            from the origin for the pair's depth range.
     """
     return _through_lenses(straight_field(pair), pair)
 
@@ -103,10 +105,11 @@ def _through_lenses(field: ReceptiveField, pair: Pair, samples: int = 96, nodes:
 
 
 def natural_bounds(pair: Pair) -> Literal["depth", "distance"]:
-    """Return the quantity that a pair's depth range bounds: "distance" where alpha sees 90 degrees off axis.
+    """Return the quantity that a pair's depth range bounds: "distance" if alpha sees 90 degrees off axis.
 
     Returns:
-        "depth" along alpha's axis, or "distance" along the ray; "depth" too while the pair is traced.
+        "distance" along the ray if one of alpha's pixels looks 90 degrees or more off its axis; else, and
+        while the pair is traced, "depth" along the axis.
 
     Raises:
         ValueError: for an uncalibrated pair.
@@ -119,9 +122,8 @@ def natural_bounds(pair: Pair) -> Literal["depth", "distance"]:
 
 
 def recorded_field(pair: Pair, *, samples: int = 256, nodes: int = 64) -> ReceptiveField:
-    """Return the `default_field`, or the whole line for a calibrated pair without a depth range.
-
-    Used for drawings, which need no depth range.
+    """Return a pair's `default_field`, or the whole line in place of `Epipolar` without a depth range, for
+    drawings.
 
     Args:
         samples: positions per pixel of `Curved` and `ThroughLenses`.

@@ -25,15 +25,16 @@ from .straight import require_straight
 
 @dataclass(frozen=True)
 class NearestVoxels:
-    """The integer pixels of beta nearest the epipolar line, in a window about H x; from F.
+    """Field of the integer pixels of beta nearest the epipolar line, in a window about H x; from F, or from
+    calibration.
 
-    The paper's own construction. Distances are perpendicular to the line; pixels equally far, to 1e-3 px, are
-    taken by row, then column. Where fewer pixels of the image lie in the window the rest are masked, and
-    where there is no line (the epipole, no baseline) all are.
+    The paper's own construction, with H as in `Pair.homography`. Distances are perpendicular to the line;
+    pixels equally far, to 1e-3 px, are taken by row, then column. Where fewer pixels of the image lie in the
+    window the rest are masked, and where there is no line (the epipole, no baseline) all are.
 
     Attributes:
         count: number of pixels, at least 1.
-        window: pixels from H x to the edge of the window, in x and y, at least 0.
+        window: pixels from the pixel nearest to H x to the edge of the window, in x and y, at least 0.
 
     Raises:
         ValueError: for a smaller `count` or `window`.
@@ -100,11 +101,7 @@ class NearestVoxels:
         return xy, mask
 
     def _choose(self, xy: Tensor, line: Tensor, centre: Tensor, pair: Pair) -> tuple[Tensor, Tensor, Tensor]:
-        """Choose the nearest `count` of some candidates.
-
-        Returns:
-            Pixels, a mask of those that count, and distances.
-        """
+        """Choose the nearest `count` of some candidates: pixels, a mask of those that count, distances."""
         h, w = pair.beta.hw
         inside = pair.beta.contains(xy) & ((xy - centre[:, None]).abs() <= self.window).all(-1)
         at_centre = (centre * line[:, :2]).sum(-1, keepdim=True) + line[:, 2:]
@@ -120,8 +117,7 @@ class NearestVoxels:
         return xy.gather(-2, nearest.indices[..., None].expand(*mask.shape, 2)), mask, nearest.values
 
     def _candidates(self, line: Tensor, centre: Tensor, beside: int) -> Tensor:
-        """List whole pixels (n, k, 2): in every column of the window (or row, if steep) those nearest the
-        line."""
+        """List whole pixels (n, k, 2) nearest the line in every column of the window (or row, if steep)."""
         steps, across = (torch.arange(-n, n + 1).to(line) for n in (self.window, beside))
         steep = line[:, 0].abs() > line[:, 1].abs()
         u = torch.where(steep, centre[:, 1], centre[:, 0])[:, None] + steps
@@ -146,7 +142,10 @@ TIE = 1e-3
 
 @dataclass(frozen=True)
 class Local:
-    """A square window around H x; from H only (the CNN-like case).
+    """Field of a square window around H x; from H only (the CNN-like case).
+
+    H is as in `Pair.homography`: the link's, else that of the plane in the middle of the depth range, else
+    that of the same field of view.
 
     Attributes:
         size: samples per side, at least 1.
@@ -168,8 +167,8 @@ class Local:
         """Compute the positions in beta of alpha's pixels.
 
         Returns:
-            Positions (*n, size^2, 2) in beta's pixels, row by row, centred on H x; those outside the image
-            are masked and 0.
+            Positions (*n, size^2, 2) in beta's pixels, row by row, centred on H x; those outside the image,
+            and all where there is no H x, are masked and 0.
 
         Raises:
             ValueError: for a pair with lenses.
@@ -185,7 +184,7 @@ class Local:
 
 @dataclass(frozen=True)
 class Dense:
-    """Every `stride`-th pixel of beta, from sizes alone (small images, and the unphysical control).
+    """Field of every `stride`-th pixel of beta, from sizes alone (small images, and the unphysical control).
 
     Attributes:
         stride: pixels between samples in x and y, at least 1.
@@ -201,7 +200,11 @@ class Dense:
         check_above(1, whole=True, stride=self.stride)
 
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Positions:
-        """Return the same positions for every alpha pixel: (*n, H W / stride^2, 2) in beta's pixels."""
+        """Return the same positions for every alpha pixel, row by row from beta's pixel (0, 0).
+
+        Returns:
+            Positions (*n, L, 2) in beta's pixels, L = ceil(H / stride) ceil(W / stride), none masked.
+        """
         x = floating(x)
         grid = pixel_grid(pair.beta.hw, dtype=x.dtype, device=x.device)[:: self.stride, :: self.stride]
         xy = grid.reshape(-1, 2).expand(*x.shape[:-1], -1, 2)

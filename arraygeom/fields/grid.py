@@ -30,17 +30,17 @@ _CHUNK = 1 << 18
 class FieldOnGrid:
     """Receptive field of a pair, evaluated on every pixel of alpha.
 
-    Segments are float64 (33 bytes a pixel, and 8 for its share of a block): float32 would round positions by
-    up to 3e-5 px, which is enough to change which of two equally good matches is taken: 7e-4 in the fused
-    image. Those of a large grid are stored as float32 (17 bytes) nevertheless, without blocks, and converted
-    to float64 when they are cut: the rounding is the same whatever the parts.
+    Segments are float64: the rounding of float32 is enough to change which of two equally good matches is
+    taken. A large grid's are stored as float32 nevertheless, without blocks, and converted to float64 when
+    they are cut: the rounding is the same whatever the parts.
 
     Attributes:
-        at: function from any pixels of alpha (n, 2) to segments or positions, (n) or (B, n).
+        at: function from any pixels of alpha (n, 2) to segments or positions, (n) or for a batch of rigs
+            (B, n).
         samples: number of positions to sample from a segment, or number of explicit positions.
         pixels: segments (B or 1, H, W) in beta's pixels; None for explicit positions, which only `at` gives.
-        blocks: segments (B or 1, H / 2, W / 2) of the centres of blocks of 2 x 2 pixels; None if not
-            requested.
+        blocks: segments (B or 1, H / 2, W / 2) of the centres of blocks of 2 x 2 pixels; None for explicit
+            positions, a large grid, and if not requested.
     """
 
     at: At
@@ -60,8 +60,9 @@ class FieldOnGrid:
             blocks: True to evaluate blocks of 2 x 2 pixels too, unless the grid is large.
 
         Returns:
-            The field; explicit positions are not evaluated, as those of a whole frame may not fit into
-            memory.
+            The field; segments that are NaN or infinite are not valid, and all are clipped to beta's image if
+            one is longer than its diagonal. Explicit positions are not evaluated: a whole frame's may not fit
+            into memory.
 
         Raises:
             ValueError: for an invalid result of the field, or whatever the field raises for this pair.
@@ -97,7 +98,8 @@ class FieldOnGrid:
         """Evaluate the segments at the centres of blocks of `side` x `side` pixels.
 
         Returns:
-            Segments (B or 1, H / side, W / side) in beta's pixels, rounded down where `side` is no divisor.
+            Segments (B or 1, H / side, W / side) in beta's pixels, rounded down where `side` is no divisor;
+            for side 2 `blocks` itself, if there is one.
 
         Raises:
             ValueError: for a field of explicit positions.
@@ -111,10 +113,11 @@ class FieldOnGrid:
         """Move the segments of a straight field.
 
         Args:
-            step: function from segments and alpha's pixels (*n, 2) to the step (*n, 2) in beta's pixels.
+            step: function from segments, (n) or (B, n), and alpha's pixels (n, 2) to steps in beta's pixels,
+                which broadcast to the segments' ends.
 
         Returns:
-            A new field; both ends of each segment are moved by the step.
+            A new field; both ends of each segment are moved by the step, and not clipped to beta's image.
 
         Raises:
             ValueError: for a field of explicit positions.
@@ -137,8 +140,7 @@ class FieldOnGrid:
         return replace(self, at=lambda x: moved(self.at(x), x), pixels=grid(self.straight, 1), blocks=blocks)
 
     def any_valid(self, hw: HW) -> bool:
-        """Return True if any of alpha's h x w pixels may see into beta; every eighth row and
-        column counts."""
+        """Return True if any of alpha's h x w pixels, in every eighth row and column, may see into beta."""
         h, w = hw
         if self.pixels is not None:
             return bool(self.pixels.valid[..., :h:8, :w:8].any())
@@ -174,11 +176,13 @@ class FieldOnGrid:
         """Return the field of a window of alpha, for a beta cut at `shift`.
 
         Args:
-            box: window of alpha: top, bottom, left, right; all even, which is not checked.
+            box: window of alpha: top, bottom, left, right, with bottom and right exclusive; all even, which
+                is not checked.
             shift: pixel (x, y) of beta that becomes (0, 0).
 
         Returns:
-            The field on the window's pixels, in pixels of the cut beta, float64.
+            The field on the window's pixels (`at` counts from its corner too), in pixels of the cut beta, to
+            which segments are not clipped; segments in float64.
         """
         top, _, left, _ = box
 

@@ -26,7 +26,7 @@ def nearest_pixels(first, last, line, centre, usable, window, tie, hw, xy, mask)
         tie: distance by which a pixel counts as farther than the one before it in the image.
         hw: height and width of beta.
         xy: pixels (n, count, 2) to write, the nearest first; 0 where masked.
-        mask: mask (n, count) to write.
+        mask: mask (n, count) to write, True where there is a pixel.
     """
     count, most = mask.shape[1], (2 * window + 1) ** 2
     keys, pixels = np.empty(most, line.dtype), np.empty((most, 2), np.int32)
@@ -45,11 +45,7 @@ def nearest_pixels(first, last, line, centre, usable, window, tie, hw, xy, mask)
 
 @compiled(inline="always")
 def _within(line, centre, window, tie, hw, count, keys, pixels):
-    """Collect the pixels up to some distance: at least `count`, or all of the window.
-
-    Returns:
-        Their number and that distance.
-    """
+    """Collect at least `count` pixels up to some distance, or all; return their number and the distance."""
     x, y, a, b = int(centre[0]), int(centre[1]), line[0], line[1]
     at_centre = centre[0] * a + centre[1] * b + line[2]
     spans = window * (abs(a) + abs(b))

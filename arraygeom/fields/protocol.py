@@ -24,13 +24,18 @@ SamplingLocations = Segments | Positions
 
 @runtime_checkable
 class ReceptiveField(Protocol):
-    """The search segment or sampling locations in beta of each alpha pixel."""
+    """Protocol of receptive fields: callables that give the search segment or sampling locations in beta of
+    each alpha pixel.
+
+    A plain function serves too. Each pixel's answer may depend on that pixel and the pair alone.
+    """
 
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> SamplingLocations:
         """Compute sampling locations in beta of alpha's pixels x.
 
         Returns:
-            Segments (*n) or positions (*n, L) in beta's pixels, differentiable in a pair's numbers.
+            Segments (*n) or positions (*n, L) in beta's pixels, differentiable in the pair's numbers unless
+            they are whole pixels or made from sizes.
         """
         ...
 
@@ -41,10 +46,11 @@ def sampling_locations(
     """Evaluate a field at given pixels, or over alpha's whole image.
 
     Args:
-        x: pixels of alpha; None for all, (H, W, 2), with the axes *b of a batch of rigs in front.
+        x: pixels of alpha, for a batch of rigs *b with as many axes (or of length 1) in front; None for all,
+            (H, W, 2) in float32.
 
     Returns:
-        Segments or positions in beta's pixels, one per pixel.
+        Segments (*n) or positions (*n, L) in beta's pixels; (H, W) or (*b, H, W) for all pixels.
 
     Raises:
         TypeError: for an object that is no field, such as a class of one, or pixels that are no tensor.
@@ -58,11 +64,11 @@ def answered(field: ReceptiveField, pair: Pair, x: Real[Tensor, "*n 2"]) -> Samp
     """Call a field, and check its result.
 
     Returns:
-        The field's segments or positions. An exception of the field gets a note with its name.
+        The field's segments or positions, as it gave them.
 
     Raises:
         ValueError: if the result is not Segments or Positions for each pixel, with floats and bools on one
-            device.
+            device. An exception of the field itself passes, with its name in a note.
     """
     name = getattr(field, "__name__", type(field).__name__)
     try:
@@ -110,7 +116,7 @@ def lazily(field: ReceptiveField, pair: Pair) -> Callable[[Tensor], SamplingLoca
 
     Returns:
         Function from pixels (n, 2) to segments or positions, (n) or for a batch of rigs (*b, n), on the
-        device of the pair's numbers. It raises as `answered`.
+        device of the pair's numbers. It raises as `answered`, and TypeError for pixels that are no tensor.
 
     Raises:
         TypeError: for an object that is no field.
@@ -133,8 +139,7 @@ def all_pixels(pair: Pair) -> Float[Tensor, "*b h w 2"]:
 
 
 def compilable(x: Tensor) -> bool:
-    """Return True if compiled loops can take a tensor: plain numbers on the CPU that neither a gradient nor a
-    trace follows."""
+    """Return True if compiled loops can take a tensor: plain numbers on the CPU that no trace follows."""
     plain = type(x) is Tensor and x.device.type == "cpu" and x.dtype in (torch.float32, torch.float64)
     return plain and not followed() and can_compile()
 
@@ -146,8 +151,7 @@ PIECE = 1 << 12
 
 
 def segments_by_rows(f: Callable[[Tensor], Segments], pair: Pair, x: Float[Tensor, "*n 2"]) -> Segments:
-    """Apply f to pixels, some rows of the first axis after the batch's at once; f must take each
-    pixel alone."""
+    """Apply f, which takes each pixel alone, to some rows of the first axis after the batch's at once."""
     axis = len(pair.batch_shape)
     if x.ndim <= axis + 1:
         return f(x)

@@ -35,20 +35,23 @@ def ray_depth(
     """Compute the depth, or distance along the ray, of matched pixels, within the pair's depth range.
 
     It is the depth of the point of alpha's ray whose image is nearest to the position in beta, through any
-    lenses.
+    lenses, however far off the position is.
 
     Args:
+        pair: one pair, not a batch.
         x: pixels of alpha.
         x_beta: positions in beta.
         bounds: "depth" along alpha's axis or "distance" along the ray, also of the pair's depth range.
         deviation: standard deviation of x_beta along the curve, pixels; None for 0.
 
     Returns:
-        Depth in the rig's unit (metres) with its standard deviation to first order and validity; invalid
-        depths are 0.
+        Depth in the rig's unit (metres) with its standard deviation to first order and validity. Not valid,
+        and 0, are NaN and infinite positions, rays that beta does not see within the range, and infinite
+        depths.
 
     Raises:
         ValueError: for pairs that are not calibrated or have no depth range.
+        NotImplementedError: within `torch.func.vmap`, for a beta that is not central.
     """
     pair.cameras  # noqa: B018  (raises for an uncalibrated pair)
     near, far = pair.depth_range
@@ -102,10 +105,12 @@ def _inverse_depth_per_pixel(curve: RayCurve, fraction: Float[Tensor, "n 1"]) ->
 
 
 def rough_transfer(pair: Pair, x: Real[Tensor, "n 2"]) -> TransformedPoints:
-    """Map pixels of alpha roughly to beta: by the pair's homography, or the middle of other cameras' curves.
+    """Map pixels of alpha roughly to beta: by the pair's homography without the lenses, or to the middles of
+    their curves if a view has no pinhole view.
 
     Returns:
-        Positions in beta's pixels, detached, with their validity; 0 where not valid.
+        Positions in beta's pixels, without gradient to the pair, with their validity; 0 where not valid.
+        Those by the homography may be off beta's image.
 
     Raises:
         ValueError: for a pair that is not calibrated or has no depth range, where curves are needed.
@@ -120,7 +125,6 @@ def rough_transfer(pair: Pair, x: Real[Tensor, "n 2"]) -> TransformedPoints:
 def _apart(
     curve: RayCurve, fraction: Float[Tensor, "n l"], x_beta: Float[Tensor, "n 2"]
 ) -> Float[Tensor, "n l"]:
-    """Return squared pixels from positions to the points at fractions; infinite where beta does not see
-    these."""
+    """Return squared pixels from positions to the points at fractions; infinite where beta sees none."""
     xy, visible = curve.at(fraction)
     return torch.where(visible, (xy - x_beta[:, None].to(xy)).square().sum(-1), torch.inf)

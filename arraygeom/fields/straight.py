@@ -25,7 +25,7 @@ from .protocol import CHUNK, all_pixels, segments_by_rows
 
 @dataclass(frozen=True)
 class Epipolar:
-    """The segment of the epipolar line between the pair's depth bounds; needs calibration.
+    """Field of the segment of the epipolar line between depth bounds; needs calibration.
 
     A segment of which nothing is in beta's image and in front of beta is invalid. Without a baseline, with
     near = far, and for identical cameras it is a point. An alpha pixel on the epipole sees one point of beta,
@@ -64,7 +64,7 @@ class Epipolar:
         """Return near and far: this field's own where given, else the pair's.
 
         Returns:
-            Near and far, in the rig's unit.
+            Near and far, in the rig's unit: tensors, (*b) for the pair's, float64 for this field's.
 
         Raises:
             ValueError: if neither states one, or near is beyond far.
@@ -77,17 +77,19 @@ class Epipolar:
 
 @dataclass(frozen=True)
 class EpipolarLine:
-    """The whole epipolar line inside beta; from calibration or F.
+    """Field of the whole epipolar line inside beta; from F or calibration.
 
-    With calibration, the part in front of both cameras, from depth zero to infinity; else all of it, from
-    either end. From F, an alpha pixel on the epipole has no line, and the segment is invalid.
+    For a calibrated pair without a link, the part in front of both cameras, from depth zero to infinity (a
+    point without a baseline); else all of it, from either end. From F, an alpha pixel on the epipole has no
+    line, and the segment is invalid.
     """
 
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Segments:
         """Compute the segments of alpha's pixels across beta's image.
 
         Returns:
-            Segments in beta's pixels; from near to far with calibration.
+            Segments in beta's pixels, from near to far for a calibrated pair without a link; invalid where
+            the line misses the image.
 
         Raises:
             ValueError: for a pair with lenses, or with neither calibration nor F.
@@ -114,20 +116,20 @@ NEAREST = 1e-3
 
 @dataclass(frozen=True)
 class HomographyDisplacement:
-    """Part of the epipolar line up to `displacement` pixels either way from the point nearest to H x.
+    """Field of the part of the epipolar line up to `displacement` pixels either way from its point nearest to
+    H x; from F and H, or from calibration.
 
-    Made from F and H, or from calibration.
-
-    The paper's homography-based field. For a calibrated pair H is that of the plane at the middle of the
-    depth range (`approximated` fits a better one), and a segment starts towards near and ends towards far.
-    Where there is no line (at the epipole, and without a baseline) the segment is the point H x.
+    The paper's homography-based field. H is as in `Pair.homography`: for a calibrated pair without a link
+    that of the plane in the middle of the depth range (`approximated` fits a better one), and a segment
+    starts towards near and ends towards far. Where there is no line (at the epipole, and without a baseline)
+    the segment is the point H x.
 
     Attributes:
         displacement: pixels of beta, at least 0; None for the smallest that covers near to far at every pixel
-            of alpha's image, which needs calibration.
+            of alpha's image, which needs calibration and a depth range.
 
     Raises:
-        ValueError: for a negative or infinite displacement.
+        ValueError: for a displacement that is negative, infinite or NaN.
         TypeError: for one that is no number.
     """
 
@@ -143,8 +145,8 @@ class HomographyDisplacement:
             Segments in beta's pixels.
 
         Raises:
-            ValueError: for a pair with lenses, with neither F nor calibration, or uncalibrated if
-                `displacement` is None.
+            ValueError: for a pair with lenses, with neither F nor calibration, or uncalibrated or without a
+                depth range if `displacement` is None.
         """
         require_straight(pair)
         F, H, hw = pair.fundamental, pair.homography, pair.beta.hw
@@ -162,7 +164,7 @@ class HomographyDisplacement:
 
 @dataclass(frozen=True)
 class AroundHomography:
-    """The row within +-`reach` pixels of H x, for cameras at one place: H is seldom exact to a pixel.
+    """Field of the row within +-`reach` pixels of H x (`Pair.homography`), for cameras at one place.
 
     Attributes:
         reach: pixels of beta, at least 0, which is not checked.
@@ -171,7 +173,7 @@ class AroundHomography:
     reach: float
 
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Segments:
-        """Compute segments centred on H x, then clipped to beta's image.
+        """Compute segments centred on H x, from right to left, then clipped to beta's image.
 
         Returns:
             Segments in beta's pixels.
@@ -191,7 +193,8 @@ class AroundHomography:
 
 
 def covering_displacement(pair: Pair, x: Real[Tensor, "*n 2"] | None = None) -> Float[Tensor, "*b"]:
-    """Compute the displacement from H x that reaches near and far for every pixel x.
+    """Compute the displacement that reaches near and far for every pixel x, along the epipolar line from its
+    point nearest to H x.
 
     Depth-bounded segments count as beta's image clips them.
 
@@ -199,7 +202,7 @@ def covering_displacement(pair: Pair, x: Real[Tensor, "*n 2"] | None = None) -> 
         x: pixels of alpha; None for all.
 
     Returns:
-        Pixels of beta, one per rig; 0 if no pixel has a segment.
+        Pixels of beta, one per rig, differentiable in the pair's numbers; 0 if no pixel has a segment.
 
     Raises:
         ValueError: for a pair that is not calibrated, has lenses, or has no depth range.
@@ -212,8 +215,7 @@ def covering_displacement(pair: Pair, x: Real[Tensor, "*n 2"] | None = None) -> 
 
 
 def _squared_reach(pair: Pair, x: Tensor) -> Tensor:
-    """Return the squared distance from the foot of H x to the farther end of the segment, 0 where there is
-    none."""
+    """Return the squared distance from the foot of H x to the segment's farther end; 0 without a segment."""
     exact = Epipolar()(pair, x)
     centre, placed = apply_homography(pair.homography, x)
     foot = foot_on_line(epipolar_lines(pair.fundamental, x), centre)
@@ -222,11 +224,8 @@ def _squared_reach(pair: Pair, x: Tensor) -> Tensor:
 
 
 def _widest(pair: Pair) -> Tensor:
-    """Return the alpha pixel (*b, 1, 2) of the largest displacement, searched once per pair and again when it
-    changes.
-
-    Nothing is kept of a trace, nor as a tensor of inference mode, which no gradient could use later.
-    """
+    """Return the alpha pixel (*b, 1, 2) of the largest displacement, searched again when the pair changes."""
+    # Nothing is kept of a trace, nor as a tensor of inference mode, which no gradient could use later.
     if followed():
         return _searched_widest(pair)
     versions = tuple(None if t.is_inference() else t._version for t, _ in tensors_of(pair))
@@ -252,15 +251,15 @@ SIDES = Literal["left", "right", "either"]
 
 @dataclass(frozen=True)
 class Rectified:
-    """Horizontal segment in beta of a rectified pair, from the two sizes alone (the PAM case).
+    """Field of the horizontal segment in beta of a rectified pair, from the two sizes alone (the PAM case).
 
     Attributes:
         max_disparity: largest disparity, pixels of beta, at least 0; None for the whole row.
-        alpha_is: "left" or "right", the camera of the rectified pair that alpha is; for "either" the segment
-            goes both ways.
+        alpha_is: "left" or "right", the camera of the rectified pair that alpha is: the segment goes to the
+            left or right in beta from the pixel of the same place; for "either" both ways.
 
     Raises:
-        ValueError: for a negative or infinite disparity, or another side.
+        ValueError: for a disparity that is negative, infinite or NaN, or another side.
         TypeError: for a disparity that is no number.
     """
 
@@ -273,12 +272,14 @@ class Rectified:
             raise ValueError(f"alpha_is must be one of {', '.join(get_args(SIDES))}, got {self.alpha_is!r}")
 
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Segments:
-        """Compute segments from the largest disparity (near) to none (far).
+        """Compute segments from the largest disparity (near) to none (far), for "either" from left to right.
 
-        Images of different sizes are taken to show the same view.
+        A whole row goes from its first pixel to its last, or back if alpha is the right camera. Images of
+        different sizes are taken to show the same view.
 
         Returns:
-            Segments in beta's pixels, not differentiable in a rig, of which nothing but sizes is used.
+            Segments in beta's pixels, on its image; not differentiable in a rig, of which nothing but sizes
+            is used.
         """
         (ha, wa), (hb, wb) = pair.alpha.hw, pair.beta.hw
         x = floating(x)
@@ -326,11 +327,11 @@ def approximated(pair: Pair) -> Pair:
     `HomographyDisplacement()` on the result takes the displacement that covers near to far.
 
     Returns:
-        The pair with a link of its exact F and this H, differentiable.
+        The pair with a link of its F (exact, or that of a link it had) and this H, differentiable.
 
     Raises:
-        ValueError: for uncalibrated or batched pairs, lenses, no depth range, and where beta sees nothing
-            between the bounds.
+        ValueError: for uncalibrated or batched pairs, lenses, no depth range, and fewer than 4 of these
+            pixels that beta sees between the bounds.
         NotImplementedError: within `torch.func.vmap`.
     """
     alpha, _ = pair.cameras
@@ -358,8 +359,7 @@ def require_straight(pair: Pair) -> None:
 
 
 def foot_on_line(line: Float[Tensor, "*#n 3"], point: Float[Tensor, "*#n 2"]) -> Float[Tensor, "*n 2"]:
-    """Return the point of a line (scaled as `epipolar_lines` does) nearest to a point; without a line, the
-    point."""
+    """Return the point of a line (scaled by `epipolar_lines`) nearest to a point; the point without one."""
     l0, l1, l2 = line.unbind(-1)
     u, v = point.unbind(-1)
     off = l2 + l0 * u + l1 * v
@@ -378,8 +378,8 @@ def line_piece(
         hw: height and width of the image.
 
     Returns:
-        Segments along (l1, -l0), which for a calibrated F is from near to far, clipped to the image; the
-        point itself where there is no line.
+        Segments along (l1, -l0), which for a calibrated F is from near to far, clipped to the image, invalid
+        where nothing is left; `point` itself where there is no line.
     """
     foot = foot_on_line(line, point)
     along = reach[..., None] * torch.stack([-line[..., 1], line[..., 0]], -1)

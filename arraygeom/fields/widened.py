@@ -27,10 +27,11 @@ from .straight import Epipolar, EpipolarLine, HomographyDisplacement
 
 @dataclass(frozen=True, eq=False)
 class Moved:
-    """Any field, for cameras that are not synchronised, evaluated where alpha's pixels are when beta records.
+    """Field that evaluates another one where alpha's pixels are when beta records, for cameras that are not
+    synchronised.
 
-    The displacement is interpolated bilinearly, and extended by the nearest pixel outside alpha's image.
-    `Widened` allows for its error.
+    The displacement is interpolated bilinearly (with gradient), and extended by the nearest pixel outside
+    alpha's image. `Widened` allows for its error.
 
     Attributes:
         field: field of the point after it has moved.
@@ -59,7 +60,8 @@ class Moved:
             Segments or positions in beta's pixels, as `field` gives them.
 
         Raises:
-            ValueError: if alpha has another size than the displacement, or the field's result is invalid.
+            ValueError: if alpha has another size than the displacement, or the field's result is invalid; the
+                field's own errors pass.
         """
         self.require(pair.alpha.hw)
         return answered(self.field, pair, self.points(x))
@@ -83,21 +85,21 @@ class Moved:
 
 @dataclass(frozen=True)
 class Widened:
-    """Any field with `across` pixels to either side of it and `along` more pixels at either end.
+    """Field that widens another one by `across` pixels to either side and `along` at either end.
 
     Uncertain calibration moves lines sideways: `across` alone. Motion between cameras that are not
     synchronised moves points anywhere: `across` and `along`. Segments that are only longer stay segments.
     Wider ones become positions, on rows at most one pixel apart, the rows following one another (the first
     `across` to the left of the way from start to end). Positions (of `Curved`) are taken as ordered along a
     curve; each is stretched and widened about its own tangent. A segment of no length widens to a window with
-    sides along x and y.
+    sides along x and y. Samples off beta's image are masked.
 
     Attributes:
         field: the field to widen.
         across: pixels of beta to either side, at least 0.
         along: pixels of beta at either end, at least 0.
         samples: number of positions along a segment that becomes wider, at least 1.
-        margins: more pixels, of each pixel's own, as `from_covariance` finds them; None for none.
+        margins: pixels to add, of each alpha pixel its own, as `from_covariance` finds them; None for none.
 
     Raises:
         ValueError: for numbers below these bounds, infinity or NaN.
@@ -130,15 +132,19 @@ class Widened:
         """Widen a field by the uncertainty of a rig's calibration, at each pixel of alpha by its own.
 
         Args:
+            rig: rig with a depth range.
             covariance: covariance of parameters of the rig, as `calib` writes it beside the rig.
+            alpha: name of a calibrated camera of the rig, and `beta` of another.
             field: field to widen; None for the pair's `default_field`.
-            confidence: probability that the band holds the point, for normal errors.
+            confidence: probability that the band holds the point, across and along each, for normal errors.
+            samples: number of positions along a segment.
 
         Returns:
-            The field of this pair, also after its images are resized or undistorted.
+            The field of this pair alone (not checked), also after its images are resized or undistorted.
 
         Raises:
-            ValueError: as `arraygeom.uncertainty.bands`, and if beta sees nothing within the depth range.
+            ValueError: as `arraygeom.uncertainty.bands`, such as for a rig without a depth range or a camera
+                that it has not, and if beta sees nothing within the depth range.
         """
         camera, pair = rig[rig.require(alpha)], rig.pair(alpha, beta)
         (h, w), (rows, columns) = camera.hw, GRID
@@ -161,8 +167,8 @@ class Widened:
         """Compute the field's sampling locations, widened and on beta's image.
 
         Returns:
-            Segments if `across` is 0 and the field gives segments, else positions (*n, rows * samples, 2), in
-            beta's pixels.
+            In beta's pixels, segments if the field gives segments and neither `across` nor margins widen
+            them, else positions (*n, rows * samples, 2), row after row; masked ones are 0.
 
         Raises:
             ValueError: for an invalid result of the field, or whatever the field raises for this pair.
@@ -203,8 +209,7 @@ class Widened:
         return 2 * math.ceil(self._most[0]) + 1
 
     def _evaluated(self, pair: Pair, x: Tensor, margin: int) -> SamplingLocations:
-        """Evaluate the field around beta's image too, as far as widening may bring in; by sizes alone on
-        the image."""
+        """Evaluate the field around beta's image too, as far as widening may bring in, unless by sizes."""
         if margin == 0 or not _follows_beta(self.field, pair):
             return answered(self.field, pair, x)
         h, w = pair.beta.hw
@@ -231,12 +236,12 @@ GRID = 12, 16
 
 
 class Margins(NamedTuple):
-    """Widths of each pixel's own, interpolated between those of a grid over alpha's image.
+    """Half-widths for each pixel, interpolated between the nodes of a grid over alpha's image.
 
     Attributes:
         alpha: the camera to whose pixels the grid belongs.
         K: intrinsics of beta, of whose pixels the widths are.
-        grid: widths (1, 4, rows, columns): across and along, each at the near and the far bound.
+        grid: half-widths (1, 4, rows, columns): across at the near and the far bound, then along at both.
         most: the largest of them, across and along.
     """
 
@@ -246,7 +251,12 @@ class Margins(NamedTuple):
     most: tuple[float, float]
 
     def at(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Float[Tensor, "*n 4"]:
-        """Return the widths at alpha's pixels, in pixels of the pair's beta."""
+        """Return the half-widths at alpha's pixels (across near, far, along near, far), pixels of the pair's
+        beta; outside the grid those at its border.
+
+        Raises:
+            ValueError: for a pair that is not calibrated.
+        """
         view, beta = pair.cameras
         x = floating(x)
         centre, directions, _ = world_rays(view, x.to(view.K))
@@ -265,8 +275,7 @@ def _between(first: Tensor, last: Tensor, like: Tensor) -> Tensor:
 
 
 def _follows_beta(field: ReceptiveField, pair: Pair) -> bool:
-    """Return True if the field of a padded beta is the same in its pixels: by F or calibration it is, by
-    sizes not."""
+    """Return True if the field of a padded beta is the same in its pixels: by F or calibration, not sizes."""
     if isinstance(field, ThroughLenses | Moved):
         return _follows_beta(field.field, pair)
     if isinstance(field, HomographyDisplacement):

@@ -25,7 +25,10 @@ HEAD = r"pinhole_radial_tangential|rightToLeft"
 
 
 def read(source: RigSource) -> Rig:
-    """Read the pair "left" and "right", or a single "camera" at the origin.
+    """Read the pair "left" (the world) and "right", or a single "camera" at the origin.
+
+    Lengths are in the board's unit, taken as metres. A size that is not stated is the requested one, else
+    guessed, with a warning.
 
     Raises:
         RigFileError: for a damaged file, another camera model, or more than three radial coefficients.

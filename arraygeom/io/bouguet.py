@@ -35,7 +35,9 @@ def recognises(path: Path, head: str) -> bool:
 
 
 def read(source: RigSource) -> Rig:
-    """Read the pair "left" and "right", or one camera "camera" at the origin.
+    """Read the pair "left" (the world) and "right" in metres, or one camera "camera" at the origin.
+
+    A size that is not stated is the requested one, else guessed, with a warning.
 
     Raises:
         RigFileError: for a damaged file, or missing variables.

@@ -73,12 +73,14 @@ def recognises(path: Path, head: str) -> bool:
 
 
 def read(source: RigSource) -> Rig:
-    """Read the cameras of a model's rig, or one for each image.
+    """Read the cameras of a model's rig, or one for each image, named as the image is.
 
-    The path is that of the folder or of any file in it.
+    The path is that of the folder, a project's with `sparse` in it, or the model's file of cameras, images,
+    rigs or frames. The scale is the model's, taken as metres.
 
     Raises:
-        RigFileError: for missing or damaged files, unknown models, or several rigs.
+        RigFileError: for missing or damaged files, unknown models, equal names, or several rigs of several
+            cameras.
     """
     folder = _folder(source.path)
     if folder is None:
@@ -104,11 +106,14 @@ def read(source: RigSource) -> Rig:
 def write(rig: Rig) -> dict[str, str]:
     """Format a text model: every camera of the rig as one camera and one image, no points.
 
+    Depth range, links and sensors are left out.
+
     Returns:
-        Texts by file name.
+        Texts of cameras.txt, points3D.txt and images.txt by file name.
 
     Raises:
-        ValueError: for names of several lines, and what the format cannot hold.
+        ValueError: for names of several lines or with spaces at an end, a rig without cameras, cameras that
+            are uncalibrated or batches, and a K with skew or a lens that the format cannot hold.
     """
     cameras = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
     images = ["# IMAGE_ID, QW..QZ, TX..TZ, CAMERA_ID, NAME"]
@@ -129,8 +134,7 @@ def write(rig: Rig) -> dict[str, str]:
 
 
 def _folder(path: Path) -> Path | None:
-    """Return the folder with the model, from itself, one of its files, or the project folder;
-    None for none."""
+    """Return the model's folder, from itself, one of its files, or the project folder; None for none."""
     files = {
         f"{stem}{suffix}" for stem in ("cameras", "images", "rigs", "frames") for suffix in (".txt", ".bin")
     }
@@ -211,8 +215,7 @@ def _cameras_text(source: RigSource) -> Iterator[tuple[Entry, int, str]]:
 
 
 def _images_text(source: RigSource) -> Iterator[Posed]:
-    """Yield the images of every other line; those between hold the points, X Y POINT3D_ID each, and may be
-    blank."""
+    """Yield the images of every other line; those between hold the points, and may be blank."""
     for entry in _lines(source, "images", every=2):
         fields = entry.value.split(maxsplit=9)
         if len(fields) != 10:
@@ -247,8 +250,7 @@ def _sensors(entry: Entry) -> Iterator[Posed]:
 
 
 def _lines(source: RigSource, what: str, every: int = 1) -> list[Entry]:
-    """Return the lines that are no comments, nor blank (of an image's two the second may be); as many as
-    stated."""
+    """Return the lines that are no comments, nor blank (of an image's two the first); as many as stated."""
     lines = [(n, line) for n, line in enumerate(source.text().splitlines(), 1) if not line.startswith("#")]
     first = next((i for i, (_, line) in enumerate(lines) if line.strip()), 0)
     content = [source.at(line, f"line {n}") for n, line in lines[first::every] if line.strip()]
@@ -323,7 +325,7 @@ class _Bytes:
         self.source, self.data, self.at = source, source.content(), 0
 
     def take(self, layout: str) -> tuple[Any, ...]:
-        """Return the next values of a `struct` layout.
+        """Return the next values of a `struct` layout, and go past them.
 
         Raises:
             RigFileError: if the file ends before.
@@ -336,10 +338,10 @@ class _Bytes:
         return values
 
     def count(self) -> int:
-        """Return the next count of entries.
+        """Return the next count of entries (8 bytes), and go past it.
 
         Raises:
-            RigFileError: if the file cannot hold so many.
+            RigFileError: if the file ends before, or has fewer bytes than that.
         """
         (n,) = self.take("<Q")
         if n > len(self.data):
@@ -349,7 +351,7 @@ class _Bytes:
         return int(n)
 
     def string(self) -> str:
-        """Return the next zero-terminated text.
+        """Return the next zero-terminated text, and go past it; bytes that are no UTF-8 are replaced.
 
         Raises:
             RigFileError: if the file ends before.

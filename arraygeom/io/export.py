@@ -31,7 +31,7 @@ def calibrated(rig: Rig, format: str) -> list[tuple[str, Camera]]:
             raise ValueError(
                 f"{format} files hold calibrated cameras and '{name}' is not one: use the native format"
             )
-        if camera.K.ndim != 2:
+        if camera.batch_shape:
             raise ValueError(
                 f"camera '{name}' is a batch of cameras; rig files hold one of each: write one rig each"
             )
@@ -75,10 +75,10 @@ def brown_conrady(name: str, lens: LensModel | None, *, at_most: int) -> list[fl
         at_most: number of coefficients, 4 or more.
 
     Returns:
-        Four coefficients or more in OpenCV's order; four zeros for a pinhole.
+        The lens's coefficients, at most so many, in OpenCV's order; four zeros for a pinhole.
 
     Raises:
-        ValueError: for another lens model, or more coefficients that are not 0.
+        ValueError: for another lens model, or coefficients beyond these that are not 0.
     """
     if lens is None:
         return [0.0] * 4

@@ -52,6 +52,8 @@ def recognises(path: Path, head: str) -> bool:
 def read(source: RigSource) -> Rig:
     """Read cameras cam0, cam1, ...; EuRoC's sensor.yaml, or a folder of them, by the names of their folders.
 
+    Lengths are metres. The world is cam0, the IMU if each camera states its place there, or EuRoC's body.
+
     Raises:
         RigFileError: for a damaged file, a gap in the chain, or unsupported models.
     """
@@ -83,13 +85,15 @@ def _sensor(fields: Entry) -> Camera:
 def write(rig: Rig) -> str:
     """Format cameras cam0, cam1, ... in the rig's order, with their names in `rostopic`.
 
-    Kalibr's chain has no world: if cam0 is not at the origin, the world is written as the IMU.
+    Kalibr's chain has no world: if cam0 is not at the origin, the world is written as the IMU. Depth range,
+    links, and of sensors all but the time offset are left out.
 
     Returns:
         The text of a YAML file.
 
     Raises:
-        ValueError: for what the format cannot hold.
+        ValueError: for a rig without cameras, cameras that are uncalibrated or batches, and a K with skew or
+            a lens that the format cannot hold.
     """
     cameras = calibrated(rig, "Kalibr")
     has_imu = not at_origin(cameras[0][1].cam_from_world)
@@ -131,8 +135,7 @@ def _camera(fields: Entry, pose: Pose) -> Camera:
 
 
 def _lens(camera: str, before: list[float], fields: Entry) -> Distortion | None:
-    """Read the lens of a camera model and a distortion model; `before` are the numbers before
-    focal lengths."""
+    """Read the lens of a camera model, by the numbers `before` focal lengths, and a distortion model."""
     lens, _, supported = MODELS[camera]
     model = fields.get("distortion_model")
     coefficients = fields.find(LENS_NAME)

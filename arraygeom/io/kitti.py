@@ -32,8 +32,8 @@ def read(source: RigSource) -> Rig:
     """Read the rectified cameras: P0..P3 of `calib.txt`, P_rect and S_rect of `calib_cam_to_cam.txt`.
 
     Returns:
-        The rig of cam0, cam1 ..., in metres. Where no image size is stated, as in `calib.txt`, it is the one
-        asked for, else twice the principal point, with a warning.
+        The rig of cam0, cam1 ..., in metres in the frame of rectified camera 0. Where no image size is
+        stated, as in `calib.txt`, it is the one asked for, else twice the principal point, with a warning.
 
     Raises:
         RigFileError: for a damaged file, or one without such a camera.
@@ -56,13 +56,15 @@ def _rectified(entries: Entry, name: str) -> Camera:
 
 
 class Raw:
-    """Reader of the cameras before rectification, in `calib_cam_to_cam.txt`."""
+    """Reader of the cameras before rectification, in `calib_cam_to_cam.txt`; in `READERS` as a module is."""
 
     HEAD = r"(?m)^K_0\d:"
 
     @staticmethod
     def read(source: RigSource) -> Rig:
-        """Read the unrectified cameras from S, K, D, R and T.
+        """Read the unrectified cameras cam0, cam1 ... from S, K, D, R and T, in metres from camera 0.
+
+        A size that is not stated is the requested one, else guessed, with a warning.
 
         Raises:
             RigFileError: for a damaged file, or one without such a camera.

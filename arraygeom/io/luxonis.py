@@ -28,7 +28,8 @@ HEAD = r'(?s)"cameraData"|(?=.*"boardRev").*"boardName"'
 def read(source: RigSource) -> Rig:
     """Read the calibrated cameras by their sockets: "CAM_A" (colour on most), "CAM_B", "CAM_C", ...
 
-    The first of them is at the origin. Cameras whose K is zeros are left out, with a warning.
+    The first of them is the world; lengths are metres. Cameras without a size are left out, and those whose
+    K is zeros, with a warning.
 
     Raises:
         RigFileError: for a damaged file, no calibrated camera, other units, or extrinsics that are circular
@@ -69,8 +70,7 @@ def _name(socket: int) -> str:
 
 
 def _to_root(entries: dict[int, Entry], socket: int) -> tuple[int, Pose]:
-    """Return the camera at which a chain of extrinsics ends, and the pose that takes points of this one into
-    it."""
+    """Return the camera at which a chain of extrinsics ends, and the pose from this one into it."""
     pose, passed = Pose.identity(), [socket]
     while True:
         extrinsics = entries[passed[-1]].get("extrinsics")

@@ -38,10 +38,11 @@ def load_variables(source: RigSource) -> dict[str, Any]:
     out.
 
     Returns:
-        Values by name: structs as mappings, numbers as arrays or scalars.
+        Values by name as scipy simplifies them: structs as mappings, text as str, numbers as arrays without
+        axes of length 1, or scalars.
 
     Raises:
-        RigFileError: for an empty or damaged file, or one of another version.
+        RigFileError: for a file that is missing, empty, too large, damaged, or not of version 5 to 7.
         ImportError: without scipy.
     """
     data = source.content()
@@ -60,13 +61,13 @@ def load_variables(source: RigSource) -> dict[str, Any]:
 
 
 def readable_variables(content: bytes) -> list[str]:
-    """List the variables of a MAT-file's bytes that consist of structs, cells, text and numbers only.
+    """List the variables of a MAT-file's bytes that `load_variables` loads: of structs, cells, text, numbers.
 
     Returns:
         Their names, in the file's order.
 
     Raises:
-        ValueError: for a file that is not a MAT-file of version 5, too large, or damaged.
+        ValueError: for a file that is no MAT-file of version 5 to 7, too large, or damaged.
     """
     if len(content) > LARGEST:
         raise ValueError(f"it has {len(content)} bytes; at most {LARGEST} are read")
@@ -76,7 +77,7 @@ def readable_variables(content: bytes) -> list[str]:
     names = []
     for element in _elements(memoryview(content)[128:], order):
         if element.kind == COMPRESSED:
-            element = next(_elements(_unpacked(element.data), order))
+            element = next(_elements(_unpacked(element.data), order), element)
         if element.kind != MATRIX:
             raise ValueError("a variable is no matrix")
         name = _check_matrix(element.data, order, 0)
@@ -99,11 +100,7 @@ def _unpacked(data: memoryview) -> memoryview:
 
 
 def _elements(data: memoryview, order: str) -> Iterator[_Element]:
-    """Yield the elements one after the other.
-
-    Raises:
-        ValueError: for one that is not whole.
-    """
+    """Yield the elements one after the other; ValueError for one that is not whole."""
     offset = 0
     while offset < len(data):
         if offset + 8 > len(data):
@@ -123,11 +120,7 @@ def _elements(data: memoryview, order: str) -> Iterator[_Element]:
 
 
 def _check_matrix(data: memoryview, order: str, depth: int) -> str | None:
-    """Return the name of a matrix; None for one of a class that is not read.
-
-    Raises:
-        ValueError: for a damaged one.
-    """
+    """Return the name of a matrix; None for one of a class that is not read; ValueError for a damaged one."""
     if depth > DEEPEST:
         raise ValueError(f"it is nested more than {DEEPEST} deep")
     parts = _elements(data, order)
@@ -148,11 +141,7 @@ def _check_matrix(data: memoryview, order: str, depth: int) -> str | None:
 
 
 def _check_contents(parts: Iterator[_Element], order: str, depth: int, what: tuple[int, int, bool]) -> bool:
-    """Return True if a matrix, and those in it, can be read.
-
-    Raises:
-        ValueError: for other sizes than it states.
-    """
+    """Return True if a matrix, and those in it, can be read; ValueError for other sizes than it states."""
     kind, count, is_complex = what
     if kind in (CELL, STRUCT):
         wanted = count * (_fields(parts, order) if kind == STRUCT else 1)
@@ -175,11 +164,7 @@ def _check_contents(parts: Iterator[_Element], order: str, depth: int, what: tup
 
 
 def _fields(parts: Iterator[_Element], order: str) -> int:
-    """Return the number of a struct's fields.
-
-    Raises:
-        ValueError: if their names are damaged.
-    """
+    """Return the number of a struct's fields; ValueError if their names are damaged."""
     length, names = (next(parts, _Element(0, memoryview(b""))) for _ in range(2))
     if length.kind != 5 or len(length.data) != 4 or names.kind != 1:
         raise ValueError("a struct has no field names")

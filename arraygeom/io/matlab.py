@@ -46,7 +46,10 @@ UNITS = {name: metres for metres, names in METRES.items() for name in names}
 
 
 def recognises(path: Path, head: str) -> bool:
-    """Return True for a MAT-file, or a JSON text with MATLAB's names of parameters."""
+    """Return True for a MAT-file, or a text with MATLAB's names of parameters in its first characters `head`.
+
+    The file is not opened: one with suffix .mat counts whatever it holds.
+    """
     names = (
         "CameraParameters1",
         "PoseCamera2",
@@ -59,12 +62,15 @@ def recognises(path: Path, head: str) -> bool:
 
 
 def read(source: RigSource) -> Rig:
-    """Read the pair "camera1" and "camera2", or a single camera "camera1" at the origin.
+    """Read the pair "camera1" and "camera2" in metres from the first, or a single "camera1" at the origin.
+
+    A size that is not stated is the requested one, else guessed, with a warning.
 
     Raises:
         RigFileError: for a damaged file, a MATLAB object in place of a struct, unknown units, or a
             fundamental matrix that contradicts the pose.
-        ImportError: without scipy.
+        OSError: for a file that cannot be opened.
+        ImportError: without scipy, for a MAT-file.
     """
     fields = _outermost(source)
     if "CameraParameters1" not in fields:

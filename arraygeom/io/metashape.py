@@ -34,7 +34,8 @@ HEAD = "<chunk"
 def read(source: RigSource) -> Rig:
     """Read all aligned cameras of the file's one chunk, by label; others are left out with a warning.
 
-    Lengths are in metres by the stated scale; without one they are in the chunk's own unit.
+    Of equal labels the file of the image, or the camera's number with the label, is the name. Lengths are in
+    metres by the stated scale; without one they are in the chunk's own unit.
 
     Raises:
         RigFileError: for a damaged file, several chunks, no aligned camera, or lens terms that are not read.
@@ -77,8 +78,7 @@ def read(source: RigSource) -> Rig:
 
 
 def _name(camera: ET.Element, labels: Counter[str | None]) -> str:
-    """Return an image's label; of several with one label with its folder, where that is stated, else its
-    number."""
+    """Return an image's label; of several with one label its file, where that is stated, else its number."""
     label, photo = camera.get("label"), camera.find(".//photo")
     if label is None or labels[label] == 1:
         return label or f"camera{camera.get('id')}"

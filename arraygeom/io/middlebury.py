@@ -23,7 +23,12 @@ HEAD = r"(?m)^cam0\s*=\s*\["
 
 
 def read(source: RigSource) -> Rig:
-    """Read the pair cam0, cam1, in metres, with the depth range of the stated disparities, or none.
+    """Read the pair cam0 (the world) and cam1, in metres.
+
+    Returns:
+        The rig, with the depth range of the stated disparities, to infinity if they reach 0; without one if
+        they are not stated or give no depth. A size that is not stated is the requested one, else guessed,
+        with a warning.
 
     Raises:
         RigFileError: for a damaged file, a baseline that is not positive, or a contradictory `doffs`.

@@ -96,6 +96,9 @@ def read_text(text: str, path: str | Path) -> Rig:
         text: content of the file, YAML.
         path: name of the file in errors; nothing is read from it.
 
+    Returns:
+        The rig, in metres and our pixels, float64.
+
     Raises:
         RigFileError: for a damaged text; its message names the file, the entry and what to do.
     """
@@ -103,10 +106,10 @@ def read_text(text: str, path: str | Path) -> Rig:
 
 
 def write(rig: Rig) -> str:
-    """Format a rig as the text of a native file.
+    """Format a rig as the text of a native file, in metres and our pixels; all of the rig is kept.
 
     Raises:
-        ValueError: for a batch of rigs, or a camera model that has no name or that no file can hold.
+        ValueError: for a batch of rigs, or a camera model that has no name or holds values that no file can.
     """
     if rig.batch_shape:
         raise ValueError(
@@ -358,11 +361,7 @@ def _camera_entry(camera: View) -> dict[str, Any]:
 
 
 def _model_entry(lens: LensModel) -> dict[str, Any]:
-    """Return a lens or a camera model with its numbers.
-
-    Raises:
-        ValueError: for one without a name, or with values that no file holds.
-    """
+    """Return a lens or a camera model with its numbers; ValueError for one that no file can hold."""
     if isinstance(lens, Distortion):
         return {"model": lens.model, "coefficients": lens.coefficients.tolist()}
     if not isinstance(lens, CameraModel) or not lens.registered:

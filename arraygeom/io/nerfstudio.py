@@ -37,10 +37,11 @@ HEAD = '"(transform_matrix|fl_x|camera_angle_x)"'
 
 
 def read(source: RigSource) -> Rig:
-    """Read one camera for each frame, named by its `file_path`.
+    """Read one camera for each frame, named by its `file_path`, in the file's scale, taken as metres.
 
     Raises:
-        RigFileError: for a damaged file, or an unsupported lens.
+        RigFileError: for a damaged file, an unsupported lens, equal names, or an image size that is neither
+            stated nor requested where a field of view stands for the focal length.
     """
     document = source.json()
     frames, shared = document["frames"].each(), document.value
@@ -54,13 +55,14 @@ def read(source: RigSource) -> Rig:
 def write(rig: Rig) -> str:
     """Format a transforms.json with intrinsics in each frame.
 
-    Depth range, links and sensors have no place in it and are left out.
+    Depth range, links and sensors are left out.
 
     Returns:
         The text of the file.
 
     Raises:
-        ValueError: for lenses that the format cannot hold, and cameras that are not calibrated.
+        ValueError: for a rig without cameras, cameras that are uncalibrated or batches, and a K with skew or
+            a lens that the format cannot hold.
     """
     frames = [_frame(name, camera) for name, camera in calibrated(rig, "nerfstudio")]
     return json.dumps({"frames": frames}, indent=1) + "\n"

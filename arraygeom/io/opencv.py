@@ -39,10 +39,10 @@ def recognises(path: Path, head: str) -> bool:
 
 
 def read(source: RigSource) -> Rig:
-    """Read one camera "camera", a stereo pair "left" and "right", or cameras named in the file.
+    """Read one camera "camera", a stereo pair "left" (the world) and "right", or cameras named in the file.
 
-    A camera without a stated pose is at the origin. An image size that is not stated is guessed, with
-    a warning.
+    One camera without a stated pose is at the origin. A size that is not stated is the requested one, else
+    guessed, with a warning. Lengths are taken as metres.
 
     Raises:
         RigFileError: for a damaged file, half a pair, or cameras without a common frame.
@@ -60,14 +60,16 @@ def read(source: RigSource) -> Rig:
 
 
 def write(rig: Rig) -> str | dict[str, str]:
-    """Format one camera as a file; two as `intrinsics.yml` and `extrinsics.yml` of a folder, with camera 1 as
-    the world.
+    """Format one camera as a file; two as `intrinsics.yml` and `extrinsics.yml` of a folder.
+
+    The world is the first camera: its place is left out, and so are depth range, links and sensors.
 
     Returns:
         A text, or texts by file name.
 
     Raises:
-        ValueError: for more cameras, and for what the format cannot hold.
+        ValueError: for no cameras or more than two, cameras that are uncalibrated or batches, and a K with
+            skew or a lens that the format cannot hold.
     """
     cameras = calibrated(rig, "OpenCV")
     if len(cameras) == 1:

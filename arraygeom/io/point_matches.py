@@ -36,16 +36,21 @@ def read_matches(path: str | Path, files: Mapping[str, str | Path], sizes: Mappi
     """Read the matches between the images of cameras from a file.
 
     Args:
-        files: image file of each camera; only names are used, the images are not opened.
-        sizes: height and width of each image, pixels.
+        path: CSV file, whose lines are x0 y0 x1 y1, or COLMAP's database.
+        files: image file of each camera, for a CSV file in the order of its columns; only names are used, the
+            images are not opened.
+        sizes: height and width of each camera's image, pixels.
 
     Returns:
-        Points by pair of camera names, with pixel centres at whole numbers.
+        By pair of camera names, in the database's order, points (n, 2) of either, float64, with pixel centres
+        at whole numbers; pairs without matches are left out.
 
     Raises:
         FileNotFoundError: for a missing file.
         ValueError: for files of another kind, more or fewer than two images with a CSV file, a database
-            without these images, and points outside the images.
+            without one of these images or without matches between them, and points that are outside the
+            images or not finite.
+        KeyError: for a camera with matches that has no size.
     """
     path = Path(path)
     if not path.is_file():
@@ -57,7 +62,7 @@ def read_matches(path: str | Path, files: Mapping[str, str | Path], sizes: Mappi
     for names, points in matches.items():
         for name, x in zip(names, points):
             h, w = sizes[name]
-            outside = ((x < -0.5) | (x > x.new_tensor([w, h]) - 0.5)).any(-1)
+            outside = ~((x >= -0.5) & (x <= x.new_tensor([w, h]) - 0.5)).all(-1)
             if outside.any():
                 raise ValueError(
                     f"{path}: {int(outside.sum())} of {len(x)} points are outside the image of '{name}', "
@@ -67,11 +72,7 @@ def read_matches(path: str | Path, files: Mapping[str, str | Path], sizes: Mappi
 
 
 def _csv(path: Path, files: Mapping[str, Path]) -> PointPairs:
-    """Read the points of two images, x0,y0,x1,y1 a line.
-
-    Raises:
-        ValueError: for a line that is not of numbers, by its text.
-    """
+    """Read the points of two images, x0,y0,x1,y1 a line; ValueError for another line, by its text."""
     if len(files) != 2:
         raise ValueError(
             f"{path}: x0 y0 x1 y1 relate two images, and {len(files)} are given: give two, or a database"
@@ -99,8 +100,7 @@ def _words(line: str) -> list[str]:
 
 
 def _named_columns(line: str) -> Sequence[int] | None:
-    """Return the columns of x0, y0, x1, y1 by a header; the first four if it has none such; None for a line
-    of numbers."""
+    """Return the columns of x0, y0, x1, y1 by a header, else the first four; None for a line of numbers."""
     words = [word.strip("\"'").lower() for word in _words(line)]
     if any(map(_is_number, words)):
         return None
@@ -148,11 +148,7 @@ def _colmap(database: sqlite3.Connection, path: Path, files: Mapping[str, Path])
 
 
 def _image(path: Path, file: Path, images: Sequence[tuple[Path, int]]) -> int:
-    """Return the number of the image named like a file; by its folder too, where several have one name.
-
-    Raises:
-        ValueError: for no or several such images.
-    """
+    """Return the number of the image named like a file, of several by its folder; ValueError unless one."""
     alike = [(name, number) for name, number in images if name.name == file.name]
     end = file.absolute().parts
     below = [(len(name.parts), number) for name, number in alike if end[-len(name.parts) :] == name.parts]

@@ -42,7 +42,7 @@ def read(source: RigSource) -> Rig:
     """Read the streams that are images, by name, each at its largest size, or the requested one.
 
     A stream without the requested size is read at the first size that is listed. "Depth", or else the first
-    stream, is at the origin.
+    stream, is the world; lengths are metres.
 
     Raises:
         RigFileError: for a damaged file, no stream, one without extrinsics, or an unsupported lens.

@@ -95,10 +95,10 @@ def decoded(content: bytes, errors: str = "replace") -> str:
 
 
 class RigFileError(ValueError):
-    """A rig file that cannot be read: in one line, the file, its entry, and what to do.
+    """Error of a rig file that cannot be read; its text names file, entry and what to do, in one line.
 
     Attributes:
-        path: the file.
+        path: the file, a Path.
         entry: name of the entry; None for the file as a whole.
     """
 
@@ -116,7 +116,7 @@ class RigFileWarning(UserWarning):
 
 
 class RigSource:
-    """One rig file while it is read.
+    """One rig file while it is read; opened only by the methods that read it.
 
     Attributes:
         path: the file or folder.
@@ -136,8 +136,8 @@ class RigSource:
         return source
 
     def warn_of_unread(self) -> None:
-        """Warn of entries that no reader has looked up, if they look like a lens, a model, a flag
-        or a unit."""
+        """Give a RigFileWarning for each file with entries that no reader has looked up and that are
+        `suspicious`."""
         unread: dict[Path, list[str]] = {}
         for entry, used in self.lookups.values():
             left = [
@@ -170,8 +170,8 @@ class RigSource:
         """Return the file's bytes.
 
         Raises:
-            RigFileError: for a file that cannot be read, and for a pipe, on which reading would wait for
-                ever.
+            RigFileError: for a file that is missing or cannot be read, a folder, and a pipe, on which reading
+                would wait for ever.
         """
         try:
             if not self.path.is_file() and self.path.exists():
@@ -187,7 +187,8 @@ class RigSource:
             most: largest number of characters; None for any.
 
         Raises:
-            RigFileError: for a file that cannot be read, is empty, too long, or no text.
+            RigFileError: for a file that cannot be read, is empty or blank, too long, or no text in UTF-8 (or
+                UTF-16 with a byte order mark).
         """
         try:
             text = decoded(self.content(), "strict")
@@ -236,7 +237,10 @@ class RigSource:
         return self._parsed("YAML", load_yaml, self.text() if text is None else text)
 
     def xml(self) -> ET.Element:
-        """Return the root of an XML file.
+        """Parse the file as XML.
+
+        Returns:
+            The root element.
 
         Raises:
             RigFileError: for a file that is too large, defines entities, or is no XML.
@@ -250,9 +254,12 @@ class RigSource:
             raise self.fail(f"line {error.position[0]}", "is not XML; is the file whole?") from None
 
     def document(self) -> Entry:
-        """Return the mapping of a file in JSON, TOML, XML or YAML, OpenCV's dialects and messages included.
+        """Parse a file in JSON, TOML (by its suffix), XML or YAML, OpenCV's dialects and printed ROS messages
+        included.
 
-        Of several YAML documents the first, and of OpenCV's data what is no picture or map.
+        Returns:
+            The entry of the whole document, whose value is a mapping that is not empty; of several YAML
+            documents the first, with large pictures and maps emptied.
 
         Raises:
             RigFileError: for any other file.
@@ -270,7 +277,7 @@ class RigSource:
     def _parsed(self, kind: str, load: Callable[[str], Any], text: str) -> Entry:
         try:
             document = load(text)
-        except (ValueError, yaml.YAMLError) as error:
+        except (ValueError, RecursionError, yaml.YAMLError) as error:
             line, problem = text_problem(error)
             raise self.fail(
                 f"line {line}" if line else None, f"is not {kind} ({problem}); is the file whole?"
@@ -292,11 +299,12 @@ class RigSource:
                 brackets, with commas and semicolons.
 
         Returns:
-            The entry of a mapping: for names that the pattern matches lists of numbers, for others the text.
-            Lines without the separator are left out.
+            The entry of a mapping: for names that the pattern matches vectors of numbers, float64, for others
+            the text of the last such line. Lines without the separator are left out.
 
         Raises:
-            RigFileError: for such a name that occurs twice, or whose values are no numbers.
+            RigFileError: for such a name that occurs twice, or whose values are no finite numbers, and as
+                `text`.
         """
         entries: dict[str, Tensor | str] = {}
         for line in self.text().splitlines():
@@ -349,6 +357,7 @@ class RigSource:
 
         Raises:
             RigFileError: for no camera, or a name that occurs twice.
+            ValueError: also as `Rig` raises it.
         """
         named: dict[str, Camera] = {}
         for name, camera in cameras:
@@ -366,7 +375,7 @@ class Entry:
     Attributes:
         source: the file.
         value: the value as parsed; None for an entry that is missing.
-        name: name in the file, with those of the mappings around it.
+        name: name in the file, after the names of the mappings around it; empty for the whole document.
     """
 
     def __init__(self, source: RigSource, value: Any, name: str) -> None:
@@ -381,21 +390,13 @@ class Entry:
         return Entry(self.source, value, f"{self.name}.{name}" if self.name else name)
 
     def mapping(self) -> Entry:
-        """Return this entry.
-
-        Raises:
-            RigFileError: unless it is a mapping that is not empty.
-        """
+        """Return this entry; RigFileError unless it is a mapping that is not empty."""
         if not self._named():
             raise self.fail(NO_MAPPING)
         return self
 
     def _named(self) -> Mapping[Any, Any]:
-        """Return the value.
-
-        Raises:
-            RigFileError: unless it is a mapping.
-        """
+        """Return the value; RigFileError unless it is a mapping."""
         if not isinstance(self.value, Mapping):
             raise self.fail(NO_MAPPING)
         return self.value
@@ -404,11 +405,7 @@ class Entry:
         return key in self._named()
 
     def __getitem__(self, keys: str | tuple[str, ...]) -> Entry:
-        """Return the entry under the first of the keys that is there and not None.
-
-        Raises:
-            RigFileError: if there is none.
-        """
+        """Return the entry under the first of the keys that is there and not None; RigFileError for none."""
         keys = (keys,) if isinstance(keys, str) else keys
         for key in keys:
             self.use(key)
@@ -417,11 +414,7 @@ class Entry:
         raise self.fail(f"has no {' or '.join(keys)}")
 
     def get(self, key: str, default: Any = None) -> Entry:
-        """Return the entry under a key, or the default.
-
-        Raises:
-            RigFileError: unless this is a mapping.
-        """
+        """Return the entry under a key, or the default; RigFileError unless this is a mapping."""
         self.use(key)
         return self.at(self._named().get(key, default), key)
 
@@ -433,18 +426,15 @@ class Entry:
             self.source.lookups.setdefault(id(mapping), (entry, set()))[1].update(map(str, keys))
 
     def items(self) -> list[tuple[str, Entry]]:
-        """Return all names and entries of a mapping.
-
-        Raises:
-            RigFileError: unless this is a mapping.
-        """
+        """Return all names and entries of a mapping; RigFileError unless this is one."""
         self.use()
         return [(str(key), self.at(value, str(key))) for key, value in self._named().items()]
 
     def find(self, name: str, side: str = "") -> Entry:
         """Find the entry of a mapping whose name matches a pattern.
 
-        Names are compared in lower case without punctuation, as `plain` returns them.
+        Names are compared in lower case without punctuation, as `plain` returns them. Entries that are None
+        do not count, nor single numbers named as one coefficient of a lens, such as k1.
 
         Args:
             name: regular expression of such a name.
@@ -455,7 +445,7 @@ class Entry:
             The entry; its value is None if no name matches.
 
         Raises:
-            RigFileError: if two names match whose values differ.
+            RigFileError: if two names match whose values differ, and unless this is a mapping.
         """
         ends = {"1": ("left|l", "1"), "2": ("right|r", "2")}.get(side)
         name = f"({name})"
@@ -481,10 +471,10 @@ class Entry:
             side: camera of a stereo pair, as for `find`; names without a side are taken where none has it.
 
         Returns:
-            The entry; its value is None if no entry names a model.
+            The entry, a word or a flag of fisheyes; its value is None if there is none.
 
         Raises:
-            RigFileError: if two names match whose values differ.
+            RigFileError: as `find`.
         """
         for name in MODEL_NAMES:
             for which in dict.fromkeys((side, "")):
@@ -506,7 +496,8 @@ class Entry:
             Height and width in pixels.
 
         Raises:
-            RigFileError: for a size that is not positive and whole, or too large.
+            RigFileError: for a size that is not positive and whole, or too large; as `find` and
+                `size_unstated`.
         """
         usual = (
             [] if keys else [(names, which) for which in (side, "") for names in (SIZE_NAMES, [SIZE_NAME])]
@@ -518,12 +509,17 @@ class Entry:
         return self.source.size_unstated(K)
 
     def K(self, side: str = "") -> Tensor:
-        """Return the intrinsic matrix under a usual name, of one side of a pair or of none.
+        """Return the intrinsic matrix under a usual name: of a matrix, or of focal lengths and centre as four
+        numbers or one by one.
 
-        A matrix, or focal lengths and centre as four numbers or one by one.
+        Args:
+            side: as of `find`.
+
+        Returns:
+            K (3, 3), float64, of pixels as the file counts them.
 
         Raises:
-            RigFileError: if there is none, and as `intrinsics`.
+            RigFileError: if there is none, and as `find` and `intrinsics`.
         """
         entry, parts = self.find(K_NAME, side), [self.find(name, side) for name in PINHOLE_NAMES]
         if entry.value is not None:
@@ -535,8 +531,14 @@ class Entry:
     def usual_lens(self, side: str = "") -> Distortion | None:
         """Return the lens of coefficients under a usual name, or of k1, k2, p1, p2 ... one by one.
 
+        Args:
+            side: as of `find`; one by one they are found for "" alone.
+
+        Returns:
+            The lens; None for a pinhole, with a warning if the file states no coefficients.
+
         Raises:
-            RigFileError: as `of_model`.
+            RigFileError: as `find` and `of_model`.
         """
         entry, word = self.find(LENS_NAME, side), self.model(side)
         fields = entry if entry.is_table else self
@@ -561,7 +563,8 @@ class Entry:
             stated: K, hw, distortion or sensor as of `Camera`.
 
         Raises:
-            RigFileError: for a camera without K, or without a pose; for numbers that no camera has.
+            RigFileError: for a camera without K, or without a pose, and as the methods that find its parts.
+            ValueError: also as `Camera` raises it.
         """
         if "K" not in stated and (inner := self.find(K_NAME, side)).is_table:
             self.use()
@@ -576,10 +579,16 @@ class Entry:
         return Camera(K=K, cam_from_world=pose, hw=hw, distortion=lens, **stated)
 
     def pose(self, side: str = "") -> Pose | None:
-        """Return the pose by R and t, or a matrix, under usual names; None if neither is there.
+        """Return the pose by R and t, or by a matrix from the world into the camera, under usual names.
+
+        Args:
+            side: as of `find`.
+
+        Returns:
+            The pose X' = R X + t in the file's unit; None if neither is there.
 
         Raises:
-            RigFileError: for one of R and t without the other, and as `pose_of`.
+            RigFileError: for one of R and t without the other, and as `find`, `pose_of` and `pose_matrix`.
         """
         R, t, both = (self.find(name, side) for name in (R_NAME, T_NAME, POSE_NAME))
         if both.value is not None and R.value is None:
@@ -599,21 +608,13 @@ class Entry:
         return isinstance(self.value, Mapping) and "data" not in self.value
 
     def each(self) -> list[Entry]:
-        """Return the parts of a list.
-
-        Raises:
-            RigFileError: unless this is a list that is not empty.
-        """
+        """Return the parts of a list; RigFileError unless this is one that is not empty."""
         if not isinstance(self.value, list) or not self.value:
             raise self.fail("is no list, or an empty one; is the file whole?")
         return [Entry(self.source, value, f"{self.name}[{i}]") for i, value in enumerate(self.value)]
 
     def listed(self, *keys: str) -> Entry:
-        """Return the values of a mapping under these keys, as one list.
-
-        Raises:
-            RigFileError: if one is missing.
-        """
+        """Return the values of a mapping under these keys, as one list; RigFileError if one is missing."""
         return self.joined([self[key] for key in keys])
 
     def joined(self, entries: Sequence[Entry]) -> Entry:
@@ -629,7 +630,8 @@ class Entry:
             also: end of the message for other values.
 
         Returns:
-            Tensor of the list's shape; of no axes for one number.
+            Tensor of the list's shape; of no axes for one number, a vector for text with numbers and for the
+            `data` of OpenCV's and ROS' matrices.
 
         Raises:
             RigFileError: for NaN, infinity unless accepted, and values that are no numbers.
@@ -647,14 +649,11 @@ class Entry:
         return tensor
 
     def numbers(self, shape: tuple[int, ...] | None = None, *, infinite: bool = False) -> Tensor:
-        """Return the numbers as a tensor of a shape (from any nesting that has as many), or as a vector.
+        """Return the numbers, float64, as a tensor of a shape (from any nesting of as many), or as a vector.
 
         Args:
             shape: wanted shape; None for a vector of any length.
             infinite: True to accept infinite numbers.
-
-        Returns:
-            The numbers, float64.
 
         Raises:
             RigFileError: for another number of numbers, and as `tensor`.
@@ -666,26 +665,18 @@ class Entry:
         return tensor.reshape(shape or (-1,))
 
     def number(self) -> float:
-        """Return one finite number.
-
-        Raises:
-            RigFileError: for anything else.
-        """
+        """Return one finite number; RigFileError for anything else."""
         return float(self.numbers((1,)))
 
     def transposed(self, side: int) -> Entry:
-        """Return a square matrix column by column.
-
-        Raises:
-            RigFileError: for another number of numbers.
-        """
+        """Return a square matrix column by column; RigFileError for another number of numbers."""
         return Entry(self.source, self.numbers((side, side)).T, self.name)
 
     def size(self) -> HW:
-        """Return height and width from a width and a height, in pixels.
+        """Return (height, width) from two numbers, width first, in pixels.
 
         Raises:
-            RigFileError: for a size that is not positive and whole, or too large.
+            RigFileError: for other numbers than two, not positive, not whole, or too large.
         """
         w, h = self.numbers((2,)).tolist()
         if min(w, h) < 1 or w != int(w) or h != int(h):
@@ -707,7 +698,7 @@ class Entry:
             K (3, 3), float64.
 
         Raises:
-            RigFileError: for another last row, or focal lengths that are not positive.
+            RigFileError: for another last row or focal lengths that are not positive, and as `numbers`.
         """
         K = self.numbers((3, 3))
         if K[2].tolist() != [0.0, 0.0, 1.0]:
@@ -735,8 +726,8 @@ class Entry:
             Matrix (3, 3), float64.
 
         Raises:
-            RigFileError: for other matrices, vectors longer than `LARGEST_ANGLE`, and another number of
-                numbers.
+            RigFileError: for other matrices, vectors with a number above `LARGEST_ANGLE`, and another number
+                of numbers.
         """
         numbers = self.numbers()
         if numbers.numel() == 3:
@@ -755,7 +746,7 @@ class Entry:
         return R if error < 1e-12 else U @ Vh
 
     def pose_matrix(self, metres: float = 1.0) -> Pose:
-        """Return a pose from a 4 x 4 or 3 x 4 matrix.
+        """Return the pose of a 4 x 4 or 3 x 4 matrix (R, t).
 
         Args:
             metres: metres of the file's unit of length.
@@ -778,7 +769,7 @@ class Entry:
             The lens; None if all coefficients are 0, or none are stated.
 
         Raises:
-            RigFileError: for more than 14.
+            RigFileError: for more than 14, and as `numbers`.
         """
         c = torch.zeros(0) if self.value is None else self.numbers()
         if not c.any():
@@ -792,7 +783,7 @@ class Entry:
         """Return a Kannala-Brandt fisheye from one to four coefficients, zero-padded to four.
 
         Raises:
-            RigFileError: for another number of them.
+            RigFileError: for another number of them, or none, and as `numbers`.
         """
         c = self.numbers()
         if not 1 <= c.numel() <= 4:
@@ -800,20 +791,21 @@ class Entry:
         return Distortion(KANNALA_BRANDT, torch.nn.functional.pad(c, (0, 4 - c.numel())))
 
     def of_model(self, word: Entry) -> Distortion | None:
-        """Return the lens of the model that an entry names, by a word or a flag of fisheyes.
+        """Return the lens of this entry's coefficients and of the model that another one names.
 
-        Where it names none: of the model that the user states, else of OpenCV's that fits, with a warning if
-        there are four numbers, which both have.
+        Where it names none, the model is the one that the user states, else Brown-Conrady, but for four
+        numbers, which a fisheye has too, the one that fits, with a warning unless all are 0.
 
         Args:
-            word: entry with the model's name or flag; its value is None if there is none.
+            word: entry with the model's name or a flag of fisheyes; its value is None if there is none.
 
         Returns:
-            The lens; None for a pinhole, with a warning if the file states no coefficients.
+            The lens; None for a pinhole: the model "none", no coefficients (with a warning if they are not
+            stated), and Brown-Conrady's that are all 0.
 
         Raises:
-            RigFileError: for an unknown model, one that contradicts the user's, or a fisheye without
-                coefficients.
+            RigFileError: for an unknown model, one that contradicts the user's, a fisheye without
+                coefficients, the model "none" with some, and as `lens`.
         """
         said = _said(word)
         wanted, none = self.source.lens, said in ("", "none")
@@ -864,6 +856,7 @@ class Entry:
 
         Raises:
             RigFileError: for another number of coefficients, or values that no lens has.
+            KeyError: for another model.
         """
         if model in (BROWN_CONRADY, KANNALA_BRANDT):
             return self.brown_conrady() if model == BROWN_CONRADY else self.kannala_brandt()
@@ -885,7 +878,11 @@ def single(value: Any) -> bool:
 
 
 def suspicious(key: Any, value: Any) -> bool:
-    """Return True if an entry may be a lens, a model, a flag or a unit, and states something."""
+    """Return True if an entry may be a lens, a model, a flag or a unit by its name, and is not 0, False or
+    empty.
+
+    A text counts if it names a lens model, or under a name of a unit.
+    """
     name = plain(key)
     if value is None or HARMLESS.fullmatch(name):
         return False
@@ -914,8 +911,7 @@ def pose_of(R: Entry, t: Entry, metres: float = 1.0) -> Pose:
 
 
 def float64_of(value: Any) -> Tensor | None:
-    """Return numbers, nested in lists or not, as a float64 tensor; None for anything else, such as true or
-    text."""
+    """Return numbers, nested in lists or not, as a float64 tensor; None for others, such as true or text."""
     if _has_truth(value):
         return None
     try:

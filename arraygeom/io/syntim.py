@@ -24,10 +24,12 @@ HEAD = r"(?s)(?=.*Intrinsic parameters:).*Scale factor"
 
 
 def read(source: RigSource) -> Rig:
-    """Read the pair "left" and "right", or the one camera that is there.
+    """Read the pair "left" and "right" of a file cam_NAME_g or cam_NAME_d, or the one there is, in metres.
+
+    A file of another name gives one camera of that name.
 
     Raises:
-        RigFileError: for a damaged file.
+        RigFileError: for a damaged file, or none.
     """
     side = source.path.name[-2:]
     if side not in SIDES:

@@ -37,8 +37,8 @@ class OpenGLCamera(NamedTuple):
     """Matrices of OpenGL: x right, y up, z backward; multiplied from the left.
 
     Attributes:
-        view: camera from world.
-        projection: clip coordinates from camera.
+        view: camera from world, lengths as the camera's, with the batch axes of the pose.
+        projection: clip coordinates from camera, y up (the image's first row is at the top), with K's axes.
     """
 
     view: Float[Tensor, "*b 4 4"]
@@ -49,11 +49,11 @@ class PyTorch3DCamera(NamedTuple):
     """Arguments of `pytorch3d.renderer.PerspectiveCameras` with `in_ndc=False`: x left, y up, rows times R.
 
     Attributes:
-        R: rotation, X_camera = X_world R + T.
-        T: translation.
+        R: rotation, X_camera = X_world R + T, with the batch axes of the pose, and the rest with K's.
+        T: translation, lengths as the camera's.
         focal_length: (fx, fy), pixels.
         principal_point: (cx, cy), with the first pixel's centre at (0.5, 0.5).
-        image_size: (height, width).
+        image_size: (height, width), pixels, as floats.
     """
 
     R: Float[Tensor, "*b 3 3"]
@@ -78,7 +78,8 @@ def from_gsplat(viewmats: Float[Tensor, "*b 4 4"], Ks: Float[Tensor, "*b 3 3"], 
 
 
 def to_opengl(camera: Camera, near: float, far: float) -> OpenGLCamera:
-    """Convert a pinhole camera, or a batch, with clipping planes at `near` and `far`; differentiable.
+    """Convert a pinhole camera, or a batch, with clipping planes at `near` and `far`, in the unit of the
+    camera's translation; differentiable in the camera.
 
     Raises:
         ValueError: for a lens, and planes that are not 0 < near < far < infinity.
@@ -114,7 +115,7 @@ def to_pytorch3d(camera: Camera) -> PyTorch3DCamera:
     """Convert a pinhole camera without skew, or a batch; differentiable.
 
     Raises:
-        ValueError: for a lens, and a skewed or rotated K.
+        ValueError: for a lens, and a skewed or rotated K (a mirrored one is not refused).
     """
     K = _pinhole(camera).K
     if bool((K[..., 0, 1] != 0).any() | (K[..., 1, 0] != 0).any()):

@@ -50,11 +50,15 @@ def read(source: RigSource) -> Rig:
 def cameras_of(nodes: Entry, *, alone: str) -> Iterator[tuple[str, Camera]]:
     """Yield the cameras of a document with their names: those stated, else left and right, or cam0, cam1 ...
 
+    The world is the first of a pair whose R and T are at the top; a single camera without a pose is at its
+    origin.
+
     Args:
+        nodes: entry of the document, a mapping.
         alone: name of a single camera for which none is stated.
 
     Raises:
-        RigFileError: as `read`.
+        RigFileError: as `read`: for a camera without K, one of several without a pose, and damaged numbers.
     """
     K, R, t = (nodes.find(name) for name in (K_NAME, R_NAME, T_NAME))
     pair, origin = R.value is not None and t.value is not None, Pose.identity()

@@ -90,11 +90,12 @@ def capture_of(path: Path) -> list[Path]:
     Its images lie in one folder, and their names differ only after the last "_".
 
     Returns:
-        Files, sorted, without those whose tags state no camera, `path` included. For a name without "_"
-        `path` alone.
+        Files, sorted; those whose tags state no camera are left out, `path` too. For a name without "_"
+        `path` alone, whatever its tags.
 
     Raises:
-        OSError: for a file that cannot be opened.
+        OSError: for a file or folder that cannot be opened.
+        ImportError: without Pillow.
     """
     stem = path.stem.rpartition("_")[0]
     beside = sorted(
@@ -104,16 +105,20 @@ def capture_of(path: Path) -> list[Path]:
 
 
 def by_capture(paths: Sequence[Path]) -> dict[str, list[Path]]:
-    """Group the images of several captures by the names of their bands.
+    """Group the images of several captures by the names of their bands (`named_by_band`).
 
-    Warns of captures that lack a band, which are left out.
+    Captures with other bands than the largest are left out, with a RigFileWarning.
 
     Args:
-        paths: files of one band each, in any order.
+        paths: files of one band each, in any order; names in a capture differ after the last "_".
 
     Returns:
-        Files of whole captures, in their order; empty for a single capture, and for images without tags of
-        their cameras.
+        Files of whole captures by band, in the captures' order; empty for a single whole capture, a single
+        band, and if the largest capture's tags do not state their cameras.
+
+    Raises:
+        OSError: for a file that cannot be opened.
+        ImportError: without Pillow.
     """
     captures: dict[tuple[Path, str], dict[str, Path]] = {}
     for path in paths:
@@ -139,6 +144,7 @@ def named_by_band(paths: Sequence[Path]) -> dict[str, Path]:
 
     Raises:
         OSError: for a file that cannot be opened.
+        ImportError: without Pillow.
     """
     bands = []
     for path in paths:
@@ -174,10 +180,11 @@ def rig_of_images(files: Mapping[str, Path]) -> Rig:
         The rig, of the images as their orientation tags rotate them; lengths in metres.
 
     Raises:
-        RigFileError: for images without tags, tags that lack the intrinsics, several captures or bodies,
-            mirrored images, and numbers that no camera has.
+        RigFileError: for images without tags, tags that lack the intrinsics, several captures or bodies, and
+            mirrored or cropped images.
         OSError: for a file that cannot be opened.
-        ValueError: for no images.
+        ValueError: for no images, and numbers that no camera or sensor has.
+        ImportError: without Pillow.
     """
     if not files:
         raise ValueError("there are no images")
@@ -214,6 +221,7 @@ class _Image(NamedTuple):
 
         Raises:
             RigFileError: unless they state its camera.
+            OSError: for a file that cannot be opened.
         """
         tags = image_tags(source.path)
         if tags is None or not _states_camera(tags):
@@ -239,7 +247,7 @@ class _Image(NamedTuple):
             Vector of `count` numbers, float64.
 
         Raises:
-            RigFileError: if it is not stated, or has another count.
+            RigFileError: if it is not stated, has another count, or is no finite numbers.
         """
         numbers = self.numbers(name, count)
         if numbers is None:
@@ -248,7 +256,7 @@ class _Image(NamedTuple):
 
     @property
     def per_mm(self) -> Tensor:
-        """Pixels per millimetre of the sensor, (x, y), float64.
+        """Pixels per millimetre of the sensor, (x, y), float64, by EXIF's resolution of the focal plane.
 
         Raises:
             RigFileError: if it is not stated.
@@ -276,7 +284,7 @@ class _Image(NamedTuple):
         """Camera's centre (3) in the rig, metres, float64; zero if it is not stated.
 
         Raises:
-            RigFileError: for numbers too large for metres.
+            RigFileError: for other than three numbers, and numbers too large for metres.
         """
         if (translation := self.numbers("RigTranslations", 3)) is None:
             return torch.zeros(3, dtype=torch.float64)
@@ -359,7 +367,17 @@ class _Image(NamedTuple):
         return K
 
     def sensor(self) -> Sensor:
-        """Return the sensor by the tags: band; of raw bands also black level, exposure and gain."""
+        """Return the sensor by the tags.
+
+        Returns:
+            Its response: "rgb", a Band, or None if unstated. Of raw bands (no colour, no JPEG) also linear
+            coding, 16 bits, black level, exposure (None if unstated), and gain (ISO / 100, or SensorGain).
+            Other tags that are missing give warnings.
+
+        Raises:
+            RigFileError: for tags that are no numbers.
+            ValueError: also as `Sensor` and `Band` raise it.
+        """
         fields = self.tags.fields
         colour = len((self.text("BandName") or "").split(",")) == 3
         centre, width = (self._one(name, 0.0) for name in ("CentralWavelength", "WavelengthFWHM"))
@@ -444,7 +462,7 @@ class ImageTags(NamedTuple):
     """Tags of an image file.
 
     Attributes:
-        hw: height and width of the stored pixels.
+        hw: height and width of the stored pixels, before an orientation is applied.
         fields: values of TIFF, EXIF and GPS fields by their number, as tuples; 0 for NaN.
         xmp: XMP tags by name (lists joined by commas), of the first of Pix4D's, DJI's and MicaSense's
             namespaces that has it.

@@ -41,12 +41,13 @@ HEAD = r"(?i)\[LEFT_CAM_"
 
 
 def read(source: RigSource) -> Rig:
-    """Read the cameras `left` and `right`, at the requested size, else at the largest.
+    """Read the cameras `left` (the world) and `right` in metres, at the requested size, else at the largest.
 
     A file without a right camera gives `left` alone.
 
     Raises:
-        RigFileError: for a damaged file, no camera of a known or of the requested size, or missing numbers.
+        RigFileError: for a damaged file, no left camera, no known size that both cameras have, none of the
+            requested size, or missing numbers.
     """
     parser = configparser.ConfigParser(interpolation=None, inline_comment_prefixes=("#", ";"))
     try:
@@ -61,7 +62,7 @@ def read(source: RigSource) -> Rig:
         name: hw for name, hw in SIZES.items() if all(f"{side}_cam_{name}" in sections for side in sides)
     }
     listed = ", ".join(f"{w}x{h}" for h, w in there.values())
-    if not there:
+    if not there or "left" not in sides:
         raise source.fail(None, f"has no LEFT_CAM and RIGHT_CAM of a known resolution ({', '.join(SIZES)})")
     if source.hw is not None and source.hw not in there.values():
         raise source.fail(None, f"has no cameras of {source.hw[1]}x{source.hw[0]}; it has {listed}")

@@ -17,7 +17,8 @@ from .model import CameraModel, beside_points
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PolynomialFisheye(CameraModel, name="polynomial-fisheye"):
-    """Fisheye that maps the angle theta off axis to the radius theta + k2 theta^2 + k3 theta^3 + ...
+    """Fisheye that maps the angle theta off axis to the radius theta + k2 theta^2 + k3 theta^3 + ... on the
+    image plane, which K takes to pixels.
 
     Without coefficients it is the equidistant fisheye. It ends at `widest`, or earlier where the radius stops
     increasing.
@@ -36,7 +37,7 @@ class PolynomialFisheye(CameraModel, name="polynomial-fisheye"):
 
         Returns:
             Points of the image plane (*n, 2), and True (*n) up to the angle at which the lens ends; NaN,
-            infinity and (0, 0, 0) are not valid.
+            infinity and (0, 0, 0) are not valid. Points that are not valid mean nothing.
         """
         X, finite = finite_points(X)
         squared = X[..., :2].square().sum(-1)
@@ -54,7 +55,7 @@ class PolynomialFisheye(CameraModel, name="polynomial-fisheye"):
 
         Returns:
             Directions (*n, 3) in the camera's frame, and True (*n) up to the radius at which the lens ends;
-            further out the direction at its end.
+            further out the direction at its end, for NaN and infinity the axis.
         """
         xy, finite = finite_points(xy)
         squared = xy.square().sum(-1)
@@ -106,11 +107,11 @@ ITERATIONS = 40
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Equirectangular(CameraModel, name="equirectangular"):
-    """Camera model of longitude and latitude, radians: x right of the axis, up to pi either way, y down, up
-    to pi / 2.
+    """Camera model whose image plane is longitude x (right of the axis, up to pi either way) and latitude y
+    (down, up to pi / 2), radians; it has no numbers.
 
-    The K of a whole sphere W pixels wide has the focal length W / (2 pi) and the image's middle as its
-    centre.
+    The K of a whole sphere in W x H pixels has the focal length W / (2 pi) and the centre
+    ((W - 1) / 2, (H - 1) / 2).
     """
 
     period: ClassVar[float] = 2 * math.pi
@@ -119,8 +120,8 @@ class Equirectangular(CameraModel, name="equirectangular"):
         """Project directions (*n, 3) of any length in the camera's frame.
 
         Returns:
-            Longitude and latitude in radians (*n, 2), and True (*n) for every direction; NaN, infinity and
-            (0, 0, 0) are not valid.
+            Longitude (0 straight up and down) and latitude in radians (*n, 2), and True (*n) for every
+            direction; NaN, infinity and (0, 0, 0) are not valid.
         """
         X, finite = finite_points(X)
         x, y, z = X.unbind(-1)
@@ -136,7 +137,7 @@ class Equirectangular(CameraModel, name="equirectangular"):
 
         Returns:
             Directions (*n, 3) in the camera's frame, and True (*n) for a longitude up to pi and a latitude up
-            to pi / 2 either way.
+            to pi / 2 either way; NaN and infinity are not valid.
         """
         xy, finite = finite_points(xy)
         longitude, latitude = xy.unbind(-1)

@@ -17,14 +17,14 @@ from .common import BEYOND, MARGIN, POLE, SOLVED, TINY, WIDEST, norm, once, poly
 
 @dataclass(frozen=True)
 class Brown:
-    """Coefficients by name, each of shape (*b, 1..).
+    """Coefficients of Brown-Conrady's model by name, each of shape (*b, 1..).
 
     Attributes:
-        k: radial coefficients k1 to k3, or to k6 if the lens is rational.
+        k: radial coefficients k1 to k3; of more than 5 coefficients (a rational lens) k1 to k6.
         p: tangential coefficients p1 and p2.
-        s: thin-prism coefficients s1 to s4; empty if there are none.
-        tilt: angles of the sensor about x and y, radians; None if there are none.
-        eighth: factor of r^8 in the numerator; None if there is none.
+        s: thin-prism coefficients s1 to s4; empty for up to 8 coefficients.
+        tilt: angles of the sensor about x and y, radians; None unless there are 14 coefficients.
+        eighth: factor of r^8 in the numerator; None unless there are 15.
     """
 
     k: tuple[Tensor, ...]
@@ -48,12 +48,13 @@ def brown_distort(c: Tensor, xy: Tensor) -> tuple[Tensor, Tensor]:
     """Distort normalised points (*n, 2), which lie in the plane z = 1 of the camera's frame.
 
     Args:
-        c: coefficients (*b, 4 to 15), as `Brown.named` takes them.
+        c: coefficients (*b, 1.., k), k from 4 to 15 in OpenCV's order, with an axis of length 1 for each
+            further one of the points.
         xy: points (*b, ..., 2).
 
     Returns:
-        Distorted points, and True (*n) within the model's range: up to `brown_limit`, without a fold, and
-        ahead of a tilted sensor. Points beyond the limit are moved back to it.
+        Distorted points (*n, 2), and True (*n) within the model's range: up to `brown_limit`, without a fold,
+        and ahead of a tilted sensor. Points beyond the limit are moved back to it first; NaN stays NaN.
     """
     lens, limit = Brown.named(c), once(brown_limit, c).to(xy)
     squared = xy.square().sum(-1)
@@ -65,15 +66,15 @@ def brown_distort(c: Tensor, xy: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def brown_derivatives(c: Tensor, xy: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Distort normalised points (n, 2), with derivatives in closed form.
+    """Distort normalised points (n, 2), with derivatives in closed form; validity is not checked.
 
     Args:
-        c: coefficients (k,) in OpenCV's order, up to the prism's; a tilt and a factor of r^8 are not refused,
-            but not differentiated.
+        c: coefficients (k,) in OpenCV's order, up to the prism's 12. More are not refused: a tilt is left
+            out, and derivatives are by the first 12 alone.
         xy: points; those beyond `brown_limit` are moved back to it.
 
     Returns:
-        Distorted points, derivatives by the points (n, 2, 2) and by the coefficients (n, 2, k).
+        Distorted points (n, 2), their derivatives by the points (n, 2, 2) and by the coefficients (n, 2, k).
     """
     lens, limit = Brown.named(c[None]), once(brown_limit, c[None]).to(xy)
     squared = xy.square().sum(-1)
@@ -103,19 +104,18 @@ def brown_derivatives(c: Tensor, xy: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def brown_undistort(c: Tensor, xy_d: Tensor) -> tuple[Tensor, Tensor]:
-    """Undistort points: undo the tilt exactly, solve for the radius in a bracket, then for (x, y) by Newton's
-    method.
+    """Undistort points, the inverse of `brown_distort`: undo the tilt exactly, solve for the radius in a
+    bracket, then for (x, y) by Newton's method.
 
-    The last two Newton steps are differentiable: from a solution that is a constant, one step propagates the
-    first derivatives and the next one the second (the error of a Newton step is the square of the one
-    before).
+    The last two Newton steps carry first and second derivatives.
 
     Args:
-        c: coefficients (*b, 4 to 15), as `Brown.named` takes them.
+        c: coefficients (*b, 1.., k), as `brown_distort` takes them.
         xy_d: distorted normalised points (*b, ..., 2).
 
     Returns:
-        Undistorted normalised points (*n, 2), and True (*n) within the model's range.
+        Undistorted normalised points (*n, 2), and True (*n) within the model's range; elsewhere the solution
+        of the radial terms alone, at most at the limit, and for NaN NaN.
     """
     lens = Brown.named(c)
     H = _tilt_matrix(lens)
@@ -168,15 +168,16 @@ def _radial_factor(lens: Brown, u: Tensor) -> tuple[Tensor, Tensor]:
 def brown_limit(c: Tensor) -> Tensor:
     """Compute the squared radius up to which the model is used: where its radial part r g(r^2) stops rising.
 
-    Earlier before a pole and where other terms may fold the image; `WIDEST` squared at most.
+    It ends earlier at a pole and where other terms may fold the image, and at `WIDEST` squared.
 
     With g = N / D the slope is P / D^2, P(u) = (N + 2 u N') D - 2 u N D', of degree 6 (or 7) with P(0) = 1.
 
     Args:
-        c: coefficients (*b, 1.., 4 to 15).
+        c: coefficients (*b, 1.., k), as `brown_distort` takes them.
 
     Returns:
-        Squared radii (*b, 1..) of undistorted normalised points, float64 on the CPU, without gradient.
+        Squared radii (*b, 1..) of undistorted normalised points, float64 on the CPU, without gradient; 0 for
+        radial coefficients that are not finite.
     """
     lens = Brown.named(c)
     k1, k2, k3, *rational = (k.detach().to("cpu", torch.float64) for k in lens.k)
@@ -269,8 +270,7 @@ def _brown_inverse(c: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _reach(lens: Brown, limit: Tensor) -> Tensor:
-    """Largest distorted radius of any point within the range: radial, tangential and prism terms at the
-    limit."""
+    """Largest distorted radius of any point within the range: all terms at the limit."""
     radial = limit.sqrt() * _radial_factor(lens, limit)[0].abs()
     constant, squared = _prism_sizes(lens)
     tangential, prism = 3 * torch.hypot(*lens.p), constant + limit * squared
@@ -290,8 +290,7 @@ FEW = 8
 
 
 def _attempts(lens: Brown, limit: Tensor, start: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    """Solve with two further attempts from further in: near the turn the slope is nearly 0 and
-    leads nowhere."""
+    """Solve with two further attempts from further in: near the turn a slope of nearly 0 leads nowhere."""
     solved, valid = start, torch.zeros_like(target[..., 0], dtype=torch.bool)
     for begin in (start, _pulled_in(start, 0.9 * limit), _pulled_in(target, 0.5 * limit)):
         begun = torch.where(valid[..., None], solved, begin)

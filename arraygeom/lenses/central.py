@@ -56,8 +56,8 @@ def central_project(model: str, c: Tensor, X: Tensor) -> tuple[Tensor, Tensor]:
 
     Returns:
         Distorted normalised points (*n, 2), and True (*n) within the cone and the range that the model sees
-        and for coefficients within its bounds. Other directions give the nearest point of the cone's border,
-        zero and straight behind (0, 0). NaN is not looked for.
+        and for coefficients within its bounds; for others points mean nothing. Other directions give the
+        nearest point of the cone's border, zero and straight behind (0, 0). NaN is not looked for.
     """
     kind = MODELS[model]
     c, sound = _sound(kind, c)
@@ -87,7 +87,8 @@ def central_unproject(model: str, c: Tensor, xy_d: Tensor) -> tuple[Tensor, Tens
         c: coefficients (*b, 1.., k) of the model.
 
     Returns:
-        Directions (*n, 3) in the camera's frame, and True (*n) for points within the model's image.
+        Directions (*n, 3) in the camera's frame, and True (*n) for points within the model's image and for
+        coefficients within its bounds; further out the direction at the border. NaN is not looked for.
     """
     kind = MODELS[model]
     c, valid = _sound(kind, c)
@@ -118,8 +119,7 @@ def _sound(kind: _Model, c: Tensor) -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def _border(kind: _Model, c: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Squared radius at the end of the model's range, and its angle's sine and cosine: float64, CPU (*b,
-    1..)."""
+    """Squared radius at the end of the range, and its angle's sine and cosine (*b, 1..): float64, CPU."""
     c = c.detach().to("cpu", torch.float64)
     limit = kind.limit(c).clamp(max=WIDEST**2) * (1 - MARGIN)
     ray = unit(kind.unproject(c, torch.stack([limit.sqrt(), torch.zeros_like(limit)], -1)))

@@ -29,10 +29,11 @@ SOLVED = 64
 
 
 def angle_over_radius(u: Tensor, z: Tensor) -> Tensor:
-    """Compute the ratio of a direction's angle off axis (radians) to its radius r, by a series near the axis.
+    """Compute the ratio of a direction's angle off axis theta (radians) to its radius r, by a series near the
+    axis.
 
     Args:
-        u: squared radius r^2 = x^2 + y^2 (*n).
+        u: squared radius r^2 = x^2 + y^2 (*n) of directions of any length.
         z: depth along the axis (*n).
 
     Returns:
@@ -98,11 +99,7 @@ def unit(ray: Tensor) -> Tensor:
 
 
 def on_plane(X: Tensor) -> tuple[Tensor, Tensor]:
-    """Intersect rays (*n, 3) with the plane z = 1.
-
-    Returns:
-        Points (*n, 2), and True for rays ahead (z > 0).
-    """
+    """Intersect rays (*n, 3) with the plane z = 1: points (*n, 2), and True for rays ahead (z > 0)."""
     ahead = X[..., 2] > 0
     return X[..., :2] / torch.where(ahead, X[..., 2], 1.0)[..., None], ahead
 
@@ -118,7 +115,11 @@ def finite_points(points: Tensor) -> tuple[Tensor, Tensor]:
     Huge float32 points are brought nearer along their direction, as their squares would be infinite.
 
     Returns:
-        The points, and True (*n) for those that were finite.
+        The points in float32 or float64 (integers and half precision in float32), and True (*n) for those
+        that were finite.
+
+    Raises:
+        TypeError: for points that are no tensor.
     """
     points = floating(points)
     finite = points.isfinite().all(-1)

@@ -12,14 +12,15 @@ from .common import MARGIN, SOLVED, TINY, angle_over_radius, cosine_and_sinc, on
 
 
 def fisheye_project(c: Tensor, X: Tensor) -> tuple[Tensor, Tensor]:
-    """Project points (*n, 3) of the camera's frame by the Kannala-Brandt fisheye.
+    """Project points (*n, 3) of the camera's frame, in any unit, by the Kannala-Brandt fisheye.
 
     Args:
-        c: coefficients k1 to k4 (*b, 1.., 4).
+        c: coefficients k1 to k4 (*b, 1.., 4), with an axis of length 1 for each further one of the points.
 
     Returns:
         Distorted normalised points (*n, 2), and True (*n) up to the angle off axis of `fisheye_limit`; points
-        further off give a point at that angle. (0, 0, 0) and points straight behind are not valid.
+        further off give a point at that angle. (0, 0, 0) and points straight behind are not valid, and give
+        (0, 0). NaN stays NaN.
     """
     xy, z = X[..., :2], X[..., 2]
     u = xy.square().sum(-1)
@@ -38,11 +39,11 @@ def fisheye_unproject(c: Tensor, xy_d: Tensor) -> tuple[Tensor, Tensor]:
     Solves v p(v)^2 = |xy_d|^2 for the squared angle v, smooth on the axis too.
 
     Args:
-        c: coefficients k1 to k4 (*b, 1.., 4).
+        c: coefficients k1 to k4 (*b, 1.., 4), as in `fisheye_project`.
 
     Returns:
-        Directions (*n, 3) in the camera's frame, from points farther out that of the border there; and True
-        (*n) within the radius of `fisheye_limit`.
+        Directions (*n, 3) in the camera's frame, and True (*n) up to the radius that `fisheye_limit` has in
+        the image; points further out give the direction at that radius. NaN is not looked for.
     """
     limit = once(fisheye_limit, c).to(xy_d)
     u_d = xy_d.square().sum(-1)

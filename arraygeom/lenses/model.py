@@ -21,30 +21,30 @@ CAMERA_MODELS: dict[str, type[CameraModel]] = {}
 
 
 class LensModel(Batched):
-    """Base class of the lens of a camera (`Camera.distortion`): a `Distortion` or a `CameraModel`.
+    """Base class of the lens of a camera (`Camera.distortion`): a `Distortion` or a `CameraModel`, from which
+    models of your own derive.
 
     Attributes:
+        central: True if all rays start in the camera's origin.
+        even: "pixels" or "distance", along which another camera's ray is followed evenly, for models that are
+            not central.
+        period: length of the image plane after which it repeats itself; 0 for never.
         model: name of the model in rig files.
         coefficients: numbers of the model (*b, n), one after the other.
     """
 
     central: ClassVar[bool] = True
-    """True if all rays start in the camera's origin."""
     even: ClassVar[Literal["pixels", "distance"]] = "pixels"
-    """Quantity along which another camera's ray is followed evenly, for models that are not central."""
     period: ClassVar[float] = 0.0
-    """Length of the image plane after which it repeats itself; 0 for never."""
     model: str
-    """Name of the model in rig files."""
     coefficients: Float[Tensor, "*b n"]
-    """Numbers of the model, one after the other."""
 
     def project(self, X: Real[Tensor, "*n 3"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
-        """Project points in the camera's frame (*n, 3).
+        """Project points in the camera's frame (*n, 3), metres.
 
         Returns:
-            Points of the image plane (*n, 2), which `Camera.K` takes to pixels, and True where seen; others
-            mean nothing. A batch of lenses (*b) takes points (*b, ..., 3).
+            Points of the image plane (*n, 2), which `Camera.K` takes to pixels, and True (*n) where seen;
+            others mean nothing. A batch of lenses (*b) takes points (*b, ..., 3).
 
         Raises:
             NotImplementedError: in this base class.
@@ -57,7 +57,8 @@ class LensModel(Batched):
         """Compute the directions of points of the image plane (*n, 2).
 
         Returns:
-            Directions (*n, 3) of any length, and True where there is one; others mean nothing.
+            Directions (*n, 3) of any length in the camera's frame, and True (*n) where there is one; others
+            mean nothing. The rays start at `origins`. A batch of lenses (*b) takes points (*b, ..., 2).
 
         Raises:
             NotImplementedError: in this base class.
@@ -115,11 +116,12 @@ class CameraModel(LensModel):
     """Base class of camera models: maps from points in a camera's frame to points (x, y) of its image plane,
     which `K` then takes to pixels.
 
-    A model of your own is a frozen dataclass with `project` and `unproject`, inverse to each other, and
-    tensors for its numbers, with `item_axes = {"k": 1}` for a vector k: without, its first axis is a batch.
-    Rig files hold it if it is defined as `class Mine(CameraModel, name="mine")`. It is used as
-    `Camera.distortion`. Resizing, cropping and rotating an image change `K` alone. Rays that do not start in
-    the camera's origin also need `origins`, `central = False`, and `lengths`.
+    A model of your own is a dataclass (`frozen=True, eq=False, repr=False`) with `project` and `unproject`,
+    inverse to each other, and tensors for its numbers, with `item_axes = {"k": 1}` for a vector k: without,
+    its first axis is a batch. Rig files hold it if it is defined as `class Mine(CameraModel, name="mine")`.
+    It is used as `Camera.distortion`, and checked there (`check_model`). Resizing, cropping and rotating an
+    image change `K` alone. Rays that do not start in the camera's origin also need `origins`, `central =
+    False`, and `lengths`, the names of its numbers in metres or metres for each second.
 
     Raises:
         ValueError: when a subclass is defined with the name of another one.
@@ -129,7 +131,6 @@ class CameraModel(LensModel):
     asked: ClassVar[bool] = False
     """True once `check_model` has called the class's methods."""
     lengths: ClassVar[tuple[str, ...] | None] = None
-    """Names of numbers in metres, or metres for each second; required for models that are not central."""
 
     def __init_subclass__(cls, *, name: str = "", **rest: Any) -> None:
         super().__init_subclass__(**rest)
@@ -155,10 +156,10 @@ class CameraModel(LensModel):
         return torch.cat([t.expand(*batch, -1) for t in numbers], -1) if numbers else torch.zeros(0).double()
 
     def scaled(self: AnyLens, factor: float) -> AnyLens:
-        """Multiply the numbers of the model that are named in `lengths` by a factor.
+        """Multiply the numbers of the model that are named in `lengths` by a factor, as for another unit.
 
         Returns:
-            A copy of the model.
+            A copy of the model; one without `lengths` has the same numbers.
 
         Raises:
             ValueError: for a model that is not central and states no `lengths`.
@@ -169,13 +170,14 @@ class CameraModel(LensModel):
         return dataclasses.replace(self, **{n: getattr(self, n) * factor for n in names or ()})  # type: ignore
 
     def with_coefficients(self: AnyLens, coefficients: Float[Tensor, "*b n"]) -> AnyLens:
-        """Return the same model with other numbers.
+        """Return the same model with other numbers; a lens within it (`BehindModel.lens`) keeps its own.
 
         Args:
             coefficients: numbers (*b, n), in the order of the property `coefficients`.
 
         Raises:
             RuntimeError: for another count of numbers.
+            ValueError: for numbers that the model refuses.
         """
         tensors = self._own()  # type: ignore[attr-defined]
         sizes = [t.shape[t.ndim - axes :].numel() for t, axes in tensors.values()]
@@ -198,11 +200,13 @@ class CameraModel(LensModel):
 def check_model(model: LensModel | None) -> None:
     """Check that a camera model's numbers are finite, and that its methods return tensors like `LensModel`'s.
 
-    Methods are called once for each class, in float32 and float64. A `Distortion` or None is not checked.
+    Methods (`origins` too if it is not central) are called once for each class, in float32 and float64. A
+    `Distortion` or None is not checked.
 
     Raises:
         ValueError: for NaN or infinity.
-        TypeError: for numpy arrays, and methods that raise, return other tensors or change their argument.
+        TypeError: for integers, numpy arrays, and methods that raise, return other tensors or change their
+            argument.
         NotImplementedError: for a missing method.
     """
     if not isinstance(model, CameraModel):

@@ -26,7 +26,7 @@ SETTLED = 64
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Orthographic(CameraModel, name="orthographic"):
-    """Camera of parallel rays along its axis, as of a telecentric lens.
+    """Camera model of parallel rays along the axis, as of a telecentric lens; it has no numbers.
 
     Points of the image plane are (x, y) in metres, and K's focal length is in pixels for each metre.
     """
@@ -41,19 +41,19 @@ class Orthographic(CameraModel, name="orthographic"):
         return False
 
     def project(self, X: Tensor) -> tuple[Tensor, Tensor]:
-        """Project points along the axis.
+        """Project points (*n, 3), metres, along the axis.
 
         Returns:
-            (x, y) in metres, and True for z > 0.
+            (x, y) in metres (*n, 2), and True (*n) for z > 0; NaN and infinity are not valid.
         """
         X, finite = finite_points(X)
         return X[..., :2], finite & (X[..., 2] > 0)
 
     def unproject(self, xy: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the axis for each point.
+        """Return the axis for each point (*n, 2) of the image plane.
 
         Returns:
-            Directions (0, 0, 1), and True for finite points.
+            Directions (0, 0, 1) (*n, 3) of rays that start at `origins`, and True (*n) for finite points.
         """
         xy, finite = finite_points(xy)
         return torch.zeros_like(to_homogeneous(xy)) + xy.new_tensor([0.0, 0.0, 1.0]), finite
@@ -65,7 +65,8 @@ class Orthographic(CameraModel, name="orthographic"):
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class BehindModel(CameraModel):
-    """Base of cameras behind something else: a pinhole, or a camera with a central lens.
+    """Base of camera models that hold a central lens: a pinhole or other lens that moves, or looks through
+    something. A subclass gives the rest of a `CameraModel` that is not central.
 
     Attributes:
         lens: central lens model; None for a pinhole.
@@ -98,16 +99,20 @@ class BehindModel(CameraModel):
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class RollingShutter(BehindModel, name="rolling-shutter"):
-    """Camera that moves while its rows are read, one after the other, at constant velocities.
+    """Camera model of a camera that moves while its rows are read, one after the other, at constant
+    velocities.
 
-    The row of the principal point is read at time 0, to which the pose refers. K is upright: images rotated
-    by a quarter turn have columns for rows.
+    The row of the principal point is read at time 0, to which the pose refers. K has to be upright (not
+    checked): images rotated by a quarter turn have columns for rows.
 
     Attributes:
-        lens: central lens model; None for a pinhole. Another one raises ValueError.
+        lens: central lens model; None for a pinhole.
         velocity: velocity (*b, 3) of the camera along its axes, metres for each second.
         rotation: angular velocity (*b, 3) about its axes, radians for each second.
         readout: seconds (*b) in which as many rows are read as the focal length has pixels, `row_time * fy`.
+
+    Raises:
+        ValueError: for a lens that is not central.
     """
 
     item_axes: ClassVar = {"velocity": 1, "rotation": 1}
@@ -118,10 +123,12 @@ class RollingShutter(BehindModel, name="rolling-shutter"):
     readout: Float[Tensor, "*b"]
 
     def project(self, X: Tensor) -> tuple[Tensor, Tensor]:
-        """Project points (*n, 3) of the frame of time 0, with the secant method for the row that sees them.
+        """Project points (*n, 3) of the frame of time 0, metres, with the secant method for the row that sees
+        them.
 
         Returns:
-            Points of the image plane (*n, 2), and True (*n) where a row is found.
+            Points of the image plane (*n, 2), and True (*n) where a row is found and the lens sees the point;
+            others mean nothing.
         """
         X, finite = finite_points(X)
         with torch.no_grad():
@@ -151,10 +158,10 @@ class RollingShutter(BehindModel, name="rolling-shutter"):
         return row, slope
 
     def unproject(self, xy: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute unit directions in the frame of time 0.
+        """Compute the unit directions of points of the image plane (*n, 2), in the frame of time 0.
 
         Returns:
-            Directions, and validity.
+            Directions (*n, 3) of rays that start at `origins`, and True (*n) where the lens has one.
         """
         ray, valid = self._ray(xy)
         return _rotated(ray, self.rotation, self._time(ray, xy[..., 1])), valid
@@ -208,14 +215,15 @@ def _cross(w: Tensor, v: Tensor) -> Tensor:
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class FlatPort(BehindModel, name="flat-port"):
-    """Camera in air that looks into water through a flat pane of glass, at right angles to its axis
-    (Treibitz, Schechner, Kunz and Singh 2012).
+    """Camera model of a camera in air (index 1) that looks into water through a flat pane of glass, at right
+    angles to its axis (Treibitz, Schechner, Kunz and Singh 2012).
 
     Attributes:
-        distance: distance from the camera's centre to the pane, metres.
-        thickness: thickness of the pane, metres.
-        glass: refractive index of the glass, at least 1.
-        water: refractive index of the water, at least 1.
+        lens: central lens model; None for a pinhole.
+        distance: distance (*b) from the camera's centre to the pane, metres.
+        thickness: thickness (*b) of the pane, metres.
+        glass: refractive index (*b) of the glass, at least 1.
+        water: refractive index (*b) of the water, at least 1.
 
     Raises:
         ValueError: for refractive indices below 1, and a lens that is not central.
@@ -241,12 +249,12 @@ class FlatPort(BehindModel, name="flat-port"):
     def project(self, X: Tensor) -> tuple[Tensor, Tensor]:
         """Project points (*n, 3) in the water by the ray that reaches them, found by Newton's method.
 
-        The unknown is the ray's tangent in air over the radius, started from its value on the axis: how far
-        off axis a ray gets is concave in its tangent, so that no step goes too far.
-
         Returns:
-            Points of the image plane (*n, 2), and True (*n) for points beyond the pane that a ray reaches.
+            Points of the image plane (*n, 2), and True (*n) for points beyond the pane that a ray of the lens
+            reaches; others mean nothing.
         """
+        # The unknown is the ray's tangent in air over the radius, started from its value on the axis: how far
+        # off axis a ray gets is concave in its tangent, so that no step goes too far.
         X, finite = finite_points(X)
         distance, thickness = self._layers(X)
         valid = finite & (X[..., 2] > distance + thickness)
@@ -270,7 +278,8 @@ class FlatPort(BehindModel, name="flat-port"):
         """Compute the unit directions in the water of points of the image plane (*n, 2), by Snell's law.
 
         Returns:
-            Directions (*n, 3) in the camera's frame, and True (*n) for rays ahead that the lens has.
+            Directions (*n, 3) in the camera's frame of rays that start at `origins`, and True (*n) where the
+            lens has a ray ahead; others mean nothing.
         """
         ray, valid = self._ray(xy)
         across = ray[..., :2] / beside_points(self.water, ray)[..., None]
@@ -291,8 +300,7 @@ class FlatPort(BehindModel, name="flat-port"):
         return beside_points(self.distance, points), beside_points(self.thickness, points)
 
     def _step(self, share: Tensor, squared: Tensor, depths: tuple[Tensor, Tensor]) -> Tensor:
-        """Newton step of the tangent in air over the radius, for the ray that reaches the
-        (squared) radius."""
+        """Newton step of the tangent in air over the radius, for the ray that reaches a squared radius."""
         across = squared * share.square()
         reached = slope = self._layers(share[..., None])[0]
         for depth, number in zip(depths, (self.glass, self.water)):

@@ -30,18 +30,20 @@ NEARLY = 1e-6
 class Splined(CameraModel, name="splined"):
     """Camera model of a simple projection plus a displacement, given by a surface of B-splines.
 
-    The surface is over the stereographic projection u = 2 tan(theta / 2) of directions. Directions beyond the
-    knots, within half a support of the border, are not valid, nor are those past a fold.
+    The surface is over the stereographic projection of directions, points u of length 2 tan(theta / 2).
+    Valid are directions at least half a spacing (cubic: a whole one) within the outermost knots, and before
+    any fold.
 
     Attributes:
-        knots: displacements (x, y) at (ny, nx) knots, the middle one at u = 0.
-        spacing: distance of the knots in u along x and y.
+        knots: displacements (*b, ny, nx, 2) along x and y of the image plane, the middle knot at u = 0.
+        spacing: distance (*b, 2) of the knots in u along x and y.
         order: 2 (quadratic) or 3 (cubic).
         base: displaced projection: "stereographic" (mrcal's LENSMODEL_SPLINED_STEREOGRAPHIC), or "pinhole" (x
             / z, y / z) (lensboy's pinhole_splined), which has no directions at 90 degrees or more off axis.
 
     Raises:
-        ValueError: for another base or order, too few knots, and a spacing that is not positive.
+        ValueError: for another base or order, knots or a spacing of another shape, fewer than 3 (cubic: 4)
+            knots to a side, and a spacing that is not positive.
     """
 
     item_axes: ClassVar = {"knots": 3, "spacing": 1}
@@ -76,8 +78,8 @@ class Splined(CameraModel, name="splined"):
         """Project directions (*n, 3) of any length in the camera's frame.
 
         Returns:
-            Points of the image plane (*n, 2), and True (*n) within the knots and before any fold; NaN,
-            infinity, (0, 0, 0) and straight behind are not valid.
+            Points of the image plane (*n, 2), and True (*n) within the valid part of the knots and before any
+            fold; NaN, infinity, (0, 0, 0) and straight behind are not valid. Others mean nothing.
         """
         X, finite = finite_points(X)
         length = _length(X)
@@ -90,11 +92,11 @@ class Splined(CameraModel, name="splined"):
     def unproject(self, xy: Tensor) -> tuple[Tensor, Tensor]:
         """Compute the unit directions of points of the image plane (*n, 2): the inverse of `project`.
 
-        Found by Newton's method, whose last two steps are differentiable.
+        They are found by Newton's method, whose last two steps carry first and second derivatives.
 
         Returns:
-            Directions (*n, 3) in the camera's frame, and True (*n) where there is one within the knots;
-            elsewhere the direction means nothing.
+            Directions (*n, 3) in the camera's frame, and True (*n) where there is one that `project` takes as
+            valid; elsewhere the direction means nothing.
         """
         xy, finite = finite_points(xy)
         with torch.no_grad():
@@ -123,16 +125,12 @@ class Splined(CameraModel, name="splined"):
         return solve_in_plane(self._displaced, start, xy, within, rounding=SOLVED / 8, steps=steps)
 
     def _off(self, u: Tensor, xy: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
-        """True for stereographic points that do not solve for the image plane's, with their projections and
-        the Jacobian."""
+        """True for stereographic points that do not solve for `xy`, their projections, and the Jacobian."""
         reached, jacobian = self._displaced(u)
         return norm(reached - xy) >= SOLVED * torch.finfo(xy.dtype).eps * (1 + norm(xy)), reached, jacobian
 
     def _within(self, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Clamp stereographic points to the border of knots and base.
-
-        Returns them, and True for points inside.
-        """
+        """Clamp stereographic points to the border of knots and base; also True for points inside."""
         spacing = beside_points(self.spacing, u, 1).detach()
         ny, nx = self.knots.shape[-3:-1]
         margin = 0.5 * (self.order - 1) + NEARLY

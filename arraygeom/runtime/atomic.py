@@ -11,19 +11,20 @@ from uuid import uuid4
 
 @contextmanager
 def write_atomically(path: str | Path) -> Iterator[Path]:
-    """Context manager that yields a temporary path beside `path`, which replaces `path` if the block
-    succeeds.
+    """Context manager that yields a temporary path beside `path`; what the block writes there replaces `path`
+    if it succeeds.
 
     After an error (such as a full disk) the temporary file is gone and a former `path` is as it was. The
     temporary name ends as `path` does, for writers that choose the format by suffix. Missing folders are
     made. Content reaches the disk before the name does, so that a file that exists after a crash is complete.
 
     Yields:
-        The temporary path.
+        The temporary path, at which there is no file yet.
 
     Raises:
         IsADirectoryError: if `path` is a folder.
-        OSError: naming `path`, if writing fails.
+        OSError: naming `path` or its folder, if writing fails or the block writes no file. Other errors of
+            the block pass.
     """
     path = Path(path)
     if path.is_dir():
@@ -51,10 +52,9 @@ def speaks_for_itself(error: OSError) -> bool:
 def naming(path: Path, error: OSError, temporary: Path) -> OSError:
     """Make the error of a failed write that names `path` in place of the temporary file.
 
-    NumPy's errors have only a text, without a number and a file; the path is replaced in it, or put before.
-
     Returns:
-        The new error, for the caller to raise.
+        The new error, for the caller to raise, with the system's number and text. An error without a number
+        (NumPy's) has only a text, in which the path is replaced, or put before.
     """
     if error.errno is not None:
         return OSError(error.errno, error.strerror, str(path))
@@ -68,7 +68,7 @@ def flush(path: Path) -> None:
     Does nothing for a folder on Windows, which opens none.
 
     Raises:
-        OSError: if the system reports an error.
+        OSError: for a path that is missing, a file that may not be written, and errors of the disk.
     """
     if os.name == "nt" and path.is_dir():  # Windows opens no folders
         return
@@ -91,11 +91,11 @@ def write_text(path: str | Path, text: str) -> None:
 
 @contextmanager
 def alone(lock: Path, longest: float) -> Iterator[None]:
-    """Context manager that admits one process at a time, by a lock file.
+    """Context manager that admits one process (and thread) at a time, by a lock file, which stays.
 
-    A process that waited `longest` seconds, or cannot lock the file, enters all the same. The system releases
-    locks of ended processes. Where Python cannot ask the system for locks, a file of another name exists
-    while a process is in the block.
+    After waiting for `longest` seconds, or where the file cannot be locked, the block runs all the same. The
+    system releases locks of ended processes. Where Python cannot ask the system for locks, a file with suffix
+    .soft exists while a process is in the block.
     """
     from filelock import FileLock, SoftFileLock
 

@@ -24,7 +24,8 @@ class Tile(NamedTuple):
     """Box of a result, and the box of the input that it needs.
 
     Attributes:
-        inner: box of the result: first row, row after the last, first column, column after the last.
+        inner: box of the result: first row, row after the last, first column, column after the last; two
+            numbers where a single axis is cut.
         outer: the same box with a halo, as far as the frame goes.
     """
 
@@ -49,20 +50,17 @@ def whole(lengths: Sequence[int]) -> Tile:
 
 
 def spans(length: int, step: int) -> list[tuple[int, int]]:
-    """Split a length into parts of `step`; the last part may be shorter.
-
-    Returns:
-        (first index, index after the last) of each part; one empty part for length 0.
-    """
+    """Split a length into (first, last + 1) of parts of `step`, the last perhaps shorter; one empty for 0."""
     return [(first, min(first + step, length)) for first in range(0, max(length, 1), step)]
 
 
 def tiles_of(lengths: Sequence[int], side: int | Sequence[int], halo: int) -> Iterator[Tile]:
-    """Yield the tiles of a frame (h, w), whose halos end at its borders.
+    """Yield the tiles of a frame row by row, the last of a row or column as small as what is left.
 
     Args:
+        lengths: lengths (h, w) of the frame, or of any axes; a length of 0 has one empty part.
         side: side of square tiles, or (height, width).
-        halo: pixels around each tile.
+        halo: pixels around each tile, as far as the frame goes.
     """
     sides = [side] * len(lengths) if isinstance(side, int) else side
     for inner in product(*map(spans, lengths, sides)):
@@ -79,9 +77,9 @@ def chunked(
 ) -> Any:
     """Compute `function(*tensors)` for some rows at a time; with several axes, for one tile at a time.
 
-    Results must be tensors as long as the input along the axis, or shorter by a whole factor of which `rows`
-    and `halo` are multiples. Each part gets up to `halo` more rows on either side, whose results are dropped.
-    On the CPU parts are computed `in_order` on several threads. Gradients pass through.
+    Results must be tensors as long as the input along the axis, or shorter by one whole factor that divides
+    the lengths, `rows` and `halo`. Each part gets up to `halo` more rows on either side, whose results are
+    dropped. On the CPU parts may be computed on several threads (`in_order`). Gradients pass through.
 
     Args:
         function: function of tensors that returns a tensor or a tuple of tensors.
@@ -91,8 +89,7 @@ def chunked(
         axis: axis, or axes, to cut along.
 
     Returns:
-        A tensor if the function returns one, else a tuple. If all fits into one part the function's own
-        result.
+        A tensor if the function returns one, else a tuple; what the function returned if all is one part.
     """
     axes = [axis] if isinstance(axis, int) else axis
     lengths = [tensors[0].shape[a] for a in axes]
@@ -112,12 +109,13 @@ def assembled(
 
     Args:
         lengths: lengths of the whole frame along `axes`.
-        parts: tiles with one or several tensors each, as large as the outer box or smaller by a whole factor.
+        parts: tiles in the order of `tiles_of`, which cover the frame, with one tensor or several each, as
+            large as the outer box or smaller by a whole factor.
         axes: axes of the tensors that the tiles cut.
 
     Returns:
-        A tensor if the parts are tensors, else a tuple; the result of a tile that is the whole frame is
-        returned as it is.
+        A tensor if the parts are tensors, else a tuple, empty without parts. The tensors of a tile that is
+        the whole frame are returned themselves.
     """
     planes: list[_Plane] = []
     single = False
@@ -135,16 +133,16 @@ def assembled(
 
 
 def sides_by_work(hw: Sequence[int], halo: int, multiple: int, most: float) -> list[tuple[int, int]]:
-    """List sizes of tiles of at most `most` pixels with their halos, the least total work first.
+    """List sizes of tiles of at most `most` pixels, the least total work (pixels of all tiles) first.
 
     Args:
         hw: height and width of the frame.
-        halo: pixels around each tile.
+        halo: pixels around each tile, as far as the frame goes, which count in the work and in `most`.
         multiple: number that sides are multiples of, unless they are 64, the least.
-        most: largest number of pixels of a tile with its halo.
+        most: largest number of pixels of a tile.
 
     Returns:
-        (height, width) of tiles without halos; empty if none fits.
+        (height, width) of tiles without halos, which may exceed the frame's; empty if none fits.
     """
     h, w = hw
     sides: dict[tuple[int, int], int] = {}

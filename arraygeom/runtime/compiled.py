@@ -20,8 +20,9 @@ LONGEST = 300.0
 def compiled(function=None, **options):
     """Compile a function by numba's njit, without the type checker that tests wrap around it.
 
-    With `cache=True` the machine code is stored in a folder, for functions that are called from Python. If no
-    folder can be written, each process compiles for itself, with a warning.
+    It is compiled at the first call with arguments of new types. With `cache=True` (for functions that are
+    called from Python) machine code is stored in a folder, by one process at a time; if no folder can be
+    written, each process compiles for itself, with a warning.
 
     Args:
         function: function to compile; None when used as a decorator with options.
@@ -31,7 +32,7 @@ def compiled(function=None, **options):
         The compiled function; without `function` a decorator.
 
     Raises:
-        ImportError: without numba.
+        ImportError: without numba. numba's own errors pass, at the first call where the code causes them.
     """
     from numba import njit
 

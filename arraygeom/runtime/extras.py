@@ -30,7 +30,7 @@ def needs(extra: str, purpose: str) -> Iterator[None]:
         purpose: purpose of the import, which begins the message, such as "writing video".
 
     Raises:
-        ImportError: in one line that names the module and how to install it, if the block's import fails.
+        ImportError: in one line that names the module and how to install it, for any ImportError inside.
     """
     try:
         yield
@@ -40,7 +40,7 @@ def needs(extra: str, purpose: str) -> Iterator[None]:
 
 
 def imported(name: str, what: str) -> Any:
-    """Import a user's "module:object", or a module, also from the current folder.
+    """Import a user's "module:object", or a module, also from the current folder; the module's code runs.
 
     Args:
         name: dotted name of a module, and after a colon of an object in it.

@@ -20,9 +20,10 @@ _CHANGED = re.compile(rf".*-[0-9a-f]{{{_DIGEST}}}", re.DOTALL)
 def file_names(names: Iterable[str]) -> dict[str, str]:
     """Make a file name (or the beginning of one) for each name; no two names share one.
 
-    Letters, digits and ``. _ + - , = @ ~ ( )`` and spaces within stay, others become "_". A name that this
-    changes, that is reserved, begins with "." or ends with "." or a space, is longer than `LONGEST` bytes, or
-    differs from another one by case alone ends in "-" and a digest of the name.
+    Letters and digits of any script, ``. _ + - , = @ ~ ( )`` and spaces within stay, others become "_", in
+    Unicode's NFC. A name that this changes, that is empty or reserved, begins or ends with "." or a space,
+    is longer than `LONGEST` bytes (and then cut), differs from another one by case alone, or ends like a
+    changed one, gets "-" and a digest of the name at its end.
 
     >>> file_names(["left", "a/b"])
     {'left': 'left', 'a/b': 'a_b-c14cddc033f6'}

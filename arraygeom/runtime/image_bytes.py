@@ -43,13 +43,14 @@ class ImageHeader(NamedTuple):
     """Header of an image file.
 
     Attributes:
-        hw: stored (height, width).
-        orientation: EXIF orientation tag, 1 to 8; 1 where there is none.
-        bits: bits of a value in TIFF, PNG and PNM files; 0 for others.
-        white: largest value of a PNM file, or of a TIFF file with 9 to 15 bits a value; 0 for others.
+        hw: stored (height, width), before the orientation is applied.
+        orientation: EXIF orientation tag, 1 to 8; 1 where there is none, or one that is none of these.
+        bits: bits of a value in TIFF (the most of its bands), PNG and PNM (at least 8); 0 for others.
+        white: largest possible value of a grey or colour PNM file, or of a TIFF file with 9 to 15 bits a
+            value; 0 for others.
         page: tifffile's TiffPage of a TIFF file's first image; None for other files.
-        several: True for a TIFF file with more images of the first one's size that are no copies or masks of
-            it.
+        several: True for a TIFF file whose second image has the first one's size and is no reduced copy or
+            mask of it.
     """
 
     hw: tuple[int, int]
@@ -69,7 +70,7 @@ def image_header(content: bytes) -> ImageHeader | None:
     """Parse the header of a PNG, TIFF, JPEG, PNM, BMP or WebP file from its bytes.
 
     Returns:
-        The header; None for another format and for a damaged file.
+        The header; None for another format and for a damaged header (pixels are not looked at).
     """
     from PIL import BmpImagePlugin, JpegImagePlugin, WebPImagePlugin
 
@@ -141,14 +142,18 @@ def _known(orientation: object) -> int:
 
 
 def stored_values(content: bytes, header: ImageHeader) -> Any:
-    """Decode an image file's values as the file states them.
+    """Decode an image file's values as the file states them, not turned by an orientation tag.
 
-    OpenCV applies orientation tags of TIFF files, returns the first of several bands that are no colours,
-    mixes planes beyond 8 bits, takes white for black, and shifts values of fewer than 16 bits up; it scales
-    8-bit values of text PNM files to 255.
+    Corrected are OpenCV's turning of TIFF files, its loss of bands that are no colours, mixed planes beyond 8
+    bits, white taken for black, values of 9 to 15 bits shifted up, and text PNM files scaled to 255.
+
+    Args:
+        content: the file's bytes.
+        header: their `image_header`; a TIFF file has 1, 3 or 4 bands (not checked).
 
     Returns:
-        Values (h, w) or (h, w, channels), blue first, type as stored; None for a damaged file.
+        Values (h, w), or (h, w, channels) with blue first and alpha last, type as stored, 0 and 255 for
+        bitmaps; None for a damaged file, and one that OpenCV cannot decode.
     """
     page, original = header.page, content
     if page is not None and header.orientation != 1:
@@ -165,7 +170,7 @@ def stored_values(content: bytes, header: ImageHeader) -> Any:
             values = 65535 - values
         if header.white and values is not None and values.dtype == np.uint16:
             values = values >> (16 - header.bits)
-    if content[:2] in PNM_OF_TEXT and values is not None and values.dtype == np.uint8:
+    if content[:2] in PNM_OF_TEXT and header.white and values is not None and values.dtype == np.uint8:
         values = ((values.astype(np.uint16) * header.white + 254) // 255).astype(np.uint8)
     return values
 
@@ -173,9 +178,12 @@ def stored_values(content: bytes, header: ImageHeader) -> Any:
 def decoded(content: bytes, flags: int = UNCHANGED) -> Any:
     """Decode an image file's bytes by OpenCV without its messages.
 
+    Args:
+        flags: OpenCV's IMREAD flags.
+
     Returns:
-        Values (h, w) or (h, w, channels), blue first, type as stored or by OpenCV's flags; None for a damaged
-        file.
+        Values (h, w), or (h, w, channels) with blue first and alpha last, type as OpenCV gives it for the
+        flags; None for a damaged file, and one that OpenCV cannot decode.
     """
     import cv2
 
@@ -197,9 +205,9 @@ def decodable(content: bytes) -> bytes | None:
     """Check an image file's bytes, and prepare them for OpenCV.
 
     Returns:
-        A PNG without its animation, a text PNM with a line break at its end, others unchanged; None for a PNG
-        that is cut or fails its checksums, an incomplete TIFF, and compressed pixels that the decoder warns
-        of.
+        A PNG without its animation, a text PNM with one more line break at its end, others (of unknown
+        format too) unchanged; None for a PNG that is cut or fails its checksums, an incomplete TIFF, and a
+        TIFF or JPEG whose compressed pixels are damaged.
     """
     if content.startswith(PNG):
         chunks = png_chunks(content)
@@ -231,11 +239,7 @@ def _is_undamaged(content: bytes, chunk: tuple[bytes, int, int]) -> bool:
 
 
 def _tiff_colours(content: bytes) -> Any:
-    """Read the values of a TIFF file's first image, which has several bands, by tifffile.
-
-    Returns:
-        Array (h, w, c) of the file's type; None for a damaged file, and a compression that needs imagecodecs.
-    """
+    """Values (h, w, c) of a TIFF file's first image by tifffile; None if damaged, or compressed otherwise."""
     try:
         with _quiet_tiff(content) as file:
             page = file.pages.first
@@ -323,13 +327,9 @@ def _is_sound(content: bytes) -> bool:
 
 
 def _jpeg_colours(content: bytes) -> Any:
-    """Decode the bytes of a JPEG file by libjpeg-turbo, to the same values as OpenCV.
+    """Decode a JPEG to uint8 (h, w, 1 or 3), red first, with OpenCV's values; None for other colours (CMYK).
 
-    Returns:
-        Array (h, w, 1 or 3), uint8, red first; None for other colours than RGB and grey, such as CMYK.
-
-    Raises:
-        Exception: where libjpeg warns; OpenCV would print the warning, and return the pixels that it has.
+    Raises Exception where libjpeg warns; OpenCV would print the warning, and return the pixels that it has.
     """
     from kornia_rs import io
     from PIL.JpegImagePlugin import JpegImageFile

@@ -11,13 +11,13 @@ CLEAR, END = 256, 257
 
 @compiled(nogil=True, cache=True)
 def lzw_length(data):
-    """Count the bytes that LZW codes stand for, up to their end.
+    """Count the bytes that LZW codes of a TIFF strip stand for, up to their end code or the end of the data.
 
     Args:
-        data: codes (uint8), the most significant bit first.
+        data: codes (n), uint8, the most significant bit first.
 
     Returns:
-        The length; 0 if a code is not in the table, or follows a full one.
+        The length; 0 if a code is not in the table or follows a full one, and for no data.
     """
     lengths = np.ones(4096, np.int64)
     width, known, before, total, position = 9, END + 1, -1, 0, 0

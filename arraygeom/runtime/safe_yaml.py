@@ -29,11 +29,13 @@ def load_yaml(text: str) -> Any:
     """Load the document of a YAML text.
 
     Returns:
-        Plain values; None for an empty text.
+        Plain values: dicts, lists, texts, numbers, booleans, None, and YAML's dates, sets and bytes; None for
+        an empty text or document.
 
     Raises:
-        yaml.YAMLError: with the line where known, for text that is not YAML, repeated keys (1 and "1" are the
-            same key, and so are 1 and true), and documents beyond this module's limits.
+        yaml.YAMLError: with the line where known, for text that is not YAML, several documents, tags of other
+            types, repeated keys (1 and "1" are the same key, and so are 1 and true), and documents beyond
+            this module's limits.
     """
     if len(text) > LARGEST_TEXT:
         raise _refused(f"has {len(text):,} characters; at most {LARGEST_TEXT:,} are read")
@@ -82,8 +84,7 @@ def _without_repeated_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def text_problem(error: Exception) -> tuple[int | None, str]:
-    """Return the line of an error of YAML, JSON or TOML (from 1; None if unknown) and its problem, for
-    messages."""
+    """Return the line (from 1; None if unknown) and the problem of an error of YAML, JSON or TOML."""
     mark = getattr(error, "problem_mark", None)
     line = mark.line + 1 if mark else getattr(error, "lineno", None)
     return line, getattr(error, "problem", None) or getattr(error, "msg", None) or str(error) or "not text"
@@ -129,7 +130,11 @@ class _SafeLoader(_Base):  # type: ignore[misc]
     """YAML loader in which a repeated key is an error."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """Build the mapping as the parent does, after a check: a repeated key raises yaml.YAMLError."""
+        """Build a mapping as PyYAML does, but refuse repeated keys; those merged in by << do not count.
+
+        Raises:
+            yaml.YAMLError: for keys that are equal or read alike (1 and "1"), or one that cannot be a key.
+        """
         lines: dict[Any, int] = {}
         for key_node, _ in node.value:
             if key_node.tag == "tag:yaml.org,2002:merge":
@@ -146,8 +151,7 @@ class _SafeLoader(_Base):  # type: ignore[misc]
 
 
 class SafeDumper(yaml.SafeDumper):
-    """YAML dumper whose text `load_yaml` reads back the same: a text such as 1e3, which is a number there, is
-    quoted."""
+    """YAML dumper that quotes texts such as 1e3, which `load_yaml` would read as numbers."""
 
 
 for _kind in (

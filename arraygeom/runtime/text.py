@@ -25,11 +25,11 @@ def length_unit(rig: Any) -> str:
 
 
 def baseline_text(cameras: Mapping[str, Any], unit: str = "m") -> str:
-    """Describe the distances between cameras of known pose, such as "baselines 10-20 mm".
+    """Describe the least and largest distance between cameras of known pose, such as "baselines 10-20 mm".
 
     Args:
-        cameras: cameras by name; those without a pose do not count.
-        unit: unit of their lengths. Metres are converted to a suitable unit; others are named as they are.
+        cameras: cameras by name, of any batch shapes that broadcast; those without a pose do not count.
+        unit: unit of their lengths. For "m" the text names m, cm or mm; for others numbers alone.
 
     Returns:
         The text; empty for fewer than two cameras of known pose.
@@ -59,8 +59,7 @@ def depth_text(depth: tuple[Tensor, Tensor] | None, unit: str = "m") -> str:
 
 
 def angle(R: Tensor) -> Tensor:
-    """Compute the angle (*b) of rotations (*b, 3, 3) in radians, without gradient; exact for small angles
-    too."""
+    """Compute the angle (*b) of rotations (*b, 3, 3), radians, without gradient; exact for small ones too."""
     R = R.detach()
     skew = torch.stack(
         [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], -1

@@ -37,10 +37,10 @@ def limited_to(count: int | None) -> Iterator[None]:
 
 @contextmanager
 def torch_in_one_thread() -> Iterator[None]:
-    """Context manager that sets torch to one thread, while `in_parallel` may still use as many as before.
+    """Context manager that sets torch to one thread, while `in_parallel`, `in_order` and compiled loops may
+    still use as many as torch had before.
 
-    For work that is mostly in compiled loops, beside which torch's own threads spin between short loops:
-    without this a frame of 640x400 took twice the time of the cores where other processes wanted them.
+    For work that is mostly in compiled loops, beside which torch's own threads spin between short loops.
     """
     allowed = _ALLOWED.set(threads())
     with _torch_threads(1):
@@ -54,11 +54,12 @@ def in_parallel(tasks: Sequence[Callable[[], Any]], *, most: int | None = None) 
     """Run tasks on several threads, this one included, with torch in one thread each, gradients and inference
     mode as here.
 
-    After an error no further task begins; it is raised once the running ones have ended.
+    A single task, or all where one thread is allowed, run here with torch's threads as they are. After an
+    error no further task begins; it is raised once the running ones have ended.
 
     Args:
         tasks: functions without arguments.
-        most: largest number of threads; None for `threads`.
+        most: largest number of threads; None or 0 for as many as `threads` gives.
 
     Returns:
         The tasks' results, in order.
@@ -91,8 +92,8 @@ def in_order(function: Callable[[Any], Any], parts: Sequence[Any]) -> Iterator[A
     """Compute `map(function, parts)` some parts ahead on several `threads`, with torch in one thread each.
 
     A single part is computed in this thread, and so are all if torch itself uses several threads, or has to
-    see each operation (`followed`, a function mode, autocast). An error is raised once no part is being
-    computed.
+    see each operation (`followed`, a function mode, autocast). A part's error is raised at its place in the
+    iterator, once no part is being computed.
 
     Args:
         function: function of one part.

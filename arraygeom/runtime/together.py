@@ -39,14 +39,15 @@ def write_together(
 ) -> Iterator[Path]:
     """Context manager that yields a temporary folder inside `folder` for files that belong together.
 
-    If the block succeeds they replace the group's former files, those of other names too: the former last
-    file goes first and the new one comes last, so where it is, the others are of the same run. After an error
-    (such as a full disk) all former files are as they were; after a kill they are so again once `recover` has
-    run, which the next call does. Missing folders are made.
+    If the block succeeds they replace the group's former files, even of other names unless changed since: the
+    former last file goes first and the new one comes last, so where it is, the others are of the same run.
+    After an error (such as a full disk) all former files are as they were; after a kill they are so again
+    once `recover` has run, which the next call does. Missing folders are made.
 
     Args:
+        folder: folder that the files are moved to; the block makes files only, no folders.
         group: name of the group, whose files, with their digests, are listed in a hidden folder.
-        last: name of the file that completes the group.
+        last: name of the file that completes the group; it is not checked that the block writes it.
         about: texts by name to store in the list (`read_about`); None for none.
         given: file names that the user chose, which may replace unlisted files.
 
@@ -54,8 +55,9 @@ def write_together(
         The temporary folder.
 
     Raises:
-        FileExistsError: for a file in the way that no list has in its present state and that is not `given`.
-        OSError: naming the file, if writing fails.
+        FileExistsError: for a file in the way, other than the new one, that no list has in its present state
+            and that is not `given`.
+        OSError: naming the file, if writing fails. Other errors of the block pass.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -80,12 +82,12 @@ def write_listed(path: Path, text: str, *, given: bool = False) -> None:
     """Write one text file as a group of its own name, as `write_together` does.
 
     Args:
-        path: file to write.
+        path: file to write; missing folders are made.
         text: content, written as UTF-8.
-        given: True if the user chose the name: an unlisted file of that name is then replaced.
+        given: True if the user chose the name: an unlisted or changed file of that name is then replaced.
 
     Raises:
-        FileExistsError: for an unlisted file in the way, unless `given`.
+        FileExistsError: for an unlisted or changed file of other content in the way, unless `given`.
         OSError: naming the file, if writing fails.
     """
     chosen = (path.name,) if given else ()
@@ -134,14 +136,14 @@ def _undo(folder: Path, temporary: Path) -> None:
 
 
 def recover(folder: Path, group: str | None = None) -> None:
-    """Restore the files that a killed `write_together` had moved away.
+    """Restore the files that a killed `write_together` had moved away; one that still runs is taken for it.
 
     Args:
-        folder: folder of the files.
+        folder: folder of the files; nothing is done for one that is missing.
         group: name of the group; None for all groups of the folder.
 
     Raises:
-        OSError: if that is not possible.
+        OSError: if files cannot be moved back.
     """
     for path in _temporary(folder, group):
         if (path / _LIST).is_file():
@@ -150,9 +152,10 @@ def recover(folder: Path, group: str | None = None) -> None:
 
 
 def sweep(folder: Path, stem: str | None = None) -> None:
-    """Run `recover`, and remove temporary files and folders by their names, a running writer's too.
+    """Run `recover`, and remove the temporary files and folders of atomic writing, a running writer's too.
 
     Args:
+        folder: folder to clean, without its subfolders.
         stem: file stem or group to restrict this to; None for all.
 
     Raises:
@@ -192,10 +195,11 @@ def refuse_others(
         folder: the folder; a missing one has no files.
         names: file names, or a mapping to digests: files of the same content are no obstacle.
         group: name of the group whose list is read first; the lists of other groups count too.
-        by_name: True to accept a file whose name is listed, without reading it.
+        by_name: True to accept a file whose name is listed, without reading it. Files of a retired group
+            are accepted in any state.
 
     Raises:
-        FileExistsError: naming the files, if there are any.
+        FileExistsError: naming the first of the files, if there are any.
     """
     new = names if isinstance(names, Mapping) else dict.fromkeys(names, "")
     there = {name: {""} for name in new if os.path.lexists(folder / name)}

@@ -22,7 +22,7 @@ def followed() -> bool:
 def needs_numbers(what: str, *tensors: Tensor) -> None:
     """Declare that a result depends on tensors' values: `torch.compile`'s graph breaks here.
 
-    With `fullgraph=True` the break is an error of torch's. Does nothing outside compilation and vmap.
+    Does nothing outside compilation and vmap.
 
     Args:
         what: the result that depends on them, for messages.
@@ -30,6 +30,7 @@ def needs_numbers(what: str, *tensors: Tensor) -> None:
 
     Raises:
         NotImplementedError: for tensors that `torch.func.vmap` has batched.
+        torch._dynamo.exc.Unsupported: while compiling with `fullgraph=True`.
     """
     if torch.compiler.is_compiling():
         torch._dynamo.graph_break(msg=f"{what} depends on numbers: compute it before compiling")

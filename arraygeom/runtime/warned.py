@@ -11,7 +11,7 @@ OWN, WRAPPERS = {"arraygeom", "calib", "pat"}, {"contextlib", "torch"}
 
 
 def warn(text: str, category: type[Warning] = UserWarning) -> None:
-    """Issue a warning that points to the line outside these packages from which they were called.
+    """Issue a warning that points to the line outside arraygeom, calib and pat from which they were called.
 
     It points to the outermost line if there is none.
     """

@@ -5,7 +5,9 @@ import json
 import os
 import random
 import shutil
+import struct
 import time
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,7 @@ import pytest
 from arraygeom import Rig
 from arraygeom.io import RigFileError, read_rig
 from arraygeom.io.matfile import readable_variables
+from arraygeom.io.source import RigSource
 
 FIXTURES = Path(__file__).parent / "fixtures"
 DEEP = 100_000
@@ -38,6 +41,12 @@ def test_deep_nesting_is_one_line(text, tmp_path):
     (tmp_path / "a.yml").write_text(text)
     with pytest.raises(RigFileError, match=r"nested|is not (XML|YAML)"):
         read_rig(tmp_path / "a.yml", format="opencv")
+
+
+def test_deep_nesting_of_toml_is_refused(tmp_path):
+    (tmp_path / "a.toml").write_text("a = " + "[" * DEEP + "]" * DEEP)
+    with pytest.raises(RigFileError, match="TOML"):
+        RigSource(tmp_path / "a.toml").toml()
 
 
 def test_a_matrix_that_claims_a_size_takes_no_memory(tmp_path):
@@ -85,6 +94,13 @@ def test_damaged_mat_files_are_read_or_refused(compressed, tmp_path):
         except RigFileError:
             refused += 1
     assert refused > 100
+
+
+def test_an_empty_variable_of_a_mat_file_is_refused():
+    packed = zlib.compress(b"")
+    content = b"MATLAB 5.0".ljust(124) + b"\0\1IM" + struct.pack("<II", 15, len(packed)) + packed
+    with pytest.raises(ValueError, match="matrix"):
+        readable_variables(content)
 
 
 def test_mat_files_of_other_versions_are_refused(tmp_path):

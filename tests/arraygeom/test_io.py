@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from arraygeom import Camera, LensView, Link, Pose, Rig, View, intrinsics
+from arraygeom import Camera, LensView, Link, Pose, Rig, View, intrinsics, stack
 from arraygeom.distortion import Distortion
 from arraygeom.fields import default_field
 from arraygeom.io import READERS, WRITERS, RigFileError, read_rig, recognise, write_rig
@@ -366,6 +366,9 @@ def test_what_a_format_cannot_hold_is_refused(tmp_path):
             write_rig(Rig({name: camera(1)}), path, format="colmap")
     with pytest.raises(ValueError, match="'u'"):
         write_rig(Rig({"u": View(hw=(4, 5))}), path, format="kalibr")
+    moving = camera(1).replace(cam_from_world=stack([camera(i).cam_from_world for i in (1, 2)]))
+    with pytest.raises(ValueError, match="batch"):
+        write_rig(Rig({"m": moving}), path, format="opencv")
     with pytest.raises(ValueError, match="'kitti'"):
         write_rig(three, path, format="kitti")
     assert not path.exists()

@@ -404,6 +404,8 @@ def test_zeds_lens_of_its_own_section(tmp_path):
     assert read(tmp_path / "SN1.conf", one)[0].names == ("left",)
     with pytest.raises(RigFileError, match="k1"):
         read(tmp_path / "SN1.conf", ZED.replace("_DISTO", "_OTHER"))
+    with pytest.raises(RigFileError, match="LEFT_CAM"):
+        read(tmp_path / "SN1.conf", ZED.replace("LEFT_CAM", "OTHER"), format="zed")
 
 
 def test_an_uncalibrated_camera_of_an_oak_is_left_out(tmp_path):

@@ -72,6 +72,15 @@ def test_a_damaged_database_is_named(tmp_path, change):
         read_matches(path, FILES, SIZES)
 
 
+def test_a_keypoint_that_is_no_number_is_refused(tmp_path):
+    path = tmp_path / "database.db"
+    database(path)
+    with sqlite3.connect(path) as file:
+        file.execute("UPDATE keypoints SET data = ?", (np.full((3, 6), np.nan, np.float32).tobytes(),))
+    with pytest.raises(ValueError, match="3 of 3"):
+        read_matches(path, FILES, SIZES)
+
+
 @pytest.mark.parametrize("header", ["id,x0,y0,x1,y1,score", 'score, "Y0", "X0", "Y1", "X1"'])
 def test_a_header_names_the_columns(tmp_path, header):
     """Columns are read by their names, in any order."""

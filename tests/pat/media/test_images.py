@@ -84,6 +84,12 @@ def test_few_bits_in_sixteen_are_said_unless_they_are_stated(tmp_path, largest, 
         read_image(tmp_path / "a.png")
 
 
+@pytest.mark.parametrize("content", [b"P1\n4 1\n0 1 0 1\n", b"P4\n4 1\n\x50"])
+def test_a_bitmap_has_two_values(tmp_path, content):
+    (tmp_path / "a.pbm").write_bytes(content)
+    assert read_recorded(tmp_path / "a.pbm").tolist() == [[[255, 0, 255, 0]]]
+
+
 @pytest.mark.parametrize("white", [1, 31, 100, 255, 1000, 1023, 4095, 40000, 65535])
 @pytest.mark.parametrize("kind", [b"P2", b"P3", b"P5", b"P6"])
 def test_a_pnm_file_states_its_white(tmp_path, white, kind):
