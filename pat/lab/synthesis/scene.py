@@ -189,7 +189,7 @@ class Object:
         profile: points (radius 0..0.5, y -0.5..0.5), from the top, that a "lathe" sweeps around the y axis.
 
     Raises:
-        ValueError: for a lathe without a profile of 2 points or more, and a profile of another shape.
+        ValueError: for a lathe without a profile of 2 points or more, and another shape with one.
     """
 
     name: str
@@ -229,7 +229,7 @@ class Light:
 
 @dataclass(frozen=True)
 class World:
-    """Light from all directions that no object blocks.
+    """Light that shines from all directions, and is the background.
 
     Attributes:
         rgb: radiance of red, green and blue.
@@ -261,6 +261,10 @@ class Scene:
     seed: int = 0
 
     def save(self, path: str | Path) -> None:
-        """Write the scene to a YAML file, atomically, for the record; nothing reads it back."""
+        """Write the scene to a YAML file, atomically, for the record; nothing reads it back.
+
+        Raises:
+            OSError: if it cannot be written.
+        """
         document = {"format": FORMAT, **to_document(self)}
         write_text(path, dump_yaml(document, width=120, default_flow_style=None))
