@@ -75,8 +75,7 @@ def generator_named(name: str) -> Callable[..., Scene]:
     """Look up a scene generator: "abstract", "photographs", or your own "module:function".
 
     Returns:
-        The function, called with seed, rig and `moving` seconds; "photographs" needs `folder` too. Your own is
-        not checked.
+        The function, called with seed, rig and `moving` seconds; "photographs" needs `folder` too.
 
     Raises:
         ValueError: for a name that is neither, or cannot be imported.
