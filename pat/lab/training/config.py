@@ -159,11 +159,11 @@ def recipes() -> tuple[str, ...]:
 
 
 def load_config(name: str | Path) -> TrainConfig:
-    """Load a recipe of the package by name, or a YAML file.
+    """Load a recipe of the package by name, or else a YAML file.
 
     Raises:
         FileNotFoundError: if it is neither.
-        ValueError: naming the entry, for an invalid recipe.
+        ValueError: naming the file and the entry, for an invalid recipe.
     """
     path = next((p for p in (RECIPES / f"{name}.yaml", Path(name)) if p.is_file()), None)
     if path is None:
@@ -172,13 +172,13 @@ def load_config(name: str | Path) -> TrainConfig:
 
 
 def parse_config(text: str, name: str = "config") -> TrainConfig:
-    """Parse a recipe from YAML text; `name` is used in messages.
+    """Parse a recipe from YAML text; `name` begins messages.
 
     Returns:
         The recipe, with defaults for entries that the text leaves out.
 
     Raises:
-        ValueError: naming the entry, for an invalid or empty recipe.
+        ValueError: naming the entry, for an invalid or empty recipe, and text that is not YAML.
     """
     values = parse_yaml(text, name)
     try:
@@ -220,6 +220,7 @@ def command_line(arguments: list[str], prog: str = "pat lab train") -> TrainConf
             not.
         FileNotFoundError: for a missing recipe.
         UsageError: for unknown options and invalid values.
+        SystemExit: after `--help`, which prints.
     """
     base = TrainConfig()
     if arguments and not arguments[0].startswith("-"):
@@ -239,10 +240,10 @@ def command_line(arguments: list[str], prog: str = "pat lab train") -> TrainConf
 
 
 def difference(config: TrainConfig, other: TrainConfig) -> str | None:
-    """Compare two recipes, except for entries that results do not depend on.
+    """Compare two recipes, except for the entries in `UNSEEN`.
 
     Returns:
-        The first difference, as "name: a, b"; None if both are the same run.
+        The first difference, as "name: value of config, value of other"; None if both are the same run.
     """
     for entry in dataclasses.fields(TrainConfig):
         ours, theirs = getattr(config, entry.name), getattr(other, entry.name)

@@ -55,8 +55,7 @@ class MeasuredPairs(Crops):
 
     Raises:
         FileNotFoundError: for a missing folder.
-        ValueError: for a folder without pairs, images that differ in size, are grey or smaller than `hw`, or
-            a pair without the disparity of both images.
+        ValueError: for a folder without pairs, no chosen pair, and as `check`.
     """
 
     def _find(self, roots: Sequence[Path], choose: Callable[[int], bool]) -> None:
@@ -70,7 +69,7 @@ class MeasuredPairs(Crops):
         """Check that both images are in colour, of one size, at least `hw`, and have disparities.
 
         Raises:
-            ValueError: naming the file, if not.
+            ValueError: naming the file, if not, or if an image is missing or none.
         """
         left, right = _header(pair.left), _header(pair.right)
         if left != right:
@@ -93,6 +92,7 @@ class MeasuredPairs(Crops):
 
         Raises:
             ValueError: for a file that cannot be read, and a missing file of disparities.
+            FileNotFoundError: for a missing image.
         """
         left, right = (read_image(path)[0] * pair.max_disparity for path in disparity_files(pair))
         return Pictures(read_image(pair.left), read_image(pair.right), (left, right), pair.max_disparity)
@@ -109,7 +109,7 @@ class MeasuredPairs(Crops):
             betas: number of betas of a window.
 
         Returns:
-            A batch of `batch` samples; depth is NaN where unknown.
+            A batch of `batch` samples, cameras as of `assumed_cameras`; depth is NaN where unknown.
 
         Raises:
             ValueError: for an image that cannot be read.
@@ -166,7 +166,7 @@ def depth_of(disparity: Float[Tensor, "b h w"], width: int) -> Float[Tensor, "b 
         width: width of the image, pixels.
 
     Returns:
-        Depth (b, h, w) in metres; NaN where the disparity is 0.
+        Depth (b, h, w) in metres; NaN where the disparity is not above 0.
     """
     return torch.where(disparity > 0, width / disparity, torch.nan)
 
@@ -195,7 +195,7 @@ def assumed_cameras(
         device: device of the batch.
 
     Returns:
-        The batch, without depth.
+        The batch, alpha's frame as the world; its lists of depth and index are empty.
     """
     batch, _, h, w = images[0].shape
     K = intrinsics(float(w), (h, w)).expand(batch, 3, 3)
