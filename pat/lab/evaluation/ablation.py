@@ -131,9 +131,7 @@ class FieldFamily:
         """Fuse a case with this family's field.
 
         Args:
-            network: network to fuse with.
             rig: rig to fuse with, calibrated rightly or wrongly; `assumed` is left to the caller.
-            case: scene whose images are fused.
             far: largest displacement from H x, pixels of beta.
 
         Returns:
@@ -183,17 +181,13 @@ class HorizontalDisplacement:
     """Field along rows around the true H x: rectified geometry with correct position and scale.
 
     Attributes:
-        disparity: half length of the segment, pixels.
+        disparity: half length of the segment, pixels of beta.
     """
 
     disparity: float
 
     def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> Segments:
-        """Compute horizontal segments in beta around H x, clipped to its image.
-
-        Args:
-            pair: alpha and beta.
-            x: pixels (x, y) of alpha.
+        """Compute horizontal segments in beta around H x, for pixels x of alpha, clipped to beta's image.
 
         Returns:
             Segments from right to left, one for each pixel; invalid where H x is infinite or the segment
@@ -236,12 +230,11 @@ def disparity(network: FusionNetwork, pair: Pair) -> float:
 
     Args:
         network: network that beta may be resized for.
-        pair: alpha and beta.
 
     Returns:
         Without lenses the largest displacement from H x, pixels of beta as the network receives it (resized
-        if it needs equal resolutions), 1 or more. With a lens the largest distance from a curve's near end,
-        pixels of beta as recorded; 1 if no curve is on the image.
+        if it needs equal resolutions), 1 or more. With a lens the largest distance on beta's image from a
+        curve's near end, pixels of beta as recorded; 1 if no near end is on the image.
 
     Raises:
         ValueError: for a pair that is not calibrated or has no depth range.
@@ -354,7 +347,6 @@ def ablate(
     """Run families on cases; write ablation.md, ablation.csv and ablation.png (crops of the first cases).
 
     Args:
-        network: network to fuse with.
         cases: scenes, read one at a time, at least one.
         chosen: families by name.
         out: folder for the three files.
@@ -488,7 +480,6 @@ def crops(case: AblationCase, images: Mapping[str, Tensor], rows: Sequence[Ablat
     """Cut squares of up to `CROP` pixels where "calibrated" is better than "rectified assumption" by most.
 
     Args:
-        case: the scene.
         images: fused images (3, h, w) by family or baseline.
         rows: scores of the case, one for each family or baseline.
 

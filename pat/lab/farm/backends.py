@@ -129,7 +129,7 @@ class BlenderSettings:
         generator: "abstract", "photographs", or your own "module:function".
         photos: folder of images, for "photographs" only.
         preset: name of a preset of render settings.
-        settings: entries of `RenderSettings` that differ from the preset.
+        settings: entries of `RenderSettings` that differ from the preset, and from one thread.
 
     Raises:
         ValueError: for a generator without its `photos` or with photos it does not take, an unknown
@@ -178,7 +178,6 @@ class BlenderSettings:
         """Prepare a renderer for a rig, which is not checked before a scene is rendered.
 
         Args:
-            rig: rig to render.
             limits: limits of the self-check, in place of those in `settings`.
 
         Returns:

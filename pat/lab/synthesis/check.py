@@ -126,6 +126,9 @@ def pair_figures(pair: Pair, here: RenderedFrame, there: RenderedFrame) -> dict[
         points: `median`, `p95` and `p99` of the error in alpha's pixels, `colour`, the median difference
         relative to brightness, and `shift`, the displacement in pixels that explains most of it. Without
         visible points only the shares.
+
+    Raises:
+        ValueError: unless both cameras are calibrated.
     """
     alpha, beta = (camera.to(dtype=torch.float64) for camera in pair.cameras)
     x, depth, index = _chosen(here, 200_000)

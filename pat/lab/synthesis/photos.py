@@ -131,7 +131,6 @@ class PhotoBank:
         """Cut a square from one level of a texture, mirrored beyond its sides.
 
         Args:
-            texture: number of the texture.
             level: level of its pyramid, 0 for the full image, at most 5.
             xy: first pixel (x, y) of the square, may lie outside.
             side: side of the square, pixels of that level.

@@ -35,7 +35,7 @@ class RenderedFrame:
         time: seconds.
         rgb: linear radiance, 1 is white, brighter is possible; stored as float16.
         depth: z in metres; infinite where nothing is hit, NaN where the lens sees nothing.
-        index: number of the object in the scene plus one; 0 where nothing is hit or seen.
+        index: number of the object or layer in the scene plus one; 0 where nothing is hit or seen.
         nir: linear radiance in near infrared; None if not rendered.
     """
 
@@ -48,7 +48,7 @@ class RenderedFrame:
 
 @dataclass(frozen=True)
 class Rendered:
-    """Rendered folder, read on demand.
+    """Rendered folder, read on demand; `about` and `rig` are kept once read.
 
     Attributes:
         folder: the folder.
@@ -89,7 +89,6 @@ class Rendered:
         """Read one frame of a camera.
 
         Args:
-            camera: name of the camera.
             number: number of the frame, from 0.
 
         Returns:
@@ -112,13 +111,10 @@ _MOST = 6e4
 
 
 def save_frame(path: Path, frame: RenderedFrame) -> None:
-    """Write the arrays of a frame to an .npz file, synced to disk; not atomically.
+    """Write the arrays of a frame (on the CPU, without gradient) to an .npz file in an existing folder.
 
-    Colours are stored as float16, at most 60,000; object numbers as uint16. The time is not written.
-
-    Args:
-        path: file in an existing folder, replaced if there is one.
-        frame: frame on the CPU, without gradient.
+    Synced to disk, not atomic. Colours are stored as float16, at most 60,000; object numbers as uint16; the
+    time is not written.
 
     Raises:
         OSError: if it cannot be written.

@@ -51,9 +51,6 @@ def collect(
     """Collect the state of a run: weights, their average, and the optimiser's state.
 
     Args:
-        network: network in training.
-        optimiser: its optimiser.
-        average: its averaged weights.
         facts: the entries of `Checkpoint.facts`, not checked.
 
     Returns:

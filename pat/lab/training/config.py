@@ -100,7 +100,7 @@ class TrainConfig:
     save: int = 250
     """Steps between checkpoints."""
     rectified: float = 0.5
-    """Share of the batches with rigs of `rectified_rigs`, the others being of `general_rigs`."""
+    """Share of the layered batches with rigs of `rectified_rigs`, the others being of `general_rigs`."""
     rectified_rigs: RigDistribution = RECTIFIED
     """Distribution of rectified rigs."""
     general_rigs: RigDistribution = GENERAL

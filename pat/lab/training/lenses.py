@@ -59,7 +59,6 @@ def lens_over(pinhole: Camera, g: Generator, lost: float = 0.0) -> Camera:
 
     Args:
         pinhole: pinhole camera, float64 on the CPU.
-        g: random generator.
         lost: largest share of height or width to lose on each side.
 
     Returns:

@@ -48,7 +48,7 @@ def train(config: TrainConfig) -> Path:
     Raises:
         FloatingPointError: for a loss or gradient that is not finite, naming the samples; their batch is
             saved.
-        FileNotFoundError: for a missing folder of data or file of weights.
+        FileNotFoundError: for a missing folder of scenes or pairs, or file of weights.
         OSError: if a file cannot be written.
         ValueError: for a folder with another run, a folder in use, no such device, or data that do not suit
             the recipe or cannot be read.
@@ -126,7 +126,7 @@ class Run:
 
     Raises:
         ValueError: for data or processes that do not suit the recipe, or a checkpoint of another network.
-        FileNotFoundError: for a missing folder of data or file of weights.
+        FileNotFoundError: for a missing folder of scenes or pairs, or file of weights.
     """
 
     def __init__(self, config: TrainConfig, here: Process, former: Checkpoint | None) -> None:
@@ -261,8 +261,6 @@ def save_sample(sample: Sample, path: Path, *, facts: dict[str, str]) -> None:
     `position/0`, `visible/0` and so on, without the fields.
 
     Args:
-        sample: group of samples.
-        path: file.
         facts: metadata of the file, text by name.
 
     Raises:

@@ -66,7 +66,6 @@ def validation(network: FusionNetwork, samples: list[Sample]) -> dict[str, float
     """Measure a network on validation samples, matches by the first beta of each.
 
     Args:
-        network: network to measure.
         samples: groups of samples, at least one.
 
     Returns:

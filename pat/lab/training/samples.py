@@ -50,7 +50,7 @@ class Sample(NamedTuple):
     """Group of training samples of one batch.
 
     Attributes:
-        alpha: recorded alpha (b, 1, h, w), 0..1.
+        alpha: recorded alpha (b, 1, h, w) in 0..1, slightly above 1 at most after a lens.
         betas: recorded betas (b, c, h, w), at alpha's size: three bands of one beta, one of each of several.
         fields: receptive field of each beta at that size.
         ground_truth: image (b, 3, h, w) to be learnt, may exceed 0..1.
@@ -119,8 +119,8 @@ def plan(config: TrainConfig, seed: int) -> Iterator[Planned]:
 class SampleSource:
     """Samples by number of the step; calling it with a count yields the first group of that many steps.
 
-    A group is one of the `Sample`s of a step. Each call begins at step 0, and yields the same for the same
-    seed.
+    A step has one group or more, each a `Sample`. Each call begins at step 0, and yields the same for the
+    same seed.
 
     Attributes:
         config: recipe.
@@ -167,7 +167,7 @@ class SampleSource:
         Args:
             planned: plan of the step.
             step: number of the step, the seed of its degradations.
-            group: number of the group.
+            group: number of the group within the step.
 
         Returns:
             The samples; the scenes stay in the cache.
@@ -206,7 +206,6 @@ def scenes(config: TrainConfig, *, device: str = "cpu") -> tuple[SampleSource, S
     """Open a recipe's data, split into training and validation by photographs, scenes and pairs.
 
     Args:
-        config: recipe.
         device: device of the samples.
 
     Returns:
@@ -233,7 +232,6 @@ def source_of(
     """Open a recipe's layered scenes, rendered scenes and measured pairs.
 
     Args:
-        config: recipe.
         photos: textures of layered scenes; None if all batches come from the recipe's folders.
         seed: random seed of scenes, degradations and the order in which items are used.
         device: device of the samples.
@@ -332,7 +330,6 @@ def recorded(
     Args:
         image: images (b, c, h, w), sRGB in 0..1.
         camera: their cameras, batched (b).
-        g: random generator.
         recording: probabilities of degradations.
         lost: largest share that an undistorted image lacks on each side.
 
@@ -369,7 +366,6 @@ def pair_of(scene: ArrayBatch, beta: int, g: Generator) -> Pair:
     """Make the batched pair of alpha and a beta at alpha's size, with depth bounds looser than the scenes'.
 
     Args:
-        scene: scenes with cameras.
         beta: number of the beta, from 1.
         g: random generator of the bounds.
 
@@ -389,7 +385,6 @@ def perturbed(pair: Pair, pixels: float, g: Generator) -> Pair:
     Args:
         pair: batched pair.
         pixels: displacement, pixels of beta.
-        g: random generator.
 
     Returns:
         The pair, its beta rotated about its centre, without link; the same pair for 0 pixels.

@@ -201,7 +201,6 @@ def large_enough(folder: Path, rig: Rig, hw: HW) -> list[str]:
 
     Args:
         folder: folder of the scene, for messages.
-        rig: its rig.
         hw: (height, width) of alpha in the samples.
 
     Returns:

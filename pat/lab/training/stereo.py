@@ -100,7 +100,7 @@ class MeasuredPairs(Crops):
     def sample(self, batch: int, generator: Generator, *, number: int, betas: int = 1) -> ArrayBatch:
         """Draw windows from the pairs that are active for group `number`.
 
-        Several betas are of the same camera.
+        Several betas are of the same camera, at sizes of their own.
 
         Args:
             batch: number of windows.

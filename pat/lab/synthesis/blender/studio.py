@@ -36,8 +36,6 @@ class Studio:
     """Blender with one scene loaded; renders frames of any pinhole camera at any time.
 
     Args:
-        scene: scene to render.
-        settings: settings of rendering.
         scratch: existing folder for temporary files.
 
     Attributes:

@@ -48,10 +48,7 @@ def render(scene: Scene, rig: Rig, out: Path, *, settings: RenderSettings) -> Re
     """Render a scene of a rig into the new folder `out`, atomically.
 
     Args:
-        scene: scene to render.
         rig: calibrated cameras to render.
-        out: new folder.
-        settings: settings of rendering.
 
     Returns:
         The rendered folder, with the outcome of the self-check in `about["check"]`; a scene that fails it is
@@ -141,9 +138,7 @@ def take(studio: Studio, lens: Lens, shot: Shot) -> RenderedFrame:
     """Render one frame of a camera, resampled to its lens.
 
     Args:
-        studio: Blender with the scene loaded.
-        lens: lens of the frame's camera.
-        shot: camera and time.
+        lens: lens of the shot's camera.
 
     Returns:
         The frame at the true camera's pixels, with near infrared if the studio's settings ask for it.

@@ -41,7 +41,6 @@ def build(bpy: Any, scene: Part, meshes: Sequence[Part], world: Any) -> BuiltSce
 
     Args:
         bpy: Blender's module.
-        scene: scene to build.
         meshes: the objects' shapes in their order, with the attributes of `pat.lab.synthesis.shapes.Mesh`.
         world: Blender's world, for the light from all around.
 
