@@ -154,7 +154,7 @@ class Ablate:
         Raises:
             FileNotFoundError: for a missing folder of rendered scenes, or file of weights.
             ValueError: for fewer than one scene, options of layered scenes next to --rendered, folders
-                without scenes or photographs, an unknown field, and as `ablate`.
+                without scenes or photographs, an unknown field, and as `ablate` and `rendered_cases`.
         """
         from ..networks.weights import load_weights
         from .evaluation.ablation import FieldFamily, ablate, families, layered_cases, rendered_cases
@@ -263,7 +263,6 @@ class Render:
 @dataclass
 class Train:
     """Train weights by a recipe, on scenes made from photographs during training.
-
 
     Example: pat lab train pat-supervised --photos ~/images --out runs/mine --minutes 60
     """

@@ -518,7 +518,7 @@ def turned(rig: Rig, rotation: Float[Tensor, "3"]) -> Rig:
 
     Args:
         rig: rig with cameras alpha and beta.
-        rotation: rotation vector in beta's axes, radians, float64.
+        rotation: rotation vector in beta's axes, radians.
 
     Returns:
         The rig, all else unchanged.

@@ -164,7 +164,7 @@ def rectified_rig(hw: HW, betas: Mapping[str, HW], max_disparity: float) -> Rig:
         The rig; its first camera is called "alpha".
 
     Raises:
-        ValueError: for a negative `max_disparity`.
+        ValueError: for a `max_disparity` that is negative, infinite or NaN.
         ZeroDivisionError: for a `max_disparity` of 0.
     """
     alpha = Camera(K=intrinsics(float(hw[1]), hw), cam_from_world=Pose.identity(), hw=hw)

@@ -45,7 +45,8 @@ class Warped(NamedTuple):
             Image (c, ha, wa), not clipped; beyond the canvas its border repeats.
 
         Raises:
-            ValueError: for another interpolation, or an image of whole numbers.
+            ValueError: for another interpolation.
+            TypeError: for an image of whole numbers.
         """
         return warped(image, self.rectification.H_alpha, self.original.alpha.hw, interpolation=interpolation)
 
@@ -120,7 +121,7 @@ def warped(image: Tensor, H: Tensor, hw: HW, *, interpolation: Interpolation = "
     """Sample an image at H x for all pixels x of a canvas.
 
     Args:
-        image: image (c, h, w), floating point.
+        image: image (c, h, w).
         H: homography (3, 3) from pixels of the canvas to those of the image.
         hw: (height, width) of the canvas.
         interpolation: "bicubic", "bilinear" or "nearest".
@@ -129,7 +130,8 @@ def warped(image: Tensor, H: Tensor, hw: HW, *, interpolation: Interpolation = "
         Image (c, *hw), bicubic not clipped; the image's border repeats beyond.
 
     Raises:
-        ValueError: for another interpolation, or an image of whole numbers.
+        ValueError: for another interpolation.
+        TypeError: for an image of whole numbers.
     """
     x = apply_homography(H, pixel_grid(hw, dtype=torch.float64)).x
     return sample(image[None], x[None].float(), interpolation=interpolation, extended=True).values[0]

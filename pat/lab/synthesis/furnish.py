@@ -67,6 +67,11 @@ class Setting:
             infinite far bound counts as 10 times the near one.
         rng: random generator.
 
+    Attributes:
+        cameras: the calibrated cameras, on the CPU.
+        near, far: depth range, metres.
+        centres: the cameras' centres in the world (n, 3), metres.
+
     Raises:
         ValueError: for a rig without a calibrated camera.
     """

@@ -139,6 +139,8 @@ class TrainConfig:
         check_fields(self, "rectified rendered measured", 0, 1)
         if not all(0 <= momentum < 1 for momentum in self.momenta):
             raise ValueError(f"momenta must be from 0 to below 1, got {self.momenta}")
+        if not 1 <= self.network.betas <= 3:
+            raise ValueError(f"network.betas must be from 1 to 3, a band each, got {self.network.betas}")
 
         if min(self.hw) < 16 or any(side % 16 for side in self.hw):
             raise ValueError(f"hw must be multiples of 16, got {self.hw[0]} x {self.hw[1]}")

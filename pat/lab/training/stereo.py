@@ -66,7 +66,8 @@ class MeasuredPairs(Crops):
         self._pictures = lru_cache(ACTIVE)(lambda i: self.read(self.pairs[i]))
 
     def check(self, pair: PairFiles) -> None:
-        """Check that both images are in colour, of one size, at least `hw`, and have disparities.
+        """Check that both images are in colour, of one size, at least `hw`, and have disparities of a scale
+        that is known by Middlebury's names of folders (`middlebury_pairs`).
 
         Raises:
             ValueError: naming the file, if not, or if an image is missing or none.
@@ -83,6 +84,9 @@ class MeasuredPairs(Crops):
         if left[0] < h or left[1] < w:
             raise ValueError(f"{pair.left} is {_described(left)}, below samples of {w}x{h}: lower `hw`")
         disparity_files(pair)
+        if pair.ground_truth is None:
+            names = "name its folder, or the one above, as Middlebury's collection, such as 2006_third"
+            raise ValueError(f"{pair.left}: the scale of the disparities is unknown: {names}")
 
     def read(self, pair: PairFiles) -> Pictures:
         """Read the images and disparities of a pair.

@@ -121,7 +121,7 @@ def shots(rig: Rig, settings: RenderSettings) -> list[Shot]:
 
 
 def refuse_inside(scene: Scene, rig: Rig, planned: list[Shot]) -> None:
-    """Check that no calibrated camera is inside an object when it takes one of the frames `planned`.
+    """Check that no camera (all calibrated) is inside an object when it takes one of the frames `planned`.
 
     Raises:
         ValueError: naming camera and object, if one is.
