@@ -69,7 +69,8 @@ class Setting:
 
     Attributes:
         cameras: the calibrated cameras, on the CPU.
-        near, far: depth range, metres.
+        near: near bound of depths, metres.
+        far: far bound of depths, metres, finite.
         centres: the cameras' centres in the world (n, 3), metres.
 
     Raises:

@@ -38,7 +38,7 @@ class ArrayBatch:
     Attributes:
         images: images 0..1, sRGB.
         depth: metres along each camera's own axis at the pixels' centres; NaN where unknown.
-        cameras: cameras, batched (b).
+        cameras: cameras, batched (b), with alpha's frame as the world.
         depth_range: nearest and farthest of alpha's depths, metres.
         index: number of the visible layer, from 1; an empty list for scenes that have no layers.
     """
