@@ -33,7 +33,7 @@ def abstract(seed: int, rig: Rig, *, moving: float = 0.0) -> Scene:
         moving: seconds for which objects move, rotate and stretch along random paths; 0 for none.
 
     Returns:
-        The scene, the same for the same seed and rig.
+        The scene, the same for the same seed and rig; fewer shapes if they do not fit.
 
     Raises:
         ValueError: for a rig without a calibrated camera, and a negative seed.

@@ -39,7 +39,7 @@ class ArrayBatch:
         images: images 0..1, sRGB.
         depth: metres along each camera's own axis at the pixels' centres; NaN where unknown.
         cameras: cameras, batched (b), with alpha's frame as the world.
-        depth_range: nearest and farthest of alpha's depths, metres.
+        depth_range: (near, far) of alpha's depths, metres; far may be infinite.
         index: number of the visible layer, from 1; an empty list for scenes that have no layers.
     """
 

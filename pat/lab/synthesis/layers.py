@@ -53,10 +53,11 @@ class Layers:
 def draw_layers(
     rigs: RigBatch, count: tuple[int, int], photos: PhotoBank, shapes: int, generator: Generator
 ) -> Layers:
-    """Draw random layers in front of the rigs' first camera, their anchors between near and far.
+    """Draw random layers in front of the rigs' first camera, between near and far.
 
     Layer 0 is the background. In half of the scenes layer 1 is a ground or a ceiling, in a quarter layer 2 is
-    a wall; the others have outlines. In one scene in eight all anchors lie within about 5 % of one depth.
+    a wall; the others have outlines. In one scene in eight all are drawn within 5 % of one depth. Layers that
+    slant nearer than near are moved back, possibly beyond far.
 
     Args:
         rigs: rigs, one for each scene.

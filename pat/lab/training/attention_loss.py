@@ -48,8 +48,8 @@ def attention_loss(
 ) -> Tensor:
     """Compute the mean cross-entropy of the attention weights against the true positions, over all betas.
 
-    For known points that a beta does not see it is against equal weights, times `UNSEEN`. No samples of beta
-    are gathered.
+    For known points that a beta does not see it is against equal weights, times `UNSEEN`. Visible points off
+    the segment (`OFF`) do not count. No samples of beta are gathered.
 
     Args:
         compared: features and segments of each of one or more betas.
