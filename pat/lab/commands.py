@@ -213,7 +213,7 @@ class Render:
     """
 
     config: Annotated[Path, Option("CONFIG", positional=True)]
-    """What to render (YAML): rig, seed, backend and its settings."""
+    """File of the job (YAML): rig, seed, backend and its settings."""
     scenes: int
     """Number of scenes there should be in the end."""
     out: Out

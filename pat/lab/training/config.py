@@ -92,7 +92,7 @@ class TrainConfig:
     clip: float = 1.0
     """Norm that gradients are clipped to; inf for none."""
     reuse: float = 2.0
-    """How many times a batch of scenes is recorded on average, each time differently."""
+    """Number of times a batch of scenes is recorded on average, each time differently."""
     average: int = 300
     """Time constant, in steps, of the weight average that is validated and saved."""
     validate: int = 250
