@@ -42,7 +42,7 @@ class StereoSets:
             The pairs, read on demand, by data set.
 
         Raises:
-            ValueError: if no folder is given, or one has no pair.
+            ValueError: if no folder is given, one has no pair, or `out` cannot be written.
             FileNotFoundError: for a missing folder.
         """
         from .evaluation.stereo import DATA_SETS
@@ -73,9 +73,10 @@ class Evaluate(StereoSets):
         """Score all methods on all pairs; write scores and strips of images to `out`, and print the scores.
 
         Raises:
-            FileNotFoundError: for a missing folder.
-            ValueError: for no folder, one without a pair, no rates or one below 1, and images that are grey
-                or of unequal sizes.
+            FileNotFoundError: for a missing folder, image, or file of weights.
+            ValueError: as `sets`, as `evaluate_pairs`, for images that cannot be read, and weights that
+                cannot be used.
+            RuntimeError: for images smaller than a rate.
         """
         from ..networks.weights import load_weights
         from .evaluation import protocols, stereo
@@ -92,7 +93,7 @@ class Evaluate(StereoSets):
             The pairs, read on demand, by data set.
 
         Raises:
-            ValueError: for no rates or one below 1, for no folder, and for one without a pair.
+            ValueError: for no rates or one below 1, no folder, one without a pair, and `out` not writable.
             FileNotFoundError: for a missing folder.
         """
         if not self.rates or min(self.rates) < 1:
@@ -151,9 +152,9 @@ class Ablate:
         """Compare the families; write and print the table.
 
         Raises:
-            FileNotFoundError: for a missing folder.
-            ValueError: for fewer than one scene, options of layered scenes next to --rendered, and a folder
-                without scenes or photographs.
+            FileNotFoundError: for a missing folder of rendered scenes, or file of weights.
+            ValueError: for fewer than one scene, options of layered scenes next to --rendered, folders
+                without scenes or photographs, an unknown field, and as `ablate` and `rendered_cases`.
         """
         from ..networks.weights import load_weights
         from .evaluation.ablation import FieldFamily, ablate, families, layered_cases, rendered_cases
@@ -188,7 +189,7 @@ class DataInfo:
 
         Raises:
             FileNotFoundError: for a missing folder.
-            ValueError: for a folder that `pat lab render` did not write.
+            ValueError: for a folder that `pat lab render` did not write, or that is damaged.
         """
         from .farm.job import summarise
 
@@ -212,7 +213,7 @@ class Render:
     """
 
     config: Annotated[Path, Option("CONFIG", positional=True)]
-    """What to render (YAML): rig, seed, backend and its settings."""
+    """File of the job (YAML): rig, seed, backend and its settings."""
     scenes: int
     """Number of scenes there should be in the end."""
     out: Out
@@ -230,9 +231,11 @@ class Render:
         """Render the missing scenes; exits with status 1 if some are still missing afterwards.
 
         Raises:
-            FileNotFoundError: for a missing configuration file.
-            ValueError: for code named in the file and not in --generator, and as `pat.lab.farm.job.render`.
+            FileNotFoundError: for a missing configuration file or rig.
+            ValueError: for an invalid configuration or shard, code named in the file and not in --generator,
+                and as `pat.lab.farm.job.render`.
             pat.support.jobs.JobError: if the job cannot go on, such as on a full disk.
+            ImportError: for a scheduler without the package of Dask.
             SystemExit: with status 1, if a scene failed.
         """
         from .farm.job import RenderConfig, Shard, render
@@ -261,7 +264,6 @@ class Render:
 class Train:
     """Train weights by a recipe, on scenes made from photographs during training.
 
-
     Example: pat lab train pat-supervised --photos ~/images --out runs/mine --minutes 60
     """
 
@@ -275,7 +277,7 @@ class Train:
             The command, ready to run.
 
         Raises:
-            ValueError: naming the entry, for a recipe that cannot be used.
+            ValueError: naming the entry, for a recipe that cannot be used, and as `command_line`.
             FileNotFoundError: for a missing recipe.
         """
         from .training.config import command_line
@@ -286,7 +288,8 @@ class Train:
         """Train, or continue a run that stopped, and print the weights' file.
 
         Raises:
-            ValueError: for a recipe that its data do not suit.
+            ValueError: for a folder with another run, and data that do not suit the recipe; it and further
+                errors as `pat.lab.training.loop.train`.
         """
         from .training.loop import train
 
@@ -337,7 +340,7 @@ class Import:
 
         Raises:
             FileNotFoundError: for a missing file.
-            ValueError: for a file that is no such checkpoint.
+            ValueError: for a file that is no such checkpoint, and if `out` cannot be written.
         """
         from ..networks.authors import read_authors
         from ..networks.paper import PAT

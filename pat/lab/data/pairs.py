@@ -26,7 +26,7 @@ class Disparity(NamedTuple):
     """True disparity of the left image.
 
     Attributes:
-        value: disparity in pixels, 0 or more; meaningless where not `valid`.
+        value: disparity in pixels of left, 0 or more; meaningless where not `valid`.
         valid: True where the disparity is known.
     """
 
@@ -37,7 +37,7 @@ class Disparity(NamedTuple):
         """Classify the left image's pixels by whether right sees their point.
 
         A pixel is occluded if another one falls on the same pixel of right with a disparity greater by more
-        than 1.
+        than 1. Right is taken to be as wide as left.
 
         Returns:
             Three masks (h, w): seen, occluded, beyond right's edge; all False where the disparity is unknown.
@@ -71,8 +71,8 @@ class StereoPair:
 
     Attributes:
         name: name in tables, usually the path.
-        left: image 0..1, grey or RGB.
-        right: image 0..1, grey or RGB.
+        left: image 0..1, grey (one channel) or RGB.
+        right: image 0..1, grey or RGB; its size is not checked.
         max_disparity: largest disparity in pixels of left; None if unknown.
         disparity: true disparity of left; None if unknown.
     """
@@ -90,8 +90,9 @@ class PairFiles(NamedTuple):
     Attributes:
         left: left image.
         right: right image.
-        max_disparity: largest disparity, pixels of left.
-        ground_truth: true disparity of left; None if unknown.
+        max_disparity: largest disparity that the files can hold, pixels of left; `PAPER_DISPARITY` if the
+            names do not tell.
+        ground_truth: file of left's true disparity, 8 bits, 0 where unknown; None if the names do not tell.
         scale: counts of that file for a pixel of disparity.
     """
 
@@ -144,12 +145,12 @@ def middlebury_pairs(root: str | Path) -> Iterator[StereoPair]:
     cameras 3 and 4.
 
     Returns:
-        Pairs, read one at a time; their `max_disparity` is what the files can hold (255 / scale), not the
-        scene's own.
+        Pairs, read one at a time, named by their folder; `max_disparity` is what the files can hold (255 /
+        scale), not the scene's own.
 
     Raises:
-        FileNotFoundError: for a missing folder.
-        ValueError: for a folder without a pair; and while they are read, for an image that cannot be.
+        FileNotFoundError: for a missing folder; while pairs are read, for a missing right image or disparity.
+        ValueError: for a folder without a pair; while pairs are read, for an image that cannot be.
     """
     root = _folder(root)
     return (_read(root, files) for files in _some(_middlebury(root), root))
@@ -161,11 +162,12 @@ def folder_pairs(root: str | Path) -> Iterator[StereoPair]:
     Rectification is assumed.
 
     Returns:
-        Pairs, read one at a time, with `max_disparity` `PAPER_DISPARITY` and no true disparity.
+        Pairs, read one at a time, named by left's path without its mark, with `max_disparity`
+        `PAPER_DISPARITY` and no true disparity.
 
     Raises:
         FileNotFoundError: for a missing folder.
-        ValueError: for a folder without a pair; and while they are read, for an image that cannot be.
+        ValueError: for a folder without a pair; while pairs are read, for an image that cannot be.
     """
     root = _folder(root)
     return (_read(root, files) for files in _some(_named(root), root))
@@ -175,7 +177,8 @@ def pair_files(root: str | Path) -> list[PairFiles]:
     """List the files of every pair that `middlebury_pairs` and `folder_pairs` would read.
 
     Returns:
-        The files, sorted by the left image's path.
+        The files, sorted by the left image's path; as Middlebury's for a left image that both would read.
+        Whether Middlebury's other files exist is not checked.
 
     Raises:
         FileNotFoundError: for a missing folder.

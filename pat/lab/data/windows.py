@@ -31,7 +31,7 @@ def scene_folders(root: str | Path) -> list[Path]:
 
     Raises:
         FileNotFoundError: for a missing folder.
-        ValueError: for a folder without a scene, or with an incomplete one.
+        ValueError: for a folder without a scene, or with an incomplete one, as which any other folder counts.
     """
     root = Path(root)
     if not root.is_dir():
@@ -54,7 +54,8 @@ def reading(folder: Path) -> Iterator[None]:
     remedy.
 
     Raises:
-        ValueError: for any error of a damaged or missing file in the block.
+        ValueError: for OSError, ValueError, KeyError, EOFError, BadZipFile and TypeError in the block; other
+            errors pass.
     """
     try:
         yield
@@ -81,8 +82,8 @@ class RenderedView(NamedTuple):
 
     Attributes:
         rgb: image in linear light, 1 is white, may exceed it.
-        depth: z in metres at the pixels' centres; infinite where nothing is hit, NaN where the lens sees
-            nothing.
+        depth: z in metres at the pixels' centres; infinite where nothing is hit, NaN where unknown (the lens
+            sees nothing, or outside the image).
         camera: the camera, float64.
     """
 
@@ -95,8 +96,8 @@ def read_view(folder: Path, name: str) -> RenderedView:
     """Read a camera's first frame as rendered.
 
     Raises:
-        ValueError: naming the folder, if it cannot be read, the camera is not calibrated, or sizes disagree
-            with the rig.
+        ValueError: naming the folder, if it cannot be read, the camera is unknown or not calibrated, or
+            sizes disagree with the rig.
     """
     with reading(folder):
         frame, camera = Rendered(folder).frame(name), Rendered(folder).rig[name]
@@ -118,7 +119,11 @@ def undistorted(view: RenderedView) -> RenderedView:
     """Resample a view to its pinhole camera.
 
     Returns:
-        The undistorted view, bicubic in colour and nearest in depth; the view itself without a lens model.
+        The undistorted view (`pinhole_view`), usually of another size, bicubic in colour, nearest in depth;
+        the view itself without a lens model.
+
+    Raises:
+        ValueError: if no pixel is within the lens's range.
     """
     if view.camera.distortion is None:
         return view
@@ -132,6 +137,7 @@ def window(view: RenderedView, top: int, left: int, size: HW, hw: HW) -> Rendere
     """Cut a window from a view and resize it to `hw`.
 
     Args:
+        view: whole view, through a lens or not.
         top: first row, may lie outside.
         left: first column, may lie outside.
         size: (height, width) of the window in the view.
@@ -165,7 +171,7 @@ def reduced_depth(depth: Float[Tensor, "n h w"], hw: HW) -> Float[Tensor, "n h2 
 
     Returns:
         Depth (n, h2, w2): inverse depth interpolated where it differs by under 1 % from the nearest pixel's,
-        else the nearest pixel's.
+        else the nearest pixel's, infinite and NaN too; the same tensor if the size is unchanged.
     """
     old = (depth.shape[-2], depth.shape[-1])
     if old == hw:

@@ -94,9 +94,9 @@ class AblationCase(NamedTuple):
     Attributes:
         name: name in tables.
         rig: rig with cameras alpha and beta, and a depth range.
-        images: recorded images by camera; alpha is grey.
-        ground_truth: alpha's view in colour, (3, h, w), 0..1.
-        depth: true depth of alpha's pixels in metres, (h, w).
+        images: recorded images (c, h, w), 0..1, by camera: alpha in grey, beta in colour.
+        ground_truth: alpha's view in colour, (3, h, w), 0..1, sRGB.
+        depth: true depth of alpha's pixels in metres, (h, w); infinite or NaN where there is none.
     """
 
     name: str
@@ -117,7 +117,8 @@ class FieldFamily:
     """Family of receptive fields, and the rig that the field is computed from.
 
     Attributes:
-        field: receptive field for the largest displacement from H x in pixels; None for the default field.
+        field: makes the field from the largest displacement from H x, pixels of beta; None from it means the
+            default field.
         assumed: returns the (possibly wrong) rig to fuse with, given the true one and a generator.
         warped: True to rectify both images by that rig first and to warp the result back.
     """
@@ -127,19 +128,19 @@ class FieldFamily:
     warped: bool = False
 
     def fuse(self, network: FusionNetwork, rig: Rig, case: AblationCase, far: float) -> tuple[Tensor, Tensor]:
-        """Fuse a case with this family.
+        """Fuse a case with this family's field.
 
         Args:
-            network: network to fuse with.
-            rig: rig to fuse with, calibrated rightly or wrongly.
-            case: scene whose images are fused.
+            rig: rig to fuse with, calibrated rightly or wrongly; `assumed` is left to the caller.
             far: largest displacement from H x, pixels of beta.
 
         Returns:
-            Alpha's fused view (3, h, w), and its depth in metres (h, w).
+            Alpha's fused view (3, h, w), possibly beyond 0..1, and its depth in metres (h, w), NaN where
+            unknown.
 
         Raises:
-            ValueError: for a rig that cannot be rectified, or a field that the network does not support.
+            ValueError: as `fuse_frame`, such as for a field that the network does not support; if `warped`,
+                also as `rectified`.
         """
         settings = FuseSettings(field=self.field(far))
         if not self.warped:
@@ -160,7 +161,8 @@ class AblationRow(NamedTuple):
         psnr: PSNR in dB; NaN if there is no result.
         ssim: SSIM; NaN if there is no result.
         end_point_error: mean error in pixels of beta of the points at the estimated depth; NaN without depth.
-        within_one: share of pixels whose point is within a pixel of its true position in beta.
+        within_one: share of pixels of known true depth whose point is within a pixel of its true position in
+            beta; NaN without depth.
         note: reason for a missing result; else empty.
     """
 
@@ -179,21 +181,20 @@ class HorizontalDisplacement:
     """Field along rows around the true H x: rectified geometry with correct position and scale.
 
     Attributes:
-        disparity: half length of the segment, pixels.
+        disparity: half length of the segment, pixels of beta.
     """
 
     disparity: float
 
     def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> Segments:
-        """Compute horizontal segments in beta around H x, clipped to its image.
-
-        Args:
-            pair: alpha and beta.
-            x: pixels (x, y) of alpha.
+        """Compute horizontal segments in beta around H x, for pixels x of alpha, clipped to beta's image.
 
         Returns:
             Segments from right to left, one for each pixel; invalid where H x is infinite or the segment
             misses beta's image.
+
+        Raises:
+            ValueError: as `Pair.homography`.
         """
         centre, finite = apply_homography(pair.homography, x)
         step = centre.new_tensor([self.disparity, 0.0])
@@ -205,8 +206,9 @@ def families() -> dict[str, FieldFamily]:
     """Make every family of receptive fields of the ablation.
 
     Returns:
-        Families by name: right calibrations, `calibrated` first, then wrong ones (beta rotated, its principal
-        point displaced).
+        Families by name. With the true rig: "calibrated", "rectified, warped", "rectified assumption", "rows
+        around H x", "homography + displacement", "nearest voxels", "local 5x5" and "dense". With a wrong
+        one: beta "rotated by A deg" for A of 0.1, 0.3 and 1, or its "centre off by P px" for P of 1, 3, 10.
     """
     exact = {
         "calibrated": FieldFamily(lambda disparity: None),  # the default
@@ -224,14 +226,15 @@ def families() -> dict[str, FieldFamily]:
 
 
 def disparity(network: FusionNetwork, pair: Pair) -> float:
-    """Bound the displacement of a point from H x over the depth range.
+    """Bound the displacement in beta of a point over the depth range.
 
     Args:
         network: network that beta may be resized for.
-        pair: alpha and beta.
 
     Returns:
-        Pixels of beta as the network receives it (resized if it needs equal resolutions); 1 or more.
+        Without lenses the largest displacement from H x, pixels of beta as the network receives it (resized
+        if it needs equal resolutions), 1 or more. With a lens the largest distance on beta's image from a
+        curve's near end, pixels of beta as recorded; 1 if no near end is on the image.
 
     Raises:
         ValueError: for a pair that is not calibrated or has no depth range.
@@ -253,15 +256,15 @@ def layered_cases(
 
     Args:
         count: number of cases.
-        photos: folders of photographs; empty for those in scikit-image.
+        photos: folders of photographs; empty for the textures of `sample_photographs`.
         hw: (height, width) of both images.
         seed: seed of the scenes and the noise.
 
     Yields:
-        One case at a time.
+        One case at a time, its depth range 10 % wider than the scene's.
 
     Raises:
-        ValueError: for folders without images, when the first case is asked for.
+        ValueError: for missing folders and folders without images, when the first case is asked for.
     """
     bank = PhotoBank.load(*photos) if photos else sample_photographs()
     scenes, g = LayeredScenes(bank, RIGS, hw=hw, seed=seed), Generator().manual_seed(seed)
@@ -276,7 +279,9 @@ def rendered_cases(folder: Path, *, seed: int = 0) -> Iterator[AblationCase]:
     """Read cases from rendered scenes (`scene_folders`): their first camera is alpha, their second beta.
 
     Returns:
-        Iterator over the cases, read on demand, with noise drawn from `seed`.
+        Iterator over the cases, read on demand, with noise drawn from `seed` for each, and a depth range 10 %
+        wider than alpha's finite depths. It raises what `Rendered` raises for a damaged scene, ValueError for
+        one camera, RuntimeError for a scene without finite depths.
 
     Raises:
         FileNotFoundError: for a missing folder.
@@ -319,12 +324,12 @@ def recorded(ideal: Mapping[str, Tensor], g: Generator) -> dict[str, Tensor]:
 
 
 def sample_photographs(*, count: int = 12, seed: int = 0) -> PhotoBank:
-    """Load the photographs in scikit-image, and `count` patterns drawn from `seed`.
+    """Load four photographs of scikit-image, and `count` patterns drawn from `seed`.
 
     They are free to use (astronaut: NASA; chelsea, coffee and rocket: CC0).
 
     Returns:
-        Bank of textures.
+        Bank of textures, the photographs first.
     """
     from skimage import io
     from skimage.data import data_dir
@@ -339,17 +344,20 @@ def sample_photographs(*, count: int = 12, seed: int = 0) -> PhotoBank:
 def ablate(
     network: FusionNetwork, cases: Iterable[AblationCase], chosen: Mapping[str, FieldFamily], *, out: Path
 ) -> list[AblationRow]:
-    """Run families on cases; write ablation.md, ablation.csv and ablation.png (crops of some cases).
+    """Run families on cases; write ablation.md, ablation.csv and ablation.png (crops of the first cases).
 
     Args:
-        network: network to fuse with.
-        cases: scenes, read one at a time.
+        cases: scenes, read one at a time, at least one.
         chosen: families by name.
         out: folder for the three files.
 
     Returns:
-        One row for each case and each family or baseline ("alpha alone", "classical"); a family that fails on
-        a case has NaN there, and the reason as its note.
+        One row for each case and each family or baseline ("alpha alone", "classical"). Where fusion raises
+        ValueError, or dense positions would need more than `DENSE_LIMIT`, scores are NaN, with a note.
+
+    Raises:
+        ValueError: for a case that is not calibrated, has no depth range, or is too small for SSIM.
+        OSError: if a file cannot be written.
     """
     rows: list[AblationRow] = []
     panels: dict[str, Tensor] = {}
@@ -400,8 +408,8 @@ def point_errors(case: AblationCase, depth: Float[Tensor, "h w"]) -> tuple[float
         depth: estimated depth of alpha's pixels, metres; NaN where unknown.
 
     Returns:
-        Mean error in pixels of beta where both are known, and share of pixels of known true depth with an
-        error of at most 1; (nan, nan) if none can be compared.
+        Mean error in pixels of beta where both are known and finite, and share of the pixels of known true
+        depth with an error of at most 1; (nan, nan) if none can be compared.
     """
     alpha, beta = case.rig.pair(ALPHA, BETA).cameras
     x = pixel_grid(alpha.hw, dtype=torch.float64).reshape(-1, 2)
@@ -419,8 +427,8 @@ def markdown(rows: Sequence[AblationRow]) -> str:
     """Format rows as a Markdown table with an introduction, one line for each family.
 
     Returns:
-        The text: mean PSNR with 95 % bootstrap interval, SSIM, difference to calibrated in dB, PSNR by focal
-        ratio, errors in beta.
+        The text: mean PSNR with 95 % bootstrap interval, mean SSIM, mean gain in PSNR over "calibrated" (dB;
+        blank if that has no scores), PSNR by focal ratio, errors in beta, and the reason for missing scores.
     """
     between = [f"ratio {low:g} to {high:g}" for low, high in pairwise(RATIOS)]
     bins = [f"ratio below {RATIOS[0]:g}", *between, f"ratio from {RATIOS[-1]:g}"]
@@ -469,16 +477,15 @@ def _mean(values: Sequence[float]) -> float:
 
 
 def crops(case: AblationCase, images: Mapping[str, Tensor], rows: Sequence[AblationRow]) -> dict[str, Tensor]:
-    """Cut crops of a case where "calibrated" is better than "rectified assumption" by most.
+    """Cut squares of up to `CROP` pixels where "calibrated" is better than "rectified assumption" by most.
 
     Args:
-        case: the scene.
         images: fused images (3, h, w) by family or baseline.
         rows: scores of the case, one for each family or baseline.
 
     Returns:
-        Crops (3, h, w) by title, the ground truth first; a title has the PSNR of the whole image. From the
-        top left corner if one of the two families has no image.
+        Crops (3, h, w) of the ground truth and of each row with an image, by title (case, family, PSNR of the
+        whole image). From the top left corner if one of the two families has no image.
     """
     window = (slice(None), *_most_different(images, case.ground_truth))
     panels = {f"{case.name}: ground truth\nfocal ratio {case.ratio:.1f}": case.ground_truth[window]}
@@ -515,6 +522,9 @@ def turned(rig: Rig, rotation: Float[Tensor, "3"]) -> Rig:
 
     Returns:
         The rig, all else unchanged.
+
+    Raises:
+        ValueError: for a rig without these cameras, or not calibrated.
     """
     beta = rig.pair(ALPHA, BETA).cameras[1]
     turn = Pose(rotation_from_vector(rotation), torch.zeros(3).double())

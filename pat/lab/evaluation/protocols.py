@@ -29,11 +29,11 @@ class MonoColourTask(NamedTuple):
     """One fusion task of the protocol.
 
     Attributes:
-        alpha: grey image, sharp.
-        beta: image in colour, `rate` times smaller: the pixel at x in right is at (x + 0.5) / rate - 0.5 in
+        alpha: left, made grey.
+        beta: right in colour, `rate` times smaller: the pixel at x in right is at (x + 0.5) / rate - 0.5 in
             it.
         ground_truth: left in colour.
-        disparity: true disparity of the ground truth's pixels; None if unknown.
+        disparity: true disparity of the ground truth's pixels, in those pixels; None if unknown.
     """
 
     alpha: Float[Tensor, "1 h w"]
@@ -46,15 +46,15 @@ def mono_colour_task(pair: StereoPair, rate: int) -> MonoColourTask:
     """Make the task of a stereo pair: left as grey alpha (Rec. 601) and as ground truth, right reduced as
     beta.
 
-    A pixel of beta is the mean of `rate` x `rate` pixels, as a sensor with larger pixels sees it. Rows and
-    columns beyond the last multiple of `rate` are cut.
+    A pixel of beta is the mean of `rate` x `rate` pixels of right. Rows and columns beyond the last multiple
+    of `rate` are cut from both images and the disparity.
 
     Args:
         pair: pair of colour images.
         rate: factor by which beta is smaller than alpha, 1 or more.
 
     Raises:
-        ValueError: for a grey pair, and images of unequal sizes.
+        ValueError: if an image is grey, and for images of unequal sizes.
         RuntimeError: for images smaller than `rate`.
     """
     if pair.left.shape[0] != 3 or pair.right.shape[0] != 3:
@@ -88,8 +88,9 @@ class StereoResult(NamedTuple):
     """Result of a fusion method.
 
     Attributes:
-        image: fused image (3, h, w), may exceed 0..1.
-        disparity: disparity (h, w) in alpha's pixels, NaN where unknown; None for a method without matching.
+        image: fused image (3, h, w) at alpha's pixels, may exceed 0..1.
+        disparity: disparity (h, w) of alpha's pixels, in pixels of alpha, NaN where unknown; None if the
+            method returns none.
     """
 
     image: Tensor
@@ -97,7 +98,7 @@ class StereoResult(NamedTuple):
 
 
 StereoMethod = Callable[[Tensor, Tensor, float], StereoResult]
-"""Fusion method: called with alpha (1, h, w), beta (3, hb, wb), the largest disparity in alpha's pixels."""
+"""Fusion method: called with alpha (1, h, w), beta (3, hb, wb), the largest disparity in pixels of alpha."""
 
 
 def enlarged(beta: Float[Tensor, "c hb wb"], hw: HW) -> Float[Tensor, "c h w"]:
@@ -124,8 +125,8 @@ def rectified_fusion(
     settings: FuseSettings = FuseSettings(),
     matcher: Matcher = match,
 ) -> StereoMethod:
-    """Make a method from `fuse` with a network, alpha on the left: segments are rows, `max_disparity` pixels
-    long.
+    """Make a method from `fuse_frame` with a network, alpha on the left: segments are rows, `max_disparity`
+    pixels long.
 
     Args:
         network: network to fuse with.
@@ -134,7 +135,8 @@ def rectified_fusion(
         matcher: matcher to use instead of `match`.
 
     Returns:
-        The method: called with alpha, beta and `max_disparity`, it returns image and disparity.
+        The method: called with alpha, beta and `max_disparity` (above 0), it returns image and disparity. It
+        raises what `rectified_rig` and `fuse_frame` raise.
     """
 
     def fused(alpha: Tensor, beta: Tensor, max_disparity: float) -> StereoResult:
@@ -155,11 +157,15 @@ def rectified_rig(hw: HW, betas: Mapping[str, HW], max_disparity: float) -> Rig:
 
     Args:
         hw: (height, width) of alpha.
-        betas: (height, width) of each beta, by name.
+        betas: (height, width) of each beta, by name; a beta called "alpha" would replace alpha.
         max_disparity: pixels of alpha, which sets the near bound; the far bound is infinity.
 
     Returns:
         The rig; its first camera is called "alpha".
+
+    Raises:
+        ValueError: for a `max_disparity` that is negative, infinite or NaN.
+        ZeroDivisionError: for a `max_disparity` of 0.
     """
     alpha = Camera(K=intrinsics(float(hw[1]), hw), cam_from_world=Pose.identity(), hw=hw)
     right = alpha.replace(cam_from_world=Pose(alpha.R, alpha.t.new_tensor([-1.0, 0.0, 0.0])))

@@ -21,9 +21,9 @@ class Warped(NamedTuple):
     """Rectified pair of images.
 
     Attributes:
-        rig: the two rectified cameras, with the depth range.
-        images: rectified images (c, h, w) by name.
-        rectification: homographies and cameras of the rectification.
+        rig: the two rectified cameras, with the numbers of the original depth range.
+        images: rectified images (c, h, w) by name, all on one canvas.
+        rectification: cameras on the canvas, and homographies to it from the original images.
         original: the pair before it.
     """
 
@@ -39,10 +39,14 @@ class Warped(NamedTuple):
 
         Args:
             image: image on the rectified canvas.
-            interpolation: kind of interpolation.
+            interpolation: "bicubic", "bilinear" or "nearest".
 
         Returns:
-            Image (c, ha, wa); beyond the canvas its border repeats.
+            Image (c, ha, wa), not clipped; beyond the canvas its border repeats.
+
+        Raises:
+            ValueError: for another interpolation.
+            TypeError: for an image of whole numbers.
         """
         return warped(image, self.rectification.H_alpha, self.original.alpha.hw, interpolation=interpolation)
 
@@ -53,7 +57,7 @@ class Warped(NamedTuple):
             depth: depth along the rectified camera's axis, metres.
 
         Returns:
-            Depth (ha, wa) along alpha's axis, metres.
+            Depth (ha, wa) along alpha's axis, metres; NaN where `depth` is, possibly where it is infinite.
         """
         level, (alpha, _) = self.rectification.pair.cameras[0], self.original.cameras
         x = apply_homography(self.rectification.H_alpha, pixel_grid(alpha.hw, dtype=torch.float64)).x
@@ -68,14 +72,14 @@ def rectified(rig: Rig, images: Mapping[str, Tensor]) -> Warped:
 
     Args:
         rig: rig of two cameras or more, with a depth range; its first camera is alpha.
-        images: images (c, h, w) of these two cameras in 0..1, by name.
+        images: images (c, h, w) of these two cameras in 0..1, by name; their sizes are not checked.
 
     Returns:
         The rectified pair; images clipped to 0..1.
 
     Raises:
-        ValueError: for a pair that cannot be rectified, or not onto a canvas of up to `LARGEST` times alpha's
-            pixels.
+        ValueError: as `whole_alpha`; for fewer than two cameras, and no depth range.
+        KeyError: if an image is missing.
     """
     first, second = rig.names[:2]
     pair = rig.pair(first, second)
@@ -94,8 +98,8 @@ def whole_alpha(pair: Pair) -> Rectification:
         The rectification: homographies from each image to the canvas, and the cameras there.
 
     Raises:
-        ValueError: if the baseline is too close to an optical axis, or the canvas would have more than
-            `LARGEST` times alpha's pixels.
+        ValueError: as `rectify`; if the baseline is too close to an optical axis, or the canvas would have
+            more than `LARGEST` times alpha's pixels.
     """
     alpha, _ = pair.cameras
     rough = rectify(pair)
@@ -120,10 +124,14 @@ def warped(image: Tensor, H: Tensor, hw: HW, *, interpolation: Interpolation = "
         image: image (c, h, w).
         H: homography (3, 3) from pixels of the canvas to those of the image.
         hw: (height, width) of the canvas.
-        interpolation: kind of interpolation.
+        interpolation: "bicubic", "bilinear" or "nearest".
 
     Returns:
-        Image (c, *hw); the image's border repeats beyond.
+        Image (c, *hw), bicubic not clipped; the image's border repeats beyond.
+
+    Raises:
+        ValueError: for another interpolation.
+        TypeError: for an image of whole numbers.
     """
     x = apply_homography(H, pixel_grid(hw, dtype=torch.float64)).x
     return sample(image[None], x[None].float(), interpolation=interpolation, extended=True).values[0]

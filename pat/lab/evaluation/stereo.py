@@ -38,8 +38,8 @@ class StereoRow(NamedTuple):
         method: name of the method.
         psnr: PSNR in dB.
         ssim: SSIM.
-        end_point_error: mean error of disparity in pixels; None without true disparity or without an
-            estimate.
+        end_point_error: mean absolute error of disparity, pixels of alpha; None if no pixel has both a true
+            and an estimated one.
         within_one: share of pixels of known true disparity with an error of at most one pixel; None likewise.
     """
 
@@ -59,7 +59,7 @@ def evaluate_sets(
     *,
     out: Path,
 ) -> dict[str, list[StereoRow]]:
-    """Evaluate methods on several data sets by `evaluate_pairs`.
+    """Evaluate methods on several data sets by `evaluate_pairs`, which says what is raised.
 
     Args:
         sets: pairs by data set.
@@ -69,9 +69,6 @@ def evaluate_sets(
 
     Returns:
         Rows by data set.
-
-    Raises:
-        ValueError: for grey pairs, and images of unequal sizes.
     """
     return {name: evaluate_pairs(pairs, methods, rates, images=out / name) for name, pairs in sets.items()}
 
@@ -86,19 +83,22 @@ def evaluate_pairs(
 ) -> list[StereoRow]:
     """Score each method on each pair at each rate: whole frames, values clipped to 0..1, not rounded.
 
+    Errors of the methods, and of reading and writing, are not caught.
+
     Args:
         pairs: stereo pairs, read one at a time.
         methods: fusion methods by name.
         rates: factors by which beta is reduced.
         max_disparity: pixels of alpha, the same for all pairs (the paper's: 120 / rate pixels of beta).
-        images: folder for one strip of each pair and rate: beta enlarged, each method, the ground truth; None
-            writes none.
+        images: folder for one strip of each pair and rate (beta enlarged, each method, the ground truth), a
+            PNG file; None writes none.
 
     Returns:
         One row for each pair, rate and method.
 
     Raises:
-        ValueError: for grey pairs, and images of unequal sizes.
+        ValueError: for grey images, those of unequal sizes, and sides too short for SSIM.
+        RuntimeError: for images smaller than a rate.
     """
     rows = []
     for pair in track(pairs, "evaluating", disable=not sys.stderr.isatty()):
@@ -120,8 +120,8 @@ PrintedScores = Mapping[int, tuple[float, float]]
 def sets_markdown(
     rows: Mapping[str, Sequence[StereoRow]], *, printed: Mapping[str, PrintedScores] = {}, depth: bool = True
 ) -> str:
-    """Format rows of several data sets: a table of each, the sentence of `structure_kept`, and errors of
-    disparity if wanted.
+    """Format rows of several data sets: the tables of `markdown`, the sentence of `structure_kept`, and the
+    table of `depth_markdown` if wanted.
 
     Args:
         rows: rows by data set; they include the methods "fusion" and "alpha".
@@ -129,10 +129,10 @@ def sets_markdown(
         depth: True to add the errors of disparity where its truth is known.
 
     Returns:
-        Markdown.
+        Markdown, a heading for each set.
 
     Raises:
-        KeyError: for a pair with "fusion" and without "alpha".
+        KeyError: for a pair and rate with "fusion" and without "alpha".
     """
     parts = []
     for name, of_set in rows.items():
@@ -151,7 +151,7 @@ def markdown(rows: Sequence[StereoRow], *, printed: PrintedScores = {}) -> str: 
         printed: published scores by rate, shown as a column with a mean only.
 
     Returns:
-        Markdown; the mean of several pairs has a 95 % bootstrap interval.
+        Markdown; the mean PSNR of several pairs has a 95 % bootstrap interval; empty text for no rows.
     """
     return "\n".join(_table(own, printed.get(rate)) for rate, own in grouped(rows, "rate").items())
 
@@ -178,10 +178,10 @@ def _mean_cell(rows: Sequence[StereoRow]) -> str:
 
 
 def depth_markdown(rows: Sequence[StereoRow]) -> str:
-    """Format disparity errors where truth is known: end-point error in pixels / share within one pixel.
+    """Format disparity errors: end-point error in pixels / share within one pixel, a line for each pair.
 
     Returns:
-        Markdown table; empty text if no row has errors.
+        Markdown table of the rows with errors, and their mean; empty text if there is none.
     """
     with_disparity = [row for row in rows if row.end_point_error is not None]
     if not with_disparity:
@@ -202,16 +202,16 @@ def _depth_cell(rows: Sequence[StereoRow]) -> str:
 
 
 def structure_kept(rows: Sequence[StereoRow]) -> str:
-    """Say in one line for which pairs, if any, the fusion's SSIM is below that of alpha alone.
+    """Count the pairs and rates where fusion's SSIM is at least that of alpha alone, and name the others.
 
     Args:
         rows: scores of the methods "fusion" and "alpha" on the same pairs; others are ignored.
 
     Returns:
-        A sentence.
+        A sentence in Markdown.
 
     Raises:
-        KeyError: for a pair with "fusion" and without "alpha".
+        KeyError: for a pair and rate with "fusion" and without "alpha".
     """
     ssim = {(row.pair, row.rate, row.method): row.ssim for row in rows}
     cases = [(pair, rate) for pair, rate, name in ssim if name == "fusion"]
@@ -234,7 +234,7 @@ def disparity_errors(
 
     Args:
         disparity: estimate in pixels; NaN or infinite where unknown.
-        ground_truth: true disparity of the same pixels.
+        ground_truth: true disparity of the same pixels, in the same unit.
 
     Returns:
         Mean absolute error in pixels where both are known, and share of all known true disparities with an

@@ -19,10 +19,10 @@ def grouped(rows: Iterable[T], *names: str) -> dict[Any, list[T]]:
 
     Args:
         rows: named tuples or other objects.
-        names: names of attributes.
+        names: names of attributes, at least one.
 
     Returns:
-        Lists of rows by the attribute's value, or by the tuple of values.
+        Lists of rows by the value of the one attribute, or by the tuple of several values.
     """
     groups: dict[Any, list[T]] = {}
     for row in rows:
@@ -59,9 +59,9 @@ def write_csv(path: str | Path, columns: Sequence[str], rows: Iterable[Sequence[
     """Write a CSV file, atomically, with all digits of numbers.
 
     Args:
-        path: file, replaced if there is one.
+        path: file, replaced if there is one; missing folders are made.
         columns: cells of the header.
-        rows: cells of each line; None is written as an empty cell.
+        rows: cells of each line; None is written as an empty cell, NaN as "nan".
 
     Raises:
         OSError: if it cannot be written.

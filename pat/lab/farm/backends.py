@@ -50,7 +50,7 @@ class LayeredSettings:
         oversampling: samples in a pixel along each axis.
 
     Raises:
-        ValueError: for values below these bounds.
+        ValueError: for values below these bounds, and layers out of order.
     """
 
     photos: tuple[Path, ...] = ()
@@ -71,7 +71,7 @@ class LayeredSettings:
             (height, width) of each camera's image, in the rig's order.
 
         Raises:
-            ValueError: for a rig that cannot be rendered.
+            ValueError: for a rig that cannot be rendered, as `rig_from_alpha`.
         """
         return [camera.hw for camera in rig_from_alpha(rig).cameras]
 
@@ -83,10 +83,11 @@ class LayeredSettings:
             limits: limits of the self-check.
 
         Returns:
-            A function that renders the scene of a seed into a new folder: `render(seed, out)`.
+            A function that renders the scene of a seed into a new folder, `render(seed, out)`; it raises
+            FileExistsError if there is one.
 
         Raises:
-            ValueError: for a rig that cannot be rendered, and folders without images.
+            ValueError: for a rig that cannot be rendered, missing folders, and folders without images.
         """
         rig_batch = rig_from_alpha(rig)
         if self.photos:
@@ -128,7 +129,7 @@ class BlenderSettings:
         generator: "abstract", "photographs", or your own "module:function".
         photos: folder of images, for "photographs" only.
         preset: name of a preset of render settings.
-        settings: entries of `RenderSettings` that differ from the preset.
+        settings: entries of `RenderSettings` that differ from the preset, and from one thread.
 
     Raises:
         ValueError: for a generator without its `photos` or with photos it does not take, an unknown
@@ -163,7 +164,8 @@ class BlenderSettings:
             (height, width) of each image, one for each camera and point in time.
 
         Raises:
-            ValueError: for a rig that cannot be rendered, and a generator that cannot be imported.
+            ValueError: for a rig that cannot be rendered, as `lens_for`, and a generator that cannot be
+                imported.
         """
         generator_named(self.generator)
         for name, camera in rig.cameras.items():
@@ -173,17 +175,16 @@ class BlenderSettings:
         return [rig[shot.camera].hw for shot in shots(rig, settings)]
 
     def renderer(self, rig: Rig, limits: CheckLimits) -> Renderer:
-        """Prepare a renderer for a rig.
+        """Prepare a renderer for a rig, which is not checked before a scene is rendered.
 
         Args:
-            rig: rig to render.
-            limits: limits of the self-check.
+            limits: limits of the self-check, in place of those in `settings`.
 
         Returns:
             A function that renders the scene of a seed into a new folder: `render(seed, out)`.
 
         Raises:
-            ValueError: if Blender is not installed, or the generator cannot be imported.
+            ValueError: if Blender or OpenEXR is not installed, or the generator cannot be imported.
         """
         blender_python()
         generator, settings = generator_named(self.generator), replace(self.render_settings(), limits=limits)
@@ -200,7 +201,7 @@ def rig_from_alpha(rig: Rig) -> RigBatch:
     """Convert a rig to a batch of one, with the first camera's frame as the world.
 
     Returns:
-        The batch; a far bound beyond `FARTHEST` times near is cut.
+        The batch, float64; a far bound beyond `FARTHEST` times near is cut.
 
     Raises:
         ValueError: for cameras that are not calibrated or have a lens model, and for a rig without a depth

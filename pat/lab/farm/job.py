@@ -103,8 +103,7 @@ class RenderConfig:
 
         Raises:
             FileNotFoundError: for a missing file.
-            ValueError: naming the file and the entry, for an invalid one, and for missing files that it
-                names.
+            ValueError: naming the file, for an invalid entry, and as `beside`.
         """
         path = Path(path)
         try:
@@ -114,13 +113,13 @@ class RenderConfig:
             raise ValueError(f"{prefix}{error}") from None
 
     def beside(self, folder: Path) -> RenderConfig:
-        """Resolve the paths of the configuration relative to a folder, and check that they exist.
+        """Resolve the paths of the configuration relative to a folder, and check that the used ones exist.
 
         Returns:
-            The configuration with absolute paths.
+            The configuration, its paths joined to the folder.
 
         Raises:
-            ValueError: for a file or folder that is missing.
+            ValueError: for a missing rig file or folder of photographs of the chosen backend.
         """
         photos = tuple(folder / p for p in self.layered.photos)
         blender = self.blender
@@ -148,7 +147,8 @@ class RenderConfig:
 
         Raises:
             FileNotFoundError: for a missing file of the rig.
-            ValueError: for a rig that cannot be rendered, or a missing library.
+            ValueError: for a rig that cannot be read or rendered, a missing library, folders without images,
+                and a generator that cannot be imported.
         """
         rig = Rig.load(self.rig)
         self.settings.images(rig)  # refuses rigs
@@ -156,13 +156,13 @@ class RenderConfig:
 
     def scene_bytes(self) -> float:
         """Estimate the bytes of a scene on disk: 2 for each colour and 4 for depth of a pixel, before
-        compression.
+        compression, without near infrared.
 
         Returns:
             Bytes of all its images and its other files together.
 
         Raises:
-            ValueError: for a rig that cannot be rendered.
+            ValueError: for a rig that cannot be read or rendered, and a generator that cannot be imported.
             FileNotFoundError: for a missing file of the rig.
         """
         return sum(10.0 * h * w for h, w in self.settings.images(Rig.load(self.rig))) + 20_000
@@ -244,6 +244,7 @@ def render(
     Raises:
         ValueError: for what cannot be rendered, scenes or workers below 1, more scenes than the disk holds,
             or a folder in use or of another configuration.
+        FileNotFoundError: for a missing file of the rig.
         JobError: if the job cannot go on, such as on a full disk.
         ImportError: for a `scheduler` without the package of Dask.
     """
@@ -276,9 +277,11 @@ def render(
 def write_manifest(config: RenderConfig, root: Path) -> None:
     """Write the manifest of a job into its folder `root`, or check that the existing one is of the same job.
 
+    A folder of scenes without a manifest gets one.
+
     Raises:
-        ValueError: if the manifest is of another configuration, or does not say; a folder of scenes without
-            one gets it.
+        ValueError: if the manifest is of another configuration, or does not say, or a file cannot be read.
+        FileNotFoundError: for a missing file of the rig.
     """
     path, identity = root / MANIFEST, json.loads(json.dumps(config.identity()))
     if path.is_file():
@@ -334,8 +337,10 @@ def make_scene(config_text: str, work: Path, scene: Path, index: int) -> None:
         index: number of the scene, from which its seeds follow.
 
     Raises:
-        ValueError: if `refusals` seeds are refused.
+        ValueError: if `refusals` seeds are refused, by the self-check or since they cannot be rendered.
         JobError: if no scene can be made: a full disk, or a configuration that cannot be used.
+        BrokenProcessPool: if Blender's process dies.
+        OSError: if a file cannot be read or written for another reason.
     """
     config, render_scene = _ready(config_text)
     reason = ""
@@ -386,7 +391,9 @@ def _ready(config_text: str) -> tuple[RenderConfig, Renderer]:
 
 
 def publish(partial: Path, final: Path) -> None:
-    """Rename the complete folder `partial` to `final` after all of it is on disk; an existing folder stays.
+    """Rename the complete folder `partial`, of files alone, to `final` after all of it is on disk.
+
+    A `final` that exists and is not empty stays, and `partial` too.
 
     Raises:
         OSError: if it cannot be renamed.
@@ -410,7 +417,8 @@ def summarise(root: Path) -> str:
 
     Raises:
         FileNotFoundError: for a missing folder.
-        ValueError: for a folder without scenes, with an incomplete one, or whose first rig cannot be read.
+        ValueError: for a folder without scenes, with an incomplete one, or whose first rig or a farm.json
+            cannot be read.
     """
     from statistics import median
 

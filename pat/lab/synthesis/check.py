@@ -29,7 +29,7 @@ class CheckLimits:
         dark: largest share of pixels below 0.004 in all colours.
         bright: largest share of pixels above 1 in all colours.
         texture: least share of 8x8 patches with contrast above 2 %.
-        overlap: least share of a view's pixels that some other view sees.
+        overlap: least share of a view's pixels of known depth that one other view sees.
     """
 
     error: float = 0.02
@@ -52,8 +52,12 @@ def check_views(
         limits: limits to keep.
 
     Returns:
-        A document for JSON: `views` and `pairs`, figures by view and by "alpha > beta" (pairs of frames of
-        different times are left out), `reasons` for refusal, and `accepted`, True without any.
+        A document for JSON: `views`, the `view_figures` by camera; `pairs`, the `pair_figures` by "alpha >
+        beta" (frames of different times make no pair); `reasons`, texts for refusal; and `accepted`, True
+        without reasons.
+
+    Raises:
+        ValueError: for a frame of an unknown camera, and cameras that are not calibrated.
     """
     views = {name: view_figures(frame) for name, frame in frames.items()}
     together = [(a, b) for a, b in permutations(frames, 2) if frames[a].time == frames[b].time]
@@ -72,9 +76,9 @@ def view_figures(frame: RenderedFrame) -> dict[str, float]:
     """Measure brightness, texture and depths of one image.
 
     Returns:
-        Figures by name: "mean" brightness; shares, 0..1, of pixels that are "dark" or "bright", of patches
-        with "texture" and of pixels "covered" by a surface; "near" and "far" in metres, infinite if nothing
-        is hit.
+        Figures to four digits by name: "mean" brightness, linear; shares, 0..1, of pixels that are "dark" or
+        "bright" (`CheckLimits`), of patches with "texture" and of pixels "covered" by a surface; "near" and
+        "far" in metres, infinite if nothing is hit.
     """
     finite = frame.depth.isfinite()
     depths = frame.depth[finite] if finite.any() else frame.depth.new_tensor([torch.inf])
@@ -92,11 +96,11 @@ def view_figures(frame: RenderedFrame) -> dict[str, float]:
 
 
 def texture(rgb: Float[Tensor, "3 h w"], patch: int = 8) -> Float[Tensor, ""]:
-    """Compute the share of patches whose brightness deviates by more than 2 % of its mean.
+    """Compute the share of patches whose brightness has a standard deviation above 2 % of its mean.
 
     Args:
         rgb: image in linear light.
-        patch: side of a patch, pixels.
+        patch: side of a patch, pixels; the image's shorter side if that is less.
 
     Returns:
         A scalar tensor, 0..1.
@@ -122,6 +126,9 @@ def pair_figures(pair: Pair, here: RenderedFrame, there: RenderedFrame) -> dict[
         points: `median`, `p95` and `p99` of the error in alpha's pixels, `colour`, the median difference
         relative to brightness, and `shift`, the displacement in pixels that explains most of it. Without
         visible points only the shares.
+
+    Raises:
+        ValueError: unless both cameras are calibrated.
     """
     alpha, beta = (camera.to(dtype=torch.float64) for camera in pair.cameras)
     x, depth, index = _chosen(here, 200_000)

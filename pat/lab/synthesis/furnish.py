@@ -60,12 +60,18 @@ class _Room:
 
 
 class Setting:
-    """Rig and random generator of one scene.
+    """Cameras, depth range and random generator of one scene.
 
     Args:
         rig: rig whose calibrated cameras see the scene; without a depth range `DEPTHS` is used, and an
             infinite far bound counts as 10 times the near one.
         rng: random generator.
+
+    Attributes:
+        cameras: the calibrated cameras, on the CPU.
+        near: near bound of depths, metres.
+        far: far bound of depths, metres, finite.
+        centres: the cameras' centres in the world (n, 3), metres.
 
     Raises:
         ValueError: for a rig without a calibrated camera.
@@ -104,21 +110,21 @@ class Setting:
 
 
 def furnished(name: str, seed: int, rig: Rig, surface: Surface, moving: float) -> Scene:
-    """Make a scene of 10 to 20 shapes in a room, within the rig's depth range.
+    """Make a scene of 10 to 20 shapes in a room, within the depth range of `Setting`.
 
     Args:
         name: name of the generator, part of the seed.
-        seed: random seed.
+        seed: random seed, 0 or more.
         rig: rig that sees the scene.
         surface: function that makes the textures, called with the setting, a depth in metres and the kinds of
             pattern to choose from.
         moving: seconds of motion; 0 for none.
 
     Returns:
-        The scene; fewer shapes if they do not fit.
+        The scene, the room its last object; fewer shapes if they do not fit.
 
     Raises:
-        ValueError: for a rig without a calibrated camera.
+        ValueError: for a rig without a calibrated camera, and a negative seed.
     """
     setting = Setting(rig, seeded(name, seed))
     room = _room(setting)

@@ -28,15 +28,15 @@ def abstract(seed: int, rig: Rig, *, moving: float = 0.0) -> Scene:
     """Generate one of the paper's scenes: 10 to 20 patterned shapes in a room, within the rig's depth range.
 
     Args:
-        seed: random seed.
-        rig: rig that sees the scene.
+        seed: random seed, 0 or more.
+        rig: rig that sees the scene; `furnish.DEPTHS` serves without a depth range, 10 near for infinite far.
         moving: seconds for which objects move, rotate and stretch along random paths; 0 for none.
 
     Returns:
-        The scene, the same for the same seed and rig.
+        The scene, the same for the same seed and rig; fewer shapes if they do not fit.
 
     Raises:
-        ValueError: for a rig without a calibrated camera.
+        ValueError: for a rig without a calibrated camera, and a negative seed.
     """
     return furnished("abstract", seed, rig, _pattern, moving)
 
@@ -47,16 +47,16 @@ def photographs(seed: int, rig: Rig, folder: str | Path, *, moving: float = 0.0)
     Images that are black in large parts are avoided.
 
     Args:
-        seed: random seed.
+        seed: random seed, 0 or more.
         rig: rig that sees the scene.
-        folder: folder of images, searched with its subfolders.
+        folder: folder of images, searched with its subfolders, once for the process.
         moving: seconds for which objects move; 0 for none.
 
     Returns:
         The scene, the same for the same seed, rig and images.
 
     Raises:
-        ValueError: for a folder without images, and a rig without a calibrated camera.
+        ValueError: for a missing folder, one without images, and as `abstract`.
     """
     files = _images(Path(folder))
 

@@ -38,9 +38,9 @@ class ArrayBatch:
     Attributes:
         images: images 0..1, sRGB.
         depth: metres along each camera's own axis at the pixels' centres; NaN where unknown.
-        cameras: cameras, batched (b).
-        depth_range: nearest and farthest of alpha's depths, metres.
-        index: number of the visible layer, from 1; empty where there are no layers.
+        cameras: cameras, batched (b), with alpha's frame as the world.
+        depth_range: (near, far) of alpha's depths, metres; far may be infinite.
+        index: number of the visible layer, from 1; an empty list for scenes that have no layers.
     """
 
     images: list[Float[Tensor, "b 3 _ _"]]
@@ -53,14 +53,14 @@ class ArrayBatch:
 class LayeredScenes:
     """Source of random layered scenes for training.
 
-    All randomness comes from the generator given to `sample` (on the CPU for any device) and from `seed`,
-    which makes the outlines.
+    All randomness comes from the generator given to `sample` or `render` (on the CPU for any device) and from
+    `seed`, which makes the outlines.
 
     Args:
         photos: textures.
         rigs: distribution of the random rigs.
         hw: (height, width) of alpha's images.
-        layers: least and greatest number of planes.
+        layers: least and greatest number of planes, 1 or more.
         seed: seed of the outlines.
         device: device of the images.
     """
@@ -86,7 +86,7 @@ class LayeredScenes:
         """Render random scenes seen by random rigs.
 
         Returns:
-            A batch of `batch` scenes.
+            A batch of `batch` scenes, without gradient.
         """
         return self.render(random_rigs(self.rigs, batch, self.hw, generator), generator)
 
@@ -95,15 +95,15 @@ class LayeredScenes:
         """Render random scenes seen by given rigs, whose first camera is alpha and the world frame.
 
         A view with fewer pixels a radian than alpha is rendered at about alpha's resolution (up to 4 times)
-        and averaged by area, as a coarser sensor would.
+        and averaged by area, as a coarser sensor would. Lens models are ignored.
 
         Args:
-            rigs: rigs, alpha at the world's origin.
+            rigs: rigs of float64 on the CPU, alpha at the world's origin.
             generator: random generator on the CPU.
             oversampling: factor of further samples in a pixel along each axis.
 
         Returns:
-            A batch, one scene for each rig, without gradient.
+            A batch, one scene for each rig, cameras float32, on this source's device, without gradient.
         """
         layers = draw_layers(rigs, self.layers, self.photos, len(self.outlines), generator)
         factors = [oversampling * _oversampling(rigs.cameras[0], v) for v in rigs.cameras]
@@ -205,7 +205,7 @@ def plane_from_camera(layers: Layers, camera: Camera) -> Float[Tensor, "b l 3 3"
         camera: cameras, batched (b), float64.
 
     Returns:
-        H (b, l, 3, 3), float64: u, v in metres on the plane, z the depth in the camera.
+        H (b, l, 3, 3), float64: u, v in metres on the plane, z its depth along the camera's axis.
     """
     planes = layers.plane_from_world
     camera_from_world = Pose(camera.R[:, None].expand_as(planes.R), camera.t[:, None].expand_as(planes.t))

@@ -25,19 +25,19 @@ _GRAZING = 0.04
 
 @dataclass(frozen=True)
 class Layers:
-    """Layers (b, l) of a batch of scenes, float64 on the CPU.
+    """Layers (b, l) of a batch of scenes, on the CPU, real numbers in float64.
 
     A layer is the plane Z = 1 of its own frame, on which (X, Y) are positions in metres.
 
     Attributes:
         plane_from_world: pose of the layer's frame.
-        present: True for layers in the scene.
+        present: True for layers in the scene; the others are to be left out.
         solid: True for a layer that covers its whole plane; otherwise it covers the inside of an outline.
         outline: number of the outline.
         outline_from_plane: map from metres to the outline's square [-1, 1]^2.
         texture: number of the texture.
-        texel_from_plane: map from metres to texels.
-        colour: matrix by which texture colours (r, g, b, 1) are multiplied.
+        texel_from_plane: map from metres to pixels of the full texture.
+        colour: matrix by which texture colours (r, g, b, 1), 0..1, are multiplied.
     """
 
     plane_from_world: Pose
@@ -56,17 +56,18 @@ def draw_layers(
     """Draw random layers in front of the rigs' first camera, between near and far.
 
     Layer 0 is the background. In half of the scenes layer 1 is a ground or a ceiling, in a quarter layer 2 is
-    a wall; the others have outlines. In one scene in eight all lie within 5 % of one depth.
+    a wall; the others have outlines. In one scene in eight all are drawn within 5 % of one depth. Layers that
+    slant nearer than near are moved back, possibly beyond far.
 
     Args:
         rigs: rigs, one for each scene.
-        count: least and greatest number of layers.
+        count: least and greatest number of layers, 1 or more.
         photos: textures to choose from.
         shapes: number of outlines to choose from.
         generator: random generator on the CPU.
 
     Returns:
-        The layers; those seen at a grazing angle are not `present`.
+        Layers (b, count[1]); those beyond a scene's number, or seen at a grazing angle, are not `present`.
     """
     g = generator
     shape = len(rigs.near), count[1]

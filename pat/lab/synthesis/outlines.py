@@ -23,7 +23,8 @@ def outlines(count: int, seed: int) -> Float[Tensor, "count 1 side side"]:
     The border is always outside, so that positions may be clamped to the square.
 
     Returns:
-        Maps (count, 1, 96, 96), float32, cached for the process: not to be modified.
+        Maps (count, 1, 96, 96), float32, distances in the square's units; cached for the process: not to be
+        modified.
     """
     rng = np.random.default_rng(seed)
     makers = (_blob, _polygon, _cloud, _rods, _fence, _branches, _box)

@@ -22,7 +22,8 @@ def patterns(rng: np.random.Generator, count: int) -> list[np.ndarray]:
 
 
 def recoloured(images: list[np.ndarray], rng: np.random.Generator, count: int) -> list[np.ndarray]:
-    """Make textures with the luminance of one image and the chroma of another, some smoothed.
+    """Make textures with the luminance (contrast reduced) of one random image and the chroma of one, some
+    smoothed.
 
     They break the correlation of colour and luminance in photographs.
 
@@ -33,6 +34,9 @@ def recoloured(images: list[np.ndarray], rng: np.random.Generator, count: int) -
 
     Returns:
         `count` arrays (256, 256, 3), uint8, RGB.
+
+    Raises:
+        ValueError: for no images.
     """
     return [to_bytes(_mixed(images, rng)) for _ in range(count)]
 

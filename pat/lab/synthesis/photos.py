@@ -28,13 +28,13 @@ _MULTIPLE = 2 ** (LEVELS - 1)
 
 
 class PhotoBank:
-    """Textures of any sizes with their pyramids, on one device.
+    """Textures of any sizes with their pyramids, on one device (the CPU, until `to`).
 
-    Sides are cropped to multiples of 32, so that every level is an exact 2x average of the one below.
-    `len(bank)` is the number of textures.
+    Sides are cropped to multiples of 32, so that every level is a 2x average of the one below. `len(bank)` is
+    the number of textures, `bank.photos` of photographs.
 
     Args:
-        images: arrays (h, w, 3), uint8, RGB.
+        images: arrays (h, w, 3), uint8, RGB, with sides of 32 or more, which is not checked.
         photos: number of photographs, which come first; None counts all as photographs.
 
     Raises:
@@ -62,7 +62,8 @@ class PhotoBank:
         seed: int = 0,
         choose: Callable[[int], bool] = lambda i: True,
     ) -> PhotoBank:
-        """Load all images under the folders, grey or in colour, and add 48 patterns and 48 mixtures of them.
+        """Load all images under the folders (`read_photographs`), and add 48 patterns and 48 mixtures of the
+        images (`recoloured`).
 
         Args:
             folders: folders, searched with their subfolders; not read if the cache exists.
@@ -70,11 +71,12 @@ class PhotoBank:
             cache: .npz file, written on the first call and read on later ones; it is not checked against the
                 folders. None for no cache.
             seed: seed of the patterns and mixtures.
-            choose: called with an image's number in the order of paths, returns True to take it; to hold some
-                out.
+            choose: called with an image's number, from 0 in the order of paths, returns True to take it; to
+                hold some out.
 
         Raises:
             ValueError: if no image is found or chosen, and for a file that is no cache.
+            OSError: if the cache cannot be written.
         """
         if cache and Path(cache).exists():
             images = _cached(Path(cache))
@@ -107,11 +109,14 @@ class PhotoBank:
         Args:
             texture: numbers of textures.
             xy: pixels of the full texture, first centre (0, 0), mirrored beyond the sides.
-            level: log2 of the distance between samples in pixels of the full texture: 0 reads the full image,
-                1 its 2x reduction, whose pixel (0, 0) lies at (0.5, 0.5) of the full one.
+            level: log2 of the distance between samples in pixels of the full texture, clipped to 0..5: 0
+                reads the full image, 1 its 2x reduction, whose pixel (0, 0) lies at (0.5, 0.5) of the full.
 
         Returns:
             Colours (3, n), 0..1, without gradient with respect to the texels.
+
+        Raises:
+            IndexError: for a number beyond the textures.
         """
         level = level.clamp(0, LEVELS - 1)
         fine = level.floor().clamp(max=LEVELS - 2)
@@ -126,13 +131,15 @@ class PhotoBank:
         """Cut a square from one level of a texture, mirrored beyond its sides.
 
         Args:
-            texture: number of the texture.
-            level: level of its pyramid, 0 for the full image.
+            level: level of its pyramid, 0 for the full image, at most 5.
             xy: first pixel (x, y) of the square, may lie outside.
             side: side of the square, pixels of that level.
 
         Returns:
             Colours (3, side, side), 0..1.
+
+        Raises:
+            IndexError: for a number or level beyond the last.
         """
         w, h = self.wh[texture, level].tolist()
         x, y = (_mirrored(start + torch.arange(side), torch.tensor(n)) for start, n in zip(xy, (w, h)))
@@ -173,11 +180,12 @@ def _cached(file: Path) -> list[np.ndarray]:
 
 
 def read_photographs(folders: tuple[str | Path, ...], max_edge: int) -> list[np.ndarray]:
-    """Read all images under the folders, subfolders included, reduced to at most `max_edge` pixels on the
-    longest side.
+    """Read all images under the folders, subfolders included, reduced to `max_edge` pixels on the longest
+    side (but no side under 32).
 
     Returns:
-        Arrays (h, w, 3), uint8, RGB; files that are no images, or have a side under 32 pixels, are skipped.
+        Arrays (h, w, 3), uint8, RGB (equal for grey), each folder's in the order of all paths; files that are
+        no images, have a side under 32 pixels, or are too large to decode, are skipped.
 
     Raises:
         ValueError: if none is found.

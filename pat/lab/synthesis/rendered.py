@@ -35,7 +35,7 @@ class RenderedFrame:
         time: seconds.
         rgb: linear radiance, 1 is white, brighter is possible; stored as float16.
         depth: z in metres; infinite where nothing is hit, NaN where the lens sees nothing.
-        index: number of the object in the scene plus one; 0 where nothing is hit or seen.
+        index: number of the object or layer in the scene plus one; 0 where nothing is hit or seen.
         nir: linear radiance in near infrared; None if not rendered.
     """
 
@@ -48,7 +48,7 @@ class RenderedFrame:
 
 @dataclass(frozen=True)
 class Rendered:
-    """Rendered folder, read on demand.
+    """Rendered folder, read on demand; `about` and `rig` are kept once read.
 
     Attributes:
         folder: the folder.
@@ -58,8 +58,8 @@ class Rendered:
 
     @cached_property
     def about(self) -> dict[str, Any]:
-        """Content of `render.json`: `settings`, `versions`, `seconds`, `frames` by camera (file and time of
-        each) and `check`, the outcome of `check_views`.
+        """Content of `render.json`: `settings`, `versions`, `seconds` that rendering took, `frames` by camera
+        (file and time of each) and `check`, the outcome of `check_views`.
 
         Raises:
             OSError: if it cannot be read.
@@ -89,16 +89,15 @@ class Rendered:
         """Read one frame of a camera.
 
         Args:
-            camera: name of the camera.
             number: number of the frame, from 0.
 
         Returns:
             The frame, float32 (index int64).
 
         Raises:
-            ValueError: for an unknown camera.
+            ValueError: for an unknown camera, and a damaged rig.yaml or render.json.
             IndexError: for a `number` beyond its frames.
-            OSError: if a file cannot be read.
+            OSError: if a file cannot be read; damaged frames give BadZipFile, KeyError, TypeError and others.
         """
         entry = self.about["frames"][self.rig.require(camera)][number]
         with np.load(self.folder / entry["file"]) as arrays:
@@ -112,9 +111,13 @@ _MOST = 6e4
 
 
 def save_frame(path: Path, frame: RenderedFrame) -> None:
-    """Write the arrays of a frame to an .npz file, synced to disk; not atomically.
+    """Write the arrays of a frame (on the CPU, without gradient) to an .npz file in an existing folder.
 
-    Colours are stored as float16, at most 60,000; object numbers as uint16.
+    Synced to disk, not atomic. Colours are stored as float16, at most 60,000; object numbers as uint16; the
+    time is not written.
+
+    Raises:
+        OSError: if it cannot be written.
     """
     arrays: dict[str, NDArray] = {}
     for name, value in vars(frame).items():
@@ -157,14 +160,14 @@ def depth_between(
     """Interpolate depth at positions (x, y), linearly in inverse depth, which is exact on planes.
 
     Args:
-        depth: depth of the pixels, metres; infinite where nothing is hit.
+        depth: depth of the pixels, metres; infinite where nothing is hit, as which NaN counts.
         index: object index of each pixel.
-        x: positions (x, y) in the image, pixels.
+        x: positions (x, y) in the image, pixels; outside it results mean nothing.
         uneven: relative deviation of inverse depth from its neighbours' mean that counts as a step or crease.
 
     Returns:
-        Depth (n), infinite depths stay infinite; and True where the four pixels around are one object without
-        step or crease.
+        Depth (n), infinite between infinite depths; and True where the four pixels around are one object, or
+        all hit nothing, without step or crease: elsewhere the depth may lie between two surfaces.
     """
     inverse = torch.where(depth.isfinite(), 1 / depth, 0.0).to(x)
     layers = torch.stack([inverse, index.to(x), *(b.to(x) for b in _creases(inverse, uneven))])[None]

@@ -11,11 +11,12 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True)
 class RigDistribution:
-    """Distribution of random rigs. Pairs are (low, high) bounds; lengths are drawn evenly in their logarithm.
+    """Distribution of random rigs. Pairs are (low, high) bounds; all but `toe_in` are drawn evenly in the
+    logarithm.
 
     Attributes:
         mode: "rectified" (betas displaced along x alone, images resized copies of alpha's geometry, so that
-            x_beta = s (x_alpha - disparity) up to the half pixel) or "general".
+            x_beta = s (x_alpha - disparity) up to the half pixel; plus with alpha on the right) or "general".
         betas: number of betas.
         parallax: displacement of the nearest depth against infinity, alpha's pixels; sets the baseline.
         near: near bound, metres.
@@ -26,12 +27,13 @@ class RigDistribution:
             camera of a batch.
         alpha: side of alpha in rectified rigs; "either" draws one for each rig.
         focal_ratio: further factor of beta's focal length (general).
-        rotation: degrees about a random axis (general).
+        rotation: size of a random rotation, degrees: two standard deviations about each axis (general).
         toe_in: rotation of betas towards a point of the scene, 0 parallel, 1 fully (general).
-        decentring: offset of beta's patch from alpha's view, as a fraction of its size (general).
+        decentring: largest offset of beta's patch from alpha's view, as a fraction of its size (general).
 
     Raises:
-        ValueError: for bounds that are not positive and in order, no betas, or no positive resolutions.
+        ValueError: for bounds (but `toe_in`) that are not positive and in order, no betas, no resolutions,
+            and those that are not positive.
     """
 
     mode: Literal["rectified", "general"] = "rectified"

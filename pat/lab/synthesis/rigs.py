@@ -40,7 +40,7 @@ def in_frame_of(alpha: Camera, camera: Camera) -> Camera:
 
 
 def random_rigs(rigs: RigDistribution, batch: int, hw: HW, generator: Generator) -> RigBatch:
-    """Draw a batch of rigs; alpha's frame is the world.
+    """Draw a batch of rigs of pinholes; alpha's frame is the world.
 
     Args:
         rigs: distribution to draw from.

@@ -46,15 +46,16 @@ class Texture:
     """Layout of paints on a surface.
 
     Attributes:
-        kind: pattern, in the object's own coordinates, that runs through the paints in order; or "image".
+        kind: pattern, in the object's own coordinates (brick: along its surface), that runs through the
+            paints in order; "plain", the first paint alone; or "image".
         paints: paints of a pattern; an image is multiplied by the first.
-        scale: features of a pattern for each metre; an image's width covers 1 / scale metres and repeats
+        scale: features of a pattern for each metre; an image's width covers 1 / scale metres and is mirrored
             beyond.
-        offset: shift of the coordinates.
-        distortion: irregularity of the pattern, 0 for none.
+        offset: shift of the coordinates, in features of a pattern, in widths and heights of an image.
+        distortion: irregularity of magic, noise and wave, 0 for none.
         grain: strength of fine noise, 0..1.
         image: sRGB file; its near infrared is red plus 1.5 times the excess of green over red and blue
-            (leaves), times the paint's.
+            (leaves), at most 1, times the paint's.
     """
 
     kind: TextureKind = "plain"
@@ -76,7 +77,7 @@ class Material:
         specular: specular level.
         metallic: share of metal.
         transmission: share of light passed through.
-        bump: metres of relief that follow the texture, in shading only.
+        bump: metres of relief that follow the pattern, in shading only; without effect for images.
         emission: strength of light in the paint's colour.
     """
 
@@ -93,7 +94,7 @@ class ObjectPose(NamedTuple):
     """Pose of a shape that fills [-0.5, 0.5]^3: X_world = R diag(extent) X_object + position.
 
     Attributes:
-        R: rotation.
+        R: rotation from the object's axes to the world's.
         position: position of the middle, metres.
         extent: lengths along its axes, metres.
     """
@@ -109,7 +110,7 @@ class Key:
 
     Attributes:
         position: position of the middle, metres.
-        rotation: rotation vector, radians.
+        rotation: vector of the rotation from the object's axes to the world's, radians.
         extent: lengths along its axes, metres.
         time: seconds.
     """
@@ -189,7 +190,7 @@ class Object:
         profile: points (radius 0..0.5, y -0.5..0.5), from the top, that a "lathe" sweeps around the y axis.
 
     Raises:
-        ValueError: for a lathe without a profile of 2 points or more, and a profile of another shape.
+        ValueError: for a lathe without a profile of 2 points or more, and another shape with one.
     """
 
     name: str
@@ -211,8 +212,8 @@ class Light:
     Attributes:
         kind: "area", "sun" or "point".
         power: watts (sun: watts for each square metre) in each colour, times `rgb` or `nir`.
-        position: metres.
-        direction: direction that an area light or a sun shines to.
+        position: world position, metres; without effect for a sun.
+        direction: world direction that an area light or a sun shines to.
         rgb: relative power in red, green and blue.
         nir: relative power in near infrared.
         size: side of an area light or radius of a point light, metres; angle of a sun, radians.
@@ -229,7 +230,7 @@ class Light:
 
 @dataclass(frozen=True)
 class World:
-    """Light from all directions that no object blocks.
+    """Light that shines from all directions, and is the background.
 
     Attributes:
         rgb: radiance of red, green and blue.
@@ -248,7 +249,7 @@ class Scene:
         objects: objects.
         lights: light sources.
         world: light from all around.
-        depth: (near, far) in metres.
+        depth: (near, far) in metres, the range from the cameras that it is made for.
         generator: name of the generator that made it; empty if none.
         seed: seed that it was made from.
     """
@@ -261,6 +262,10 @@ class Scene:
     seed: int = 0
 
     def save(self, path: str | Path) -> None:
-        """Write the scene to a YAML file, atomically, for the record; nothing reads it back."""
+        """Write the scene to a YAML file, atomically, for the record; nothing reads it back.
+
+        Raises:
+            OSError: if it cannot be written.
+        """
         document = {"format": FORMAT, **to_document(self)}
         write_text(path, dump_yaml(document, width=120, default_flow_style=None))

@@ -29,7 +29,7 @@ class Mesh(NamedTuple):
 
     Attributes:
         vertices: metres in the object's frame, at the extent of its first key.
-        faces: vertex numbers, counter-clockwise from outside; a triangle has its last one twice.
+        faces: vertex numbers, counter-clockwise from outside; a triangle has its last number twice.
         uv: texture position of each face's corners, metres, x right, y down.
     """
 
@@ -54,6 +54,9 @@ def mesh(item: Object) -> Mesh:
 
     Patches of a plain shape do not share corners, so that edges between them are sharp; patches with relief
     do.
+
+    Raises:
+        KeyError: for another shape than `Shape` lists.
     """
     extent = np.asarray(item.motion.keys[0].extent)
     surfaces = (_lathe(item.profile),) if item.shape == "lathe" else SURFACES[item.shape]

@@ -24,13 +24,13 @@ OFF = 1.5
 
 
 class Target(NamedTuple):
-    """Samples around a true position.
+    """Samples around true positions, for each pixel of alpha.
 
     Attributes:
         first: position (x, y) of the sample before it, pixels of beta.
-        second: position of the sample after it.
+        second: position of the sample after it; the same for a segment of one sample.
         share: weight of the second, 0..1.
-        on_segment: True if the position is within `OFF` of the segment.
+        on_segment: True if the true position is within `OFF` of the segment.
     """
 
     first: Float[Tensor, "b h w 2"]
@@ -48,16 +48,20 @@ def attention_loss(
 ) -> Tensor:
     """Compute the mean cross-entropy of the attention weights against the true positions, over all betas.
 
-    No samples of beta are gathered.
+    For known points that a beta does not see it is against equal weights, times `UNSEEN`. Visible points off
+    the segment (`OFF`) do not count. No samples of beta are gathered.
 
     Args:
-        compared: features and segments of each beta.
-        position: true positions (x, y) in pixels of each beta; (0, 0) where unknown.
+        compared: features and segments of each of one or more betas.
+        position: true positions (x, y) of all pixels of alpha, pixels of each beta; (0, 0) where unknown.
         visible: True where that beta sees the point.
         stride: only every `stride`-th row and column of alpha counts.
 
     Returns:
         A scalar, with gradient.
+
+    Raises:
+        ValueError: for a field of explicit positions, not segments.
     """
     sparse = (slice(None), slice(None, None, stride), slice(None, None, stride))
     losses = [
@@ -80,12 +84,12 @@ def target_of(segments: Segments, samples: int, position: Float[Tensor, "b h w 2
     """Find the samples around true positions on segments.
 
     Args:
-        segments: segments (b, h, w) of alpha's pixels.
+        segments: segments (b or 1, h, w) of alpha's pixels.
         samples: number of samples on each segment.
         position: true positions (x, y), pixels of beta.
 
     Returns:
-        The targets, clamped to the segment.
+        The targets, clamped to the segment; meaningless where it is not valid.
     """
     along = segments.end - segments.start
     squared = along.square().sum(-1).clamp(min=1e-12)

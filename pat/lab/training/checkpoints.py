@@ -35,7 +35,8 @@ class Checkpoint(NamedTuple):
     """State of a run.
 
     Attributes:
-        tensors: weights, averaged weights and optimiser's state, by name.
+        tensors: weights, averaged weights and optimiser's state, by names that begin "network/", "average/"
+            and "optimiser/".
         facts: "step"; "best" validation PSNR so far, dB; "minutes" spent; "done", True for a finished run;
             and "recipe" as YAML text.
     """
@@ -50,13 +51,10 @@ def collect(
     """Collect the state of a run: weights, their average, and the optimiser's state.
 
     Args:
-        network: network in training.
-        optimiser: its optimiser.
-        average: its averaged weights.
-        facts: the entries of `Checkpoint.facts`.
+        facts: the entries of `Checkpoint.facts`, not checked.
 
     Returns:
-        The checkpoint; tensors are not copied.
+        The checkpoint; tensors are not copied, so that training changes them.
     """
     tensors = {f"network/{k}": v for k, v in network.state_dict().items()}
     tensors |= {f"average/{k}": v for k, v in average.state_dict().items()}
@@ -69,7 +67,7 @@ def restore(checkpoint: Checkpoint, network: nn.Module, optimiser: Optimizer, av
     """Restore the state of a run into network, optimiser and average, in place.
 
     Raises:
-        ValueError: if the checkpoint is of another network or optimiser.
+        ValueError: if the checkpoint is of another network (nothing is changed then) or optimiser.
     """
     parts: dict[str, dict[str, Tensor]] = {"network": {}, "average": {}, "optimiser": {}}
     for name, tensor in checkpoint.tensors.items():
@@ -97,13 +95,14 @@ def _state(tensors: Mapping[str, Tensor], optimiser: Optimizer) -> dict[int, dic
 
 
 def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> Path:
-    """Write a checkpoint into a folder atomically, and remove all but it and the previous one.
+    """Write a checkpoint into a folder atomically, and remove all but the two of the latest steps.
 
     Returns:
         Its file, named after the step.
 
     Raises:
         OSError: if it cannot be written, on a full disk for instance; older ones stay.
+        RuntimeError: for tensors that share memory.
     """
     step = checkpoint.facts["step"]
     path = folder / f"step-{step:08d}.safetensors"
@@ -120,7 +119,7 @@ def newest_checkpoint(folder: Path) -> Checkpoint | None:
     """Read the newest readable checkpoint of a folder.
 
     Returns:
-        The checkpoint; None if the folder has none.
+        The checkpoint, of the latest step; None if the folder has none or is missing.
 
     Raises:
         ValueError: if the folder has checkpoints and none can be read, so that no run starts again by
@@ -142,7 +141,7 @@ def read_checkpoint(path: Path) -> Checkpoint | None:
     """Read a checkpoint file.
 
     Returns:
-        The checkpoint; None for a damaged file and for one that is no checkpoint.
+        The checkpoint, tensors on the CPU; None for a missing or damaged file, and one that is no checkpoint.
     """
     try:
         tensors, metadata = read_tensors(path)

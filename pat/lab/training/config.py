@@ -92,7 +92,7 @@ class TrainConfig:
     clip: float = 1.0
     """Norm that gradients are clipped to; inf for none."""
     reuse: float = 2.0
-    """How many times a batch of scenes is recorded on average, each time differently."""
+    """Number of times a batch of scenes is recorded on average, each time differently."""
     average: int = 300
     """Time constant, in steps, of the weight average that is validated and saved."""
     validate: int = 250
@@ -100,7 +100,7 @@ class TrainConfig:
     save: int = 250
     """Steps between checkpoints."""
     rectified: float = 0.5
-    """Share of the batches with rigs of `rectified_rigs`, the others being of `general_rigs`."""
+    """Share of the layered batches with rigs of `rectified_rigs`, the others being of `general_rigs`."""
     rectified_rigs: RigDistribution = RECTIFIED
     """Distribution of rectified rigs."""
     general_rigs: RigDistribution = GENERAL
@@ -139,6 +139,8 @@ class TrainConfig:
         check_fields(self, "rectified rendered measured", 0, 1)
         if not all(0 <= momentum < 1 for momentum in self.momenta):
             raise ValueError(f"momenta must be from 0 to below 1, got {self.momenta}")
+        if not 1 <= self.network.betas <= 3:
+            raise ValueError(f"network.betas must be from 1 to 3, a band each, got {self.network.betas}")
 
         if min(self.hw) < 16 or any(side % 16 for side in self.hw):
             raise ValueError(f"hw must be multiples of 16, got {self.hw[0]} x {self.hw[1]}")
@@ -159,11 +161,11 @@ def recipes() -> tuple[str, ...]:
 
 
 def load_config(name: str | Path) -> TrainConfig:
-    """Load a recipe of the package by name, or a YAML file.
+    """Load a recipe of the package by name, or else a YAML file.
 
     Raises:
         FileNotFoundError: if it is neither.
-        ValueError: naming the entry, for an invalid recipe.
+        ValueError: naming the file and the entry, for an invalid recipe.
     """
     path = next((p for p in (RECIPES / f"{name}.yaml", Path(name)) if p.is_file()), None)
     if path is None:
@@ -172,13 +174,13 @@ def load_config(name: str | Path) -> TrainConfig:
 
 
 def parse_config(text: str, name: str = "config") -> TrainConfig:
-    """Parse a recipe from YAML text; `name` is used in messages.
+    """Parse a recipe from YAML text; `name` begins messages.
 
     Returns:
         The recipe, with defaults for entries that the text leaves out.
 
     Raises:
-        ValueError: naming the entry, for an invalid or empty recipe.
+        ValueError: naming the entry, for an invalid or empty recipe, and text that is not YAML.
     """
     values = parse_yaml(text, name)
     try:
@@ -220,6 +222,7 @@ def command_line(arguments: list[str], prog: str = "pat lab train") -> TrainConf
             not.
         FileNotFoundError: for a missing recipe.
         UsageError: for unknown options and invalid values.
+        SystemExit: after `--help`, which prints.
     """
     base = TrainConfig()
     if arguments and not arguments[0].startswith("-"):
@@ -239,10 +242,10 @@ def command_line(arguments: list[str], prog: str = "pat lab train") -> TrainConf
 
 
 def difference(config: TrainConfig, other: TrainConfig) -> str | None:
-    """Compare two recipes, except for entries that results do not depend on.
+    """Compare two recipes, except for the entries in `UNSEEN`.
 
     Returns:
-        The first difference, as "name: a, b"; None if both are the same run.
+        The first difference, as "name: value of config, value of other"; None if both are the same run.
     """
     for entry in dataclasses.fields(TrainConfig):
         ours, theirs = getattr(config, entry.name), getattr(other, entry.name)

@@ -32,14 +32,14 @@ def through_lenses(
 
     Args:
         images: images in 0..1.
-        cameras: pinhole cameras, one for each image.
-        recorded: simulates the recording of a batch of images.
+        cameras: pinhole cameras, batched (b).
+        recorded: simulates the recording of a batch of images; called once.
         g: random generator of the lenses.
         lost: largest share of height or width that the lens loses on each side.
 
     Returns:
-        Images (b, c, h, w) at the pinholes, without gradient; where the lens saw nothing, the edge repeats
-        and `valid` is False.
+        Images (b, c, h, w) at the pinholes, possibly above 1, and masks `valid` (b, h, w); where a lens saw
+        nothing, the edge repeats and `valid` is False.
     """
     pinholes = [cameras[i].to("cpu", torch.float64) for i in range(len(images))]
     lenses = [lens_over(pinhole, g, lost) for pinhole in pinholes]
@@ -58,12 +58,11 @@ def lens_over(pinhole: Camera, g: Generator, lost: float = 0.0) -> Camera:
     borders.
 
     Args:
-        pinhole: pinhole camera.
-        g: random generator.
+        pinhole: pinhole camera, float64 on the CPU.
         lost: largest share of height or width to lose on each side.
 
     Returns:
-        The camera with its lens.
+        The camera with a Brown-Conrady lens (k1 alone), its K such that the lens's image fills the pixels.
     """
     x = border(pinhole)
     rays, _ = pinhole.rays(x)
@@ -87,8 +86,8 @@ def filling(low: Float[Tensor, "2"], high: Float[Tensor, "2"], hw: tuple[int, in
     """Make the map of pixels from the area between two corners to a whole image.
 
     Args:
-        low: top left corner (x, y) of the area.
-        high: bottom right corner (x, y) of the area.
+        low: top left corner (x, y) of the area, which goes to (-0.5, -0.5).
+        high: bottom right corner (x, y) of the area, which goes to (w - 0.5, h - 0.5).
         hw: (height, width) of the image.
 
     Returns:

@@ -39,8 +39,8 @@ def train(config: TrainConfig) -> Path:
     """Train a network by a recipe, or continue the interrupted run in `config.out`.
 
     Writes best.safetensors, config.yaml, log.jsonl (a line for each validation), steps.csv (a line for each
-    step), images/ and checkpoints/. With `steps` a continued run gives bit-identical weights; with `minutes`
-    the time spent before counts.
+    step), images/ and checkpoints/. A finished run is left as it is. With `steps` a continued run gives
+    bit-identical weights on a CPU; with `minutes` the time spent before counts.
 
     Returns:
         File of the best weights.
@@ -48,8 +48,10 @@ def train(config: TrainConfig) -> Path:
     Raises:
         FloatingPointError: for a loss or gradient that is not finite, naming the samples; their batch is
             saved.
-        OSError: if a checkpoint cannot be written.
-        ValueError: for a folder with another run, a folder in use, or data that do not suit the recipe.
+        FileNotFoundError: for a missing folder of scenes or pairs, or file of weights.
+        OSError: if a file cannot be written.
+        ValueError: for a folder with another run, a folder in use, no such device, or data that do not suit
+            the recipe or cannot be read.
     """
     former = former_run(config)
     if former and former.facts["done"]:
@@ -72,7 +74,8 @@ def former_run(config: TrainConfig) -> Checkpoint | None:
         The checkpoint; None if there is none.
 
     Raises:
-        ValueError: if the folder holds another recipe's run, or checkpoints of which none can be read.
+        ValueError: if the folder holds another recipe's run, or checkpoints of which none, or whose recipe,
+            cannot be read.
     """
     checkpoint = newest_checkpoint(config.out / CHECKPOINTS)
     if checkpoint is None:
@@ -92,7 +95,7 @@ def rate_at(config: TrainConfig, step: int, share: float) -> float:
     Args:
         config: recipe, for `rate`, `schedule` and `warmup`.
         step: number of the step, from 1.
-        share: share of the run that is done, 1 at the end.
+        share: share of the run that is done, 1 at the end; more counts as 1.
     """
     if config.schedule == "halving":
         fall = 0.5 ** int(min(share, 1) * 80 / 30)
@@ -104,6 +107,8 @@ def rate_at(config: TrainConfig, step: int, share: float) -> float:
 class Run:
     """State of a run: network, objective, averaged weights, and sources of samples.
 
+    Making one seeds torch, and in the first process writes config.yaml and opens the logs in `config.out`.
+
     Args:
         config: recipe.
         here: this process.
@@ -113,14 +118,15 @@ class Run:
         network: network in training.
         average: its averaged weights.
         together: objective whose gradients all processes share.
-        groups: this process's groups of each step.
+        groups: numbers of this process's groups of each step.
         examined: validation samples; empty except in the first process.
         watch: progress reports; None except in the first process.
         step: steps done.
         best: best validation PSNR so far, dB; -infinity before the first.
 
     Raises:
-        ValueError: for data that do not suit the recipe, or a checkpoint of another network.
+        ValueError: for data or processes that do not suit the recipe, or a checkpoint of another network.
+        FileNotFoundError: for a missing folder of scenes or pairs, or file of weights.
     """
 
     def __init__(self, config: TrainConfig, here: Process, former: Checkpoint | None) -> None:
@@ -161,7 +167,8 @@ class Run:
 
         Raises:
             FloatingPointError: for a loss or gradient that is not finite.
-            OSError: if a checkpoint cannot be written.
+            OSError: if a file cannot be written.
+            ValueError: for images that cannot be read.
         """
         groups_by_step = self.samples.steps(self.groups, start=self.step)
         recipe = self.config
@@ -251,11 +258,9 @@ class Run:
 
 def save_sample(sample: Sample, path: Path, *, facts: dict[str, str]) -> None:
     """Write the tensors of a group of samples to a safetensors file: `alpha`, `ground_truth`, and `betas/0`,
-    `position/0`, `visible/0` and so on.
+    `position/0`, `visible/0` and so on, without the fields.
 
     Args:
-        sample: group of samples.
-        path: file.
         facts: metadata of the file, text by name.
 
     Raises:

@@ -35,7 +35,7 @@ class Objective(nn.Module):
 
     Args:
         network: network in training.
-        loss: name of the image loss, "psnr" or "mse".
+        loss: name of the image loss, "psnr" or "mse"; others raise KeyError.
         attention: weight of the attention loss; 0 leaves it out.
     """
 
@@ -50,6 +50,9 @@ class Objective(nn.Module):
 
         Returns:
             A scalar, with gradient: the image loss plus `attention` times the attention loss.
+
+        Raises:
+            ValueError: for samples that do not fit the network, and an attention loss without segments.
         """
         if not self.attention:
             return self.image_loss(self.network(sample.inputs).image, sample.ground_truth)
@@ -60,12 +63,16 @@ class Objective(nn.Module):
 
 @torch.no_grad()
 def validation(network: FusionNetwork, samples: list[Sample]) -> dict[str, float]:
-    """Measure a network on validation samples, by the first beta of each.
+    """Measure a network on validation samples, matches by the first beta of each.
+
+    Args:
+        samples: groups of samples, at least one.
 
     Returns:
-        By name: `psnr` in dB, the mean over samples, clipped to 0..1; `matched`, the share of visible pixels
-        whose match is within 1.5 pixels (NaN without truth); and for networks that are `Comparing` `peaks`,
-        the share whose largest weight is within one pixel.
+        By name: "psnr" of images clipped to 0..1, in dB, the mean over samples, each at most 80; "matched",
+        the share of visible pixels whose match is within 1.5 pixels of beta (NaN without truth); and "peaks",
+        the share whose largest weight is within one pixel, only for networks that are `Comparing` and fields
+        of segments.
     """
     psnr, near, peaks = [], [], []
     for sample in samples:

@@ -99,7 +99,7 @@ def process(device: str = "auto") -> Iterator[Process]:
         This process.
 
     Raises:
-        ValueError: for a device that does not exist.
+        ValueError: for a device that torch does not know, and CUDA where it has no GPU.
     """
     count = int(os.environ.get("WORLD_SIZE", "1"))
     chosen = _device(device)

@@ -50,11 +50,12 @@ class Sample(NamedTuple):
     """Group of training samples of one batch.
 
     Attributes:
-        alpha: recorded alpha (b, 1, h, w).
-        betas: recorded betas (b, c, h, w), at alpha's size.
-        fields: receptive field of each beta.
-        ground_truth: image (b, 3, h, w) to be learnt.
-        position: true positions (b, h, w, 2) of alpha's pixels, pixels of each beta; (0, 0) where unknown.
+        alpha: recorded alpha (b, 1, h, w) in 0..1, slightly above 1 at most after a lens.
+        betas: recorded betas (b, c, h, w), at alpha's size: three bands of one beta, one of each of several.
+        fields: receptive field of each beta at that size.
+        ground_truth: image (b, 3, h, w) to be learnt, may exceed 0..1.
+        position: true positions (x, y) of alpha's pixels (b, h, w, 2) in each beta at that size; (0, 0) where
+            unknown.
         visible: masks (b, h, w), True where that beta sees the point.
     """
 
@@ -75,8 +76,8 @@ class Planned(NamedTuple):
     """Scenes that a step records.
 
     Attributes:
-        scenes: number of the group of scenes.
-        kind: kind of their rigs or source.
+        scenes: number of the group of scenes, that of the step that first uses it.
+        kind: "rectified" or "general" rigs of layered scenes, "rendered" or "measured".
         dropped: number of the group to drop from the cache; None for none.
     """
 
@@ -86,7 +87,7 @@ class Planned(NamedTuple):
 
 
 def plan(config: TrainConfig, seed: int) -> Iterator[Planned]:
-    """Plan the scenes of each step: new ones, or one of the last `CACHED` groups again.
+    """Plan the scenes of each step: new ones, or one of the latest groups again.
 
     Args:
         config: recipe, for its shares of kinds and `reuse`.
@@ -118,13 +119,13 @@ def plan(config: TrainConfig, seed: int) -> Iterator[Planned]:
 class SampleSource:
     """Samples by number of the step; calling it with a count yields the first group of that many steps.
 
-    A group is one process's share of a step: a `Sample`. Each call begins at step 0, and yields the same for
-    the same seed.
+    A step has one group or more, each a `Sample`. Each call begins at step 0, and yields the same for the
+    same seed.
 
     Attributes:
         config: recipe.
-        layered: layered scenes by kind of their rigs.
-        folders: windows of rendered scenes and measured pairs, by kind.
+        layered: layered scenes by kind of their rigs, "rectified" and "general"; empty without photographs.
+        folders: windows by kind: "rendered" scenes and "measured" pairs, if the recipe has such folders.
         seed: random seed.
         field: receptive field.
         cache: groups of scenes, by (number, group).
@@ -150,6 +151,9 @@ class SampleSource:
 
         Yields:
             The samples of a step, one for each group.
+
+        Raises:
+            ValueError: for images that cannot be read, and as the field refuses a pair.
         """
         for step, planned in enumerate(plan(self.config, self.seed)):
             for key in [key for key in self.cache if key[0] == planned.dropped]:
@@ -163,10 +167,13 @@ class SampleSource:
         Args:
             planned: plan of the step.
             step: number of the step, the seed of its degradations.
-            group: number of the group.
+            group: number of the group within the step.
 
         Returns:
             The samples; the scenes stay in the cache.
+
+        Raises:
+            ValueError: as `steps`.
         """
         if (planned.scenes, group) not in self.cache:
             g = _generator(self.seed, SCENE, planned.scenes, group)
@@ -185,7 +192,7 @@ class SampleSource:
 def made_ahead(samples: Iterator[list[Sample]]) -> Iterator[list[Sample]]:
     """Yield the same samples, while a thread makes the next step's.
 
-    `samples` must be without end.
+    `samples` must be without end: at its end RuntimeError is raised. Its errors pass.
     """
     with ThreadPoolExecutor(1) as beside:
         coming = beside.submit(next, samples)
@@ -199,15 +206,15 @@ def scenes(config: TrainConfig, *, device: str = "cpu") -> tuple[SampleSource, S
     """Open a recipe's data, split into training and validation by photographs, scenes and pairs.
 
     Args:
-        config: recipe.
         device: device of the samples.
 
     Returns:
         Sources of training and of validation samples.
 
     Raises:
-        ValueError: for no photographs, or too few to hold some out, and other data that cannot be used.
-        FileNotFoundError: for a missing folder.
+        ValueError: for no photographs, as in a missing folder, or too few to hold some out, an unknown field,
+            and other data that cannot be used.
+        FileNotFoundError: for a missing folder of rendered scenes or measured pairs.
     """
     n, layered = config.held_out, config.rendered + config.measured < 1
     bank, unseen = photographs(config) if layered else (None, None)
@@ -225,17 +232,16 @@ def source_of(
     """Open a recipe's layered scenes, rendered scenes and measured pairs.
 
     Args:
-        config: recipe.
         photos: textures of layered scenes; None if all batches come from the recipe's folders.
         seed: random seed of scenes, degradations and the order in which items are used.
         device: device of the samples.
-        choose: called with an item's number, returns True to take it.
+        choose: called with the number of a rendered scene or a pair, returns True to take it.
 
     Returns:
         The source.
 
     Raises:
-        ValueError: for folders that cannot be used.
+        ValueError: for folders that cannot be used, and an unknown field.
         FileNotFoundError: for a missing folder.
     """
     rectified, general = config.rectified_rigs, config.general_rigs
@@ -255,13 +261,14 @@ def source_of(
 
 
 def photographs(config: TrainConfig) -> tuple[PhotoBank, PhotoBank]:
-    """Load the recipe's photographs, every `held_out`-th for validation.
+    """Load the recipe's photographs, every `held_out`-th, from the first, for validation.
 
     Returns:
-        Textures for training and for validation.
+        Textures for training and for validation, each with patterns and mixtures (`PhotoBank.load`).
 
     Raises:
-        ValueError: if there are none, or too few to hold some out.
+        ValueError: if there are none, or too few to hold some out, and for a cache that is none.
+        OSError: if the cache cannot be written.
     """
     if not config.photos and not (config.cache and config.cache.exists()):
         raise ValueError("photos: none are given: name folders with images, --photos FOLDER")
@@ -283,14 +290,17 @@ def degraded(
     """Record a scene by random cameras: alpha grey, betas in colour (one band each if there are several).
 
     Args:
-        scene: scenes with ground truth.
+        scene: scenes with ground truth, of up to three betas, pinholes.
         g: random generator of the degradations.
         field: receptive field of all betas; one with a method `of_depth` is asked for that of alpha's true
             depth, (b, h, w) in metres: an upper bound.
         recording: probabilities of degradations.
 
     Returns:
-        The samples, betas at alpha's size.
+        The samples, betas at alpha's size, with the true positions of the cameras as they are, not perturbed.
+
+    Raises:
+        ValueError: as the field refuses a pair.
     """
     images, two_views = scene.images, len(scene.images) == 2
     ideal, grey, cameras = images[0], luminance(scene.images[0]), scene.cameras
@@ -320,12 +330,11 @@ def recorded(
     Args:
         image: images (b, c, h, w), sRGB in 0..1.
         camera: their cameras, batched (b).
-        g: random generator.
         recording: probabilities of degradations.
         lost: largest share that an undistorted image lacks on each side.
 
     Returns:
-        Images of the same shape; `valid` (b, h, w) is False where the lens saw nothing.
+        Images of the same shape; `valid` (b, h, w) is False where the lens saw nothing, else True.
     """
 
     def record_here(image: Tensor) -> Tensor:
@@ -357,12 +366,11 @@ def pair_of(scene: ArrayBatch, beta: int, g: Generator) -> Pair:
     """Make the batched pair of alpha and a beta at alpha's size, with depth bounds looser than the scenes'.
 
     Args:
-        scene: scenes with cameras.
         beta: number of the beta, from 1.
         g: random generator of the bounds.
 
     Returns:
-        The pair, float64; the far bound is infinite in half of the cases.
+        The pair, float64; the far bound is infinite in about half of the batch.
     """
     near, far = scene.depth_range.double().unbind(-1)
     loose = torch.rand(2, len(near), generator=g, dtype=torch.float64).to(near.device)
@@ -377,10 +385,9 @@ def perturbed(pair: Pair, pixels: float, g: Generator) -> Pair:
     Args:
         pair: batched pair.
         pixels: displacement, pixels of beta.
-        g: random generator.
 
     Returns:
-        The pair; the same one for 0 pixels.
+        The pair, its beta rotated about its centre, without link; the same pair for 0 pixels.
     """
     if pixels == 0:
         return pair
@@ -397,11 +404,14 @@ def transfer(pair: Pair, depth: Tensor, beta_depth: Tensor) -> tuple[Tensor, Ten
     Args:
         pair: batched pair of pinhole cameras.
         depth: depth (b, h, w) of alpha, metres; NaN where unknown.
-        beta_depth: depth (b, hb, wb) of beta, of any size; NaN where unknown.
+        beta_depth: depth (b, hb, wb) of beta's view at any resolution, metres; NaN where unknown.
 
     Returns:
-        Positions (b, h, w, 2) in beta's pixels, (0, 0) where unknown, and masks (b, h, w), True where
-        visible.
+        Positions (b, h, w, 2) in beta's pixels, also outside its image, (0, 0) where unknown; and masks
+        (b, h, w), True where visible: nowhere at infinite depth.
+
+    Raises:
+        ValueError: for cameras that are not calibrated or have lenses.
     """
     hw = pair.alpha.hw
     track = pinhole_track(pair, pixel_grid(hw, device=depth.device).reshape(1, -1, 2))

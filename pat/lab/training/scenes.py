@@ -40,6 +40,8 @@ DECENTRED = 0.1
 class Crops:
     """Base class of random windows of the items in folders.
 
+    Subclasses define `sample`, and `_find(roots, choose)`, which lists the items.
+
     Args:
         roots: folders.
         hw: (height, width) of alpha in the samples.
@@ -79,7 +81,7 @@ class Crops:
             betas: number of betas of a window.
 
         Returns:
-            A batch of `batch` samples with `betas` betas.
+            A batch of `batch` samples with `betas` betas; depth is NaN where unknown.
 
         Raises:
             NotImplementedError: in this base class.
@@ -100,8 +102,9 @@ class RenderedCrops(Crops):
 
     Raises:
         FileNotFoundError: for a missing folder.
-        ValueError: for a folder without scenes or with an incomplete one, a scene with fewer than two
-            calibrated cameras, or without an image as large as `hw`.
+        ValueError: for a folder without scenes or with an incomplete one, no chosen scene, a scene whose rig
+            cannot be read, with fewer than two cameras or one that is not calibrated, or without an image as
+            large as `hw`.
     """
 
     def _find(self, roots: Sequence[Path], choose: Callable[[int], bool]) -> None:
@@ -124,7 +127,7 @@ class RenderedCrops(Crops):
             betas: number of betas of a window.
 
         Returns:
-            A batch of `batch` samples with `betas` betas.
+            A batch of `batch` samples with `betas` betas of pinhole cameras; depth is NaN where unknown.
 
         Raises:
             ValueError: naming the scene, if its images cannot be read.
@@ -178,7 +181,7 @@ def chosen(every: list[T], choose: Callable[[int], bool], what: str) -> list[T]:
 
     Args:
         every: all items.
-        choose: called with an item's number, returns True to take it.
+        choose: called with an item's number, from 0, returns True to take it.
         what: name of the items in messages.
 
     Returns:
@@ -198,14 +201,13 @@ def large_enough(folder: Path, rig: Rig, hw: HW) -> list[str]:
 
     Args:
         folder: folder of the scene, for messages.
-        rig: its rig.
         hw: (height, width) of alpha in the samples.
 
     Returns:
         Their names.
 
     Raises:
-        ValueError: if none is large enough, a camera is not calibrated, or there is only one.
+        ValueError: if none is large enough, a camera is not calibrated, or there are fewer than two.
     """
     sizes = {name: windows.pinhole_of(c).hw for name, c in rig.cameras.items() if isinstance(c, Camera)}
     count = len(rig.names)
@@ -219,8 +221,8 @@ def large_enough(folder: Path, rig: Rig, hw: HW) -> list[str]:
 
 
 def beside(alpha: RenderedView, beta: RenderedView, size: HW, hw: HW, g: Generator) -> RenderedView:
-    """Cut beta's window with alpha's angle of view, around the projection of alpha's centre at a random
-    depth.
+    """Cut beta's window with about alpha's angle of view, around the projection of alpha's centre at a random
+    depth (the image's middle where beta does not see it), moved into the image and shifted at random.
 
     Args:
         alpha: alpha's window.
@@ -230,7 +232,7 @@ def beside(alpha: RenderedView, beta: RenderedView, size: HW, hw: HW, g: Generat
         g: random generator of the depth.
 
     Returns:
-        Beta's window, resized to `size`, with its camera.
+        Beta's window, resized to `size`, with its camera; where it leaves the image depth is NaN.
     """
     ratio = pixels_per_radian(beta.camera) / pixels_per_radian(alpha.camera)
     wanted = (max(round(hw[0] * ratio), 1), max(round(hw[1] * ratio), 1))
@@ -262,7 +264,7 @@ def finite_window(view: RenderedView, top: int, left: int, size: HW, hw: HW) -> 
     """Cut a `window` (see its arguments) and replace infinite depths by those at a distance of `SKY` metres.
 
     Returns:
-        The window, with its camera.
+        The window, with its camera; depth stays NaN where unknown.
     """
     cut = windows.window(view, top, left, size, hw)
     rays, _ = cut.camera.rays(pixel_grid(hw, dtype=torch.float64))
@@ -289,7 +291,7 @@ def batched(drawn: Sequence[Sequence[RenderedView]], device: str) -> ArrayBatch:
         device: device of the batch.
 
     Returns:
-        A batch on the device, images sRGB-encoded, alpha's frame as the world.
+        A batch on the device, images sRGB-encoded, cameras float32, alpha's frame as the world, no index.
     """
     views = list(zip(*drawn))
     images = [srgb_image(torch.stack([v.rgb for v in same])).to(device) for same in views]

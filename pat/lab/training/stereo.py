@@ -55,8 +55,7 @@ class MeasuredPairs(Crops):
 
     Raises:
         FileNotFoundError: for a missing folder.
-        ValueError: for a folder without pairs, images that differ in size, are grey or smaller than `hw`, or
-            a pair without the disparity of both images.
+        ValueError: for a folder without pairs, no chosen pair, and as `check`.
     """
 
     def _find(self, roots: Sequence[Path], choose: Callable[[int], bool]) -> None:
@@ -67,10 +66,11 @@ class MeasuredPairs(Crops):
         self._pictures = lru_cache(ACTIVE)(lambda i: self.read(self.pairs[i]))
 
     def check(self, pair: PairFiles) -> None:
-        """Check that both images are in colour, of one size, at least `hw`, and have disparities.
+        """Check that both images are in colour, of one size, at least `hw`, and have disparities of a scale
+        that is known by Middlebury's names of folders (`middlebury_pairs`).
 
         Raises:
-            ValueError: naming the file, if not.
+            ValueError: naming the file, if not, or if an image is missing or none.
         """
         left, right = _header(pair.left), _header(pair.right)
         if left != right:
@@ -84,6 +84,9 @@ class MeasuredPairs(Crops):
         if left[0] < h or left[1] < w:
             raise ValueError(f"{pair.left} is {_described(left)}, below samples of {w}x{h}: lower `hw`")
         disparity_files(pair)
+        if pair.ground_truth is None:
+            names = "name its folder, or the one above, as Middlebury's collection, such as 2006_third"
+            raise ValueError(f"{pair.left}: the scale of the disparities is unknown: {names}")
 
     def read(self, pair: PairFiles) -> Pictures:
         """Read the images and disparities of a pair.
@@ -93,6 +96,7 @@ class MeasuredPairs(Crops):
 
         Raises:
             ValueError: for a file that cannot be read, and a missing file of disparities.
+            FileNotFoundError: for a missing image.
         """
         left, right = (read_image(path)[0] * pair.max_disparity for path in disparity_files(pair))
         return Pictures(read_image(pair.left), read_image(pair.right), (left, right), pair.max_disparity)
@@ -100,7 +104,7 @@ class MeasuredPairs(Crops):
     def sample(self, batch: int, generator: Generator, *, number: int, betas: int = 1) -> ArrayBatch:
         """Draw windows from the pairs that are active for group `number`.
 
-        Several betas are of the same camera.
+        Several betas are of the same camera, at sizes of their own.
 
         Args:
             batch: number of windows.
@@ -109,7 +113,7 @@ class MeasuredPairs(Crops):
             betas: number of betas of a window.
 
         Returns:
-            A batch of `batch` samples; depth is NaN where unknown.
+            A batch of `batch` samples, cameras as of `assumed_cameras`; depth is NaN where unknown.
 
         Raises:
             ValueError: for an image that cannot be read.
@@ -166,7 +170,7 @@ def depth_of(disparity: Float[Tensor, "b h w"], width: int) -> Float[Tensor, "b 
         width: width of the image, pixels.
 
     Returns:
-        Depth (b, h, w) in metres; NaN where the disparity is 0.
+        Depth (b, h, w) in metres; NaN where the disparity is not above 0.
     """
     return torch.where(disparity > 0, width / disparity, torch.nan)
 
@@ -195,7 +199,7 @@ def assumed_cameras(
         device: device of the batch.
 
     Returns:
-        The batch, without depth.
+        The batch, alpha's frame as the world; its lists of depth and index are empty.
     """
     batch, _, h, w = images[0].shape
     K = intrinsics(float(w), (h, w)).expand(batch, 3, 3)

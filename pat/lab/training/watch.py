@@ -37,7 +37,8 @@ class Watch:
         tensorboard: True to log for TensorBoard too.
 
     Raises:
-        ValueError: if TensorBoard is wanted and not installed.
+        ValueError: if TensorBoard is wanted and not installed, or a line of the two files is damaged.
+        OSError: if a file cannot be written.
     """
 
     def __init__(self, out: Path, step: int, scenes: int, *, tensorboard: bool) -> None:
@@ -67,7 +68,7 @@ class Watch:
             loss: its loss.
             norm: norm of the gradient, before clipping.
             rate: learning rate.
-            done: completed share of the run, 0..1.
+            done: completed share of the run, 1 at the end.
         """
         now = time.monotonic()
         speed, self.ticked = self.scenes / (now - self.ticked), now
@@ -79,10 +80,11 @@ class Watch:
                 self.board.add_scalar(name, value, step)
 
     def validated(self, facts: Mapping[str, float]) -> None:
-        """Report the figures of a validation: print them and write them to log.jsonl, and two to TensorBoard.
+        """Report the figures of a validation: print them and write them to log.jsonl, rounded to 4 decimals,
+        and two to TensorBoard.
 
         Args:
-            facts: figures by name, rounded to 4 decimals: `step`, and for TensorBoard `psnr` and `matched`.
+            facts: figures by name: "step", and for TensorBoard "psnr" and "matched".
         """
         line = json.dumps({k: round(v, 4) for k, v in facts.items()})
         self.bar.console.print(line, highlight=False) if not self.bar.disable else print(line, flush=True)
@@ -97,7 +99,8 @@ class Watch:
         """Write an image of validation samples: beta, alpha, fused image, ground truth, confidence side by
         side.
 
-        It is `images/step-N.png` in the run's folder, the first scene of up to `SHOWN` groups.
+        It is `images/step-N.png` in the run's folder (N of six digits), and is sent to TensorBoard too: the
+        first scene of up to `SHOWN` groups, of which there must be one.
         """
         sheet = contact_sheet(network, samples[:SHOWN])
         write_image(self.out / "images" / f"step-{step:06d}.png", sheet)

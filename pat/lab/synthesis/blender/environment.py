@@ -16,7 +16,7 @@ def blender_python() -> str:
     """Return the path of a Python interpreter that has bpy: this one, or that of `FOLDER`.
 
     Raises:
-        ValueError: with the command to install what is missing, in one line.
+        ValueError: in one line with the command to install it, if OpenEXR is missing here, or bpy in both.
     """
     if find_spec("OpenEXR") is None:
         line = install_line("OpenEXR", "synthesis")

@@ -28,7 +28,7 @@ class Lens(NamedTuple):
     """Pinhole camera to render with, and the resampling to the true camera.
 
     Attributes:
-        pinhole: the pinhole camera.
+        pinhole: the pinhole camera, possibly rotated about the optical axis and of another size.
         x: positions (x, y) of the true camera's pixels in the pinhole's image; None if the pixels are the
             same.
         valid: True where the lens sees something; None if the pixels are the same.
@@ -43,8 +43,11 @@ class Lens(NamedTuple):
 
         The bicubic kernel of `grid_sample` shifts linear ramps by up to 0.05 pixels, splines do not.
 
+        Args:
+            image: image of the pinhole, on the CPU, without gradient.
+
         Returns:
-            Image (c, h2, w2), clipped at 0.
+            Image (c, h2, w2), clipped at 0; the image itself if the pixels are the same.
         """
         if self.x is None or self.valid is None:
             return image
@@ -56,7 +59,7 @@ class Lens(NamedTuple):
         """Resample values to the true camera from the nearest pixel; 0 where the lens sees nothing.
 
         Returns:
-            Image (c, h2, w2).
+            Image (c, h2, w2); the image itself if the pixels are the same.
         """
         if self.x is None or self.valid is None:
             return image
@@ -68,11 +71,12 @@ class Lens(NamedTuple):
         extrapolated.
 
         Args:
-            depth: depth of the pinhole's pixels, metres.
+            depth: depth of the pinhole's pixels, metres; infinite where nothing is hit.
             index: object index of each pixel.
 
         Returns:
-            Depth (h2, w2) in metres; NaN where the lens sees nothing.
+            Depth (h2, w2) in metres, infinite where nothing is hit, NaN where the lens sees nothing; `depth`
+            itself if the pixels are the same.
         """
         if self.x is None or self.valid is None:
             return depth
@@ -105,6 +109,8 @@ def _gentlest(inverse: Float[Tensor, "h w"], dim: int) -> Float[Tensor, "h w"]:
 
 def lens_for(camera: View, name: str) -> Lens:
     """Make the lens of a rig's camera.
+
+    Rays of a lens model that is not central are taken to start at the camera's centre.
 
     Returns:
         The lens, float64 on the CPU.

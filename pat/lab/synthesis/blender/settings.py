@@ -16,10 +16,9 @@ class RenderSettings:
         width: width in pixels of the rig's widest image; all are resized by the same factor. None keeps the
             sizes.
         samples: rays for each pixel.
-        denoise: denoiser.
+        denoise: "none", or the quality of the denoiser.
         fast_light: True for Blender's fast approximation of indirect light.
         bounces: reflections of light.
-
         threads: CPU threads; 0 uses all cores.
         infrared: True to render near infrared beside colours.
         duration: seconds to render, at each camera's frame rate and time offset; 0 renders one frame of each

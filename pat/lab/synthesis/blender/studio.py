@@ -36,16 +36,14 @@ class Studio:
     """Blender with one scene loaded; renders frames of any pinhole camera at any time.
 
     Args:
-        scene: scene to render.
-        settings: settings of rendering.
         scratch: existing folder for temporary files.
 
     Attributes:
         version: Blender's version.
 
     Raises:
-        ValueError: if Blender is not installed.
-        BrokenProcessPool: if its process dies.
+        ValueError: as `blender_python`, and as `build` refuses a scene.
+        BrokenProcessPool: if Blender's process dies.
     """
 
     def __init__(self, scene: Scene, settings: RenderSettings, scratch: Path):
@@ -67,7 +65,7 @@ class Studio:
         """Render one frame.
 
         Args:
-            camera: pinhole camera; a lens model is ignored.
+            camera: pinhole camera on the CPU, without gradient; skew and a lens model are ignored.
             time: seconds, for the objects' motion.
             spectrum: "rgb" for colours, "nir" for near infrared.
 
@@ -77,7 +75,7 @@ class Studio:
             object's number from 1, or 0.
 
         Raises:
-            ValueError: for what Blender refuses, in one line.
+            ValueError: for what Blender refuses, in one line; no further frame can be rendered then.
             BrokenProcessPool: if its process dies.
         """
         places = [_place(thing.motion, time) for thing in self.scene.objects]
@@ -139,10 +137,13 @@ def _aim(camera: Camera) -> dict[str, Any]:
 
 
 def read_layers(path: Path) -> dict[str, Tensor]:
-    """Read the channels of a multi-layer EXR file.
+    """Read the channels of a multi-layer EXR file that Blender wrote.
 
     Returns:
-        Channels (h, w), float32, by `Pass.Channel`.
+        Channels (h, w), float32, by pass and channel without the layer, such as "Combined.R".
+
+    Raises:
+        ImportError: without OpenEXR.
     """
     import OpenEXR
 

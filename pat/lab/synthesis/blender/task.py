@@ -36,7 +36,7 @@ class Shot(NamedTuple):
     Attributes:
         camera: name of the camera.
         number: number of the frame, from 0.
-        time: time in seconds.
+        time: time in seconds, the camera's time offset included.
     """
 
     camera: str
@@ -48,19 +48,17 @@ def render(scene: Scene, rig: Rig, out: Path, *, settings: RenderSettings) -> Re
     """Render a scene of a rig into the new folder `out`, atomically.
 
     Args:
-        scene: scene to render.
         rig: calibrated cameras to render.
-        out: new folder.
-        settings: settings of rendering.
 
     Returns:
         The rendered folder, with the outcome of the self-check in `about["check"]`; a scene that fails it is
         kept.
 
     Raises:
-        ValueError: in one line, if `out` exists or the scene cannot be rendered (skew, a camera inside an
-            object, a missing library).
+        ValueError: in one line, if `out` exists or the scene cannot be rendered (such as a camera that
+            `lens_for` refuses, or that is inside an object, or a missing library).
         BrokenProcessPool: if Blender's process dies.
+        OSError: if a file cannot be written.
     """
     out = Path(out)
     if out.exists():
@@ -92,9 +90,10 @@ def render(scene: Scene, rig: Rig, out: Path, *, settings: RenderSettings) -> Re
 
 
 def fitted(rig: Rig, settings: RenderSettings) -> Rig:
-    """Return the rig resized to the settings' width; the rig itself if there is none.
+    """Return the rig resized by one factor so that its widest image has the settings' width; the rig itself
+    if that is None.
 
-    Sides have at least 4 pixels.
+    Sides are rounded, to at least 4 pixels.
     """
     if settings.width is None:
         return rig
@@ -122,7 +121,7 @@ def shots(rig: Rig, settings: RenderSettings) -> list[Shot]:
 
 
 def refuse_inside(scene: Scene, rig: Rig, planned: list[Shot]) -> None:
-    """Check that no camera is inside an object when it takes one of the frames `planned`.
+    """Check that no camera (all calibrated) is inside an object when it takes one of the frames `planned`.
 
     Raises:
         ValueError: naming camera and object, if one is.
@@ -139,15 +138,14 @@ def take(studio: Studio, lens: Lens, shot: Shot) -> RenderedFrame:
     """Render one frame of a camera, resampled to its lens.
 
     Args:
-        studio: Blender with the scene loaded.
-        lens: lens of the frame's camera.
-        shot: camera and time.
+        lens: lens of the shot's camera.
 
     Returns:
-        The frame, with near infrared if the studio's settings ask for it.
+        The frame at the true camera's pixels, with near infrared if the studio's settings ask for it.
 
     Raises:
-        ValueError: if the camera sees nothing.
+        ValueError: if the camera sees nothing; also as `Studio.channels`.
+        BrokenProcessPool: if Blender's process dies.
     """
     rendered = studio.channels(lens.pinhole, shot.time, "rgb")
     index = rendered[index_name(rendered)].round().int()

@@ -71,6 +71,7 @@ def test_the_papers_recipes_are_the_papers():
         ("momenta: [0.9, 1.5]", "c: momenta"),
         ("general_rigs: {near: [0, 2]}", "c: general_rigs: near"),
         ("general_rigs: {resolutions: []}", "c: general_rigs: betas"),
+        ("network: {betas: 4}", "c: network.betas"),
         ("rendered: 1.5", "c: rendered"),
         ("rendered: 0.5", "c: rendered"),
         ("rendered_from: a", "c: rendered"),

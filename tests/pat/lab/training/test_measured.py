@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+
 import numpy as np
 import pytest
 import torch
@@ -68,6 +70,12 @@ def test_pairs_without_the_disparity_of_both_images_are_refused(pair, tmp_path):
     for name in ("view1.png", "view5.png", "disp1.png"):
         (folder / name).write_bytes((pair / name).read_bytes())
     with pytest.raises(ValueError, match=r"disp5\.png"):
+        MeasuredPairs([folder], hw=HW)
+
+
+def test_pairs_whose_folder_does_not_tell_the_scale_are_refused(pair, tmp_path):
+    folder = shutil.copytree(pair, tmp_path / "aloe")
+    with pytest.raises(ValueError, match="scale of the disparities"):
         MeasuredPairs([folder], hw=HW)
 
 

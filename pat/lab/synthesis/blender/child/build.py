@@ -37,11 +37,11 @@ class BuiltScene:
 
 
 def build(bpy: Any, scene: Part, meshes: Sequence[Part], world: Any) -> BuiltScene:
-    """Build all objects and lights of a scene in Blender; `meshes` are the objects' shapes.
+    """Build all objects and lights of a scene in Blender.
 
     Args:
         bpy: Blender's module.
-        scene: scene to build.
+        meshes: the objects' shapes in their order, with the attributes of `pat.lab.synthesis.shapes.Mesh`.
         world: Blender's world, for the light from all around.
 
     Returns:
@@ -49,6 +49,7 @@ def build(bpy: Any, scene: Part, meshes: Sequence[Part], world: Any) -> BuiltSce
 
     Raises:
         ValueError: for a texture whose image file is missing.
+        KeyError: for an unknown kind of texture or light.
     """
     stage = BuiltScene([], [])
     for i, (thing, surface) in enumerate(zip(scene.objects, meshes)):

@@ -16,7 +16,10 @@ from .build import build
 
 
 def serve() -> None:
-    """Answer requests on standard input until it ends; an answer is {} or {"error": one line}."""
+    """Answer requests on standard input until it ends, or one is refused.
+
+    An answer is a line of JSON: {"version": Blender's} to the first, {} to others, {"error": one line}.
+    """
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # Blender prints there, past Python
     threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
@@ -50,7 +53,7 @@ class Stage:
         request: `scene`, `meshes` and `settings`, as the studio sends them.
 
     Raises:
-        ValueError: if Blender is not installed.
+        ValueError: if bpy cannot be imported, and as `build`.
     """
 
     def __init__(self, request: Any):
@@ -64,7 +67,12 @@ class Stage:
         self._quality()
 
     def render(self, request: Any) -> None:
-        """Render one frame to the multi-layer EXR file `request.path`."""
+        """Render one frame (colours, depth, object index) to a multi-layer EXR file.
+
+        Args:
+            request: `places`, `spectrum`, `path`, `image`, `camera` and `pose`, as `Studio.channels` sends
+                them; `path` is the file.
+        """
         for item, place in zip(self.built.objects, request.places):
             item.location, item.rotation_quaternion, item.scale = place
         self.blender.frame_set(1)
