@@ -154,13 +154,14 @@ def transferred(inputs: Inputs, matches: Matches) -> Matches:
     """Transfer the betas' bands to alpha's view, also for matches from another source.
 
     Fills are colours for pixels that beta does not see. Of several betas matched together, those with all of
-    the result's bands share one fill; any other has its own. Gradients reach images and fields.
+    the result's bands share one fill; any other has its own. Gradients reach images and fields, but not
+    through fills.
 
     Returns:
         The matches with `colours` (bands minus alpha); float16 for a large frame without gradients.
 
     Raises:
-        ValueError: for matches of another size or number of betas.
+        ValueError: as `Matches.check`, and for a beta whose field is not of straight segments.
     """
     matches.check(inputs)
     large = len(inputs.pieces) > 1
@@ -244,11 +245,13 @@ def transferred_bands(
         beta: beta's image and field.
         matches: matches in that beta.
         statistics: statistics to use; None for those of these pixels.
-        sees_luma: True if alpha sees about the luma of RGB betas.
+        sees_luma: True if alpha sees about the luma of RGB betas; not used for matches with a mix of bands.
 
     Returns:
-        Bands minus alpha, their weight and their similarity to alpha (`Colours`) at alpha's pixels; and the
-        statistics.
+        `bands`, `weight` and `likeness` of `Colours`, at alpha's pixels; and the statistics.
+
+    Raises:
+        ValueError: for a field that is not of straight segments.
     """
     if matches.comparison.mix is not None:
         return _colours_of_bands(alpha, beta, matches, matches.comparison.mix, statistics)
@@ -265,7 +268,7 @@ def matched_colours(
 ) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 1 h w"], Float[Tensor, "b 1 h w"], MatchStatistics]:
     """Compute beta's bands minus alpha at the matches, with the detail that alpha has and beta lacks.
 
-    The bands are combined to luma or their mean, as where their spectra are known.
+    Alpha is compared with luma of three bands, or the mean of others, whatever mix the matches have.
 
     Args:
         statistics: statistics to use; None for those of these pixels.
@@ -273,8 +276,11 @@ def matched_colours(
             weight, and colours grow with alpha's brightness.
 
     Returns:
-        Bands minus alpha (the frame's mean where the match is not on beta); the weight of these colours, 0 to
-        1; the photometric similarity, 0 to 1, with 1 for what it cannot tell; and the statistics.
+        Bands minus alpha (the statistics' mean where the match is not on beta); the weight of these colours,
+        0 to 1; the photometric similarity, 0 to 1, with 1 where it cannot tell; and the statistics.
+
+    Raises:
+        ValueError: for a field that is not of straight segments.
     """
     guide, normalisation = combined_bands(beta.image), matches.comparison.whole
     bands = beta.image.shape[1]
@@ -320,12 +326,12 @@ def with_clipped_light(
     differs between the views, each by its expected variance: a ridge regression of one number at each pixel.
 
     Args:
-        luma: luma of the values.
+        luma: Rec. 601 luma of the values.
         alpha: alpha, as sharp as these.
         clipped: 1 where a band is clipped, 0 elsewhere, and between them beside such pixels.
 
     Returns:
-        The bands, and their luma.
+        The bands, which may exceed 1, and their luma.
     """
     share = (clipped * values.new_tensor(REC601)[:, None, None]).sum(1, keepdim=True)
     beyond = (alpha - luma).clamp(min=0) * share / (share.square() + SETTINGS.light_differs)
@@ -386,7 +392,7 @@ def match_weight(
         valid: mask of the matches that are on beta.
 
     Returns:
-        Weights, 0 to 1; 0 off beta.
+        Weights, 0 to 1; 0 where `valid` is False.
     """
     checked = alike * (1 + is_consistent(matches.facts)) / 2
     if matches.certainty is None:
@@ -405,6 +411,8 @@ def filled_from(
 ) -> Float[Tensor, "b fills c h w"]:
     """Fill in the colours of pixels that beta does not see by those of the most similar pixels that it sees.
 
+    Seen pixels, those of a weight above 1/2, keep their colour; if these are hardly any, all pixels do.
+
     Args:
         colour: bands minus alpha.
         alpha: alpha's image.
@@ -414,7 +422,7 @@ def filled_from(
             and take only the difference from it from examples.
 
     Returns:
-        One fill at all pixels, or with `regressed` the regression and the fill; detached.
+        One fill at all pixels, or with `regressed` the regression and the fill, minus alpha; detached.
     """
     planes = zip(numpy_of(colour), numpy_of(alpha[:, 0]), numpy_of(weight[:, 0]), to_bytes(alpha[:, 0]))
     fills = []
@@ -440,7 +448,7 @@ def colour_noise(
         weight: weight of each pixel, 0 to 1; those above a half count.
 
     Returns:
-        Variance for each of the batch; 0 where there is none, or no pixel counts.
+        Variance for each of the batch, without gradient; 0 where there is none, or no pixel counts.
     """
     parts, radius = torch.cat([unlike, texture], 1), SETTINGS.detail_radius
     fine = box_mean((parts - box_mean(parts, radius)).square(), radius)

@@ -81,10 +81,11 @@ class Response(NamedTuple):
     """Response of alpha: alpha = weights . (gain * shaded beta^gamma).
 
     Attributes:
-        weights: weights of red, green and blue; their sum is 1.
+        weights: weights of red, green and blue (3), float64; their sum is 1.
         gain: factor of beta's brightness.
         gamma: power of beta's brightness.
-        explained: share of alpha's variance at the matches that this explains, 0 to 1.
+        explained: share of alpha's variance at the matches that any combination of bands explains, 0 to 1,
+            also where Rec. 601's was kept; 1 if none was fitted.
         shading: coefficients of `_shading_terms` in the logarithm of a gain that corrects beta's vignetting;
             empty without.
     """
@@ -174,7 +175,8 @@ def stated_response(weights: Sequence[float]) -> Response:
         The response, with weights that sum to 1 and their sum as the gain.
 
     Raises:
-        ValueError: unless there are three weights, none negative or infinite, not all 0.
+        ValueError: unless there are three weights, none negative, infinite or NaN, not all 0.
+        TypeError: for no sequence of numbers.
     """
     values = torch.tensor([float(w) for w in weights], dtype=torch.float64)
     if values.shape != (3,) or not bool((values >= 0).all() & (values.sum() > 0) & values.isfinite().all()):
@@ -187,13 +189,14 @@ def given_response(response: ResponseSpec) -> Response:
     """Return the response that the user stated; Rec. 601's for "rec601", and for "fit" until it is fitted.
 
     Args:
-        response: "fit", "rec601", three weights of red, green and blue, or a `Response`.
+        response: "fit", "rec601", three weights of red, green and blue, or a `Response`, returned as it is.
 
     Returns:
         The response.
 
     Raises:
-        ValueError: for a value of another kind.
+        ValueError: for another word, and as `stated_response`.
+        TypeError: as `stated_response`, also for None.
     """
     if isinstance(response, Response):
         return response
@@ -219,7 +222,7 @@ def fit(
     brightness (a Gaussian process, by which Kennedy and O'Hagan 2001 model the lack of a model).
 
     Args:
-        bands: beta's bands at the points.
+        bands: red, green and blue of beta at the points, 0..1; points near black or clipped do not count.
         alpha: alpha at the points.
         where: positions of the points in beta, in its width and height, from its middle, with which
             vignetting is estimated; None without.
@@ -227,8 +230,8 @@ def fit(
             explain anything: only an exposure is fitted, and no more of alpha than this need be explained.
 
     Returns:
-        The response; Rec. 601's where there are too few points, or where no combination of bands explains
-        alpha.
+        The response; Rec. 601's where there are too few points (`SETTINGS.points`; `explained` is 1 then), or
+        where no combination of bands explains alpha (`Response.explains` is False).
     """
     most, fewest = SETTINGS.points
     step = max(alpha.numel() // most, 1)
@@ -399,7 +402,7 @@ class _Groups(NamedTuple):
         return self.explained_by(shading, kinds, vignetted=vignetted)
 
     def explained_by(self, shading: Tensor, kinds: Sequence[_Kind], *, vignetted: bool) -> _Explanation:
-        """Return the most probable response of these kinds after this shading is removed from beta.
+        """Return the most probable `_Explanation` of these kinds after this shading is removed from beta.
 
         `shading` has the coefficients (s) of `_shading_terms`. Tried without a gamma and with one; if
         vignetted, with the shading that is left.

@@ -57,7 +57,7 @@ class SpectralMix(NamedTuple):
         slopes: change of each band (B, C) where the combination changes by 1 from one pixel to the next; less
             if that explains alpha badly.
         gain: share (B), 0 to 1, of alpha's difference from the combination that is an error of the bands, and
-            not another spectrum; 0 for one band, where that cannot be known.
+            not another spectrum; 0 for the mean of bands (`equal`), of which that is not known.
     """
 
     weights: Float[Tensor, "b c"]
@@ -88,7 +88,7 @@ class SpectralMix(NamedTuple):
             weight: weight of each pixel, at least 0.
 
         Returns:
-            The combination for each of the batch.
+            The combination for each of the batch, float64.
         """
         parts = [_mix(*tensors) for tensors in zip(bands.double(), alpha.double(), weight.double())]
         return cls(*(torch.stack(tensors) for tensors in zip(*parts)))

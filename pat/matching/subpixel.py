@@ -75,7 +75,8 @@ def matched_at_full_size(
         half: disparity at half the size, pixels of the full-size beta.
 
     Returns:
-        Disparity in pixels of beta, and the left-right error, 0 to 1, at half the size.
+        Disparity in pixels of beta, and the left-right error, 0 to 1 (for 8 pixels), at half the size;
+        detached.
     """
     alpha, beta = views.alpha, views.beta
     geometry = geometry_of(segments, len(alpha), (beta.shape[-2], beta.shape[-1]), factor=1)
@@ -122,10 +123,13 @@ def _surfaces(disparity: Plane, weight: Plane, brightness: NDArray[np.uint8], ed
 
 
 def following(inputs: Inputs, matches: Matches) -> Matches:
-    """Give the matches gradients by the images and segments that require some.
+    """Give matches, chosen ones too, gradients by the images and segments that require some.
 
     Returns:
-        The matches with the same values; those in other betas are unchanged.
+        The matches with the same values; those in betas of which none requires one are unchanged.
+
+    Raises:
+        ValueError: for a beta whose field is not of straight segments.
     """
     betas, alpha = [], inputs.alpha
     for beta, one in zip(inputs.betas, matches.betas):
