@@ -20,7 +20,7 @@ def soft(x):
 def compared(alpha, beta, end, towards, candidates, scales, out):
     """Compare alpha with beta at each candidate disparity, with 2 x 2 pixels as channels.
 
-    Beyond h or w the last row or column is repeated.
+    Beyond h or w alpha's last row or column is repeated, beyond beta's edge its nearest pixel.
 
     Args:
         alpha: brightness (h, w) of alpha.

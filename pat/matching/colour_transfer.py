@@ -88,7 +88,7 @@ class MatchStatistics(NamedTuple):
     They are taken over the whole frame: statistics of its tiles would differ, and their borders show.
 
     Attributes:
-        matches: number of consistent matches, plus one, (B, 1, 1, 1).
+        matches: number of consistent matches, plus one, (B, 1, 1, 1); of a frame in pieces a mean of theirs.
         colour: mean of beta's bands minus alpha, (B, C, 1, 1).
         level: means of beta's brightness and of its square, and of alpha and of its square, (4, B, 1, 1, 1).
         explained: share of the variance of beta's combined bands that alpha explains, 0 to 1, (B, 1, 1, 1).

@@ -115,7 +115,7 @@ def fit_misalignment(
         beta: brightness of beta, as bright and sharp as alpha.
         position: positions (x, y) of alpha's pixels in beta, by the matches.
         normal: unit vectors across the segments (`normals`).
-        weight: weight of each match, 0 to 1; those above .3 count.
+        weight: weight of each match, 0 to 1.
 
     Returns:
         The misalignment, in widths of this alpha; all zeros for too little texture, for less than

@@ -114,7 +114,7 @@ class Inputs:
         return list(tiles_of(self.hw, sides[0], SETTINGS.halo))
 
     def in_pieces(self, make: Callable[..., Any], *more: Any) -> Any:
-        """Apply a function to these inputs, or to each tile of large ones (`pieces`), and assemble the results.
+        """Apply a function to these inputs, or to tiles of large ones (`pieces`), and assemble the results.
 
         Args:
             make: function of `Inputs` (and of each of `more`) that returns one plane (..., h, w) or several,

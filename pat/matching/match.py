@@ -128,7 +128,7 @@ def seen_mix(inputs: Inputs) -> SpectralMix | None:
         of the result's bands is stated (`inputs.bands`), or the beta has one band.
 
     Raises:
-        ValueError: for several betas, or a field that is not of straight segments.
+        ValueError: for several betas; where it is estimated, for a field that is not of straight segments.
     """
     alpha, (beta,) = inputs.alpha, inputs.betas
     if inputs.bands is not None or beta.image.shape[1] == 1:

@@ -86,8 +86,8 @@ class Response(NamedTuple):
         gamma: power of beta's brightness.
         explained: share of alpha's variance at the matches that any combination of bands explains, 0 to 1,
             also where Rec. 601's was kept; 1 if none was fitted.
-        shading: coefficients of `_shading_terms` in the logarithm of a gain that corrects beta's vignetting;
-            empty without.
+        shading: coefficients of u, v, u^2, u v and v^2, the place in beta's width and height from its middle,
+            in the logarithm of a gain that corrects beta's vignetting; empty without.
     """
 
     weights: Float[Tensor, "3"]
@@ -175,13 +175,14 @@ def stated_response(weights: Sequence[float]) -> Response:
         The response, with weights that sum to 1 and their sum as the gain.
 
     Raises:
-        ValueError: unless there are three weights, none negative, infinite or NaN, not all 0.
-        TypeError: for no sequence of numbers.
+        ValueError: unless there are three numbers, none negative, infinite or NaN, not all 0.
     """
-    values = torch.tensor([float(w) for w in weights], dtype=torch.float64)
+    try:
+        values = torch.tensor([float(w) for w in weights], dtype=torch.float64)
+    except (TypeError, ValueError):
+        values = torch.zeros(0)
     if values.shape != (3,) or not bool((values >= 0).all() & (values.sum() > 0) & values.isfinite().all()):
-        shares = tuple(weights)
-        raise ValueError(f"a response is three weights, of red, green and blue, none negative; got {shares}")
+        raise ValueError(f"a response is three weights, of red, green and blue, none negative; got {weights}")
     return Response(values / values.sum(), gain=float(values.sum()))
 
 
@@ -195,8 +196,7 @@ def given_response(response: ResponseSpec) -> Response:
         The response.
 
     Raises:
-        ValueError: for another word, and as `stated_response`.
-        TypeError: as `stated_response`, also for None.
+        ValueError: for a value of another kind, and weights that `stated_response` refuses.
     """
     if isinstance(response, Response):
         return response

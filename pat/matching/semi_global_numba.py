@@ -70,8 +70,8 @@ def _count_within(length, first, count):
 def costs(alpha, beta, first, count, end, along, length, cut, rows, columns, out):
     """Compute the matching cost of each label of each pixel.
 
-    Label l lies l pixels from the segment's end. A label beyond its length costs `NOWHERE`, or `UNSEEN` where
-    it is beta's edge that cuts the segment.
+    Label l lies l pixels from the segment's end. Labels off beta and beyond the segment's length cost
+    `NOWHERE`; those beyond the length cost `UNSEEN` where it is beta's edge that cuts the segment.
 
     Args:
         alpha: flat planes of alpha, as `planes_of` computes them.
