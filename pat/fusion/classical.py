@@ -62,8 +62,8 @@ def classical_baseline(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> Fl
         order.
 
     Raises:
-        ValueError: for no beta with an image, uncalibrated cameras, lenses, no depth range, and cameras that
-            cannot be rectified.
+        ValueError: for no beta with an image, an alpha that the rig lacks, and as `classical`.
+        KeyError: without an image of alpha.
     """
     betas = [name for name in rig.betas(alpha) if name in images]
     if not betas:
@@ -85,7 +85,9 @@ def classical_view(
         The fused bands (C, h, w), 0..1, at the pixels of the reduced alpha, lens included.
 
     Raises:
-        ValueError: for cameras that are not calibrated or cannot be rectified, and no depth range.
+        ValueError: for cameras that are not calibrated, have no pinhole view or cannot be rectified, no depth
+            range, and images that do not fit the rig (`Views.of`).
+        TypeError: for images that are no tensors.
     """
     if names := [name for name in images if not isinstance(rig[name], Camera)]:
         raise ValueError(
@@ -108,15 +110,16 @@ def classical(rig: Rig, images: Mapping[str, Tensor], alpha: str, beta: str) -> 
     Args:
         images: images (C, h, w), 0..1, by camera.
         alpha: name of alpha.
-        beta: name of the beta, of three bands or one.
+        beta: name of the beta, of three bands or one (not checked).
 
     Returns:
-        Three bands with alpha's luminance, or one, 0..1, at alpha's pixels; where beta does not see a pixel,
-        by seen ones that are similar.
+        Three bands with alpha's luminance, or one, 0..1, at alpha's pixels, detached; where beta does not see
+        a pixel, by seen ones that are similar.
 
     Raises:
-        ValueError: for uncalibrated cameras, lenses, no depth range, and for cameras that look along the line
-            between them or have one centre.
+        ValueError: for unknown or uncalibrated cameras, lenses, no depth range, and for cameras that look
+            along the line between them or have one centre.
+        KeyError: for a camera without an image.
     """
     pair, mono, other = rig.pair(alpha, beta), luminance_of(images[alpha]), images[beta]
     if pair.has_lens:
@@ -170,8 +173,8 @@ def non_local_means(image: Float[Tensor, "c h w"], deviation: float) -> Float[Te
     Patches of 5 x 5 pixels within 6 pixels, h = 0.8 deviations, as its documentation advises.
 
     Args:
-        image: image, values 0..1.
-        deviation: standard deviation of the noise, in the same values.
+        image: image, values 0..1, on the CPU and without a gradient.
+        deviation: standard deviation of the noise, in the same values, above 0.
 
     Returns:
         The image without noise, not clipped.
@@ -343,7 +346,8 @@ def _softened(mono: Image, sharpness: float) -> Image:
 def raw_disparity(left: NDArray[np.uint8], right: NDArray[np.uint8], max_disparity: float) -> Image:
     """Compute the disparity of a left image (h, w) by OpenCV's semi-global matching, without a check.
 
-    The right image has the same size; disparities up to `max_disparity` pixels are searched.
+    The right image has the same size; disparities from 0 to `max_disparity` pixels, or the width, are
+    searched, and up to the next multiple of 16.
 
     Returns:
         Disparity (h, w) of the left image's pixels, in pixels; negative where unknown.

@@ -88,10 +88,11 @@ class Corrections:
             hw: alpha's size without padding.
 
         Returns:
-            The corrected inputs: alpha and RGB betas by the response, segments by the misalignments.
+            The corrected inputs: alpha and RGB betas by the response, segments by the misalignments; fields
+            of positions stay.
 
         Raises:
-            ValueError: for misalignments of other cameras.
+            ValueError: for misalignments of other cameras than these.
         """
         cameras = [camera for names in inputs.cameras for camera in names]
         if self.misalignments and set(cameras) != set(self.misalignments):
@@ -154,8 +155,7 @@ def find_corrections(
         The corrections; the stated or the Rec. 601 response where none is fitted.
 
     Raises:
-        ValueError: for a stated response that is not three weights, none negative, or where there is no RGB
-            beta.
+        ValueError: for a response of another kind, and for stated weights where there is no RGB beta.
     """
     rgb = any(map(_is_rgb, frame.inputs.betas))
     if not isinstance(response, str | Response) and not rgb:

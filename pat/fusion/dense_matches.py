@@ -101,10 +101,11 @@ def matched_depth(images: Images, rig: Rig, *, alpha: str, bands: int | None) ->
             bands that is most similar.
 
     Returns:
-        Depth and confidence at alpha's pixels.
+        Depth and confidence at alpha's pixels, detached.
 
     Raises:
-        ValueError: for images that do not fit the rig, and views that do not overlap.
+        ValueError: for images that do not fit the rig, views that do not overlap, and a field that raises it.
+        TypeError: for images that are no tensors.
     """
     network = MatchesAlone(bands)
     views = Views.of(rig, images, alpha=alpha)

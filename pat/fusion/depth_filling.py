@@ -69,11 +69,11 @@ def final_depth(frame: Frame, frame_inputs: FrameInputs) -> Float[Tensor, "h w"]
 def without_outliers(depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
     """Replace each depth by the median of 5 x 5 pixels, of inverse depth.
 
-    Unknown depth counts as far away; where most is unknown, a pixel keeps its own. Gradients are those of the
-    pixel's own inverse depth.
+    Unknown depth (NaN) counts as far away; where most is unknown, a pixel keeps its own. Gradients are those
+    of the pixel's own inverse depth.
 
     Returns:
-        Depth (H, W), NaN where it was unknown.
+        Depth (H, W), in the same unit, NaN where it was unknown.
     """
     inverse = 1 / depth
     median = torch.from_numpy(cv2.medianBlur(np.nan_to_num(numpy_of(inverse)), 5)).to(depth)
@@ -91,8 +91,8 @@ def background_filled(frame: Frame, frame_inputs: FrameInputs) -> Float[Tensor, 
     bounds that were searched. No gradient passes through planes.
 
     Returns:
-        Depth (H, W), in the rig's unit, NaN where it was unknown; the frame's own where betas on several
-        sides see occluded points.
+        Depth (H, W), in the rig's unit, NaN where it was unknown; the frame's own if betas on several sides
+        see occluded points, for fields of positions, and without any known depth or its half-width.
     """
     depth, confidence, inputs = frame.depth, frame.confidence, frame_inputs.inputs
     steps = [beta.field.pixels for beta in inputs.betas if beta.field.pixels is not None]

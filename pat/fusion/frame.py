@@ -23,13 +23,13 @@ class Frame(NamedTuple):
 
     Attributes:
         image: (C, H, W), in alpha's coding, not clipped to 0..1.
-        depth: (H, W), metres along alpha's axis, or its rays (`measured_along`); NaN where no calibrated beta
-            sees the point.
+        depth: (H, W), along alpha's axis, or its rays (`measured_along`), in the rig's unit; NaN where no
+            calibrated beta sees the point.
         confidence: (H, W), the probability that every band's beta sees the point and its position is right to
             a pixel.
-        half_width: (H, W), 1/metres: in 9 of 10 pixels the true inverse depth is within it of 1 / depth; NaN
-            where depth is.
-        by_band: (C, H, W), the confidence of each band alone, where each is another beta's; else None.
+        half_width: (H, W), one over that unit: in 9 of 10 pixels the true inverse depth is within it of 1 /
+            depth; NaN where depth is.
+        by_band: (C, H, W), the confidence of each band, where they are several betas'; else None.
     """
 
     image: Float[Tensor, "c h w"]

@@ -48,8 +48,8 @@ class Flow(NamedTuple):
 def flow_between(a: Float[Tensor, "1 h w"], b: Float[Tensor, "1 h w"]) -> Flow:
     """Compute optical flow from frame a to b by dense inverse search (Kroeger et al. 2016).
 
-    Frames are grey, 0..1, on the CPU. Values of b are first brought to a's mean: flickering light is no
-    motion.
+    Frames are grey, 0..1, of one size, on the CPU. Values of b are first brought to a's mean: flickering
+    light is no motion.
 
     Returns:
         The flow, weighted by forward-backward consistency and photometric similarity; the weight is 0 where

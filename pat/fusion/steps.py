@@ -71,7 +71,8 @@ def steps_for(network: FusionNetwork, *, normalise: bool, joined: bool = True) -
         joined: True to join co-located betas to one, False to keep each by itself.
 
     Returns:
-        Functions from views to a `StepResult`.
+        Functions from views to a `StepResult`: `undistort`, `linear_luminance` and `upright`; where wanted,
+        `equal_resolution`, `normalise_betas` and `join`.
     """
     resize = [partial(equal_resolution, network)] if network.equal_resolution else []
     radiometry = [partial(normalise_betas, undone=not network.keeps_luminance)] if normalise else []
@@ -82,15 +83,16 @@ def steps_for(network: FusionNetwork, *, normalise: bool, joined: bool = True) -
 def undistort(views: Views) -> StepResult:
     """Replace views with lenses by pinhole views, up to 62 degrees off axis.
 
-    Unchanged if a field goes through lenses, or a camera has no pinhole view. Undone, the frame is at alpha's
-    own pixels: the fusion's difference from alpha is resampled and added to alpha's own image, and pixels
-    outside the pinhole view have confidence 0.
+    Unchanged if no camera has a lens, a field goes through lenses, or a camera has no pinhole view. Undone, a
+    frame of an alpha with a lens is at alpha's own pixels: the fusion's difference from alpha is resampled
+    and added to alpha's own image, and pixels outside the pinhole view have confidence 0 and unknown depth.
 
     Returns:
         The views, and the function that undoes the step.
 
     Raises:
-        ValueError: for an image without a pixel inside its lens's range.
+        ValueError: for an image without a pixel inside its lens's range, and a `Moved` field of another size
+            than alpha's.
     """
     if not takes_pinhole_views(views):
         return StepResult(views)
@@ -125,7 +127,7 @@ def linear_luminance(views: Views) -> StepResult:
 
 
 def upright(views: Views) -> StepResult:
-    """Rotate back betas that are rotated by about a quarter or half a turn against alpha.
+    """Rotate back betas, images and rig, that are rotated by about a quarter or half a turn against alpha.
 
     Returns:
         The views; there is nothing to undo.
@@ -140,12 +142,15 @@ def upright(views: Views) -> StepResult:
 def equal_resolution(network: FusionNetwork, views: Views) -> StepResult:
     """Resize betas to about alpha's angular resolution where views meet.
 
-    Betas within a quarter of it keep their size. A beta that would be enlarged is first cropped to the part
-    that search segments touch, if that is much smaller.
-    smaller.
+    Betas within a quarter of it keep their size; resized images are clipped to 0..1. A beta that would be
+    enlarged is first cropped to the part that search segments touch, if that is much smaller.
 
     Returns:
         The views; there is nothing to undo.
+
+    Raises:
+        ValueError: for an invalid result of a field, or whatever a field raises for its pair.
+        TypeError: for an object that is no field.
     """
     for name in views.betas:
         views = _cropped(network, views, name)
@@ -186,8 +191,8 @@ def normalise_betas(views: Views, *, undone: bool = False) -> StepResult:
     """Give each beta alpha's mean and standard deviation: for cameras of other exposures or filters.
 
     Args:
-        undone: True to give bands their own scale in the result, as measurements need it; else that is as
-            bright as alpha.
+        undone: True to give bands their own mean and deviation again in the result, which must have those of
+            all betas, in order; False to leave it as bright as alpha.
 
     Returns:
         The views, and the function that undoes the step.
@@ -212,8 +217,8 @@ def with_own_levels(
 def join(which: JoinsBands, views: Views) -> StepResult:
     """Join co-located betas of the same size, lens and field to one of several bands.
 
-    Undone, the frame's bands are in the rig's order. For "neighbours" nothing is joined if a beta has three
-    bands.
+    Undone, the frame's bands are in the rig's order, each with its confidence (`by_band`). For "neighbours"
+    nothing is joined if a beta has three bands.
 
     Args:
         which: "neighbours" to join only those that follow each other in the rig, "all", or "no" for none.
@@ -239,13 +244,13 @@ def join(which: JoinsBands, views: Views) -> StepResult:
 
 
 def co_located(rig: Rig, names: Sequence[str], fields: Fields, which: JoinsBands) -> list[list[str]]:
-    """Group the betas with the same K, R, t, lens and size, and the same field.
+    """Group the calibrated betas with the same K, R, t, lens, size and field; sensors may differ.
 
     Args:
         which: "neighbours" to group only those that follow each other, "all", or "no" for none.
 
     Returns:
-        Groups of names, in order.
+        Groups of names, in order; a beta without another like it is a group of one.
     """
     groups: list[list[str]] = []
     for name in names:
@@ -262,11 +267,14 @@ def co_located(rig: Rig, names: Sequence[str], fields: Fields, which: JoinsBands
 def without_lenses(rig: Rig, images: Images) -> tuple[Rig, dict[str, Tensor]]:
     """Replace cameras with lenses, and their images, by pinhole views; see `arraygeom.pinhole_view`.
 
+    Cameras without an image, and pinholes with theirs, stay as they are.
+
     Returns:
-        The rig, and the images resampled; pixels outside a lens's range repeat the nearest one inside.
+        The rig, and the images resampled, at least 0; pixels outside a lens's range repeat the nearest one
+        inside.
 
     Raises:
-        ValueError: for an image without a pixel inside its lens's range.
+        ValueError: for an image without a pixel inside its lens's range, or of another size than its camera.
     """
     straight = dict(images)
     for name, image in images.items():
