@@ -113,8 +113,8 @@ def classical(rig: Rig, images: Mapping[str, Tensor], alpha: str, beta: str) -> 
         beta: name of the beta, of three bands or one (not checked).
 
     Returns:
-        Three bands with alpha's luminance, or one, 0..1, at alpha's pixels, detached; where beta does not see
-        a pixel, by seen ones that are similar.
+        Three bands with alpha's luminance, or one, 0..1, at alpha's pixels; where beta does not see a pixel,
+        by seen ones that are similar.
 
     Raises:
         ValueError: for unknown or uncalibrated cameras, lenses, no depth range, and for cameras that look

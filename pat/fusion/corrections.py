@@ -72,7 +72,7 @@ class Corrections:
 
     Attributes:
         response: response of alpha in terms of beta's bands.
-        misalignments: misalignment by camera; empty if none is to be corrected.
+        misalignments: misalignment by camera of the betas, zeros for none; empty if none has any.
     """
 
     response: Response

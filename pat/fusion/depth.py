@@ -89,7 +89,7 @@ def certain(output: FusionOutput, matches: Matches | None, inputs: Inputs) -> Fu
 def measured_depth(
     output: FusionOutput, inputs: Inputs, placements: list[Placement], hw: HW, corner: tuple[int, int]
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Compute depth from the calibrated betas, weighted by confidence in inverse depth.
+    """Compute depth from the calibrated betas: the mean of inverse depths, weighted by their confidences.
 
     A position whose depth is beyond the bounds that were searched counts as the end of its segment: a pixel
     beyond the far end may otherwise stand for any distance.

@@ -64,7 +64,7 @@ class FuseSettings:
             True unless the fusion is differentiable, where a corrected rig has no gradient of its error.
         noise: noise level of each camera that has some, or "estimate": views are denoised before they are
             matched, and jointly after they are fused. "auto" does so only if an image shows noise plainly.
-            None for no denoising; {} too where None stands for "auto" (`pat.fuse` without a rig).
+            None for no denoising; but `pat.fuse` without a rig takes None for "auto", and only {} for none.
         keep_alpha: True to leave alpha's values as recorded, noise included; as is done too if alpha has no
             noticeable noise.
         luminance: luminance of the image: "alpha", which the network keeps exactly, that of "beta" in alpha's

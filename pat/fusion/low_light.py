@@ -127,7 +127,7 @@ class LowLight:
     ) -> Frame:
         """Add the brightness and colours that betas recorded to a frame fused from the denoised views.
 
-        Nothing is added unless all betas are RGB, and brightness only to a noisy alpha that is similar to a
+        Betas add nothing unless all are RGB, and brightness only to a noisy alpha that is similar to a
         combination of their bands.
 
         Args:

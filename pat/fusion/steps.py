@@ -115,7 +115,7 @@ def linear_luminance(views: Views) -> StepResult:
     """Schedule the correction of luminance for an alpha that measured light; the views stay as they are.
 
     Undone, a frame in RGB betas' colours has the luminance of light that alpha measured (`match_luminance`).
-    For other alphas nothing happens.
+    For other alphas, and without a beta of three bands, nothing happens.
 
     Returns:
         The views, and the function that undoes the step.
