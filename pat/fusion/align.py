@@ -242,8 +242,7 @@ def _as_recorded(confidence: Float[Tensor, "1 h w"], now: View, recorded: View) 
 def _located(
     inputs: FrameInputs, i: int, matches: BetaMatches, recorded: View
 ) -> tuple[Float[Tensor, "h w 2"], Bool[Tensor, "h w"]]:
-    """Return the positions of alpha's recorded pixels in the i-th beta as prepared, with a mask of those on
-    it."""
+    """Return positions of alpha's recorded pixels in the i-th beta as prepared, with a mask of those on it."""
     h, w = inputs.hw
     beta, pinhole = inputs.inputs.betas[i], inputs.placements[i].pair.alpha
     hw = (beta.image.shape[-2], beta.image.shape[-1])

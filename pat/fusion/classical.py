@@ -245,8 +245,7 @@ def _rectified_plane(pair: Pair) -> _Plane:
 
 
 def _rectifying_rotation(R: NDArray, t: NDArray) -> NDArray[np.float64]:
-    """Return the rotation from alpha's axes to axes with x along the baseline and z near the mean of both
-    optical axes."""
+    """Return the rotation from alpha's axes to x along the baseline, z near the mean of both optical axes."""
     baseline = R.T @ t
     if not np.linalg.norm(baseline) > 0:
         raise ValueError("both cameras have the same centre (t is zero): there is no depth to match")
@@ -264,8 +263,7 @@ def _project(H: NDArray, points: NDArray) -> tuple[NDArray[np.float64], NDArray[
 
 
 class _Correspondence(NamedTuple):
-    """Positions of `mono`'s pixels in the other image, with masks of visible pixels and weights of consistent
-    ones."""
+    """Positions of `mono`'s pixels in the other image, mask of visible ones, weights of consistent ones."""
 
     columns: Image
     rows: Image
@@ -310,8 +308,7 @@ def checked_disparity(
 def _warped_chroma(
     mono: Image, colours: Image, inside: Image, max_disparity: float, sharpness: float
 ) -> Image:
-    """Compute colour differences (R - Y, B - Y) of `colours` at `mono`'s pixels; both (h, w) on one rectified
-    grid.
+    """Compute differences (R - Y, B - Y) of `colours` at `mono`'s pixels, both (h, w) on one rectified grid.
 
     `inside` is 1 where `colours` has content; `sharpness` is their resolution over mono's.
     """
@@ -360,8 +357,7 @@ def raw_disparity(left: NDArray[np.uint8], right: NDArray[np.uint8], max_dispari
 
 
 def _normalised(luma: Image, mono: Image, weight: Image) -> Image:
-    """Return `luma` with mono's mean and standard deviation, so that cameras of different exposure can be
-    compared."""
+    """Return `luma` with mono's mean and standard deviation: cameras may differ in exposure."""
     mean, deviation = _mean_and_deviation(luma, weight)
     wanted_mean, wanted_deviation = _mean_and_deviation(mono, weight)
     gain = wanted_deviation / deviation if deviation > 1e-3 else 1.0

@@ -255,8 +255,7 @@ class _Matches(NamedTuple):
 
 
 def _of_beta(alpha: Tensor, before: Beta, beta: Beta, matches: BetaMatches, hw: HW) -> _Matches:
-    """Return the data for corrections: a beta's blurred bands at alpha's pixels, alpha, and
-    reliable matches."""
+    """Return a beta's blurred bands at alpha's pixels, alpha, and reliable matches."""
     h, w = hw
     positions, valid = matches.positions(beta.field.straight, (beta.image.shape[-2], beta.image.shape[-1]))
     where = positions[0, :h, :w]

@@ -136,8 +136,7 @@ def _filled_rows(
     unit: float,
     bounds: tuple[float, float],
 ) -> Float[Tensor, "h w"]:
-    """Compute depth by matches and planes, which are computed for every second pixel, in units of inverse
-    depth.
+    """Compute depth by matches and planes, these for every second pixel, in units of inverse depth.
 
     `least` is the confidence from which matches count before any plane is known; `bounds` are planes', in
     these units.
@@ -165,8 +164,7 @@ def _far_by_depth(inverse: Plane) -> list[Plane]:
 
 
 def _far_by_slope(inverse: Plane) -> list[Plane]:
-    """Return a guide whose changes of 1 are those of slopes, by a half-width in two pixels:
-    planes are whole."""
+    """Return a guide whose changes of 1 are those of slopes, by a half-width in two pixels."""
     return [np.diff(inverse, axis=axis, append=inverse.take([-1], axis)) for axis in (0, 1)]
 
 

@@ -49,8 +49,7 @@ class Frame(NamedTuple):
         return 1 / (inverse + self.half_width), farthest
 
     def mapped(self, change: Callable[[Tensor], Tensor]) -> Frame:
-        """Return the frame with a function applied to each tensor, such as one that moves it to another
-        device."""
+        """Return the frame with a function applied to each tensor, as one that moves it to another device."""
         return Frame(*(tensor if tensor is None else change(tensor) for tensor in self))  # type: ignore[arg-type]
 
     def __repr__(self) -> str:
@@ -61,8 +60,7 @@ class Frame(NamedTuple):
         return f"Frame({w}x{h}, {bands} bands, {depth}, mean confidence {self.confidence.mean():.2f})"
 
     def _repr_png_(self) -> bytes:
-        """Return the image and, beside it, depth (red is near) and confidence, as a PNG file for
-        notebooks."""
+        """Return the image, depth (red is near) and confidence side by side, as a PNG file for notebooks."""
         confidence = self.confidence[None].expand(3, -1, -1)
         parts = picture_of(self.image).expand(3, -1, -1), colour_depth(self.depth), confidence
         factor = min(SHOWN / max(self.image.shape[-2:]), 1.0)

@@ -124,8 +124,7 @@ def _endings(files: Files) -> Keys | None:
 
 
 def _numbers(files: Files) -> Keys | None:
-    """Return numbers in names that differ between a camera's files; of single ones, nearly equal times as
-    equal.
+    """Return numbers in names that differ between a camera's files; single ones that nearly agree as equal.
 
     None where two files of a camera have the same, or some have other numbers of numbers.
     """

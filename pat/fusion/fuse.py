@@ -328,9 +328,6 @@ def _given(kind: type[T], value: T) -> T:
 def matches_by(matcher: Matcher, inputs: Inputs) -> Matches:
     """Match inputs by a matcher, and check its result.
 
-    Returns:
-        The matches.
-
     Raises:
         TypeError: for a result of another type.
         ValueError: for matches that `Matches.check` refuses. The matcher's own errors pass.

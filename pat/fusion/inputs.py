@@ -215,8 +215,7 @@ def bounds_of(field: ReceptiveField) -> Literal["depth", "distance"]:
 
 
 def measured_along(views: Views) -> Literal["depth", "distance"]:
-    """Return the kind of depth of a frame of these views: "depth" along alpha's axis or "distance" along its
-    rays."""
+    """Return the kind of a frame's depth: "depth" along alpha's axis or "distance" along its rays."""
     if takes_pinhole_views(views):
         return "depth"
     fields = (views.fields.get(name) or default_field(views.pair(name)) for name in views.betas)

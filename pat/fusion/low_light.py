@@ -107,8 +107,7 @@ class LowLight:
         return f"noise shows plainly and is removed: {', '.join(texts)}; --noise none leaves it"
 
     def kept(self, hw: HW, betas: int) -> float:
-        """Return the bytes held until the frame of this size is corrected: views, its pixels' positions in
-        each beta."""
+        """Return the bytes held until a frame of this size is corrected: views, positions in each beta."""
         if not self.noisy:
             return 0.0
         images = [*self.given.images.values(), *self.views.images.values()]

@@ -74,8 +74,7 @@ def warped(image: Float[Tensor, "c h w"], step: Float[Tensor, "2 h w"]) -> Float
 
 
 def _steps(a: Tensor, b: Tensor) -> Float[Tensor, "2 h w"]:
-    """Compute the flow of frames extended to two of OpenCV's patches a side: it refuses smaller ones, or
-    crashes."""
+    """Compute the flow of frames extended to two of OpenCV's patches a side: it may crash by smaller ones."""
     h, w = a.shape[-2:]
     engine = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     least = 2 * engine.getPatchSize()

@@ -209,8 +209,7 @@ def describe_bands(frame: Frame, names: Sequence[str], kind: ImageFormat) -> str
 
 
 def depth_scale(near: float) -> float:
-    """Return counts per metre in a 16-bit depth image: the power of ten with which `near` is at most a
-    twentieth."""
+    """Return counts per metre of a 16-bit depth image: a power of ten, so that `near` is at most MOST / 20."""
     return 10.0 ** math.floor(math.log10(MOST / 20 / near))
 
 

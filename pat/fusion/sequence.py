@@ -126,21 +126,15 @@ class SequenceFusion:
         return grey_alpha(self.alpha, self.frames[self.alpha][i])
 
     def grey(self, i: int) -> Float[Tensor, "1 h w"]:
-        """Return alpha's frame in grey, denoised if its noise is known or estimated; colours follow its
-        motion."""
+        """Return alpha's frame in grey, denoised if its noise is known or estimated, to find motion in."""
         return grey_alpha(self.alpha, self._quiet[i])
 
     def base(self, i: int) -> Float[Tensor, "1 h w"]:
-        """Return the image to which colours are added: with `keep_alpha` alpha's frame as recorded, else
-        `grey`."""
+        """Return the image that colours are added to: alpha as recorded with `keep_alpha`, else `grey`."""
         return self.recorded(i) if self.settings.keep_alpha else self.grey(i)
 
     def alone(self, i: int) -> Frame:
-        """Fuse a frame alone with the betas nearest in time, for comparison with warping.
-
-        Returns:
-            The frame.
-        """
+        """Fuse a frame alone with the betas nearest in time, for comparison with warping."""
         return self._fused(i, self.timeline.at(i), {}, alone=True)
 
     def colour(self, key: KeyFrame) -> KeyColour:
@@ -329,8 +323,7 @@ class SequenceFusion:
         )
 
     def _levels(self, names: Iterable[str], i: int) -> tuple[Moments, dict[str, Moments]]:
-        """Return moments of alpha's and of each beta's images over several key frames, so as not
-        to flicker."""
+        """Return moments of alpha's and each beta's images over several key frames, so as not to flicker."""
         keys = self.timeline.key_frames()
         nearest = min(range(len(keys)), key=lambda k: abs(keys[k].alpha - i))
         around = keys[max(nearest - SETTINGS.neighbours, 0) : nearest + SETTINGS.neighbours + 1]

@@ -208,8 +208,7 @@ def normalise_betas(views: Views, *, undone: bool = False) -> StepResult:
 def with_own_levels(
     frame: Frame, bands: Sequence[int], alpha_level: Moments, beta_levels: Sequence[Moments]
 ) -> Frame:
-    """Return a frame whose bands, so many of each beta, have each its beta's own level in place
-    of alpha's."""
+    """Return a frame whose bands, so many of each beta, have their beta's level in place of alpha's."""
     parts = zip(frame.image.split(list(bands)), beta_levels, strict=True)
     return frame._replace(image=torch.cat([alpha_level.matched(planes, scale) for planes, scale in parts]))
 
@@ -337,8 +336,7 @@ def _distorted(frame: Frame, straight: Tensor, original: Tensor, pinhole: View, 
 
 
 def of_size(image: Float[Tensor, "c h w"], hw: HW) -> Float[Tensor, "c h2 w2"]:
-    """Return an image of this size, by cubic interpolation, clipped to 0..1; the image itself if it has that
-    size."""
+    """Return an image of this size, by cubic interpolation, clipped to 0..1; itself if it has that size."""
     if image.shape[-2:] == hw:
         return image
     resized = interpolate(image[None], size=hw, mode="bicubic", align_corners=False, antialias=True)
@@ -357,16 +355,14 @@ def hw_at_alphas_resolution(pair: Pair) -> HW:
 
 
 def resolution_ratio(pair: Pair) -> float:
-    """Return pixels of beta per pixel of alpha, by the pair's rough homography at alpha's middle; 1 if
-    undefined."""
+    """Return pixels of beta per pixel of alpha, by the rough homography at its middle; 1 if undefined."""
     steps = _steps_in_beta(pair)
     area = 0.0 if steps is None else abs(float(torch.linalg.det(steps)))
     return math.sqrt(area) if area > 0 else 1.0
 
 
 def quarter_turns(pair: Pair) -> int:
-    """Return the number of quarter turns (see `Camera.rot90`), 0 to 3, that make beta's image upright like
-    alpha's; 0 if undefined."""
+    """Return the quarter turns (`Camera.rot90`), 0 to 3, that make beta upright as alpha; 0 if undefined."""
     steps = _steps_in_beta(pair)
     if steps is None:
         return 0
@@ -375,8 +371,7 @@ def quarter_turns(pair: Pair) -> int:
 
 
 def _steps_in_beta(pair: Pair) -> Float[Tensor, "2 2"] | None:
-    """Return the steps in beta of a pixel right and one down from alpha's middle, by the pair's rough
-    homography."""
+    """Return steps in beta, by the rough homography, of a pixel right and one down from alpha's middle."""
     h, w = pair.alpha.hw
     middle = torch.tensor([[(w - 1) / 2, (h - 1) / 2]], dtype=torch.float64)
     steps = torch.cat([middle, middle + torch.tensor([[1.0, 0.0], [0.0, 1.0]], dtype=torch.float64)])

@@ -160,8 +160,7 @@ def tiles_within(
 
 
 def working_memory(network: FusionNetwork, inputs: Inputs, tile: Tile) -> float:
-    """Return the bytes of a tile: those for its part of alpha and the part of each beta that its segments
-    touch."""
+    """Return the bytes of a tile: its part of alpha, and the part of each beta that its segments touch."""
     betas = [area(inputs.touched(beta, tile.outer, 16)) for beta in inputs.betas]
     return network.working_bytes(area(tile.outer), betas)
 

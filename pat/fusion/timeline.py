@@ -68,8 +68,7 @@ class Timeline:
         return self.rig[name].sensor.time_offset + i / self.rate(name)
 
     def nearest(self, name: str, time: float) -> int:
-        """Return the number of the frame recorded nearest to a time: the first or last one outside the
-        recording."""
+        """Return the number of the frame recorded nearest to a time; the first or last one beyond these."""
         i = round((time - self.rig[name].sensor.time_offset) * self.rate(name))
         return min(max(i, 0), self.counts[name] - 1)
 

@@ -115,8 +115,7 @@ class Views:
         return [name for name in self.rig.betas(self.alpha) if name in self.images]
 
     def pair(self, beta: str) -> Pair:
-        """Return alpha and a beta, with the depth range that is searched: fields may have bounds of their
-        own."""
+        """Return alpha and a beta, with the depth range that is searched: a field may have its own."""
         pair, field = self.rig.pair(self.alpha, beta), innermost(self.fields.get(beta))
         field = innermost(field.field) if isinstance(field, ThroughLenses) else field
         if not (pair.calibrated and isinstance(field, Curved | Epipolar)):

@@ -139,8 +139,7 @@ def _chosen(inputs: Inputs, matches: BetaMatches, network: Choice) -> BetaMatche
 def _answered(
     k: int, views: ComparedViews, segments: Segments, matches: BetaMatches, typical: Tensor, network: Choice
 ) -> tuple[Float[Tensor, "b 1 h w"], Float[Tensor, "b 2 h2 w2"]]:
-    """Return the disparity chosen, and the statements about it, all turned so many quarter turns for the
-    network."""
+    """Return the disparity chosen, and the statements about it, all turned for the network and back."""
 
     def turned(x: Tensor, by: int = k, sides: tuple[int, int] = (-2, -1)) -> Tensor:
         return x.rot90(by, sides) if k else x  # turned by nothing it would be a copy
@@ -164,8 +163,7 @@ def _answered(
 
 
 def quarter_turns(segments: Segments) -> Int[Tensor, "b h w"]:
-    """Compute the quarter turns (`Tensor.rot90`), 0 to 3, after which a segment's near end is left of its far
-    end.
+    """Compute the quarter turns (`Tensor.rot90`), 0 to 3, that bring a segment's start left of its end.
 
     That is the order of rectified views whose alpha is on the left.
     """

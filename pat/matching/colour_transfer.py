@@ -211,8 +211,7 @@ def _fills(inputs: Inputs, carried: Sequence[tuple[Tensor, Tensor, Tensor]]) -> 
 
 
 def directions_of(segments: Segments) -> Float[NDArray, "2 2"]:
-    """Compute the mean outer product of the unit vectors along valid segments; half the identity
-    without any."""
+    """Compute the mean outer product of unit vectors along valid segments; half the identity without any."""
     some = (segments.end - segments.start)[..., ::DIRECTIONS, ::DIRECTIONS, :].detach().double()
     some = some[segments.valid[..., ::DIRECTIONS, ::DIRECTIONS]]
     units = some[some.norm(dim=-1) > LEAST].cpu().numpy()
@@ -365,8 +364,7 @@ def _colours_of_bands(
 def _scaled_to_alpha(
     colour: Tensor, brightness: Tensor, alpha: Tensor, weight: Tensor, power: float
 ) -> tuple[Tensor, Tensor]:
-    """Return colour differences (B, C, H, W) and brightness of beta, larger where alpha is brighter around a
-    pixel.
+    """Return beta's colour differences (B, C, H, W) and brightness, larger where alpha is brighter around.
 
     Light or a lens that makes a surface brighter keeps its saturation, a reflection does not: the power is in
     between; and 0 where alpha sees another spectrum, such as near infrared: there the ratio is of materials.
@@ -459,8 +457,7 @@ def colour_noise(
 
 
 def _without_noise(colour: Tensor, brightness: Tensor, noise: Tensor) -> Tensor:
-    """Return colour (B, C, H, W) nearer its local regression on brightness, the noisier the rest
-    (Lee 1980)."""
+    """Return colour (B, C, H, W) nearer its regression on brightness, the noisier the rest (Lee 1980)."""
     local = LocalMoments.within(SETTINGS.detail_radius, colour, brightness)
     slope = local.slope(SETTINGS.floor)
     fitted = local.bands + slope * (brightness - local.image)
@@ -478,8 +475,7 @@ def _each_detailed(colour: Tensor, brightness: Tensor, alpha: Tensor, radii: Seq
 def _detailed(
     colour: Tensor, brightness: Tensor, alpha: Tensor, radius: int = SETTINGS.detail_radius
 ) -> Tensor:
-    """Move colour (B, C, H, W) along its local regression on brightness by the excess of alpha's
-    brightness."""
+    """Move colour (B, C, H, W) along its local regression on brightness by the excess of alpha's."""
 
     def of(colour: Tensor, brightness: Tensor, alpha: Tensor) -> Tensor:
         return colour + local_slope(colour, brightness, radius) * SETTINGS.detail(alpha - brightness)
@@ -515,8 +511,7 @@ def local_slope(
 def _diffused(
     colour: NDArray, brightness: NDArray, weight: NDArray, guide: NDArray[np.uint8]
 ) -> NDArray[np.float32]:
-    """Compute colour (c, h, w) by its weighted regression on brightness (h, w) over connected regions of the
-    guide.
+    """Compute colour (c, h, w) by its regression on brightness (h, w) over connected regions of the guide.
 
     The moments of the guided filter (He et al. 2013), diffused instead of averaged over a window: a region
     that no beta sees has colour that varies with brightness as it does nearby.

@@ -42,8 +42,7 @@ def blurred(images: Float[Tensor, "b 1 h w"], blurs: Sequence[float]) -> Float[T
 
 
 def box_mean(x: Tensor, radius: int) -> Tensor:
-    """Compute means of planes (*b, h, w) over squares of side 2 `radius` + 1, as far as these are on the
-    image."""
+    """Compute means of planes (*b, h, w) over squares of side 2 `radius` + 1, as far as on the image."""
     side = 2 * radius + 1
     if compilable(x) and not x.requires_grad:
         return _box_mean_of_numbers(x, radius)
@@ -93,8 +92,7 @@ class LocalMoments(NamedTuple):
         return cls(centre, middle, variation, variance, mean(bands * image) - centre * middle)
 
     def slope(self, floor: float) -> Float[Tensor, "b c h w"]:
-        """Return the slope of the bands' regression on the image, whose variance is regularised
-        by the floor."""
+        """Return the slope of the bands' regression on the image, whose variance the floor regularises."""
         return self.covariance / (self.variance_of_image + floor)
 
 

@@ -151,8 +151,7 @@ class Inputs:
         return [replace(self, betas=(beta,)) for beta in self.betas]
 
     def cut(self, box: Box) -> Inputs:
-        """Return a part of alpha, (top, bottom, left, right), with the part of each beta that its segments
-        touch."""
+        """Return a part of alpha, (top, bottom, left, right), with the part of each beta that it touches."""
         top, bottom, left, right = box
         return replace(
             self,

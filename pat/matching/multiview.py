@@ -176,14 +176,12 @@ class MatchedBeta:
         return x / z, y / z
 
     def disparity_of(self, inverse_depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-        """Return the distance of the point of an inverse depth from its segment's end, pixels;
-        not clipped."""
+        """Return the distance of a point from its segment's end by inverse depth, pixels; not clipped."""
         (x, y), (u, v) = self._seen(inverse_depth), self.extent.towards.unbind(-1)
         return torch.addcmul(x * u, y, v) - self._end
 
     def depth_buffer(self) -> Float[Tensor, " n"]:
-        """Return an empty depth buffer: the nearest inverse depth at each pixel of half of beta's size, row
-        by row.
+        """Return an empty depth buffer: the nearest inverse depth at each pixel of half the size, by rows.
 
         Alpha's pixels leave no holes at that size. One more element is for points outside.
         """
@@ -196,8 +194,7 @@ class MatchedBeta:
     def distance_from_front(
         self, inverse_depth: Float[Tensor, "h w"], buffer: Float[Tensor, " n"]
     ) -> Float[Tensor, "h w"]:
-        """Return the distance in pixels of the nearest point at the same pixel of beta; infinite off the
-        image."""
+        """Return the distance in pixels from the nearest point at beta's pixel; infinite off the image."""
         index = self._index(inverse_depth)
         (x, y), (u, v) = self._seen(buffer[index]), self._seen(inverse_depth)
         apart = torch.hypot(x - u, y - v)  # not along the segments: around a known depth they may be points
@@ -305,8 +302,7 @@ def with_likeliest_colours(inputs: Inputs, own: Matches, agreed: Matches) -> Mat
 
 
 def _likelier(piece: Inputs, own: BetaMatches, agreed: BetaMatches) -> Float[Tensor, "b 1 h w"]:
-    """Return, of a piece with one beta, the disparity of each pixel at which beta is more similar
-    to alpha."""
+    """Return, of a piece with one beta, each pixel's disparity at which beta is more similar to alpha."""
     (beta,) = piece.betas
     alpha, other, *_ = own.comparison.views(piece.alpha, beta.image)
     mine, theirs = (
@@ -318,8 +314,7 @@ def _likelier(piece: Inputs, own: BetaMatches, agreed: BetaMatches) -> Float[Ten
 def _of_all(
     inputs: Inputs, views: Sequence[Callable[[tuple[int, int]], MatchedBeta]], initial: Sequence[BetaMatches]
 ) -> Iterator[BetaMatches]:
-    """Return the matches of each beta from the inverse depths on which all agree; `views` are by rows of
-    alpha."""
+    """Return the matches of each beta from the inverse depths on which `views`, by rows of alpha, agree."""
     height, width = inputs.hw
     strips = spans(height, max(STRIP // width // FINE, 1) * FINE)
     parts = [Agreement.from_views([at(rows) for at in views], inputs.alpha) for rows in strips]
@@ -397,8 +392,7 @@ class _Sampled(NamedTuple):
 def _most_agreed(
     terms: Float[Tensor, "n k"], measured: Float[Tensor, " n"], rise: Tensor
 ) -> Float[Tensor, " k"]:
-    """Return the factors of the terms with which most measured values agree; then by least
-    squares of these."""
+    """Return the factors of the terms with which most measured values agree, by least squares of these."""
     n, k = terms.shape
     size = terms.abs().amax(0).clamp(min=1e-12)
     scaled = terms / size

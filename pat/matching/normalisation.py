@@ -192,8 +192,7 @@ def equalising_blurs(
 
 
 def _equal_blur(image: Float[Tensor, "1 h w"], wanted: float) -> float:
-    """Return the blur after which an image is so sharp: sharpness falls exponentially between two of the
-    blurs."""
+    """Return the blur after which an image is so sharp; sharpness falls exponentially between two blurs."""
     less, before = 0.0, _sharpness(image)
     if before <= wanted:
         return less

@@ -136,8 +136,7 @@ class Response(NamedTuple):
         return alpha if total == 1 else alpha / total
 
     def of_beta(self, beta: Float[Tensor, "*b 3 h w"]) -> Float[Tensor, "*b 3 h w"]:
-        """Return beta at alpha's exposure, sheared along grey so that its Rec. 601 luma is the combination
-        that alpha sees."""
+        """Return beta at alpha's exposure, sheared along grey so that its luma is the mix that alpha sees."""
         scaled = self.exposed(beta)
         return scaled + self._shear(scaled)
 
@@ -191,9 +190,6 @@ def given_response(response: ResponseSpec) -> Response:
 
     Args:
         response: "fit", "rec601", three weights of red, green and blue, or a `Response`, returned as it is.
-
-    Returns:
-        The response.
 
     Raises:
         ValueError: for a value of another kind, and weights that `stated_response` refuses.
@@ -275,8 +271,7 @@ class _Kind(NamedTuple):
     def evidence(
         self, gram: Float[Tensor, "g m m"], further: Float[Tensor, " s"]
     ) -> tuple[Float[Tensor, " g"], Float[Tensor, "g m-1"]]:
-        """Return the logarithm of alpha's probability for each gamma, up to a constant, and the best
-        coefficients.
+        """Return log-probabilities of alpha by gamma, up to a constant, and the best coefficients.
 
         `gram`: the inner products of bands, shading and alpha, whitened; `further`: the expected shading.
         """

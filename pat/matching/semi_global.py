@@ -248,8 +248,7 @@ def flat(planes: Sequence[NDArray]) -> tuple[NDArray, ...]:
 
 
 def _boxes(hw: Sequence[int], along: NDArray, labels: int, settings: SemiGlobalSettings) -> list[Tile]:
-    """Return blocks and margins: as high as an image with few costs, else longer along the segments than
-    across."""
+    """Return blocks with margins: as high as an image with few costs, else longer along the segments."""
     side, margin = settings.block, settings.margin
     if hw[0] * (side + 2 * margin) * labels <= settings.most_costs:
         return list(tiles_of(hw, (hw[0], side), margin))
