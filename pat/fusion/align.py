@@ -177,7 +177,7 @@ def align_frame(
         network: network that uses matches.
         settings: settings of fusion.
         recorded: values to resample, of the images' sizes; None for the images themselves.
-        interpolation: interpolation of values.
+        interpolation: "nearest", "bilinear" or "cubic", of the values.
         min_confidence: confidence below which a pixel counts as occluded.
         fill: "none" for 0 or NaN where a camera does not see the point, "propagate" for the nearest value.
         explain: function that is called with lines about what was corrected; None for none.
@@ -242,7 +242,7 @@ def _as_recorded(confidence: Float[Tensor, "1 h w"], now: View, recorded: View) 
 def _located(
     inputs: FrameInputs, i: int, matches: BetaMatches, recorded: View
 ) -> tuple[Float[Tensor, "h w 2"], Bool[Tensor, "h w"]]:
-    """Return positions of alpha's recorded pixels in the i-th beta as prepared, with a mask of those on it."""
+    """Return positions of alpha's recorded pixels in the i-th beta as prepared, and a mask of those on it."""
     h, w = inputs.hw
     beta, pinhole = inputs.inputs.betas[i], inputs.placements[i].pair.alpha
     hw = (beta.image.shape[-2], beta.image.shape[-1])
@@ -312,7 +312,16 @@ class _ViewRule:
         confidence: Float[Tensor, "h w"],
         values: NDArray[Any],
     ) -> AlignedView:
-        """Return a beta's values (C, hb, wb) at alpha's pixels, which are `located` in it as prepared."""
+        """Resample a beta's recorded values (C, hb, wb) to alpha's pixels.
+
+        Args:
+            camera: the beta as recorded.
+            name: its name.
+            place: its relation to alpha, as prepared for matching.
+            located: positions of alpha's pixels in the prepared beta, with a mask of those on it.
+            confidence: confidence of each position, 0 to 1.
+            values: the recorded values.
+        """
         now = place.pair.beta
         assert isinstance(now, LensView)
         where, valid = chunked(lambda x: recorded_pixels(x, now, camera), located[0].double(), axis=0)

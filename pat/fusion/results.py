@@ -209,7 +209,7 @@ def describe_bands(frame: Frame, names: Sequence[str], kind: ImageFormat) -> str
 
 
 def depth_scale(near: float) -> float:
-    """Return counts per metre of a 16-bit depth image: a power of ten, so that `near` is at most MOST / 20."""
+    """Return counts per metre of a 16-bit depth image: a power of ten that makes `near` at most MOST / 20."""
     return 10.0 ** math.floor(math.log10(MOST / 20 / near))
 
 
