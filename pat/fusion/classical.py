@@ -110,18 +110,20 @@ def classical(rig: Rig, images: Mapping[str, Tensor], alpha: str, beta: str) -> 
     Args:
         images: images (C, h, w), 0..1, by camera.
         alpha: name of alpha.
-        beta: name of the beta, of three bands or one (not checked).
+        beta: name of the beta, of three bands or one.
 
     Returns:
         Three bands with alpha's luminance, or one, 0..1, at alpha's pixels; where beta does not see a pixel,
         by seen ones that are similar.
 
     Raises:
-        ValueError: for unknown or uncalibrated cameras, lenses, no depth range, and for cameras that look
-            along the line between them or have one centre.
+        ValueError: for unknown or uncalibrated cameras, lenses, no depth range, another number of bands, and
+            cameras that look along the line between them or have one centre.
         KeyError: for a camera without an image.
     """
     pair, mono, other = rig.pair(alpha, beta), luminance_of(images[alpha]), images[beta]
+    if len(other) not in (1, 3):
+        raise ValueError(f"'{beta}' has {len(other)} bands: the classical baseline takes one or three")
     if pair.has_lens:
         raise ValueError("the classical baseline needs pinhole cameras: undistort the images first")
     plane = _rectified_plane(pair)
@@ -174,7 +176,7 @@ def non_local_means(image: Float[Tensor, "c h w"], deviation: float) -> Float[Te
 
     Args:
         image: image, values 0..1, on the CPU and without a gradient.
-        deviation: standard deviation of the noise, in the same values, above 0.
+        deviation: standard deviation of the noise, in the same values.
 
     Returns:
         The image without noise, not clipped.

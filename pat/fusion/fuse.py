@@ -138,8 +138,8 @@ def fuse_frame(
         TypeError: for images, settings, corrections, fields or matches of another type.
         OSError: if a finished tile cannot be written to `store`.
     """
-    align = not differentiable if settings.align is None else settings.align
-    settings = replace(_given(FuseSettings, settings), align=align)
+    given = _given(FuseSettings, settings).align
+    settings = replace(settings, align=not differentiable if given is None else given)
     in_parts, luminance = settings.max_memory is not None or store is not None, settings.luminance
     _check_gradients(differentiable, in_parts=in_parts, noisy=bool(settings.noise))
     check_luminance(network, luminance, noisy=settings.noise is not None)

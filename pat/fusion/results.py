@@ -121,8 +121,8 @@ def save_frame(
         Paths of the files, the image first; a shared view.yaml is not among them.
 
     Raises:
-        ValueError: for bits that the format cannot hold, EXR without its extra, and an image or confidence
-            with NaN or infinity.
+        ValueError: for bits that the format cannot hold, EXR without its extra, an image or confidence with
+            NaN or infinity, and `points` of a frame of two bands.
         FileExistsError: for files in the way that no fusion wrote.
         OSError: if files cannot be written. After any error those of a former frame stay.
     """

@@ -83,7 +83,7 @@ class Views:
             ValueError: for a camera that the rig lacks, no image of alpha or of any beta, an alpha of other
                 bands than one and three, a depth range that `Rig` refuses, and as `range_of` and
                 `check_exposures`. Images that are read when asked for raise as their mapping does.
-            TypeError: for images that are no tensors, or have no names.
+            TypeError: for images that are no tensors, or have no names, and a depth range that is no pair.
         """
         if not isinstance(images, Mapping):
             raise TypeError(f"the images are a {type(images).__name__}: give {{NAME: image}}, by camera")
