@@ -87,7 +87,6 @@ def classical_view(
     Raises:
         ValueError: for cameras that are not calibrated, have no pinhole view or cannot be rectified, no depth
             range, and images that do not fit the rig (`Views.of`).
-        TypeError: for images that are no tensors.
     """
     if names := [name for name in images if not isinstance(rig[name], Camera)]:
         raise ValueError(
