@@ -292,7 +292,7 @@ def checked_disparity(
     Args:
         left: left rectified image (h, w).
         right: right rectified image of the same size.
-        max_disparity: largest disparity, pixels.
+        max_disparity: largest disparity, pixels, rounded up as in `raw_disparity`.
 
     Returns:
         Disparity (h, w) in pixels, from x in the left image to x - disparity in the right, negative where
