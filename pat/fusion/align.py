@@ -68,9 +68,11 @@ class AlignedView:
             unless filled.
         positions: (H, W, 2), float32, positions of alpha's pixels in the recorded image (x, y); NaN beyond
             its edge.
-        visibility: (H, W), `OUTSIDE`, `OCCLUDED` or `SEEN`.
-        confidence: (H, W), float32: probability that this camera sees the point at this position, 0 to 1.
-        bands: name of each channel of the values.
+        visibility: (H, W), uint8, `OUTSIDE`, `OCCLUDED` or `SEEN`.
+        confidence: (H, W), float32: probability that this camera sees the point at this position, 0 to 1; 0
+            beyond its edge.
+        bands: name of each channel of the values: the camera's; NAME.red, NAME.green and NAME.blue for three;
+            NAME.1 and so on for others.
         response: spectral response of the sensor; None if the rig does not state it.
     """
 
@@ -131,7 +133,7 @@ class Aligned(Mapping[str, AlignedView]):
         return tuple(wave for view in self.views.values() for wave in view.wavelengths)
 
     def band(self, name: str) -> NDArray[Any]:
-        """Return one band (H, W) by name.
+        """Return one band (H, W) by name, a view of its camera's values.
 
         Raises:
             KeyError: for an unknown name; the text lists the bands.
@@ -175,7 +177,7 @@ def align_frame(
         network: network that uses matches.
         settings: settings of fusion.
         recorded: values to resample, of the images' sizes; None for the images themselves.
-        interpolation: interpolation of values.
+        interpolation: "nearest", "bilinear" or "cubic", of the values.
         min_confidence: confidence below which a pixel counts as occluded.
         fill: "none" for 0 or NaN where a camera does not see the point, "propagate" for the nearest value.
         explain: function that is called with lines about what was corrected; None for none.
@@ -187,9 +189,10 @@ def align_frame(
         Values, masks and positions by camera, with alpha's depth: NumPy arrays, without gradients.
 
     Raises:
-        ValueError: as `pat.align`; for a network that uses no matches, and recorded values that are missing,
-            no numbers, or of another size.
-        TypeError: for what `matcher` returns if that is no `Matches`.
+        ValueError: for what `fuse_frame` refuses, a network that uses no matches, other words or numbers for
+            `interpolation`, `fill` and `min_confidence`, and recorded values that are missing, no numbers, or
+            of another size. Images that are read when asked for raise as their mapping does.
+        TypeError: for images that are no tensors, and what `matcher` returns if that is no `Matches`.
     """
     rule = _ViewRule(interpolation, min_confidence, fill)
     rig = with_pixels(rig)
@@ -239,8 +242,7 @@ def _as_recorded(confidence: Float[Tensor, "1 h w"], now: View, recorded: View) 
 def _located(
     inputs: FrameInputs, i: int, matches: BetaMatches, recorded: View
 ) -> tuple[Float[Tensor, "h w 2"], Bool[Tensor, "h w"]]:
-    """Return the positions of alpha's recorded pixels in the i-th beta as prepared, with a mask of those on
-    it."""
+    """Return positions of alpha's recorded pixels in the i-th beta as prepared, and a mask of those on it."""
     h, w = inputs.hw
     beta, pinhole = inputs.inputs.betas[i], inputs.placements[i].pair.alpha
     hw = (beta.image.shape[-2], beta.image.shape[-1])
@@ -310,7 +312,16 @@ class _ViewRule:
         confidence: Float[Tensor, "h w"],
         values: NDArray[Any],
     ) -> AlignedView:
-        """Return a beta's values (C, hb, wb) at alpha's pixels, which are `located` in it as prepared."""
+        """Resample a beta's recorded values (C, hb, wb) to alpha's pixels.
+
+        Args:
+            camera: the beta as recorded.
+            name: its name.
+            place: its relation to alpha, as prepared for matching.
+            located: positions of alpha's pixels in the prepared beta, with a mask of those on it.
+            confidence: confidence of each position, 0 to 1.
+            values: the recorded values.
+        """
         now = place.pair.beta
         assert isinstance(now, LensView)
         where, valid = chunked(lambda x: recorded_pixels(x, now, camera), located[0].double(), axis=0)
@@ -367,7 +378,7 @@ def resampled_values(
     Computed in float64: float32 would round positions by 1e-4 pixels in an image of 4000.
 
     Returns:
-        Values (C, h, w) in the type given, integers rounded; 0 beyond the edge.
+        Values (C, h, w) in the type given, integers rounded and clipped to it; 0 beyond the edge and at NaN.
     """
     kind, where = INTERPOLATIONS[interpolation], torch.from_numpy(positions)
 

@@ -37,10 +37,11 @@ LARGEST_TIFF = 2**32 - 2**25
 
 
 class RecordedFiles(FilesOfCameras[NDArray[Any]]):
-    """Values of an image file of each camera, read when asked for: counts, linear for raw images.
+    """Values (C, H, W) of an image file of each camera as recorded, in its type, read when asked for.
 
     Made of a rig and an image file of each camera. Images behind a colour filter pattern are demosaiced: red,
-    green and blue counts. Access raises as `read_recorded`.
+    green and blue counts. Three equal bands are one where the rig states one. Access raises as
+    `read_recorded`, also for another size than the rig's; KeyError for a camera without a file.
     """
 
     def __getitem__(self, name: str) -> NDArray[Any]:
@@ -73,9 +74,9 @@ def save_aligned(
 
     The files are aligned.tif (all bands, alpha's first, with their names and wavelengths), visibility.txt,
     and of each camera but alpha NAME_visibility.png (0 beyond its edge, 128 occluded, 255 seen),
-    NAME_confidence.png and NAME_positions.npy (or .tif: x, y); and depth.tif (metres) if any depth is known.
-    NAME is by `file_names`. All are swapped in together, and those of a former alignment of this name are
-    removed (`write_together`).
+    NAME_confidence.png and NAME_positions.npy (H, W, 2), or .tif of two bands: x, y; and depth.tif (rig's
+    unit) if any depth is known. NAME is by `file_names`. All are swapped in together, and those of a former
+    alignment of this name are removed (`write_together`).
 
     Args:
         aligned: the alignment.
@@ -197,6 +198,10 @@ def write_bands(
         facts: further numbers of each band by name, written as its metadata.
         tags: tags of the file whose pixels these are, written too; left out of files over `LARGEST_TIFF`.
             None for none.
+
+    Raises:
+        ValueError: for other numbers of names and wavelengths.
+        OSError: if the file cannot be written; a part of it may be there.
     """
     items = [
         f'<Item name="{name}" sample="{i}">{value:.9g}</Item>'

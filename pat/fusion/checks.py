@@ -47,8 +47,8 @@ def warn_of_confidence(network: FusionNetwork, frame: Frame, inputs: FrameInputs
     """Warn if confidence is low, in the mean or in a large part, where the segments of all betas are valid.
 
     A mean below `UNFIT_CONFIDENCE` gives a `LowConfidenceWarning`, others a UserWarning. If each band is of
-    another beta, the median band decides: some bands of nine differ from alpha whatever the rig. Networks
-    without matches, whose confidence is no probability, are not checked.
+    another beta, the median band decides: some bands of nine differ from alpha whatever the rig. Nothing is
+    checked without such pixels, and for networks without matches, whose confidence is no probability.
     """
     overlap = _overlap(inputs).to(frame.confidence.device)
     if not (network.uses_matches and overlap.any()):

@@ -62,8 +62,8 @@ def classical_baseline(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> Fl
         order.
 
     Raises:
-        ValueError: for no beta with an image, uncalibrated cameras, lenses, no depth range, and cameras that
-            cannot be rectified.
+        ValueError: for no beta with an image, an alpha that the rig lacks, and as `classical`.
+        KeyError: without an image of alpha.
     """
     betas = [name for name in rig.betas(alpha) if name in images]
     if not betas:
@@ -85,7 +85,8 @@ def classical_view(
         The fused bands (C, h, w), 0..1, at the pixels of the reduced alpha, lens included.
 
     Raises:
-        ValueError: for cameras that are not calibrated or cannot be rectified, and no depth range.
+        ValueError: for cameras that are not calibrated, have no pinhole view or cannot be rectified, no depth
+            range, and images that do not fit the rig (`Views.of`).
     """
     if names := [name for name in images if not isinstance(rig[name], Camera)]:
         raise ValueError(
@@ -115,10 +116,13 @@ def classical(rig: Rig, images: Mapping[str, Tensor], alpha: str, beta: str) -> 
         by seen ones that are similar.
 
     Raises:
-        ValueError: for uncalibrated cameras, lenses, no depth range, and for cameras that look along the line
-            between them or have one centre.
+        ValueError: for unknown or uncalibrated cameras, lenses, no depth range, another number of bands, and
+            cameras that look along the line between them or have one centre.
+        KeyError: for a camera without an image.
     """
     pair, mono, other = rig.pair(alpha, beta), luminance_of(images[alpha]), images[beta]
+    if len(other) not in (1, 3):
+        raise ValueError(f"'{beta}' has {len(other)} bands: the classical baseline takes one or three")
     if pair.has_lens:
         raise ValueError("the classical baseline needs pinhole cameras: undistort the images first")
     plane = _rectified_plane(pair)
@@ -170,7 +174,7 @@ def non_local_means(image: Float[Tensor, "c h w"], deviation: float) -> Float[Te
     Patches of 5 x 5 pixels within 6 pixels, h = 0.8 deviations, as its documentation advises.
 
     Args:
-        image: image, values 0..1.
+        image: image, values 0..1, on the CPU and without a gradient.
         deviation: standard deviation of the noise, in the same values.
 
     Returns:
@@ -242,8 +246,7 @@ def _rectified_plane(pair: Pair) -> _Plane:
 
 
 def _rectifying_rotation(R: NDArray, t: NDArray) -> NDArray[np.float64]:
-    """Return the rotation from alpha's axes to axes with x along the baseline and z near the mean of both
-    optical axes."""
+    """Return the rotation from alpha's axes to x along the baseline, z near the mean of both optical axes."""
     baseline = R.T @ t
     if not np.linalg.norm(baseline) > 0:
         raise ValueError("both cameras have the same centre (t is zero): there is no depth to match")
@@ -261,8 +264,7 @@ def _project(H: NDArray, points: NDArray) -> tuple[NDArray[np.float64], NDArray[
 
 
 class _Correspondence(NamedTuple):
-    """Positions of `mono`'s pixels in the other image, with masks of visible pixels and weights of consistent
-    ones."""
+    """Positions of `mono`'s pixels in the other image, mask of visible ones, weights of consistent ones."""
 
     columns: Image
     rows: Image
@@ -290,7 +292,7 @@ def checked_disparity(
     Args:
         left: left rectified image (h, w).
         right: right rectified image of the same size.
-        max_disparity: largest disparity, pixels.
+        max_disparity: largest disparity, pixels, rounded up as in `raw_disparity`.
 
     Returns:
         Disparity (h, w) in pixels, from x in the left image to x - disparity in the right, negative where
@@ -307,8 +309,7 @@ def checked_disparity(
 def _warped_chroma(
     mono: Image, colours: Image, inside: Image, max_disparity: float, sharpness: float
 ) -> Image:
-    """Compute colour differences (R - Y, B - Y) of `colours` at `mono`'s pixels; both (h, w) on one rectified
-    grid.
+    """Compute differences (R - Y, B - Y) of `colours` at `mono`'s pixels, both (h, w) on one rectified grid.
 
     `inside` is 1 where `colours` has content; `sharpness` is their resolution over mono's.
     """
@@ -343,7 +344,8 @@ def _softened(mono: Image, sharpness: float) -> Image:
 def raw_disparity(left: NDArray[np.uint8], right: NDArray[np.uint8], max_disparity: float) -> Image:
     """Compute the disparity of a left image (h, w) by OpenCV's semi-global matching, without a check.
 
-    The right image has the same size; disparities up to `max_disparity` pixels are searched.
+    The right image has the same size; disparities from 0 to `max_disparity` pixels, or the width, are
+    searched, and up to the next multiple of 16.
 
     Returns:
         Disparity (h, w) of the left image's pixels, in pixels; negative where unknown.
@@ -356,8 +358,7 @@ def raw_disparity(left: NDArray[np.uint8], right: NDArray[np.uint8], max_dispari
 
 
 def _normalised(luma: Image, mono: Image, weight: Image) -> Image:
-    """Return `luma` with mono's mean and standard deviation, so that cameras of different exposure can be
-    compared."""
+    """Return `luma` with mono's mean and standard deviation: cameras may differ in exposure."""
     mean, deviation = _mean_and_deviation(luma, weight)
     wanted_mean, wanted_deviation = _mean_and_deviation(mono, weight)
     gain = wanted_deviation / deviation if deviation > 1e-3 else 1.0

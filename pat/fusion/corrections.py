@@ -72,7 +72,7 @@ class Corrections:
 
     Attributes:
         response: response of alpha in terms of beta's bands.
-        misalignments: misalignment by camera; empty if none is to be corrected.
+        misalignments: misalignment by camera of the betas, zeros for none; empty if none has any.
     """
 
     response: Response
@@ -88,10 +88,11 @@ class Corrections:
             hw: alpha's size without padding.
 
         Returns:
-            The corrected inputs: alpha and RGB betas by the response, segments by the misalignments.
+            The corrected inputs: alpha and RGB betas by the response, segments by the misalignments; fields
+            of positions stay.
 
         Raises:
-            ValueError: for misalignments of other cameras.
+            ValueError: for misalignments of other cameras than these.
         """
         cameras = [camera for names in inputs.cameras for camera in names]
         if self.misalignments and set(cameras) != set(self.misalignments):
@@ -154,8 +155,7 @@ def find_corrections(
         The corrections; the stated or the Rec. 601 response where none is fitted.
 
     Raises:
-        ValueError: for a stated response that is not three weights, none negative, or where there is no RGB
-            beta.
+        ValueError: for a response of another kind, and for stated weights where there is no RGB beta.
     """
     rgb = any(map(_is_rgb, frame.inputs.betas))
     if not isinstance(response, str | Response) and not rgb:
@@ -255,8 +255,7 @@ class _Matches(NamedTuple):
 
 
 def _of_beta(alpha: Tensor, before: Beta, beta: Beta, matches: BetaMatches, hw: HW) -> _Matches:
-    """Return the data for corrections: a beta's blurred bands at alpha's pixels, alpha, and
-    reliable matches."""
+    """Return a beta's blurred bands at alpha's pixels, alpha, and reliable matches."""
     h, w = hw
     positions, valid = matches.positions(beta.field.straight, (beta.image.shape[-2], beta.image.shape[-1]))
     where = positions[0, :h, :w]

@@ -48,7 +48,7 @@ class MatchedDepth(NamedTuple):
 
 
 class MatchesAlone:
-    """Network that fuses nothing: its image is alpha, its positions and confidences are those of the matches.
+    """Network that fuses nothing: its image is alpha, its positions those of matches, confident on beta.
 
     Args:
         bands: number of beta's bands, with whose luma alpha is compared; None for any combination of bands.
@@ -70,8 +70,8 @@ class MatchesAlone:
         """Return alpha's image with the matches' positions and confidences.
 
         Returns:
-            Alpha; the chosen positions; deviations of 0; and confidences, 1 where a position within a pixel
-            of the match is on beta's image.
+            Alpha; the chosen positions; deviations of 0; and confidences, 1 where a position near the match
+            along its segment (`AROUND`) is on beta's image, else 0.
 
         Raises:
             ValueError: without matches.
@@ -101,10 +101,11 @@ def matched_depth(images: Images, rig: Rig, *, alpha: str, bands: int | None) ->
             bands that is most similar.
 
     Returns:
-        Depth and confidence at alpha's pixels.
+        Depth and confidence at alpha's pixels, detached.
 
     Raises:
-        ValueError: for images that do not fit the rig, and views that do not overlap.
+        ValueError: for images that do not fit the rig, views that do not overlap, and a field that raises it.
+        TypeError: for images that are no tensors.
     """
     network = MatchesAlone(bands)
     views = Views.of(rig, images, alpha=alpha)

@@ -63,9 +63,11 @@ def certain(output: FusionOutput, matches: Matches | None, inputs: Inputs) -> Fu
     Args:
         output: the network's output.
         matches: matches that it was given; None for none.
+        inputs: the network's inputs.
 
     Returns:
-        The output with these, and the largest as `overall` if it had one; unchanged without matches.
+        The output with these, and the largest confidence as `overall` if it had one; unchanged without
+        matches.
     """
     if matches is None:
         return output
@@ -87,7 +89,7 @@ def certain(output: FusionOutput, matches: Matches | None, inputs: Inputs) -> Fu
 def measured_depth(
     output: FusionOutput, inputs: Inputs, placements: list[Placement], hw: HW, corner: tuple[int, int]
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Compute depth from the calibrated betas, weighted by confidence in inverse depth.
+    """Compute depth from the calibrated betas: the mean of inverse depths, weighted by their confidences.
 
     A position whose depth is beyond the bounds that were searched counts as the end of its segment: a pixel
     beyond the far end may otherwise stand for any distance.
@@ -98,8 +100,11 @@ def measured_depth(
 
     Returns:
         Depth (h, w) along alpha's axis, or along its rays where a placement's `bounds` are distances, in the
-        rig's unit, NaN where unknown; the half-width (h, w) of the interval of its
-        inverse, as in `Frame`; and the image's confidence (h, w), 0 to 1.
+        rig's unit, NaN where unknown; the half-width (h, w) of the interval of its inverse, as in `Frame`;
+        and the image's confidence (h, w), 0 to 1: `overall`, or the least of the betas'.
+
+    Raises:
+        ValueError: as `Placement.depth`, for calibrated betas; others give no depth.
     """
 
     def of_rows(tile: Tile) -> tuple[Tensor, ...]:

@@ -69,11 +69,11 @@ def final_depth(frame: Frame, frame_inputs: FrameInputs) -> Float[Tensor, "h w"]
 def without_outliers(depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
     """Replace each depth by the median of 5 x 5 pixels, of inverse depth.
 
-    Unknown depth counts as far away; where most is unknown, a pixel keeps its own. Gradients are those of the
-    pixel's own inverse depth.
+    Unknown depth (NaN) counts as far away; where most is unknown, a pixel keeps its own. Gradients are those
+    of the pixel's own inverse depth.
 
     Returns:
-        Depth (H, W), NaN where it was unknown.
+        Depth (H, W), in the same unit, NaN where it was unknown.
     """
     inverse = 1 / depth
     median = torch.from_numpy(cv2.medianBlur(np.nan_to_num(numpy_of(inverse)), 5)).to(depth)
@@ -91,8 +91,8 @@ def background_filled(frame: Frame, frame_inputs: FrameInputs) -> Float[Tensor, 
     bounds that were searched. No gradient passes through planes.
 
     Returns:
-        Depth (H, W), in the rig's unit, NaN where it was unknown; the frame's own where betas on several
-        sides see occluded points.
+        Depth (H, W), in the rig's unit, NaN where it was unknown; the frame's own if betas on several sides
+        see occluded points, for fields of positions, and without any known depth or its half-width.
     """
     depth, confidence, inputs = frame.depth, frame.confidence, frame_inputs.inputs
     steps = [beta.field.pixels for beta in inputs.betas if beta.field.pixels is not None]
@@ -136,8 +136,7 @@ def _filled_rows(
     unit: float,
     bounds: tuple[float, float],
 ) -> Float[Tensor, "h w"]:
-    """Compute depth by matches and planes, which are computed for every second pixel, in units of inverse
-    depth.
+    """Compute depth by matches and planes, these for every second pixel, in units of inverse depth.
 
     `least` is the confidence from which matches count before any plane is known; `bounds` are planes', in
     these units.
@@ -165,8 +164,7 @@ def _far_by_depth(inverse: Plane) -> list[Plane]:
 
 
 def _far_by_slope(inverse: Plane) -> list[Plane]:
-    """Return a guide whose changes of 1 are those of slopes, by a half-width in two pixels:
-    planes are whole."""
+    """Return a guide whose changes of 1 are those of slopes, by a half-width in two pixels."""
     return [np.diff(inverse, axis=axis, append=inverse.take([-1], axis)) for axis in (0, 1)]
 
 

@@ -23,13 +23,13 @@ class Frame(NamedTuple):
 
     Attributes:
         image: (C, H, W), in alpha's coding, not clipped to 0..1.
-        depth: (H, W), metres along alpha's axis, or its rays (`measured_along`); NaN where no calibrated beta
-            sees the point.
+        depth: (H, W), along alpha's axis, or its rays (`measured_along`), in the rig's unit; NaN where no
+            calibrated beta sees the point.
         confidence: (H, W), the probability that every band's beta sees the point and its position is right to
             a pixel.
-        half_width: (H, W), 1/metres: in 9 of 10 pixels the true inverse depth is within it of 1 / depth; NaN
-            where depth is.
-        by_band: (C, H, W), the confidence of each band alone, where each is another beta's; else None.
+        half_width: (H, W), one over that unit: in 9 of 10 pixels the true inverse depth is within it of 1 /
+            depth; NaN where depth is.
+        by_band: (C, H, W), the confidence of each band, where they are several betas'; else None.
     """
 
     image: Float[Tensor, "c h w"]
@@ -49,8 +49,7 @@ class Frame(NamedTuple):
         return 1 / (inverse + self.half_width), farthest
 
     def mapped(self, change: Callable[[Tensor], Tensor]) -> Frame:
-        """Return the frame with a function applied to each tensor, such as one that moves it to another
-        device."""
+        """Return the frame with a function applied to each tensor, as one that moves it to another device."""
         return Frame(*(tensor if tensor is None else change(tensor) for tensor in self))  # type: ignore[arg-type]
 
     def __repr__(self) -> str:
@@ -61,8 +60,7 @@ class Frame(NamedTuple):
         return f"Frame({w}x{h}, {bands} bands, {depth}, mean confidence {self.confidence.mean():.2f})"
 
     def _repr_png_(self) -> bytes:
-        """Return the image and, beside it, depth (red is near) and confidence, as a PNG file for
-        notebooks."""
+        """Return the image, depth (red is near) and confidence side by side, as a PNG file for notebooks."""
         confidence = self.confidence[None].expand(3, -1, -1)
         parts = picture_of(self.image).expand(3, -1, -1), colour_depth(self.depth), confidence
         factor = min(SHOWN / max(self.image.shape[-2:]), 1.0)

@@ -38,10 +38,11 @@ def matched_frames(files: Files) -> dict[str, list[Path]]:
         files: files of each camera, in order.
 
     Returns:
-        Files of the frames that every camera has, in order, by camera; all files if a camera has only one.
+        Files of the frames that every camera has, in order, by camera; all files as given if a camera has
+        fewer than two.
 
     Raises:
-        ValueError: if nothing relates the files and their numbers differ.
+        ValueError: if nothing relates the files and their numbers differ, and without cameras.
     """
     files_of = {name: list(paths) for name, paths in files.items()}
     if min(map(len, files_of.values())) < 2:
@@ -63,7 +64,9 @@ def matched_frames(files: Files) -> dict[str, list[Path]]:
 
 
 def warn_of_gaps(files: Files) -> None:
-    """Warn of a gap in the numbers of a camera's files: a sequence takes all frames to be equally far apart.
+    """Warn of the first gap in the numbers of each camera's files: a sequence has frames equally far apart.
+
+    Nothing is known of names without numbers, or with several that vary: there is no warning.
 
     Args:
         files: files of each camera, in order.
@@ -121,8 +124,7 @@ def _endings(files: Files) -> Keys | None:
 
 
 def _numbers(files: Files) -> Keys | None:
-    """Return numbers in names that differ between a camera's files; of single ones, nearly equal times as
-    equal.
+    """Return numbers in names that differ between a camera's files; single ones that nearly agree as equal.
 
     None where two files of a camera have the same, or some have other numbers of numbers.
     """

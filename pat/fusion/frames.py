@@ -21,7 +21,7 @@ CACHED = 96 * 2**20
 
 @runtime_checkable
 class Frames(Protocol):
-    """Images (C, H, W) of one camera in the order of time: a list, or read when asked for (`ImageFiles`)."""
+    """Images (C, H, W), 0..1, of one camera in the order of time: a list, or read on access: `ImageFiles`."""
 
     def __len__(self) -> int:
         """Return the number of images."""
@@ -40,6 +40,9 @@ class ImageFiles:
         rig: the cameras.
         name: name of the camera.
         alpha: camera to whose scale of light the images are brought.
+
+    Raises:
+        ValueError: for an `alpha` that the rig lacks.
     """
 
     def __init__(self, paths: Sequence[Path], rig: Rig, name: str, *, alpha: str) -> None:
@@ -62,9 +65,11 @@ class ImageFiles:
 class CachedFrames:
     """Frames with a cache of the last used ones, up to `CACHED` bytes: neighbours in time need them again.
 
+    An image is the cached tensor itself, not to be changed in place.
+
     Args:
         frames: images of one camera.
-        level: noise level of the images, which are then denoised; None leaves them.
+        level: noise level of the images, which are then denoised if it is noticeable; None leaves them.
     """
 
     def __init__(self, frames: Frames, level: NoiseLevel | None = None) -> None:

@@ -49,21 +49,22 @@ class FuseSettings:
     """Settings of fusion that one frame, many and a sequence have in common.
 
     Attributes:
-        depth: (near, far) in metres, in place of the rig's; None for the rig's.
+        depth: (near, far) in the rig's unit, in place of the rig's; None for the rig's.
         field: receptive field, or one for each of some betas, by name; None for `arraygeom`'s
             `default_field`.
         max_memory: limit of memory in bytes, or like "4GiB": of the whole process, libraries and images
             included, if nothing else runs in it; None for no limit.
         match_levels: True to bring each beta to alpha's mean and standard deviation first, for cameras whose
             exposures or filters differ and which are not radiometrically calibrated.
-        response: weights of red, green and blue of its one colour beta in alpha. "fit" fits them to matches,
-            with a gain and a gamma, and leaves them at Rec. 601 luma ("rec601") where that explains the
-            images as well; three numbers state them. The result has alpha as this combination of its colours.
+        response: weights in alpha of the RGB betas' red, green and blue. "fit" fits them to matches, with a
+            gain and a gamma, and leaves them at Rec. 601 luma ("rec601") where that explains the images as
+            well; three numbers, or a `Response`, state them. The result has alpha as this combination of its
+            colours.
         align: True to estimate the betas' distance across their search segments, and correct it; None for
             True unless the fusion is differentiable, where a corrected rig has no gradient of its error.
         noise: noise level of each camera that has some, or "estimate": views are denoised before they are
-            matched, and jointly after they are fused. "auto", as without a rig: so where an image shows noise
-            plainly ({} never). None for no denoising.
+            matched, and jointly after they are fused. "auto" does so only if an image shows noise plainly.
+            None for no denoising; but `pat.fuse` without a rig takes None for "auto", and only {} for none.
         keep_alpha: True to leave alpha's values as recorded, noise included; as is done too if alpha has no
             noticeable noise.
         luminance: luminance of the image: "alpha", which the network keeps exactly, that of "beta" in alpha's
@@ -131,12 +132,14 @@ def fuse_frame(
 
     Raises:
         ValueError: for images that do not fit the rig or the network, views that do not overlap, settings
-            that contradict each other, and a memory limit that is too small.
+            that contradict each other, corrections of other cameras, matches that `Matches.check` refuses,
+            and a memory limit that is too small. Images, fields and matcher raise their own errors too.
         NotImplementedError: within a transformation of `torch.func`.
-        TypeError: for settings or corrections of another type.
+        TypeError: for images, settings, corrections, fields or matches of another type.
+        OSError: if a finished tile cannot be written to `store`.
     """
-    align = not differentiable if settings.align is None else settings.align
-    settings = replace(_given(FuseSettings, settings), align=align)
+    given = _given(FuseSettings, settings).align
+    settings = replace(settings, align=not differentiable if given is None else given)
     in_parts, luminance = settings.max_memory is not None or store is not None, settings.luminance
     _check_gradients(differentiable, in_parts=in_parts, noisy=bool(settings.noise))
     check_luminance(network, luminance, noisy=settings.noise is not None)
@@ -182,14 +185,14 @@ def fuse_frame(
 
 
 class ReadyFrame(NamedTuple):
-    """Inputs of a frame that is ready to be matched, and what its fusion needs later.
+    """Inputs of a frame that is ready to be matched, and the rest that its fusion needs.
 
     Attributes:
         inputs: the network's inputs, corrected.
         undo: functions that take a frame of these back to alpha's pixels.
         plan: the plan of the fusion.
         corrections: the corrections made.
-        low_light: views before and after denoising.
+        low_light: views before and after denoising; without images if none had noticeable noise.
         in_colour: True if alpha's image was in colour.
     """
 
@@ -216,10 +219,11 @@ def ready_frame(
 ) -> ReadyFrame:
     """Prepare a frame for fusion or alignment: all steps before alpha's pixels are matched.
 
-    Views are denoised, undistorted and resized, tiles planned, and corrections estimated and applied. Other
-    arguments are those of `fuse_frame`.
+    Views are denoised, undistorted and resized, tiles planned, and corrections estimated and applied.
+    Arguments that are not listed are those of `fuse_frame`.
 
     Args:
+        settings: settings of fusion; `align` None counts as True here.
         joined: True to join co-located betas to one of several bands.
         corrections: corrections to apply; None to estimate them.
         stored: True if finished tiles are stored on disk.
@@ -230,8 +234,9 @@ def ready_frame(
         The prepared frame.
 
     Raises:
-        ValueError: for images that do not fit the rig or the network, views that do not overlap, and a memory
-            limit that is too small.
+        ValueError: for images that do not fit the rig or the network, views that do not overlap, corrections
+            of other cameras, and a memory limit that is too small.
+        TypeError: for images that are no tensors, and an object that is no field.
     """
     say = explain or (lambda line: None)
     least = LEAST_MATCHED if network.uses_matches else LEAST_BYTES
@@ -297,13 +302,14 @@ def corrections_of(
         rig: the cameras.
         alpha: name of alpha.
         network: network that will fuse.
-        settings: settings of fusion; `response` and `align` say what to estimate.
+        settings: settings of fusion; `response` and `align` (None for True) say what to estimate.
 
     Returns:
         The response and misalignments, which `fuse` takes as `corrections`.
 
     Raises:
-        ValueError: for images that do not fit the rig or the network, and views that do not overlap.
+        ValueError: as `ready_frame`.
+        TypeError: as `ready_frame`.
     """
     return ready_frame(images, rig, alpha, network, settings, explain=None, announce=None).corrections
 
@@ -322,12 +328,9 @@ def _given(kind: type[T], value: T) -> T:
 def matches_by(matcher: Matcher, inputs: Inputs) -> Matches:
     """Match inputs by a matcher, and check its result.
 
-    Returns:
-        The matches.
-
     Raises:
         TypeError: for a result of another type.
-        ValueError: for matches that do not belong to these inputs.
+        ValueError: for matches that `Matches.check` refuses. The matcher's own errors pass.
     """
     matches = _given(Matches, matcher(inputs))
     matches.check(inputs)

@@ -33,13 +33,16 @@ def without_gradient(
     look-ups at whole pixels.
 
     Args:
+        settings: settings of fusion, without `max_memory` and `noise`.
         free: patterns of the parameters to look at, as for `Rig.parameters`.
 
     Returns:
         Names of the parameters, under "image" and under "depth".
 
     Raises:
-        ValueError: as `fuse_frame`, and for a field that only fits images of the full size (`Moved`).
+        ValueError: as `fuse_frame` and `Rig.parameters`, and for a field that only fits images of the full
+            size (`Moved`).
+        TypeError: as `fuse_frame`.
     """
     small = {name: image for name, image in images.items() if name in rig}
     for name, image in small.items():

@@ -63,7 +63,7 @@ class Placement(NamedTuple):
     ) -> Depth:
         """Compute the depth of matches, or the distance along alpha's rays if `bounds` says so.
 
-        With lenses it lies within the pair's depth range.
+        With lenses it lies within the pair's depth range, if there is one.
 
         Args:
             x: pixels of alpha.
@@ -71,7 +71,11 @@ class Placement(NamedTuple):
             deviation: standard deviation of `x_beta` along the segment, pixels.
 
         Returns:
-            Depth in the rig's unit, with its standard deviation and validity.
+            Depth in the rig's unit, 0 where not valid, with its standard deviation and validity.
+
+        Raises:
+            ValueError: for a pair that is not calibrated; without a depth range, for distances and cameras
+                that have no pinhole view.
         """
         pair, x = self.pair, self.points(x)
         on_curve = partial(ray_depth, pair, bounds=self.bounds)
@@ -91,7 +95,7 @@ class FrameInputs(NamedTuple):
 
     Attributes:
         inputs: images and fields, padded to whole multiples.
-        placements: relation of each beta to alpha.
+        placements: relation of each beta to alpha, in the order of `inputs.betas`.
         hw: alpha's size without padding.
     """
 
@@ -109,8 +113,8 @@ def prepared(
         The inputs, and the functions that take a frame back to the views, last step first.
 
     Raises:
-        ValueError: for views that do not overlap, and images of another precision or device than the
-            network's weights.
+        ValueError: as `check_precision`, `frame_inputs` and the steps.
+        TypeError: as `frame_inputs`.
     """
     check_precision(views, network)
     LOG.info("preparing %d images", len(views.images))
@@ -128,7 +132,9 @@ def frame_inputs(network: FusionNetwork, views: Views) -> FrameInputs:
         The inputs, with alpha's size without padding.
 
     Raises:
-        ValueError: if alpha's pixels have no valid search segment in a beta: views that do not overlap.
+        ValueError: if alpha's pixels have no valid search segment in a beta (views that do not overlap), for
+            an invalid result of a field, or whatever a field raises for its pair.
+        TypeError: for an object that is no field.
     """
     m, hw = network.multiple, views.rig[views.alpha].hw
     alpha, *images = (padded(views.images[name][None], m) for name in (views.alpha, *views.betas))
@@ -164,12 +170,13 @@ def frame_inputs(network: FusionNetwork, views: Views) -> FrameInputs:
 
 
 def clipped_in(image: Float[Tensor, "1 c h w"], sensor: Sensor) -> Float[Tensor, "1 c h w"] | None:
-    """Compute the mask of bands at their largest value, or beside such a pixel: 1 there, else 0, in the
-    image's type.
-
+    """Compute the mask of clipped bands: 1 at the largest value and beside such a pixel, else 0.
 
     The largest value is 1; the image's own if that is more, or if its exposure is stated, which scaled it.
-    None if no value is so large.
+    Values from `CLIPPED` times that count.
+
+    Returns:
+        The mask, in the image's type; None if no value counts.
     """
     image = image.detach()
     largest = float(image.max())
@@ -208,8 +215,7 @@ def bounds_of(field: ReceptiveField) -> Literal["depth", "distance"]:
 
 
 def measured_along(views: Views) -> Literal["depth", "distance"]:
-    """Return the kind of depth of a frame of these views: "depth" along alpha's axis or "distance" along its
-    rays."""
+    """Return the kind of a frame's depth: "depth" along alpha's axis or "distance" along its rays."""
     if takes_pinhole_views(views):
         return "depth"
     fields = (views.fields.get(name) or default_field(views.pair(name)) for name in views.betas)

@@ -92,7 +92,7 @@ class LowLight:
     Attributes:
         given: views as recorded; without images if no view had noticeable noise.
         views: views after denoising; without images if no view had noticeable noise.
-        noisy: recorded and denoised image, and noise, of each camera that had noticeable noise.
+        noisy: recorded and denoised image, and noise, of each camera that had noticeable noise, by name.
         seconds_left: estimated time of `corrected`, seconds.
     """
 
@@ -107,8 +107,7 @@ class LowLight:
         return f"noise shows plainly and is removed: {', '.join(texts)}; --noise none leaves it"
 
     def kept(self, hw: HW, betas: int) -> float:
-        """Return the bytes held until the frame of this size is corrected: views, its pixels' positions in
-        each beta."""
+        """Return the bytes held until a frame of this size is corrected: views, positions in each beta."""
         if not self.noisy:
             return 0.0
         images = [*self.given.images.values(), *self.views.images.values()]
@@ -127,18 +126,18 @@ class LowLight:
     ) -> Frame:
         """Add the brightness and colours that betas recorded to a frame fused from the denoised views.
 
-        Betas that are not all RGB are only denoised one by one, and brightness is alpha's alone where no
-        combination of beta's bands is similar to alpha.
+        Betas add nothing unless all are RGB, and brightness only to a noisy alpha that is similar to a
+        combination of their bands.
 
         Args:
             frame: frame fused from the denoised views, its steps not undone yet.
             matched: positions of its pixels in each beta, x and y, with their confidence.
             steps: steps before it was fused, without the one of radiometry: values keep their scale.
             response: response that brings betas to alpha's exposure.
-            keep_alpha: True for the luma of alpha as recorded.
+            keep_alpha: True to add alpha's recorded noise again, in place of the betas' brightness.
 
         Returns:
-            The frame; as given if no view was noisy.
+            The frame with the new image; as given if no view was noisy.
         """
         if not self.noisy:
             return frame
@@ -190,11 +189,11 @@ def denoised_views(views: Views, noise: Noise | None) -> tuple[Views, LowLight]:
             noise plainly; None for no denoising.
 
     Returns:
-        The views after denoising (as given where noise is not noticeable), and both versions for
-        `LowLight.corrected`.
+        The views after denoising (as given where noise is not noticeable, `SETTINGS.least_deviation`), and
+        both versions for `LowLight.corrected`.
 
     Raises:
-        ValueError: for a camera that is not among the views, or a `noise` of another kind.
+        ValueError: for a camera without an image among the views, or a `noise` of another kind.
     """
     begin = time.perf_counter()
     noisy: dict[str, NoisyView] = {}
@@ -261,7 +260,8 @@ def noise_levels(images: Mapping[str, Tensor], noise: Noise | None) -> Mapping[s
         noise: levels by camera, "estimate", "auto" to estimate them if an image shows noise plainly, or None.
 
     Returns:
-        Levels by camera; empty for None, and for "auto" if no image shows noise plainly.
+        Levels by camera, the given mapping itself, or those of all images; empty for None, and for "auto" if
+        no image shows noise plainly.
 
     Raises:
         ValueError: for a `noise` of another kind.
@@ -299,7 +299,7 @@ def denoised(
     """Denoise images with noise of this standard deviation; bands other than three are denoised one by one.
 
     Returns:
-        Images without noise, in their own type, detached.
+        Images without noise, in their own type, not clipped, detached.
     """
     network, dtype = shipped_denoiser(), image.dtype
     image, deviation = image.float(), deviation.float()
@@ -379,7 +379,7 @@ def colours_averaged(
         matched: positions of alpha's pixels in each beta, x and y, with their confidence.
 
     Returns:
-        The image with the same luma, without gradient; unchanged without noise in the betas.
+        The image with the same luma, without gradient; the tensor `image` itself without noise in the betas.
     """
     beta, confidence = warped(betas, matched)
     deviation = float(beta.deviation.mean())
@@ -395,13 +395,14 @@ def colours_averaged(
 def warped(
     betas: Sequence[NoisyView], matched: Float[Tensor, "n 3 h w"]
 ) -> tuple[NoisyView, Float[Tensor, "1 1 h w"]]:
-    """Warp all betas to alpha's pixels, and average them weighted by their confidences.
+    """Warp all betas, of the same bands, to alpha's pixels, and average them weighted by their confidences.
 
     Args:
         matched: positions of alpha's pixels in each beta, x and y, with their confidence.
 
     Returns:
-        The average, as recorded, denoised and deviation, and the largest confidence of a beta.
+        The average, as recorded, denoised and deviation, and the largest confidence of a beta. A beta counts
+        as 0 off its image; without any confidence all count alike.
     """
     positions, confidence = matched[:, :2].movedim(1, -1), matched[:, 2]
     images = [

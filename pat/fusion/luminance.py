@@ -51,12 +51,12 @@ def check_luminance(network: FusionNetwork, kept: Luminance, *, noisy: bool) -> 
 
     Args:
         network: network that fuses.
-        kept: camera whose luminance the image keeps, one of `SHARES`.
+        kept: luminance that the image has, one of `SHARES`.
         noisy: True if the images are denoised.
 
     Raises:
-        ValueError: for a word that is not in `SHARES`; and for another than "alpha" where the network has
-            alpha's alone, or with noise.
+        ValueError: for a word that is not in `SHARES`; and for another than "alpha" with noise, or for a
+            network without `keeps_luminance`.
     """
     if kept not in SHARES:
         raise ValueError(f"luminance is one of {', '.join(SHARES)}; got {kept!r}")
@@ -93,11 +93,12 @@ def with_alpha_detail(frame: Frame, alpha: Float[Tensor, "1 h w"]) -> Frame:
 def with_own_colours(frame: Frame, alpha: Float[Tensor, "3 h w"]) -> Frame:
     """Replace a fused frame's chroma by alpha's own where confidence is low, converted to the betas' colours.
 
-    Luma stays. The conversion of alpha's colours is fitted where the betas see the same points.
+    Luma stays. The conversion of alpha's colours is fitted where the betas see the same points. Between the
+    confidences `OWN_COLOUR.unseen` and `OWN_COLOUR.seen` both are mixed.
 
     Args:
         frame: frame of RGB bands.
-        alpha: alpha's image in colour, values 0..1.
+        alpha: alpha's image in colour, values 0..1, at the frame's pixels.
 
     Returns:
         The frame with the new image.

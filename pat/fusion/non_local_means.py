@@ -53,10 +53,10 @@ def averaged_with_alike(
         image: RGB image, values 0..1.
         confidence: confidence of beta's values, 0 to 1.
         beta: beta's values at alpha's pixels, which count as much as the image's own where `confidence` is 1.
-        deviation: mean standard deviation of beta's noise.
+        deviation: mean standard deviation of beta's noise, above 0.
 
     Returns:
-        The image with this chroma, detached.
+        The image with this chroma, not clipped; the chroma is detached.
     """
     luma, counts = luminance(image), confidence.square()
     image_chroma, beta_chroma = ((colours - luminance(colours))[[0, 2]] for colours in (image, beta))
@@ -70,12 +70,12 @@ def sums_of_alike(
 ) -> Float[Tensor, "k h w"]:
     """Compute for each pixel the weighted sums of the values at pixels up to `radius` rows and columns away.
 
-    The weight is about exp(-d / scale^2), where d is the mean square difference of the guide's 3 x 3 patches
-    around both. Beyond the edges images are mirrored. Computed in float32 on the CPU, on as many threads as
-    torch may use.
+    The weight is about exp(-d / scale^2), with a scale above 0, where d is the mean square difference of the
+    guide's 3 x 3 patches around both; that of the pixel itself is 1. Beyond the edges images are mirrored.
+    Computed in float32 on the CPU, on as many threads as torch may use.
 
     Returns:
-        Sums on the values' device, detached.
+        Sums in the values' type and on their device, detached.
     """
     h, w = guide.shape[-2:]
     around = radius + 1

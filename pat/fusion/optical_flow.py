@@ -48,8 +48,8 @@ class Flow(NamedTuple):
 def flow_between(a: Float[Tensor, "1 h w"], b: Float[Tensor, "1 h w"]) -> Flow:
     """Compute optical flow from frame a to b by dense inverse search (Kroeger et al. 2016).
 
-    Frames are grey, 0..1, on the CPU. Values of b are first brought to a's mean: flickering light is no
-    motion.
+    Frames are grey, 0..1, of one size, on the CPU. Values of b are first brought to a's mean: flickering
+    light is no motion.
 
     Returns:
         The flow, weighted by forward-backward consistency and photometric similarity; the weight is 0 where
@@ -74,8 +74,7 @@ def warped(image: Float[Tensor, "c h w"], step: Float[Tensor, "2 h w"]) -> Float
 
 
 def _steps(a: Tensor, b: Tensor) -> Float[Tensor, "2 h w"]:
-    """Compute the flow of frames extended to two of OpenCV's patches a side: it refuses smaller ones, or
-    crashes."""
+    """Compute the flow of frames extended to two of OpenCV's patches a side: it may crash by smaller ones."""
     h, w = a.shape[-2:]
     engine = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     least = 2 * engine.getPatchSize()

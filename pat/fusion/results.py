@@ -94,7 +94,7 @@ def save_frame(
 ) -> list[Path]:
     """Write the files of a frame to a folder.
 
-    The files are fused.png, confidence.png, depth.tif (metres, float; NaN where unknown), depth_16.png
+    The files are fused.png, confidence.png, depth.tif (rig's unit, float; NaN where unknown), depth_16.png
     (`write_depth`), depth.png (red is near), depth_nearest.tif and depth_farthest.tif (the true depth is
     between in 9 of 10 pixels). Without any known depth there are no depth files, and no bounds of it for a
     view whose focal lengths are assumed. For other numbers of bands than one and three fused.png is the mean.
@@ -106,7 +106,7 @@ def save_frame(
         out: folder, made if missing.
         bits: 8 or 16 for sRGB values; 32 (tif, exr) for linear light as floats, not clipped.
         kind: format of the fused image.
-        view: rig of alpha alone, written to view.yaml; None for no such file.
+        view: rig of alpha alone, written to view.yaml, which frames with a `name` share; None for none.
         rig: rig of all cameras, written to found_rig.yaml; None for no such file.
         points: camera of alpha; the pixels of known depth are written to points.ply. None for no such file.
         along: kind of depth (`measured_along`), for `points`.
@@ -118,11 +118,13 @@ def save_frame(
         about: texts that `write_together` keeps about the group; None for none.
 
     Returns:
-        Paths of the files, the image first.
+        Paths of the files, the image first; a shared view.yaml is not among them.
 
     Raises:
+        ValueError: for bits that the format cannot hold, EXR without its extra, an image or confidence with
+            NaN or infinity, and `points` of a frame of two bands.
         FileExistsError: for files in the way that no fusion wrote.
-        OSError: if files cannot be written; those of a former frame stay.
+        OSError: if files cannot be written. After any error those of a former frame stay.
     """
     frame = frame.mapped(lambda tensor: tensor.detach().cpu())
     prefix = f"{name}_" if name else ""
@@ -207,21 +209,21 @@ def describe_bands(frame: Frame, names: Sequence[str], kind: ImageFormat) -> str
 
 
 def depth_scale(near: float) -> float:
-    """Return counts per metre in a 16-bit depth image: the power of ten with which `near` is at most a
-    twentieth."""
+    """Return counts per metre of a 16-bit depth image: a power of ten that makes `near` at most MOST / 20."""
     return 10.0 ** math.floor(math.log10(MOST / 20 / near))
 
 
 def write_depth(path: Path, depth: Float[Tensor, "h w"], *, near: float | None = None) -> float:
-    """Write depth as a 16-bit PNG, in which 0 is unknown and 65535 is that far or farther.
+    """Write depth as a 16-bit PNG, in which 0 is unknown (not finite, or not above 0) and 65535 that or more.
 
     The scale is in the file's text chunk "Description" too.
 
     Args:
-        near: depth in metres by which the scale is chosen; None for the nearest depth.
+        depth: depth, metres or another unit of the rig's.
+        near: depth by which the scale is chosen; None for the nearest in `depth`, or 1 if none is known.
 
     Returns:
-        The scale in counts per metre.
+        The scale in counts per metre (or that unit): a power of ten.
     """
     has_depth = depth.isfinite() & (depth > 0)
     scale = depth_scale(near or float(depth[has_depth].min() if has_depth.any() else 1.0))

@@ -72,8 +72,8 @@ class KeyColour(NamedTuple):
     Attributes:
         added: values that fusion adds to alpha, (C, H, W).
         confidence: confidence of these, 0 to 1, (H, W).
-        inverse_depth: inverse depth and the half-width of its interval, 1 / metres, (2, H, W); 0 where
-            unknown.
+        inverse_depth: inverse depth and the half-width of its interval, one over the rig's unit, (2, H, W); 0
+            where unknown.
     """
 
     added: Float[Tensor, "c h w"]
@@ -90,13 +90,14 @@ class SequenceFusion:
     Attributes:
         network: network that fuses key frames.
         rig: cameras with `frame_rate` and `time_offset`.
-        frames: frames by camera name, in the order of time; cached.
+        frames: frames by camera name, in the order of time; kept as `CachedFrames`.
         alpha: camera whose frames are wanted.
         speed: largest speed of motion, pixels of alpha a second; None for a quarter of the motion seen.
         settings: settings of fusion.
 
     Raises:
-        ValueError: for a negative speed.
+        ValueError: for a negative or infinite speed; the rest is checked when it is used.
+        TypeError: for a speed that is no number.
     """
 
     network: FusionNetwork
@@ -125,31 +126,26 @@ class SequenceFusion:
         return grey_alpha(self.alpha, self.frames[self.alpha][i])
 
     def grey(self, i: int) -> Float[Tensor, "1 h w"]:
-        """Return alpha's frame in grey, denoised if its noise is known or estimated; colours follow its
-        motion."""
+        """Return alpha's frame in grey, denoised if its noise is known or estimated, to find motion in."""
         return grey_alpha(self.alpha, self._quiet[i])
 
     def base(self, i: int) -> Float[Tensor, "1 h w"]:
-        """Return the image to which colours are added: with `keep_alpha` alpha's frame as recorded, else
-        `grey`."""
+        """Return the image that colours are added to: alpha as recorded with `keep_alpha`, else `grey`."""
         return self.recorded(i) if self.settings.keep_alpha else self.grey(i)
 
     def alone(self, i: int) -> Frame:
-        """Fuse a frame alone with the betas nearest in time, for comparison with warping.
-
-        Returns:
-            The frame.
-        """
+        """Fuse a frame alone with the betas nearest in time, for comparison with warping."""
         return self._fused(i, self.timeline.at(i), {}, alone=True)
 
     def colour(self, key: KeyFrame) -> KeyColour:
         """Fuse a key frame; in each beta points are searched where they are at its time.
 
         Returns:
-            The colour that fusion adds to alpha, with confidence and depth.
+            The colour that fusion adds to alpha, with depth, and confidence, lowered where motion is unsure.
 
         Raises:
             ValueError: if the frame cannot be fused, or an image cannot be read.
+            OSError: for an image file that is missing.
         """
         fields, weight = {}, torch.ones(self.rig[self.alpha].hw)
         for name, i in key.betas.items():
@@ -163,11 +159,17 @@ class SequenceFusion:
         """Compute any frame, its colour warped from the key frames around it.
 
         Args:
+            i: number of alpha's frame.
             keys: the key frames.
             fetch: function that returns a key frame's colour, or None for one that could not be fused.
 
+        Returns:
+            The frame, without `by_band`.
+
         Raises:
-            ValueError: if none of the key frames around it could be fused.
+            ValueError: if none of the key frames around it could be fused, or an image cannot be read.
+            OSError: for an image file that is missing.
+            IndexError: for a number that alpha's frames lack.
         """
         grey = self.grey(i)
         fetched = ((key, fetch(key)) for key in self._around(i, keys))
@@ -321,8 +323,7 @@ class SequenceFusion:
         )
 
     def _levels(self, names: Iterable[str], i: int) -> tuple[Moments, dict[str, Moments]]:
-        """Return moments of alpha's and of each beta's images over several key frames, so as not
-        to flicker."""
+        """Return moments of alpha's and each beta's images over several key frames, so as not to flicker."""
         keys = self.timeline.key_frames()
         nearest = min(range(len(keys)), key=lambda k: abs(keys[k].alpha - i))
         around = keys[max(nearest - SETTINGS.neighbours, 0) : nearest + SETTINGS.neighbours + 1]
@@ -345,11 +346,12 @@ def mixed(base: Float[Tensor, "1 h w"], sources: Sequence[tuple[float, KeyColour
 
     Args:
         base: alpha's frame.
-        sources: nearness in time, above 0, and the colour of each key frame, warped to this frame.
+        sources: nearness in time, above 0, and the colour of each key frame, warped to this frame; at least
+            one.
 
     Returns:
-        The frame. Its confidence is the weighted mean of the sources', lowered where sources of about the
-        same weight disagree.
+        The frame, without `by_band`; depth is NaN where no source has any. Its confidence is the weighted
+        mean of the sources', lowered where sources of about the same weight disagree.
     """
     weights = torch.stack([nearness * (s.confidence + SETTINGS.floor) for nearness, s in sources])
     share = (weights / weights.sum(0))[:, None]
@@ -377,7 +379,7 @@ def fuse_sequence(
     """Fuse every frame of alpha, in order, as they are asked for.
 
     Args:
-        frames: frames by camera name, in the order of time. Cameras without are left out.
+        frames: frames by camera name, in the order of time. The rig's other cameras are left out.
         rig: cameras with `frame_rate` (per second) and `time_offset` (seconds after a common clock).
         alpha: camera whose frames are wanted.
         network: network that fuses key frames.
@@ -390,8 +392,9 @@ def fuse_sequence(
         Frames at alpha's pixels.
 
     Raises:
-        ValueError: for a negative speed, unknown frame rates, recordings that do not overlap in time, and a
-            frame that cannot be fused: all when the frames are asked for.
+        ValueError: for a negative speed, a camera that the rig lacks, unknown frame rates, recordings that do
+            not overlap in time, and a frame that cannot be fused: all when the frames are asked for.
+        OSError: for an image file that is missing, then too.
     """
     job = SequenceFusion(network, rig, frames, alpha, speed, settings)
     keys = job.timeline.key_frames()

@@ -71,7 +71,8 @@ def steps_for(network: FusionNetwork, *, normalise: bool, joined: bool = True) -
         joined: True to join co-located betas to one, False to keep each by itself.
 
     Returns:
-        Functions from views to a `StepResult`.
+        Functions from views to a `StepResult`: `undistort`, `linear_luminance` and `upright`; where wanted,
+        `equal_resolution`, `normalise_betas` and `join`.
     """
     resize = [partial(equal_resolution, network)] if network.equal_resolution else []
     radiometry = [partial(normalise_betas, undone=not network.keeps_luminance)] if normalise else []
@@ -82,15 +83,16 @@ def steps_for(network: FusionNetwork, *, normalise: bool, joined: bool = True) -
 def undistort(views: Views) -> StepResult:
     """Replace views with lenses by pinhole views, up to 62 degrees off axis.
 
-    Unchanged if a field goes through lenses, or a camera has no pinhole view. Undone, the frame is at alpha's
-    own pixels: the fusion's difference from alpha is resampled and added to alpha's own image, and pixels
-    outside the pinhole view have confidence 0.
+    Unchanged if no camera has a lens, a field goes through lenses, or a camera has no pinhole view. Undone, a
+    frame of an alpha with a lens is at alpha's own pixels: the fusion's difference from alpha is resampled
+    and added to alpha's own image, and pixels outside the pinhole view have confidence 0 and unknown depth.
 
     Returns:
         The views, and the function that undoes the step.
 
     Raises:
-        ValueError: for an image without a pixel inside its lens's range.
+        ValueError: for an image without a pixel inside its lens's range, and a `Moved` field of another size
+            than alpha's.
     """
     if not takes_pinhole_views(views):
         return StepResult(views)
@@ -113,7 +115,7 @@ def linear_luminance(views: Views) -> StepResult:
     """Schedule the correction of luminance for an alpha that measured light; the views stay as they are.
 
     Undone, a frame in RGB betas' colours has the luminance of light that alpha measured (`match_luminance`).
-    For other alphas nothing happens.
+    For other alphas, and without a beta of three bands, nothing happens.
 
     Returns:
         The views, and the function that undoes the step.
@@ -125,7 +127,7 @@ def linear_luminance(views: Views) -> StepResult:
 
 
 def upright(views: Views) -> StepResult:
-    """Rotate back betas that are rotated by about a quarter or half a turn against alpha.
+    """Rotate back betas, images and rig, that are rotated by about a quarter or half a turn against alpha.
 
     Returns:
         The views; there is nothing to undo.
@@ -140,12 +142,15 @@ def upright(views: Views) -> StepResult:
 def equal_resolution(network: FusionNetwork, views: Views) -> StepResult:
     """Resize betas to about alpha's angular resolution where views meet.
 
-    Betas within a quarter of it keep their size. A beta that would be enlarged is first cropped to the part
-    that search segments touch, if that is much smaller.
-    smaller.
+    Betas within a quarter of it keep their size; resized images are clipped to 0..1. A beta that would be
+    enlarged is first cropped to the part that search segments touch, if that is much smaller.
 
     Returns:
         The views; there is nothing to undo.
+
+    Raises:
+        ValueError: for an invalid result of a field, or whatever a field raises for its pair.
+        TypeError: for an object that is no field.
     """
     for name in views.betas:
         views = _cropped(network, views, name)
@@ -186,8 +191,8 @@ def normalise_betas(views: Views, *, undone: bool = False) -> StepResult:
     """Give each beta alpha's mean and standard deviation: for cameras of other exposures or filters.
 
     Args:
-        undone: True to give bands their own scale in the result, as measurements need it; else that is as
-            bright as alpha.
+        undone: True to give bands their own mean and deviation again in the result, which must have those of
+            all betas, in order; False to leave it as bright as alpha.
 
     Returns:
         The views, and the function that undoes the step.
@@ -203,8 +208,7 @@ def normalise_betas(views: Views, *, undone: bool = False) -> StepResult:
 def with_own_levels(
     frame: Frame, bands: Sequence[int], alpha_level: Moments, beta_levels: Sequence[Moments]
 ) -> Frame:
-    """Return a frame whose bands, so many of each beta, have each its beta's own level in place
-    of alpha's."""
+    """Return a frame whose bands, so many of each beta, have their beta's level in place of alpha's."""
     parts = zip(frame.image.split(list(bands)), beta_levels, strict=True)
     return frame._replace(image=torch.cat([alpha_level.matched(planes, scale) for planes, scale in parts]))
 
@@ -212,8 +216,8 @@ def with_own_levels(
 def join(which: JoinsBands, views: Views) -> StepResult:
     """Join co-located betas of the same size, lens and field to one of several bands.
 
-    Undone, the frame's bands are in the rig's order. For "neighbours" nothing is joined if a beta has three
-    bands.
+    Undone, the frame's bands are in the rig's order, each with its confidence (`by_band`). For "neighbours"
+    nothing is joined if a beta has three bands.
 
     Args:
         which: "neighbours" to join only those that follow each other in the rig, "all", or "no" for none.
@@ -239,13 +243,13 @@ def join(which: JoinsBands, views: Views) -> StepResult:
 
 
 def co_located(rig: Rig, names: Sequence[str], fields: Fields, which: JoinsBands) -> list[list[str]]:
-    """Group the betas with the same K, R, t, lens and size, and the same field.
+    """Group the calibrated betas with the same K, R, t, lens, size and field; sensors may differ.
 
     Args:
         which: "neighbours" to group only those that follow each other, "all", or "no" for none.
 
     Returns:
-        Groups of names, in order.
+        Groups of names, in order; a beta without another like it is a group of one.
     """
     groups: list[list[str]] = []
     for name in names:
@@ -262,11 +266,14 @@ def co_located(rig: Rig, names: Sequence[str], fields: Fields, which: JoinsBands
 def without_lenses(rig: Rig, images: Images) -> tuple[Rig, dict[str, Tensor]]:
     """Replace cameras with lenses, and their images, by pinhole views; see `arraygeom.pinhole_view`.
 
+    Cameras without an image, and pinholes with theirs, stay as they are.
+
     Returns:
-        The rig, and the images resampled; pixels outside a lens's range repeat the nearest one inside.
+        The rig, and the images resampled, at least 0; pixels outside a lens's range repeat the nearest one
+        inside.
 
     Raises:
-        ValueError: for an image without a pixel inside its lens's range.
+        ValueError: for an image without a pixel inside its lens's range, or of another size than its camera.
     """
     straight = dict(images)
     for name, image in images.items():
@@ -329,8 +336,7 @@ def _distorted(frame: Frame, straight: Tensor, original: Tensor, pinhole: View, 
 
 
 def of_size(image: Float[Tensor, "c h w"], hw: HW) -> Float[Tensor, "c h2 w2"]:
-    """Return an image of this size, by cubic interpolation, clipped to 0..1; the image itself if it has that
-    size."""
+    """Return an image of this size, by cubic interpolation, clipped to 0..1; itself if it has that size."""
     if image.shape[-2:] == hw:
         return image
     resized = interpolate(image[None], size=hw, mode="bicubic", align_corners=False, antialias=True)
@@ -349,16 +355,14 @@ def hw_at_alphas_resolution(pair: Pair) -> HW:
 
 
 def resolution_ratio(pair: Pair) -> float:
-    """Return pixels of beta per pixel of alpha, by the pair's rough homography at alpha's middle; 1 if
-    undefined."""
+    """Return pixels of beta per pixel of alpha, by the rough homography at its middle; 1 if undefined."""
     steps = _steps_in_beta(pair)
     area = 0.0 if steps is None else abs(float(torch.linalg.det(steps)))
     return math.sqrt(area) if area > 0 else 1.0
 
 
 def quarter_turns(pair: Pair) -> int:
-    """Return the number of quarter turns (see `Camera.rot90`), 0 to 3, that make beta's image upright like
-    alpha's; 0 if undefined."""
+    """Return the quarter turns (`Camera.rot90`), 0 to 3, that make beta upright as alpha; 0 if undefined."""
     steps = _steps_in_beta(pair)
     if steps is None:
         return 0
@@ -367,8 +371,7 @@ def quarter_turns(pair: Pair) -> int:
 
 
 def _steps_in_beta(pair: Pair) -> Float[Tensor, "2 2"] | None:
-    """Return the steps in beta of a pixel right and one down from alpha's middle, by the pair's rough
-    homography."""
+    """Return steps in beta, by the rough homography, of a pixel right and one down from alpha's middle."""
     h, w = pair.alpha.hw
     middle = torch.tensor([[(w - 1) / 2, (h - 1) / 2]], dtype=torch.float64)
     steps = torch.cat([middle, middle + torch.tensor([[1.0, 0.0], [0.0, 1.0]], dtype=torch.float64)])

@@ -92,7 +92,8 @@ def plan_frame(
 
     Args:
         limit: memory limit of the process, bytes; None for no limit.
-        estimate: True to estimate a large frame's time by fusing a small part.
+        estimate: True to estimate a very large frame's time by fusing a small part; with a limit that is
+            done for large frames anyway.
         stored: True if finished tiles are stored on disk until all are there.
         before: work before fusion, as a share of it, to add to the time.
         after: seconds of work after fusion, to add to the time.
@@ -102,7 +103,7 @@ def plan_frame(
         The plan; its time is None unless it was measured.
 
     Raises:
-        ValueError: for a limit that is too small even for tiles of 64 pixels.
+        ValueError: for a limit that is too small even for tiles of 64 pixels, or for matching.
     """
     pieces, pixels = frame.inputs.pieces, math.prod(frame.hw)
     bands = frame.inputs.bands or sum(beta.image.shape[1] for beta in frame.inputs.betas)
@@ -159,8 +160,7 @@ def tiles_within(
 
 
 def working_memory(network: FusionNetwork, inputs: Inputs, tile: Tile) -> float:
-    """Return the bytes of a tile: those for its part of alpha and the part of each beta that its segments
-    touch."""
+    """Return the bytes of a tile: its part of alpha, and the part of each beta that its segments touch."""
     betas = [area(inputs.touched(beta, tile.outer, 16)) for beta in inputs.betas]
     return network.working_bytes(area(tile.outer), betas)
 
@@ -219,12 +219,12 @@ class FusedTile(NamedTuple):
 
     Attributes:
         image: fused image (C, h, w), not clipped.
-        depth: depth in alpha (h, w), in the rig's unit; NaN where unknown.
+        depth: depth (h, w) along alpha's axis, or its rays, in the rig's unit; NaN where unknown.
         confidence: confidence of the image (h, w), 0 to 1.
         half_width: half-width of the interval of inverse depth (h, w), as in `Frame`.
         matched: positions of its pixels in each whole beta with their confidence, (betas, 3, h, w): x, y in
             beta's pixels, confidence; empty if not kept.
-        by_band: confidence of each band (C, h, w), where each is another beta's; else empty.
+        by_band: confidence of each band (C, h, w), float16, where they are several betas'; else empty.
     """
 
     image: Tensor
@@ -291,7 +291,7 @@ def fused_in_tiles(
         keep_matched: False to leave out `matched`, which takes 12 bytes a pixel and beta.
         progress: function of the tiles and their number that yields the tiles to show progress; None for
             none.
-        store: folder of finished tiles, read and written; None for none.
+        store: folder of finished tiles, read and written if they are several; None for none.
 
     Returns:
         The whole frame, in the form of one tile. A stored tile that is damaged is fused again.

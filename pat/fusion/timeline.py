@@ -32,7 +32,8 @@ class Timeline:
         alpha: name of alpha.
 
     Raises:
-        ValueError: for a camera without a frame rate or frames, and without frames of alpha or any beta.
+        ValueError: for a camera without a frame rate or frames, or that the rig lacks, and without frames of
+            alpha or any beta.
     """
 
     rig: Rig
@@ -67,8 +68,7 @@ class Timeline:
         return self.rig[name].sensor.time_offset + i / self.rate(name)
 
     def nearest(self, name: str, time: float) -> int:
-        """Return the number of the frame recorded nearest to a time: the first or last one outside the
-        recording."""
+        """Return the number of the frame recorded nearest to a time; the first or last one beyond these."""
         i = round((time - self.rig[name].sensor.time_offset) * self.rate(name))
         return min(max(i, 0), self.counts[name] - 1)
 
@@ -106,7 +106,7 @@ class Timeline:
         return [KeyFrame(i, self.at(i)) for i in sorted(gains)]
 
     def warn_of_ends(self) -> None:
-        """Warn of each beta that recorded nothing during a part of alpha's time.
+        """Warn of each beta without a frame within one of its own intervals of each of alpha's frames.
 
         Its first or last frame gives colour there.
         """

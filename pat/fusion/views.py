@@ -58,9 +58,7 @@ class Views:
     alpha: str
     fields: Fields = dataclasses.field(default_factory=dict)
     alpha_in_colour: bool = False
-    """True if alpha's image was in colour before it was made grey."""
     joined: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
-    """Cameras whose bands a beta's image has, if they are several."""
 
     @classmethod
     def of(
@@ -82,10 +80,10 @@ class Views:
             field: field of all betas, or of each; None for the default.
 
         Raises:
-            ValueError: for a camera that the rig lacks, no image of alpha or of any beta, an image of another
-                size than the rig states, of another type, with values that are not finite or far outside
-                0..1, or so much brighter than another that the stated exposures must be wrong.
-            TypeError: for images that are no tensors, or have no names.
+            ValueError: for a camera that the rig lacks, no image of alpha or of any beta, an alpha of other
+                bands than one and three, a depth range that `Rig` refuses, and as `range_of` and
+                `check_exposures`. Images that are read when asked for raise as their mapping does.
+            TypeError: for images that are no tensors, or have no names, and a depth range that is no pair.
         """
         if not isinstance(images, Mapping):
             raise TypeError(f"the images are a {type(images).__name__}: give {{NAME: image}}, by camera")
@@ -117,8 +115,7 @@ class Views:
         return [name for name in self.rig.betas(self.alpha) if name in self.images]
 
     def pair(self, beta: str) -> Pair:
-        """Return alpha and a beta, with the depth range that is searched: fields may have bounds of their
-        own."""
+        """Return alpha and a beta, with the depth range that is searched: a field may have its own."""
         pair, field = self.rig.pair(self.alpha, beta), innermost(self.fields.get(beta))
         field = innermost(field.field) if isinstance(field, ThroughLenses) else field
         if not (pair.calibrated and isinstance(field, Curved | Epipolar)):
@@ -143,13 +140,13 @@ def dense_bytes(alpha: HW, beta: HW, stride: int = 1) -> float:
 
 
 def check_dense(views: Views, limit: float | None) -> None:
-    """Check that dense fields fit into memory.
+    """Check that dense fields fit into memory: this machine's, and a limit.
 
     Args:
-        limit: memory limit, bytes; None for the memory of this machine.
+        limit: memory limit, bytes; None for no limit.
 
     Raises:
-        ValueError: for a `Dense` field of a beta that takes more.
+        ValueError: for a `Dense` field of a beta whose positions take more.
     """
     has = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") if os.name == "posix" else math.inf
     most, (h, w) = min(limit or math.inf, has), views.rig[views.alpha].hw
@@ -173,7 +170,7 @@ def check_exposures(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> None:
     Each image is compared with alpha's; pairs without two stated exposures are not checked.
 
     Raises:
-        ValueError: for images so different in brightness that their exposures must be wrong.
+        ValueError: for images that differ more than `BRIGHTER` times in light: exposures must be wrong.
     """
     light = {n: float(i[:, ::4, ::4].detach().clamp(min=0).pow(2.2).mean()) for n, i in images.items()}
     for name, one in light.items():
@@ -211,10 +208,11 @@ def grey_alpha(name: str, image: Float[Tensor, "c h w"]) -> Float[Tensor, "1 h w
 
 
 def check_precision(views: Views, network: Any) -> None:
-    """Refuse images of another precision than a network's weights, and images or a rig on another device.
+    """Check that images have the precision of a network's weights, and that all is on alpha's device.
 
     Raises:
-        ValueError: in either case; the text says what to do.
+        ValueError: for an image of another precision, and an image, a rig or weights on another device; the
+            text says what to do.
     """
     weights = next(network.parameters(), None) if isinstance(network, nn.Module) else None
     own = views.images[views.alpha].device
@@ -271,7 +269,7 @@ def checked_image(rig: Rig, images: Images, name: str) -> Tensor:
 
     Raises:
         TypeError: unless it is a tensor.
-        ValueError: unless it is (C, H, W), as large as the rig states, with plausible values.
+        ValueError: as `range_of`, for the size that the rig states. The look-up raises as `images` does.
     """
     image = images[name]
     exposed = rig[name].sensor.exposure is not None
@@ -295,8 +293,8 @@ def range_of(name: str, image: Any, hw: HW | None = None, *, exposed: bool = Fal
 
     Raises:
         TypeError: unless it is a tensor.
-        ValueError: unless it is a float image (C, H, W), of this size, in 0..1 except for noise and
-            highlights.
+        ValueError: unless it is a dense float image (C, H, W) of this size (without `hw`, wider than 3), with
+            finite values from `SMALLEST_VALUE` to `LARGEST_VALUE`, at most half above 1 if not `exposed`.
     """
     if not isinstance(image, Tensor):
         raise TypeError(
@@ -340,6 +338,8 @@ memory is worth."""
 class FilesOfCameras(Mapping[str, T]):
     """Base class of a mapping of cameras to the content of an image file of each, read when asked for.
 
+    Subclasses define `__getitem__`.
+
     Args:
         rig: the cameras.
         files: image file of each camera.
@@ -361,7 +361,7 @@ class FilesOfCameras(Mapping[str, T]):
 class ViewFiles(FilesOfCameras[Tensor]):
     """Images by camera, read from files and developed when asked for; small ones (`KEPT`) stay in memory.
 
-    Looking up a camera raises FileNotFoundError or ValueError as `read_view` does.
+    Looking up a camera raises FileNotFoundError or ValueError as `read_view` does, KeyError without a file.
 
     Args:
         rig: the cameras.
@@ -369,7 +369,7 @@ class ViewFiles(FilesOfCameras[Tensor]):
         alpha: camera to whose scale of light the images are brought.
 
     Raises:
-        ValueError: for an alpha too large for the memory limit (`check_limit`).
+        ValueError: for an alpha that the rig lacks, or too large for the memory limit (`check_limit`).
     """
 
     def __init__(self, rig: Rig, files: Mapping[str, str | Path], *, alpha: str) -> None:
@@ -407,12 +407,13 @@ def read_view(
         sized: True to require the size that the rig states.
 
     Returns:
-        The image (C, H, W), sRGB values in 0..1, or above where light exceeds white.
+        The image (C, H, W) of one band or three, sRGB values in 0..1, or above where light exceeds white; one
+        band where the rig states one and the file has three equal ones.
 
     Raises:
         FileNotFoundError: for a missing file, with camera and file.
-        ValueError: for a file that cannot be read, has another size than the rig states, or is in colour
-            where the rig states raw, with camera and file.
+        ValueError: for a file that cannot be read, contradicts the `bits` or (if `sized`) the size that the
+            rig states, or is in colour where it states raw, with camera and file; for an unknown camera.
     """
     view = rig[name]
     hw = view.hw if sized else None

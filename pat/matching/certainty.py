@@ -53,10 +53,11 @@ MEASURED = 3 * (1 + len(SETTINGS.around)) + len(SETTINGS.apart) + 4 + 2
 
 
 class CertaintyNetwork(nn.Sequential):
-    """Network of a match's confidence, from the `measured` numbers of its pixel.
+    """Network of a match's confidence, from the `measured` numbers of its pixel; a new one is not trained.
 
-    It returns two numbers for each pixel: the logit of the probability that the match is right, and the
-    logarithm of the half-width, pixels of beta, of the interval that holds the true position.
+    It takes them in the last axis, (..., `MEASURED`), and returns two (..., 2): the logit of the probability
+    that the match is right, and the logarithm of the half-width, pixels of beta, of the interval that holds
+    the true position in 9 of 10 cases.
     """
 
     def __init__(self) -> None:
@@ -75,11 +76,13 @@ def fitted_network() -> CertaintyNetwork:
 def with_certainty(matches: Matches) -> Matches:
     """Add the confidence of each match, by the network that ships.
 
-    The choice network must have run before (`stated` is not None). Where matches had a confidence before, of
-    each beta alone, the smaller one counts.
+    Where matches had a confidence before, of each beta alone, the smaller probability counts.
 
     Returns:
-        The matches with `certainty`, detached.
+        The matches with `certainty`, detached, else as given.
+
+    Raises:
+        AssertionError: for matches before the choice network has run (`stated` is None).
     """
     return Matches(tuple(replace(beta, certainty=_certainty(beta)) for beta in matches.betas))
 
@@ -113,11 +116,13 @@ def measured(matches: BetaMatches, typical: Float[Tensor, "b 2"]) -> Float[Tenso
     """Compute the confidence network's inputs: `MEASURED` numbers of each pixel at half the size.
 
     Args:
-        matches: matches in one beta, after the choice network.
+        matches: matches in one beta, after the choice network (AssertionError before).
         typical: `typical_facts` of the whole frame.
 
     Returns:
-        Numbers (B, `MEASURED`, H / 2, W / 2).
+        Numbers (B, `MEASURED`, H / 2, W / 2): `facts`, and their means in each radius of `SETTINGS.around`;
+        logarithms of the range of disparities in each of `SETTINGS.apart`; blurs of alpha and of beta;
+        `typical`; `stated`.
     """
     assert matches.stated is not None
     facts = [matches.facts, *(box_mean(matches.facts, radius) for radius in SETTINGS.around)]

@@ -69,10 +69,11 @@ its views."""
 
 
 class Choice(nn.Module):
-    """U-Net that scores a pixel's candidate disparities.
+    """U-Net that scores a pixel's candidate disparities; a new one is not trained.
 
-    It also estimates the logit of the probability that beta sees the point and the best candidate is right to
-    a pixel, and the logarithm of that candidate's error in pixels of beta.
+    From `features` it computes planes (B, `CANDIDATES` + 2, 4, h2, w2), 2 x 2 pixels row by row: a score for
+    each candidate, the logit of the probability that beta sees the point and the best one is right to a
+    pixel, and the logarithm of that one's error in pixels of beta.
 
     Args:
         widths: channels at 1/2, 1/4 and 1/8 of alpha's size.
@@ -97,14 +98,17 @@ def fitted_choice() -> Choice:
 def chosen(inputs: Inputs, matches: Matches, network: Choice | None = None) -> Matches:
     """Choose each pixel's candidate disparity of the highest score, in each beta.
 
-    Where each segment is around a known depth of its own pixel, candidates from other pixels mean nothing:
-    then matches stay as they are, and only their confidence is estimated.
+    Where each segment is around a known depth of its own pixel (`Beta.around`), candidates from other pixels
+    mean nothing: then nothing is chosen, and only `stated` is estimated.
 
     Args:
         network: network that scores the candidates; None for the one that ships.
 
     Returns:
-        The matches with `chosen` and `stated`, detached.
+        The matches with `chosen` (None for such a beta) and `stated`, detached.
+
+    Raises:
+        ValueError: for a beta whose field is not of straight segments.
     """
     best = network or fitted_choice()
     return Matches(tuple(_chosen(*one, best) for one in zip(inputs.by_beta, matches.betas)))
@@ -135,8 +139,7 @@ def _chosen(inputs: Inputs, matches: BetaMatches, network: Choice) -> BetaMatche
 def _answered(
     k: int, views: ComparedViews, segments: Segments, matches: BetaMatches, typical: Tensor, network: Choice
 ) -> tuple[Float[Tensor, "b 1 h w"], Float[Tensor, "b 2 h2 w2"]]:
-    """Return the disparity chosen, and the statements about it, all turned so many quarter turns for the
-    network."""
+    """Return the disparity chosen, and the statements about it, all turned for the network and back."""
 
     def turned(x: Tensor, by: int = k, sides: tuple[int, int] = (-2, -1)) -> Tensor:
         return x.rot90(by, sides) if k else x  # turned by nothing it would be a copy
@@ -160,8 +163,7 @@ def _answered(
 
 
 def quarter_turns(segments: Segments) -> Int[Tensor, "b h w"]:
-    """Compute the quarter turns (`Tensor.rot90`), 0 to 3, after which a segment's near end is left of its far
-    end.
+    """Compute the quarter turns (`Tensor.rot90`), 0 to 3, that bring a segment's start left of its end.
 
     That is the order of rectified views whose alpha is on the left.
     """
@@ -193,11 +195,12 @@ def features(
         views: alpha and beta, equally bright and sharp.
         segments: segments of alpha's pixels.
         matches: semi-global matches.
-        options: disparities of the candidates, pixels of beta.
+        options: disparities of the `CANDIDATES`, pixels of beta.
         typical: `typical_facts` of the whole frame.
 
     Returns:
-        Channels at half the size, in which full-size planes have four for each 2 x 2 pixels.
+        Channels at half the size, detached: the `FACTS`, then the numbers of `choice_numba.compared`, four
+        for the 2 x 2 pixels of each plane.
     """
     extent, (h, w) = Extent.from_segments(segments), options.shape[-2:]
     half = _at_half(matches, typical)

@@ -20,7 +20,7 @@ def soft(x):
 def compared(alpha, beta, end, towards, candidates, scales, out):
     """Compare alpha with beta at each candidate disparity, with 2 x 2 pixels as channels.
 
-    Beyond h or w the last row or column is repeated.
+    Beyond h or w alpha's last row or column is repeated, beyond beta's edge its nearest pixel.
 
     Args:
         alpha: brightness (h, w) of alpha.
@@ -29,9 +29,10 @@ def compared(alpha, beta, end, towards, candidates, scales, out):
         towards: unit vectors (h, w, 2) from end to start.
         candidates: disparities (n, h, w), pixels from the end; the first is the pixel's own match.
         scales: differences of disparity and of brightness that are mapped to 1/2.
-        out: numbers (h / 2, w / 2, 4 + 8 n) to write, four for the 2 x 2 pixels of each plane: alpha minus
-            1/2; for each candidate but the first the difference of its disparity from the first one's; for
-            each the excess of alpha's brightness over beta's; and 1 where the first is on beta.
+        out: numbers (h / 2, w / 2, 4 + 8 n), or more rows and columns, to write; of each plane four for the 2
+            x 2 pixels: alpha minus 1/2; for each candidate but the first the difference of its disparity from
+            the first one's, by `soft`; for each the excess of alpha's brightness over beta's, by `soft`; and
+            1 where the first is on beta, else 0.
     """
     n, height, width = candidates.shape
     rows, columns = beta.shape

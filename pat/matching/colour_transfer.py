@@ -88,7 +88,7 @@ class MatchStatistics(NamedTuple):
     They are taken over the whole frame: statistics of its tiles would differ, and their borders show.
 
     Attributes:
-        matches: number of consistent matches, plus one, (B, 1, 1, 1).
+        matches: number of consistent matches, plus one, (B, 1, 1, 1); of a frame in pieces a mean of theirs.
         colour: mean of beta's bands minus alpha, (B, C, 1, 1).
         level: means of beta's brightness and of its square, and of alpha and of its square, (4, B, 1, 1, 1).
         explained: share of the variance of beta's combined bands that alpha explains, 0 to 1, (B, 1, 1, 1).
@@ -154,13 +154,14 @@ def transferred(inputs: Inputs, matches: Matches) -> Matches:
     """Transfer the betas' bands to alpha's view, also for matches from another source.
 
     Fills are colours for pixels that beta does not see. Of several betas matched together, those with all of
-    the result's bands share one fill; any other has its own. Gradients reach images and fields.
+    the result's bands share one fill; any other has its own. Gradients reach images and fields, but not
+    through fills.
 
     Returns:
         The matches with `colours` (bands minus alpha); float16 for a large frame without gradients.
 
     Raises:
-        ValueError: for matches of another size or number of betas.
+        ValueError: as `Matches.check`, and for a beta whose field is not of straight segments.
     """
     matches.check(inputs)
     large = len(inputs.pieces) > 1
@@ -210,8 +211,7 @@ def _fills(inputs: Inputs, carried: Sequence[tuple[Tensor, Tensor, Tensor]]) -> 
 
 
 def directions_of(segments: Segments) -> Float[NDArray, "2 2"]:
-    """Compute the mean outer product of the unit vectors along valid segments; half the identity
-    without any."""
+    """Compute the mean outer product of unit vectors along valid segments; half the identity without any."""
     some = (segments.end - segments.start)[..., ::DIRECTIONS, ::DIRECTIONS, :].detach().double()
     some = some[segments.valid[..., ::DIRECTIONS, ::DIRECTIONS]]
     units = some[some.norm(dim=-1) > LEAST].cpu().numpy()
@@ -244,11 +244,13 @@ def transferred_bands(
         beta: beta's image and field.
         matches: matches in that beta.
         statistics: statistics to use; None for those of these pixels.
-        sees_luma: True if alpha sees about the luma of RGB betas.
+        sees_luma: True if alpha sees about the luma of RGB betas; not used for matches with a mix of bands.
 
     Returns:
-        Bands minus alpha, their weight and their similarity to alpha (`Colours`) at alpha's pixels; and the
-        statistics.
+        `bands`, `weight` and `likeness` of `Colours`, at alpha's pixels; and the statistics.
+
+    Raises:
+        ValueError: for a field that is not of straight segments.
     """
     if matches.comparison.mix is not None:
         return _colours_of_bands(alpha, beta, matches, matches.comparison.mix, statistics)
@@ -265,7 +267,7 @@ def matched_colours(
 ) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 1 h w"], Float[Tensor, "b 1 h w"], MatchStatistics]:
     """Compute beta's bands minus alpha at the matches, with the detail that alpha has and beta lacks.
 
-    The bands are combined to luma or their mean, as where their spectra are known.
+    Alpha is compared with luma of three bands, or the mean of others, whatever mix the matches have.
 
     Args:
         statistics: statistics to use; None for those of these pixels.
@@ -273,8 +275,11 @@ def matched_colours(
             weight, and colours grow with alpha's brightness.
 
     Returns:
-        Bands minus alpha (the frame's mean where the match is not on beta); the weight of these colours, 0 to
-        1; the photometric similarity, 0 to 1, with 1 for what it cannot tell; and the statistics.
+        Bands minus alpha (the statistics' mean where the match is not on beta); the weight of these colours,
+        0 to 1; the photometric similarity, 0 to 1, with 1 where it cannot tell; and the statistics.
+
+    Raises:
+        ValueError: for a field that is not of straight segments.
     """
     guide, normalisation = combined_bands(beta.image), matches.comparison.whole
     bands = beta.image.shape[1]
@@ -320,12 +325,12 @@ def with_clipped_light(
     differs between the views, each by its expected variance: a ridge regression of one number at each pixel.
 
     Args:
-        luma: luma of the values.
+        luma: Rec. 601 luma of the values.
         alpha: alpha, as sharp as these.
         clipped: 1 where a band is clipped, 0 elsewhere, and between them beside such pixels.
 
     Returns:
-        The bands, and their luma.
+        The bands, which may exceed 1, and their luma.
     """
     share = (clipped * values.new_tensor(REC601)[:, None, None]).sum(1, keepdim=True)
     beyond = (alpha - luma).clamp(min=0) * share / (share.square() + SETTINGS.light_differs)
@@ -359,8 +364,7 @@ def _colours_of_bands(
 def _scaled_to_alpha(
     colour: Tensor, brightness: Tensor, alpha: Tensor, weight: Tensor, power: float
 ) -> tuple[Tensor, Tensor]:
-    """Return colour differences (B, C, H, W) and brightness of beta, larger where alpha is brighter around a
-    pixel.
+    """Return beta's colour differences (B, C, H, W) and brightness, larger where alpha is brighter around.
 
     Light or a lens that makes a surface brighter keeps its saturation, a reflection does not: the power is in
     between; and 0 where alpha sees another spectrum, such as near infrared: there the ratio is of materials.
@@ -386,7 +390,7 @@ def match_weight(
         valid: mask of the matches that are on beta.
 
     Returns:
-        Weights, 0 to 1; 0 off beta.
+        Weights, 0 to 1; 0 where `valid` is False.
     """
     checked = alike * (1 + is_consistent(matches.facts)) / 2
     if matches.certainty is None:
@@ -405,6 +409,8 @@ def filled_from(
 ) -> Float[Tensor, "b fills c h w"]:
     """Fill in the colours of pixels that beta does not see by those of the most similar pixels that it sees.
 
+    Seen pixels, those of a weight above 1/2, keep their colour; if these are hardly any, all pixels do.
+
     Args:
         colour: bands minus alpha.
         alpha: alpha's image.
@@ -414,7 +420,7 @@ def filled_from(
             and take only the difference from it from examples.
 
     Returns:
-        One fill at all pixels, or with `regressed` the regression and the fill; detached.
+        One fill at all pixels, or with `regressed` the regression and the fill, minus alpha; detached.
     """
     planes = zip(numpy_of(colour), numpy_of(alpha[:, 0]), numpy_of(weight[:, 0]), to_bytes(alpha[:, 0]))
     fills = []
@@ -440,7 +446,7 @@ def colour_noise(
         weight: weight of each pixel, 0 to 1; those above a half count.
 
     Returns:
-        Variance for each of the batch; 0 where there is none, or no pixel counts.
+        Variance for each of the batch, without gradient; 0 where there is none, or no pixel counts.
     """
     parts, radius = torch.cat([unlike, texture], 1), SETTINGS.detail_radius
     fine = box_mean((parts - box_mean(parts, radius)).square(), radius)
@@ -451,8 +457,7 @@ def colour_noise(
 
 
 def _without_noise(colour: Tensor, brightness: Tensor, noise: Tensor) -> Tensor:
-    """Return colour (B, C, H, W) nearer its local regression on brightness, the noisier the rest
-    (Lee 1980)."""
+    """Return colour (B, C, H, W) nearer its regression on brightness, the noisier the rest (Lee 1980)."""
     local = LocalMoments.within(SETTINGS.detail_radius, colour, brightness)
     slope = local.slope(SETTINGS.floor)
     fitted = local.bands + slope * (brightness - local.image)
@@ -470,8 +475,7 @@ def _each_detailed(colour: Tensor, brightness: Tensor, alpha: Tensor, radii: Seq
 def _detailed(
     colour: Tensor, brightness: Tensor, alpha: Tensor, radius: int = SETTINGS.detail_radius
 ) -> Tensor:
-    """Move colour (B, C, H, W) along its local regression on brightness by the excess of alpha's
-    brightness."""
+    """Move colour (B, C, H, W) along its local regression on brightness by the excess of alpha's."""
 
     def of(colour: Tensor, brightness: Tensor, alpha: Tensor) -> Tensor:
         return colour + local_slope(colour, brightness, radius) * SETTINGS.detail(alpha - brightness)
@@ -507,8 +511,7 @@ def local_slope(
 def _diffused(
     colour: NDArray, brightness: NDArray, weight: NDArray, guide: NDArray[np.uint8]
 ) -> NDArray[np.float32]:
-    """Compute colour (c, h, w) by its weighted regression on brightness (h, w) over connected regions of the
-    guide.
+    """Compute colour (c, h, w) by its regression on brightness (h, w) over connected regions of the guide.
 
     The moments of the guided filter (He et al. 2013), diffused instead of averaged over a window: a region
     that no beta sees has colour that varies with brightness as it does nearby.

@@ -111,15 +111,15 @@ def fit_misalignment(
     """Estimate the displacement of beta across its segments, from matches.
 
     Args:
-        alpha: brightness of alpha.
+        alpha: brightness of alpha, 0..1.
         beta: brightness of beta, as bright and sharp as alpha.
-        position: positions of alpha's pixels in beta, by the matches.
+        position: positions (x, y) of alpha's pixels in beta, by the matches.
         normal: unit vectors across the segments (`normals`).
         weight: weight of each match, 0 to 1.
 
     Returns:
-        The misalignment; all zeros for too little texture, for less than `SETTINGS.least` pixels anywhere, or
-        if it explains the images hardly better.
+        The misalignment, in widths of this alpha; all zeros for too little texture, for less than
+        `SETTINGS.least` pixels anywhere, or if it explains the images hardly better.
     """
     arrays = (t.detach().cpu().float().numpy() for t in (alpha, beta, position, normal, weight))
     views = _Windows.from_arrays(*arrays)

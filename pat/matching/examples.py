@@ -62,8 +62,8 @@ def by_examples(
             examples count as nearer along these.
 
     Returns:
-        Colour at all pixels; seen ones keep theirs. `colour` itself if all are seen, or fewer than a mean
-        takes.
+        Colour at all pixels; seen ones keep theirs. The array `colour` itself if all are seen, or fewer than
+        a mean takes.
     """
     seen = weight > SETTINGS.seen
     near = cv2.dilate((~seen).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0

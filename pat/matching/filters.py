@@ -21,10 +21,10 @@ def blurred(images: Float[Tensor, "b 1 h w"], blurs: Sequence[float]) -> Float[T
     """Blur each image of a batch by its own Gaussian.
 
     Args:
-        blurs: standard deviation for each image, pixels; 0 leaves it.
+        blurs: standard deviation for each image, pixels, as many as images; 0 leaves one as it is.
 
     Returns:
-        Images of the same shape, with gradients if the images have some.
+        Images of the same shape and type, with gradients if the images have some.
     """
 
     def one(image: Tensor, blur: float) -> Tensor:
@@ -42,8 +42,7 @@ def blurred(images: Float[Tensor, "b 1 h w"], blurs: Sequence[float]) -> Float[T
 
 
 def box_mean(x: Tensor, radius: int) -> Tensor:
-    """Compute means of planes (*b, h, w) over squares of side 2 `radius` + 1, as far as these are on the
-    image."""
+    """Compute means of planes (*b, h, w) over squares of side 2 `radius` + 1, as far as on the image."""
     side = 2 * radius + 1
     if compilable(x) and not x.requires_grad:
         return _box_mean_of_numbers(x, radius)
@@ -65,14 +64,14 @@ def _box_mean_of_numbers(x: Tensor, radius: int) -> Tensor:
 
 
 class LocalMoments(NamedTuple):
-    """Moments of bands (B, C, H, W) and an image (B, 1, H, W) within squares around each pixel.
+    """Moments of bands and an image within squares around each pixel, as far as these are on the image.
 
     Attributes:
-        bands: means of the bands.
-        image: means of the image.
-        variance_of_bands: variances of the bands.
-        variance_of_image: variances of the image.
-        covariance: covariances of each band with the image.
+        bands: means of the bands (B, C, H, W).
+        image: means of the image (B, 1, H, W).
+        variance_of_bands: variances of the bands (B, C, H, W).
+        variance_of_image: variances of the image (B, 1, H, W).
+        covariance: covariances of each band with the image (B, C, H, W).
     """
 
     bands: Tensor
@@ -93,8 +92,7 @@ class LocalMoments(NamedTuple):
         return cls(centre, middle, variation, variance, mean(bands * image) - centre * middle)
 
     def slope(self, floor: float) -> Float[Tensor, "b c h w"]:
-        """Return the slope of the bands' regression on the image, whose variance is regularised
-        by the floor."""
+        """Return the slope of the bands' regression on the image, whose variance the floor regularises."""
         return self.covariance / (self.variance_of_image + floor)
 
 
@@ -103,7 +101,7 @@ def filled(planes: NDArray, weight: NDArray, guide: NDArray, how: tuple[float, f
 
     Args:
         planes: planes (c, h, w).
-        weight: weight (h, w) of each pixel, above 0.
+        weight: weight (h, w) of each pixel, above 0; 0 gives NaN where no other weight reaches.
         guide: image (h, w), uint8, whose edges bound the regions.
         how: strength of smoothing, and 8-bit difference of an edge.
 
@@ -121,11 +119,11 @@ def smoothed(planes: Sequence[NDArray], guide: NDArray[np.uint8], how: tuple[flo
 
     Args:
         planes: planes (h, w).
-        guide: image (h, w).
+        guide: image (h, w), uint8.
         how: strength of smoothing, and 8-bit difference of an edge.
 
     Returns:
-        Planes in float32.
+        The smoothed planes (h, w), float32, in order.
     """
     smoother = cv2.ximgproc.createFastGlobalSmootherFilter(guide, *how)
     return [smoother.filter(np.ascontiguousarray(plane, np.float32)) for plane in planes]

@@ -42,12 +42,13 @@ class Beta:
         image: image (B, C, H, W), values 0..1.
         field: segments or positions of alpha's pixels, in pixels of `image`.
         offset: (x, y) of its first pixel in the whole image; other than (0, 0) for a part of an image.
-        track: function from alpha's pixels (*n, 2) to their tracks in the image; None for an uncalibrated
-            beta.
+        track: function from alpha's pixels (*n, 2) to their tracks in the image; None for a beta that is
+            uncalibrated, known by a link, or of a pair with lenses.
         around: True if each segment is around a known depth of its own pixel: positions along the segments of
             two pixels cannot be compared.
-        cameras: names of the cameras whose bands it shows, one after another.
-        clipped: mask (B, C, H, W), 1 where a band is at its largest value; None for none.
+        cameras: names of the cameras whose bands are its channels, in order; empty if not known.
+        clipped: mask (B, C, H, W), in the type of `image`, 1 where a band is at its largest value or beside
+            such a pixel, else 0; None for none.
     """
 
     image: Float[Tensor, "b c h w"]
@@ -66,7 +67,7 @@ class Inputs:
     Attributes:
         alpha: image (B, C, H, W), values 0..1; one channel for matching.
         betas: the betas.
-        multiple: pixels at whose multiples parts of betas are cut.
+        multiple: pixels at whose multiples parts of alpha and betas are cut.
         beta_halo: pixels around the segments that parts of betas include.
         luminance: alpha's share of the result's luminance, for networks that keep it; the rest is beta's.
         bands: number of the result's bands, whose luminance (the mean, if they are not three) alpha sees;
@@ -106,23 +107,22 @@ class Inputs:
 
     @property
     def pieces(self) -> list[Tile]:
-        """Pieces in which a frame is matched: one, or those with the least work of a size that fits into
-        memory."""
+        """Pieces in which a frame is matched: one, or of a large frame those with the least work."""
         if math.prod(self.hw) <= SETTINGS.at_once:
             return [whole(self.hw)]
         sides = sides_by_work(self.hw, SETTINGS.halo, self.multiple, SETTINGS.at_once)
         return list(tiles_of(self.hw, sides[0], SETTINGS.halo))
 
     def in_pieces(self, make: Callable[..., Any], *more: Any) -> Any:
-        """Apply a function to each tile of these inputs, and assemble the results.
+        """Apply a function to these inputs, or to tiles of large ones (`pieces`), and assemble the results.
 
         Args:
-            make: function of `Inputs` (and of each of `more`) that returns one plane or several, of the
-                tile's size or smaller by a whole factor.
+            make: function of `Inputs` (and of each of `more`) that returns one plane (..., h, w) or several,
+                of the size of its `alpha` or smaller by a whole factor.
             more: values with a method `cut(box)`, which are cut to the same tiles.
 
         Returns:
-            Planes (..., h, w), one or several, as the function returns.
+            Planes of the whole frame: a tensor or a tuple; with a single tile the function's own result.
         """
         pieces = self.pieces
         if len(pieces) == 1:
@@ -151,8 +151,7 @@ class Inputs:
         return [replace(self, betas=(beta,)) for beta in self.betas]
 
     def cut(self, box: Box) -> Inputs:
-        """Return a part of alpha, (top, bottom, left, right), with the part of each beta that its segments
-        touch."""
+        """Return a part of alpha, (top, bottom, left, right), with the part of each beta that it touches."""
         top, bottom, left, right = box
         return replace(
             self,
@@ -161,14 +160,15 @@ class Inputs:
         )
 
     def touched(self, beta: Beta, box: Box, step: int = 2) -> Box:
-        """Compute the part of a beta that the segments of a part of alpha touch, with the halo.
+        """Compute the part of a beta that the segments or positions of a part of alpha touch.
 
         Args:
+            beta: one of `betas`.
             box: part of alpha: top, bottom, left, right.
             step: distance of the rows and columns of alpha that are looked at.
 
         Returns:
-            Rows and columns of beta: top, bottom, left, right, at multiples of `multiple`.
+            Rows and columns of beta, `beta_halo` included: top, bottom, left, right, as of `box_around`.
         """
         hw = beta.image.shape[-2], beta.image.shape[-1]
         return box_around(_ends_in(beta.field, box, step), hw, self.beta_halo, self.multiple)
@@ -189,13 +189,13 @@ def track_in(
     scale: float,
     offset: tuple[float, float],
 ) -> Callable[[Tensor], Track]:
-    """Convert a function of tracks to a part of alpha and a resized or cropped beta.
+    """Convert a function of tracks to a part of alpha, or a resized one, and a resized or cropped beta.
 
     Args:
         track: function from pixels of the whole alpha to tracks in the whole beta.
         whole: function from pixels of the part of alpha to those of the whole.
         scale: factor of beta's pixels.
-        offset: (x, y) added after that.
+        offset: (x, y) added after that, in new pixels.
 
     Returns:
         Function from pixels of the part to tracks in the new pixels of beta.
@@ -215,18 +215,19 @@ def ends_of(locations: Segments | Positions) -> Float[Tensor, "n 2"]:
 
 
 def box_around(points: Float[Tensor, "n 2"], hw: HW, halo: int, multiple: int) -> Box:
-    """Compute the part of an image around points (x, y).
+    """Compute the part of an image around points.
 
     Points off the image count as the nearest pixel.
 
     Args:
-        points: pixels.
+        points: pixels (x, y), floats.
         hw: height and width of the image.
         halo: pixels to add on each side.
         multiple: number to whose multiples the part is widened, as far as the image goes.
 
     Returns:
-        Rows and columns: top, bottom, left, right; the first `multiple` of each without points.
+        Rows and columns: top, bottom, left, right; without points the first `multiple` of each, whatever
+        `hw`.
     """
     if not len(points):
         return 0, multiple, 0, multiple

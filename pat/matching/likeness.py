@@ -27,8 +27,7 @@ UNLIKE = SETTINGS.unlike
 
 
 def likeness(difference: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b 1 h w"]:
-    """Compute photometric similarity: 1 where two images are equally bright around a pixel, 0 where they are
-    not.
+    """Compute photometric similarity: 1 where images are equally bright around a pixel, down to 0 elsewhere.
 
     Args:
         difference: difference of brightness.

@@ -38,17 +38,18 @@ def match(inputs: Inputs, choice: Choice | None = None) -> Matches:
     """Match alpha with every beta, estimate the confidence of each match, and transfer the betas' bands.
 
     Gradients reach images and fields, through the positions too. Without `inputs.learned` matches are
-    semi-global ones with a left-right check, and have no trained confidence.
+    semi-global ones with a left-right check, without `chosen`, `stated` and `certainty`.
 
     Args:
-        inputs: alpha, of one channel and even sides, and the betas.
-        choice: network that chooses between candidate disparities; None for the one that ships.
+        inputs: alpha, of one channel (not checked) and even sides, and the betas.
+        choice: network that chooses between candidate disparities; None for the one that ships. Not used
+            without `inputs.learned`.
 
     Returns:
         The matches in each beta, with `colours` at alpha's view.
 
     Raises:
-        ValueError: for a beta whose field is not of straight segments, and for an alpha of odd sides.
+        ValueError: for no beta, a beta whose field is not of straight segments, and an alpha of odd sides.
     """
     if any(side % FINE for side in inputs.hw):
         h, w = inputs.hw
@@ -79,7 +80,10 @@ def in_each_beta(inputs: Inputs) -> Matches:
     """Match each beta as if it were the only one.
 
     Returns:
-        The matches, detached.
+        The matches, detached, as of `located_in_one`.
+
+    Raises:
+        ValueError: for a beta whose field is not of straight segments.
     """
     of_betas = []
     for number, one in enumerate(inputs.by_beta, 1):
@@ -92,10 +96,13 @@ def located_in_one(inputs: Inputs) -> BetaMatches:
     """Match a single beta semi-globally: at half the size for the whole frame, then at full size around that.
 
     Args:
-        inputs: inputs with one beta.
+        inputs: inputs with one beta, and an alpha of even sides.
 
     Returns:
         The matches, detached, without choice, confidence or colours.
+
+    Raises:
+        ValueError: for several betas, or a field that is not of straight segments.
     """
     comparison = Comparison.from_images(inputs.alpha, inputs.betas[0].image, seen_mix(inputs))
     halves = comparison.half_views(inputs.alpha, inputs.betas[0].image)
@@ -117,8 +124,11 @@ def seen_mix(inputs: Inputs) -> SpectralMix | None:
         inputs: inputs with one beta.
 
     Returns:
-        The combination; None where luma or the mean of the bands is compared: the number of the result's
-        bands is stated (`inputs.bands`), or the beta has one band.
+        The combination, without gradients; None where luma or the mean of the bands is compared: the number
+        of the result's bands is stated (`inputs.bands`), or the beta has one band.
+
+    Raises:
+        ValueError: for several betas; where it is estimated, for a field that is not of straight segments.
     """
     alpha, (beta,) = inputs.alpha, inputs.betas
     if inputs.bands is not None or beta.image.shape[1] == 1:
@@ -143,8 +153,11 @@ def coarse_mix(
     Args:
         segments: segments (B or 1, h / factor, w / factor) of the centres of blocks of alpha's pixels, in
             pixels of the whole beta.
-        blocks: segments (B or 1, h / 2 factor, w / 2 factor) of blocks of twice the side.
+        blocks: segments (B or 1, h / (2 factor), w / (2 factor)) of blocks of twice the side.
         factor: whole number by which both images are reduced.
+
+    Returns:
+        The combination of each of the batch, float64, without gradients.
     """
     coarse_alpha, bands = avg_pool2d(alpha, factor), avg_pool2d(beta, factor)
     comparison = Comparison.from_images(coarse_alpha, bands, SpectralMix.equal(bands))

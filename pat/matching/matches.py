@@ -34,12 +34,14 @@ class Colours(NamedTuple):
     """Bands of one beta carried to alpha's view, each minus alpha.
 
     Attributes:
-        bands: (B, C, H, W), bands minus alpha at the match, with the detail that alpha has and beta lacks.
-        weight: (B, 1, H, W), weight of `bands` against the fills, 0 to 1.
-        likeness: (B, 1, H, W), photometric similarity of alpha and beta at the match, 0 to 1; 1 where alpha
-            does not see luma.
-        fills: (B, F, C, H, W), the bands by nearest examples at pixels that beta does not see; before it,
-            where the bands' spectra are not known, their local regression on brightness.
+        bands: (B, C, H, W), bands minus alpha at the match, with the detail that alpha has and beta lacks;
+            the frame's mean where the match is off beta.
+        weight: (B, 1, H, W), weight of `bands` against the fills, 0 to 1; 0 off beta.
+        likeness: (B, 1, H, W), photometric similarity of alpha and beta at the match, 0 to 1; 1 where luma is
+            compared and alpha does not see it.
+        fills: (B, F, C, H, W), further bands minus alpha, at all pixels, without gradients: those of nearest
+            examples where beta does not see the pixel; before these, where the bands' spectra are not known,
+            their local regression on brightness. Several betas may share one tensor.
     """
 
     bands: Tensor
@@ -48,11 +50,11 @@ class Colours(NamedTuple):
     fills: Tensor
 
     def cut(self, box: Box, shared: dict[int, Tensor]) -> Colours:
-        """Return the part at alpha's (top, bottom, left, right).
+        """Return the part at alpha's (top, bottom, left, right), as views of these tensors.
 
         Args:
-            shared: fills that were cut before, by the id of the whole: fills that several betas share stay
-                shared.
+            shared: fills that were cut before, by the id of the whole, to which these are added: fills that
+                several betas share stay shared.
         """
         index = (..., *slices(box))
         fills = shared.setdefault(id(self.fills), self.fills[index])
@@ -66,13 +68,14 @@ class BetaMatches:
     Attributes:
         disparity: (B, 1, H, W), the distance of the match from the end of its segment, pixels of beta; where
             no match passes the left-right check, diffused from where one does.
-        facts: (B, 3, H / 2, W / 2), statistics of the match: left-right error (1 for 8 pixels and more),
-            margin of its cost to the next best, and its cost; each 0 to 1.
-        comparison: the images that were compared.
+        facts: (B, 3, H / 2, W / 2), statistics of the match: left-right error (1 for 8 pixels and more; for
+            agreed matches the distance from the foremost point there, 1 for 16), margin of its cost to the
+            next best, and its cost; each 0 to 1.
+        comparison: combination of beta's bands that was compared, and its normalisation to alpha.
         chosen: (B, 1, H, W), the disparity of the surface that alpha sees, which may be occluded in beta; of
-            several betas, the one on which they agree; None before it is chosen.
+            several betas, the one on which they agree; None if none was chosen.
         stated: (B, 2, H / 2, W / 2), the choice network's logit that its disparity is right, and the
-            logarithm of its error, pixels; None before one is chosen.
+            logarithm of its error, pixels; None before that network has run.
         certainty: (B, 2, H / 2, W / 2), the probability that beta sees the point and the match is within a
             pixel of it, and the half-width, in pixels of beta, of the interval around the match that holds
             the true position in 9 of 10 cases; None where it is not known.
@@ -119,20 +122,29 @@ class BetaMatches:
         return self.colours
 
     def positions(self, segments: Segments, hw: HW) -> tuple[Float[Tensor, "b h w 2"], Bool[Tensor, "b h w"]]:
-        """Compute the positions (x, y) in beta of the surface that alpha sees.
+        """Compute the positions (x, y) in beta of the surface that alpha sees (`surface`).
 
         Args:
             segments: segments of alpha's pixels.
             hw: height and width of the beta.
 
         Returns:
-            Positions (B, H, W, 2) in beta's pixels, and a mask (B, H, W) of those on its image.
+            Positions (B, H, W, 2) in beta's pixels, also beyond segments' starts; and a mask (B, H, W) of
+            those on its image whose segment is valid.
         """
         where = match_positions(segments, self.surface, beyond_edge=True)
         return where, segments.valid & on_image(where, hw)
 
     def check(self, inputs: Inputs) -> None:
-        """Raise ValueError unless all planes are finite floats of the shapes that inputs of one beta need."""
+        """Check the planes, but not that they are of these very images.
+
+        Args:
+            inputs: inputs of this beta alone.
+
+        Raises:
+            ValueError: for planes of other shapes than these inputs need, no floats, or NaN or infinite; for
+                a probability in `certainty` beyond 0 to 1; for `disparity` and `facts` of two types.
+        """
         (batch, _, *hw), bands = inputs.alpha.shape, inputs.betas[0].image.shape[1]
         planes = {name: getattr(self, name) for name in CHANNELS}
         shapes = {
@@ -206,7 +218,11 @@ class Matches:
         return Matches(tuple(beta.cut(box, shared) for beta in self.betas))
 
     def check(self, inputs: Inputs) -> None:
-        """Raise ValueError unless they belong to inputs with so many betas, and pass `BetaMatches.check`."""
+        """Check sizes and planes, but not that the matches are of these very images.
+
+        Raises:
+            ValueError: for another size of alpha or number of betas, and as `BetaMatches.check`.
+        """
         size, betas = self.hw if self.betas else (0, 0), len(inputs.betas)
         if size != inputs.hw or len(self.betas) != betas:
             (h, w), (height, width) = size, inputs.hw

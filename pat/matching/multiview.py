@@ -98,7 +98,7 @@ class MatchedBeta:
 
     Attributes:
         segments: search segments, pixels of beta.
-        track: positions in beta by inverse depth.
+        track: positions in beta by inverse depth in alpha.
         disparity: matches, pixels of beta from the segments' ends.
         facts: left-right error, margin and cost of the matches, (3, h, w), as in `BetaMatches`.
         weight: weight with which a match votes for its inverse depth; 0 for none.
@@ -119,13 +119,18 @@ class MatchedBeta:
         """Read the matches in a beta, at some rows of alpha.
 
         Args:
-            beta: a calibrated beta (its `track` is not None).
-            matches: its matches; if a disparity was chosen, that is taken, with its confidence.
+            beta: a calibrated beta (its `track` is not None), in a field of straight segments.
+            matches: its matches; the first of a batch. A chosen disparity is taken where there is one,
+                weighted by its confidence (`certainty` is not None); else the match, weighted by its margin
+                where it passes the left-right check.
             rows: first row, and row after the last, both even.
             ambiguity: relation of its inverse depths to those of a reference beta.
 
         Returns:
             The matches at these rows, float64.
+
+        Raises:
+            AssertionError: without the track, or the certainty of a chosen disparity.
         """
         (top, bottom), pixels = rows, beta.field.straight
         half = slice(top // FINE, bottom // FINE)
@@ -171,14 +176,12 @@ class MatchedBeta:
         return x / z, y / z
 
     def disparity_of(self, inverse_depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-        """Return the distance of the point of an inverse depth from its segment's end, pixels;
-        not clipped."""
+        """Return the distance of a point from its segment's end by inverse depth, pixels; not clipped."""
         (x, y), (u, v) = self._seen(inverse_depth), self.extent.towards.unbind(-1)
         return torch.addcmul(x * u, y, v) - self._end
 
     def depth_buffer(self) -> Float[Tensor, " n"]:
-        """Return an empty depth buffer: the nearest inverse depth at each pixel of half of beta's size, row
-        by row.
+        """Return an empty depth buffer: the nearest inverse depth at each pixel of half the size, by rows.
 
         Alpha's pixels leave no holes at that size. One more element is for points outside.
         """
@@ -191,8 +194,7 @@ class MatchedBeta:
     def distance_from_front(
         self, inverse_depth: Float[Tensor, "h w"], buffer: Float[Tensor, " n"]
     ) -> Float[Tensor, "h w"]:
-        """Return the distance in pixels of the nearest point at the same pixel of beta; infinite off the
-        image."""
+        """Return the distance in pixels from the nearest point at beta's pixel; infinite off the image."""
         index = self._index(inverse_depth)
         (x, y), (u, v) = self._seen(buffer[index]), self._seen(inverse_depth)
         apart = torch.hypot(x - u, y - v)  # not along the segments: around a known depth they may be points
@@ -209,9 +211,10 @@ class Agreement(NamedTuple):
     """Inverse depths on which the matches of all betas agree, at alpha's pixels.
 
     Attributes:
-        inverse_depth: inverse depth in alpha (1, h, w), 1 / metres.
+        inverse_depth: inverse depth in alpha (1, h, w), one over the rig's unit; 0 where not known.
         known: mask (1, h, w) of the pixels for which any match has a vote.
-        facts: margin and cost (2, h / 2, w / 2), 0 to 1: the best of the matches that agree.
+        facts: margin and cost (2, h / 2, w / 2), 0 to 1: the best of the matches that agree; 0 and 1 where
+            none does.
     """
 
     inverse_depth: Tensor
@@ -251,15 +254,16 @@ class Agreement(NamedTuple):
 def agreed(inputs: Inputs, matches: Matches) -> Matches:
     """Replace the matches in each beta by the inverse depths on which all betas agree.
 
-    Occluded pixels are found with a z-buffer. `disparity` and `facts` are replaced; `chosen` too if it is
-    known for every beta, by agreement of the chosen disparities.
+    Occluded pixels are found with a z-buffer: their left-right error (`facts`) is their distance from the
+    point in front. `disparity` and `facts` are replaced; `chosen` too if it is known for every beta, by
+    agreement of the chosen disparities, and is None otherwise.
 
     Args:
-        inputs: inputs for which `can_agree` is True.
-        matches: matches of each beta alone.
+        inputs: inputs for which `can_agree` is True, which is not checked.
+        matches: matches of each beta alone; chosen ones with `certainty` (AssertionError without).
 
     Returns:
-        The matches, consistent in all betas.
+        The matches, consistent in all betas, detached.
     """
     of_betas = [replace(one, chosen=None) for one in matches.betas]
     between = ambiguities(inputs, of_betas)
@@ -287,8 +291,8 @@ def with_likeliest_colours(inputs: Inputs, own: Matches, agreed: Matches) -> Mat
         agreed: matches on which all betas agree.
 
     Returns:
-        The agreed matches (`chosen` is unchanged), with `disparity` where colours are taken, and `facts` of
-        the own matches.
+        The agreed matches, detached; those in betas with all bands have their `disparity` where colours are
+        taken, and the `facts` of the own matches.
     """
     betas = list(agreed.betas)
     for i, (one, found, same) in enumerate(zip(inputs.by_beta, own.betas, agreed.betas)):
@@ -298,8 +302,7 @@ def with_likeliest_colours(inputs: Inputs, own: Matches, agreed: Matches) -> Mat
 
 
 def _likelier(piece: Inputs, own: BetaMatches, agreed: BetaMatches) -> Float[Tensor, "b 1 h w"]:
-    """Return, of a piece with one beta, the disparity of each pixel at which beta is more similar
-    to alpha."""
+    """Return, of a piece with one beta, each pixel's disparity at which beta is more similar to alpha."""
     (beta,) = piece.betas
     alpha, other, *_ = own.comparison.views(piece.alpha, beta.image)
     mine, theirs = (
@@ -311,8 +314,7 @@ def _likelier(piece: Inputs, own: BetaMatches, agreed: BetaMatches) -> Float[Ten
 def _of_all(
     inputs: Inputs, views: Sequence[Callable[[tuple[int, int]], MatchedBeta]], initial: Sequence[BetaMatches]
 ) -> Iterator[BetaMatches]:
-    """Return the matches of each beta from the inverse depths on which all agree; `views` are by rows of
-    alpha."""
+    """Return the matches of each beta from the inverse depths on which `views`, by rows of alpha, agree."""
     height, width = inputs.hw
     strips = spans(height, max(STRIP // width // FINE, 1) * FINE)
     parts = [Agreement.from_views([at(rows) for at in views], inputs.alpha) for rows in strips]
@@ -366,7 +368,7 @@ class _Sampled(NamedTuple):
             x: columns of alpha's sampled pixels, of the planes' shape; `y` are their rows.
 
         Returns:
-            The ambiguity; `NO_AMBIGUITY` unless clearly more pixels agree than without, or too few are known.
+            The ambiguity; `NO_AMBIGUITY` if too few pixels are known, or not clearly more agree than without.
         """
         both = self.known & other.known
         measured, w, rise, x, y = (plane[both] for plane in (self.w, other.w, self.pixels_per_w, x, y))
@@ -390,8 +392,7 @@ class _Sampled(NamedTuple):
 def _most_agreed(
     terms: Float[Tensor, "n k"], measured: Float[Tensor, " n"], rise: Tensor
 ) -> Float[Tensor, " k"]:
-    """Return the factors of the terms with which most measured values agree; then by least
-    squares of these."""
+    """Return the factors of the terms with which most measured values agree, by least squares of these."""
     n, k = terms.shape
     size = terms.abs().amax(0).clamp(min=1e-12)
     scaled = terms / size

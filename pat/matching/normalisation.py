@@ -62,7 +62,7 @@ class Moments(NamedTuple):
 
 
 def moments(image: Float[Tensor, "*b c h w"], weight: Float[Tensor, "*b 1 h w"] | None = None) -> Moments:
-    """Compute the moments of whole images, or of the pixels with weight."""
+    """Compute the moments of whole images, or, of one band, of the pixels with weight."""
     if weight is None:
         deviation, mean = torch.std_mean(image, (-3, -2, -1), keepdim=True)
         return Moments(mean, deviation)
@@ -77,19 +77,19 @@ def normalised(
     *,
     largest_gain: float = math.inf,
 ) -> Float[Tensor, "*b c h w"]:
-    """Return an image with another's mean and standard deviation.
+    """Return an image with another's mean and standard deviation, of all bands together.
 
     Statistics of whole images mean little where these show different parts of a scene.
 
     Args:
         image: image to change.
         like: image whose mean and standard deviation are wanted.
-        weight: weight of pixels at which both show the same point, for images of one size; None for whole
-            images.
+        weight: weight of pixels at which both show the same point, for images of one size and one band; None
+            for whole images.
         largest_gain: largest factor of the standard deviation.
 
     Returns:
-        The image, scaled and shifted as a whole, not clipped.
+        The image, scaled and shifted as a whole, not clipped; a flat image stays flat.
     """
     return moments(image, weight).matched(image, moments(like, weight), largest_gain)
 
@@ -113,7 +113,7 @@ def explained_share(
         weight: weight of each pixel, at least 0.
 
     Returns:
-        Share for each of the batch, 0 to 1; 0 for a negative correlation.
+        Share for each of the batch, 0 to 1; 0 for a negative correlation or a flat image.
     """
     a, b = (p - _weighted_mean(p, weight) for p in (image, of))
     common, one, other = (_weighted_mean(p, weight) for p in (a * b, a * a, b * b))
@@ -129,10 +129,10 @@ class ComparedViews(NamedTuple):
     """Alpha and beta for comparison, equally bright and sharp.
 
     Attributes:
-        alpha: alpha's image (B, 1, h, w).
-        beta: combination of beta's bands (B, 1, hb, wb).
+        alpha: alpha's image (B, 1, h, w), blurred where it is the sharper one.
+        beta: combination of beta's bands (B, 1, hb, wb), normalised; blurred where it is the sharper one.
         guides: alpha before it is blurred, in 8 bits, (B, h, w).
-        blurs: standard deviation, in pixels, by which each alpha was blurred to be as sharp as beta.
+        blurs: standard deviation of each alpha's blur, pixels; 0 where it is not blurred.
     """
 
     alpha: Tensor
@@ -192,8 +192,7 @@ def equalising_blurs(
 
 
 def _equal_blur(image: Float[Tensor, "1 h w"], wanted: float) -> float:
-    """Return the blur after which an image is so sharp: sharpness falls exponentially between two of the
-    blurs."""
+    """Return the blur after which an image is so sharp; sharpness falls exponentially between two blurs."""
     less, before = 0.0, _sharpness(image)
     if before <= wanted:
         return less
@@ -222,7 +221,7 @@ class Comparison(NamedTuple):
     Attributes:
         mix: combination of bands that alpha sees; None for Rec. 601 luma of three bands, the mean of others.
         whole: normalisation of the combination.
-        half: the same at half the size.
+        half: normalisation of the combination at half the size.
     """
 
     mix: SpectralMix | None

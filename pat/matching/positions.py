@@ -21,7 +21,7 @@ class Extent(NamedTuple):
 
     Attributes:
         length: lengths (*n), pixels.
-        towards: unit vectors from end to start (*n, 2); zero where a segment is a point.
+        towards: unit vectors (x, y) from end to start (*n, 2); zero where a segment is a point.
     """
 
     length: Tensor
@@ -51,12 +51,14 @@ def match_positions(
 
     Args:
         segments: segments (B or 1, H, W) of alpha's pixels.
-        disparity: distance of the match from the segment's end, pixels of beta; may be at half the size.
-        beyond_edge: True to allow positions beyond the segments' near ends.
+        disparity: distance of the match from the segment's end, pixels of beta: (B, 1, H, W), or of half the
+            size, and interpolated.
+        beyond_edge: True to allow positions beyond the segments' starts; else they are moved onto the start.
         extent: extent of the segments; None to compute it.
 
     Returns:
-        Positions (x, y) in beta's pixels, in the type of the segments.
+        Positions (x, y) in beta's pixels, in the type of the segments, never beyond their ends; those of
+        invalid segments mean nothing.
     """
     length, towards = extent or Extent.from_segments(segments)
     if disparity.shape[-2:] != length.shape[-2:]:
@@ -71,15 +73,15 @@ def at_matches(
     disparity: Float[Tensor, "b 1 _ _"],
     extent: Extent | None = None,
 ) -> tuple[Float[Tensor, "b c h w"], Bool[Tensor, "b 1 h w"]]:
-    """Sample beta bicubically at the matches; beyond its edge, at the edge.
+    """Sample beta bicubically at the matches, kept on their segments; beyond beta's edge, at the edge.
 
     Args:
-        disparity: distance of the match from the segment's end, pixels of beta; may be at half the size.
+        disparity: distance of the match from the segment's end, as for `match_positions`.
         extent: extent of the segments; None to compute it.
 
     Returns:
-        Bands at alpha's pixels, and a mask of the matches that are on beta. Matches of invalid segments are
-        nowhere, and their bands mean nothing.
+        Bands at alpha's pixels, and a mask of the matches that are on beta: False for invalid segments, whose
+        bands mean nothing.
     """
     hw, middle = (
         (beta.shape[-2], beta.shape[-1]),

@@ -81,12 +81,13 @@ class Response(NamedTuple):
     """Response of alpha: alpha = weights . (gain * shaded beta^gamma).
 
     Attributes:
-        weights: weights of red, green and blue; their sum is 1.
+        weights: weights of red, green and blue (3), float64; their sum is 1.
         gain: factor of beta's brightness.
         gamma: power of beta's brightness.
-        explained: share of alpha's variance at the matches that this explains, 0 to 1.
-        shading: coefficients of `_shading_terms` in the logarithm of a gain that corrects beta's vignetting;
-            empty without.
+        explained: share of alpha's variance at the matches that any combination of bands explains, 0 to 1,
+            also where Rec. 601's was kept; 1 if none was fitted.
+        shading: coefficients of u, v, u^2, u v and v^2, the place in beta's width and height from its middle,
+            in the logarithm of a gain that corrects beta's vignetting; empty without.
     """
 
     weights: Float[Tensor, "3"]
@@ -135,8 +136,7 @@ class Response(NamedTuple):
         return alpha if total == 1 else alpha / total
 
     def of_beta(self, beta: Float[Tensor, "*b 3 h w"]) -> Float[Tensor, "*b 3 h w"]:
-        """Return beta at alpha's exposure, sheared along grey so that its Rec. 601 luma is the combination
-        that alpha sees."""
+        """Return beta at alpha's exposure, sheared along grey so that its luma is the mix that alpha sees."""
         scaled = self.exposed(beta)
         return scaled + self._shear(scaled)
 
@@ -174,12 +174,14 @@ def stated_response(weights: Sequence[float]) -> Response:
         The response, with weights that sum to 1 and their sum as the gain.
 
     Raises:
-        ValueError: unless there are three weights, none negative or infinite, not all 0.
+        ValueError: unless there are three numbers, none negative, infinite or NaN, not all 0.
     """
-    values = torch.tensor([float(w) for w in weights], dtype=torch.float64)
+    try:
+        values = torch.tensor([float(w) for w in weights], dtype=torch.float64)
+    except (TypeError, ValueError):
+        values = torch.zeros(0)
     if values.shape != (3,) or not bool((values >= 0).all() & (values.sum() > 0) & values.isfinite().all()):
-        shares = tuple(weights)
-        raise ValueError(f"a response is three weights, of red, green and blue, none negative; got {shares}")
+        raise ValueError(f"a response is three weights, of red, green and blue, none negative; got {weights}")
     return Response(values / values.sum(), gain=float(values.sum()))
 
 
@@ -187,13 +189,10 @@ def given_response(response: ResponseSpec) -> Response:
     """Return the response that the user stated; Rec. 601's for "rec601", and for "fit" until it is fitted.
 
     Args:
-        response: "fit", "rec601", three weights of red, green and blue, or a `Response`.
-
-    Returns:
-        The response.
+        response: "fit", "rec601", three weights of red, green and blue, or a `Response`, returned as it is.
 
     Raises:
-        ValueError: for a value of another kind.
+        ValueError: for a value of another kind, and weights that `stated_response` refuses.
     """
     if isinstance(response, Response):
         return response
@@ -219,7 +218,7 @@ def fit(
     brightness (a Gaussian process, by which Kennedy and O'Hagan 2001 model the lack of a model).
 
     Args:
-        bands: beta's bands at the points.
+        bands: red, green and blue of beta at the points, 0..1; points near black or clipped do not count.
         alpha: alpha at the points.
         where: positions of the points in beta, in its width and height, from its middle, with which
             vignetting is estimated; None without.
@@ -227,8 +226,8 @@ def fit(
             explain anything: only an exposure is fitted, and no more of alpha than this need be explained.
 
     Returns:
-        The response; Rec. 601's where there are too few points, or where no combination of bands explains
-        alpha.
+        The response; Rec. 601's where there are too few points (`SETTINGS.points`; `explained` is 1 then), or
+        where no combination of bands explains alpha (`Response.explains` is False).
     """
     most, fewest = SETTINGS.points
     step = max(alpha.numel() // most, 1)
@@ -272,8 +271,7 @@ class _Kind(NamedTuple):
     def evidence(
         self, gram: Float[Tensor, "g m m"], further: Float[Tensor, " s"]
     ) -> tuple[Float[Tensor, " g"], Float[Tensor, "g m-1"]]:
-        """Return the logarithm of alpha's probability for each gamma, up to a constant, and the best
-        coefficients.
+        """Return log-probabilities of alpha by gamma, up to a constant, and the best coefficients.
 
         `gram`: the inner products of bands, shading and alpha, whitened; `further`: the expected shading.
         """
@@ -399,7 +397,7 @@ class _Groups(NamedTuple):
         return self.explained_by(shading, kinds, vignetted=vignetted)
 
     def explained_by(self, shading: Tensor, kinds: Sequence[_Kind], *, vignetted: bool) -> _Explanation:
-        """Return the most probable response of these kinds after this shading is removed from beta.
+        """Return the most probable `_Explanation` of these kinds after this shading is removed from beta.
 
         `shading` has the coefficients (s) of `_shading_terms`. Tried without a gamma and with one; if
         vignetted, with the shading that is left.

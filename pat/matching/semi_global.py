@@ -71,7 +71,8 @@ class HalfSizeMatches(NamedTuple):
     Attributes:
         disparity: distance of the match from the segment's end (B, 1, H / 2, W / 2), pixels of the full-size
             beta.
-        facts: left-right error, margin and cost (B, 3, H / 2, W / 2), each 0 to 1, as in `BetaMatches`.
+        facts: left-right error (1 for 8 pixels of half the size), margin and cost (B, 3, H / 2, W / 2), each
+            0 to 1, as in `BetaMatches`.
     """
 
     disparity: Tensor
@@ -89,7 +90,7 @@ class Windows(NamedTuple):
     Runs do not overlap.
 
     Attributes:
-        first: first labels (B, h, w, runs), int32.
+        first: first labels (B, h, w, runs), int32; label l is l pixels from the segment's end.
         labels: labels per run; at most 5 if there are two runs.
     """
 
@@ -174,7 +175,7 @@ def matched_by_labels(
     """Match views semi-globally over the labels in each pixel's window.
 
     Where matching back from beta disagrees, disparity is diffused from where it agrees, within connected
-    regions of alpha.
+    regions of alpha; then it is smoothed by a median.
 
     Args:
         views: alpha and beta, equally bright and sharp.
@@ -184,8 +185,8 @@ def matched_by_labels(
         facts: number of statistics to compute: 1 (left-right error), or 3 (margin and cost too).
 
     Returns:
-        Disparity, pixels of the beta given, and the statistics, 0 to 1, as in `BetaMatches`; on the CPU,
-        detached.
+        Disparity, pixels of the beta given, from the segments' ends; and the statistics in the last axis, 0
+        to 1, as in `BetaMatches`. Both are float32, on the CPU, detached.
     """
     alpha, beta = (numpy_of(image[:, 0]) for image in (views.alpha, views.beta))
     disparity, measured = _matched_blocks(alpha, beta, geometry, windows, settings, facts)
@@ -247,8 +248,7 @@ def flat(planes: Sequence[NDArray]) -> tuple[NDArray, ...]:
 
 
 def _boxes(hw: Sequence[int], along: NDArray, labels: int, settings: SemiGlobalSettings) -> list[Tile]:
-    """Return blocks and margins: as high as an image with few costs, else longer along the segments than
-    across."""
+    """Return blocks with margins: as high as an image with few costs, else longer along the segments."""
     side, margin = settings.block, settings.margin
     if hw[0] * (side + 2 * margin) * labels <= settings.most_costs:
         return list(tiles_of(hw, (hw[0], side), margin))

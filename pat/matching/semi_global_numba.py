@@ -47,8 +47,7 @@ def _halves(first, runs, lane):
 
 @compiled(inline="always")
 def _places(end, along, low, high, last, rows, columns, out):
-    """Write the pixels of a vector of labels in beta, counted row by row; -1 for those off it or beyond the
-    last.
+    """Write the pixels of a vector of labels in beta, row by row; -1 for those off it or beyond the last.
 
     The vector's halves begin at `low` and `high`.
     """
@@ -70,8 +69,8 @@ def _count_within(length, first, count):
 def costs(alpha, beta, first, count, end, along, length, cut, rows, columns, out):
     """Compute the matching cost of each label of each pixel.
 
-    Label l lies l pixels from the segment's end. A label beyond its length costs `NOWHERE`, or `UNSEEN` where
-    it is beta's edge that cuts the segment.
+    Label l lies l pixels from the segment's end. Labels off beta and beyond the segment's length cost
+    `NOWHERE`; those beyond the length cost `UNSEEN` where it is beta's edge that cuts the segment.
 
     Args:
         alpha: flat planes of alpha, as `planes_of` computes them.
@@ -139,8 +138,7 @@ _subtract = instruction(lambda a, b: a)(lambda code, a, b: code.sub(a, b))
 
 @instruction(lambda path, small: path)
 def _spread(code, path, small):
-    """Return the costs of two runs' labels, and those beside them, for a neighbour without the penalty of a
-    jump.
+    """Return the costs of two runs' labels, and those beside them, for a neighbour without a jump's penalty.
 
     Each run is in half a vector. One lane farther on, so that lane 0 is of the label before the run.
     """
@@ -176,8 +174,7 @@ def _least(code, path):
 
 @compiled(inline="always")
 def _jumps(guide, beside, small, large, out):
-    """Write penalties of labels that differ by more than one, between pixels of alpha's
-    brightness; in parts."""
+    """Write penalties of labels that differ by more than one, by alpha's brightness; in parts."""
     for i in range(len(guide)):
         out[i] = np.int16(max(small + ONE, large / (ONE + abs(guide[i] - beside[i]) / EDGE)) * PARTS + HALF)
 
@@ -253,8 +250,7 @@ def _sweep(way, shape, planes, guide, reach, pad, small, large, paths, fewest, j
 
 @compiled(inline="always")
 def _advance(context, p, q, before, now, jump, is_first):
-    """Advance a path from pixel q, in slot `before`, to pixel p, in slot `now`, and add its costs to the
-    sums."""
+    """Advance a path from pixel q, in slot `before`, to p, in slot `now`, and add its costs to the sums."""
     cost, first, total, paths, fewest, runs, lanes, pad, reach, penalty = context
     base, leap, lowest = splat(fewest[before]), splat(np.int16(fewest[before] + jump)), splat(WALL)
     stride = lanes + pad
@@ -312,13 +308,14 @@ def winners(total, first, count, segments, hw, corner, large, claims, labels):
         segments: end, along, length and cut of alpha's segments, as for `costs`.
         hw: height and width of beta.
         corner: first row and column of the block.
-        large: the large penalty, in whose units margin and cost are.
+        large: the large penalty.
         claims: int32, for each pixel of beta, and one more, the least cost with which a pixel of alpha
             matches it and that pixel's label (16 bits each), at first the largest int32; updated.
-        labels: three arrays to write, of the block: disparity, the best label to a fraction; numbers (h, w, 1
-            or 3): the whole label, by how much the second best costs more (one that is no neighbour of it, or
-            `UNRELATED` if there is none), and its cost; and position in beta, pixels counted row by row
-            (height times width for none).
+        labels: three arrays to write, of the block: disparity (h, w), the best label to a fraction; numbers
+            (h, w, 1 or 3): the best label, its margin, by which the best of labels not beside it costs more
+            (the cost of that is `UNRELATED` if there is none), at least 0 and at most 1, and its cost, both
+            in 8 large penalties; and position (h, w) in beta, pixels counted row by row (height times width
+            for none).
     """
     (end, along, length, cut), (rows, columns), (top, left) = segments, hw, corner
     disparity, facts, positions = labels
@@ -378,16 +375,14 @@ def _lowest(costs, first, last):
 
 @compiled(inline="always")
 def _rounding(end, along, label):
-    """Return the distance along its segment of a label's pixel of beta, its rounded position, from that
-    position."""
+    """Return the distance along its segment from a label's position to the pixel of beta it rounds to."""
     x, y = end[0] + label * along[0], end[1] + label * along[1]
     return (np.floor(x + HALF) - x) * along[0] + (np.floor(y + HALF) - y) * along[1]
 
 
 @compiled(inline="always")
 def _between(total, best, last):
-    """Return the offset of the minimum from the label, by the two lines of equal slope through it and its
-    neighbours."""
+    """Return the offset of the minimum from the label, by two lines of equal slope through neighbours."""
     if not 0 < best < last:
         return np.float32(0)
     before, after = np.float32(total[best - 1]), np.float32(total[best + 1])

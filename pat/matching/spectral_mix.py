@@ -57,7 +57,7 @@ class SpectralMix(NamedTuple):
         slopes: change of each band (B, C) where the combination changes by 1 from one pixel to the next; less
             if that explains alpha badly.
         gain: share (B), 0 to 1, of alpha's difference from the combination that is an error of the bands, and
-            not another spectrum; 0 for one band, where that cannot be known.
+            not another spectrum; 0 for the mean of bands (`equal`), of which that is not known.
     """
 
     weights: Float[Tensor, "b c"]
@@ -88,7 +88,7 @@ class SpectralMix(NamedTuple):
             weight: weight of each pixel, at least 0.
 
         Returns:
-            The combination for each of the batch.
+            The combination for each of the batch, float64.
         """
         parts = [_mix(*tensors) for tensors in zip(bands.double(), alpha.double(), weight.double())]
         return cls(*(torch.stack(tensors) for tensors in zip(*parts)))
@@ -106,8 +106,7 @@ class SpectralMix(NamedTuple):
     def reconciled(
         self, bands: Float[Tensor, "b c h w"], alpha: Float[Tensor, "b 1 h w"]
     ) -> Float[Tensor, "b c h w"]:
-        """Return the bands corrected so that their combination is nearer to alpha, as far as it
-        is reliable."""
+        """Return the bands corrected so that their combination nears alpha, as far as that is reliable."""
         step = self.gain[:, None, None, None].to(bands) * self.rises(bands)
         return bands + step * (alpha - self.combined(bands))
 
@@ -136,8 +135,7 @@ def _mix(bands: Tensor, alpha: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, 
 
 
 def _combination(x: Tensor, y: Tensor, weight: Tensor) -> RobustFit:
-    """Return weights (C) by which bands x (C, n) make y (n), both about 0, drawn to equal; then without
-    outliers."""
+    """Return weights (C) by which bands x (C, n) make y (n), drawn to equal; then without outliers."""
     share, mean = weight / weight.sum(), x.mean(0)
     scale = (share @ y.square()).sqrt() / (share @ mean.square()).sqrt().clamp(min=1e-3)
     equal = scale.expand(len(x)) / len(x)
@@ -154,15 +152,13 @@ def _combination(x: Tensor, y: Tensor, weight: Tensor) -> RobustFit:
 
 
 def _beyond_local_mean(planes: Tensor, weight: Tensor) -> Tensor:
-    """Return planes (c, h, w) less their weighted mean in wide squares: light and lenses of views differ,
-    slowly."""
+    """Return planes (c, h, w) less their weighted mean in wide squares: light of views differs slowly."""
     radius = max(planes.shape[-2:]) // SETTINGS.wide
     return planes - box_mean(planes * weight, radius) / box_mean(weight, radius)
 
 
 def _smooth_misfit(rest: Tensor, share: Tensor) -> Tensor:
-    """Return the root mean square of the rest (1, h, w) around each pixel: matches' errors, at edges, average
-    out."""
+    """Return the root mean square of the rest (1, h, w) averaged around: errors at edges cancel out."""
     total = box_mean(share, SETTINGS.smooth).clamp(min=1e-12)
     smooth = box_mean(share * rest, SETTINGS.smooth) / total
     return (share * smooth.square()).sum().sqrt()

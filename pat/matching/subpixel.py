@@ -75,7 +75,8 @@ def matched_at_full_size(
         half: disparity at half the size, pixels of the full-size beta.
 
     Returns:
-        Disparity in pixels of beta, and the left-right error, 0 to 1, at half the size.
+        Disparity in pixels of beta, and the left-right error, 0 to 1 (for 8 pixels), at half the size;
+        detached.
     """
     alpha, beta = views.alpha, views.beta
     geometry = geometry_of(segments, len(alpha), (beta.shape[-2], beta.shape[-1]), factor=1)
@@ -112,8 +113,7 @@ def _precise(
 
 
 def _surfaces(disparity: Plane, weight: Plane, brightness: NDArray[np.uint8], edge: float) -> Plane:
-    """Return disparity on planes through it, within regions that neither alpha nor such a change of disparity
-    parts."""
+    """Return disparity on planes through it, parted by edges of alpha and by such a change of disparity."""
     (h, w), every, whole = disparity.shape, (slice(None, None, FINE),) * 2, disparity
     for _ in range(SETTINGS.surfaces):
         guide = np.stack([brightness[every] / np.float32(255), whole[every] / np.float32(edge)], -1)
@@ -122,10 +122,13 @@ def _surfaces(disparity: Plane, weight: Plane, brightness: NDArray[np.uint8], ed
 
 
 def following(inputs: Inputs, matches: Matches) -> Matches:
-    """Give the matches gradients by the images and segments that require some.
+    """Give matches, chosen ones too, gradients by the images and segments that require some.
 
     Returns:
-        The matches with the same values; those in other betas are unchanged.
+        The matches with the same values; those in betas of which none requires one are unchanged.
+
+    Raises:
+        ValueError: for a beta whose field is not of straight segments.
     """
     betas, alpha = [], inputs.alpha
     for beta, one in zip(inputs.betas, matches.betas):
@@ -161,8 +164,7 @@ def _step(views: ComparedViews, segments: Segments, disparity: Tensor) -> Float[
 
 
 def _agreement(rise: Tensor, rest: Tensor, radius: int) -> tuple[Tensor, Tensor]:
-    """Return the product of rise and rest within squares, and the square of the rise, both less their means
-    around."""
+    """Return means within squares of rise times rest, and of the rise squared, both less means around."""
     rise, rest = (values - box_mean(values, 2 * radius) for values in (rise, rest))
     common, slope = box_mean(torch.cat([rise * rest, rise.square()], 1), radius).split(1, 1)
     return common, slope
@@ -171,8 +173,7 @@ def _agreement(rise: Tensor, rest: Tensor, radius: int) -> tuple[Tensor, Tensor]
 def _compared(
     alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b 1 hb wb"], segments: Segments, disparity: Tensor
 ) -> tuple[Float[Tensor, "b 1 h w"], Float[Tensor, "b 1 h w"]]:
-    """Return the rise of beta's brightness per pixel along its segment at each match, and alpha's excess over
-    beta there."""
+    """Return beta's rise per pixel along its segment at each match, and alpha's excess over beta there."""
     across, down = (torch.gradient(beta, dim=side)[0] for side in (3, 2))
     still = Segments(segments.start.detach(), segments.end.detach(), segments.valid)
     extent = Extent.from_segments(segments)

@@ -39,7 +39,7 @@ SETTINGS = SurfaceSettings()
 
 
 class Planes(NamedTuple):
-    """Planes fitted around every second pixel in each direction.
+    """Planes fitted around every second pixel in each direction, each attribute (h, w), float32.
 
     Attributes:
         value: value at the pixel.
@@ -60,11 +60,11 @@ class Planes(NamedTuple):
         Args:
             values: values (h, w) of every second pixel.
             weight: their weights, at least 0.
-            guide: image (h, w, c); a change of 1 in it counts as far as `reach`.
+            guide: image (h, w, c), float32; a change of 1 in it counts as far as `reach`.
             reach: full-size pixels to which values count.
 
         Returns:
-            The planes; pixels that no value reaches have no weight around.
+            The planes; where no value reaches, `around` is about 0 and the rest means nothing.
         """
         reach /= FINE
         values, weight = (np.ascontiguousarray(plane, np.float32) for plane in (values, weight))

@@ -53,8 +53,9 @@ def along_tangents(
 ) -> FieldOnGrid:
     """Convert a field of positions to straight segments: the tangents of its curves at the matches.
 
-    The positions are matched semi-globally at half the size. Positions without an order along a curve are
-    matched pixel by pixel, with a warning. Which position is matched is a constant; its gradients are kept.
+    The positions are matched semi-globally at half the size. Which position is matched is a constant; its
+    gradients are kept. Positions without an order along a curve are matched pixel by pixel, with a warning,
+    and give horizontal segments around the match, without gradients.
 
     Args:
         alpha: image of even sides.
@@ -66,7 +67,7 @@ def along_tangents(
         The field of segments, pixels of beta.
 
     Raises:
-        TypeError: for a field that gives segments for some pixels and positions for others.
+        TypeError: for a field that gives segments, for some pixels or all.
     """
     grid = _BlockCentres(field, (alpha.shape[-2] // FINE, alpha.shape[-1] // FINE))
     ordered = grid.ordered()
@@ -137,7 +138,8 @@ class _BlockCentres:
         return Segments(*(torch.cat(tensors) for tensors in zip(*parts)))
 
     def chosen(self, labels: Tensor) -> Segments:
-        """Return segments (h, w) along x around the positions of labels (h, w), smoothed by a median."""
+        """Return segments (h, w) along x around the positions of labels (h, w), smoothed by a median and
+        detached."""
         parts = []
         for rows in self.by_rows():
             locations = self.at(rows, slice(None))

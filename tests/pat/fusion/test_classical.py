@@ -70,6 +70,12 @@ def test_a_featureless_pair_takes_betas_colour():
     torch.testing.assert_close(result, beta.contiguous(), atol=1e-4, rtol=0)
 
 
+def test_a_beta_of_other_bands_than_one_and_three_is_refused():
+    rig = rig_of(camera(200.0, (24, 32)), camera(200.0, (24, 32), t=[-0.1, 0.0, 0.0]), (2.0, 6.0))
+    with pytest.raises(ValueError, match=r"'beta'.*5"):
+        classical(rig, {"alpha": torch.rand(1, 24, 32), "beta": torch.rand(5, 24, 32)}, "alpha", "beta")
+
+
 def test_no_disparity_to_search_is_refused():
     with pytest.raises(ValueError, match="max_disparity"):
         classical_fusion(torch.rand(1, 20, 20), torch.rand(3, 20, 20), max_disparity=0.0)

@@ -155,6 +155,7 @@ WRONG = """
 import torch
 from pat import FuseSettings, fuse
 from pat.app.sample_array import load_sample
+from pat.fusion.fuse import fuse_frame
 from pat.media.images import write_image
 
 sample = load_sample()
@@ -166,12 +167,14 @@ for use in (
     lambda: fuse("mono-colour", rig, alpha="mono"),
     lambda: fuse(images, rig, alpha="mono", settings=FuseSettings(noise="much")),
     lambda: fuse(images, rig, alpha="mono", settings=FuseSettings(response="luma")),
+    lambda: fuse(images, rig, alpha="mono", settings=FuseSettings(response=None)),
     lambda: fuse(images, rig, alpha="mono", settings=FuseSettings(noise=0.1)),
     lambda: fuse(images, rig, alpha="mono", settings=FuseSettings(noise={"mono": 200})),
     lambda: fuse([*images.values()], rig, alpha="mono"),
     lambda: fuse([*images.values()]),
     lambda: fuse(images, rig, alpha="mono", network=torch.nn.Linear(2, 2)),
     lambda: fuse(images, rig, alpha="mono", settings={"noise": None}),
+    lambda: fuse_frame(images, rig, alpha="mono", network=None, settings={"noise": None}),
     lambda: fuse(images, rig, alpha="mono", corrections={"colour": 1}),
     lambda: fuse(images, rig, alpha="mono", matcher=lambda inputs: 3),
     lambda: fuse(images, rig, alpha=0),
@@ -194,12 +197,14 @@ def test_what_is_not_what_it_should_be_is_refused_in_a_line():
         "an array has two images or more, got mono-colour",
         "noise is 'estimate', 'auto' or a NoiseLevel of each camera; got 'much'",
         "response is 'fit', 'rec601' or three weights; got 'luma'",
+        "a response is three weights, of red, green and blue, none negative; got None",
         "noise is 'estimate', 'auto' or a NoiseLevel of each camera; got 0.1: give {NAME",
         "noise is 'estimate', 'auto' or a NoiseLevel of each camera; got {'mono': 200}: give {NAME",
         "an image is a Tensor without a name",
         "an image is a Tensor without a name",
         "network is a Linear",
         "settings are a dict",
+        "wanted FuseSettings, got a dict",
         "wanted Corrections, got a dict",
         "wanted Matches, got a int",
         "name is a int",
