@@ -60,7 +60,7 @@ class Compared(NamedTuple):
         """Locations as segments (b or 1, ha, wa).
 
         Raises:
-            ValueError: for explicit positions.
+            ValueError: for a function.
         """
         if not isinstance(self.locations, Segments):
             raise ValueError("a loss on attention needs straight segments: choose a straight field")
@@ -70,10 +70,10 @@ class Compared(NamedTuple):
         """Keep every `stride`-th row and column of alpha, from the first on.
 
         Returns:
-            The features with fewer queries and segments; key and value are shared.
+            The features with fewer queries and segments, views of these; all else is as it was.
 
         Raises:
-            ValueError: for explicit positions.
+            ValueError: for `locations` that are a function, or a stride below 1.
         """
         sparse = (..., slice(None, None, stride), slice(None, None, stride))
         start, end, valid = self.segments.start, self.segments.end, self.segments.valid
@@ -90,7 +90,9 @@ def log_sum(compared: Compared) -> Float[Tensor, "b ha wa"]:
         these too and any number of times.
 
     Raises:
-        ValueError: for explicit positions.
+        ValueError: for `locations` that are a function, or do not fit the query. That key and query agree in
+            batch, channels, type and device is not checked.
+        TypeError: for a mask that is not bool.
     """
     query, key, value, _, _, interpolation, _ = compared
     positions = sample_positions(compared.segments, query, compared.samples)
@@ -121,6 +123,9 @@ def peak_position(compared: Compared) -> Float[Tensor, "b 2 ha wa"]:
     Returns:
         Positions (x, y) in beta's pixels, (b, 2, ha, wa), float32, without gradient; 0 where no sample
         counts.
+
+    Raises:
+        ValueError: as `attend`; so do TypeError and RuntimeError.
     """
     query, key, _, locations, samples, interpolation, _ = compared
     sharp = query.float() * SHARPENED
