@@ -119,6 +119,7 @@ class Batch:
 
         Raises:
             FileNotFoundError: for unknown weights.
+            ValueError: as `to_json`.
         """
         stamp = hashlib.sha256(find_weights(self.weights).read_bytes()).hexdigest()
         entries = json.loads(self.to_json())
@@ -175,14 +176,15 @@ class Batch:
             console: console for progress and messages; None for standard error.
 
         Returns:
-            Frames made, kept and failed.
+            Frames made, kept and failed, each by its `list_file`.
 
         Raises:
             JobError: for a frame that fails with on_error="stop".
-            ValueError: to resume with other settings, a folder in use or not writable, and an invalid video
-                rate.
-            ImportError: for a video without the extra `video`.
+            ValueError: to resume with other settings, a folder in use or not writable, an invalid video rate,
+                a scheduler that does not answer, a field as in `to_json`, and what `SequenceFusion` refuses.
+            ImportError: for a video without the extra `video`, and a scheduler without Dask.
             FileExistsError: for files in the way that no run wrote.
+            FileNotFoundError: for unknown weights.
             OSError: if files cannot be written, on a full disk for instance.
         """
         if video is not None:
@@ -252,8 +254,14 @@ class Batch:
     def from_json(cls, text: str, source: str = PLAN) -> Batch:
         """Parse the text of `to_json`.
 
+        Args:
+            source: name of the text in messages.
+
+        Returns:
+            The batch.
+
         Raises:
-            ValueError: naming `source`, for other text.
+            ValueError: for other text.
         """
         try:
             entries = json.loads(text, object_hook=_made)
@@ -297,15 +305,19 @@ class Batch:
         write_tensors(self._key_file(key), colour._asdict())
 
     def fuse_one(self, i: int, inputs: str = "") -> None:
-        """Fuse frame `i`, and write its files into the folder `out`.
+        """Fuse frame `i`, and write its files into the folder `out` (`save_frame`).
+
+        A frame of a sequence takes colours that `fuse_key` has written, unless `alone`; it needs one of them.
 
         Args:
-            i: number of the frame.
+            i: number of the frame, from 0.
             inputs: digest of what the frame depends on (`inputs`), if known; empty to compute it.
 
         Raises:
             ValueError: if it cannot be fused.
-            OSError: if a file cannot be read or written.
+            LowConfidenceWarning: for unfit confidence if `strict`.
+            OSError: if a file cannot be read or written, or is in the way; FileNotFoundError for unknown
+                weights.
         """
         with limited(self.settings.limit):
             with confidence_checked(strict=self.strict):
@@ -409,8 +421,8 @@ def find_images(text: str | Path, *, name: str = "") -> list[Path]:
     """Find the images of a folder, a pattern such as "a/mono_*.png", or one file.
 
     Args:
-        text: folder, pattern or file.
-        name: name of the camera, for messages.
+        text: folder, file, or pattern of a file's name in a folder.
+        name: name of the camera, for messages; empty for none.
 
     Returns:
         Files in natural order, numbers in names counting as such; of a folder those with the suffix of an
