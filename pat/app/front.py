@@ -164,10 +164,6 @@ def align(
         min_confidence: confidence, 0 to 1, from which a camera counts as seeing a point.
         fill: "none" leaves 0, or NaN in floats, where a camera does not see the point; "propagate" takes its
             nearest seen value.
-        explain: function that is called with lines about what was corrected; None for none.
-        progress: function that wraps the tiles to show progress; None for none.
-        announce: function that is called with the plan; None for none.
-        matcher: function that matches, instead of `match`.
 
     Returns:
         Values, masks and positions of alpha and each beta by name, with alpha's depth, as NumPy arrays.

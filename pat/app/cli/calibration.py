@@ -59,6 +59,8 @@ class Calibrate:
         Raises:
             ValueError: without a board, for invalid options, and for images that cannot be used.
             FileNotFoundError: for a missing folder, start or board file.
+            FileExistsError: for a report or covariance in the way that no run wrote.
+            OSError: if files cannot be written.
         """
         from calib.boards.run import calibrate_photos
 
@@ -107,7 +109,6 @@ class Calibrate:
 class PrintBoard:
     """Make a calibration board to print at its true size.
 
-
     Example: pat board charuco:8x6:30mm -o board.pdf
     """
 
@@ -121,7 +122,8 @@ class PrintBoard:
         """Write the board, and say what to print it on.
 
         Raises:
-            ValueError: for a text that is no board, and a sheet that it does not fit on.
+            ValueError: for a text that is no board, a sheet that it does not fit on, and an `out` with another
+                suffix or where it cannot be written.
             FileNotFoundError: for a missing target file.
         """
         from calib.boards.target import page_note, parse_board, write_board

@@ -70,6 +70,8 @@ class Fuse(Around, Fusing):
             UsageError: for invalid options.
             ValueError: for images or a rig that cannot be used.
             FileNotFoundError: for a missing file, and unknown weights.
+            FileExistsError: for files in the way that no run wrote.
+            OSError: if files cannot be written.
             SystemExit: as `judged`.
         """
         self._extras = options.some_of(self.extras, EXTRAS)
@@ -230,13 +232,14 @@ def fuse_with_progress(
         rig: the cameras.
         images: images (c, h, w) by camera.
         device: "cpu", "cuda" or "auto" (the GPU if there is one).
-        further: further arguments of `pat.fuse`.
+        further: further arguments of `pat.fuse`, `alpha` among them.
 
     Returns:
         The frame, on the CPU.
 
     Raises:
-        ValueError: as `fuse`, and for a GPU that is not available.
+        ValueError: as `fuse` and `load_weights`, and for a GPU that is not available.
+        TypeError: as `fuse`.
         FileNotFoundError: for unknown weights.
     """
     from ...networks.weights import load_weights
