@@ -29,15 +29,11 @@ def aligned_page(aligned: Aligned, rig: Rig, facts: Facts) -> str:
     """Compose the page of an aligned frame, with everything in one HTML file.
 
     Args:
-        aligned: the frame; its layers are those of `shown_layers`.
-        rig: rig of the recorded files.
+        rig: rig of the recorded files, with all of these cameras.
         facts: notes and warnings; the rest is not used.
 
     Returns:
         The HTML.
-
-    Raises:
-        ValueError: as `ndvi`.
     """
     h, w = aligned.depth.shape
     figures = {"size": f"{w} x {h} pixels", "bands": ", ".join(aligned.bands)}
@@ -59,16 +55,13 @@ def shown_layers(aligned: Aligned, rig: Rig | None = None) -> dict[str, Float[Te
     Bands are stretched to 0..1. Composites and NDVI need bands of suitable wavelengths.
 
     Args:
-        rig: rig of the recorded files, for NDVI; None to take values as light.
+        rig: rig of the recorded files, with all of these cameras, for NDVI; None to take values as light.
 
     Returns:
         Images (1 or 3, h, w), 0..1, by name: a camera's for its one or three bands, else for its first one,
-        and a band's own for the others; then those derived: "colour", "infrared composite", "NDVI" and
-        "depth", where there are such bands and known depths. One that has a camera's name, such as "colour",
-        is called "derived colour".
-
-    Raises:
-        ValueError: as `ndvi`.
+        and a band's own for the others; then "colour", "infrared composite", "NDVI" and "depth", where there
+        are such bands and known depths. One that has a camera's name, such as "colour", is called "derived
+        colour".
     """
     layers, derived = {}, {}
     for name, view in aligned.items():
@@ -99,7 +92,7 @@ def ndvi(aligned: Aligned, rig: Rig | None = None) -> NDArray[np.float32] | None
             removed from values, which are counts; None to take values as light.
 
     Returns:
-        The index (h, w), -1..1 for values from 0; NaN where a camera does not see the point, or neither
+        The index (h, w), -1..1 unless values are negative; NaN where a camera does not see the point, or none
         records light. None without a band within `NEAREST` of 840 nm and another within it of 660 nm.
 
     Raises:

@@ -184,8 +184,7 @@ class Batch:
                 a scheduler that does not answer, a field as in `to_json`, and what `SequenceFusion` refuses.
             ImportError: for a video without the extra `video`, and a scheduler without Dask.
             FileExistsError: for files in the way that no run wrote.
-            FileNotFoundError: for unknown weights.
-            OSError: if files cannot be written, on a full disk for instance.
+            OSError: if files cannot be written, on a full disk for instance, and for unknown weights.
         """
         if video is not None:
             check_video(video)
@@ -252,13 +251,7 @@ class Batch:
 
     @classmethod
     def from_json(cls, text: str, source: str = PLAN) -> Batch:
-        """Parse the text of `to_json`.
-
-        Args:
-            source: name of the text in messages.
-
-        Returns:
-            The batch.
+        """Parse the text of `to_json`, which messages call `source`.
 
         Raises:
             ValueError: for other text.
@@ -316,8 +309,7 @@ class Batch:
         Raises:
             ValueError: if it cannot be fused.
             LowConfidenceWarning: for unfit confidence if `strict`.
-            OSError: if a file cannot be read or written, or is in the way; FileNotFoundError for unknown
-                weights.
+            OSError: if a file cannot be read or written, or is in the way, and for unknown weights.
         """
         with limited(self.settings.limit):
             with confidence_checked(strict=self.strict):

@@ -56,7 +56,6 @@ def classical_methods(
 
     Raises:
         ValueError: as `classical`, and for images that do not fit the rig or the network.
-        KeyError: for a camera without a noise level.
     """
     rig, images, _ = array
     methods = {"classical": classical(rig, images, ALPHA, BETA)}

@@ -219,9 +219,9 @@ def _focal_lengths(
 def camera_names(paths: Sequence[Path]) -> dict[str, Path]:
     """Name the cameras of files.
 
-    Names are by `named_by_band` if the files' tags state the cameras; else the files' without suffix, else
-    their folders', with _ in place of all but letters, digits, "." and "-", else "camera1", "camera2", ...:
-    the first kind in which no two are equal and none is empty.
+    Names are by `named_by_band` if the files' tags state the cameras; else the files' names without suffix,
+    else their folders', with _ in place of all but letters, digits, "." and "-", else "camera1", "camera2",
+    ...: the first kind in which no two are equal and none is empty.
 
     Returns:
         Files by camera, in their order.

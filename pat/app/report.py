@@ -69,10 +69,6 @@ def report_page(frame: Frame, images: Images, rig: Rig, alpha: str, facts: Facts
 
     Returns:
         The HTML; images are reduced to `LONGEST` pixels of the longer side.
-
-    Raises:
-        ValueError: for an alpha that the rig lacks.
-        KeyError: if alpha has no image.
     """
     layers = {f"alpha: {alpha}": images[alpha]}
     layers |= {f"beta: {name}": images[name] for name in rig.betas(alpha) if name in images}
@@ -122,13 +118,10 @@ def filled_page(
         overlays: URLs of overlays to switch, by name.
         figures: values of the table, by title.
         facts: notes and warnings; the rest is not used.
-        parts: "RIG", as HTML, and "LEGEND" if there is one.
+        parts: "RIG", which is needed, and "LEGEND", both as HTML.
 
     Returns:
         The HTML, with all texts but URLs and `parts` escaped.
-
-    Raises:
-        KeyError: without "RIG".
     """
     h, w = hw
     parts = {"LEGEND": "", **parts, "TITLE": html.escape(title), "RATIO": f"calc({w} / {h})"}

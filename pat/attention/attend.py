@@ -119,19 +119,16 @@ def attend_with_statistics(
     border: float = 0.0,
     backend: Backend = "auto",
 ) -> Attended:
-    """Compute `attend` together with statistics of its weights; arguments as there.
+    """Compute `attend` together with statistics of its weights; arguments and errors as there.
 
     Returns:
-        `Attended`: the values (B, Dv, Ha, Wa) as `attend` returns them; the expected position of the match
-        (B, 2, Ha, Wa) and the spread of the weights (`deviation`, (B, Ha, Wa)), pixels of beta; and the
-        largest weight (`peak`, (B, Ha, Wa)). Statistics are float32 (float64 for float64 inputs) and
-        differentiable. All are 0 where no sample counts.
+        `Attended`: the values as `attend` returns them; the expected position of the match (B, 2, Ha, Wa) and
+        the spread of the weights (`deviation`, (B, Ha, Wa)), pixels of beta; and the largest weight (`peak`,
+        (B, Ha, Wa)). Statistics are float32 (float64 for float64 inputs) and differentiable, the peak not by
+        the geometry if `nearest`. All are 0 where no sample counts.
 
     Raises:
-        ValueError: as `attend`.
-        TypeError: as `attend`.
         RuntimeError: as `attend`; also for the backend `local`, which has no statistics.
-        NotImplementedError: as `attend`.
     """
     given = query, key, value, locations, samples, interpolation, bias, border, backend
     return Attended(*_attend(*given, measured=True))

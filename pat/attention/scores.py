@@ -90,9 +90,8 @@ def log_sum(compared: Compared) -> Float[Tensor, "b ha wa"]:
         these too and any number of times.
 
     Raises:
-        ValueError: for `locations` that are a function, or do not fit the query. That key and query agree in
-            batch, channels, type and device is not checked.
-        TypeError: for a mask that is not bool.
+        ValueError: for `locations` that are a function, or do not fit the query. Whether the key fits it is
+            not checked.
     """
     query, key, value, _, _, interpolation, _ = compared
     positions = sample_positions(compared.segments, query, compared.samples)
@@ -125,7 +124,7 @@ def peak_position(compared: Compared) -> Float[Tensor, "b 2 ha wa"]:
         counts.
 
     Raises:
-        ValueError: as `attend`; so do TypeError and RuntimeError.
+        ValueError: as `attend`, and also TypeError.
     """
     query, key, _, locations, samples, interpolation, _ = compared
     sharp = query.float() * SHARPENED

@@ -59,8 +59,7 @@ class Calibrate:
         Raises:
             ValueError: without a board, for invalid options, and for images that cannot be used.
             FileNotFoundError: for a missing folder, start or board file.
-            FileExistsError: for a report or covariance in the way that no run wrote.
-            OSError: if files cannot be written.
+            OSError: if files cannot be written, or are in the way of the report and no run wrote them.
         """
         from calib.boards.run import calibrate_photos
 
@@ -122,8 +121,8 @@ class PrintBoard:
         """Write the board, and say what to print it on.
 
         Raises:
-            ValueError: for a text that is no board, a sheet that it does not fit on, and an `out` with another
-                suffix or where it cannot be written.
+            ValueError: for a text that is no board, a sheet that it does not fit on, and an `out` of another
+                suffix or where nothing can be written.
             FileNotFoundError: for a missing target file.
         """
         from calib.boards.target import page_note, parse_board, write_board

@@ -130,9 +130,7 @@ class Fusing(Known):
 
     @contextmanager
     def recordings(self, image: Sequence[str], *, with_rig: bool) -> Iterator[Recordings]:
-        """Context manager that yields the images with the given rig or one found.
-
-        Sets `network`, unless given, if the bands want others than the default, and `bits`.
+        """Context manager that yields the images with the given rig or one found; sets `network` and `bits`.
 
         Args:
             image: images NAME=FILE, as `named` returns them.
@@ -231,15 +229,12 @@ class Fusing(Known):
     def healed(self, views: ViewFiles) -> Rig:
         """Compare the rig with the images, and refine it, or warn, if they contradict it (`checked_rig`).
 
-        To be called within `judged`.
-
         Returns:
             The rig of the views, or the corrected one, which is then written beside the results too.
 
         Raises:
-            LowConfidenceWarning: for a rig that is wrong, with `--misfit refuse`.
-            FileExistsError: for a file in its place that no run wrote.
-            OSError: if it cannot be written.
+            LowConfidenceWarning: for a rig that is wrong, with `--misfit refuse` (within `judged`).
+            OSError: if it cannot be written, or a file in its place was written by no run.
         """
         from arraygeom.io.native import write
         from arraygeom.runtime.together import write_listed
@@ -273,8 +268,8 @@ def named_images(paths: Sequence[Path], image: Sequence[str], command: str) -> t
         image: values of --image.
 
     Returns:
-        Images NAME=FILE, and True if the first argument is taken as a rig, as it always is with `image`;
-        empty without a rig.
+        Images NAME=FILE, and True if the first argument is taken as a rig, as it always is with `image`; else
+        no images, and False.
 
     Raises:
         ValueError: for fewer than two images without a rig, a rig without images, `image` without a rig, text

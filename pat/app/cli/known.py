@@ -107,7 +107,7 @@ class Known:
 
     @contextmanager
     def judged(self) -> Iterator[None]:
-        """Context manager for the command's work, which is done within --max-memory; begins the notes.
+        """Context manager for the command's work, within --max-memory, and for its notes (`note`).
 
         Raises:
             SystemExit: with status 3, if the work warned that the rig does not fit the images; with `--misfit
@@ -148,9 +148,6 @@ class Known:
             focal: focal lengths in pixels by camera.
             matches: file of matched points; None to match the images.
             flight: True to use other captures too, unless `matches` are given.
-
-        Returns:
-            The array.
 
         Raises:
             ValueError: as `array_from_images`, and for a memory limit that the images' size exceeds.
@@ -194,7 +191,7 @@ class KnownFile(NamedTuple):
 
     Attributes:
         path: depth map or matched points.
-        scale: metres for each unit of a depth map; None for 1 for floats, 0.001 for whole numbers.
+        scale: metres for each unit of a depth map; None: 1 for floats, 0.001 for whole numbers.
         tolerance: relative error of the depth map; 0 = exact.
     """
 

@@ -208,9 +208,6 @@ def load_rig(path: Path, depth: tuple[float, float] | None = None, *, or_image: 
         depth: (near, far) in place of the rig's bounds, metres; None for the rig's.
         or_image: True where an image may be given too, as the message for another file then says.
 
-    Returns:
-        The rig.
-
     Raises:
         FileNotFoundError: for a missing file.
         ValueError: for a file that is no rig (`RigFileError`), and invalid bounds.
@@ -233,15 +230,10 @@ NO_IMAGE = "is no image: images end in .png, .tif, .jpg and the like"
 
 
 def some_of(text: str, names: Sequence[str], option: str = "--extras") -> set[str]:
-    """Parse a value such as "page,points".
-
-    Args:
-        text: names between commas.
-        names: names that there are.
-        option: name of the option, for messages.
+    """Parse names between commas, such as "page,points", as the value of an option.
 
     Returns:
-        The names in it.
+        The names.
 
     Raises:
         UsageError: for a name that is none of `names`.
@@ -273,7 +265,7 @@ def refuse_missing(path: Path, *, rig: bool) -> None:
 
 
 def files_by_name(texts: Iterable[str], option: str = "--image") -> dict[str, Path]:
-    """Parse values of a NAME=FILE option, whose name in messages is `option`.
+    """Parse values of a NAME=FILE option.
 
     Returns:
         Files by name, in order; whether they exist is not checked.
@@ -285,7 +277,7 @@ def files_by_name(texts: Iterable[str], option: str = "--image") -> dict[str, Pa
 
 
 def numbers_by_name(texts: Iterable[str], option: str) -> dict[str, float]:
-    """Parse values of a NAME=NUMBER option, whose name in messages is `option`.
+    """Parse values of a NAME=NUMBER option.
 
     Returns:
         Numbers by name, in order.
@@ -303,7 +295,7 @@ def read_images(rig: Rig, texts: Iterable[str], *, sized: bool = True) -> dict[s
         sized: False accepts images of another size than the rig's.
 
     Returns:
-        Images (c, h, w) by camera, as `read_view` gives them.
+        Images (c, h, w) by camera, sRGB values (`read_view`).
 
     Raises:
         ValueError: for text other than NAME=FILE, a camera given twice or not of the rig, images that cannot
@@ -320,7 +312,7 @@ def read_frames(rig: Rig, texts: Iterable[str]) -> list[dict[str, Tensor]]:
     """Read images of `--image NAME=FILE` as frames: the first of every camera, then the second ones.
 
     Returns:
-        Images (C, H, W) by camera for each frame, as `read_view` gives them, of the files' own sizes.
+        Images (C, H, W) by camera for each frame, sRGB values (`read_view`), of the files' own sizes.
 
     Raises:
         ValueError: for no images, text other than NAME=FILE, cameras that the rig lacks, cameras with unequal

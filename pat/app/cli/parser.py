@@ -145,7 +145,7 @@ def script(kind: Callable[..., T], arguments: Sequence[str] | None = None, *, pr
         The instance, or the function's result.
 
     Raises:
-        SystemExit: with one line for each UsageError of `parse`, and after `--help`.
+        SystemExit: with one line where `parse` raises UsageError, and after `--help`.
     """
     try:
         return parse(kind, arguments, prog=prog)
@@ -286,9 +286,7 @@ def _entries(kind: Any, base: Any, before: str = "") -> Iterator[_Entry]:
 
 
 def field_docs(kind: Any) -> dict[str, str]:
-    """Return the docstrings that follow a dataclass's fields, parents' included, by field.
-
-    Fields without one are absent.
+    """Return the docstrings that follow some of a dataclass's fields, parents' included, by field.
 
     Raises:
         OSError: for a class whose source is not there.

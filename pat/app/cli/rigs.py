@@ -83,15 +83,11 @@ def warn_of_misfit(rig: Rig, images: Mapping[str, Tensor]) -> None:
 
 
 def matched_points(rig: Rig, alpha: str, images: Mapping[str, Tensor]) -> dict[str, tuple[Tensor, Tensor]]:
-    """Match points between alpha's image and each beta's.
-
-    Args:
-        images: images (c, h, w), values 0..1, by camera.
+    """Match points between alpha's image (c, h, w), 0..1, and each beta's.
 
     Returns:
-        Points (n, 2) of alpha and of the beta, pixels of their images, by beta. Betas without an image, whose
-        images cannot be matched with alpha's, or that the rig does not relate to it, are left out; empty
-        without an image of alpha.
+        Points (n, 2) of alpha and of the beta, pixels, by beta. Betas without an image, with one that cannot
+        be matched, or that the rig does not relate to alpha, are left out; all without an image of alpha.
     """
     from calib.images.matches import match_cameras
     from calib.images.residuals import related
@@ -266,7 +262,7 @@ def print_tables(cameras: Sequence[CameraSummary], pairs: Sequence[PairSummary],
     """Print two tables of cameras (views and lenses) and, if there are any, one of pairs, on standard output.
 
     Args:
-        unit: unit of lengths, as it is printed; pixels on the scene are in mm for "m", else in thousandths.
+        unit: unit of lengths; the footprints of pixels are printed in thousandths of it, mm for "m".
     """
     from rich.console import Console
     from rich.table import Table

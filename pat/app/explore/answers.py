@@ -92,12 +92,7 @@ SHIPPED = "pat-supervised"
 
 
 def answer(scene: ExplorerScene, alpha: str, controls: Controls) -> dict[str, Any]:
-    """Compute what is drawn for a state of the controls.
-
-    Args:
-        scene: the scene, of the rig before changes.
-        alpha: name of alpha.
-        controls: values of all controls of `DEFAULTS`, and x.
+    """Compute what is drawn for a state of the controls, which are all of `DEFAULTS`, and x.
 
     Returns:
         Plain values for JSON: `x`, alpha's pixel; `depth` by all betas, in the rig's unit (None if unknown);
@@ -140,10 +135,7 @@ def answer(scene: ExplorerScene, alpha: str, controls: Controls) -> dict[str, An
 
 
 def clicked(scene: ExplorerScene, alpha: str, controls: Controls) -> tuple[Controls, list[Any]]:
-    """Find the alpha pixel that matches a beta's clicked pixel.
-
-    Args:
-        controls: values of the controls; `clicked` is the beta's name, and column and row of its pixel.
+    """Find the alpha pixel that matches a beta's pixel, the control `clicked` (name, column, row).
 
     Returns:
         The controls with that pixel as `x`, and the samples in alpha, a list of (x, y).
@@ -249,10 +241,10 @@ def drawn(beta: BetaReport) -> dict[str, Any]:
     """Convert a beta's report to plain values for JSON.
 
     Returns:
-        `samples` on the image and `match`, the one of the largest weight, in beta's pixels; their `weights`;
-        `depths` and the match's `depth` in the rig's unit (None where unknown); `off`, the distance from the
-        line of what the images themselves show to match, pixels, and `band`, its corners in beta's pixels
-        (both None where there is none); or a `problem` if no sample is on the image.
+        `samples` on the image, in beta's pixels, their `weights` and their `depths`; `match`, the sample of
+        the largest weight, and its `depth`; depths are in the rig's unit, None where unknown; `off` and
+        `band`, the report's offset and band (None where there is none); or a `problem` alone if no sample is
+        on the image.
     """
     if not bool(beta.valid.any()):
         return {"problem": "no part of the segment lies in this image: the views do not overlap here"}
@@ -317,10 +309,9 @@ def grid_pixels(hw: HW, columns: int) -> tuple[int, list[list[float]]]:
 def whole_map(scene: ExplorerScene, alpha: str, controls: Controls) -> dict[str, Any] | None:
     """Compute the map that the controls choose (`MAPS`), on a grid of alpha's pixels; kept until they change.
 
-    Betas for which that fails do not count.
-
     Returns:
-        Plain values: `columns`, `rows`, and `values` row by row (None where there is none); None for no map.
+        Plain values: `columns`, `rows`, and `values` row by row (None where there is none), of the betas for
+        which that succeeds; None for no map.
 
     Raises:
         ValueError: for an unknown map, and impossible depth bounds.
@@ -390,9 +381,9 @@ def slider_ranges(rig: Rig) -> list[list[Any]]:
     """List the sliders that suit a rig.
 
     Returns:
-        A list [name, label, [low, high, step, value], change] for each: `change` is True for a change of a
-        camera (`ERRORS`), False for "near", "far" and "baseline". Depths only with a depth range, an infinite
-        one as `FARTHEST`; others only with calibrated cameras.
+        A list [name, label, [low, high, step, value], change] for each, with `change` True for a change of
+        one camera (`ERRORS`, lens), False for "near", "far" and "baseline". Depths only with a depth range,
+        at most `FARTHEST`; others only with calibrated cameras.
     """
     ranges: list[list[Any]] = []
     unit = length_unit(rig)

@@ -74,9 +74,8 @@ class Explorer:
     def values(self) -> dict[str, Any]:
         """Return the widget's initial values, as plain values for JSON.
 
-        Returns:
-            `cameras` (`shown_cameras`), `ranges` (`slider_ranges`) and `choices`, all empty for an error;
-            `controls`, `defaults` and `files`; and the first `answer`.
+        They are `cameras` (`shown_cameras`), `ranges` (`slider_ranges`) and `choices`, all empty for an
+        error, `controls`, `defaults`, `files`, and the first `answer`.
         """
         scene = self.scene
         return {
@@ -137,8 +136,7 @@ class Explorer:
             columns: columns of the grid; cells are about square.
 
         Returns:
-            Plain values: `columns`, `rows`, and `answers` (`answer`) by "column,row", of one cell for an
-            error in a scene's place.
+            Plain values: `columns`, `rows`, and `answers` by "column,row"; one cell for an error.
         """
         if self.scene is None:
             return {"columns": 1, "rows": 1, "answers": {"0,0": {"error": self.error}}}
@@ -211,9 +209,9 @@ def opened(
         rig: the rig.
         images: images (C, H, W) by camera; None for a checkered room.
         alpha: name of alpha; None for the first camera with an image.
-        x: pixel of alpha; None for the middle.
-        network: network of the paper, or its weights by name or file, whose attention is shown; None for
-            correlations of windows.
+        x: pixel (x, y) of alpha; None for the middle.
+        network: network of the paper, or weights of one, whose attention is shown; None for correlations of
+            windows.
         fields: further fields by name; None for none.
         covariance: covariance of the rig's parameters, for bands; None for none.
         files: files of the rig and the images, as for `Explorer`; None if unknown.
@@ -282,7 +280,7 @@ def checkered_room(rig: Rig, alpha: str) -> dict[str, Float[Tensor, "1 h w"]]:
     Squares differ in brightness, so that each has one match. The back wall is at most `DEEPEST` times near.
 
     Returns:
-        Images (1, h, w) by camera, as `room_image` makes them.
+        Images (1, h, w) by camera (`room_image`).
 
     Raises:
         ValueError: for a rig without all poses or without depth range.
@@ -300,12 +298,10 @@ def checkered_room(rig: Rig, alpha: str) -> dict[str, Float[Tensor, "1 h w"]]:
 
 
 def room_image(camera: Camera, alpha: Camera, half: Float[Tensor, "3"]) -> Float[Tensor, "1 h w"]:
-    """Render the room for one camera.
+    """Render the room for one camera; numbers are float64.
 
     Args:
-        camera: camera in the room, float64 as all here.
-        alpha: camera in the room's middle.
-        half: half the room's size in alpha's axes, in the rig's unit.
+        half: half the room's size in alpha's axes, in the rig's unit, with alpha in its middle.
 
     Returns:
         Image (1, h, w), float32, 0.1..0.9; 0 where the lens has no ray.

@@ -61,7 +61,7 @@ class ExplorerState:
     Attributes:
         alpha: name of alpha.
         x: pixel (x, y) of alpha.
-        family: name of the receptive field; "auto" for the default.
+        family: name of the receptive field, one of `FAMILIES` or the scene's, or MODULE:OBJECT.
         near: near bound, in the rig's unit; None for the rig's.
         far: far bound, in the rig's unit; None for the rig's.
         weights: `WINDOWS`, or the name of a network.
@@ -85,13 +85,12 @@ class BetaReport(NamedTuple):
     Attributes:
         xy: samples, pixels of beta.
         valid: True for samples in the image.
-        ends: start and end of a segment, pixels of beta; None for other fields, and a segment that is not
-            valid.
+        ends: start and end of a segment, pixels of beta; None for other fields, or if it is not valid.
         weight: weight of each sample, summing to 1 over valid ones; 0 for others.
         depth: depth of each sample along alpha's axis, in the rig's unit; NaN where it has none.
-        offset: distance of the images' own match from the line (`match_offset`), pixels; None without one.
-        band: corners of the band that holds the match by the calibration's uncertainty (`band_corners`),
-            pixels of beta; None without one.
+        offset: distance of the images' own match from the line, pixels; None without one (`match_offset`).
+        band: corners of the band that holds the match by the calibration's uncertainty, pixels of beta; None
+            without one (`band_corners`).
     """
 
     xy: Float[Tensor, "l 2"]
@@ -121,9 +120,7 @@ class PixelReport(NamedTuple):
 
 @dataclass(frozen=True)
 class ExplorerScene:
-    """Rig and images of the explorer; derived features are computed once.
-
-    The last three are caches that the scene fills itself.
+    """Rig and images of the explorer; the scene itself fills the last three, what is computed once.
 
     Attributes:
         rig: the rig.
@@ -247,9 +244,7 @@ def with_depths(rig: Rig, state: ExplorerState) -> Rig:
         The rig; unchanged if the state has none.
 
     Raises:
-        ValueError: for only one bound where the rig has none, near beyond far, and bounds that are not
-            positive.
-        TypeError: for bounds that are no numbers.
+        ValueError: for only one bound where the rig has none, near beyond far, and bounds not above 0.
     """
     if state.near is None and state.far is None:
         return rig
@@ -267,7 +262,7 @@ def inspect_pixel(scene: ExplorerScene, state: ExplorerState) -> PixelReport:
         The reports; errors that concern one beta, and betas without an image, are in `problems`.
 
     Raises:
-        ValueError: as `with_depths`, which may raise TypeError too; for an alpha that the rig lacks.
+        ValueError: for an alpha that the rig lacks, and impossible depth bounds.
     """
     rig = with_depths(scene.rig, state)
     betas: dict[str, BetaReport] = {}
@@ -298,16 +293,9 @@ def pixel_of(state: ExplorerState) -> Float[Tensor, "1 2"]:
 
 
 def beta_report(scene: ExplorerScene, pair: Pair, name: str, state: ExplorerState) -> BetaReport:
-    """Compute a pixel's samples in one beta, with weights and depths.
+    """Compute a pixel's samples in the beta called `name`, with weights and depths, but no offset and band.
 
-    Args:
-        scene: the scene, with images of both cameras.
-        pair: alpha and beta, with the depth bounds of the state.
-        name: name of beta.
-        state: pixel, field and weights.
-
-    Returns:
-        The report, without offset and band.
+    `pair` is alpha and this beta, with the state's depth bounds; the scene has images of both.
 
     Raises:
         ValueError: for an unknown field, one that does not suit the pair, and as `shipped_attention`; other
@@ -337,16 +325,9 @@ def beta_report(scene: ExplorerScene, pair: Pair, name: str, state: ExplorerStat
 def band_corners(
     scene: ExplorerScene, rig: Rig, name: str, state: ExplorerState, ends: Float[Tensor, "2 2"] | None
 ) -> Float[Tensor, "4 2"] | None:
-    """Return the corners of the 95 % band around a segment, in turn, pixels of beta.
+    """Return the corners of the 95 % band around a segment from `ends`, in turn, all in beta's pixels.
 
-    Args:
-        rig: rig with the depth bounds of the state.
-        name: name of beta.
-        ends: start and end of the segment, pixels of beta; None for none.
-
-    Returns:
-        Corners (4, 2), two about the start first and last; None without a segment or a covariance, and where
-        a bound's point is not in front of beta.
+    None without a segment or a covariance, and where the point at a depth bound is not in front of beta.
 
     Raises:
         ValueError: as `bands`.
