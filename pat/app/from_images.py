@@ -399,7 +399,7 @@ def found_rig(
     Returns:
         The rig of the images at their own sizes, calibrated up to a scale where points matched between alpha
         and a beta have parallax, else with F or a homography alone; and its cameras' names, alpha first. The
-        rig is named `UNSCALED` or `ASSUMED` if calibrated, `OPEN` if some lines stay open, else not at all.
+        rig is named `UNSCALED` or `ASSUMED` if calibrated, else `OPEN` if lines stay open, else not at all.
 
     Raises:
         ValueError: if no image shows enough of what alpha shows, and as `rig_from_images`.

@@ -74,7 +74,8 @@ def fuse(
         images: an image of each camera by name: files, or tensors (C, H, W) in 0..1; or files alone, which
             name the cameras. Of tensors a mapping that reads them when asked saves memory.
         rig: the cameras, or their file. Those without an image are left out. Files are developed as it says.
-        alpha: the camera whose view is wanted; without a rig by default the largest grey image.
+        alpha: the camera whose view is wanted; without a rig by default the largest grey image, else the
+            largest.
         network: weights by name or file, or a network; by default "mono-colour" for betas in colour, else
             "mono-spectral".
         settings: settings that frames of the same cameras have in common.

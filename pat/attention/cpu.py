@@ -36,10 +36,10 @@ def forward(inputs: AttentionInputs, measured: bool) -> tuple[Tensor, Tensor, Te
         measured: True to compute statistics.
 
     Returns:
-        Values (b, dv, ha, wa) of the query's type, channels last in memory; statistics (b, ha, wa, 4): x, y,
-        spread, peak (empty if not `measured`); log of the sum of exponentials (b, ha, wa), -inf where no
-        sample counts; and an empty tensor, where the GPU backend has the samples of largest weight. All but
-        the values are in `accumulated` precision. Nothing has a gradient.
+        Values (b, dv, ha, wa) of the query's type, channels last in memory; in `accumulated` precision
+        statistics (b, ha, wa, 4): x, y, spread, peak (empty if not `measured`), and the log of the sum of
+        exponentials (b, ha, wa), -inf where no sample counts; and an empty tensor, where the GPU backend has
+        the samples of largest weight. Nothing has a gradient.
     """
     query = inputs.query
     b, _, ha, wa = query.shape

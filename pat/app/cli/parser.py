@@ -49,9 +49,9 @@ class Option:
     """Properties of an option that a field's type does not state.
 
     Attributes:
-        metavar: name of its value in the help.
+        metavar: name of its value in the help; None for one by the field's type.
         help: help text; None for the field's docstring.
-        short: short name, such as "-o".
+        short: short name, such as "-o"; None for none.
         also: further names, such as "--matches".
         positional: True for an argument without a name.
         repeat: True if the option is given once for each value.
