@@ -204,7 +204,7 @@ class KnownFile(NamedTuple):
         """Parse the option's text, and check that the file exists; the numbers' signs are not checked.
 
         Raises:
-            UsageError: for another name than these, and a missing file.
+            UsageError: for another name than scale and tolerance, and a missing file.
             ValueError: for what is no NAME=NUMBER, and a name given twice.
         """
         path, *parts = text.split(",")
