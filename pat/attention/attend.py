@@ -77,7 +77,8 @@ def attend(
             (x, y) to either, with the leading axes (n) or (B, n), which is called on one piece of alpha at a
             time, and for Positions again in backward, so that not all of these exist at once. Or the field
             `Local`: windows, of views of the same field of view; or `Dense`: all of beta, by
-            `scaled_dot_product_attention` if `border`, `samples` and `backend` have their defaults.
+            `scaled_dot_product_attention`, which may store all weights, if `border`, `samples` and `backend`
+            have their defaults.
         samples: how many samples a segment has. None: one for each beta pixel of the longest valid one.
             Positions have their own number, which alone may be given.
         interpolation: `bilinear` (differentiable in the geometry) or `nearest` (the paper's).
@@ -98,8 +99,8 @@ def attend(
         ValueError: shapes, devices, numbers or options that do not fit together.
         TypeError: not tensors, or not Segments or Positions; a mask that is not bool; dtypes that differ or
             are not supported.
-        RuntimeError: an explicit backend that cannot serve; torch's own for a bias on another device, or a
-            function that returns other axes than those of its pixels. What else it raises passes.
+        RuntimeError: an explicit backend that cannot serve, or a function that returns other axes than those
+            of its pixels. What else the function raises passes.
         NotImplementedError: derivatives that an explicit backend does not have; segments without `samples`
             under `torch.func.vmap`.
     """
@@ -145,6 +146,8 @@ def _attend(*given: Any, measured: bool) -> tuple[Tensor, ...]:
     if kind != "meta" and torch.is_autocast_enabled(kind):
         query, key, value = (t.to(torch.get_autocast_dtype(kind)) for t in (query, key, value))
     _check(query, key, value, interpolation, backend)
+    if bias is not None and bias.device != query.device:
+        raise ValueError(f"bias is on {bias.device}, features on {query.device}: move one of them")
     nearest = interpolation == "nearest"
     if border > 0 and isinstance(locations, Local | Dense):
         locations = _lazily_between(query, key, locations)
@@ -231,7 +234,7 @@ def _lazily_between(query: Tensor, key: Tensor, field: Local | Dense) -> Callabl
 
 
 def _attend_dense(query: Tensor, key: Tensor, value: Tensor, stride: int, bias: Tensor | None) -> Tensor:
-    """Attend to every `stride`-th pixel of beta by torch's own operator, which stores no weights."""
+    """Attend to every `stride`-th pixel of beta by torch's own operator."""
     (b, _, ha, wa), dv = query.shape, value.shape[1]
     q, k, v = (t.flatten(2).mT for t in (query, key[..., ::stride, ::stride], value[..., ::stride, ::stride]))
     bias = _bias(bias, query, k.shape[1])

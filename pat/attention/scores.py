@@ -90,10 +90,12 @@ def log_sum(compared: Compared) -> Float[Tensor, "b ha wa"]:
         these too and any number of times.
 
     Raises:
-        ValueError: for `locations` that are a function, or do not fit the query. Whether the key fits it is
-            not checked.
+        ValueError: for `locations` that are a function, and `locations` or a key that do not fit the query.
     """
     query, key, value, _, _, interpolation, _ = compared
+    if query.shape[:2] != key.shape[:2]:
+        shapes = f"query {tuple(query.shape)}, key {tuple(key.shape)}"
+        raise ValueError(f"query and key must agree in batch and channels, got {shapes}")
     positions = sample_positions(compared.segments, query, compared.samples)
     nearest = interpolation == "nearest"
     if torch_op.wants_gradient(positions.points):
