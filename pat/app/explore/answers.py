@@ -96,10 +96,10 @@ def answer(scene: ExplorerScene, alpha: str, controls: Controls) -> dict[str, An
 
     Returns:
         Plain values for JSON: `x`, alpha's pixel; `depth` by all betas, in the rig's unit (None if unknown);
-        `betas` by name, as `drawn` gives them, or with a `problem`, with `epipole` (None if not seen) and,
-        where there is a second field, the same for it as `second`; `backwards`, samples in alpha of a
-        `clicked` pixel of beta; `pins`, each with `x` and `betas`; `top` (`top_view`); `map` (`whole_map`);
-        and `rig`, the changed rig's file, empty if it is unchanged.
+        `betas` by name, as `drawn` gives them, or with a `problem`, each with `epipole` (None if not seen)
+        and for a second field `second`, as `drawn` gives it; `backwards`, samples in alpha of a `clicked`
+        pixel of beta; `pins`, each with `x` and `betas`; `top` (`top_view`); `map` (`whole_map`); and `rig`,
+        the changed rig's file, empty if it is unchanged.
 
     Raises:
         ValueError: for impossible controls; missing ones and other types give TypeError, AttributeError,
@@ -173,7 +173,8 @@ def moved_rig(rig: Rig, alpha: str, controls: Controls) -> Rig:
         The moved rig, its links unchanged; the same one for unchanged controls.
 
     Raises:
-        ValueError: for a change that a camera's lens has not, and for unknown cameras and changes.
+        ValueError: for a change that a camera's lens has not, unknown cameras and changes, and numbers that
+            no camera has.
     """
     alpha_view, cameras, errors = rig[alpha], dict(rig.cameras), controls["errors"]
     known = {*rig.names, ALL}
