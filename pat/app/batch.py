@@ -213,10 +213,7 @@ class Batch:
             return report
 
     def _begin(self, resume: bool) -> None:
-        """Write settings and plan; to resume, compare the settings with the former ones.
-
-        Incomplete frames are retired.
-        """
+        """Write settings and plan, and retire incomplete frames; to resume, compare former settings."""
         text, file = self.dependencies, self.out / SETTINGS
         changed = _differing(text, file.read_text(encoding="utf-8")) if resume and file.is_file() else []
         if changed:

@@ -432,10 +432,7 @@ def _observed_focal_lengths(
     uncalibrated: UncalibratedRig, alpha: str, betas: Sequence[str]
 ) -> dict[str, tuple[float, float]]:
     """Focal length, pixels, and its relative deviation, of alpha and the betas of its size, from the
-    best-determined pair.
-
-    Empty if no pair determines it.
-    """
+    best-determined pair; empty if there is none."""
     fits = []
     for name in betas:
         LOG.info("looking for the focal length of %s and %s", alpha, name)
@@ -559,11 +556,7 @@ def _moved(pairs: Pairs, maps: Mapping[str, Tensor]) -> dict[tuple[str, str], Po
 
 
 def resized_rig(rig: Rig, images: Images) -> Rig:
-    """Return the rig with its cameras resized to the images' sizes.
-
-    Returns:
-        The rig; `images` must have all of its cameras.
-    """
+    """Return the rig with its cameras resized to the images' sizes; `images` must have all of them."""
     for name in rig.names:
         rig = rig.resize(name, _hw(images[name]))
     return rig

@@ -85,10 +85,7 @@ class Fuse(Around, Fusing):
         return [] if self.around is None else [KnownFile.parse(self.around).path]
 
     def frames(self, files: Files) -> Files:
-        """Check that there is one image of each camera.
-
-        Returns:
-            The files, unchanged.
+        """Check that there is one image of each camera; returns the files unchanged.
 
         Raises:
             UsageError: for several frames.

@@ -134,15 +134,9 @@ def parse(
 
 
 def script(kind: Callable[..., T], arguments: Sequence[str] | None = None, *, prog: str = "") -> T:
-    """Parse the command line of a stand-alone script, as `parse`, and end the process for a bad one.
+    """Parse the command line of a stand-alone script, and end the process for a bad one.
 
-    Args:
-        kind: dataclass or function whose fields or parameters are the options.
-        arguments: words; None for those of this process.
-        prog: name of the program in the help; empty for that of this process.
-
-    Returns:
-        The instance, or the function's result.
+    Arguments and result are as for `parse`.
 
     Raises:
         SystemExit: with one line where `parse` raises UsageError, and after `--help`.

@@ -261,8 +261,7 @@ def warn_of_oddities(rig: Rig) -> None:
 def print_tables(cameras: Sequence[CameraSummary], pairs: Sequence[PairSummary], unit: str) -> None:
     """Print two tables of cameras (views and lenses) and, if there are any, one of pairs, on standard output.
 
-    Args:
-        unit: unit of lengths; the footprints of pixels are printed in thousandths of it, mm for "m".
+    `unit` is the unit of lengths; footprints of pixels are in thousandths of it, mm for "m".
     """
     from rich.console import Console
     from rich.table import Table

@@ -57,10 +57,7 @@ class FuseSequence(FuseBatch):
         return files
 
     def timed(self, rig: Rig) -> Rig:
-        """Set the cameras' frame rates and time offsets that the command line states.
-
-        Returns:
-            The rig.
+        """Return the rig with the cameras' frame rates and time offsets that the command line states.
 
         Raises:
             ValueError: for a camera that the rig lacks or that is given twice, text that is no number, and a

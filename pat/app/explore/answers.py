@@ -311,8 +311,8 @@ def whole_map(scene: ExplorerScene, alpha: str, controls: Controls) -> dict[str,
     """Compute the map that the controls choose (`MAPS`), on a grid of alpha's pixels; kept until they change.
 
     Returns:
-        Plain values: `columns`, `rows`, and `values` row by row (None where there is none), of the betas for
-        which that succeeds; None for no map.
+        Plain values: `columns`, `rows`, and `values` row by row (None where no beta has one); None for no
+        map.
 
     Raises:
         ValueError: for an unknown map, and impossible depth bounds.

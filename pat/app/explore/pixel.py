@@ -238,10 +238,7 @@ def displacement(pair: Pair, x: Float[Tensor, "n 2"]) -> float:
 
 
 def with_depths(rig: Rig, state: ExplorerState) -> Rig:
-    """Replace a rig's depth bounds by those that the state has.
-
-    Returns:
-        The rig; unchanged if the state has none.
+    """Return the rig with those depth bounds that the state has, unchanged if it has none.
 
     Raises:
         ValueError: for only one bound where the rig has none, near beyond far, and bounds not above 0.
@@ -361,8 +358,6 @@ def match_offset(
     ends: Float[Tensor, "2 2"] | None,
 ) -> float | None:
     """Find how far beside the line the images' own match lies, by correlating windows around both pixels.
-
-    It lies on the line unless the rig is off.
 
     Args:
         guides: luminances of alpha and of beta.
