@@ -291,8 +291,8 @@ class Around(Known):
 
 
 def _around_depth(known: KnownFile, images: Mapping[str, Tensor], rig: Rig, alpha: str) -> ReceptiveField:
-    """Field around the depth map, with a warning if matched points contradict it. Raises ValueError for depths
-    outside the rig's range."""
+    """Field around the depth map, with a warning if matched points contradict it. Raises ValueError for
+    depths outside the rig's range."""
     import torch
 
     from arraygeom import Camera
