@@ -29,8 +29,8 @@ def aligned_page(aligned: Aligned, rig: Rig, facts: Facts) -> str:
     """Compose the page of an aligned frame, with everything in one HTML file.
 
     Args:
-        rig: rig of the recorded files.
-        facts: notes, warnings and figures.
+        rig: rig of the recorded files, with all of these cameras.
+        facts: notes and warnings; the rest is not used.
 
     Returns:
         The HTML.
@@ -55,13 +55,13 @@ def shown_layers(aligned: Aligned, rig: Rig | None = None) -> dict[str, Float[Te
     Bands are stretched to 0..1. Composites and NDVI need bands of suitable wavelengths.
 
     Args:
-        rig: rig of the recorded files, for NDVI; None to take values as light.
+        rig: rig of the recorded files, with all of these cameras, for NDVI; None to take values as light.
 
     Returns:
         Images (1 or 3, h, w), 0..1, by name: a camera's for its one or three bands, else for its first one,
-        and a band's own for the others; a derived layer with a camera's name, such as "colour", is called
-        "derived colour".
-        called "derived colour".
+        and a band's own for the others; then "colour", "infrared composite", "NDVI" and "depth", where there
+        are such bands and known depths. One that has a camera's name, such as "colour", is called "derived
+        colour".
     """
     layers, derived = {}, {}
     for name, view in aligned.items():
@@ -87,14 +87,16 @@ def ndvi(aligned: Aligned, rig: Rig | None = None) -> NDArray[np.float32] | None
     1979).
 
     Args:
-        aligned: values of the cameras at alpha's pixels.
-        rig: rig of the recorded files, whose sensors' black level, exposure and gain are removed; None to
-            take values as light.
+        aligned: values of the cameras at alpha's pixels, in one unit.
+        rig: rig of the recorded files, whose sensors' black level, exposure and gain (if one number) are
+            removed from values, which are counts; None to take values as light.
 
     Returns:
-        The index (h, w), -1..1; NaN where a camera does not see the point, or records no light. None without
-        a band within `NEAREST` of 840 nm and another within it of 660 nm.
-        660 nm.
+        The index (h, w), -1..1 unless values are negative; NaN where a camera does not see the point, or none
+        records light. None without a band within `NEAREST` of 840 nm and another within it of 660 nm.
+
+    Raises:
+        ValueError: for a rig without the camera of either band.
     """
     nir, red = (_band_near(aligned, wave) for wave in (NEAR_INFRARED, RED))
     if nir is None or red is None or nir.name == red.name:

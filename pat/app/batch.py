@@ -119,6 +119,7 @@ class Batch:
 
         Raises:
             FileNotFoundError: for unknown weights.
+            ValueError: as `to_json`.
         """
         stamp = hashlib.sha256(find_weights(self.weights).read_bytes()).hexdigest()
         entries = json.loads(self.to_json())
@@ -175,15 +176,15 @@ class Batch:
             console: console for progress and messages; None for standard error.
 
         Returns:
-            Frames made, kept and failed.
+            Frames made, kept and failed, each by its `list_file`.
 
         Raises:
             JobError: for a frame that fails with on_error="stop".
-            ValueError: to resume with other settings, a folder in use or not writable, and an invalid video
-                rate.
-            ImportError: for a video without the extra `video`.
+            ValueError: to resume with other settings, a folder in use or not writable, an invalid video rate,
+                a scheduler that does not answer, a field as in `to_json`, and what `SequenceFusion` refuses.
+            ImportError: for a video without the extra `video`, and a scheduler without Dask.
             FileExistsError: for files in the way that no run wrote.
-            OSError: if files cannot be written, on a full disk for instance.
+            OSError: if files cannot be written, on a full disk for instance, and for unknown weights.
         """
         if video is not None:
             check_video(video)
@@ -212,10 +213,7 @@ class Batch:
             return report
 
     def _begin(self, resume: bool) -> None:
-        """Write settings and plan; to resume, compare the settings with the former ones.
-
-        Incomplete frames are retired.
-        """
+        """Write settings and plan, and retire incomplete frames; to resume, compare former settings."""
         text, file = self.dependencies, self.out / SETTINGS
         changed = _differing(text, file.read_text(encoding="utf-8")) if resume and file.is_file() else []
         if changed:
@@ -250,10 +248,10 @@ class Batch:
 
     @classmethod
     def from_json(cls, text: str, source: str = PLAN) -> Batch:
-        """Parse the text of `to_json`.
+        """Parse the text of `to_json`, which messages call `source`.
 
         Raises:
-            ValueError: naming `source`, for other text.
+            ValueError: for other text.
         """
         try:
             entries = json.loads(text, object_hook=_made)
@@ -297,15 +295,18 @@ class Batch:
         write_tensors(self._key_file(key), colour._asdict())
 
     def fuse_one(self, i: int, inputs: str = "") -> None:
-        """Fuse frame `i`, and write its files into the folder `out`.
+        """Fuse frame `i`, and write its files into the folder `out` (`save_frame`).
+
+        A frame of a sequence takes colours that `fuse_key` has written, unless `alone`; it needs one of them.
 
         Args:
-            i: number of the frame.
+            i: number of the frame, from 0.
             inputs: digest of what the frame depends on (`inputs`), if known; empty to compute it.
 
         Raises:
             ValueError: if it cannot be fused.
-            OSError: if a file cannot be read or written.
+            LowConfidenceWarning: for unfit confidence if `strict`.
+            OSError: if a file cannot be read or written, or is in the way, and for unknown weights.
         """
         with limited(self.settings.limit):
             with confidence_checked(strict=self.strict):
@@ -409,8 +410,8 @@ def find_images(text: str | Path, *, name: str = "") -> list[Path]:
     """Find the images of a folder, a pattern such as "a/mono_*.png", or one file.
 
     Args:
-        text: folder, pattern or file.
-        name: name of the camera, for messages.
+        text: folder, file, or pattern of a file's name in a folder.
+        name: name of the camera, for messages; empty for none.
 
     Returns:
         Files in natural order, numbers in names counting as such; of a folder those with the suffix of an

@@ -29,7 +29,7 @@ def as_real_cameras(array: SampleArray) -> tuple[SampleArray, dict[str, NoiseLev
     """Simulate an array's images as real cameras record them: another response and exposure, in low light.
 
     Returns:
-        The array with these images, and the noise level of each camera.
+        The array with these images, the same for each call, and the noise level by camera.
     """
     generator = Generator().manual_seed(0)
     ideal = {ALPHA: luminance(array.ground_truth, RESPONSE), BETA: EXPOSURE * array.images[BETA]}
@@ -53,6 +53,9 @@ def classical_methods(
     Returns:
         Fused images (3, h, w) by method: "classical", "classical, corrected", "classical, denoised" and
         "classical, denoised and corrected"; the first alone for ideal cameras (`noise` None).
+
+    Raises:
+        ValueError: as `classical`, and for images that do not fit the rig or the network.
     """
     rig, images, _ = array
     methods = {"classical": classical(rig, images, ALPHA, BETA)}
@@ -73,12 +76,16 @@ def classical_methods(
 
 
 def save_demo_figure(panels: Mapping[str, Tensor], corner: tuple[int, int], path: Path) -> None:
-    """Write a figure of images of one size, three in a row, with an enlarged window of each below.
+    """Write a figure of images of one size, three in a row, followed by an enlarged window of each.
 
     Args:
-        panels: images (c, h, w), values 0..1, by title.
-        corner: (row, column) of the window's first pixel.
-        path: file to write.
+        panels: images (c, h, w), grey or RGB, values 0..1, by title; at least one.
+        corner: (row, column) of the window's first pixel; it has `1 / CROP` of the height and width.
+        path: image file to write, of a format that Pillow writes.
+
+    Raises:
+        ValueError: for another suffix.
+        OSError: if it cannot be written.
     """
     h, w = next(iter(panels.values())).shape[-2:]
     top, left = corner

@@ -70,7 +70,8 @@ class ImageArray:
     Attributes:
         rig: rig of the developed images.
         recorded: rig of the files, with their sensors' coding and black level.
-        images: images (c, h, w) of alpha and of the betas to fuse.
+        images: images (c, h, w) of alpha, which is first, and of the betas to fuse; one band where all of a
+            file are equal.
         alpha: name of alpha.
         weights: name of the weights to fuse with.
         match_levels: True to match each beta's mean and contrast to alpha's.
@@ -87,7 +88,8 @@ class ImageArray:
 
     @property
     def lasting(self) -> Rig | None:
-        """Rig for other captures of these cameras; None if the images leave its lines and depth open."""
+        """The recorded rig, for other captures of these cameras; None if the images leave its lines and depth
+        open."""
         return None if self.recorded.name == OPEN else self.recorded
 
 
@@ -104,9 +106,9 @@ def array_from_images(
     """Find the array of one image from each camera.
 
     Args:
-        sources: files or tensors by camera, or a list of files.
+        sources: files or tensors (c, h, w) in 0..1 by camera, or a list of files (`camera_names`).
         alpha: camera whose view is wanted; None for the largest grey image, or else the largest.
-        weights: weights by name; None chooses them by the bands.
+        weights: weights by name or file; None chooses them by the bands.
         focal: focal lengths in pixels by camera, in place of those in the files' tags; None for none.
         matches: file of matched points (`read_matches`) from which the rig is found; None matches the
             images.
@@ -117,11 +119,11 @@ def array_from_images(
         The array: alpha, and the betas that show enough of what alpha shows.
 
     Raises:
-        ValueError: in one line, for fewer than two images, tensors that are no image in 0..1, an image of one
-            colour, images that do not show the same things, and a focal length that is not positive, of an
-            unknown camera, or beside tags that state it.
-        FileNotFoundError: for a missing file, and unknown weights.
-        TypeError: for an image without a name that is no file.
+        ValueError: in one line, for fewer than two images, what is no image in 0..1, an image of one colour,
+            images that do not show the same things, an unknown alpha, tags, matches or weights that cannot be
+            used, and a focal length that is not positive, of an unknown camera, or beside tags that state it.
+        FileNotFoundError: for a missing file, and unknown weights where no tags state the cameras.
+        TypeError: for an image that is neither file nor tensor, and a tensor without a name.
     """
     sources, focal = by_camera(sources), focal or {}
     files = {name: Path(path) for name, path in sources.items() if isinstance(path, str | Path)}
@@ -178,13 +180,13 @@ def _with_sensors(rig: Rig, sensors: Mapping[str, Sensor]) -> Rig:
 
 
 def by_camera(sources: ImageSources) -> Mapping[str, str | Path | Tensor]:
-    """Name the images of a list by camera (`camera_names`); a mapping is only checked.
+    """Name the images of a list by camera (`camera_names`); of a mapping only the number is checked.
 
     Args:
         sources: files or tensors by camera, or a list of files.
 
     Returns:
-        Files or tensors by camera.
+        Files or tensors by camera; a mapping itself.
 
     Raises:
         ValueError: for fewer than two images.
@@ -217,11 +219,12 @@ def _focal_lengths(
 def camera_names(paths: Sequence[Path]) -> dict[str, Path]:
     """Name the cameras of files.
 
-    Names are the bands in the files' tags, else the files' names without suffix, else their folders, else
-    "camera1", "camera2", ...: the first kind in which no two are equal.
+    Names are by `named_by_band` if the files' tags state the cameras; else the files' names without suffix,
+    else their folders', with _ in place of all but letters, digits, "." and "-", else "camera1", "camera2",
+    ...: the first kind in which no two are equal and none is empty.
 
     Returns:
-        Files by camera.
+        Files by camera, in their order.
     """
     if states_cameras(paths):
         return named_by_band(paths)
@@ -233,19 +236,21 @@ def camera_names(paths: Sequence[Path]) -> dict[str, Path]:
 
 
 def video_frames(videos: Mapping[str, Path], folder: Path) -> tuple[dict[str, list[Path]], dict[str, float]]:
-    """Write the frames of videos as image files into a folder.
+    """Write the frames of videos as PNG files into a folder.
 
     Files get their video's modification time, by which a resumed job recognises them.
 
     Args:
         videos: video file by camera.
-        folder: folder to write to, with a subfolder for each camera.
+        folder: folder to write to, with a subfolder for each camera, made if missing.
 
     Returns:
-        Files, and frames for each second, by camera.
+        Files in the order of frames, by camera; and frames for each second, by camera.
 
     Raises:
         ValueError: for a video without frames, or one that cannot be read.
+        FileNotFoundError: for a missing video.
+        OSError: if a file cannot be written.
     """
     files: dict[str, list[Path]] = {}
     rates: dict[str, float] = {}
@@ -392,11 +397,12 @@ def found_rig(
         by_pair: matches between the images by pair; None to match the images.
 
     Returns:
-        The rig, calibrated up to a scale where points matched between alpha and a beta have parallax, else
-        with F alone; and the names of its cameras, alpha first.
+        The rig of the images at their own sizes, calibrated up to a scale where points matched between alpha
+        and a beta have parallax, else with F or a homography alone; and its cameras' names, alpha first. The
+        rig is named `UNSCALED` or `ASSUMED` if calibrated, else `OPEN` if lines stay open, else not at all.
 
     Raises:
-        ValueError: if no image shows enough of what alpha shows.
+        ValueError: if no image shows enough of what alpha shows, and as `rig_from_images`.
     """
     factors = {name: min(MATCHED / max(image.shape[-2:]), 1.0) for name, image in images.items()}
     reduced = {name: scaled(image, factors[name]) for name, image in images.items()}
@@ -426,10 +432,7 @@ def _observed_focal_lengths(
     uncalibrated: UncalibratedRig, alpha: str, betas: Sequence[str]
 ) -> dict[str, tuple[float, float]]:
     """Focal length, pixels, and its relative deviation, of alpha and the betas of its size, from the
-    best-determined pair.
-
-    Empty if no pair determines it.
-    """
+    best-determined pair; empty if there is none."""
     fits = []
     for name in betas:
         LOG.info("looking for the focal length of %s and %s", alpha, name)
@@ -553,11 +556,7 @@ def _moved(pairs: Pairs, maps: Mapping[str, Tensor]) -> dict[tuple[str, str], Po
 
 
 def resized_rig(rig: Rig, images: Images) -> Rig:
-    """Return the rig with its cameras resized to the images' sizes.
-
-    Returns:
-        The rig; `images` must have all of its cameras.
-    """
+    """Return the rig with its cameras resized to the images' sizes; `images` must have all of them."""
     for name in rig.names:
         rig = rig.resize(name, _hw(images[name]))
     return rig
@@ -568,10 +567,10 @@ def _hw(image: Tensor) -> HW:
 
 
 def scaled(image: Float[Tensor, "c h w"], factor: float) -> Float[Tensor, "c h2 w2"]:
-    """Reduce an image by a factor (bicubic, antialiased), sides at least 16 pixels.
+    """Reduce an image by a factor (bicubic, antialiased), to sides of at least 16 pixels.
 
     Returns:
-        The image, clipped to 0..1; the same tensor for a factor of 1 or more.
+        The image, clipped to 0..1; the same tensor, not clipped, for a factor of 1 or more.
     """
     if factor >= 1:
         return image

@@ -62,19 +62,20 @@ def fuse(
 ) -> Frame:
     """Fuse one frame at camera `alpha`'s view.
 
-    Without a rig one is estimated from the images as by `pat fuse`, noise is measured, and depths are
-    multiples of the baseline. Frames too large for the memory allowed are fused in tiles of alpha, each with
-    the part of every beta that its segments touch, and a halo: equal to the whole to 1e-4. Distorted images
-    are first resampled to pinhole views (`pat.fusion.steps.undistort`), rotated betas made upright, and betas
-    resized to alpha's angular resolution; the result is at alpha's own pixels all the same. Where alpha is
-    known to measure the luminance of linear light and one beta the colours, the result is as bright in that
-    sense (`pat.media.raw.match_luminance`).
+    Without a rig one is estimated from the images as by `pat fuse`, noise that shows plainly is removed (not
+    with `differentiable` or another `luminance`), and depths are multiples of the baseline. Frames too large
+    for the memory allowed are fused in tiles of alpha, each with the part of every beta that its segments
+    touch, and a halo: equal to the whole to 1e-4. Distorted images are first resampled to pinhole views,
+    rotated betas made upright, and betas resized to alpha's angular resolution; the result is at alpha's own
+    pixels all the same. Where alpha is known to measure the luminance of linear light and one beta the
+    colours, the result is as bright in that sense (`pat.media.raw.match_luminance`).
 
     Args:
         images: an image of each camera by name: files, or tensors (C, H, W) in 0..1; or files alone, which
             name the cameras. Of tensors a mapping that reads them when asked saves memory.
         rig: the cameras, or their file. Those without an image are left out. Files are developed as it says.
-        alpha: the camera whose view is wanted; without a rig by default the largest grey image.
+        alpha: the camera whose view is wanted; without a rig by default the largest grey image, else the
+            largest.
         network: weights by name or file, or a network; by default "mono-colour" for betas in colour, else
             "mono-spectral".
         settings: settings that frames of the same cameras have in common.
@@ -101,16 +102,17 @@ def fuse(
         The frame of alpha: fused image, depth and confidence at alpha's own pixels.
 
     Raises:
-        ValueError: a camera that the rig lacks, an image of another size, a rig whose views do not overlap,
-            bands that the network does not make, `differentiable` with a memory limit, `store` or noise;
-            without a rig, images that do not show the same things; with one, no `alpha`.
-        TypeError: a rig or settings of another type.
+        ValueError: a camera that the rig lacks, an image of another size, files that cannot be used, a rig
+            whose views do not overlap, bands that the network does not make, settings that contradict each
+            other, a memory limit that is too small, `differentiable` with a memory limit, `store` or noise;
+            without a rig, what `array_from_images` refuses; with one, no `alpha`.
+        TypeError: arguments in the wrong order or of another type.
         NotImplementedError: within a transformation of `torch.func`.
         FileNotFoundError: a missing file, or weights of an unknown name.
 
     Warns:
         LowConfidenceWarning: the images hardly match: the rig is probably wrong. A filter makes it an error,
-            as `warnings.simplefilter("error", LowConfidenceWarning)`.
+            as `warnings.simplefilter("error", LowConfidenceWarning)`. Lesser doubts are a UserWarning.
     """
     known = _known(images, rig, alpha, network, settings, explain)
     if rig is None and settings.luminance == "alpha" and not differentiable and settings.noise is None:
@@ -161,20 +163,16 @@ def align(
         interpolation: "nearest" keeps recorded values; "bilinear" and "cubic" interpolate, rounded for
             integers.
         min_confidence: confidence, 0 to 1, from which a camera counts as seeing a point.
-        fill: "none" invents no values; "propagate" gives pixels that a camera does not see its nearest seen
-            value.
-        explain: function that is called with lines about what was corrected; None for none.
-        progress: function that wraps the tiles to show progress; None for none.
-        announce: function that is called with the plan; None for none.
-        matcher: function that matches, instead of `match`.
+        fill: "none" leaves 0, or NaN in floats, where a camera does not see the point; "propagate" takes its
+            nearest seen value.
 
     Returns:
-        Values, masks and positions by camera, with alpha's depth.
+        Values, masks and positions of alpha and each beta by name, with alpha's depth, as NumPy arrays.
 
     Raises:
-        ValueError: for what `fuse` refuses, a network that uses no matches, and recorded values that are
-            missing, no numbers, or of another size than the rig says.
-        TypeError: for arguments in the wrong order, and settings of another type.
+        ValueError: for what `fuse` refuses, a network that uses no matches, options other than these, and
+            recorded values that are missing, no numbers, or of another size than the rig says.
+        TypeError: for arguments in the wrong order or of another type.
         FileNotFoundError: for a missing file, or weights of an unknown name.
     """
     return align_frame(

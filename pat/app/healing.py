@@ -40,7 +40,7 @@ class Healed(NamedTuple):
     """Rig refined by its images.
 
     Attributes:
-        rig: the rig of the image files.
+        rig: the refined rig, of the image files as recorded.
         text: sentence on the changes.
     """
 
@@ -52,11 +52,13 @@ def checked_rig(views: ViewFiles, *, heal: bool) -> Healed | None:
     """Compare a rig with its images, and refine it, or warn that it fits badly.
 
     The warning is a `LowConfidenceWarning` if the rig is wrong: mistaken by the doctor's verdict, or with
-    points behind cameras or outside its depth range. Images that cannot be read are left to the fusion.
+    most points behind cameras or outside its depth range; else a UserWarning. Only the first four images are
+    compared. Images that cannot be read are left to the fusion.
 
     Args:
         views: images by camera, with their rig.
-        heal: True to refine the rig where it is not wrong and points determine it far better; False to warn.
+        heal: True to refine the rig where it is not wrong and points determine it far better, and to warn
+            otherwise; False to warn only.
 
     Returns:
         The refined rig; None if the rig fits, if there was a warning, and where nothing can be said, as
@@ -84,12 +86,12 @@ def healed_rig(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> Healed | N
 
     Args:
         rig: rig of the image files.
-        images: images (c, h, w) by camera.
+        images: images (c, h, w) of alpha and betas, by camera; other cameras stay as they are.
         alpha: name of alpha.
 
     Returns:
-        The refined rig; None unless held-out points then lie about as near to their lines as to those of an F
-        fitted to them, and far nearer than before.
+        The refined rig; None for too few points, and unless held-out points then lie about as near to their
+        lines as to those of an F fitted to them, far nearer than before, and not behind the cameras.
     """
     small = {name: scaled(image, min(MATCHED / max(image.shape[-2:]), 1.0)) for name, image in images.items()}
     reduced = resized_rig(rig.replace(cameras={name: rig[name] for name in (alpha, *small)}), small)

@@ -46,7 +46,7 @@ class Facts(NamedTuple):
         seconds: duration of the fusion; None if unknown.
         memory: peak memory in bytes; None if unknown.
         unit: unit of depths.
-        classical: classical baseline at alpha's view, as a layer to compare with; None for none.
+        classical: classical baseline (c, h, w) at alpha's view, as a layer to compare with; None for none.
     """
 
     notes: Sequence[str] = ()
@@ -62,13 +62,13 @@ def report_page(frame: Frame, images: Images, rig: Rig, alpha: str, facts: Facts
 
     Args:
         frame: fused frame.
-        images: images (c, h, w), values 0..1, of alpha and the betas.
-        rig: rig of the images.
+        images: images (c, h, w), values 0..1, of alpha and the betas; shown as a mean unless c is 1 or 3.
+        rig: rig of the images, drawn if some depth is known.
         alpha: name of alpha.
         facts: notes, warnings and figures.
 
     Returns:
-        The HTML; images are reduced to `LONGEST` pixels.
+        The HTML; images are reduced to `LONGEST` pixels of the longer side.
     """
     layers = {f"alpha: {alpha}": images[alpha]}
     layers |= {f"beta: {name}": images[name] for name in rig.betas(alpha) if name in images}
@@ -117,11 +117,11 @@ def filled_page(
         layers: URLs of images to compare, by name.
         overlays: URLs of overlays to switch, by name.
         figures: values of the table, by title.
-        facts: notes and warnings.
-        parts: further parts as HTML, by placeholder; "RIG" is needed.
+        facts: notes and warnings; the rest is not used.
+        parts: "RIG", which is needed, and "LEGEND", both as HTML.
 
     Returns:
-        The HTML.
+        The HTML, with all texts but URLs and `parts` escaped.
     """
     h, w = hw
     parts = {"LEGEND": "", **parts, "TITLE": html.escape(title), "RATIO": f"calc({w} / {h})"}
@@ -152,10 +152,11 @@ def rig_drawing(rig: Rig, alpha: str) -> str:
     """Draw the calibrated cameras from above as inline SVG, the world's x to the right and z upwards.
 
     Args:
+        rig: rig of single cameras, not a batch.
         alpha: name of alpha, which is marked.
 
     Returns:
-        The SVG; empty without a calibrated camera.
+        The SVG and a line on it, as HTML; empty without a calibrated camera.
     """
     cameras = {name: camera for name, camera in rig.cameras.items() if isinstance(camera, Camera)}
     if not cameras:

@@ -23,8 +23,8 @@ class SampleArray(NamedTuple):
 
     Attributes:
         rig: rig of the images.
-        images: images (c, h, w), values 0..1, by camera.
-        ground_truth: image of alpha's view in true colour.
+        images: images, values 0..1, by camera: "mono" (1, h, w) and "colour" (3, h, w), of their own sizes.
+        ground_truth: image of alpha's view in true colour, values 0..1.
     """
 
     rig: Rig
@@ -49,7 +49,7 @@ def load_motorcycle() -> SampleArray:
     The left photograph made grey is the mono camera's, the right one at half its size the colour one's.
 
     Returns:
-        The array; the left photograph is the ground truth.
+        The array, with a depth range in metres; the left photograph is the ground truth.
     """
     from skimage.data import stereo_motorcycle
 

@@ -75,29 +75,34 @@ def attend(
         locations: the search segments or sampling locations in beta of each alpha pixel: Segments or
             Positions with the leading axes (Ha, Wa) or (B, Ha, Wa), or a function from (n, 2) alpha pixels
             (x, y) to either, with the leading axes (n) or (B, n), which is called on one piece of alpha at a
-            time and again in backward, so that not all explicit positions exist at once. Or the field
+            time, and for Positions again in backward, so that not all of these exist at once. Or the field
             `Local`: windows, of views of the same field of view; or `Dense`: all of beta, by
-            `scaled_dot_product_attention`.
+            `scaled_dot_product_attention`, which may store all weights, if `border`, `samples` and `backend`
+            have their defaults.
         samples: how many samples a segment has. None: one for each beta pixel of the longest valid one.
+            Positions have their own number, which alone may be given.
         interpolation: `bilinear` (differentiable in the geometry) or `nearest` (the paper's).
-        bias: added to the scores; anything that broadcasts to (B, Ha, Wa, L); None for none.
+        bias: added to the scores; anything that broadcasts to (B, Ha, Wa, L); -inf skips a sample; None for
+            none.
         border: pixels from beta's border within which weights and values fall smoothly to 0, so that nothing
             jumps when a sample enters or leaves the image. Takes one number of memory for each sample.
         backend: `reference` (plain torch, differentiable any number of times and in forward mode), `cpu`,
             `triton`, `local` (windows alone, see `LOCAL_SERVES`; its output is channels-first in memory), or
             `auto`: `local` where that serves, or the compiled one of the tensors' device, with forward-mode
-            derivatives and gradients of gradients by the reference, or the reference if there is none. An
-            explicit compiled backend that cannot serve raises.
+            derivatives and gradients of gradients by the reference, or the reference if there is none.
 
     Returns:
-        Weighted means of the values (B, Dv, Ha, Wa), in the type of `value`; 0 where no sample counts.
+        Weighted means of the values (B, Dv, Ha, Wa), in the type of `value` (autocast's under autocast); 0
+        where no sample counts.
 
     Raises:
-        ValueError: shapes, devices or options that do not fit together.
-        TypeError: not Segments or Positions; a mask that is not bool; dtypes that differ or are not
-            supported.
-        RuntimeError: an explicit backend that cannot serve.
-        NotImplementedError: derivatives that an explicit backend does not have.
+        ValueError: shapes, devices, numbers or options that do not fit together.
+        TypeError: not tensors, or not Segments or Positions; a mask that is not bool; dtypes that differ or
+            are not supported.
+        RuntimeError: an explicit backend that cannot serve, or a function that returns other axes than those
+            of its pixels. What else the function raises passes.
+        NotImplementedError: derivatives that an explicit backend does not have; segments without `samples`
+            under `torch.func.vmap`.
     """
     given = query, key, value, locations, samples, interpolation, bias, border, backend
     return _attend(*given, measured=False)[0]
@@ -115,18 +120,16 @@ def attend_with_statistics(
     border: float = 0.0,
     backend: Backend = "auto",
 ) -> Attended:
-    """Compute `attend` together with statistics of its weights; arguments as there.
+    """Compute `attend` together with statistics of its weights; arguments and errors as there.
 
     Returns:
-        The values (B, Dv, Ha, Wa); the expected position of the match (B, 2, Ha, Wa) and the spread of the
-        weights (B, Ha, Wa), pixels of beta; and the largest weight (B, Ha, Wa). Statistics are float32
-        (float64 for float64 inputs) and differentiable. All are 0 where no sample counts.
+        `Attended`: the values as `attend` returns them; the expected position of the match (B, 2, Ha, Wa) and
+        the spread of the weights (`deviation`, (B, Ha, Wa)), pixels of beta; and the largest weight (`peak`,
+        (B, Ha, Wa)). Statistics are float32 (float64 for float64 inputs) and differentiable, the peak not by
+        the geometry if `nearest`. All are 0 where no sample counts.
 
     Raises:
-        ValueError: as `attend`.
-        TypeError: as `attend`.
-        RuntimeError: as `attend`.
-        NotImplementedError: as `attend`.
+        RuntimeError: as `attend`; also for the backend `local`, which has no statistics.
     """
     given = query, key, value, locations, samples, interpolation, bias, border, backend
     return Attended(*_attend(*given, measured=True))
@@ -143,6 +146,8 @@ def _attend(*given: Any, measured: bool) -> tuple[Tensor, ...]:
     if kind != "meta" and torch.is_autocast_enabled(kind):
         query, key, value = (t.to(torch.get_autocast_dtype(kind)) for t in (query, key, value))
     _check(query, key, value, interpolation, backend)
+    if bias is not None and bias.device != query.device:
+        raise ValueError(f"bias is on {bias.device}, features on {query.device}: move one of them")
     nearest = interpolation == "nearest"
     if border > 0 and isinstance(locations, Local | Dense):
         locations = _lazily_between(query, key, locations)
@@ -229,7 +234,7 @@ def _lazily_between(query: Tensor, key: Tensor, field: Local | Dense) -> Callabl
 
 
 def _attend_dense(query: Tensor, key: Tensor, value: Tensor, stride: int, bias: Tensor | None) -> Tensor:
-    """Attend to every `stride`-th pixel of beta by torch's own operator, which stores no weights."""
+    """Attend to every `stride`-th pixel of beta by torch's own operator."""
     (b, _, ha, wa), dv = query.shape, value.shape[1]
     q, k, v = (t.flatten(2).mT for t in (query, key[..., ::stride, ::stride], value[..., ::stride, ::stride]))
     bias = _bias(bias, query, k.shape[1])
@@ -243,15 +248,16 @@ def sample_positions(locations: Locations, query: Tensor, samples: int | None) -
     Args:
         locations: segments (ha, wa) or (b, ha, wa), or positions with one more axis.
         query: features (b, d, ha, wa), for their sizes, device and precision.
-        samples: samples of each segment; None for one on each beta pixel of the longest segment.
+        samples: samples of each segment; None for one on each beta pixel of the longest valid segment.
 
     Returns:
-        The positions, with a leading batch axis of 1 or b.
+        `SamplePositions` with a leading batch axis of 1 or b, float64 for a float64 query, else float32.
 
     Raises:
         ValueError: for wrong axes, another device, no samples, or a number of samples that contradicts the
             positions.
         TypeError: for other types, and a mask that is not bool.
+        NotImplementedError: for segments without `samples` under `torch.func.vmap`.
     """
     if isinstance(locations, Segments):
         points = torch.stack([locations.start, locations.end], -2)
@@ -324,13 +330,14 @@ def chosen_backend(backend: Backend, device: str) -> str:
     """Resolve "auto", and check that a backend can serve tensors on a device.
 
     Args:
+        backend: name of a backend; "reference" and "local" are returned without a check.
         device: type of the device, such as "cuda", without a number.
 
     Returns:
-        "cpu", "triton" or "reference".
+        The backend; for "auto" "cpu", "triton" (on "cuda", if installed) or "reference".
 
     Raises:
-        RuntimeError: if the requested backend cannot serve.
+        RuntimeError: for "cpu" or "triton" that cannot serve tensors on the device.
     """
     triton = importlib.util.find_spec("triton") is not None
     if backend == "auto":

@@ -14,13 +14,14 @@ def segment_block_mask(segments: Segments, hw: HW, *, radius: float = 0.5, block
 
     Args:
         segments: segments (Ha, Wa), or (B, Ha, Wa) for a batch.
-        hw: size of beta; keys are its H W pixels, row by row.
-        radius: largest distance of a key from the segment, pixels.
-        block: block size of the mask.
+        hw: (height, width) of beta; keys are its H W pixels, row by row.
+        radius: largest distance of a key from the segment, pixels of beta.
+        block: queries, and keys, of a block of the mask.
 
     Returns:
-        The mask. Queries without a key in reach get zeros. Torch evaluates all pairs of pixels: meant for
-        features of some thousand pixels. `Segments.mask` is the same, dense, for
+        The mask, for any number of heads, on the segments' device; without a batch for any batch. Queries
+        without a key in reach, or with an invalid segment, get zeros. Torch evaluates all pairs of pixels:
+        meant for features of some thousand pixels. `Segments.mask` is the same, dense, for
         scaled_dot_product_attention.
     """
     batch = segments.valid.shape[0] if segments.valid.ndim > 2 else None

@@ -36,9 +36,10 @@ def forward(inputs: AttentionInputs, measured: bool) -> tuple[Tensor, Tensor, Te
         measured: True to compute statistics.
 
     Returns:
-        Values (b, dv, ha, wa), channels last in memory; statistics (b, ha, wa, 4): x, y, spread, peak (empty
-        if not `measured`); log of the sum of exponentials (b, ha, wa), -inf where no sample counts; and an
-        empty tensor, where the GPU backend has the samples of largest weight.
+        Values (b, dv, ha, wa) of the query's type, channels last in memory; in `accumulated` precision
+        statistics (b, ha, wa, 4): x, y, spread, peak (empty if not `measured`), and the log of the sum of
+        exponentials (b, ha, wa), -inf where no sample counts; and an empty tensor, where the GPU backend has
+        the samples of largest weight. Nothing has a gradient.
     """
     query = inputs.query
     b, _, ha, wa = query.shape
@@ -61,13 +62,13 @@ def forward_local(
         query: features (b, d, h, w) of alpha.
         key: features (b, d, h, w) of beta.
         value: values (b, dv, h, w) of beta.
-        field: size and spacing of the windows.
+        field: size and spacing of the windows; an odd size and whole spacing, which are not checked.
         bias: score (size²) added to each sample, the same for all pixels, where -inf skips the sample; None
             for none.
 
     Returns:
-        Values (b, dv, h, w), channels first; log of the sum of exponentials (b, h, w), inf where no sample
-        counts.
+        Values (b, dv, h, w), channels first, 0 where no sample counts; log of the sum of exponentials
+        (b, h, w), inf there. Neither has a gradient.
     """
     planes = [_planes(x) for x in (query, key, value)]
     out = np.empty_like(planes[2])
@@ -90,7 +91,7 @@ def backward_local(
         inputs: query, key and value, as given to `forward_local`; so are `field` and `bias`.
         outputs: results of `forward_local`.
         upstream: gradient (b, dv, h, w) by the values.
-        wanted: True for each of the three gradients to compute.
+        wanted: three flags, True for a gradient to compute.
 
     Returns:
         Three gradients of the inputs' shapes; zeros where not `wanted`.
@@ -131,11 +132,12 @@ def backward(
     Args:
         inputs: inputs of `forward`.
         saved: results of `forward`: statistics, log sums, and two that only the GPU's needs.
-        cotangents: gradients by values and statistics.
-        wanted: True for each of the five gradients to compute.
+        cotangents: gradients by values and statistics (empty if these are).
+        wanted: five flags, True for a gradient to compute.
 
     Returns:
-        Five gradients of the inputs' shapes, images channels last in memory; empty where not `wanted`.
+        Five gradients of the inputs' shapes, empty where not `wanted`: of images in the query's type,
+        channels last in memory; of points and of bias (b, ha, wa, samples) in `accumulated` precision.
     """
     query, key, value, positions, *_ = inputs
     b, d, ha, wa = query.shape

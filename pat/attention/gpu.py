@@ -34,7 +34,8 @@ def forward(inputs: AttentionInputs, measured: bool) -> tuple[Tensor, Tensor, Te
     """Compute attention as `cpu.forward`, on the GPU.
 
     Returns:
-        As `cpu.forward`, and last the sample of largest weight (b, ha, wa), int32.
+        As `cpu.forward`, but last the number of the sample of largest weight (b, ha, wa), int32; 0 where none
+        counts.
     """
     query = inputs.query
     b, _, ha, wa = query.shape
@@ -59,10 +60,10 @@ def backward(
     Args:
         saved: results of `forward`: statistics, log sums, samples of largest weight, and values.
         cotangents: gradients by values and statistics.
-        wanted: True for each of the five gradients to compute.
+        wanted: five flags, True for a gradient to compute.
 
     Returns:
-        Five gradients of the inputs' shapes; empty where not `wanted`.
+        Five gradients as `cpu.backward` returns them, those of key and value summed in no fixed order.
     """
     query, key, value, positions, *_ = inputs
     b, _, ha, wa = query.shape

@@ -55,14 +55,14 @@ class SamplePositions(NamedTuple):
 
 
 class AttentionInputs(NamedTuple):
-    """Inputs of the backends, checked.
+    """Inputs of the backends, which do not check them.
 
     Attributes:
         query: (b, d, ha, wa).
         key: (b, d, hb, wb), of the query's dtype and device, as is `value`.
         value: (b, dv, hb, wb).
         positions: positions of the samples.
-        bias: (b, ha, wa, l), added to the scores; None for none.
+        bias: (b, ha, wa, l), added to the scores, of any dtype; None for none.
         nearest: True for nearest look-up, False for bilinear.
     """
 
@@ -80,7 +80,8 @@ class Attended(NamedTuple):
     Attributes:
         value: (b, dv, ha, wa), weighted mean of the values.
         position: (b, 2, ha, wa), expected (x, y) of the match, beta's pixels.
-        deviation: (b, ha, wa), root of the expected squared distance of the samples from `position`, pixels.
+        deviation: (b, ha, wa), root of the expected squared distance of the samples from `position`, pixels;
+            0 below `LEAST_DEVIATION`.
         peak: (b, ha, wa), largest weight.
     """
 
@@ -94,7 +95,8 @@ def attend(inputs: AttentionInputs) -> Attended:
     """Compute attention by its formula in plain torch, some rows of alpha at a time.
 
     Returns:
-        Values in the query's type, and statistics in `accumulated` precision; differentiable.
+        Values in the query's type, and statistics in `accumulated` precision; differentiable any number of
+        times.
     """
     query, positions, bias = inputs.query, inputs.positions, inputs.bias
     counted = accumulated(query)

@@ -60,7 +60,7 @@ class Compared(NamedTuple):
         """Locations as segments (b or 1, ha, wa).
 
         Raises:
-            ValueError: for explicit positions.
+            ValueError: for a function.
         """
         if not isinstance(self.locations, Segments):
             raise ValueError("a loss on attention needs straight segments: choose a straight field")
@@ -70,10 +70,10 @@ class Compared(NamedTuple):
         """Keep every `stride`-th row and column of alpha, from the first on.
 
         Returns:
-            The features with fewer queries and segments; key and value are shared.
+            The features with fewer queries and segments, views of these; all else is as it was.
 
         Raises:
-            ValueError: for explicit positions.
+            ValueError: for `locations` that are a function, or a stride below 1.
         """
         sparse = (..., slice(None, None, stride), slice(None, None, stride))
         start, end, valid = self.segments.start, self.segments.end, self.segments.valid
@@ -90,9 +90,12 @@ def log_sum(compared: Compared) -> Float[Tensor, "b ha wa"]:
         these too and any number of times.
 
     Raises:
-        ValueError: for explicit positions.
+        ValueError: for `locations` that are a function, and `locations` or a key that do not fit the query.
     """
     query, key, value, _, _, interpolation, _ = compared
+    if query.shape[:2] != key.shape[:2]:
+        shapes = f"query {tuple(query.shape)}, key {tuple(key.shape)}"
+        raise ValueError(f"query and key must agree in batch and channels, got {shapes}")
     positions = sample_positions(compared.segments, query, compared.samples)
     nearest = interpolation == "nearest"
     if torch_op.wants_gradient(positions.points):
@@ -121,6 +124,9 @@ def peak_position(compared: Compared) -> Float[Tensor, "b 2 ha wa"]:
     Returns:
         Positions (x, y) in beta's pixels, (b, 2, ha, wa), float32, without gradient; 0 where no sample
         counts.
+
+    Raises:
+        ValueError: as `attend`, and also TypeError.
     """
     query, key, _, locations, samples, interpolation, _ = compared
     sharp = query.float() * SHARPENED

@@ -37,7 +37,8 @@ def attend(inputs: AttentionInputs, *, measured: bool, backend: str, strict: boo
         strict: True refuses gradients of gradients instead of using the reference.
 
     Returns:
-        Values and statistics.
+        Values and statistics, as the reference's; in backward NotImplementedError is raised if `strict`
+        refuses.
     """
     query, key, value, positions, bias, nearest = inputs
     if is_plain(query, key, value, positions.points, bias):
@@ -79,16 +80,15 @@ def attend_local(
     bias: Tensor | None,
     again: Callable[[Tensor, Tensor, Tensor], Tensor],
 ) -> Tensor:
-    """Compute `cpu.forward_local` with gradients by query, key and value, which are shaped as there.
+    """Compute `cpu.forward_local` with gradients by query, key and value; arguments as there.
 
     Args:
-        field: size and spacing of the windows.
-        bias: score added to each sample, without gradient; None for none.
+        bias: score (size²) added to each sample, without gradient; None for none.
         again: function of query, key and value that computes the values by the general operator, for
             gradients of gradients.
 
     Returns:
-        Values (b, dv, h, w).
+        Values (b, dv, h, w), channels first; 0 where no sample counts.
     """
     if not wants_gradient(query, key, value):
         return compiled("cpu").forward_local(query, key, value, field, bias)[0]

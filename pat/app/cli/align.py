@@ -37,8 +37,8 @@ class Align(Around):
 
     Values keep their recorded type and bits. Without a rig it is found from the tags of the images, or from
     the images, and written to found_rig.yaml beside the result. A folder of a multispectral camera's captures
-    has one rig, found from several. With folders, or quoted patterns, frames are
-    aligned one by one, matched by names or by the numbers or times in them.
+    has one rig, found from several. With folders, or quoted patterns, frames are aligned one by one, matched
+    by names or by the numbers or times in them.
     """
 
     headings: ClassVar[Mapping[str, str]] = {
@@ -73,6 +73,8 @@ class Align(Around):
             UsageError: for invalid options.
             ValueError: for images or a rig that cannot be used.
             FileNotFoundError: for a missing file.
+            FileExistsError: for files in the way that no run wrote.
+            OSError: if files cannot be written.
             SystemExit: as `judged`.
         """
         flight = self._flight()

@@ -51,8 +51,12 @@ class FuseBatch(Fusing):
 
         Raises:
             UsageError: for invalid options.
-            ValueError: for images or a rig that cannot be used.
-            SystemExit: with status 1, if frames failed.
+            ValueError: for images or a rig that cannot be used, and as `Batch.run`.
+            FileNotFoundError: for a missing file, and unknown weights.
+            FileExistsError: for files in the way that no run wrote.
+            OSError: if files cannot be written.
+            ImportError: for a video or a scheduler without its package.
+            SystemExit: with status 1, if frames failed and `on_error` is "skip"; and as `judged`.
         """
         for option, count in {"--workers": self.workers, "--threads": self.threads}.items():
             if count is not None and count < 1:

@@ -59,6 +59,7 @@ class Calibrate:
         Raises:
             ValueError: without a board, for invalid options, and for images that cannot be used.
             FileNotFoundError: for a missing folder, start or board file.
+            OSError: if files cannot be written, or are in the way of the report and no run wrote them.
         """
         from calib.boards.run import calibrate_photos
 
@@ -107,7 +108,6 @@ class Calibrate:
 class PrintBoard:
     """Make a calibration board to print at its true size.
 
-
     Example: pat board charuco:8x6:30mm -o board.pdf
     """
 
@@ -121,7 +121,8 @@ class PrintBoard:
         """Write the board, and say what to print it on.
 
         Raises:
-            ValueError: for a text that is no board, and a sheet that it does not fit on.
+            ValueError: for a text that is no board, a sheet that it does not fit on, and an `out` of another
+                suffix or where nothing can be written.
             FileNotFoundError: for a missing target file.
         """
         from calib.boards.target import page_note, parse_board, write_board

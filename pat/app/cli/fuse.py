@@ -70,6 +70,8 @@ class Fuse(Around, Fusing):
             UsageError: for invalid options.
             ValueError: for images or a rig that cannot be used.
             FileNotFoundError: for a missing file, and unknown weights.
+            FileExistsError: for files in the way that no run wrote.
+            OSError: if files cannot be written.
             SystemExit: as `judged`.
         """
         self._extras = options.some_of(self.extras, EXTRAS)
@@ -83,10 +85,7 @@ class Fuse(Around, Fusing):
         return [] if self.around is None else [KnownFile.parse(self.around).path]
 
     def frames(self, files: Files) -> Files:
-        """Check that there is one image of each camera.
-
-        Returns:
-            The files, unchanged.
+        """Check that there is one image of each camera; returns the files unchanged.
 
         Raises:
             UsageError: for several frames.
@@ -230,13 +229,14 @@ def fuse_with_progress(
         rig: the cameras.
         images: images (c, h, w) by camera.
         device: "cpu", "cuda" or "auto" (the GPU if there is one).
-        further: further arguments of `pat.fuse`.
+        further: further arguments of `pat.fuse`, `alpha` among them.
 
     Returns:
         The frame, on the CPU.
 
     Raises:
-        ValueError: as `fuse`, and for a GPU that is not available.
+        ValueError: as `fuse` and `load_weights`, and for a GPU that is not available.
+        TypeError: as `fuse`.
         FileNotFoundError: for unknown weights.
     """
     from ...networks.weights import load_weights

@@ -36,7 +36,7 @@ class Recordings(NamedTuple):
         files: files by camera, in the order of frames.
         alpha: camera whose view is fused.
         found: array found from the first images; None for a given rig.
-        rates: frames for each second of videos, by camera.
+        rates: frames for each second of videos, by camera; empty for images.
     """
 
     rig: Rig
@@ -85,7 +85,7 @@ class Fusing(Known):
             further: further fields of the settings, or `noise_by_default` of `settings`.
 
         Raises:
-            ValueError: for invalid options.
+            ValueError: for invalid options, and as `field_named`.
         """
         return self.settings(
             field=options.field_named(self.field),
@@ -130,7 +130,7 @@ class Fusing(Known):
 
     @contextmanager
     def recordings(self, image: Sequence[str], *, with_rig: bool) -> Iterator[Recordings]:
-        """Context manager that yields the images with the given rig or one found, and chooses weights.
+        """Context manager that yields the images with the given rig or one found; sets `network` and `bits`.
 
         Args:
             image: images NAME=FILE, as `named` returns them.
@@ -140,9 +140,9 @@ class Fusing(Known):
             The recordings; frames of videos exist within the block only.
 
         Raises:
-            ValueError: for options that contradict each other, before images are read, and images that cannot
-                be used.
-            FileNotFoundError: for a missing file.
+            ValueError: for options that contradict each other, before images are read, and a rig, images or
+                videos that cannot be used.
+            FileNotFoundError: for a missing file, and unknown weights.
         """
         self.fuse_settings()
         if with_rig:
@@ -227,10 +227,14 @@ class Fusing(Known):
             say(f"network: {self.network} (--network NAME takes others)")
 
     def healed(self, views: ViewFiles) -> Rig:
-        """Compare the rig with the images, and refine it, or warn (`--misfit warn`), if they contradict it.
+        """Compare the rig with the images, and refine it, or warn, if they contradict it (`checked_rig`).
 
         Returns:
             The rig of the views, or the corrected one, which is then written beside the results too.
+
+        Raises:
+            LowConfidenceWarning: for a rig that is wrong, with `--misfit refuse` (within `judged`).
+            OSError: if it cannot be written, or a file in its place was written by no run.
         """
         from arraygeom.io.native import write
         from arraygeom.runtime.together import write_listed
@@ -264,12 +268,12 @@ def named_images(paths: Sequence[Path], image: Sequence[str], command: str) -> t
         image: values of --image.
 
     Returns:
-        Images NAME=FILE, and True if the first argument is taken as a rig, as it always is with `image`;
-        empty without a rig.
+        Images NAME=FILE, and True if the first argument is taken as a rig, as it always is with `image`; else
+        no images, and False.
 
     Raises:
-        ValueError: for fewer than two images without a rig, a rig without images, `image` without a rig, and
-            text other than NAME=FILE.
+        ValueError: for fewer than two images without a rig, a rig without images, `image` without a rig, text
+            other than NAME=FILE, and a camera named twice.
         FileNotFoundError: for a missing rig file, and without a rig for a missing image; a rig's images are
             not looked for here.
     """
@@ -309,11 +313,12 @@ def files_by_camera(
         image: images NAME=FILE; FILE may be a folder or a pattern.
 
     Returns:
-        Alpha's name, and files by camera.
+        Alpha's name, and files by camera, of those in `image` alone; alpha may be missing.
 
     Raises:
-        ValueError: without alpha, for names that the rig lacks, and one image given twice.
-        FileNotFoundError: if a camera has no image.
+        ValueError: without alpha, for names that the rig lacks or that are given twice, one image given
+            twice, and as `find_images`.
+        FileNotFoundError: for a FILE that matches no image.
     """
     from ..batch import find_images
 

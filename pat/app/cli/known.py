@@ -44,7 +44,7 @@ OFF_LINES = 5.0
 class Known:
     """Base class of commands on an array's images: options on rig, depth, noise and matching.
 
-    Fields are options of the command line, each described beside its name.
+    Fields are options of the command line, each described beside its name. A subclass defines `run`.
 
     Raises:
         UsageError: for a --max-memory that is no amount of memory.
@@ -107,11 +107,12 @@ class Known:
 
     @contextmanager
     def judged(self) -> Iterator[None]:
-        """Context manager for the command's work, which is done within --max-memory.
+        """Context manager for the command's work, within --max-memory, and for its notes (`note`).
 
         Raises:
             SystemExit: with status 3, if the work warned that the rig does not fit the images; with `--misfit
-                refuse` before anything is written.
+                refuse` before anything is written. Other errors of the work pass.
+            ValueError: for invalid options.
         """
         from ...fusion.checks import LowConfidenceWarning, confidence_checked
         from ...support.memory import limited
@@ -149,7 +150,7 @@ class Known:
             flight: True to use other captures too, unless `matches` are given.
 
         Raises:
-            ValueError: for images that cannot be used, and a memory limit that their size exceeds.
+            ValueError: as `array_from_images`, and for a memory limit that the images' size exceeds.
             FileNotFoundError: for a missing file, and unknown weights.
         """
         from arraygeom.runtime.image_bytes import image_header
@@ -190,7 +191,7 @@ class KnownFile(NamedTuple):
 
     Attributes:
         path: depth map or matched points.
-        scale: metres for each unit of the file; None for its default.
+        scale: metres for each unit of a depth map; None: 1 for floats, 0.001 for whole numbers.
         tolerance: relative error of the depth map; 0 = exact.
     """
 
@@ -200,10 +201,10 @@ class KnownFile(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> KnownFile:
-        """Parse the option's text, and check that the file exists.
+        """Parse the option's text, and check that the file exists; the numbers' signs are not checked.
 
         Raises:
-            UsageError: for another name than these, and a missing file.
+            UsageError: for another name than scale and tolerance, and a missing file.
             ValueError: for what is no NAME=NUMBER, and a name given twice.
         """
         path, *parts = text.split(",")
@@ -226,7 +227,7 @@ class Around(Known):
     """Base class of commands with --around: a file of known depth or matches of one frame.
 
     Raises:
-        UsageError: for text that is no such value, and a missing file.
+        UsageError: as `Known`, and as `KnownFile.parse`, which may raise ValueError too.
     """
 
     around: Annotated[str | None, Option("FILE", also=("--matches", "--depth-map"))] = None
@@ -269,10 +270,12 @@ class Around(Known):
             field: field of --field; None for the default.
 
         Returns:
-            The rig, and the field around the known depth or matches by beta; `field` itself without --around.
+            The rig, and the field: one for all betas around a depth map; one for each by name around matches,
+            `field` for a beta without any; `field` itself without --around.
 
         Raises:
-            ValueError: for options that contradict each other, and files that do not suit these cameras.
+            ValueError: for options that contradict each other, files that cannot be read or do not suit these
+                cameras, and an alpha that the rig lacks.
         """
         from arraygeom.rig import with_pixels
 
@@ -288,11 +291,8 @@ class Around(Known):
 
 
 def _around_depth(known: KnownFile, images: Mapping[str, Tensor], rig: Rig, alpha: str) -> ReceptiveField:
-    """Field around the depth map, with a warning if matched points contradict it.
-
-    Raises:
-        ValueError: for depths outside the rig's range.
-    """
+    """Field around the depth map, with a warning if matched points contradict it. Raises ValueError for
+    depths outside the rig's range."""
     import torch
 
     from arraygeom import Camera

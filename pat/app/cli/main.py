@@ -30,7 +30,10 @@ class Lab:
 
 
 class Pat:
-    """Fuse the images of an array of unlike cameras into one."""
+    """Fuse the images of an array of unlike cameras into one.
+
+    The group of all commands: `commands` has a class, a group, or the path "module:Class" of one by word.
+    """
 
     commands: ClassVar[Mapping[str, Any]] = {
         "fuse": fuse.Fuse,
@@ -69,16 +72,16 @@ def command_paths(group: Any = Pat, before: tuple[str, ...] = ()) -> Iterator[tu
 def main(arguments: list[str] | None = None, *, group: Any = Pat, prog: str = "pat") -> None:
     """Run a command of `pat`, or of another group of commands.
 
-    Errors in the input are printed as one line on standard error.
+    Errors in the input are printed as one line on standard error; with --debug they are raised.
 
     Args:
         arguments: words after the program's name; None for those of this process.
-        group: class with `commands` by name.
+        group: class with `commands` by name, as `Pat`.
         prog: name of the program in messages.
 
     Raises:
-        SystemExit: with status 2 for such errors, 130 for an interrupt, 141 for a broken pipe; others by the
-            commands.
+        SystemExit: with status 0 after --help and --version, 2 for such errors, 130 for an interrupt, 141 for
+            a broken pipe; others by the commands.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):

@@ -46,7 +46,7 @@ def response_of(text: str) -> Any:
         The text, or the three weights.
 
     Raises:
-        ValueError: for other text, and weights that do not sum to about 1.
+        ValueError: for other text, and weights whose sum is not from 0.8 to 1.25.
     """
     if text in ("fit", "rec601"):
         return text
@@ -69,7 +69,8 @@ def noise_of(texts: Iterable[str], *, by_default: bool = False) -> Any:
         "estimate", "auto", noise levels by camera, or None for no denoising.
 
     Raises:
-        ValueError: for other text.
+        ValueError: for other text, a camera given twice, fewer than 1 electron, and a negative read noise.
+            That the rig has the cameras is not checked.
     """
     from ...sensors import NoiseLevel
 
@@ -110,7 +111,7 @@ def rig_first(arguments: Sequence[str], command: Any) -> list[str]:
     """Move the rig of `--rig RIG` to the front of the arguments, for commands with a positional rig.
 
     Returns:
-        The arguments.
+        The arguments; those of other commands, and without --rig, as they are.
 
     Raises:
         UsageError: for --rig without a value.
@@ -137,10 +138,10 @@ def writable(out: Path, *, folder: bool = False, option: str = "--out") -> Path:
         option: name of the option, for messages.
 
     Returns:
-        The path.
+        The path; nothing is made.
 
     Raises:
-        ValueError: for a folder where a file is wanted, a file in the way, or no permission.
+        ValueError: for a folder where a file is wanted, a file in the way, or a place that cannot be written.
     """
     if out.exists() and out.is_dir() != folder:
         kind = "folder: name a file in it" if out.is_dir() else "file: name a folder"
@@ -162,7 +163,7 @@ def device_of(name: str) -> str:
     """Resolve a device's name.
 
     Args:
-        name: "cpu", "cuda", or "auto" for a GPU if there is one.
+        name: "cpu", "cuda", or "auto" for a GPU if there is one; other names are as "auto".
 
     Returns:
         "cpu" or "cuda".
@@ -188,7 +189,8 @@ def field_named(name: str) -> ReceptiveField | None:
         The field; None for "auto".
 
     Raises:
-        ValueError: for an unknown name, and a module or object that cannot be imported.
+        ValueError: for an unknown name, a module or object that cannot be imported, and an object that is no
+            field.
     """
     from arraygeom.fields import named_field
 
@@ -208,7 +210,7 @@ def load_rig(path: Path, depth: tuple[float, float] | None = None, *, or_image: 
 
     Raises:
         FileNotFoundError: for a missing file.
-        ValueError: for a file that is no rig, and invalid bounds.
+        ValueError: for a file that is no rig (`RigFileError`), and invalid bounds.
     """
     refuse_missing(path, rig=True)
     from arraygeom import Rig
@@ -228,10 +230,10 @@ NO_IMAGE = "is no image: images end in .png, .tif, .jpg and the like"
 
 
 def some_of(text: str, names: Sequence[str], option: str = "--extras") -> set[str]:
-    """Parse a value such as "page,points".
+    """Parse names between commas, such as "page,points", as the value of an option.
 
     Returns:
-        The names in it.
+        The names.
 
     Raises:
         UsageError: for a name that is none of `names`.
@@ -266,7 +268,7 @@ def files_by_name(texts: Iterable[str], option: str = "--image") -> dict[str, Pa
     """Parse values of a NAME=FILE option.
 
     Returns:
-        Files by name.
+        Files by name, in order; whether they exist is not checked.
 
     Raises:
         ValueError: for other text, and a name given twice.
@@ -278,10 +280,10 @@ def numbers_by_name(texts: Iterable[str], option: str) -> dict[str, float]:
     """Parse values of a NAME=NUMBER option.
 
     Returns:
-        Numbers by name.
+        Numbers by name, in order.
 
     Raises:
-        ValueError: for other text, and a name given twice.
+        ValueError: for other text, a number that is not finite, and a name given twice.
     """
     return dict(_once(option, (_named_number(option, text) for text in texts)))
 
@@ -293,11 +295,11 @@ def read_images(rig: Rig, texts: Iterable[str], *, sized: bool = True) -> dict[s
         sized: False accepts images of another size than the rig's.
 
     Returns:
-        Images (c, h, w) by camera.
+        Images (c, h, w) by camera, sRGB values (`read_view`).
 
     Raises:
-        ValueError: for a camera given twice or not of the rig, images that cannot be read or have another
-            size.
+        ValueError: for text other than NAME=FILE, a camera given twice or not of the rig, images that cannot
+            be read or, if `sized`, have another size.
         FileNotFoundError: for a missing file.
     """
     from ...fusion.views import read_view
@@ -310,7 +312,7 @@ def read_frames(rig: Rig, texts: Iterable[str]) -> list[dict[str, Tensor]]:
     """Read images of `--image NAME=FILE` as frames: the first of every camera, then the second ones.
 
     Returns:
-        Images (C, H, W) in 0..1 by camera, for each frame, of the files' own sizes.
+        Images (C, H, W) by camera for each frame, sRGB values (`read_view`), of the files' own sizes.
 
     Raises:
         ValueError: for no images, text other than NAME=FILE, cameras that the rig lacks, cameras with unequal
@@ -418,7 +420,7 @@ def working(title: str) -> Iterator[Callable[[str], None]]:
     Without a terminal, steps are lines, `LINE_EVERY` seconds apart.
 
     Yields:
-        A function that changes the title.
+        A function of a text, which becomes the title.
     """
     import time
 
@@ -449,7 +451,7 @@ def working_by_plan(title: str) -> Iterator[Callable[[Plan], None]]:
     """Context manager during which the terminal shows a title and steps (`working`), for work with a plan.
 
     Yields:
-        A function that prints the plan and adds its duration to the title.
+        A function of the plan, which prints it and adds its duration, if known, to the title.
     """
     with working(title) as retitle:
 

@@ -36,6 +36,7 @@ class UsageError(ValueError):
         option: name of the option or argument.
         expected: description of what it expects.
         got: value that it got; None to leave that out of the message.
+        text: message in place of both; empty for none.
     """
 
     def __init__(self, option: str, expected: str, got: object = None, *, text: str = "") -> None:
@@ -48,9 +49,9 @@ class Option:
     """Properties of an option that a field's type does not state.
 
     Attributes:
-        metavar: name of its value in the help.
+        metavar: name of its value in the help; None for one by the field's type.
         help: help text; None for the field's docstring.
-        short: short name, such as "-o".
+        short: short name, such as "-o"; None for none.
         also: further names, such as "--matches".
         positional: True for an argument without a name.
         repeat: True if the option is given once for each value.
@@ -95,14 +96,15 @@ def parse(
         kind: dataclass or function whose fields or parameters are the options; its docstring is the help.
         arguments: words; None for those of this process.
         prog: name of the program in the help; empty for that of this process.
-        base: instance that holds the defaults, and is copied with changes; None for the class's defaults.
+        base: instance of `kind` that holds the defaults, and is copied with changes; None for the class's
+            defaults.
         description: help text; empty for the docstring.
 
     Returns:
         The instance, or the function's result.
 
     Raises:
-        UsageError: for unknown options and invalid values.
+        UsageError: for unknown and missing options, and invalid values; what `kind` itself raises passes.
         SystemExit: after `--help`, which prints.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
@@ -132,18 +134,12 @@ def parse(
 
 
 def script(kind: Callable[..., T], arguments: Sequence[str] | None = None, *, prog: str = "") -> T:
-    """Parse the command line of a stand-alone script, as `parse`, and end the process for a bad one.
+    """Parse the command line of a stand-alone script, and end the process for a bad one.
 
-    Args:
-        kind: dataclass or function whose fields or parameters are the options.
-        arguments: words; None for those of this process.
-        prog: name of the program in the help; empty for that of this process.
-
-    Returns:
-        The instance, or the function's result.
+    Arguments and result are as for `parse`.
 
     Raises:
-        SystemExit: with one line, for unknown options and invalid values.
+        SystemExit: with one line where `parse` raises UsageError, and after `--help`.
     """
     try:
         return parse(kind, arguments, prog=prog)
@@ -212,7 +208,7 @@ class _Entry:
         return text.replace("%", "%%")
 
     def add_to(self, group: Any) -> None:
-        """Add the option to a parser's group."""
+        """Add the option to a parser's group (argparse's); if not given it leaves no entry in the result."""
         how: dict[str, Any] = {"default": argparse.SUPPRESS, "help": self.help}
         how |= {} if self.option.positional else {"dest": self.name}
         flag, members = f"--{self.dashed}", typing.get_args(self.kind)
@@ -284,7 +280,11 @@ def _entries(kind: Any, base: Any, before: str = "") -> Iterator[_Entry]:
 
 
 def field_docs(kind: Any) -> dict[str, str]:
-    """Return the docstrings that follow a dataclass's fields, parents' included, by field."""
+    """Return the docstrings that follow some of a dataclass's fields, parents' included, by field.
+
+    Raises:
+        OSError: for a class whose source is not there.
+    """
     docs: dict[str, str] = {}
     for parent in reversed(kind.__mro__):
         if parent is object:

@@ -42,9 +42,10 @@ class Show:
         """Write the drawings, and warn of a rig that does not fit the images.
 
         Raises:
-            ValueError: for a rig or images that cannot be used.
+            ValueError: for a rig or images that cannot be used, and an unknown alpha.
             FileExistsError: for files in the way that no run wrote.
             FileNotFoundError: for a missing file.
+            OSError: if files cannot be written.
         """
         from arraygeom import Camera
         from arraygeom.runtime.together import refuse_others, write_together
@@ -82,11 +83,11 @@ def warn_of_misfit(rig: Rig, images: Mapping[str, Tensor]) -> None:
 
 
 def matched_points(rig: Rig, alpha: str, images: Mapping[str, Tensor]) -> dict[str, tuple[Tensor, Tensor]]:
-    """Match points between alpha's image and each beta's.
+    """Match points between alpha's image (c, h, w), 0..1, and each beta's.
 
     Returns:
-        Points (n, 2) of alpha and of the beta, pixels, by beta. Betas without an image, that show too little
-        in common with alpha, or that the rig does not relate to it, are left out.
+        Points (n, 2) of alpha and of the beta, pixels, by beta. Betas without an image, with one that cannot
+        be matched, or that the rig does not relate to alpha, are left out; all without an image of alpha.
     """
     from calib.images.matches import match_cameras
     from calib.images.residuals import related
@@ -106,13 +107,13 @@ def given_matches(path: Path | None, texts: Sequence[str], images: Mapping[str, 
     Args:
         path: file of matched points; None for none.
         texts: values NAME=FILE of --image.
-        images: images (c, h, w) by camera, whose sizes points must fit.
+        images: images (c, h, w) of the same cameras, whose sizes points must fit.
 
     Returns:
-        Matches by pair; None without a file.
+        Matches by pair of names; None without a file.
 
     Raises:
-        ValueError: for a file that does not suit the images.
+        ValueError: for a file that does not suit the images, and as `files_by_name`.
         FileNotFoundError: for a missing file.
     """
     if path is None:
@@ -137,7 +138,6 @@ def _twelve_pixels(hw: tuple[int, int]) -> Tensor:
 class Explore:
     """Explore receptive fields in the browser: point at a pixel of alpha, see its segments, move the rig.
 
-
     Example: pat explore rig.yaml --image mono=a.png --image colour=b.png
     """
 
@@ -157,11 +157,12 @@ class Explore:
     """Print the address of the page, and open no browser."""
 
     def run(self) -> None:
-        """Serve the explorer, or save its page.
+        """Serve the explorer until Ctrl+C, or save its page.
 
         Raises:
-            ValueError: for a rig or images that it cannot show.
+            ValueError: for a rig, images, a covariance beside the rig or options that it cannot use.
             FileNotFoundError: for a missing file.
+            OSError: if the page cannot be written.
         """
         from ..explore import opened, serve
 
@@ -218,7 +219,7 @@ class Info:
         """Print what is odd about the rig, and a line for each camera and each pair.
 
         Raises:
-            ValueError: for a file that is no rig, and an unknown alpha.
+            ValueError: for a file that is no rig, invalid bounds, and an unknown alpha.
             FileNotFoundError: for a missing file.
         """
         from arraygeom.io import ANY_SCALE, recognise
@@ -258,7 +259,10 @@ def warn_of_oddities(rig: Rig) -> None:
 
 
 def print_tables(cameras: Sequence[CameraSummary], pairs: Sequence[PairSummary], unit: str) -> None:
-    """Print a table of cameras and, if there are any, one of pairs; `unit` is the unit of lengths."""
+    """Print two tables of cameras (views and lenses) and, if there are any, one of pairs, on standard output.
+
+    `unit` is the unit of lengths; footprints of pixels are in thousandths of it, mm for "m".
+    """
     from rich.console import Console
     from rich.table import Table
 
@@ -308,8 +312,10 @@ class Convert:
 
         Raises:
             FileNotFoundError: for a missing file.
-            ValueError: for a damaged file, a size that it contradicts or that is below 1, and a rig that the
-                target format cannot hold.
+            ValueError: for a damaged file, an unknown format or lens, a size that it contradicts or that is
+                below 1, and a rig that the target format cannot hold.
+            FileExistsError: for files in a target folder that no run wrote.
+            OSError: if it cannot be written.
         """
         from arraygeom.io import read_rig, write_rig
         from arraygeom.lens_fit import refit_rig
@@ -352,11 +358,12 @@ class Doctor:
     """Print JSON instead of text."""
 
     def run(self) -> None:
-        """Print the diagnosis, and write the repaired rig to `out` if one is given.
+        """Print the diagnosis, and write the repaired rig to `out`, if given, for a mistake that is certain.
 
         Raises:
             FileNotFoundError: for a missing file.
-            ValueError: for a rig or images that cannot be used.
+            ValueError: for a rig, images or matches that cannot be used.
+            OSError: if it cannot be written.
             SystemExit: with status 4, if a rig is to be written and several repairs do as well.
         """
         from arraygeom.runtime.atomic import write_atomically
@@ -425,6 +432,7 @@ class Refine:
         Raises:
             ValueError: for a rig, images or options that cannot be used.
             FileNotFoundError: for a missing file.
+            OSError: if it cannot be written.
             SystemExit: with status 4, as above.
         """
         from arraygeom.io.native import write
@@ -474,7 +482,6 @@ class Refine:
 class RigFromImages:
     """Make a rig from images alone: fundamental matrices and rough homographies, good enough to fuse with.
 
-
     Example: pat rig start --image mono=a.png --image colour=b.png --focal mono=800 --out rig.yaml
     """
 
@@ -490,8 +497,9 @@ class RigFromImages:
         """Estimate and write the rig, and print its statistics.
 
         Raises:
-            ValueError: for images with too little in common.
+            ValueError: for images with too little in common or that cannot be read, and invalid options.
             FileNotFoundError: for a missing file.
+            OSError: if it cannot be written.
         """
         from arraygeom.runtime.text import OPEN
         from calib.images.from_images import rig_from_images
@@ -535,8 +543,10 @@ class RigDiff:
         """Print the comparison and the verdict.
 
         Raises:
-            ValueError: for rigs of other cameras, no depth range, and options that contradict each other.
+            ValueError: for rigs of other cameras, no depth range, files that cannot be used, and options that
+                contradict each other.
             FileNotFoundError: for a missing file.
+            OSError: if the picture cannot be written.
         """
         from calib.boards.rig_diff import draw_difference, rig_difference
         from calib.boards.uncertainty import RigCovariance

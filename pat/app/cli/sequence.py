@@ -57,13 +57,11 @@ class FuseSequence(FuseBatch):
         return files
 
     def timed(self, rig: Rig) -> Rig:
-        """Set the cameras' frame rates and time offsets that the command line states.
-
-        Returns:
-            The rig.
+        """Return the rig with the cameras' frame rates and time offsets that the command line states.
 
         Raises:
-            ValueError: for a camera that the rig lacks, and text that is no number.
+            ValueError: for a camera that the rig lacks or that is given twice, text that is no number, and a
+                rate that is not positive.
         """
         for entry, given in {"frame_rate": self.frame_rate, "time_offset": self.time_offset}.items():
             for name, value in options.numbers_by_name(given, f"--{entry.replace('_', '-')}").items():

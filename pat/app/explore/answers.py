@@ -92,14 +92,18 @@ SHIPPED = "pat-supervised"
 
 
 def answer(scene: ExplorerScene, alpha: str, controls: Controls) -> dict[str, Any]:
-    """Compute what is drawn for a state of the controls.
+    """Compute what is drawn for a state of the controls, which are all of `DEFAULTS`, and x.
 
     Returns:
-        Pixel `x`, `depth`, `betas` with samples, weights and match (or a `problem`), `pins`, and the rig's
-        `top` view, as plain values for JSON.
+        Plain values for JSON: `x`, alpha's pixel; `depth` by all betas, in the rig's unit (None if unknown);
+        `betas` by name, as `drawn` gives them, or with a `problem`, each with `epipole` (None if not seen)
+        and for a second field `second`, as `drawn` gives it; `backwards`, samples in alpha of a `clicked`
+        pixel of beta; `pins`, each with `x` and `betas`; `top` (`top_view`); `map` (`whole_map`); and `rig`,
+        the changed rig's file, empty if it is unchanged.
 
     Raises:
-        ValueError: or TypeError, AttributeError, KeyError, for impossible controls.
+        ValueError: for impossible controls; missing ones and other types give TypeError, AttributeError,
+            LookupError, ArithmeticError or RuntimeError.
     """
     rig = scene.rig
     scene = scene.with_rig(moved_rig(rig, alpha, controls))
@@ -131,13 +135,13 @@ def answer(scene: ExplorerScene, alpha: str, controls: Controls) -> dict[str, An
 
 
 def clicked(scene: ExplorerScene, alpha: str, controls: Controls) -> tuple[Controls, list[Any]]:
-    """Find the alpha pixel that matches a beta's clicked pixel.
+    """Find the alpha pixel that matches a beta's pixel, the control `clicked` (name, column, row).
 
     Returns:
-        The controls with that pixel, and the samples in alpha.
+        The controls with that pixel as `x`, and the samples in alpha, a list of (x, y).
 
     Raises:
-        ValueError: if no pixel can match.
+        ValueError: if no pixel can match, and for an unknown beta.
     """
     name, column, row = controls["clicked"]
     x = image_pixel(column, row, scene.rig[name].hw)
@@ -163,13 +167,14 @@ def moved_rig(rig: Rig, alpha: str, controls: Controls) -> Rig:
 
     Args:
         alpha: name of alpha, in whose axes steps are; uncalibrated, nothing moves.
-        controls: values of the controls: `baseline`, and `errors` by camera.
+        controls: values of the controls: `baseline`, and `errors` by camera or `ALL`, as `ERRORS` has them.
 
     Returns:
-        The moved rig; the same one for unchanged controls.
+        The moved rig, its links unchanged; the same one for unchanged controls.
 
     Raises:
-        ValueError: for a change that a camera's lens has not, and for unknown cameras and changes.
+        ValueError: for a change that a camera's lens has not, unknown cameras and changes, and numbers that
+            no camera has.
     """
     alpha_view, cameras, errors = rig[alpha], dict(rig.cameras), controls["errors"]
     known = {*rig.names, ALL}
@@ -207,10 +212,10 @@ def with_lens(name: str, camera: Camera, changes: Controls) -> LensModel | None:
 
     Args:
         name: name of the camera, for messages.
-        changes: values by the index of the number as text; none leaves the lens.
+        changes: values by the index of the number as text, from "0"; empty leaves the lens.
 
     Returns:
-        The lens; for a pinhole one of Brown-Conrady.
+        The lens; for a pinhole one of Brown-Conrady with four numbers, None if nothing changes.
 
     Raises:
         ValueError: for a number that the lens has not.
@@ -237,10 +242,10 @@ def drawn(beta: BetaReport) -> dict[str, Any]:
     """Convert a beta's report to plain values for JSON.
 
     Returns:
-        `samples` on the image and `match`, the one of the largest weight, in beta's pixels; their `weights`;
-        `depths` and the match's `depth` in the rig's unit (None where unknown); `off`, the distance from the
-        line of what the images themselves show to match, pixels, and `band`, its corners in beta's pixels
-        (both None where there is none); or a `problem` if no sample is on the image.
+        `samples` on the image, in beta's pixels, their `weights` and their `depths`; `match`, the sample of
+        the largest weight, and its `depth`; depths are in the rig's unit, None where unknown; `off` and
+        `band`, the report's offset and band (None where there is none); or a `problem` alone if no sample is
+        on the image.
     """
     if not bool(beta.valid.any()):
         return {"problem": "no part of the segment lies in this image: the views do not overlap here"}
@@ -266,11 +271,12 @@ def epipole(rig: Rig, alpha: str, beta: str) -> list[float] | None:
 
 
 def top_view(rig: Rig, alpha: str, report: PixelReport) -> list[dict[str, Any]]:
-    """List the cameras from above, in alpha's axes (right, forward), in the rig's unit.
+    """List the calibrated cameras from above, in alpha's axes (right, forward), with alpha's centre at 0.
 
     Returns:
-        Plain values of each camera: `at`, its centre, `ahead`, its viewing direction, and `ray`, to
-        alpha's pixel or to the match (None without one); empty if alpha is not calibrated.
+        Plain values of each camera: `name`; `at`, its centre in the rig's unit; `ahead`, its viewing
+        direction; and `ray`, the direction of alpha's pixel or of the match (None without one); both are of
+        unit length in space. Empty if alpha is not calibrated.
     """
     alpha_view = rig[alpha]
     if not isinstance(alpha_view, Camera):
@@ -302,10 +308,14 @@ def grid_pixels(hw: HW, columns: int) -> tuple[int, list[list[float]]]:
 
 
 def whole_map(scene: ExplorerScene, alpha: str, controls: Controls) -> dict[str, Any] | None:
-    """Compute the map that the controls choose, on a grid of alpha's pixels; kept until they change.
+    """Compute the map that the controls choose (`MAPS`), on a grid of alpha's pixels; kept until they change.
 
     Returns:
-        Plain values: `columns`, `rows`, and `values` row by row (None where there is none); None for no map.
+        Plain values: `columns`, `rows`, and `values` row by row (None where no beta has one); None for no
+        map.
+
+    Raises:
+        ValueError: for an unknown map, and impossible depth bounds.
     """
     which = MAPS.index(controls["map"])
     kept = {k: controls[k] for k in ("map", "field", "weights", "near", "far", "baseline", "errors")}
@@ -372,8 +382,9 @@ def slider_ranges(rig: Rig) -> list[list[Any]]:
     """List the sliders that suit a rig.
 
     Returns:
-        Name, label, [low, high, step, value], and True for a change of one camera, of each; depths only with
-        a depth range, others only with calibrated cameras.
+        A list [name, label, [low, high, step, value], change] for each, with `change` True for a change of
+        one camera (`ERRORS`, lens), False for "near", "far" and "baseline". Depths only with a depth range,
+        at most `FARTHEST`; others only with calibrated cameras.
     """
     ranges: list[list[Any]] = []
     unit = length_unit(rig)
@@ -398,10 +409,10 @@ def slider_ranges(rig: Rig) -> list[list[Any]]:
 
 
 def choices(scene: ExplorerScene, controls: Controls) -> list[list[Any]]:
-    """List the drop-down choices of the explorer: field, second field, and weights.
+    """List the drop-down choices of the explorer: field, second field, weights, map, and camera to change.
 
     Returns:
-        Name, label and options of each.
+        A list [name of the control, label, options] for each.
     """
     fields = [*FAMILIES, *scene.fields]
     unlisted = [name for name in (controls["field"], controls["second"]) if name not in ("none", *fields)]
@@ -424,8 +435,8 @@ def shown_cameras(scene: ExplorerScene, alpha: str) -> list[dict[str, Any]]:
     """Describe alpha and each beta with an image, in this order, for the page.
 
     Returns:
-        Plain values: `name`, `hw`, `src` (the image as a data URL), `alpha` (True for alpha), and `unit` of
-        depths.
+        Plain values of each: `name`, `hw` (of the camera), `src` (the image as `data_url` makes it), `alpha`
+        (True for alpha), and `unit` of depths ("m" or "baselines").
     """
     names = [alpha, *(n for n in scene.rig.betas(alpha) if n in scene.images)]
     unit = length_unit(scene.rig)

@@ -41,8 +41,8 @@ class Explorer:
 
     Attributes:
         scene: the scene; None for an error.
-        alpha: name of alpha.
-        controls: initial controls.
+        alpha: name of alpha; empty for an error.
+        controls: initial controls, all of `DEFAULTS` and x.
         error: message; empty if there is a scene.
         files: files of the rig ("") and of the images by camera, for the code that makes the view; empty if
             unknown.
@@ -59,7 +59,7 @@ class Explorer:
 
         Returns:
             The values of `answers.answer`, or for impossible controls and without a scene `error`, a
-            message; with a scene also the control `asked` as it was given.
+            message; with a scene also the control `asked` as it was given, None if it was not.
         """
         if self.scene is None:
             return {"error": self.error}
@@ -72,7 +72,11 @@ class Explorer:
             return {"error": str(error), "asked": controls.get("asked")}
 
     def values(self) -> dict[str, Any]:
-        """Return the widget's initial values, as plain values for JSON."""
+        """Return the widget's initial values, as plain values for JSON.
+
+        They are `cameras` (`shown_cameras`), `ranges` (`slider_ranges`) and `choices`, all empty for an
+        error, `controls`, `defaults`, `files`, and the first `answer`.
+        """
         scene = self.scene
         return {
             "cameras": [] if scene is None else shown_cameras(scene, self.alpha),
@@ -118,7 +122,7 @@ class Explorer:
         """The rig as the controls have changed it.
 
         Raises:
-            ValueError: if there is none, or for impossible controls.
+            ValueError: for an error in a scene's place, and otherwise as `answers.answer`.
         """
         if self.scene is None:
             raise ValueError(self.error)
@@ -132,7 +136,7 @@ class Explorer:
             columns: columns of the grid; cells are about square.
 
         Returns:
-            Plain values: `columns`, `rows`, and `answers` by "column,row".
+            Plain values: `columns`, `rows`, and `answers` by "column,row"; one cell for an error.
         """
         if self.scene is None:
             return {"columns": 1, "rows": 1, "answers": {"0,0": {"error": self.error}}}
@@ -154,8 +158,8 @@ def geometry(rig: Rig, alpha: str) -> dict[str, Any]:
     """Return the calibrated cameras as plain numbers, for the page's own computation.
 
     Returns:
-        Name of `alpha`; `cameras` by name, each with K, R, centre and hw; `near` and `far`, at most 1e9.
-        Lengths are in the rig's unit; the rig must have a depth range.
+        Name of `alpha`; `cameras` by name, each with K, R (camera from world), centre and hw, lenses left
+        out; `near` and `far`, at most 1e9. Lengths are in the rig's unit; the rig must have a depth range.
     """
     cameras = {
         name: {k: getattr(camera, k).tolist() for k in ("K", "R", "centre")} | {"hw": list(camera.hw)}
@@ -205,16 +209,16 @@ def opened(
         rig: the rig.
         images: images (C, H, W) by camera; None for a checkered room.
         alpha: name of alpha; None for the first camera with an image.
-        x: pixel of alpha; None for the middle.
-        network: network of the paper, or its weights by name, whose attention is shown; None for correlations
-            of windows.
+        x: pixel (x, y) of alpha; None for the middle.
+        network: network of the paper, or weights of one, whose attention is shown; None for correlations of
+            windows.
         fields: further fields by name; None for none.
         covariance: covariance of the rig's parameters, for bands; None for none.
         files: files of the rig and the images, as for `Explorer`; None if unknown.
-        controls: initial values of the controls (`explore`).
+        controls: initial values of the controls (`explore`); impossible ones are errors of its answers.
 
     Returns:
-        The explorer; problems with the arguments are its `error`.
+        The explorer; problems with the other arguments are its `error`.
 
     Raises:
         TypeError: for an unknown argument.
@@ -245,7 +249,7 @@ def checked(
         alpha: name of alpha; None for the first camera with an image.
 
     Returns:
-        Images by camera, and alpha's name.
+        Images by camera, those of the room if none are given, and alpha's name.
 
     Raises:
         ValueError: for a rig of one camera, unknown names, no image of alpha or of any beta, and a rig for
@@ -273,13 +277,13 @@ DEEPEST = 20.0
 def checkered_room(rig: Rig, alpha: str) -> dict[str, Float[Tensor, "1 h w"]]:
     """Render every camera's image of a box: the back wall far, the side walls seen by alpha from near on.
 
-    Squares differ in brightness, so that each has one match.
+    Squares differ in brightness, so that each has one match. The back wall is at most `DEEPEST` times near.
 
     Returns:
-        Images (1, h, w) by camera.
+        Images (1, h, w) by camera (`room_image`).
 
     Raises:
-        ValueError: for a rig without poses or depth range.
+        ValueError: for a rig without all poses or without depth range.
     """
     cameras = {name: view for name, view in rig.to(torch.float64).cameras.items() if isinstance(view, Camera)}
     if len(cameras) < len(rig.cameras) or rig.depth is None:
@@ -294,13 +298,13 @@ def checkered_room(rig: Rig, alpha: str) -> dict[str, Float[Tensor, "1 h w"]]:
 
 
 def room_image(camera: Camera, alpha: Camera, half: Float[Tensor, "3"]) -> Float[Tensor, "1 h w"]:
-    """Render the room for one camera.
+    """Render the room for one camera; numbers are float64.
 
     Args:
         half: half the room's size in alpha's axes, in the rig's unit, with alpha in its middle.
 
     Returns:
-        Image (1, h, w), 0 where the lens has no ray.
+        Image (1, h, w), float32, 0.1..0.9; 0 where the lens has no ray.
     """
     rays, valid = camera.rays(pixel_grid(camera.hw, dtype=torch.float64))
     R = alpha.R @ camera.R.T

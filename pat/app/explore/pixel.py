@@ -61,7 +61,7 @@ class ExplorerState:
     Attributes:
         alpha: name of alpha.
         x: pixel (x, y) of alpha.
-        family: name of the receptive field; "auto" for the default.
+        family: name of the receptive field, one of `FAMILIES` or the scene's, or MODULE:OBJECT.
         near: near bound, in the rig's unit; None for the rig's.
         far: far bound, in the rig's unit; None for the rig's.
         weights: `WINDOWS`, or the name of a network.
@@ -85,12 +85,12 @@ class BetaReport(NamedTuple):
     Attributes:
         xy: samples, pixels of beta.
         valid: True for samples in the image.
-        ends: start and end of a segment; None for other fields.
-        weight: weight of each sample, summing to 1.
-        depth: depth of each sample in alpha, in the rig's unit; NaN where it has none.
-        offset: distance of the images' own match from the line, pixels; None without a segment or a match.
+        ends: start and end of a segment, pixels of beta; None for other fields, or if it is not valid.
+        weight: weight of each sample, summing to 1 over valid ones; 0 for others.
+        depth: depth of each sample along alpha's axis, in the rig's unit; NaN where it has none.
+        offset: distance of the images' own match from the line, pixels; None without one (`match_offset`).
         band: corners of the band that holds the match by the calibration's uncertainty, pixels of beta; None
-            without a covariance or a segment.
+            without one (`band_corners`).
     """
 
     xy: Float[Tensor, "l 2"]
@@ -106,10 +106,10 @@ class PixelReport(NamedTuple):
     """Reports of one pixel of alpha in all betas.
 
     Attributes:
-        x: the pixel.
+        x: the pixel (x, y), float64.
         betas: report by beta.
         problems: reason, in a sentence, by beta that has no report.
-        depth: depth by all betas, in the rig's unit; NaN if unknown.
+        depth: depth along alpha's axis by all betas (`joint_depth`), in the rig's unit; NaN if unknown.
     """
 
     x: Float[Tensor, "2"]
@@ -120,20 +120,21 @@ class PixelReport(NamedTuple):
 
 @dataclass(frozen=True)
 class ExplorerScene:
-    """Rig and images of the explorer; derived features are computed once.
+    """Rig and images of the explorer; the scene itself fills the last three, what is computed once.
 
     Attributes:
         rig: the rig.
-        images: images (c, h, w) by camera.
+        images: images (c, h, w), values 0..1, by camera.
         fields: further fields by name.
         networks: further networks by name.
         covariance: covariance of the rig's parameters, which gives segments their bands; None for none.
-        maps: maps of the whole image, by the controls that gave them.
+        maps: the last map of the whole image, by the controls that gave it.
         guides: luminances (1, 1, h, w) that windows are cut from, by camera.
         features: computed features of networks.
 
     Raises:
-        ValueError: for an image that does not suit its camera.
+        ValueError: for an image that does not suit its camera, and one of an unknown camera.
+        TypeError: for an image that is no tensor.
     """
 
     rig: Rig
@@ -190,10 +191,10 @@ class ExplorerScene:
 
 @cache
 def shipped_attention(name: str) -> PAT:
-    """Load weights of the paper's network, cached.
+    """Load weights of the paper's network, shipped or a file; the network is cached, not to be changed.
 
     Raises:
-        ValueError: for weights of another network.
+        ValueError: for weights of another network, and as `load_weights`.
         FileNotFoundError: for unknown weights.
     """
     network = load_weights(name)
@@ -237,13 +238,10 @@ def displacement(pair: Pair, x: Float[Tensor, "n 2"]) -> float:
 
 
 def with_depths(rig: Rig, state: ExplorerState) -> Rig:
-    """Replace a rig's depth bounds by those that the state has.
-
-    Returns:
-        The rig; unchanged if the state has none.
+    """Return the rig with those depth bounds that the state has, unchanged if it has none.
 
     Raises:
-        ValueError: for only one bound where the rig has none, and near beyond far.
+        ValueError: for only one bound where the rig has none, near beyond far, and bounds not above 0.
     """
     if state.near is None and state.far is None:
         return rig
@@ -258,10 +256,10 @@ def inspect_pixel(scene: ExplorerScene, state: ExplorerState) -> PixelReport:
     """Report on the state's pixel in every beta that has an image.
 
     Returns:
-        The reports; errors that concern one beta are in `problems`.
+        The reports; errors that concern one beta, and betas without an image, are in `problems`.
 
     Raises:
-        ValueError: for depth bounds that are impossible.
+        ValueError: for an alpha that the rig lacks, and impossible depth bounds.
     """
     rig = with_depths(scene.rig, state)
     betas: dict[str, BetaReport] = {}
@@ -292,10 +290,14 @@ def pixel_of(state: ExplorerState) -> Float[Tensor, "1 2"]:
 
 
 def beta_report(scene: ExplorerScene, pair: Pair, name: str, state: ExplorerState) -> BetaReport:
-    """Compute a pixel's samples in one beta, with weights and depths.
+    """Compute a pixel's samples in the beta called `name`, with weights and depths, but no offset and band.
+
+    `pair` is alpha and this beta, with the state's depth bounds; the scene has images of both.
 
     Raises:
-        ValueError: if the field does not suit the pair.
+        ValueError: for an unknown field, one that does not suit the pair, and as `shipped_attention`; other
+            errors of a field of one's own pass.
+        FileNotFoundError: for unknown weights.
     """
     x = pixel_of(state)
     locations = located(scene, pair, state.family, x)
@@ -320,7 +322,13 @@ def beta_report(scene: ExplorerScene, pair: Pair, name: str, state: ExplorerStat
 def band_corners(
     scene: ExplorerScene, rig: Rig, name: str, state: ExplorerState, ends: Float[Tensor, "2 2"] | None
 ) -> Float[Tensor, "4 2"] | None:
-    """Return the corners of the 95 % band around a segment; None without one, or without a covariance."""
+    """Return the corners of the 95 % band around a segment from `ends`, in turn, all in beta's pixels.
+
+    None without a segment or a covariance, and where the point at a depth bound is not in front of beta.
+
+    Raises:
+        ValueError: as `bands`.
+    """
     if scene.covariance is None or ends is None:
         return None
     band = bands(rig, scene.covariance, state.alpha, name, pixel_of(state))
@@ -351,8 +359,6 @@ def match_offset(
 ) -> float | None:
     """Find how far beside the line the images' own match lies, by correlating windows around both pixels.
 
-    It lies on the line unless the rig is off.
-
     Args:
         guides: luminances of alpha and of beta.
         pair: alpha and beta.
@@ -361,7 +367,8 @@ def match_offset(
         ends: start and end of the segment; None for other fields.
 
     Returns:
-        Its distance, pixels; None without a segment, or if nothing matches clearly.
+        Its distance, pixels; 0 unless it matches better than all on the line. None without a segment of some
+        length or valid samples, if nothing matches clearly, or if it is at the edge of the search (`ACROSS`).
     """
     xy, weight = samples
     if ends is None or not bool((weight > 0).any()) or float((ends[1] - ends[0]).norm()) < 1e-6:
@@ -467,8 +474,11 @@ def depths(
         valid: mask of the samples in the image.
 
     Returns:
-        Depths in the rig's unit; NaN for invalid samples, samples without depth, and pairs that are not
-        calibrated.
+        Depths along alpha's axis in the rig's unit; NaN for invalid samples, samples without depth, and pairs
+        that are not calibrated or have a link.
+
+    Raises:
+        ValueError: for cameras with no pinhole view in a pair without a depth range.
     """
     if pair.link is not None or not pair.calibrated:
         return torch.full_like(xy[:, 0], torch.nan)
@@ -478,8 +488,9 @@ def depths(
 
 
 def joint_depth(betas: Mapping[str, BetaReport]) -> float:
-    """Return the inverse of the weighted mean inverse depth of all betas, in the rig's unit; NaN if no sample
-    has a depth.
+    """Return the inverse of the weighted mean inverse depth of all betas' samples, in the rig's unit.
+
+    A sample has its own weight, times the largest one of its beta. NaN if no sample has a depth.
     """
     inverse, total = 0.0, 0.0
     for beta in betas.values():

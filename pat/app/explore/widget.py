@@ -92,8 +92,8 @@ def explore(
             None for none.
         controls: initial values of the controls: `field` and `second` (names of fields), `weights`, `near`
             and `far` (in the rig's unit), `baseline` (factor), `errors` (changes by camera, such as
-            {"colour": {"ry": 0.5, "cx": 3}}), `camera` (the one that sliders change), `pins` (pixels of alpha
-            that stay drawn).
+            {"colour": {"ry": 0.5, "cx": 3}}; `answers.ERRORS` lists them), `camera` (the one that sliders
+            change), `map` (of `answers.MAPS`), `pins` (pixels of alpha that stay drawn).
 
     Returns:
         The widget; problems with the input are shown in it. Its `rig` is the rig as changed.

@@ -57,9 +57,9 @@ def inner_products(x, rows, first, last, image, channels, out):
 
     Args:
         x: vector of `channels` numbers.
-        rows: numbers of pixels, padded to a multiple of TAP_BLOCK.
+        rows: numbers of pixels; read up to a multiple of TAP_BLOCK after `first`, so padded with any pixel's.
         image: pixels of `channels` numbers, one after the other.
-        out: numbers to write, up to the next multiple of LANES after `last`.
+        out: numbers to write, those from `last` up to a multiple of LANES after `first` with no meaning.
     """
     c = 0
     for t in range(first, last, LANES):
@@ -158,9 +158,9 @@ def block_sums(pixels, counts, weights, rows, image, channels, out):
 
     Args:
         pixels: number of pixels of the block.
-        counts: number of taps of each pixel.
-        weights: weights of each pixel's taps.
-        rows: beta's pixels of the taps.
+        counts: number of taps of each pixel; a `Column`, as are `weights`, `rows` and `out`.
+        weights: weights of each pixel's taps, padded as for `weighted_sum`.
+        rows: numbers of the taps' pixels in `image`, padded likewise.
         image: beta's image, flat, `channels` numbers a pixel.
         out: sums (channels) of each pixel to write.
     """
@@ -187,8 +187,8 @@ def _most(counts, n):
 
 @compiled(nogil=True, cache=True)
 def scatter(taps, weights, last, x, channels, first_channel, last_channel, out):
-    """Add to beta's pixels: out[row, c] += weight x[pixel, c] for all taps of the alpha pixels taps.first ..
-    last.
+    """Add to beta's pixels: out[row, c] += weight x[pixel, c] for all taps of the alpha pixels from
+    `taps.first` to before `last`.
 
     Taps of a block are added in turn, as in `block_products`. One caller owns the channels from
     `first_channel` to before `last_channel`, so the order of additions, and with it every bit, is the same
@@ -197,9 +197,8 @@ def scatter(taps, weights, last, x, channels, first_channel, last_channel, out):
     Args:
         taps: `TapList` of the pixels.
         weights: one of its two lists of weights.
-        last: alpha pixel after the last.
-        x: gradients by alpha's pixels, flat, `channels` numbers a pixel.
-        out: sums by beta's pixels to add to, of the same form.
+        x: alpha's query or gradients by the output, all pixels, flat, `channels` numbers a pixel.
+        out: gradient by beta's key or value to add to, of the same form.
     """
     taps, (weights, x, out) = pointers(taps), pointers((weights, x, out))
     for first in range(0, last - taps.first, BLOCK):

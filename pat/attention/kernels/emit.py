@@ -111,8 +111,8 @@ def _constants(lanes):
 def instruction(result):
     """Make a decorator that turns a function into a numba intrinsic.
 
-    The function takes a `Code` and LLVM values, and emits instructions. Arguments annotated `index` are
-    64-bit; those annotated `literal` are numbers at compile time.
+    The function takes a `Code` and LLVM values, emits instructions, and returns LLVM's value, or None for
+    void. Arguments annotated `index` are 64-bit; those annotated `literal` are Python's numbers.
 
     Args:
         result: function from the arguments' numba types to the result's type.

@@ -53,8 +53,8 @@ def block_scratch(samples: int, channels: int, number: np.dtype) -> Block:
         number: type of computation, float32 or float64.
 
     Returns:
-        An array (BLOCK, length) for each line of `LAYOUT`, the values of a pixel side by side, int32 or of
-        type `number`; not initialised.
+        `Block` of an array (BLOCK, length) for each line of `LAYOUT`, the values of a pixel side by side,
+        int32 or of type `number`; not initialised.
     """
     lengths = {"pixel": 1, "sample": samples + LANES, "tap": 4 * samples + 2 * LANES, "channel": channels}
     ends = {"integer": 0, "number": 0}
@@ -74,8 +74,8 @@ class Geometry(NamedTuple):
 
     Attributes:
         points: x and y of each pixel's two ends, or of its explicit positions, in turn.
-        mask: bytes, 1 for each segment (one a pixel) or position (`samples` a pixel) that counts.
-        fractions: fractions of a segment at its `samples`, padded by `LANES`.
+        mask: bytes, 1 for each valid segment (one a pixel) or position (`samples` a pixel), otherwise 0.
+        fractions: fractions of a segment at its `samples`, padded by `LANES` numbers.
         samples: number of samples per pixel.
         straight: True for segments, False for explicit positions.
         nearest: True for nearest pixels in place of bilinear interpolation.
@@ -150,8 +150,8 @@ class Outputs(NamedTuple):
 
     Attributes:
         value: weighted values, channels last.
-        statistics: x, y, spread and peak of each pixel, if `measured`.
-        logsum: logarithm of each pixel's sum of exponentials.
+        statistics: x, y, spread and peak of each pixel; empty unless `measured`.
+        logsum: logarithm of each pixel's sum of exponentials; -inf where no sample counts.
         measured: True if statistics are wanted.
     """
 
@@ -168,8 +168,8 @@ class Saved(NamedTuple):
         statistics: statistics of forward; those of pixel p start at `step` p.
         logsum: logarithms of the sums of exponentials.
         value_upstream: gradients by the values.
-        statistics_upstream: gradients by the statistics.
-        step: distance between two pixels' statistics.
+        statistics_upstream: gradients by the statistics, at the same places.
+        step: 4; 0 if there are no statistics, with four zeros in either array for all pixels.
     """
 
     statistics: Any
@@ -182,11 +182,11 @@ class Saved(NamedTuple):
 class Gradients(NamedTuple):
     """Flat arrays for the gradients of alpha's pixels, with flags for the wanted ones.
 
-    `points` and `bias` are added to, so they must be zero before.
+    `points` and `bias` are written only where samples count, so they must be zero before.
 
     Attributes:
         query: gradients by the query, `channels` a pixel.
-        points: gradients by the points, in their order in `Geometry`.
+        points: gradients by the points, in their order in `Geometry`, for each image even if `shared`.
         bias: gradients by the bias, `samples` a pixel.
         wants_query: True if `query` is wanted.
         wants_points: True if `points` is wanted.
@@ -207,9 +207,9 @@ class TapList(NamedTuple):
     Attributes:
         first: first alpha pixel.
         tap_count: number of its taps (n, 1).
-        rows: numbers of beta's pixels of the taps (n, most).
-        key_weight: weights of the taps in the gradient of key.
-        value_weight: weights of the taps in the gradient of value.
+        rows: flat numbers of beta's pixels of the taps (n, most), counted through all images.
+        key_weight: weights of the taps in the gradient by the key (n, most).
+        value_weight: weights of the taps in the gradient by the value (n, most).
     """
 
     first: int
@@ -223,7 +223,7 @@ class Taps(NamedTuple):
     """Fields of a block that backward stores in a `TapList`.
 
     Attributes:
-        tap_count: number of a pixel's taps.
+        tap_count: number of each pixel's taps.
         rows: flat numbers of beta's pixels, one for each tap, as in `TapList`.
     """
 
@@ -232,11 +232,11 @@ class Taps(NamedTuple):
 
 
 class Column(NamedTuple):
-    """One list for each pixel.
+    """Pointer form of an array of two axes: one list for each pixel.
 
     Attributes:
         first: pointer to the first list.
-        step: distance to the next list.
+        step: distance to the next list, in numbers.
     """
 
     first: Any

@@ -23,9 +23,9 @@ LOWEST = np.finfo(np.float32).min
 
 @compiled(nogil=True, cache=True, fastmath={"contract"})
 def attend_rows(query, key, value, out, logsum, bias, which, size, spacing, top):
-    """Attend to windows, for up to `ROWS` rows of one image: softmax-weighted means of the values.
+    """Attend to windows, for `ROWS` rows of one image from `top` on: softmax-weighted means of the values.
 
-    Samples outside the image do not count.
+    Samples outside the image do not count, nor do samples with a score of -inf.
 
     Args:
         query: features (d, h, w) of alpha, float32.
@@ -35,8 +35,8 @@ def attend_rows(query, key, value, out, logsum, bias, which, size, spacing, top)
         logsum: logs of the sums of exponentials (h, w) to write; inf where no sample counts.
         bias: score (size²) added to each sample.
         which: samples of the window to use, numbered row by row.
-        size: samples per side of the window.
-        spacing: pixels between samples.
+        size: samples per side of the window, an odd number.
+        spacing: pixels between samples, a whole number.
         top: first row.
     """
     channels, height, width = query.shape
@@ -109,7 +109,7 @@ def differentiate_rows(query, key, value, upstream, sums, gradients, wanted, bia
         upstream: gradient (dv, h, w) by the means.
         sums: planes (2, h, w): `logsum`, and the inner product of `upstream` with the means.
         gradients: gradients by query, key and value to add to.
-        wanted: True for each of the three to compute.
+        wanted: three flags, True for a gradient to compute.
     """
     (channels, height, width), (by_query, by_key, by_value) = query.shape, gradients
     weight, slope = np.zeros((2, -(-width // LANES) * LANES), np.float32)

@@ -223,7 +223,7 @@ def interpolate(by_tap, geometry, here, out):
         by_tap: number of each tap.
         geometry: `Geometry` of the call: nearest look-up or bilinear.
         here: the pixel's part of the `Block`, after `find_samples`.
-        out: number of each sample to write, up to a multiple of LANES.
+        out: number of each sample to write, with room up to a multiple of LANES.
     """
     n, m = here.sample_count[0], here.tap_count[0]
     if geometry.nearest:

@@ -76,7 +76,7 @@ def softmax(n, score, weight):
 
     Args:
         n: number of scores, 0 or more.
-        score: scores, padded with -inf to a multiple of LANES.
+        score: scores, padded with -inf to a multiple of LANES, at least one.
         weight: weights to write; left as they are if all scores are -inf.
 
     Returns:

@@ -39,3 +39,10 @@ def test_a_field_without_positions_is_refused():
     image = torch.ones(1, 2, 3, 4)
     with pytest.raises(ValueError, match="samples"):
         attend(image, image, image, lambda x: Positions(x[:, None][:, :0], x[:, :0] > 0))
+
+
+def test_a_bias_on_another_device_is_refused():
+    image, valid = torch.ones(1, 2, 3, 4), torch.ones(3, 4, dtype=torch.bool)
+    ends = torch.zeros(3, 4, 2)
+    with pytest.raises(ValueError, match="bias is on meta"):
+        attend(image, image, image, Segments(ends, ends, valid), bias=torch.zeros(1, device="meta"))

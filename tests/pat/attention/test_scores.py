@@ -81,3 +81,9 @@ def test_explicit_positions_are_refused_by_what_needs_segments():
     )
     with pytest.raises(ValueError, match="straight"):
         one.strided(2)
+
+
+def test_a_key_of_other_channels_is_refused():
+    one = compared()
+    with pytest.raises(ValueError, match="batch and channels"):
+        log_sum(one._replace(key=one.key[:, :2]))
