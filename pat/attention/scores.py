@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.autograd import Function
+from torch.autograd.function import once_differentiable
 
 from arraygeom.segments import Segments
 
@@ -149,6 +150,7 @@ class _LogSum(Function):
         return total.clone()
 
     @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, Tensor, None, None]:
         inputs, (_, _, _, value) = ctx.inputs, ctx.saved
         weighted = upstream[:, None].to(inputs.query)

@@ -122,7 +122,7 @@ def save_frame(
 
     Raises:
         ValueError: for bits that the format cannot hold, EXR without its extra, an image or confidence with
-            NaN or infinity, and `points` of a frame of two bands.
+            NaN or infinity.
         FileExistsError: for files in the way that no fusion wrote.
         OSError: if files cannot be written. After any error those of a former frame stay.
     """
@@ -148,7 +148,7 @@ def save_frame(
         if rig is not None:
             rig.save(folder / FOUND_RIG)
         if points is not None:
-            write_points(folder / "points.ply", points, frame.depth, frame.image, along=along)
+            write_points(folder / "points.ply", points, frame.depth, picture_of(frame.image), along=along)
         image = linear_from_srgb(frame.image) if bits == 32 else frame.image
         bands = bands or ([] if len(image) in (1, 3) else [str(i + 1) for i in range(len(image))])
         bands = list(file_names(bands).values()) if len({*bands}) == len(bands) else bands

@@ -41,7 +41,7 @@ def match(inputs: Inputs, choice: Choice | None = None) -> Matches:
     semi-global ones with a left-right check, without `chosen`, `stated` and `certainty`.
 
     Args:
-        inputs: alpha, of one channel (not checked) and even sides, and the betas.
+        inputs: alpha, of one channel and even sides, and the betas.
         choice: network that chooses between candidate disparities; None for the one that ships. Not used
             without `inputs.learned`.
 
@@ -49,8 +49,11 @@ def match(inputs: Inputs, choice: Choice | None = None) -> Matches:
         The matches in each beta, with `colours` at alpha's view.
 
     Raises:
-        ValueError: for no beta, a beta whose field is not of straight segments, and an alpha of odd sides.
+        ValueError: for no beta, a beta whose field is not of straight segments, and an alpha of odd sides or
+            several channels.
     """
+    if inputs.alpha.shape[1] != 1:
+        raise ValueError(f"alpha has {inputs.alpha.shape[1]} channels: what is matched has one")
     if any(side % FINE for side in inputs.hw):
         h, w = inputs.hw
         raise ValueError(f"alpha has {w}x{h} pixels to match: pad both sides to whole multiples of {FINE}")

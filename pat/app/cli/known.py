@@ -201,10 +201,10 @@ class KnownFile(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> KnownFile:
-        """Parse the option's text, and check that the file exists; the numbers' signs are not checked.
+        """Parse the option's text, and check that the file exists.
 
         Raises:
-            UsageError: for another name than scale and tolerance, and a missing file.
+            UsageError: for another name than scale and tolerance, a scale of 0 or less, and a missing file.
             ValueError: for what is no NAME=NUMBER, and a name given twice.
         """
         path, *parts = text.split(",")
@@ -212,6 +212,8 @@ class KnownFile(NamedTuple):
         if unknown := numbers.keys() - {"scale", "tolerance"}:
             raise UsageError("--around", "FILE[,scale=METRES][,tolerance=SHARE]", min(unknown))
         known = cls(Path(path), **numbers)
+        if known.scale is not None and known.scale <= 0:
+            raise UsageError("--around", "a scale of more than 0", known.scale)
         if not known.path.is_file():
             raise UsageError("--around", "an existing depth map, or file of matched points", path)
         return known

@@ -163,14 +163,16 @@ def device_of(name: str) -> str:
     """Resolve a device's name.
 
     Args:
-        name: "cpu", "cuda", or "auto" for a GPU if there is one; other names are as "auto".
+        name: "cpu", "cuda", or "auto" for a GPU if there is one.
 
     Returns:
         "cpu" or "cuda".
 
     Raises:
-        ValueError: for "cuda" without a GPU.
+        ValueError: for "cuda" without a GPU, and another name.
     """
+    if name not in ("cpu", "cuda", "auto"):
+        raise ValueError(f"device is '{name}': wanted cpu, cuda or auto")
     if name == "cpu":
         return name
     import torch

@@ -53,6 +53,13 @@ def test_log_sum_and_mean_score_are_the_formula_in_value_and_gradient(interpolat
         torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-9)
 
 
+def test_a_second_derivative_of_the_log_sum_is_refused():
+    one = compared("bilinear")
+    (first,) = torch.autograd.grad(log_sum(one).square().sum(), one.query, create_graph=True)
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        first.sum().backward()
+
+
 def test_pixels_without_samples_pass_no_gradient():
     one = compared()
     by_query = torch.autograd.grad(log_sum(one)[0, 0, 0], one.query)[0]

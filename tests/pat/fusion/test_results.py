@@ -9,6 +9,7 @@ import tifffile
 import torch
 from PIL import Image, ImageCms
 
+from arraygeom import Camera, Pose
 from pat.fusion.frame import Frame
 from pat.fusion.results import depth_scale, refuse_to_replace, save_frame, write_depth
 from pat.media.images import read_image
@@ -30,6 +31,8 @@ def test_one_band_and_three_are_one_image(bands, tmp_path):
 @pytest.mark.parametrize("bands", [2, 4])
 def test_other_bands_are_written_one_by_one_and_their_mean(bands, tmp_path):
     frame = frame_of(bands)
+    points = Camera(K=torch.eye(3).double(), cam_from_world=Pose.identity(), hw=(6, 8))
+    assert "points.ply" in [p.name for p in save_frame(frame, tmp_path / "points", points=points)]
     written = save_frame(frame, tmp_path, bits=16, name="7")
     each = [f"7_fused_{i + 1}.png" for i in range(bands)]
     assert [p.name for p in written] == ["7_fused.png", *each, "7_confidence.png"]

@@ -138,6 +138,11 @@ def test_matches_of_other_inputs_are_refused(network, inputs):
         transferred(inputs, Matches(found.betas * 2))
 
 
+def test_an_alpha_in_colour_is_refused(inputs):
+    with pytest.raises(ValueError, match="3 channels"):
+        match(replace(inputs, alpha=inputs.alpha.expand(-1, 3, -1, -1)))
+
+
 def test_a_network_that_needs_matches_says_so(network, inputs):
     with pytest.raises(ValueError, match="matches"):
         network(inputs)
