@@ -139,7 +139,8 @@ def refit_rig(rig: Rig) -> tuple[Rig, list[str]]:
         The rig, and a sentence on each refitted lens; none if all cover their images.
 
     Raises:
-        ValueError: as `refit_lens` for the first that cannot be refitted, and for a batch.
+        ValueError: as `refit_lens` for the first that cannot be refitted, and for a batch with lenses that
+            end within their images.
     """
     cameras, said = dict(rig.cameras), []
     for name, camera in rig.cameras.items():

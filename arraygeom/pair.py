@@ -215,10 +215,11 @@ class Pair(Batched):
         return dataclasses.replace(self, beta=self.beta.transformed(A, hw), link=link)
 
     def homography_at(self, depth: Float[Tensor, "*d"] | float) -> Float[Tensor, "*b 3 3"]:
-        """Compute the homography from alpha's to beta's pixels of the plane z = depth in alpha's frame.
+        """Compute the homography of the plane z = depth in alpha's frame, from alpha's undistorted pixels to
+        beta's.
 
         Args:
-            depth: metres (*d), which broadcast with the pair's batch axes; may be infinite.
+            depth: depths (*d) in the rig's unit, which broadcast with the pair's batch axes; may be infinite.
 
         Returns:
             H (*b, 3, 3), of batch and depths broadcast, scaled so that its third coordinate is positive

@@ -106,7 +106,9 @@ def read_text(text: str, path: str | Path) -> Rig:
 
 
 def write(rig: Rig) -> str:
-    """Format a rig as the text of a native file, in metres and our pixels; all of the rig is kept.
+    """Format a rig as the text of a native file, in metres and our pixels.
+
+    All of the rig is kept, but K of an uncalibrated view without a lens.
 
     Raises:
         ValueError: for a batch of rigs, or a camera model that has no name or holds values that no file can.

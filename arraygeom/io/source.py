@@ -531,6 +531,9 @@ class Entry:
     def usual_lens(self, side: str = "") -> Distortion | None:
         """Return the lens of coefficients under a usual name, or of k1, k2, p1, p2 ... one by one.
 
+        One by one, if neither file nor user names a model, k4 without p1 and p2 means a Kannala-Brandt
+        fisheye, else they are Brown-Conrady's.
+
         Args:
             side: as of `find`; one by one they are found for "" alone.
 
@@ -545,12 +548,15 @@ class Entry:
         keys = {re.sub("^cam(era)?", "", plain(key)): key for key in fields.value} if not side else {}
         if "k1" not in keys or (entry.value is not None and not entry.is_table):
             return entry.of_model(word)
-        said, perspective = _said(word), "k4" not in keys or "p1" in keys or "p2" in keys
-        fisheye = said in FISHEYE_WORDS or (said is None and not perspective)
+        said, wanted = _said(word), self.source.lens
+        without_model = "k4" in keys and not {"p1", "p2"} & {*keys}
+        fisheye = said in FISHEYE_WORDS or (
+            said is None and (wanted == KANNALA_BRANDT if wanted else without_model)
+        )
         names = FISHEYE_KEYS if fisheye else BROWN_KEYS
         c = [fields.get(keys[name]).number() if name in keys else 0.0 for name in names]
         listed = fields.at(c if any(c[5:]) else c[:5], ", ".join(name for name in names if name in keys))
-        if said is not None:
+        if said is not None or wanted:
             return listed.of_model(word)
         return listed.kannala_brandt() if fisheye else listed.brown_conrady()
 

@@ -91,11 +91,11 @@ def write_text(path: str | Path, text: str) -> None:
 
 @contextmanager
 def alone(lock: Path, longest: float) -> Iterator[None]:
-    """Context manager that admits one process (and thread) at a time, by a lock file, which stays.
+    """Context manager that admits one process (and thread) at a time, by a lock file (filelock's).
 
     After waiting for `longest` seconds, or where the file cannot be locked, the block runs all the same. The
     system releases locks of ended processes. Where Python cannot ask the system for locks, a file with suffix
-    .soft exists while a process is in the block.
+    .soft exists while a process is in the block. The lock file may stay.
     """
     from filelock import FileLock, SoftFileLock
 

@@ -136,10 +136,11 @@ class RigDifference:
         )
         if not motion.moved:
             return f"verdict: the same: the rigs differ no more than their calibrations' errors ({test})"
+        shift = f"{1e3 * motion.metres:.2f} mm" if self.unit == "m" else f"{motion.metres:.3g} {self.unit}"
         return (
             f"verdict: moved: the rigs differ by more than their calibrations' errors ({test}); "
             f"a rotation of {motion.camera} by {motion.degrees:.3f} degrees and a shift of "
-            f"{1e3 * motion.metres:.2f} mm explain {motion.share:.0%} of it"
+            f"{shift} explain {motion.share:.0%} of it"
         )
 
 

@@ -88,7 +88,7 @@ class FitStatistics(NamedTuple):
         return self.misfit + WRONG_SIDE_PENALTY * wrong
 
     def as_text(self, unit: str = "m") -> str:
-        """Return the statistics in words, without those that are NaN.
+        """Return the statistics in words, without those that are NaN, and `handed` only below a half.
 
         Args:
             unit: unit of the rig's lengths, for depth.

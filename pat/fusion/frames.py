@@ -63,9 +63,9 @@ class ImageFiles:
 
 
 class CachedFrames:
-    """Frames with a cache of the last used ones, up to `CACHED` bytes: neighbours in time need them again.
+    """Frames with a cache of the last used ones, up to `CACHED` bytes or one image.
 
-    An image is the cached tensor itself, not to be changed in place.
+    Neighbours in time need them again. An image is the cached tensor itself, not to be changed in place.
 
     Args:
         frames: images of one camera.

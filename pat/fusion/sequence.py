@@ -385,8 +385,8 @@ def fuse_sequence(
         network: network that fuses key frames.
         speed: largest speed of motion, pixels of alpha a second, for the margin of fields where a beta did
             not record at a key frame's time. None for a quarter of the motion seen between alpha's frames.
-        settings: settings of fusion; response, alignment and noise are estimated once, at the key frame in
-            the middle.
+        settings: settings of fusion; response and noise, and alignment if all betas recorded at alpha's time
+            there, are estimated once, at the key frame nearest to the middle whose images can be read.
 
     Yields:
         Frames at alpha's pixels.

@@ -65,7 +65,8 @@ class Inputs:
     """Inputs of matching and of a network: alpha's image and the betas, which may be of any sizes.
 
     Attributes:
-        alpha: image (B, C, H, W), values 0..1; one channel for matching.
+        alpha: image (B, C, H, W), values 0..1, beyond for noise and exposure; one channel and even sides for
+            matching.
         betas: the betas.
         multiple: pixels at whose multiples parts of alpha and betas are cut.
         beta_halo: pixels around the segments that parts of betas include.

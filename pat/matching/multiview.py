@@ -251,6 +251,7 @@ class Agreement(NamedTuple):
         return cls(inverse_depth[None].to(like), taken.any(0)[None], facts.to(like))
 
 
+@torch.no_grad()
 def agreed(inputs: Inputs, matches: Matches) -> Matches:
     """Replace the matches in each beta by the inverse depths on which all betas agree.
 

@@ -399,8 +399,8 @@ class _Groups(NamedTuple):
     def explained_by(self, shading: Tensor, kinds: Sequence[_Kind], *, vignetted: bool) -> _Explanation:
         """Return the most probable `_Explanation` of these kinds after this shading is removed from beta.
 
-        `shading` has the coefficients (s) of `_shading_terms`. Tried without a gamma and with one; if
-        vignetted, with the shading that is left.
+        `shading` has the coefficients (s) of `_shading_terms`. Tried without a gamma, and with one if the
+        kind's gain is free; if vignetted, with the shading that is left, which else is empty.
         """
         gammas = self.y.new_tensor(SETTINGS.gammas)
         _, gram = self._modelled(gammas, shading, vignetted)

@@ -163,6 +163,8 @@ def test_a_fisheye_by_its_numbers_names(tmp_path):
     (camera,) = read(tmp_path / "a.json", document)[0].cameras.values()
     assert camera.distortion.model == "kannala-brandt"
     assert camera.distortion.coefficients.tolist() == FISHEYE
+    stated = read_rig(tmp_path / "a.json", lens="brown-conrady")
+    assert next(iter(stated.cameras.values())).distortion.model == "brown-conrady"
 
 
 @pytest.mark.parametrize("missing", ["R", "t"])

@@ -36,9 +36,9 @@ class Align(Around):
         pat align rig.yaml --alpha mono --image mono=a.png --image nir=b.tif --depth 2 20 --out out/
 
     Values keep their recorded type and bits. Without a rig it is found from the tags of the images, or from
-    the images, and written to found_rig.yaml beside the result. A folder of a multispectral camera's captures
-    has one rig, found from several. With folders, or quoted patterns, frames are aligned one by one, matched
-    by names or by the numbers or times in them.
+    the images, and written to found_rig.yaml beside the result, unless they determine no lines. A folder of a
+    multispectral camera's captures has one rig, found from several. With folders, or quoted patterns, frames
+    are aligned one by one, matched by names or by the numbers or times in them.
     """
 
     headings: ClassVar[Mapping[str, str]] = {

@@ -119,7 +119,8 @@ def instruction(result):
     """
 
     def decorate(emit):
-        """Make numba's intrinsic of the function `emit`, with its name, typed by its annotations."""
+        """Make numba's intrinsic of the function `emit`, with its name. Parameters annotated "index" are
+        whole numbers, "literal" ones constants, others of any type."""
         _, *parameters = inspect.signature(inspect.unwrap(emit)).parameters.values()
         notes = [str(parameter.annotation) for parameter in parameters]
 

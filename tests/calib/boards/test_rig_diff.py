@@ -173,8 +173,11 @@ def test_without_deviations_there_is_no_verdict(files, capsys):
 def test_depths_of_rigs_of_unknown_scale_are_not_in_metres(files, tmp_path, capsys):
     for name in ("a", "turned"):
         Rig.load(files / f"{name}.yaml").replace(name=UNSCALED).save(tmp_path / f"{name}.yaml")
+        shutil.copy(files / f"{name}.covariance.json", tmp_path)
     diff(tmp_path, "a", "turned")
-    assert re.search(r"depth by \w+ and \w+, \S+ to \S+ baselines: differs", capsys.readouterr().out)
+    said = capsys.readouterr().out
+    assert re.search(r"depth by \w+ and \w+, \S+ to \S+ baselines: differs", said)
+    assert re.search(r"a shift of \S+ baselines explain", said)
     with pytest.raises(ValueError, match="baselines"):
         rig_difference(Rig.load(files / "a.yaml"), Rig.load(tmp_path / "a.yaml"), depth=(1.0, 2.0))
 
