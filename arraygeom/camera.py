@@ -262,7 +262,8 @@ class LensView(View):
 
         Raises:
             ValueError: for a last row of A other than (0, 0, 1) (no K describes a perspective), a singular A,
-                an invalid size, or batch axes that do not broadcast.
+                or an invalid size.
+            RuntimeError: for batch axes that do not broadcast.
         """
         if checking() and not bool(((A[..., 2, :] - A.new_tensor([0, 0, 1])).abs() < 1e-6).all()):
             raise ValueError("A is a perspective, which no K follows: crop, resize, mirror, rotate or shear")

@@ -78,7 +78,6 @@ class Curved:
         Raises:
             ValueError: for an uncalibrated pair, one without the bounds that the field leaves open, and a
                 near bound beyond the far one.
-            NotImplementedError: within `torch.func.vmap`, for a beta that is not central.
         """
         pair.cameras  # noqa: B018  (raises for an uncalibrated pair, before the depth range is asked for)
         near, far = Epipolar(self.near, self.far).bounds(pair)
@@ -227,7 +226,6 @@ class RayCurve(NamedTuple):
 
         Raises:
             ValueError: for a pair that is not calibrated.
-            NotImplementedError: within `torch.func.vmap`, for a beta that is not central.
         """
         pose = pair.beta_from_alpha.to(x.dtype)
         alpha, beta = (c.to(x.dtype) for c in pair.cameras)

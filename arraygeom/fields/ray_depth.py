@@ -51,7 +51,6 @@ def ray_depth(
 
     Raises:
         ValueError: for pairs that are not calibrated or have no depth range.
-        NotImplementedError: within `torch.func.vmap`, for a beta that is not central.
     """
     pair.cameras  # noqa: B018  (raises for an uncalibrated pair)
     near, far = pair.depth_range

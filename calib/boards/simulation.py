@@ -118,7 +118,7 @@ def photograph(
     """Render the image of a printed board by a camera, through its lens, as the mean of four samples a pixel.
 
     Args:
-        camera: the camera; its own pose does not count.
+        camera: the camera, which counts as central; its own pose does not count.
         cam_from_board: pose of the board, float64.
         board: a single board; ValueError for one that cannot be printed (`draw_board`).
         rays: result of `fine_rays(camera)`; None to compute it.

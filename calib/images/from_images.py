@@ -69,10 +69,10 @@ class UncalibratedRig(NamedTuple):
 
     def describe(self, a: str, b: str) -> str:
         """Return a sentence on a link: its explanation, what that leaves undetermined, and how well its lines
-        fit.
+        fit, if it has any.
 
         Raises:
-            KeyError: for cameras without a link.
+            KeyError: unless (a, b), in this order, is a key of `fits`.
         """
         explained = self.explained[a, b].as_text(focal_lengths=self.by_focal[a, b])
         if not self.explained[a, b].has_lines:

@@ -115,7 +115,8 @@ class Batch:
 
     @cached_property
     def dependencies(self) -> str:
-        """Everything but the images that the results depend on, as YAML text.
+        """Settings, rig and digest of the weights, as YAML text, computed once: all but the images and the
+        program's version that the results depend on.
 
         Raises:
             FileNotFoundError: for unknown weights.

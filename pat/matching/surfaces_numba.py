@@ -46,9 +46,10 @@ def planes_through(one, two, three, centre, reach, level, out):
         three: last four.
         centre: number that was subtracted from the values.
         reach: pixels that are the unit of x and y.
-        level: variance of position, in that unit squared, below which planes are level.
-        out: planes (4, h, w) to write: value, slope per full-size pixel to the right and downwards, and mean
-            weight.
+        level: number, in that unit squared, added to the variances of position, which makes slopes smaller:
+            half as large where it is the variance.
+        out: planes (4, h, w) to write: value, slope per full-size pixel to the right and downwards, and the
+            mean of the weights, weighted by themselves.
     """
     (height, width), centre, reach = one.shape[:2], np.float32(centre), np.float32(reach)
     level = np.float32(level)

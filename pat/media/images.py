@@ -283,13 +283,16 @@ def _upright(values: NDArray, orientation: int) -> NDArray:
 def decoded_photograph(path: Path, flags: int, *, least: int = 1) -> NDArray | None:
     """Decode an image file to 8 bits by OpenCV.
 
+    Values of 9 to 15 bits in 16 come dark, except of PNM files.
+
     Args:
-        flags: IMREAD_GRAYSCALE or IMREAD_COLOR, with IMREAD_IGNORE_ORIENTATION for pixels as stored.
+        flags: IMREAD_GRAYSCALE, IMREAD_COLOR or a reduced one, with IMREAD_IGNORE_ORIENTATION for pixels as
+            stored, except of TIFF files.
         least: least pixels of a side.
 
     Returns:
         Values (h, w) or (h, w, 3) by the flags, uint8, blue first, turned by the file's orientation tag if
-        the flags let it; None if it is no image of `image_header`'s formats, is damaged, holds floats, has a
+        the flags let it (WebP never); None if it is no image of `image_header`'s formats, is damaged, holds floats, has a
         side under `least`, or has more than `MOST_PIXELS`.
 
     Raises:

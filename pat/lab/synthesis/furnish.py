@@ -110,7 +110,8 @@ class Setting:
 
 
 def furnished(name: str, seed: int, rig: Rig, surface: Surface, moving: float) -> Scene:
-    """Make a scene of 10 to 20 shapes in a room, within the depth range of `Setting`.
+    """Make a scene of 10 to 20 shapes in a room, within the depth range of `Setting`: walls too, unless a view
+    is wider than 150 degrees.
 
     Args:
         name: name of the generator, part of the seed.
@@ -124,7 +125,8 @@ def furnished(name: str, seed: int, rig: Rig, surface: Surface, moving: float) -
         The scene, the room its last object; fewer shapes if they do not fit.
 
     Raises:
-        ValueError: for a rig without a calibrated camera, and a negative seed.
+        ValueError: for a rig without a calibrated camera, a far bound below 5/3 of the near one, and a
+            negative seed.
     """
     setting = Setting(rig, seeded(name, seed))
     room = _room(setting)
