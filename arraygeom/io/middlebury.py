@@ -26,8 +26,8 @@ def read(source: RigSource) -> Rig:
     """Read the pair cam0 (the world) and cam1, in metres.
 
     Returns:
-        The rig, with the depth range of the stated disparities, to infinity if they reach -doffs; without one if
-        they are not stated or give no depth. A size that is not stated is the requested one, else guessed,
+        The rig, with the depth range of the stated disparities, to infinity if they reach -doffs; without one
+        if they are not stated or give no depth. A size that is not stated is the requested one, else guessed,
         with a warning.
 
     Raises:

@@ -292,8 +292,8 @@ def decoded_photograph(path: Path, flags: int, *, least: int = 1) -> NDArray | N
 
     Returns:
         Values (h, w) or (h, w, 3) by the flags, uint8, blue first, turned by the file's orientation tag if
-        the flags let it (WebP never); None if it is no image of `image_header`'s formats, is damaged, holds floats, has a
-        side under `least`, or has more than `MOST_PIXELS`.
+        the flags let it (WebP never); None if it is no image of `image_header`'s formats, is damaged, holds
+        floats, has a side under `least`, or has more than `MOST_PIXELS`.
 
     Raises:
         OSError: if the file is missing or cannot be read.

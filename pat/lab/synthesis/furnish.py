@@ -110,8 +110,9 @@ class Setting:
 
 
 def furnished(name: str, seed: int, rig: Rig, surface: Surface, moving: float) -> Scene:
-    """Make a scene of 10 to 20 shapes in a room, within the depth range of `Setting`: walls too, unless a view
-    is wider than 150 degrees.
+    """Make a scene of 10 to 20 shapes in a room, within the depth range of `Setting`.
+
+    The walls are within it too, unless a view is wider than 150 degrees.
 
     Args:
         name: name of the generator, part of the seed.
