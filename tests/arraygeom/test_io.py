@@ -207,6 +207,11 @@ def test_matlab_mat_files(file, tmp_path):
         read_rig(path)
 
 
+def test_a_missing_matlab_file_is_named(tmp_path):
+    with pytest.raises(RigFileError, match=r"none\.json"):
+        read_rig(tmp_path / "none.json", format="matlab")
+
+
 def test_matlab_fundamental_matrix_has_to_agree(tmp_path):
     """F of pixels from 1, x2^T F x1 = 0; a transposed rotation contradicts it."""
     fields = json.loads((FIXTURES / "matlab_old.json").read_text())
