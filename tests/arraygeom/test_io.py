@@ -207,9 +207,9 @@ def test_matlab_mat_files(file, tmp_path):
         read_rig(path)
 
 
-def test_a_missing_matlab_file_is_named(tmp_path):
-    with pytest.raises(RigFileError, match=r"none\.json"):
-        read_rig(tmp_path / "none.json", format="matlab")
+def test_a_folder_in_place_of_matlabs_file_is_named(tmp_path):
+    with pytest.raises(RigFileError, match=re.escape(tmp_path.name)):
+        read_rig(tmp_path, format="matlab")
 
 
 def test_matlab_fundamental_matrix_has_to_agree(tmp_path):
