@@ -478,7 +478,7 @@ def _two(value: Any, name: str) -> tuple[Any, Any]:
         raise TypeError(f"{name} is {value!r}: give one number or two, in pixels")
     if len(pair) != 2 or any(isinstance(v, Tensor) and v.numel() != 1 for v in pair):
         raise ValueError(
-            f"{name} is one number or two, in pixels, got {value!r}: make one K a camera and stack them"
+            f"{name} is one number or two, in pixels, of one camera: make cameras one by one, and stack them"
         )
     return tuple(v.reshape(()) if isinstance(v, Tensor) else v for v in pair)  # type: ignore[return-value]
 

@@ -69,7 +69,7 @@ class Rig(Batched):
                 raise TypeError(f"depth is {self.depth!r}: wanted (near, far), in metres")
             object.__setattr__(self, "depth", depth_range(*self.depth))
         if checking():
-            check_batches("the rig's numbers", *{t.shape[: t.ndim - n] for t, n in tensors_of(self)})
+            check_batches("the rig's numbers", *sorted({t.shape[: t.ndim - n] for t, n in tensors_of(self)}))
         if self.depth is not None:
             shape = self.batch_shape
             object.__setattr__(self, "depth", tuple(bound.expand(shape) for bound in self.depth))

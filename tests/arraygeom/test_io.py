@@ -15,7 +15,8 @@ import torch
 from arraygeom import Camera, LensView, Link, Pose, Rig, View, intrinsics, stack
 from arraygeom.distortion import Distortion
 from arraygeom.fields import default_field
-from arraygeom.io import READERS, WRITERS, RigFileError, read_rig, recognise, write_rig
+from arraygeom.io import READERS, WRITERS, RigFileError, matlab, read_rig, recognise, write_rig
+from arraygeom.io.source import RigSource
 from arraygeom.pose import rotation_from_vector
 from arraygeom.sensor import Sensor
 from tests.oracles import Oracle
@@ -207,9 +208,9 @@ def test_matlab_mat_files(file, tmp_path):
         read_rig(path)
 
 
-def test_a_folder_in_place_of_matlabs_file_is_named(tmp_path):
-    with pytest.raises(RigFileError, match=re.escape(tmp_path.name)):
-        read_rig(tmp_path, format="matlab")
+def test_a_missing_matlab_file_is_named(tmp_path):
+    with pytest.raises(RigFileError, match=r"none\.json"):
+        matlab.read(RigSource(tmp_path / "none.json"))
 
 
 def test_matlab_fundamental_matrix_has_to_agree(tmp_path):
