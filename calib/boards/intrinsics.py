@@ -87,7 +87,6 @@ def initial_camera(name: str, views: BoardViews, board: Board, lens: Lens) -> Ca
     Raises:
         ValueError: for fewer than three images with a board (one, for points that are not coplanar), and if
             no camera is found.
-        cv2.error: if OpenCV fails on a board's pose.
     """
     fewest = FEWEST_IMAGES if board.flat else 1
     if len(views.seen) < fewest:

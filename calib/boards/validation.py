@@ -183,7 +183,6 @@ def compare_lenses(views: Mapping[str, BoardViews], board: Board) -> dict[str, L
 
     Raises:
         ValueError: if a camera with enough frames cannot be calibrated with the usual model, brown-conrady.
-        cv2.error: if OpenCV fails on a board's pose.
     """
     return {name: _compared(name, v, board) for name, v in views.items()}
 

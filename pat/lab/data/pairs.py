@@ -149,7 +149,7 @@ def middlebury_pairs(root: str | Path) -> Iterator[StereoPair]:
         scale), not the scene's own.
 
     Raises:
-        FileNotFoundError: for a missing folder; while pairs are read, for a missing right image or disparity.
+        FileNotFoundError: for a missing folder, right image or disparity.
         ValueError: for a folder without a pair; while pairs are read, for an image that cannot be.
     """
     root = _folder(root)
@@ -181,8 +181,8 @@ def pair_files(root: str | Path) -> list[PairFiles]:
         Whether Middlebury's true disparities exist is not checked.
 
     Raises:
-        FileNotFoundError: for a missing folder.
-        ValueError: for a folder without a pair, and a missing right image of Middlebury's.
+        FileNotFoundError: for a missing folder, or right image of Middlebury's.
+        ValueError: for a folder without a pair.
     """
     root = _folder(root)
     files = {pair.left: pair for pair in (*_named(root), *_middlebury(root, "right"))}
@@ -203,7 +203,7 @@ def _some(items: list[T], root: Path) -> list[T]:
 
 
 def _middlebury(root: Path, *needed: str) -> list[PairFiles]:
-    """Pairs in folders of Middlebury's collections, in order; ValueError if a `needed` file is missing."""
+    """Pairs in folders of Middlebury's collections, in order; FileNotFoundError for a missing one."""
     found = sorted(
         PairFiles(file, file.with_name(right), 255 / scale, file.with_name(ground_truth), scale)
         for key, (left, right, ground_truth, scale) in MIDDLEBURY.items()
@@ -212,7 +212,7 @@ def _middlebury(root: Path, *needed: str) -> list[PairFiles]:
     )
     for path in (getattr(files, name) for files in found for name in needed):
         if not path.is_file():
-            raise ValueError(f"{path}: missing beside its left image: fetch the collection again")
+            raise FileNotFoundError(f"{path}: missing beside its left image: fetch the collection again")
     return found
 
 

@@ -59,11 +59,11 @@ def test_a_file_that_is_missing_is_said_at_once(tmp_path):
     folder = tmp_path / "2006_third" / "Cloth"
     write(folder / "view1.png")
     for reader in (middlebury_pairs, pair_files):
-        with pytest.raises(ValueError, match=r"view5\.png"):
+        with pytest.raises(FileNotFoundError, match=r"view5\.png"):
             reader(tmp_path)
     write(folder / "view5.png")
     assert len(pair_files(tmp_path)) == 1
-    with pytest.raises(ValueError, match=r"disp1\.png"):
+    with pytest.raises(FileNotFoundError, match=r"disp1\.png"):
         middlebury_pairs(tmp_path)
 
 
