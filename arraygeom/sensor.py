@@ -108,8 +108,9 @@ class Sensor:
         check_above(-math.inf, itself=False, time_offset=self.time_offset)
         if isinstance(self.gain, tuple) and len(gains) != 3:
             raise ValueError(f"gain is {self.gain}: wanted one number, or three for red, green and blue")
+        _refuse_none(time_offset=self.time_offset, black_level=self.black_level)
         for gain in gains:
-            _refuse_none(gain=gain, time_offset=self.time_offset, black_level=self.black_level)
+            _refuse_none(gain=gain)
             check_above(0, itself=False, gain=gain)
         check_above(1, whole=True, bits=self.bits)
         check_above(0, black_level=self.black_level)
