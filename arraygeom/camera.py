@@ -383,8 +383,8 @@ class Camera(LensView):
         `PinholeCamera.scale` moves the principal point differently: `resize` first.
 
         Raises:
-            ValueError: for a lens, or prism or tilt terms, that kornia does not have, with a lens for a K
-                that is skewed or rotated, and without one for a batch of K or of poses alone.
+            ValueError: for a lens, or prism or tilt terms, that kornia does not have, and with a lens for
+                a K that is skewed or rotated.
         """
         if self.distortion is not None and not self.distortion.harmless:
             return to_kornia_model(self.K, self.hw, self.distortion)
@@ -460,7 +460,6 @@ def intrinsics(
     Raises:
         ValueError: for other than one or two numbers, or an invalid size.
         TypeError: for values that are no numbers.
-        RuntimeError: for a pair of tensors of several numbers.
     """
     fx, fy = _two(focal, "focal")
     cx, cy = _two(((hw[1] - 1) / 2, (hw[0] - 1) / 2) if centre is None else centre, "centre")
@@ -478,9 +477,9 @@ def _two(value: Any, name: str) -> tuple[Any, Any]:
     pair = tuple(value) if isinstance(value, tuple | list) else (value, value)
     if any(not isinstance(v, Number | Tensor) for v in pair):
         raise TypeError(f"{name} is {value!r}: give one number or two, in pixels")
-    if len(pair) != 2:
+    if len(pair) != 2 or any(isinstance(v, Tensor) and v.numel() != 1 for v in pair):
         raise ValueError(
-            f"{name} is one number or two, in pixels; got {len(pair)}: make one K a camera and stack them"
+            f"{name} is one number or two, in pixels, of one camera: make cameras one by one, and stack them"
         )
     return tuple(v.reshape(()) if isinstance(v, Tensor) else v for v in pair)  # type: ignore[return-value]
 

@@ -224,9 +224,6 @@ def lens_derivatives(
     Returns:
         Distorted normalised points (n, 2), derivatives by the points (n, 2, 3), and by the coefficients (n,
         2, k), k = 0 for None. Validity is not checked: points that the lens does not see give finite numbers.
-
-    Raises:
-        RuntimeError: for a lens without coefficients.
     """
     X, c = X.detach(), X.new_zeros(0) if lens is None else lens.coefficients.detach()
     if lens is None or (lens.model == BROWN_CONRADY and len(c) < COEFFICIENT_COUNTS[BROWN_CONRADY][-1]):
@@ -240,7 +237,10 @@ def lens_derivatives(
     with torch.enable_grad():
         through = X.requires_grad_(), c.requires_grad_().expand(len(X), -1)
         x_d = lens.with_coefficients(through[1]).project(through[0][:, None])[0][:, 0]
-        slopes = [torch.autograd.grad(v.sum(), through, retain_graph=True) for v in x_d.unbind(-1)]
+        slopes = [
+            torch.autograd.grad(v.sum(), through, retain_graph=True, materialize_grads=True)
+            for v in x_d.unbind(-1)
+        ]
     by_point, by_lens = (torch.stack(parts, 1) for parts in zip(*slopes))
     return x_d.detach(), by_point, by_lens
 

@@ -97,10 +97,11 @@ def to_pinhole(K: Float[Tensor, "*b 3 3"], cam_from_world: Pose, hw: HW) -> Pinh
     """Make kornia's `PinholeCamera`, a batch of one or more."""
     from kornia.geometry.camera import PinholeCamera
 
-    intrinsics = pad(K.reshape(-1, 3, 3), (0, 1, 0, 1))
+    shape = broadcast_shapes(K.shape[:-2], cam_from_world.batch_shape)
+    intrinsics = pad(K.expand(*shape, 3, 3).reshape(-1, 3, 3), (0, 1, 0, 1))
     intrinsics[:, 3, 3] = 1
     h, w = (K.new_full((len(intrinsics),), n) for n in hw)
-    return PinholeCamera(intrinsics, cam_from_world.matrix.reshape(-1, 4, 4), h, w)
+    return PinholeCamera(intrinsics, cam_from_world.matrix.expand(*shape, 4, 4).reshape(-1, 4, 4), h, w)
 
 
 def pinholes_by_name(

@@ -14,9 +14,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .batching import Batched, map_tensors
+from .batching import Batched, map_tensors, tensors_of
 from .camera import Camera, LensView, View, view_facts
-from .checks import check_above, check_tensors, checking, derived
+from .checks import check_above, check_batches, check_tensors, checking, derived
 from .kornia_models import pinholes_by_name
 from .pair import Link, Pair, depth_range
 from .pixels import HW, resize_matrix, rot90_matrix, shift_matrix
@@ -33,8 +33,8 @@ SERVICES: dict[str, Callable[..., Any]] = {}
 class Rig(Batched):
     """Ordered, named cameras of different sizes, lenses and spectral responses.
 
-    Every number may have leading batch axes, the same for all (not checked without a depth range): a batch of
-    rigs. A rig never changes, except by `requires_grad_`: methods return new ones.
+    Every number may have leading batch axes, the same for all: a batch of rigs. A rig never changes, except
+    by `requires_grad_`: methods return new ones.
 
     Attributes:
         cameras: views by name; kornia's pinholes are converted, batches of one to single cameras.
@@ -44,8 +44,8 @@ class Rig(Batched):
         name: name of the rig; `runtime.text.UNSCALED` and `ASSUMED` say that lengths are not in metres.
 
     Raises:
-        ValueError: for invalid depth bounds, names that cannot be printed, and links to unknown cameras or
-            from a camera to itself.
+        ValueError: for invalid depth bounds, names that cannot be printed, links to unknown cameras or from a
+            camera to itself, and batch axes that do not broadcast.
         TypeError: for cameras, links or a depth of other types, or bounds that are not two.
     """
 
@@ -68,6 +68,9 @@ class Rig(Batched):
             if not isinstance(self.depth, Sequence | Tensor) or len(self.depth) != 2:
                 raise TypeError(f"depth is {self.depth!r}: wanted (near, far), in metres")
             object.__setattr__(self, "depth", depth_range(*self.depth))
+        if checking():
+            check_batches("the rig's numbers", *sorted({t.shape[: t.ndim - n] for t, n in tensors_of(self)}))
+        if self.depth is not None:
             shape = self.batch_shape
             object.__setattr__(self, "depth", tuple(bound.expand(shape) for bound in self.depth))
         if checking():

@@ -14,6 +14,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from .checks import check_above
+
 NORMAL_DEVIATION = 1.4826
 """Physics: standard deviation of normal values divided by the median of their absolute values."""
 STEPS = 8
@@ -78,7 +80,7 @@ def least_squares(
         values: values to explain; axes *m are solved at once.
         weight: weight of each value, at least 0.
         precision: inverse covariance (k, k) of a prior of zero mean; None for no prior: terms may then be
-            dependent, and must be on the CPU.
+            dependent.
 
     Returns:
         Coefficients c (k, *m); without a prior the shortest of all solutions.
@@ -90,8 +92,8 @@ def least_squares(
         information, slope = normal_equations(terms, values, weight)
         return torch.linalg.solve(information + precision, slope)
     root, columns = weight.sqrt()[:, None], values.reshape(len(values), -1)
-    solution = torch.linalg.lstsq(root * terms.T, root * columns, driver="gelsd").solution
-    return solution.reshape(len(terms), *values.shape[1:])
+    solution = torch.linalg.lstsq((root * terms.T).cpu(), (root * columns).cpu(), driver="gelsd").solution
+    return solution.to(values).reshape(len(terms), *values.shape[1:])
 
 
 def robust_least_squares(
@@ -112,14 +114,16 @@ def robust_least_squares(
         weigh: function from residuals (n, *m) to weights (n).
         precision: inverse covariance of a prior of zero mean, or a function of the coefficients that returns
             it; None for no prior.
-        steps: number of steps, at least 1 (not checked): each makes weights, and a fit with them.
+        steps: number of steps, at least 1: each makes weights, and a fit with them.
 
     Returns:
         The fit after the last step.
 
     Raises:
+        ValueError: for fewer steps.
         RuntimeError: as `least_squares`.
     """
+    check_above(1, whole=True, steps=steps)
     coefficients = start
     for _ in range(steps):
         weight = weigh(values - terms.T @ coefficients)

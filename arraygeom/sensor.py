@@ -20,14 +20,20 @@ class Band:
 
     Raises:
         ValueError: for other numbers.
-        TypeError: for values that are no numbers; None and tensors are not refused.
+        TypeError: for values that are no numbers; tensors are not refused.
     """
 
     centre: float
     width: float
 
     def __post_init__(self) -> None:
+        _refuse_none(centre=self.centre, width=self.width)
         check_above(0, itself=False, centre=self.centre, width=self.width)
+
+
+def _refuse_none(**values: object) -> None:
+    if missing := [name for name, value in values.items() if value is None]:
+        raise TypeError(f"{missing[0]} is None: give a number")
 
 
 @dataclass(frozen=True)
@@ -81,8 +87,9 @@ class Sensor:
         gain: factor of the value; three numbers for red, green and blue.
 
     Raises:
-        ValueError: for numbers out of range, another coding, pattern or response.
-        TypeError: for values that are no numbers. None and the number of gains are not checked.
+        ValueError: for numbers out of range, a tuple of other than three gains, another coding, pattern or
+            response.
+        TypeError: for values that are no numbers.
     """
 
     response: str | Band | Curve | None = None
@@ -99,7 +106,11 @@ class Sensor:
         gains = self.gain if isinstance(self.gain, tuple) else (self.gain,)
         check_above(0, itself=False, frame_rate=self.frame_rate, exposure=self.exposure)
         check_above(-math.inf, itself=False, time_offset=self.time_offset)
+        if isinstance(self.gain, tuple) and len(gains) != 3:
+            raise ValueError(f"gain is {self.gain}: wanted one number, or three for red, green and blue")
+        _refuse_none(time_offset=self.time_offset, black_level=self.black_level)
         for gain in gains:
+            _refuse_none(gain=gain)
             check_above(0, itself=False, gain=gain)
         check_above(1, whole=True, bits=self.bits)
         check_above(0, black_level=self.black_level)

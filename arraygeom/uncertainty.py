@@ -179,6 +179,10 @@ def _propagated(rig: Rig, covariance: Covariance, f: Callable[[Rig], Tensor]) ->
     places = torch.zeros(len(names), sum(z.numel() for z in zeros.values()), dtype=torch.float64)
     first = dict(zip(zeros, torch.tensor([0, *(z.numel() for z in zeros.values())]).cumsum(0).tolist()))
     for row, (kind, _, index) in enumerate(names):
+        if not index.isdecimal() or int(index) >= zeros[kind].numel():
+            raise ValueError(
+                f"the rig's parameter {kind} has no part {index}: is the covariance of this rig?"
+            )
         places[row, first[kind] + int(index)] = 1
 
     def moved(change: Tensor) -> Tensor:

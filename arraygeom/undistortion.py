@@ -37,7 +37,7 @@ def pinhole_view(camera: AnyLensView) -> AnyLensView:
         NotImplementedError: within `torch.func.vmap`.
     """
     needs_numbers("the size of a pinhole view", camera.K)
-    if camera.K.ndim > 2:
+    if camera.batch_shape:
         raise ValueError("a pinhole view is made of one camera at a time: take one of the batch")
     with torch.no_grad():
         rays, valid = camera.rays(coarse_grid(camera.hw).to(camera.K))
@@ -69,7 +69,12 @@ def pixels_between(
     Returns:
         Positions in source's image, float64, and True where both lenses are valid and the position is on the
         image; others mean nothing.
+
+    Raises:
+        ValueError: for a batch of views.
     """
+    if source.batch_shape or target.batch_shape:
+        raise ValueError("pixels are mapped between single views: take one of the batch")
     if x is None:
         return _by_rows(lambda x: pixels_between(source, target, x), target.hw, axis=0)
     source, target = source.to(torch.float64), target.to(torch.float64)
@@ -156,7 +161,7 @@ def resampled(
         H, W).
 
     Raises:
-        ValueError: for an image of another size than source's, and as `sample`.
+        ValueError: for an image of another size than source's, a batch of views, and as `sample`.
     """
     if tuple(image.shape[-2:]) != tuple(source.hw):
         raise ValueError(f"the image is {tuple(image.shape[-2:])}, its camera {tuple(source.hw)}: resize one")

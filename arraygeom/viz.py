@@ -277,9 +277,10 @@ def draw_matches(
 
     Raises:
         ImportError: without matplotlib.
-        ValueError: for an unknown camera, and as `Pair.fundamental`.
+        ValueError: for an unknown camera, no matches, and as `Pair.fundamental`.
     """
     count, half = 7, 18
+    _require_matches(*(len(x) for x, _ in matches.values()))
     figure = new_figure(figsize=(1.55 * count, 3.7 * len(matches)), layout="constrained")
     parts: Any = figure.subfigures(len(matches), 1, squeeze=False)
     for row, (subfigure, (name, (x, y))) in enumerate(zip(parts[:, 0], matches.items())):
@@ -302,6 +303,11 @@ def draw_matches(
             fontsize=10,
         )
     return figure
+
+
+def _require_matches(*counts: int) -> None:
+    if not min(counts, default=0):
+        raise ValueError("no matches to draw: give one or more of each beta")
 
 
 def _draw_patch(axes: Axes, hw: HW, image: Any, middle: np.ndarray, half: float) -> None:
@@ -341,11 +347,12 @@ def draw_residuals(
         image: beta's undistorted image, as `show_image` takes it; None for an empty frame.
 
     Raises:
-        ValueError: as `Pair.fundamental`.
+        ValueError: for no matches, and as `Pair.fundamental`.
         ImportError: without matplotlib.
     """
     with needs("plots", "drawing"):
         from matplotlib.collections import LineCollection
+    _require_matches(len(x_alpha))
     line = epipolar_lines(pair.fundamental.to(x_alpha.dtype), x_alpha)
     distance = epipolar_distance(pair.fundamental.to(x_alpha.dtype), x_alpha, x_beta)
     size = distance.abs()
@@ -393,20 +400,19 @@ def show_image(axes: Axes, hw: HW, image: Any = None) -> None:
     Args:
         hw: height and width of the frame; an image of another size is not refused.
         image: tensor or array (H, W), (H, W, 1 or 3) or (1 or 3, H, W); None for the frame alone. Floats are
-            0 to 1; grey integers up to their type's largest, coloured ones up to 255.
+            0 to 1, integers up to their type's largest.
 
     Raises:
-        ValueError: for an image of bools.
-        TypeError: for one of another shape.
+        TypeError: for an image of another shape.
     """
     h, w = hw
     if image is not None:
         pixels = np.asarray(image.detach().cpu() if isinstance(image, Tensor) else image)
         pixels = pixels.transpose(1, 2, 0) if pixels.ndim == 3 and pixels.shape[0] in (1, 3) else pixels
-        white = 1.0 if np.issubdtype(pixels.dtype, np.floating) else np.iinfo(pixels.dtype).max
+        white = np.iinfo(pixels.dtype).max if np.issubdtype(pixels.dtype, np.integer) else 1
         grey = pixels.ndim == 3 and pixels.shape[-1] == 1
         options: dict[str, Any] = {"cmap": "gray", "interpolation": "antialiased", "aspect": "equal"}
-        axes.imshow(pixels[..., 0] if grey else pixels, vmin=0, vmax=white, **options)
+        axes.imshow((pixels[..., 0] if grey else pixels) / np.float32(white), vmin=0, vmax=1, **options)
     axes.set(xlim=(-0.5, w - 0.5), ylim=(h - 0.5, -0.5), aspect="equal", xticks=[], yticks=[])
     axes.set_facecolor("0.94")
 

@@ -111,9 +111,9 @@ def cube_faces(camera: Camera, *, overlap: float = 5.0) -> dict[str, Camera]:
         of which the lens sees something, with its resolution in the middle.
 
     Raises:
-        ValueError: for a batch of K, lenses whose rays do not meet in a point, and an overlap near 45.
+        ValueError: for a batch of cameras, lenses whose rays do not meet in a point, and an overlap near 45.
     """
-    if camera.K.ndim > 2 or not camera.central:
+    if camera.batch_shape or not camera.central:
         raise ValueError("faces are of one camera at a time, whose rays meet in a point")
     rays, valid = _rays(camera)
     tangent, scale = math.tan(math.radians(45 + overlap)), _focal(camera)

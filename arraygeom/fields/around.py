@@ -140,9 +140,11 @@ class AroundMatches:
             The field, its positions in float32 on alpha's device; elsewhere its segments are whole.
 
         Raises:
-            ValueError: as the class.
+            ValueError: for unequal numbers of points, and as the class.
             TypeError: as the class.
         """
+        if alpha.shape != beta.shape:
+            raise ValueError(f"{len(alpha)} points of alpha and {len(beta)} of beta: give a match of each")
         positions = torch.full((*hw, 2), torch.nan, dtype=torch.float32, device=alpha.device)
         column, row = alpha.round().long().unbind(-1)
         displacement = (beta - alpha).float()

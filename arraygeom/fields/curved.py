@@ -62,8 +62,7 @@ class Curved:
     bounds: Literal["depth", "distance"] = "depth"
 
     def __post_init__(self) -> None:
-        if self.bounds not in ("depth", "distance"):
-            raise ValueError(f"bounds is {self.bounds!r}: wanted 'depth' or 'distance'")
+        _check_word(self.bounds)
         check_above(1, whole=True, samples=self.samples)
         check_above(2, whole=True, nodes=self.nodes)
         check_bounds(self.near, self.far)
@@ -92,6 +91,11 @@ class Curved:
         xy, inside = _onto_edge(xy, pair.beta.hw, EDGE)
         mask = inside & visible & (pieces.length.sum(-1, keepdim=True) > 0)
         return Positions(torch.where(mask[..., None], xy, 0.0), mask)
+
+
+def _check_word(bounds: str) -> None:
+    if bounds not in ("depth", "distance"):
+        raise ValueError(f"bounds is {bounds!r}: wanted 'depth' or 'distance'")
 
 
 FEW = 16
@@ -225,8 +229,9 @@ class RayCurve(NamedTuple):
             The curves, in the precision of x; valid ones may yet be off the image where beta has a lens.
 
         Raises:
-            ValueError: for a pair that is not calibrated.
+            ValueError: for a pair that is not calibrated, or other `bounds`.
         """
+        _check_word(bounds)
         pose = pair.beta_from_alpha.to(x.dtype)
         alpha, beta = (c.to(x.dtype) for c in pair.cameras)
         start, rays, ahead = _lines(alpha, x, bounds)

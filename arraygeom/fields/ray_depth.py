@@ -50,7 +50,7 @@ def ray_depth(
         depths.
 
     Raises:
-        ValueError: for pairs that are not calibrated or have no depth range.
+        ValueError: for pairs that are not calibrated or have no depth range, and other `bounds`.
     """
     pair.cameras  # noqa: B018  (raises for an uncalibrated pair)
     near, far = pair.depth_range

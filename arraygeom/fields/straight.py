@@ -335,7 +335,7 @@ def approximated(pair: Pair) -> Pair:
         NotImplementedError: within `torch.func.vmap`.
     """
     alpha, _ = pair.cameras
-    if alpha.K.ndim > 2:
+    if pair.batch_shape:
         raise ValueError("fitting works on one pair at a time: take one of the batch")
     x = coarse_grid(pair.alpha.hw).to(alpha.K)
     segments = Epipolar()(pair, x)

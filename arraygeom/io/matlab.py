@@ -69,7 +69,6 @@ def read(source: RigSource) -> Rig:
     Raises:
         RigFileError: for a damaged file, a MATLAB object in place of a struct, unknown units, or a
             fundamental matrix that contradicts the pose.
-        OSError: for a file that cannot be opened.
         ImportError: without scipy, for a MAT-file.
     """
     fields = _outermost(source)
@@ -84,8 +83,7 @@ def read(source: RigSource) -> Rig:
 
 def _outermost(source: RigSource) -> Entry:
     """Return the struct itself, or the first variable of the file that holds one."""
-    with source.path.open("rb") as file:
-        is_text = source.path.suffix != ".mat" and not file.read(7).startswith(b"MATLAB ")
+    is_text = source.path.suffix != ".mat" and not source.content().startswith(b"MATLAB ")
     fields = source.json().value if is_text else load_variables(source)
     second = any(name.endswith("Camera2") or name == "CameraParameters2" for name in fields)
     for value in (fields,) if second else (fields, *fields.values()):

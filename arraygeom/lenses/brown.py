@@ -69,13 +69,17 @@ def brown_derivatives(c: Tensor, xy: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Distort normalised points (n, 2), with derivatives in closed form; validity is not checked.
 
     Args:
-        c: coefficients (k,) in OpenCV's order, up to the prism's 12. More are not refused: a tilt is left
-            out, and derivatives are by the first 12 alone.
+        c: coefficients (k,) in OpenCV's order, up to the prism's 12.
         xy: points; those beyond `brown_limit` are moved back to it.
 
     Returns:
         Distorted points (n, 2), their derivatives by the points (n, 2, 2) and by the coefficients (n, 2, k).
+
+    Raises:
+        ValueError: for coefficients of a tilt.
     """
+    if len(c) > 12:
+        raise ValueError(f"{len(c)} coefficients: a tilt has no derivatives in closed form")
     lens, limit = Brown.named(c[None]), once(brown_limit, c[None]).to(xy)
     squared = xy.square().sum(-1)
     inside = squared < limit

@@ -26,7 +26,7 @@ ON_A_LINE = 0.01
 class Board:
     """Base class of calibration boards: a flat grid of points in the plane z = 0, x across, y down.
 
-    Subclasses say where they differ. Constructors check nothing: `parse_board` does.
+    Subclasses say where they differ. Constructors check next to nothing: `parse_board` does.
 
     Attributes:
         columns: points in a row.
@@ -153,16 +153,22 @@ class Chessboard(Board):
 class Charuco(MarkedBoard):
     """Chessboard with markers in its white squares; `columns` x `rows` counts inner corners, its points.
 
-    The fields of `Board` (`spacing` is a square's side) and `MarkedBoard` come first. Values that do not fit
-    together fail in OpenCV when the board is detected or drawn.
+    The fields of `Board` (`spacing` is a square's side) and `MarkedBoard` come first.
 
     Attributes:
         marker: side of a marker, metres, less than `spacing`.
         legacy: True for the layout of OpenCV before 4.6.
+
+    Raises:
+        ValueError: for a marker that does not fit.
     """
 
     marker: float
     legacy: bool = False
+
+    def __post_init__(self) -> None:
+        if not 0 < self.marker < self.spacing:
+            raise ValueError(f"board '{self}': its markers do not fit into its squares")
 
     @cached_property
     def opencv(self) -> cv2.aruco.CharucoBoard:
@@ -249,7 +255,7 @@ class Boards(Board):
     """Several boards in view at once, each with its own pose; their points form one list, each in its own
     board's frame.
 
-    `columns`, `rows` and `spacing` are the first board's. All count as flat, points in space too.
+    `columns`, `rows` and `spacing` are the first board's.
 
     Attributes:
         boards: the single boards, at least one.
@@ -262,6 +268,11 @@ class Boards(Board):
     def members(self) -> tuple[Board, ...]:
         """The single boards."""
         return self.boards
+
+    @property
+    def flat(self) -> bool:
+        """True if the points of each board lie in a plane."""
+        return all(board.flat for board in self.boards)
 
     @cached_property
     def points(self) -> Float[np.ndarray, "n 3"]:

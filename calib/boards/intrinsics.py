@@ -18,7 +18,7 @@ from arraygeom.lenses.central import MODELS
 from arraygeom.pixels import HW
 
 from . import Lens
-from .board import Board
+from .board import Board, on_a_line
 from .detect import BoardViews, Detection, homography_errors
 from .photos import FrameKey
 
@@ -87,7 +87,6 @@ def initial_camera(name: str, views: BoardViews, board: Board, lens: Lens) -> Ca
     Raises:
         ValueError: for fewer than three images with a board (one, for points that are not coplanar), and if
             no camera is found.
-        cv2.error: if OpenCV fails on a board's pose.
     """
     fewest = FEWEST_IMAGES if board.flat else 1
     if len(views.seen) < fewest:
@@ -188,7 +187,7 @@ def _solved(name: str, views: BoardViews, board: Board, lens: Lens) -> tuple[Cam
     """OpenCV's camera, and `cam_from_board` by moment. Raises ValueError if it finds none."""
     model, count = LENSES[lens]
     if model not in ("brown-conrady", "none"):
-        camera, poses = _fisheye(views, board)
+        camera, poses = _fisheye(name, views, board)
         return camera if model == "kannala-brandt" else _with_model(camera, model), poses
     try:
         K, coefficients, rotations, translations = _pinhole(views, board, count)
@@ -201,7 +200,7 @@ def _solved(name: str, views: BoardViews, board: Board, lens: Lens) -> tuple[Cam
 
 def _advice(name: str, views: BoardViews, board: Board) -> str:
     """Sentence on boards that no pinhole camera fits: whether a fisheye does."""
-    camera, poses = _fisheye(views, board)
+    camera, poses = _fisheye(name, views, board)
     errors = [_projection_errors(camera, poses[key], d, board.points) for key, d in views.seen.items()]
     off = float(np.median(np.concatenate(errors)))
     wrong = f"{name}: no pinhole camera fits these boards"
@@ -246,7 +245,7 @@ def board_pose(camera: Camera, detection: Detection, board: Board) -> Pose:
     try:
         return _pose_of_rays(board, detection.ids[valid], rays[valid])
     except ValueError as error:
-        raise ValueError(f"{error} of {camera}: check its lens and focal length") from None
+        raise ValueError(f"{error} of {camera}: check its image, lens and focal length") from None
 
 
 def _unit_rays(
@@ -264,12 +263,12 @@ def _pose_of_rays(board: Board, ids: Int[np.ndarray, " n"], rays: Float[np.ndarr
         ahead = Rotation.align_vectors([0.0, 0.0, 1.0], rays.mean(0))[0].as_matrix()
         rays = rays @ ahead.T
     usable = rays[:, 2] > 0.05
-    if usable.sum() < 4:
+    points = board.points[ids[usable]]
+    if len(points) < 4 or on_a_line(points):
         raise ValueError(
-            f"only {usable.sum()} points of a board (a pose needs four) have rays through the lens"
+            f"{len(points)} points of a board have rays through the lens (a pose needs four, not on a line)"
         )
     flat = rays[usable, :2] / rays[usable, 2:]
-    points = board.points[ids[usable]]
     method = cv2.SOLVEPNP_IPPE if board.flat else cv2.SOLVEPNP_SQPNP
     first = points * (1, 1, 0) if board.flat else points
     _, r, t = cv2.solvePnP(first, flat, np.eye(3), np.zeros(4), flags=method)
@@ -322,7 +321,7 @@ def _linear_intrinsics(view: tuple[np.ndarray, np.ndarray], hw: HW) -> np.ndarra
     return intrinsics(float(np.clip(focal, 0.3 * max(hw), 30 * max(hw))), hw).numpy()
 
 
-def _fisheye(views: BoardViews, board: Board) -> tuple[Camera, dict[FrameKey, Pose]]:
+def _fisheye(name: str, views: BoardViews, board: Board) -> tuple[Camera, dict[FrameKey, Pose]]:
     """Fit focal length (from the best of `FISHEYE_FOCALS`) and two terms of a fisheye, and boards' poses."""
 
     def changed(values: np.ndarray) -> Camera:
@@ -352,7 +351,10 @@ def _fisheye(views: BoardViews, board: Board) -> tuple[Camera, dict[FrameKey, Po
     first = min(tried, key=lambda values: float(np.median(off(values))))
     found = least_squares(off, first, loss="soft_l1", diff_step=1e-4, x_scale=(0.01, 0.01, 0.01), max_nfev=6)
     camera = changed(found.x)
-    return camera, dict(zip(views.seen, placed(camera)))
+    try:
+        return camera, dict(zip(views.seen, placed(camera)))
+    except (cv2.error, ValueError) as error:
+        raise ValueError(f"{name}: no camera fits these boards: {error}") from None
 
 
 def _pose(r: np.ndarray, t: np.ndarray) -> Pose:

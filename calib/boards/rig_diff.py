@@ -20,6 +20,7 @@ from matplotlib.figure import Figure
 from scipy.special import chdtrc
 
 from arraygeom import Camera, Pose, Rig, triangulate
+from arraygeom.pair import depth_range
 from arraygeom.pose import cross_matrix
 from arraygeom.runtime.text import length_unit
 
@@ -158,16 +159,17 @@ def rig_difference(
         b: second rig.
         covariances: covariances of both; where one is None the other serves for both, without any nothing is
             tested.
-        depth: (near, far) along each camera's axis, metres, or the rigs' own unit; 0 < near <= far, which is
-            not checked. Far counts as `FARTHEST` times near at most, infinity too.
+        depth: (near, far) along each camera's axis, metres, or the rigs' own unit. Far counts as `FARTHEST`
+            times near at most, infinity too.
 
     Returns:
         Differences of pixels and depths, and the test's result.
 
     Raises:
-        ValueError: for rigs of other cameras, sizes or units, cameras that are not calibrated, and a
-            covariance of parameters that the first rig has not.
+        ValueError: for rigs of other cameras, sizes or units, cameras that are not calibrated, a
+            covariance of parameters that the first rig has not, and depths unless 0 < near <= far.
     """
+    depth_range(*depth)
     names = _same_cameras(a, b)
     a, b = (rig.replace(cameras={name: rig[name].to(torch.float64) for name in names}) for rig in (a, b))
     grids = {name: _points(a[name], b[name], depth) for name in names}

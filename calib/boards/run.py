@@ -151,7 +151,7 @@ def watch(
         which the page leaves out.
 
     Raises:
-        OSError: if the page cannot be written, the folder is missing, or a file goes before it is read.
+        OSError: if the page cannot be written, or the folder is missing.
         cv2.error: as `calibrate`.
         KeyboardInterrupt: for Ctrl-C.
     """
@@ -185,7 +185,7 @@ def watch(
             if (name, key) not in seen:
                 try:
                     seen[name, key] = detected(photos[name][key], key, board)
-                except ValueError as error:  # still being written: it is tried again
+                except (ValueError, OSError) as error:  # still being written, or renamed: tried again
                     problem = str(error)
 
 

@@ -89,7 +89,7 @@ def calibrate_single(
     Raises:
         ValueError: with advice, for too few images, parallel boards, no camera that fits, or (`final`) an
             undetermined focal length.
-        KeyError, cv2.error: as `initial_camera`.
+        KeyError: as `initial_camera`.
     """
     first = initial_camera(name, views, board, lens)
     kept = without_bad_images(views, first, board)

@@ -46,7 +46,6 @@ from .board import (
     MarkedBoard,
     apart,
     marker_dictionary,
-    millimetres,
     on_a_line,
 )
 
@@ -169,8 +168,6 @@ def parse_boards(texts: Sequence[str]) -> Board:
 
 def _charuco(text: str, columns: int, rows: int, spacing: float, options: Mapping[str, str]) -> Charuco:
     marker = _length(text, options["length"]) if "length" in options else 0.75 * spacing
-    if not marker < spacing:
-        raise ValueError(f"board '{text}': markers of {millimetres(marker)} do not fit into its squares")
     first = int(options.get("first", "from0")[4:])
     markers = range(first, first + columns * rows // 2)
     name = _smallest_dictionary(text, options.get("dictionary", "4x4"), first + (columns * rows + 1) // 2)

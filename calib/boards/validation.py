@@ -183,7 +183,6 @@ def compare_lenses(views: Mapping[str, BoardViews], board: Board) -> dict[str, L
 
     Raises:
         ValueError: if a camera with enough frames cannot be calibrated with the usual model, brown-conrady.
-        cv2.error: if OpenCV fails on a board's pose.
     """
     return {name: _compared(name, v, board) for name, v in views.items()}
 
@@ -256,14 +255,16 @@ def start_notes(
 
     Args:
         detected: detections by camera before outliers were left out.
-        solved: solution with priors about the start; AssertionError for one without a covariance.
+        solved: solution with priors about the start.
         deviations: standard deviations about the start.
         lens: lens model by camera that was asked for.
 
     Yields:
-        Sentences on gains by the images, lenses, distance from the start, and images and points left out.
+        Sentences on gains by the images (if there is a covariance), lenses, distance from the start, and
+        images and points left out.
     """
-    yield _gains(solved, deviations)
+    if solved.covariance is not None:
+        yield _gains(solved, deviations)
     for name, camera in solved.problem.cameras.items():
         if (distortion := camera.distortion) is not None and distortion.model != LENSES[lens[name]][0]:
             yield f"{name}: keeps the start's lens, {distortion.model}"

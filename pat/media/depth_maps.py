@@ -118,8 +118,7 @@ def write_points(
     Args:
         path: file to write; missing folders are made.
         camera: camera of the image.
-        depth: metres, positive, which is not checked; pixels that are not finite, or without a ray, are left
-            out.
+        depth: metres; pixels where it is not positive and finite, or without a ray, are left out.
         image: values 0..1; grey for one channel, or three and more, of which the first are RGB.
         along: "depth" for z along the optical axis, "distance" for the length of the ray.
 
@@ -129,7 +128,7 @@ def write_points(
     Raises:
         OSError: if it cannot be written.
     """
-    has_depth = depth.isfinite()
+    has_depth = depth.isfinite() & (depth > 0)
     x = pixel_grid(camera.hw, dtype=torch.float64)[has_depth]
     colours = image.expand(3, -1, -1) if len(image) == 1 else image[:3]
     double_camera, to_point = camera.to(torch.float64), depth[has_depth].double()

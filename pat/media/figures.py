@@ -27,13 +27,13 @@ def colour_depth(depth: Float[Tensor, "h w"]) -> Float[Tensor, "3 h w"]:
     """Colour a depth map by inverse depth, from its 1st to its 99th percentile.
 
     Args:
-        depth: positive; NaN and infinity are unknown. 0 is not refused, and spoils the colours of all.
+        depth: NaN, infinity, 0 and less are unknown.
 
     Returns:
         RGB image (3, h, w) 0..1, float32 on the CPU; near is red, far dark blue, unknown black.
     """
     depth = depth.detach().cpu()
-    has_depth = depth.isfinite()
+    has_depth = depth.isfinite() & (depth > 0)
     inverse = torch.where(has_depth, 1 / torch.where(has_depth, depth, 1.0), 0.0)
     low, high = np.percentile(inverse[has_depth].numpy(), (1, 99)) if has_depth.any() else (0.0, 1.0)
     table = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], cv2.COLORMAP_TURBO)[:, 0, ::-1]

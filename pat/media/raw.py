@@ -17,6 +17,7 @@ from torch import Tensor
 
 from arraygeom import Rig, Sensor
 from arraygeom.runtime.chunks import chunked
+from arraygeom.sensor import PATTERNS
 
 from .colour import linear_from_srgb, luminance, srgb_from_linear
 
@@ -118,9 +119,11 @@ def demosaiced(raw: Float[Tensor, "1 h w"], pattern: str) -> Float[Tensor, "3 h 
         RGB image of the same size, clipped to 0..1, of the type and on the device of `raw`.
 
     Raises:
-        AttributeError: for another pattern; OpenCV's own of two letters pass, and name other pixels.
+        ValueError: for another pattern, such as OpenCV's of two letters.
         RuntimeError: for values that require a gradient.
     """
+    if pattern not in PATTERNS:
+        raise ValueError(f"the filter pattern is {pattern!r}: wanted {' or '.join(PATTERNS)}")
     code = getattr(cv2, f"COLOR_Bayer{pattern}2RGB_EA")
     counts = np.rint(raw[0].clamp(0, 1).cpu().numpy().astype(np.float64) * 65535).astype(np.uint16)
     colours = cv2.demosaicing(counts, code).astype(np.float32) / np.float32(65535)

@@ -90,7 +90,7 @@ class NoiseLevel:
         underestimated; fine texture all over the image is taken for noise.
 
         Args:
-            image: image on the CPU, values 0..1, which is not checked; blocks with several black pixels, or
+            image: values 0..1, which is not checked; blocks with several black pixels, or
                 brighter than .95, are left out.
 
         Returns:
@@ -99,7 +99,7 @@ class NoiseLevel:
         """
         if min(image.shape[-2:]) < SIDE + 2:
             return cls()
-        value, variance = _smoothest(image.double())
+        value, variance = (part.cpu() for part in _smoothest(image.double()))
         if not len(value) or not float(variance.max()) > 0:
             return cls()
         fits = [_fitted(added_to, value, variance) for added_to in ("light", "values")]

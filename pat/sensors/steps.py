@@ -152,18 +152,18 @@ class Noise(Step):
     The signal is in electrons, 0 for negative values. The result is not clipped, and differentiable.
 
     Attributes:
-        full_well: electrons at value 1, more than 0; infinity is not refused and gives NaN.
+        full_well: electrons at value 1, more than 0.
         read: standard deviation of the read noise in electrons, 0 or more.
 
     Raises:
-        ValueError: for numbers outside these ranges or NaN.
+        ValueError: for numbers outside these ranges, infinity or NaN.
     """
 
     full_well: float
     read: float = 0.0
 
     def __post_init__(self) -> None:
-        if not (self.full_well > 0 and self.read >= 0):
+        if not (0 < self.full_well < math.inf and 0 <= self.read < math.inf):
             got = f"{self.full_well:g} and {self.read:g}"
             raise ValueError(f"noise: wanted full_well > 0 and read >= 0 electrons, got {got}")
 

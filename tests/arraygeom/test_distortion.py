@@ -11,6 +11,7 @@ from torch.autograd import gradgradcheck
 from arraygeom import distortion
 from arraygeom.checks import derived
 from arraygeom.distortion import Distortion
+from arraygeom.lenses import Equirectangular
 from arraygeom.lenses import brown as brown_lens
 from arraygeom.lenses.fisheye import fisheye_limit
 from tests.arraygeom.rigs import directions
@@ -219,6 +220,19 @@ def test_derivatives_at_once_are_automatic_ones(count):
     for i, v in enumerate(x.unbind(-1)):
         for slope, part in zip(torch.autograd.grad(v.sum(), through, retain_graph=True), found[1:]):
             assert torch.allclose(part[:, i], slope, rtol=1e-9, atol=1e-9 * float(slope.abs().max()))
+
+
+def test_derivatives_of_a_lens_without_numbers_are_by_the_points_alone():
+    X = torch.randn(9, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    _, by_point, by_lens = distortion.lens_derivatives(Equirectangular(), X)
+    jacobian = torch.func.vmap(torch.func.jacrev(lambda x: Equirectangular().project(x)[0]))(X)
+    torch.testing.assert_close(by_point, jacobian)
+    assert by_lens.shape == (9, 2, 0)
+
+
+def test_derivatives_in_closed_form_have_no_tilt():
+    with pytest.raises(ValueError, match="14"):
+        brown_lens.brown_derivatives(brown(14).coefficients, torch.zeros(1, 2, dtype=torch.float64))
 
 
 def test_fisheye_derivatives_beyond_90_degrees():

@@ -15,7 +15,8 @@ import torch
 from arraygeom import Camera, LensView, Link, Pose, Rig, View, intrinsics, stack
 from arraygeom.distortion import Distortion
 from arraygeom.fields import default_field
-from arraygeom.io import READERS, WRITERS, RigFileError, read_rig, recognise, write_rig
+from arraygeom.io import READERS, WRITERS, RigFileError, matlab, read_rig, recognise, write_rig
+from arraygeom.io.source import RigSource
 from arraygeom.pose import rotation_from_vector
 from arraygeom.sensor import Sensor
 from tests.oracles import Oracle
@@ -205,6 +206,11 @@ def test_matlab_mat_files(file, tmp_path):
     path.write_bytes(path.read_bytes()[:300])
     with pytest.raises(RigFileError, match=r"stereo\.mat: "):
         read_rig(path)
+
+
+def test_a_missing_matlab_file_is_named(tmp_path):
+    with pytest.raises(RigFileError, match=r"none\.json"):
+        matlab.read(RigSource(tmp_path / "none.json"))
 
 
 def test_matlab_fundamental_matrix_has_to_agree(tmp_path):

@@ -55,6 +55,13 @@ def test_a_batch_of_six_is_a_rig_and_comes_back():
         torch.testing.assert_close(getattr(back, name), getattr(theirs, name), check_dtype=False)
 
 
+@pytest.mark.parametrize("field", ["K", "cam_from_world"])
+def test_a_batch_of_one_field_alone_is_a_batch(field):
+    batch = ALPHA.replace(**{field: getattr(stack([ALPHA, ALPHA]), field)})
+    back = batch.to_kornia()
+    torch.testing.assert_close(back.project(X.expand(2, -1, -1)), ALPHA.project(X).x.expand(2, -1, -1))
+
+
 def stereo(baselines: list[float]) -> StereoCamera:
     K = torch.tensor([[500.0, 0, 31.0], [0, 510, 24.0], [0, 0, 1]], dtype=F64).expand(len(baselines), 3, 3)
     moved = torch.tensor([[-b, 0, 0] for b in baselines], dtype=F64)[..., None]

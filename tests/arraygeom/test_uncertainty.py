@@ -116,6 +116,8 @@ def test_covariances_of_another_rig_are_refused():
     rig = random_rig(1)
     with pytest.raises(ValueError, match="gamma"):
         bands(rig, Stated(("gamma.rotation.0",), torch.eye(1)), "alpha", "beta", torch.zeros(1, 2))
+    with pytest.raises(ValueError, match=r"beta\.rotation"):
+        bands(rig, Stated(("beta.rotation.3",), torch.eye(1)), "alpha", "beta", torch.zeros(1, 2))
     with pytest.raises(ValueError, match="depth"):
         bands(rig.replace(depth=None), stated(rig), "alpha", "beta", torch.zeros(1, 2))
     with pytest.raises(ValueError, match="confidence"):

@@ -81,6 +81,18 @@ def test_images_of_a_single_row_are_drawn():
     assert len(png(figure)) > 1000
 
 
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("kind", [np.uint16, bool])
+def test_numbers_of_any_type_are_as_bright_as_their_share_of_white(kind, channels):
+    axes = viz.new_figure().subplots()
+    ramp = np.linspace(0, 1, 12).reshape(2, 6, 1)
+    values = np.broadcast_to(ramp * (65535 if kind is np.uint16 else 2), (2, 6, channels)).astype(kind)
+    viz.show_image(axes, (2, 6), values)
+    wanted = ramp if kind is np.uint16 else values
+    shown = axes.images[0].get_array().reshape(2, 6, channels)
+    np.testing.assert_allclose(shown, np.broadcast_to(wanted, shown.shape), atol=1e-4)
+
+
 def test_any_field_can_be_drawn():
     def here(pair, x):
         return Segments(x, x + 3, torch.ones_like(x[..., 0], dtype=torch.bool))

@@ -74,7 +74,11 @@ from arraygeom import (
     warp,
     world_rays,
 )
-from arraygeom.wide_views import rectify_spherical
+from arraygeom.fields import AroundMatches
+from arraygeom.fields.ray_depth import ray_depth
+from arraygeom.robust import robust_least_squares
+from arraygeom.viz import draw_matches, draw_residuals
+from arraygeom.wide_views import cube_faces, rectify_spherical
 
 HW = (48, 64)
 K = intrinsics(60.0, HW)
@@ -91,6 +95,10 @@ def camera(**changes: Any) -> Camera:
 
 def moved(**changes: Any) -> Camera:
     return camera(cam_from_world=Pose(EYE, ASIDE), **changes)
+
+
+def batch_of_poses(count: int = 2) -> Camera:
+    return camera(cam_from_world=Pose(EYE, ASIDE.expand(count, 3)))
 
 
 def rig(beta: Camera | None = None, alpha: Camera | None = None, **changes: Any) -> Rig:
@@ -176,6 +184,7 @@ WRONG: dict[str, Callable[[], Any]] = {
     "depth reversed": lambda: rig(depth=(5, 1)),
     "depth one number": lambda: rig(depth=5.0),
     "depth in millimetres": lambda: rig(depth=(1000.0, 5000.0)),
+    "cameras of batches unlike": lambda: Rig({"a": batch_of_poses(2), "b": batch_of_poses(3)}),
     "cameras a list": lambda: Rig([camera(), camera()]),
     "a camera that is K": lambda: Rig({"a": K}),
     "both cameras the same": lambda: Rig({"a": camera(), "b": camera()}, depth=(1, 5)),
@@ -193,6 +202,7 @@ WRONG: dict[str, Callable[[], Any]] = {
     "pixels a list, of a curve": lambda: Curved(8)(pair(), [[20.0, 20]]),
     "pixels a list, of a camera": lambda: camera().unproject([20.0, 20], torch.ones(())),
     "pixels an array, on the image": lambda: camera().contains(X.numpy()),
+    "a curve's bounds by another word": lambda: ray_depth(pair(), X, X, "range"),
     "near beyond far": lambda: Epipolar(near=5, far=2)(pair(), X),
     "near below 0": lambda: Curved(near=-1.0),
     "no samples": lambda: Curved(0),
@@ -212,6 +222,9 @@ WRONG: dict[str, Callable[[], Any]] = {
     "frame rate below 0": lambda: Sensor(frame_rate=-30.0),
     "coding unknown": lambda: Sensor(coding="sRGB"),
     "band without width": lambda: Band(450, 0),
+    "band of None": lambda: Band(None, None),
+    "time offset None": lambda: Sensor(time_offset=None),
+    "gains of two colours": lambda: Sensor(gain=(1.0, 2.0)),
     "curve of unlike lengths": lambda: Curve((400.0, 500.0), (1.0,)),
     "a rig in half precision": lambda: rig().to(torch.float16),
     "a depth of each pixel as a column": lambda: camera().unproject(X.expand(5, 2), torch.ones(5, 1)),
@@ -231,6 +244,13 @@ WRONG: dict[str, Callable[[], Any]] = {
     "cameras by number": lambda: Rig({0: camera(), 1: moved()}),
     "three points for a homography": lambda: fit_homography(X.expand(3, 2), X.expand(3, 2)),
     "points of other counts": lambda: fit_homography(X.expand(5, 2), X.expand(4, 2)),
+    "matches of other counts": lambda: AroundMatches.from_points(X.expand(5, 2), X.expand(4, 2), HW),
+    "no matches to draw": lambda: draw_matches(rig(), "alpha", {}, {}),
+    "no matches of beta to draw": lambda: draw_matches(rig(), "alpha", {"beta": (X[:0], X[:0])}, {}),
+    "no residuals to draw": lambda: draw_residuals(pair(), X[:0], X[:0]),
+    "robust least squares of no steps": lambda: robust_least_squares(
+        EYE, ZERO, ZERO, torch.ones_like, steps=0
+    ),
     "points of NaN": lambda: fit_homography(X.expand(5, 2) * math.nan, X.expand(5, 2)),
     "epipoles of a 3 x 4 matrix": lambda: epipoles(torch.zeros(3, 4)),
     "an image without its batch": lambda: sample(torch.rand(1, *HW), X[None]),
@@ -329,6 +349,9 @@ WRONG: dict[str, Callable[[], Any]] = {
     "consistent, no such camera": lambda: consistent_depth(rig(), {"alpha": torch.ones(HW)}, "gamma"),
     "resampled from a pair": lambda: resampled(IMAGE[0], pair(), pair()),
     "resampled with a batch": lambda: resampled(IMAGE, camera(), camera()),
+    "resampled from a batch of poses": lambda: resampled(IMAGE[0], batch_of_poses(), camera()),
+    "a pinhole view of a batch of poses": lambda: pinhole_view(batch_of_poses()),
+    "faces of a batch of poses": lambda: cube_faces(batch_of_poses()),
     "resampled an array": lambda: resampled(IMAGE[0].numpy(), camera(), camera()),
     "resampled, an image of another size": lambda: resampled(IMAGE[0, :, :8], camera(), camera()),
     "rectified to no size": lambda: rectify(pair(), hw=(0, 64)),
@@ -341,6 +364,9 @@ WRONG: dict[str, Callable[[], Any]] = {
         Pair(camera(), camera(cam_from_world=Pose(EYE, EYE[2] / 10)), None)
     ),
     "approximated without depth": lambda: approximated(rig(depth=None).pair("alpha", "beta")),
+    "approximated, a batch of poses": lambda: approximated(
+        posed(EYE, ASIDE.expand(2, 3)).pair("alpha", "beta")
+    ),
     "approximated F": lambda: approximated(Link(EYE)),
     "locations without a field": lambda: sampling_locations(None, pair(), X),
     "lazily, a name": lambda: lazily("epipolar", pair()),
@@ -351,6 +377,7 @@ WRONG: dict[str, Callable[[], Any]] = {
     "projected on another device": lambda: apply_homography(EYE, X.to("meta")),
     "projected NaN for a camera": lambda: camera().project(None),
     "focal lengths of three numbers": lambda: intrinsics((1.0, 2.0, 3.0), HW),
+    "focal lengths a matrix": lambda: intrinsics(torch.rand(2, 2), HW),
     "a focal length of text": lambda: intrinsics("wide", HW),
     "intrinsics of no size": lambda: intrinsics(60.0, (0, 64)),
     "a pose looking at itself": lambda: Pose.look_at(ZERO, ZERO),

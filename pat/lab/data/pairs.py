@@ -149,11 +149,11 @@ def middlebury_pairs(root: str | Path) -> Iterator[StereoPair]:
         scale), not the scene's own.
 
     Raises:
-        FileNotFoundError: for a missing folder; while pairs are read, for a missing right image or disparity.
+        FileNotFoundError: for a missing folder, right image or disparity.
         ValueError: for a folder without a pair; while pairs are read, for an image that cannot be.
     """
     root = _folder(root)
-    return (_read(root, files) for files in _some(_middlebury(root), root))
+    return (_read(root, files) for files in _some(_middlebury(root, "right", "ground_truth"), root))
 
 
 def folder_pairs(root: str | Path) -> Iterator[StereoPair]:
@@ -178,14 +178,14 @@ def pair_files(root: str | Path) -> list[PairFiles]:
 
     Returns:
         The files, sorted by the left image's path; as Middlebury's for a left image that both would read.
-        Whether Middlebury's other files exist is not checked.
+        Whether Middlebury's true disparities exist is not checked.
 
     Raises:
-        FileNotFoundError: for a missing folder.
+        FileNotFoundError: for a missing folder, or right image of Middlebury's.
         ValueError: for a folder without a pair.
     """
     root = _folder(root)
-    files = {pair.left: pair for pair in (*_named(root), *_middlebury(root))}
+    files = {pair.left: pair for pair in (*_named(root), *_middlebury(root, "right"))}
     return [files[left] for left in _some(sorted(files), root)]
 
 
@@ -202,14 +202,18 @@ def _some(items: list[T], root: Path) -> list[T]:
     return items
 
 
-def _middlebury(root: Path) -> list[PairFiles]:
-    """Pairs in folders of Middlebury's collections, in order."""
-    return sorted(
+def _middlebury(root: Path, *needed: str) -> list[PairFiles]:
+    """Pairs in folders of Middlebury's collections, in order; FileNotFoundError for a missing one."""
+    found = sorted(
         PairFiles(file, file.with_name(right), 255 / scale, file.with_name(ground_truth), scale)
         for key, (left, right, ground_truth, scale) in MIDDLEBURY.items()
         for file in files_below(root)
         if file.name == left and any(key in folder for folder in file.parts[-3:-1])
     )
+    for path in (getattr(files, name) for files in found for name in needed):
+        if not path.is_file():
+            raise FileNotFoundError(f"{path}: missing beside its left image: fetch the collection again")
+    return found
 
 
 def _named(root: Path) -> list[PairFiles]:

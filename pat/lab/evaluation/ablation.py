@@ -39,10 +39,12 @@ from arraygeom import (
     Rig,
     Segments,
     apply_homography,
+    pinhole_view,
     pixel_grid,
     rotation_from_vector,
 )
 from arraygeom.fields.default import natural_bounds
+from arraygeom.fields.ray_depth import rough_transfer
 from arraygeom.fields.straight import covering_displacement
 from arraygeom.pixels import HW, coarse_grid
 from arraygeom.runtime.atomic import write_text
@@ -50,7 +52,7 @@ from arraygeom.segments import clip_to_image
 
 from ...fusion.classical import classical
 from ...fusion.fuse import FuseSettings, fuse_frame
-from ...fusion.steps import resolution_ratio
+from ...fusion.steps import has_lens, resolution_ratio
 from ...fusion.views import dense_bytes
 from ...media.colour import luminance, srgb_image
 from ...media.depth_maps import at_distance
@@ -58,7 +60,7 @@ from ...media.figures import save_panels
 from ...networks.protocol import FusionNetwork
 from ...sensors import Clip, Noise, Quantise, record
 from ...support.metrics import bootstrap_interval, score
-from ..data.windows import scene_folders
+from ..data.windows import reading, scene_folders
 from ..synthesis.layered import LayeredScenes
 from ..synthesis.photos import PhotoBank
 from ..synthesis.rendered import Rendered
@@ -232,21 +234,27 @@ def disparity(network: FusionNetwork, pair: Pair) -> float:
         network: network that beta may be resized for.
 
     Returns:
-        Without lenses the largest displacement from H x, pixels of beta as the network receives it (resized
-        if it needs equal resolutions), 1 or more. With a lens the largest distance on beta's image from a
-        curve's near end, pixels of beta as recorded; 1 if no near end is on the image.
+        The largest displacement from H x, 1 or more, pixels of beta as the network receives it: of its
+        pinhole view if it has a lens, and resized if the network needs equal resolutions. Where a camera has
+        no pinhole view, the largest distance on beta's image from the middle of a pixel's curve.
 
     Raises:
         ValueError: for a pair that is not calibrated or has no depth range.
     """
+    if pair.has_lens and all(view.has_pinhole_view for view in pair.cameras):
+        alpha, beta = (pinhole_view(view) if has_lens(view) else view for view in pair.cameras)
+        pair = Pair(alpha, beta, pair.depth)
     if pair.has_lens:
         grid = coarse_grid(pair.alpha.hw).reshape(-1, 2).double()
         segments = Curved(bounds=natural_bounds(pair))(pair, grid)
-        reached = (segments.xy - segments.xy[:, :1]).norm(dim=-1)[segments.mask & segments.mask[:, :1]]
-        return float(reached.amax()) if len(reached) else 1.0
+        rough = rough_transfer(pair, grid)
+        reached = (segments.xy - rough.x[:, None]).norm(dim=-1)
+        far = float(torch.where(segments.mask & rough.valid[:, None], reached, 0.0).max())
+    else:
+        far = float(covering_displacement(pair))
     scale = resolution_ratio(pair)
     resized = network.equal_resolution and not 0.8 < scale < 1.25
-    return max(float(covering_displacement(pair)) / (scale if resized else 1.0), 1.0)
+    return max(far / (scale if resized else 1.0), 1.0)
 
 
 def layered_cases(
@@ -280,8 +288,8 @@ def rendered_cases(folder: Path, *, seed: int = 0) -> Iterator[AblationCase]:
 
     Returns:
         Iterator over the cases, read on demand, with noise drawn from `seed` for each, and a depth range 10 %
-        wider than alpha's finite depths. It raises what `Rendered` raises for a damaged scene, ValueError for
-        one camera, RuntimeError for a scene without finite depths.
+        wider than alpha's finite depths. It raises ValueError for a damaged scene, one camera, or a scene
+        without finite depths.
 
     Raises:
         FileNotFoundError: for a missing folder.
@@ -290,8 +298,11 @@ def rendered_cases(folder: Path, *, seed: int = 0) -> Iterator[AblationCase]:
 
     def case(path: Path) -> AblationCase:
         scene, g = Rendered(path), Generator().manual_seed(seed)
-        names = scene.rig.names[:2]
-        frames = [scene.frame(name) for name in names]
+        with reading(path):
+            names = scene.rig.names[:2]
+            frames = [scene.frame(name) for name in names]
+        if len(names) < 2:
+            raise ValueError(f"{path}: has one camera, and alpha and beta are needed")
         ground_truth, beta_image = (srgb_image(f.rgb) for f in frames)
         rig = Rig(dict(zip((ALPHA, BETA), (scene.rig[name] for name in names))))
         return _recorded(path.name, rig, ground_truth, beta_image, frames[0].depth, g)
@@ -304,6 +315,8 @@ def _recorded(
 ) -> AblationCase:
     """Case of two ideal images, with noise and a depth range 10 % wider than the scene's."""
     finite = depth[depth.isfinite()]
+    if not len(finite):
+        raise ValueError(f"{name}: alpha sees nothing, all its depths are infinite or unknown")
     images = recorded({ALPHA: luminance(ground_truth), BETA: beta_image}, g)
     rig = rig.replace(depth=(float(finite.min()) / 1.1, float(finite.max()) * 1.1))
     return AblationCase(name, rig, images, ground_truth, depth)
@@ -356,7 +369,8 @@ def ablate(
         ValueError, or dense positions would need more than `DENSE_LIMIT`, scores are NaN, with a note.
 
     Raises:
-        ValueError: for a case that is not calibrated, has no depth range, or is too small for SSIM.
+        ValueError: for no cases (nothing is written then), and for one that is not calibrated, has no depth
+            range, or is too small for SSIM.
         OSError: if a file cannot be written.
     """
     rows: list[AblationRow] = []
@@ -365,6 +379,8 @@ def ablate(
         result, images = _case(network, case, chosen)
         rows += result
         panels |= crops(case, images, result) if i < SHOWN else {}
+    if not rows:
+        raise ValueError("no scenes to compare on: give one or more")
     write_text(out / "ablation.md", markdown(rows))
     write_csv(out / "ablation.csv", AblationRow._fields, rows)
     save_panels(panels, out / "ablation.png", columns=6)

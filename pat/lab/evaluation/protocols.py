@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
 from arraygeom import Camera, Pose, Rectified, Rig, intrinsics
+from arraygeom.checks import check_above
 from arraygeom.pixels import HW
 
 from ...fusion.classical import classical_fusion
@@ -54,8 +55,7 @@ def mono_colour_task(pair: StereoPair, rate: int) -> MonoColourTask:
         rate: factor by which beta is smaller than alpha, 1 or more.
 
     Raises:
-        ValueError: if an image is grey, and for images of unequal sizes.
-        RuntimeError: for images smaller than `rate`.
+        ValueError: if an image is grey, and for images of unequal sizes or smaller than `rate`.
     """
     if pair.left.shape[0] != 3 or pair.right.shape[0] != 3:
         raise ValueError(f"{pair.name}: the mono + colour protocol needs colour images, and these are grey")
@@ -63,6 +63,10 @@ def mono_colour_task(pair: StereoPair, rate: int) -> MonoColourTask:
         raise ValueError(
             f"{pair.name}: left is {tuple(pair.left.shape[1:])} and right {tuple(pair.right.shape[1:])}: "
             "the mono + colour protocol needs equal sizes"
+        )
+    if min(pair.left.shape[1:]) < rate:
+        raise ValueError(
+            f"{pair.name}: images of {tuple(pair.left.shape[1:])} are smaller than {rate} pixels"
         )
     ground_truth, right = (cut_to_multiple(image, rate) for image in (pair.left, pair.right))
     disparity = pair.disparity and Disparity(*(cut_to_multiple(plane, rate) for plane in pair.disparity))
@@ -164,9 +168,9 @@ def rectified_rig(hw: HW, betas: Mapping[str, HW], max_disparity: float) -> Rig:
         The rig; its first camera is called "alpha".
 
     Raises:
-        ValueError: for a `max_disparity` that is negative, infinite or NaN.
-        ZeroDivisionError: for a `max_disparity` of 0.
+        ValueError: for a `max_disparity` that is not above 0, or infinite.
     """
+    check_above(0, itself=False, max_disparity=max_disparity)
     alpha = Camera(K=intrinsics(float(hw[1]), hw), cam_from_world=Pose.identity(), hw=hw)
     right = alpha.replace(cam_from_world=Pose(alpha.R, alpha.t.new_tensor([-1.0, 0.0, 0.0])))
     cameras = {"alpha": alpha} | {name: right.resize(size) for name, size in betas.items()}

@@ -78,10 +78,12 @@ def rectified(rig: Rig, images: Mapping[str, Tensor]) -> Warped:
         The rectified pair; images clipped to 0..1.
 
     Raises:
-        ValueError: as `whole_alpha`; for fewer than two cameras, and no depth range.
-        KeyError: if an image is missing.
+        ValueError: as `whole_alpha`; for fewer than two cameras or images of them, and no depth range.
     """
-    first, second = rig.names[:2]
+    named = [name for name in rig.names[:2] if name in images]
+    if len(named) < 2:
+        raise ValueError(f"two cameras are rectified, with their images: got those of {named}")
+    first, second = named
     pair = rig.pair(first, second)
     plane = whole_alpha(pair)
     views = (first, plane.H_alpha), (second, plane.H_beta)

@@ -162,12 +162,13 @@ def depth_between(
     Args:
         depth: depth of the pixels, metres; infinite where nothing is hit, as which NaN counts.
         index: object index of each pixel.
-        x: positions (x, y) in the image, pixels; outside it results mean nothing.
+        x: positions (x, y), pixels.
         uneven: relative deviation of inverse depth from its neighbours' mean that counts as a step or crease.
 
     Returns:
-        Depth (n), infinite between infinite depths; and True where the four pixels around are one object, or
-        all hit nothing, without step or crease: elsewhere the depth may lie between two surfaces.
+        Depth (n), infinite between infinite depths; and True on the image where the four pixels around are
+        one object, or all hit nothing, without step or crease: elsewhere the depth may lie between two
+        surfaces, and off the image it is infinite.
     """
     inverse = torch.where(depth.isfinite(), 1 / depth, 0.0).to(x)
     layers = torch.stack([inverse, index.to(x), *(b.to(x) for b in _creases(inverse, uneven))])[None]
@@ -176,7 +177,8 @@ def depth_between(
     q, around, across, down = corners.unbind(0)
     flat = (across[0::2] * across[1::2] == 0).all(0) & (down[:2] * down[2:] == 0).all(0)
     clean = (around == around[:1]).all(0) & flat & ((q > 0) == (q[:1] > 0)).all(0)
-    return 1 / sample(layers[:, :1], x[None]).values[0, 0], clean
+    between, inside = sample(layers[:, :1], x[None])
+    return 1 / between[0, 0], clean & inside[0]
 
 
 def _creases(inverse: Float[Tensor, "h w"], uneven: float) -> tuple[Bool[Tensor, "h w"], Bool[Tensor, "h w"]]:

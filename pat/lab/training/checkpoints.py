@@ -67,7 +67,7 @@ def restore(checkpoint: Checkpoint, network: nn.Module, optimiser: Optimizer, av
     """Restore the state of a run into network, optimiser and average, in place.
 
     Raises:
-        ValueError: if the checkpoint is of another network (nothing is changed then) or optimiser.
+        ValueError: if the checkpoint is of another network or optimiser; nothing is changed then.
     """
     parts: dict[str, dict[str, Tensor]] = {"network": {}, "average": {}, "optimiser": {}}
     for name, tensor in checkpoint.tensors.items():
@@ -76,9 +76,10 @@ def restore(checkpoint: Checkpoint, network: nn.Module, optimiser: Optimizer, av
     wrong = misfit(network, parts["network"]) or misfit(average, parts["average"])
     if wrong:
         raise ValueError(f"the checkpoint is of another network ({wrong}): give its recipe, or another --out")
+    state = _state(parts["optimiser"], optimiser)
     network.load_state_dict(parts["network"])
     average.load_state_dict(parts["average"])
-    optimiser.load_state_dict(optimiser.state_dict() | {"state": _state(parts["optimiser"], optimiser)})
+    optimiser.load_state_dict(optimiser.state_dict() | {"state": state})
 
 
 def _state(tensors: Mapping[str, Tensor], optimiser: Optimizer) -> dict[int, dict[str, Tensor]]:

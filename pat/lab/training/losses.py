@@ -66,14 +66,19 @@ def validation(network: FusionNetwork, samples: list[Sample]) -> dict[str, float
     """Measure a network on validation samples, matches by the first beta of each.
 
     Args:
-        samples: groups of samples, at least one.
+        samples: groups of samples.
 
     Returns:
         By name: "psnr" of images clipped to 0..1, in dB, the mean over samples, each at most 80; "matched",
         the share of visible pixels whose match is within 1.5 pixels of beta (NaN without truth); and "peaks",
         the share whose largest weight is within one pixel, only for networks that are `Comparing` and fields
         of segments.
+
+    Raises:
+        ValueError: for no samples.
     """
+    if not samples:
+        raise ValueError("no samples to validate on: give one group or more")
     psnr, near, peaks = [], [], []
     for sample in samples:
         fused, compared = _compared(network, sample)

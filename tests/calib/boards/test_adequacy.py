@@ -293,6 +293,18 @@ def test_what_is_wrong_with_the_folder_is_on_the_page_until_it_is_mended(tmp_pat
     assert "too few images" in pages[2]
 
 
+def test_an_image_that_goes_before_it_is_read_does_not_end_the_guidance(tmp_path, monkeypatch):
+    simulate_photos(SMALL, BOARD, tmp_path / "photos", count=1)
+    page, turns = tmp_path / "page.html", iter((False, False, True))
+
+    def gone(*_):
+        raise FileNotFoundError("000.png: renamed")
+
+    monkeypatch.setattr("calib.boards.run.detected", gone)
+    watch(tmp_path / "photos", BOARD, page, interval=0.0, finished=lambda: next(turns))
+    assert "000.png" in page.read_text()
+
+
 def test_notes_of_several_cameras_are_one():
     notes = ["a: no points: here", "b: no points: here", "held to the start", "b: bent", "a: no points: here"]
     assert by_cameras(notes) == ["a, b: no points: here", "held to the start", "b: bent"]

@@ -11,7 +11,7 @@ from calib.boards.board import marker_dictionary
 from calib.boards.detect import detect, explain
 from calib.boards.rig import calibrate
 from calib.boards.simulation import printed
-from calib.boards.target import parse_board
+from calib.boards.target import parse_board, parse_boards
 from tests.calib.board_scenes import errors_of, four_cameras, see
 
 
@@ -60,6 +60,12 @@ def test_one_image_of_a_room_is_enough(room):
     assert np.abs(errors).max() < 4
     assert float((found.rig["colour"].centre - rig["colour"].centre).norm()) < 0.01
     assert found.rig["mono"].K[0, 0] == pytest.approx(1150, rel=0.01)
+
+
+def test_a_room_beside_a_board_is_no_plane(room):
+    board = "charuco:5x7:40mm:30mm:5x5"
+    assert not parse_boards([room.file, board]).flat
+    assert parse_boards([board, "charuco:5x7:40mm:30mm:4x4"]).flat
 
 
 def test_nobody_is_told_to_tilt_a_room(room):

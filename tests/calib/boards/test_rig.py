@@ -398,3 +398,14 @@ def test_small_boards_around_the_centre_do_not_lead_the_start_astray(shared_data
 def test_without_views_there_is_nothing_to_calibrate():
     with pytest.raises(ValueError, match="views"):
         calibrate({}, parse_board("chessboard:9x6:25mm"))
+
+
+def test_points_on_a_line_have_no_pose():
+    camera = four_cameras()["mono"]
+    row = np.arange(BOARD.columns)
+    x = camera.project_local(torch.from_numpy(BOARD.points[row]) + torch.tensor([0.0, 0, 1.5])).x.numpy()
+    with pytest.raises(ValueError, match="line"):
+        intrinsics.board_pose(camera, Detection(row, x), BOARD)
+    views = BoardViews(camera.hw, dict.fromkeys(range(3), Detection(row, x)))
+    with pytest.raises(ValueError, match=r"^mono: "):
+        intrinsics.initial_camera("mono", views, BOARD, "kannala-brandt")

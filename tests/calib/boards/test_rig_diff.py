@@ -254,3 +254,9 @@ def test_cameras_that_look_away_from_each_other_have_no_depths(rig):
     assert found.depths == {}
     assert "depth by" not in found.as_text()
     assert len(draw_difference(found).axes) == 8
+
+
+@pytest.mark.parametrize("depth", [(0.0, 4.0), (4.0, 1.0)])
+def test_depths_that_are_no_range_are_refused(rig, depth):
+    with pytest.raises(ValueError, match="near"):
+        rig_difference(rig, rig, depth=depth)

@@ -2,6 +2,7 @@
 
 import re
 import shutil
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -14,6 +15,7 @@ from calib.boards.detect import BoardViews
 from calib.boards.poses import StartDeviations, start_prior
 from calib.boards.rig import calibrate
 from calib.boards.simulation import photograph
+from calib.boards.validation import start_notes
 from calib.images.matches import match_cameras
 from calib.images.residuals import line_distances
 from experiments.alignment import nine_band_calibration
@@ -109,6 +111,12 @@ def test_what_one_board_leaves_open_is_said():
     assert focal[1] < 0.5 * focal[0]
     assert centre[1] < centre[0] == pytest.approx(6.4)
     assert 0.6 < position[1] <= position[0] == 1.0
+
+
+def test_without_a_covariance_no_gain_is_said():
+    fit = replace(calibrated(four()).fit, covariance=None)
+    notes = list(start_notes(fit.views, fit, STATED, dict.fromkeys(fit.views, "none")))
+    assert not any("positions" in note for note in notes)
 
 
 def test_a_wrong_start_is_named():

@@ -52,6 +52,7 @@ def test_points_are_numbered_as_opencv_numbers_them():
         ("charuco:8x6:30mm:30mm", "30mm"),
         ("charuco:8x6:30mm:9x9", "'9x9'"),
         ("charuco:40x40:30mm:4x4_50", "800 markers"),
+        ("charuco:8x6:30mm:30mm", "charuco:8x6:30mm:30mm"),
         ("charuco:8x6:30mm:22mm:blue", "'blue'"),
         ("charuco:8x6:30mm:22mm:blue", "charuco:8x6:30mm:22mm:4x4_50 (squares, markers, dictionary)"),
         ("charuco:8x6:30mm:22mm:20mm", "'22mm' and '20mm' say the same: give one"),
@@ -132,3 +133,9 @@ def test_legacy_boards_differ():
 def test_the_figure_is_as_large_as_the_board():
     board = parse_board("chessboard:9x6:25mm")
     assert draw_board(board).get_size_inches() * 25.4 == pytest.approx([274, 213])
+
+
+@pytest.mark.parametrize("marker", [0.0, 0.03, 0.05])
+def test_markers_that_do_not_fit_are_refused(marker):
+    with pytest.raises(ValueError, match="charuco"):
+        Charuco(7, 5, 0.03, "4x4_50", range(24), marker=marker)

@@ -5,7 +5,7 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 
-from pat.media.figures import GAP, TITLE, draw_panels, save_figure
+from pat.media.figures import GAP, TITLE, colour_depth, draw_panels, save_figure
 
 
 @pytest.mark.parametrize("factor", [0.5, 4.0], ids=["reduced", "enlarged"])
@@ -42,3 +42,11 @@ def test_a_figure_of_no_format_is_refused_and_leaves_nothing(name, tmp_path):
     with pytest.raises(ValueError, match=name):
         save_figure(Figure(), tmp_path / name)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_depth_of_zero_is_unknown_and_changes_no_colour():
+    depth = torch.linspace(1.0, 5.0, 200).reshape(10, 20)
+    unknown = torch.zeros_like(depth, dtype=torch.bool)
+    unknown[:3] = True
+    coloured, wanted = (colour_depth(torch.where(unknown, gap, depth)) for gap in (0.0, torch.nan))
+    assert torch.equal(coloured, wanted)

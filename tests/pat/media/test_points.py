@@ -12,7 +12,7 @@ def test_points_are_the_pixels_of_known_depth_in_the_camera_frame(tmp_path):
     pose = Pose(torch.eye(3).double(), torch.tensor([1.0, 2.0, 3.0]).double())
     camera = Camera(K=intrinsics(100.0, (3, 4), (1.0, 1.0)), cam_from_world=pose, hw=(3, 4))
     depth = torch.full((3, 4), torch.nan)
-    depth[1, 1], depth[2, 3] = 5.0, 2.0
+    depth[1, 1], depth[2, 3], depth[0, 0] = 5.0, 2.0, 0.0
     image = torch.zeros(3, 3, 4)
     image[:, 2, 3] = torch.tensor([1.0, 0.5, 0.0])
     assert write_points(tmp_path / "p.ply", camera, depth, image) == 2

@@ -173,3 +173,8 @@ def test_a_mosaic_makes_little_false_colour():
     plain = cv2.demosaicing(whole, cv2.COLOR_BayerRGGB2RGB_EA).transpose(2, 0, 1) / 65535
     of_plain, ours = (np.abs(rgb - rgb[1:2]).mean() for rgb in (plain, demosaiced(raw, "RGGB").numpy()))
     assert ours < 0.7 * of_plain
+
+
+def test_a_pattern_by_opencvs_two_letters_is_refused():
+    with pytest.raises(ValueError, match="'BG'"):
+        demosaiced(light(channels=1), "BG")

@@ -110,19 +110,19 @@ def _gentlest(inverse: Float[Tensor, "h w"], dim: int) -> Float[Tensor, "h w"]:
 def lens_for(camera: View, name: str) -> Lens:
     """Make the lens of a rig's camera.
 
-    Rays of a lens model that is not central are taken to start at the camera's centre.
-
     Returns:
         The lens, float64 on the CPU.
 
     Raises:
         ValueError: naming the camera, if it is not calibrated, batched, skewed or mirrored, or its lens is
-            invalid or too wide for a plane image.
+            not central, invalid, or too wide for a plane image.
     """
     if not isinstance(camera, Camera):
         raise ValueError(f"camera '{name}' is not calibrated: rendering needs its K, R and t")
-    if camera.K.ndim != 2:
-        raise ValueError(f"camera '{name}' is batched {tuple(camera.K.shape[:-2])}: render one rig at a time")
+    if camera.batch_shape:
+        raise ValueError(f"camera '{name}' is batched {tuple(camera.batch_shape)}: render one rig at a time")
+    if not camera.central:
+        raise ValueError(f"camera '{name}' has rays that do not meet in a point: render a central lens")
     camera = camera.to(dtype=torch.float64, device="cpu")
     upright = _upright(camera, name)
     return Lens(upright, None, None) if camera.distortion is None else _wide(camera, upright, name)

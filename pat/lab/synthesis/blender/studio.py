@@ -48,13 +48,13 @@ class Studio:
 
     def __init__(self, scene: Scene, settings: RenderSettings, scratch: Path):
         self.scene, self.settings, self.path = scene, settings, scratch / "layers.exr"
+        shapes = [mesh(thing)._asdict() for thing in scene.objects]
+        meshes = [{name: values.tolist() for name, values in shape.items()} for shape in shapes]
+        entries = to_document(scene, defaults=True), to_document(settings, defaults=True)
         command = [blender_python(), "-I", "-B", "-c", _SERVE, str(Path(__file__).parent)]
         self.errors, pipe = scratch / "errors.txt", subprocess.PIPE
         with self.errors.open("w") as errors:
             self.process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=errors, text=True)
-        shapes = [mesh(thing)._asdict() for thing in scene.objects]
-        meshes = [{name: values.tolist() for name, values in shape.items()} for shape in shapes]
-        entries = to_document(scene, defaults=True), to_document(settings, defaults=True)
         try:
             self.version = self._ask(scene=entries[0], settings=entries[1], meshes=meshes)["version"]
         except BaseException:

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from pat.lab.data import folder_pairs, middlebury_pairs
-from pat.lab.data.pairs import Disparity
+from pat.lab.data.pairs import Disparity, pair_files
 from pat.media.images import write_image
 
 READERS = [middlebury_pairs, folder_pairs]
@@ -53,6 +53,18 @@ def test_middlebury_disparities_are_scaled_by_the_collection(tmp_path):
     torch.testing.assert_close(pair.disparity.value, torch.tensor([[0.0, 10.0, 85.0]]))
     assert pair.disparity.valid.tolist() == [[False, True, True]]
     assert pair.max_disparity == 85
+
+
+def test_a_file_that_is_missing_is_said_at_once(tmp_path):
+    folder = tmp_path / "2006_third" / "Cloth"
+    write(folder / "view1.png")
+    for reader in (middlebury_pairs, pair_files):
+        with pytest.raises(FileNotFoundError, match=r"view5\.png"):
+            reader(tmp_path)
+    write(folder / "view5.png")
+    assert len(pair_files(tmp_path)) == 1
+    with pytest.raises(FileNotFoundError, match=r"disp1\.png"):
+        middlebury_pairs(tmp_path)
 
 
 def test_true_disparity_takes_left_to_right(shared_data):

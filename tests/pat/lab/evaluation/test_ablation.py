@@ -7,6 +7,7 @@ import math
 import pytest
 import torch
 
+from arraygeom import Distortion, Pair, Rig
 from pat.fusion.classical import classical
 from pat.lab.evaluation.ablation import (
     ALPHA,
@@ -14,6 +15,7 @@ from pat.lab.evaluation.ablation import (
     AblationRow,
     ablate,
     crops,
+    disparity,
     families,
     layered_cases,
     markdown,
@@ -97,6 +99,12 @@ def test_unsupported_families_are_named_and_the_rest_is_ordered(case, tmp_path):
     assert read_image(tmp_path / "ablation.png").shape[0] == 3
 
 
+def test_no_scenes_are_refused_and_leave_nothing(tmp_path):
+    with pytest.raises(ValueError, match="scenes"):
+        ablate(PAT(PATConfig()), [], {}, out=tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
 def test_the_papers_network_supports_every_family(tmp_path):
     case = next(layered_cases(1, hw=(32, 48), seed=1))
     chosen = {name: families()[name] for name in ("calibrated", "nearest voxels", "local 5x5", "dense")}
@@ -137,6 +145,16 @@ def test_a_figure_that_is_missing_empties_no_column():
     assert "nan" not in markdown(rows[:2])
 
 
+@pytest.mark.parametrize(("k1", "off"), [(1e-7, 0.01), (-0.2, 0.2)])
+@pytest.mark.parametrize("equal_resolution", [False, True])
+def test_a_lens_changes_the_largest_displacement_little(case, k1, off, equal_resolution):
+    network = PAT(PATConfig(equal_resolution=equal_resolution))
+    pair = case.rig.pair(ALPHA, BETA)
+    lens = Distortion("brown-conrady", torch.tensor([k1, 0.0, 0.0, 0.0], dtype=torch.float64))
+    bent = Pair(*(camera.replace(distortion=lens) for camera in pair.cameras), pair.depth)
+    assert disparity(network, bent) == pytest.approx(disparity(network, pair), rel=off)
+
+
 def test_what_was_not_fused_is_not_in_the_picture(case):
     rows = [AblationRow("a", 1.2, "calibrated", 30.0, 0.9), AblationRow("a", 1.2, "other", note="cannot")]
     found = crops(case, {"calibrated": case.ground_truth}, rows)
@@ -169,6 +187,16 @@ def test_rendered_folders(tmp_path, case):
     assert (read.ground_truth - case.ground_truth).abs().max() < 2e-3
     assert read.ratio == pytest.approx(case.ratio)
     assert torch.equal(read.depth, case.depth)
+    nothing = RenderedFrame(time=0.0, rgb=linear, depth=torch.full_like(case.depth, torch.inf), index=index)
+    save_frame(folder / f"{ALPHA}.npz", nothing)
+    with pytest.raises(ValueError, match="one: "):
+        next(rendered_cases(tmp_path))
+    (folder / f"{ALPHA}.npz").write_bytes(b"PK")
+    with pytest.raises(ValueError, match="one: "):
+        next(rendered_cases(tmp_path))
+    Rig({BETA: case.rig[BETA]}).save(folder / "rig.yaml")
+    with pytest.raises(ValueError, match="one: "):
+        next(rendered_cases(tmp_path))
     (tmp_path / "scenes" / "two").mkdir()
     with pytest.raises(ValueError, match=r"two.*render.json"):
         rendered_cases(tmp_path)

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from pat.lab.data import StereoPair
-from pat.lab.evaluation.protocols import mono_colour_task
+from pat.lab.evaluation.protocols import mono_colour_task, rectified_rig
 from pat.media.colour import luminance
 
 
@@ -16,8 +16,18 @@ def test_a_task_is_grey_alpha_small_colour_beta_and_colour_ground_truth():
 
 
 @pytest.mark.parametrize(
-    ("left", "right", "complaint"), [((1, 8, 8), (1, 8, 8), "colour"), ((3, 8, 8), (3, 8, 9), "equal")]
+    ("left", "right", "complaint"),
+    [
+        ((1, 8, 8), (1, 8, 8), "colour"),
+        ((3, 8, 8), (3, 8, 9), "equal"),
+        ((3, 1, 8), (3, 1, 8), r"\(1, 8\)"),
+    ],
 )
 def test_pairs_that_cannot_serve_are_named(left, right, complaint):
     with pytest.raises(ValueError, match=f"tools: .*{complaint}"):
         mono_colour_task(StereoPair("tools", torch.rand(left), torch.rand(right)), 2)
+
+
+def test_a_rig_without_disparity_is_refused():
+    with pytest.raises(ValueError, match="max_disparity"):
+        rectified_rig((8, 8), {"beta": (8, 8)}, 0)

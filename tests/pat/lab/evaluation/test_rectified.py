@@ -56,3 +56,9 @@ def test_positions_are_those_of_beta_as_recorded(ratio):
 def test_a_camera_nearly_ahead_is_refused(degrees):
     with pytest.raises(ValueError, match="baseline"):
         level(point("ahead", degrees, hw=HW).rig)
+
+
+def test_an_image_that_is_missing_is_said():
+    rig = point("focal ratio", 1, hw=HW).rig
+    with pytest.raises(ValueError, match=ALPHA):
+        rectified(rig, {ALPHA: torch.zeros(3, *HW)})

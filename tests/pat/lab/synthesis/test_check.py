@@ -7,7 +7,7 @@ from arraygeom.camera import Camera, intrinsics
 from arraygeom.pixels import pixel_grid
 from arraygeom.rig import Rig
 from pat.lab.synthesis.check import CheckLimits, _chosen, check_views
-from pat.lab.synthesis.rendered import RenderedFrame
+from pat.lab.synthesis.rendered import RenderedFrame, depth_between
 from tests.pat.lab.synthesis.scenes import LENS, posed
 
 HW = (60, 80)
@@ -114,3 +114,9 @@ def test_no_more_pixels_than_stated_are_checked(frames):
     frame = dataclasses.replace(frames["a"], depth=torch.ones(HW))
     for most in (HW[0] * HW[1], 3000, 2400, 7):
         assert most / 2 < len(_chosen(frame, most)[0]) <= most
+
+
+def test_depth_between_pixels_is_that_of_the_image_alone():
+    x = torch.tensor([[1.5, 1.5], [3.3, 1.0], [3.7, 1.0], [-5.0, 1.0], [1.0, 40.0]])
+    depth, clean = depth_between(torch.full((4, 4), 2.0), torch.ones(4, 4, dtype=torch.long), x)
+    assert depth[clean].tolist() == [2.0]

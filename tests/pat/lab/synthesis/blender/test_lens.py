@@ -5,7 +5,9 @@ import torch
 
 from arraygeom.camera import View, intrinsics
 from arraygeom.distortion import KANNALA_BRANDT, Distortion
+from arraygeom.lenses import Orthographic
 from arraygeom.pixels import pixel_grid
+from arraygeom.pose import Pose
 from pat.lab.synthesis.blender.lens import lens_for
 from tests.pat.lab.synthesis.scenes import unlike_cameras
 
@@ -83,6 +85,11 @@ def test_what_the_lens_cannot_see_is_marked():
         (RIG["oblong"].replace(K=RIG["oblong"].K * torch.tensor([[-1.0], [1], [1]])), "mirrors"),
         (View(hw=(48, 64)), "calibrated"),
         (RIG["distorted"].replace(K=RIG["distorted"].K[None]), "batched"),
+        (
+            RIG["oblong"].replace(cam_from_world=Pose(torch.eye(3).expand(2, 3, 3), torch.zeros(2, 3))),
+            "batched",
+        ),
+        (RIG["oblong"].replace(distortion=Orthographic()), "meet"),
         (
             RIG["distorted"].replace(
                 K=intrinsics(20.0, (48, 64)), distortion=Distortion(KANNALA_BRANDT, torch.zeros(4).double())

@@ -10,7 +10,7 @@ import torch
 
 from arraygeom.camera import Camera, intrinsics
 from arraygeom.rig import Rig
-from pat.lab.synthesis.blender import RenderSettings, environment, render, task
+from pat.lab.synthesis.blender import RenderSettings, environment, render, studio, task
 from pat.lab.synthesis.blender.child import compat
 from pat.lab.synthesis.blender.settings import PRESETS
 from tests.pat.lab.synthesis.scenes import posed, room_scene, unlike_cameras
@@ -31,6 +31,17 @@ def test_skew_is_refused_before_blender_starts(tmp_path):
     with pytest.raises(ValueError, match=r"'oblong' .*skew"):
         render(room_scene(), RIG.with_camera("oblong", skewed), tmp_path / "x", settings=SETTINGS)
     assert "bpy" not in sys.modules
+
+
+def test_a_scene_without_a_mesh_is_refused_before_blender_starts(monkeypatch, tmp_path):
+    def unknown(thing):
+        raise KeyError("torus")
+
+    monkeypatch.setattr(studio, "mesh", unknown)
+    monkeypatch.setattr(studio, "blender_python", lambda: "python")
+    monkeypatch.setattr(subprocess, "Popen", lambda *_, **__: pytest.fail("started"))
+    with pytest.raises(KeyError, match="torus"):
+        studio.Studio(room_scene(), SETTINGS, tmp_path)
 
 
 def test_a_folder_that_exists_is_refused(tmp_path):
