@@ -99,7 +99,7 @@ def unit(ray: Tensor) -> Tensor:
 
 
 def on_plane(X: Tensor) -> tuple[Tensor, Tensor]:
-    """Intersect rays (*n, 3) with the plane z = 1: points (*n, 2), and True for rays ahead (z > 0)."""
+    """Compute points (*n, 2) of rays (*n, 3) on the plane z = 1, and True for rays ahead (z > 0)."""
     ahead = X[..., 2] > 0
     return X[..., :2] / torch.where(ahead, X[..., 2], 1.0)[..., None], ahead
 

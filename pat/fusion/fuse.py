@@ -326,7 +326,7 @@ def _given(kind: type[T], value: T) -> T:
 
 
 def matches_by(matcher: Matcher, inputs: Inputs) -> Matches:
-    """Match inputs by a matcher, and check its result.
+    """Return the matches of inputs by a matcher, checked.
 
     Raises:
         TypeError: for a result of another type.

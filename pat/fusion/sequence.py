@@ -134,7 +134,7 @@ class SequenceFusion:
         return self.recorded(i) if self.settings.keep_alpha else self.grey(i)
 
     def alone(self, i: int) -> Frame:
-        """Fuse a frame alone with the betas nearest in time, for comparison with warping."""
+        """Return a frame fused alone with the betas nearest in time, for comparison with warping."""
         return self._fused(i, self.timeline.at(i), {}, alone=True)
 
     def colour(self, key: KeyFrame) -> KeyColour:

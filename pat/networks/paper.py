@@ -82,10 +82,13 @@ class PAT(nn.Module):
         return self.compare(inputs)[0]
 
     def compare(self, inputs: Inputs) -> tuple[FusionOutput, list[Compared]]:
-        """Fuse as `forward` (and raise as it), and keep the features that attention compares in each beta.
+        """Fuse as `forward`, and keep the features that attention compares in each beta.
 
         Returns:
             The output of `forward`, and the compared features of each beta.
+
+        Raises:
+            ValueError: as `forward`.
         """
         if len(inputs.betas) != self.config.betas:
             asked = f"this PAT is made for {self.config.betas} betas, got {len(inputs.betas)}"

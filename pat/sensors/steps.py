@@ -238,7 +238,10 @@ def _separably(image: Tensor, kernel: Tensor) -> Tensor:
 
 
 def convolved(image: Tensor, kernel: Tensor) -> Tensor:
-    """Convolve each channel with a kernel (kh, kw) of odd sides (others fail); the border is replicated."""
+    """Return the image, each channel convolved with a kernel (kh, kw) of odd sides (others fail).
+
+    The border is replicated.
+    """
     h, w = kernel.shape
     planes = pad(image.flatten(0, 1)[:, None], (w // 2, w // 2, h // 2, h // 2), mode="replicate")
     return conv2d(planes, kernel[None, None]).view(image.shape)
