@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -83,13 +83,7 @@ class Curved:
         curve = RayCurve.from_pixels(pair, near, far, x, self.bounds)
         if curve.compilable and curve.valid.numel() > FEW:
             return curve.positions(self.nodes, self.samples)
-        fractions = curve.nodes(self.nodes)
-        nodes, visible = curve.at(fractions)
-        pieces = visible_pieces(nodes, visible & curve.valid[..., None], pair.beta.hw, curve.turn)
-        xy, visible = curve.at(along_pieces(pieces, sample_fractions(self.samples, like=x), fractions))
-        xy, inside = _onto_edge(xy, pair.beta.hw, EDGE)
-        mask = inside & visible & (pieces.length.sum(-1, keepdim=True) > 0)
-        return Positions(torch.where(mask[..., None], xy, 0.0), mask)
+        return curve.formulas(self.nodes, self.samples)
 
 
 FEW = 16
@@ -286,49 +280,51 @@ class RayCurve(NamedTuple):
 
     @property
     def compilable(self) -> bool:
-        """True if a compiled loop can follow the curve: on the CPU, of one pair, without gradients."""
+        """True if compiled loops can follow the curve, and its gradients: on the CPU, of one pair."""
         lens = self.beta.distortion
-        numbers = [self.first, self.last, self.beta.K, *([] if lens is None else [lens.coefficients])]
-        free = torch.is_grad_enabled() and any(t.requires_grad for t in numbers)
         lens_compiled = lens is None or (
             isinstance(lens, Distortion)
             and lens.model in COMPILED_LENSES
             and lens.coefficients.shape[-1] < 14
         )
-        return not free and lens_compiled and not self.beta.batch_shape and compilable(self.first)
+        return lens_compiled and not self.beta.batch_shape and compilable(self.first)
 
     def positions(self, nodes: int, samples: int) -> Positions:
-        """Compute the positions of `Curved` by a compiled loop in float64; the curve must be `compilable`.
+        """Compute the positions of `Curved` by compiled loops in float64; the curve must be `compilable`.
 
         Args:
             nodes: number of points at which each curve is followed.
             samples: number of positions per pixel.
 
         Returns:
-            Positions (*n, samples, 2) in beta's pixels, in the precision of `first`, without gradient.
+            Positions (*n, samples, 2) in beta's pixels, in the precision of `first`; differentiable, twice.
 
         Raises:
             ValueError: for fewer than 1 sample.
         """
-        from .curve_kernels import curved_positions
+        return Positions(*_Followed.apply(*self.numbers, self, nodes, samples))
 
-        like, n = self.first, self.valid.numel()
-        xy = np.empty((n, samples, 2), f"f{like.dtype.itemsize}")
-        mask = np.empty((n, samples), bool)
-        ends = (t.detach().double().reshape(n, 3).contiguous().numpy() for t in (self.first, self.last))
-        double = like.new_empty(0, dtype=torch.float64)
-        fractions = (torch.linspace(0, 1, nodes, dtype=torch.float64), sample_fractions(samples, like=double))
-        given = (
-            *ends,
-            self.valid.reshape(n).contiguous().numpy(),
-            LensNumbers.from_camera(self.beta, wide=bool(self.wide)),
-        )
-        rest = (*(t.numpy() for t in fractions), self.beta.hw, xy, mask)
-        in_parallel([partial(curved_positions, *span, *given, *rest) for span in spans(n, PIECE)])
-        axes = self.valid.shape
-        return Positions(
-            torch.from_numpy(xy).reshape(*axes, samples, 2), torch.from_numpy(mask).reshape(*axes, samples)
-        )
+    def formulas(self, nodes: int, samples: int) -> Positions:
+        """Compute the positions of `Curved` by torch, as `positions` does by compiled loops."""
+        fractions = self.nodes(nodes)
+        xy, visible = self.at(fractions)
+        pieces = visible_pieces(xy, visible & self.valid[..., None], self.beta.hw, self.turn)
+        xy, visible = self.at(along_pieces(pieces, sample_fractions(samples, like=xy), fractions))
+        xy, inside = _onto_edge(xy, self.beta.hw, EDGE)
+        mask = inside & visible & (pieces.length.sum(-1, keepdim=True) > 0)
+        return Positions(torch.where(mask[..., None], xy, 0.0), mask)
+
+    @property
+    def numbers(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Both ends, beta's intrinsics, and its lens's coefficients, none without a lens."""
+        lens = self.beta.distortion
+        return self.first, self.last, self.beta.K, self.beta.K[0, :0] if lens is None else lens.coefficients
+
+    def with_numbers(self, first: Tensor, last: Tensor, K: Tensor, coefficients: Tensor) -> RayCurve:
+        """Return the same curve with other `numbers`."""
+        lens = self.beta.distortion
+        lens = lens.with_coefficients(coefficients) if isinstance(lens, Distortion) else lens
+        return self._replace(first=first, last=last, beta=self.beta.replace(K=K, distortion=lens))
 
     def nodes(self, count: int) -> Float[Tensor, "*n k"]:
         """Compute the fractions of the way from `first` to `last`, 0..1, at which to follow the curve.
@@ -454,6 +450,61 @@ class RayCurve(NamedTuple):
             X.square().sum(-1, keepdim=True).clamp(min=FRONT**2).sqrt() for X in (self.first, self.last)
         )
         return (1 - u) * torch.sinc((1 - u) * angle / math.pi) * r1, u * torch.sinc(u * angle / math.pi) * r0
+
+
+class _Followed(torch.autograd.Function):
+    """Positions and mask by compiled loops, with gradients by a loop too; theirs are by the formulas."""
+
+    @staticmethod
+    def forward(ctx, first, last, K, coefficients, curve, nodes, samples):
+        from .curve_kernels import curved_positions
+
+        xy = np.empty((curve.valid.numel(), samples, 2), f"f{first.dtype.itemsize}")
+        mask = np.empty(xy.shape[:2], bool)
+        given = _loop_inputs(curve, nodes, samples)
+        in_parallel([partial(curved_positions, *span, *given, xy, mask) for span in spans(len(xy), PIECE)])
+        ctx.save_for_backward(first, last, K, coefficients)
+        ctx.rest = curve, nodes, samples
+        found = torch.from_numpy(xy), torch.from_numpy(mask)
+        xy, mask = (t.reshape(*curve.valid.shape, *t.shape[1:]) for t in found)
+        ctx.mark_non_differentiable(mask)
+        return xy, mask
+
+    @staticmethod
+    def backward(ctx, by_xy, _):
+        numbers, wanted, (curve, nodes, samples) = ctx.saved_tensors, ctx.needs_input_grad[:4], ctx.rest
+        if torch.is_grad_enabled():
+            copies = [t.view_as(t) for t in numbers]  # the ends may depend on K: each has its own part
+            xy = curve.with_numbers(*copies).formulas(nodes, samples).xy
+            asked = [t for t, want in zip(copies, wanted) if want]
+            of_asked = iter(torch.autograd.grad(xy, asked, by_xy, create_graph=True, allow_unused=True))
+            return *(next(of_asked) if want else None for want in wanted), None, None, None
+        from .curve_kernels import curved_gradients
+
+        given, by_xy = _loop_inputs(curve, nodes, samples), by_xy.reshape(-1, samples, 2).contiguous().numpy()
+        pieces = list(spans(len(by_xy), PIECE))
+        by_first, by_last = np.zeros((2, len(by_xy), 3))
+        by_K, by_lens = np.zeros((len(pieces), 3, 3)), np.zeros((len(pieces), 14))
+        rest = by_xy, by_first, by_last
+        in_parallel(
+            [
+                partial(curved_gradients, *span, *given, *rest, *sums)
+                for span, *sums in zip(pieces, by_K, by_lens)
+            ]
+        )
+        found = by_first, by_last, by_K.sum(0), by_lens.sum(0)[: numbers[3].numel()]
+        of_each = (torch.from_numpy(g).reshape(t.shape).to(t.dtype) for g, t in zip(found, numbers))
+        return *(g if want else None for g, want in zip(of_each, wanted)), None, None, None
+
+
+def _loop_inputs(curve: RayCurve, nodes: int, samples: int) -> tuple[Any, ...]:
+    """Arguments of the compiled loops, from the ends to beta's height and width."""
+    n, double = curve.valid.numel(), torch.empty(0, dtype=torch.float64)
+    ends = (t.detach().double().reshape(n, 3).contiguous().numpy() for t in (curve.first, curve.last))
+    lens = LensNumbers.from_camera(curve.beta, wide=bool(curve.wide))
+    fractions = torch.linspace(0, 1, nodes, dtype=torch.float64), sample_fractions(samples, like=double)
+    valid = curve.valid.reshape(n).contiguous().numpy()
+    return *ends, valid, lens, *(t.numpy() for t in fractions), curve.beta.hw
 
 
 NODES, PASSES = 64, 2
