@@ -13,7 +13,7 @@ from ..epipolar import FRONT
 from ..runtime.compiled import compiled
 from ..segments import FLAT
 
-PINHOLE, BROWN, FISHEYE = 0, 1, 2
+BROWN, FISHEYE = 1, 2
 TINY = 1e-24
 FARTHEST_OFF = 0.25
 SERIES = 1e-3
@@ -36,67 +36,72 @@ def curved_positions(begin, end, first, last, valid, lens, even, fractions, hw, 
         xy: positions (n, samples, 2) to write, pixels of beta; 0 where masked.
         mask: mask (n, samples) to write.
     """
-    count, samples = len(even), len(fractions)
-    s, x, y, visible = np.empty(count), np.empty(count), np.empty(count), np.empty(count, np.bool_)
-    pieces, piece, within = np.empty((4, count - 1)), np.empty(samples, np.int64), np.empty(samples)
-    along, s_at, x_at, y_at = np.empty(samples), np.empty(samples), np.empty(samples), np.empty(samples)
-    visible_at = np.empty(samples, np.bool_)
+    room = _room(len(even), len(fractions))
+    _, x, y, visible = room[1]
     right, bottom = hw[1] - 0.5, hw[0] - 0.5
     for p in range(begin, end):
-        total = 0.0
-        if valid[p]:
-            _project(first[p], last[p], lens, even, s, x, y, visible)
-            total = _pieces(x, y, visible, hw, pieces)
-        if total > 0:
-            _along(pieces, total, fractions, piece, within, along)
-            _project(first[p], last[p], lens, along, s_at, x_at, y_at, visible_at)
-        for i in range(samples):
-            counts = total > 0 and visible_at[i] and _near(x_at[i], y_at[i], hw)
+        total = _follow(first[p], last[p], lens, even, fractions, hw, room) if valid[p] else 0.0
+        for i in range(len(fractions)):
+            counts = total > 0 and visible[i] and _near(x[i], y[i], hw)
             mask[p, i] = counts
-            xy[p, i, 0] = min(max(x_at[i], -0.5), right) if counts else 0.0
-            xy[p, i, 1] = min(max(y_at[i], -0.5), bottom) if counts else 0.0
+            xy[p, i, 0] = min(max(x[i], -0.5), right) if counts else 0.0
+            xy[p, i, 1] = min(max(y[i], -0.5), bottom) if counts else 0.0
 
 
 @compiled(nogil=True, cache=True, error_model="numpy")
-def curved_gradients(
-    begin, end, first, last, valid, lens, even, fractions, hw, by_xy, by_first, by_last, by_K, by_c
-):
-    """Add up the gradients of `curved_positions`, in reverse order; what it computes is computed again.
+def curved_gradients(begin, end, first, last, valid, lens, even, fractions, hw, by_xy, by_first, by_last):
+    """Write the gradient by the ends of some of alpha's curves: `curved_positions` in reverse.
+
+    What that computes is computed again.
 
     Args:
-        begin: first pixel of alpha; this and what follows up to `hw` as in `curved_positions`.
+        begin: first pixel of alpha; this and the next eight as in `curved_positions`.
         by_xy: gradient by the positions (n, samples, 2).
-        by_first: gradient by the near ends (n, 3) to add to.
-        by_last: gradient by the far ends (n, 3) to add to.
-        by_K: gradient by the intrinsics (3, 3) to add to.
-        by_c: gradient by the coefficients (14) to add to.
+        by_first: gradient by the near ends (n, 3) to write, zeros before.
+        by_last: gradient by the far ends (n, 3) to write, zeros before.
+
+    Returns:
+        The sums over these pixels of the gradients by the intrinsics (3, 3) and by the coefficients (14).
     """
-    count, samples = len(even), len(fractions)
-    s, x, y, visible = np.empty(count), np.empty(count), np.empty(count), np.empty(count, np.bool_)
-    pieces, piece, within = np.empty((4, count - 1)), np.empty(samples, np.int64), np.empty(samples)
-    along, s_at, x_at, y_at = np.empty(samples), np.empty(samples), np.empty(samples), np.empty(samples)
-    visible_at = np.empty(samples, np.bool_)
-    by_x, by_y, by_even = np.empty(count), np.empty(count), np.empty(count)
-    by_x_at, by_y_at, by_along = np.empty(samples), np.empty(samples), np.empty(samples)
-    by_pieces = np.empty((4, count - 1))
+    room, by_nodes = _room(len(even), len(fractions)), np.empty((3, len(even)))
+    by_samples, by_pieces = np.empty((3, len(fractions))), np.empty((4, len(even) - 1))
+    (s, x, y, _), (s_at, x_at, y_at, visible), pieces, along, piece, within = room
+    by_K, by_c = np.zeros((3, 3)), np.zeros(14)
     for p in range(begin, end):
-        if not valid[p]:
+        if not valid[p] or not _follow(first[p], last[p], lens, even, fractions, hw, room) > 0:
             continue
-        _project(first[p], last[p], lens, even, s, x, y, visible)
-        total = _pieces(x, y, visible, hw, pieces)
-        if not total > 0:
-            continue
+        for i in range(len(fractions)):
+            counts = visible[i] and _near(x_at[i], y_at[i], hw)
+            by_samples[0, i] = by_xy[p, i, 0] if counts and -0.5 <= x_at[i] <= hw[1] - 0.5 else 0.0
+            by_samples[1, i] = by_xy[p, i, 1] if counts and -0.5 <= y_at[i] <= hw[0] - 0.5 else 0.0
+        numbers = (first[p], last[p], lens, by_first[p], by_last[p], by_K, by_c)
+        _project_back(numbers, along, s_at, by_samples)
+        _along_back(pieces, fractions, piece, within, by_samples[2], by_pieces)
+        _pieces_back(x, y, hw, pieces, by_pieces, by_nodes)
+        _project_back(numbers, even, s, by_nodes)
+    return by_K, by_c
+
+
+@compiled
+def _room(nodes, samples):
+    """Make arrays for a curve's numbers: shares, x, y and visibility at the nodes, the same at the samples,
+    pieces, fractions of samples, their pieces, and fractions within these."""
+    at_nodes = np.empty(nodes), np.empty(nodes), np.empty(nodes), np.empty(nodes, np.bool_)
+    at_samples = np.empty(samples), np.empty(samples), np.empty(samples), np.empty(samples, np.bool_)
+    pieces, within = np.empty((4, nodes - 1)), np.empty(samples)
+    return at_nodes, at_samples, pieces, np.empty(samples), np.empty(samples, np.int64), within
+
+
+@compiled
+def _follow(first, last, lens, even, fractions, hw, room):
+    """Write the numbers of a curve, those of the samples if there are any, and return its visible length."""
+    (s, x, y, visible), (s_at, x_at, y_at, visible_at), pieces, along, piece, within = room
+    _project(first, last, lens, even, s, x, y, visible)
+    total = _pieces(x, y, visible, hw, pieces)
+    if total > 0:
         _along(pieces, total, fractions, piece, within, along)
-        _project(first[p], last[p], lens, along, s_at, x_at, y_at, visible_at)
-        for i in range(samples):
-            counts = visible_at[i] and _near(x_at[i], y_at[i], hw)
-            by_x_at[i] = by_xy[p, i, 0] if counts and -0.5 <= x_at[i] <= hw[1] - 0.5 else 0.0
-            by_y_at[i] = by_xy[p, i, 1] if counts and -0.5 <= y_at[i] <= hw[0] - 0.5 else 0.0
-        ends = (first[p], last[p], by_first[p], by_last[p])
-        _project_back(ends, lens, along, s_at, by_x_at, by_y_at, by_along, by_K, by_c)
-        _along_back(pieces, fractions, piece, within, by_along, by_pieces)
-        _pieces_back(x, y, hw, pieces, by_pieces, by_x, by_y)
-        _project_back(ends, lens, even, s, by_x, by_y, by_even, by_K, by_c)
+        _project(first, last, lens, along, s_at, x_at, y_at, visible_at)
+    return total
 
 
 @compiled(inline="always")
@@ -115,8 +120,7 @@ def _shares(first, last, wide, u, s):
         for i in range(len(u)):
             s[i] = u[i] * z0 / ((1 - u[i]) * z1 + u[i] * z0)
         return
-    angle, _, _, f0, f1 = _opening(first, last)
-    r0, r1 = math.sqrt(max(f0, FRONT**2)), math.sqrt(max(f1, FRONT**2))
+    angle, _, _, _, _, r0, r1 = _opening(first, last)
     for i in range(len(u)):
         a, b = (1 - u[i]) * _sinc((1 - u[i]) * angle) * r1, u[i] * _sinc(u[i] * angle) * r0
         s[i] = b / (a + b)
@@ -124,8 +128,8 @@ def _shares(first, last, wide, u, s):
 
 @compiled(inline="always")
 def _opening(first, last):
-    """Return the angle between two points, what its sine and cosine are times the lengths, and their
-    squared lengths."""
+    """Return the angle between two points, its sine and cosine times the lengths, the squared lengths, and
+    the lengths, which are not below `FRONT`."""
     cx = first[1] * last[2] - first[2] * last[1]
     cy = first[2] * last[0] - first[0] * last[2]
     cz = first[0] * last[1] - first[1] * last[0]
@@ -134,7 +138,8 @@ def _opening(first, last):
     sine = math.sqrt(squared) if squared > TINY else 0.0
     f0 = first[0] * first[0] + first[1] * first[1] + first[2] * first[2]
     f1 = last[0] * last[0] + last[1] * last[1] + last[2] * last[2]
-    return math.atan2(sine, dot) if sine > 0 else 0.0, sine, dot, f0, f1
+    angle, r0, r1 = math.atan2(sine, dot), math.sqrt(max(f0, FRONT**2)), math.sqrt(max(f1, FRONT**2))
+    return angle if sine > 0 else 0.0, sine, dot, f0, f1, r0, r1
 
 
 @compiled(inline="always")
@@ -156,13 +161,7 @@ def _project(first, last, lens, u, s, x, y, visible):
     see."""
     _shares(first, last, lens.wide, u, s)
     a, b = (first[0], first[1], first[2]), (last[0] - first[0], last[1] - first[1], last[2] - first[2])
-    # A loop for each model, without branches within the first two: they become vector instructions.
-    if lens.model == PINHOLE:
-        for i in range(len(s)):
-            X, Y, Z = a[0] + s[i] * b[0], a[1] + s[i] * b[1], a[2] + s[i] * b[2]
-            z = Z if Z > 0 else 1.0
-            x[i], y[i], visible[i] = X / z, Y / z, (Z > 0) & (X * X + Y * Y + Z * Z > FRONT**2)
-    elif lens.model == BROWN:
+    if lens.model == BROWN:  # without branches within the loops: they become vector instructions
         for i in range(len(s)):
             X, Y, Z = a[0] + s[i] * b[0], a[1] + s[i] * b[1], a[2] + s[i] * b[2]
             inverse = 1 / (Z if Z > 0 else 1.0)
@@ -171,8 +170,9 @@ def _project(first, last, lens, u, s, x, y, visible):
     else:
         for i in range(len(s)):
             X, Y, Z = a[0] + s[i] * b[0], a[1] + s[i] * b[1], a[2] + s[i] * b[2]
-            x[i], y[i], inside = _fisheye(lens.c, lens.limit, X, Y, Z)
-            visible[i] = inside and X * X + Y * Y + Z * Z > FRONT**2
+            u, _, inside, _, scale, p = _fisheye(lens.c, lens.limit, X, Y, Z)
+            x[i], y[i] = X * scale * p, Y * scale * p
+            visible[i] = inside and (u > 0 or Z > 0) and X * X + Y * Y + Z * Z > FRONT**2
     K = lens.K
     for i in range(len(s)):
         u, v = x[i], y[i]
@@ -180,66 +180,54 @@ def _project(first, last, lens, u, s, x, y, visible):
 
 
 @compiled
-def _project_back(ends, lens, u, s, by_x, by_y, by_u, by_K, by_c):
-    """Write the gradient by the fractions u, and add those by the ends, K and the coefficients: `_project` in
-    reverse."""
-    first, last, by_first, by_last = ends
-    angle, sine, dot, f0, f1 = _opening(first, last)
-    r0, r1 = math.sqrt(max(f0, FRONT**2)), math.sqrt(max(f1, FRONT**2))
+def _project_back(numbers, u, s, by):
+    """Write the gradient by the fractions u as by[2], that by the pixels being by[:2], and add those by the
+    ends, K and the coefficients: `_project` in reverse."""
+    first, last, lens, by_first, by_last, by_K, by_c = numbers
+    angle, sine, dot, f0, f1, r0, r1 = _opening(first, last)
+    if not lens.wide:  # the same, with depths for lengths
+        angle, r0, r1 = 0.0, first[2], last[2]
     by_angle, by_r0, by_r1, K = 0.0, 0.0, 0.0, lens.K
     for i in range(len(u)):
-        by_u[i] = 0.0
-        if by_x[i] == 0 and by_y[i] == 0:
+        by_x, by_y = by[0, i], by[1, i]
+        by[2, i] = 0.0
+        if by_x == 0 and by_y == 0:
             continue
         X, Y = first[0] + s[i] * (last[0] - first[0]), first[1] + s[i] * (last[1] - first[1])
         Z = first[2] + s[i] * (last[2] - first[2])
-        by_a, by_b = K[0, 0] * by_x[i] + K[1, 0] * by_y[i], K[0, 1] * by_x[i] + K[1, 1] * by_y[i]
-        a, b, by_X, by_Y, by_Z = _distort_back(lens, X, Y, Z, by_a, by_b, by_c)
+        by_a, by_b = K[0, 0] * by_x + K[1, 0] * by_y, K[0, 1] * by_x + K[1, 1] * by_y
+        if lens.model == BROWN:
+            z = Z if Z > 0 else 1.0
+            a, b, by_X, by_Y = _brown_back(lens.c, lens.limit, X / z, Y / z, by_a, by_b, by_c)
+            by_X, by_Y, by_Z = by_X / z, by_Y / z, -(X * by_X + Y * by_Y) / (z * z) if Z > 0 else 0.0
+        else:
+            a, b, by_X, by_Y, by_Z = _fisheye_back(lens.c, lens.limit, X, Y, Z, by_a, by_b, by_c)
         for j, v in enumerate((a, b, 1.0)):
-            by_K[0, j] += by_x[i] * v
-            by_K[1, j] += by_y[i] * v
+            by_K[0, j] += by_x * v
+            by_K[1, j] += by_y * v
         by_s = 0.0
         for j, v in enumerate((by_X, by_Y, by_Z)):
             by_first[j] += (1 - s[i]) * v
             by_last[j] += s[i] * v
             by_s += v * (last[j] - first[j])
         w, v = 1 - u[i], u[i]
-        if lens.wide:
-            a, b = w * _sinc(w * angle), v * _sinc(v * angle)
-            by_share = by_s / (a * r1 + b * r0) ** 2
-            by_a, by_b = -by_share * b * r0, by_share * a * r1
-            by_u[i] = by_b * math.cos(v * angle) * r0 - by_a * math.cos(w * angle) * r1
-            by_angle += by_b * r0 * v * v * _sinc_slope(v * angle) + by_a * r1 * w * w * _sinc_slope(
-                w * angle
-            )
-            by_r0, by_r1 = by_r0 + by_b * b, by_r1 + by_a * a
-        else:
-            z0, z1 = first[2], last[2]
-            by_share = by_s / (w * z1 + v * z0) ** 2
-            by_u[i] = by_share * z0 * z1
-            by_first[2] += by_share * v * w * z1
-            by_last[2] -= by_share * v * w * z0
+        a, b = w * _sinc(w * angle), v * _sinc(v * angle)
+        by_share = by_s / (a * r1 + b * r0) ** 2
+        by_a, by_b = -by_share * b * r0, by_share * a * r1
+        by_r0, by_r1 = by_r0 + by_b * b, by_r1 + by_a * a
+        by[2, i] = by_b * r0 * math.cos(v * angle) - by_a * r1 * math.cos(w * angle)
+        by_angle += by_b * r0 * v * v * _sinc_slope(v * angle)
+        by_angle += by_a * r1 * w * w * _sinc_slope(w * angle)
+    if not lens.wide:
+        by_first[2] += by_r0
+        by_last[2] += by_r1
+        return
     for j in range(3):
         if sine > 0:
             by_first[j] += by_angle / sine * (dot / f0 * first[j] - last[j])
             by_last[j] += by_angle / sine * (dot / f1 * last[j] - first[j])
         by_first[j] += by_r0 * first[j] / r0 if f0 > FRONT**2 else 0.0
         by_last[j] += by_r1 * last[j] / r1 if f1 > FRONT**2 else 0.0
-
-
-@compiled(inline="always")
-def _distort_back(lens, X, Y, Z, by_x, by_y, by_c):
-    """Return the normalised distorted point of a point in the camera's frame, and the gradient by the latter;
-    add that by the coefficients."""
-    if lens.model == FISHEYE:
-        return _fisheye_back(lens.c, lens.limit, X, Y, Z, by_x, by_y, by_c)
-    inverse = 1 / (Z if Z > 0 else 1.0)
-    a, b = X * inverse, Y * inverse
-    x, y = a, b
-    if lens.model == BROWN:
-        x, y, by_x, by_y = _brown_back(lens.c, lens.limit, a, b, by_x, by_y, by_c)
-    by_X, by_Y = by_x * inverse, by_y * inverse
-    return x, y, by_X, by_Y, -(a * by_X + b * by_Y) if Z > 0 else 0.0
 
 
 @compiled(inline="always")
@@ -302,16 +290,15 @@ def _brown_back(c, limit, a, b, by_x, by_y, by_c):
 
 @compiled(inline="always")
 def _fisheye(c, limit, x, y, z):
-    """Return the normalised distorted point of a point in the camera's frame;
-    `distortion._fisheye_project`."""
+    """Return a point's squared radius u, the slope in u of its angle over the radius, whether that is within
+    the limit, the squared angle, and angle over radius and distorted over plain angle, moved in to it;
+    `lenses.fisheye.fisheye_project`."""
     u = x * x + y * y
-    ratio, _ = _angle_over_radius(u, z)
-    v = u * ratio * ratio
-    inside = v < limit
-    pull = 1.0 if inside else math.sqrt(limit / max(v, 1e-30))
-    w = v if inside else limit
-    factor = ratio * pull * (1 + w * (c[0] + w * (c[1] + w * (c[2] + w * c[3]))))
-    return x * factor, y * factor, inside and (u > 0 or z > 0)
+    ratio, slope = _angle_over_radius(u, z)
+    inside = u * ratio * ratio < limit
+    w = u * ratio * ratio if inside else limit
+    scale = ratio if inside else math.sqrt(limit / max(u, 1e-30))
+    return u, slope, inside, w, scale, 1 + w * (c[0] + w * (c[1] + w * (c[2] + w * c[3])))
 
 
 @compiled(inline="always")
@@ -332,12 +319,7 @@ def _angle_over_radius(u, z):
 def _fisheye_back(c, limit, x, y, z, by_x, by_y, by_c):
     """Return the distorted point of a point in the camera's frame, and the gradient by the latter; add that
     by the coefficients."""
-    u = x * x + y * y
-    ratio, slope = _angle_over_radius(u, z)
-    inside = u * ratio * ratio < limit
-    w = u * ratio * ratio if inside else limit
-    scale = ratio if inside else math.sqrt(limit / u)
-    p = 1 + w * (c[0] + w * (c[1] + w * (c[2] + w * c[3])))
+    u, slope, inside, w, scale, p = _fisheye(c, limit, x, y, z)
     by_factor = by_x * x + by_y * y
     for j, v in enumerate((w, w * w, w * w * w, w * w * w * w)):
         by_c[j] += by_factor * scale * v
@@ -345,7 +327,7 @@ def _fisheye_back(c, limit, x, y, z, by_x, by_y, by_c):
     if inside:
         p_slope = c[0] + w * (2 * c[1] + w * (3 * c[2] + w * 4 * c[3]))
         by_ratio = by_factor * (p + 2 * w * p_slope)
-        by_u, by_z = by_factor * ratio**3 * p_slope + by_ratio * slope, -by_ratio / (u + z * z)
+        by_u, by_z = by_factor * scale**3 * p_slope + by_ratio * slope, -by_ratio / (u + z * z)
     factor = scale * p
     return x * factor, y * factor, by_x * factor + 2 * x * by_u, by_y * factor + 2 * y * by_u, by_z
 
@@ -384,9 +366,9 @@ def _crossings(a, b, limit):
 
 
 @compiled(inline="always")
-def _pieces_back(x, y, hw, pieces, by_pieces, by_x, by_y):
-    """Write the gradient by the nodes' pixels: `_pieces` in reverse."""
-    by_x[:], by_y[:], by_end = 0.0, 0.0, 0.0
+def _pieces_back(x, y, hw, pieces, by_pieces, by):
+    """Write the gradient by the nodes' pixels as by[:2]: `_pieces` in reverse."""
+    by[:], by_end = 0.0, 0.0
     for i in range(pieces.shape[1] - 1, -1, -1):
         low, high, length = pieces[0, i], pieces[1, i], pieces[2, i]
         by_end += by_pieces[3, i]
@@ -395,19 +377,17 @@ def _pieces_back(x, y, hw, pieces, by_pieces, by_x, by_y):
         by_length, whole = by_pieces[2, i] + by_end, length / (high - low)
         by_low, by_high = by_pieces[0, i] - by_length * whole, by_pieces[1, i] + by_length * whole
         at_x, at_y = _crossings(x[i], x[i + 1], hw[1] - 0.5), _crossings(y[i], y[i + 1], hw[0] - 0.5)
-        for v, by_v, mine, other in ((x, by_x, at_x, at_y), (y, by_y, at_y, at_x)):
+        for axis, v, mine, other in ((0, x, at_x, at_y), (1, y, at_y, at_x)):
             moves = v[i + 1] - v[i]
-            by_start, by_stop = (
-                -by_length * (high - low) * moves / whole,
-                by_length * (high - low) * moves / whole,
-            )
+            by_stop = by_length * (high - low) * moves / whole
+            by_start = -by_stop
             if low > 0 and mine[0] >= other[0]:
                 share = by_low / moves * (0.5 if mine[0] == other[0] else 1.0)
                 by_start, by_stop = by_start + (low - 1) * share, by_stop - low * share
             if high < 1 and mine[1] <= other[1]:
                 share = by_high / moves * (0.5 if mine[1] == other[1] else 1.0)
                 by_start, by_stop = by_start + (high - 1) * share, by_stop - high * share
-            by_v[i], by_v[i + 1] = by_v[i] + by_start, by_v[i + 1] + by_stop
+            by[axis, i], by[axis, i + 1] = by[axis, i] + by_start, by[axis, i + 1] + by_stop
 
 
 @compiled(inline="always")

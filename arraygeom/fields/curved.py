@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Real
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from ..camera import Camera, LensView, View
 from ..checks import check_above, check_bounds, check_field
@@ -287,7 +288,8 @@ class RayCurve(NamedTuple):
             and lens.model in COMPILED_LENSES
             and lens.coefficients.shape[-1] < 14
         )
-        return lens_compiled and not self.beta.batch_shape and compilable(self.first)
+        plain = lens_compiled and not self.beta.batch_shape and compilable(self.first)
+        return plain and all(forward_ad.unpack_dual(t).tangent is None for t in self.numbers)
 
     def positions(self, nodes: int, samples: int) -> Positions:
         """Compute the positions of `Curved` by compiled loops in float64; the curve must be `compilable`.
@@ -459,52 +461,47 @@ class _Followed(torch.autograd.Function):
     def forward(ctx, first, last, K, coefficients, curve, nodes, samples):
         from .curve_kernels import curved_positions
 
-        xy = np.empty((curve.valid.numel(), samples, 2), f"f{first.dtype.itemsize}")
-        mask = np.empty(xy.shape[:2], bool)
-        given = _loop_inputs(curve, nodes, samples)
-        in_parallel([partial(curved_positions, *span, *given, xy, mask) for span in spans(len(xy), PIECE)])
+        xy = np.empty((*curve.valid.shape, samples, 2), f"f{first.dtype.itemsize}")
+        mask = np.empty(xy.shape[:-1], bool)
+        flat = xy.reshape(-1, samples, 2), mask.reshape(-1, samples)
+        _loop(curved_positions, curve, nodes, samples, *flat)
         ctx.save_for_backward(first, last, K, coefficients)
         ctx.rest = curve, nodes, samples
         found = torch.from_numpy(xy), torch.from_numpy(mask)
-        xy, mask = (t.reshape(*curve.valid.shape, *t.shape[1:]) for t in found)
-        ctx.mark_non_differentiable(mask)
-        return xy, mask
+        ctx.mark_non_differentiable(found[1])
+        return found
 
     @staticmethod
     def backward(ctx, by_xy, _):
         numbers, wanted, (curve, nodes, samples) = ctx.saved_tensors, ctx.needs_input_grad[:4], ctx.rest
-        if torch.is_grad_enabled():
-            copies = [t.view_as(t) for t in numbers]  # the ends may depend on K: each has its own part
-            xy = curve.with_numbers(*copies).formulas(nodes, samples).xy
+        if torch.is_grad_enabled() or not compilable(by_xy):
+            again = torch.is_grad_enabled()
+            with torch.enable_grad():
+                copies = [t.view_as(t) for t in numbers]  # the ends may depend on K: each has its own part
+                xy = curve.with_numbers(*copies).formulas(nodes, samples).xy
             asked = [t for t, want in zip(copies, wanted) if want]
-            of_asked = iter(torch.autograd.grad(xy, asked, by_xy, create_graph=True, allow_unused=True))
+            of_asked = iter(torch.autograd.grad(xy, asked, by_xy, create_graph=again, allow_unused=True))
             return *(next(of_asked) if want else None for want in wanted), None, None, None
         from .curve_kernels import curved_gradients
 
-        given, by_xy = _loop_inputs(curve, nodes, samples), by_xy.reshape(-1, samples, 2).contiguous().numpy()
-        pieces = list(spans(len(by_xy), PIECE))
-        by_first, by_last = np.zeros((2, len(by_xy), 3))
-        by_K, by_lens = np.zeros((len(pieces), 3, 3)), np.zeros((len(pieces), 14))
-        rest = by_xy, by_first, by_last
-        in_parallel(
-            [
-                partial(curved_gradients, *span, *given, *rest, *sums)
-                for span, *sums in zip(pieces, by_K, by_lens)
-            ]
-        )
-        found = by_first, by_last, by_K.sum(0), by_lens.sum(0)[: numbers[3].numel()]
-        of_each = (torch.from_numpy(g).reshape(t.shape).to(t.dtype) for g, t in zip(found, numbers))
-        return *(g if want else None for g, want in zip(of_each, wanted)), None, None, None
+        ends = np.zeros((2, curve.valid.numel(), 3))
+        flat = by_xy.reshape(-1, samples, 2).contiguous().numpy()
+        sums = zip(*_loop(curved_gradients, curve, nodes, samples, flat, *ends))
+        by_K, by_lens = (np.sum(parts, 0) for parts in sums)
+        found = zip((*ends, by_K, by_lens[: numbers[3].numel()]), numbers, wanted)
+        of_each = [torch.from_numpy(g).reshape(t.shape).to(t.dtype) if want else None for g, t, want in found]
+        return *of_each, None, None, None
 
 
-def _loop_inputs(curve: RayCurve, nodes: int, samples: int) -> tuple[Any, ...]:
-    """Arguments of the compiled loops, from the ends to beta's height and width."""
+def _loop(loop: Callable[..., Any], curve: RayCurve, nodes: int, samples: int, *arrays: Any) -> list[Any]:
+    """Run a compiled loop over the pixels of a curve; return what it returns for each thread's piece."""
     n, double = curve.valid.numel(), torch.empty(0, dtype=torch.float64)
     ends = (t.detach().double().reshape(n, 3).contiguous().numpy() for t in (curve.first, curve.last))
     lens = LensNumbers.from_camera(curve.beta, wide=bool(curve.wide))
     fractions = torch.linspace(0, 1, nodes, dtype=torch.float64), sample_fractions(samples, like=double)
-    valid = curve.valid.reshape(n).contiguous().numpy()
-    return *ends, valid, lens, *(t.numpy() for t in fractions), curve.beta.hw
+    given = *ends, curve.valid.reshape(n).contiguous().numpy(), lens, *(t.numpy() for t in fractions)
+    parts = [partial(loop, *span, *given, curve.beta.hw, *arrays) for span in spans(n, PIECE)]
+    return in_parallel(parts)
 
 
 NODES, PASSES = 64, 2
@@ -545,9 +542,9 @@ class LensNumbers(NamedTuple):
     """A camera's numbers for the compiled loop, in float64.
 
     Attributes:
-        model: 0 for a pinhole, else a number of `COMPILED_LENSES`.
+        model: number of `COMPILED_LENSES`; a pinhole is the first with coefficients of zero.
         c: coefficients (14), padded with zeros.
-        limit: squared limit of the lens model's domain (`Distortion.squared_limit`); 0 for a pinhole.
+        limit: squared limit of the lens model's domain (`Distortion.squared_limit`); infinite for a pinhole.
         K: intrinsics (3, 3).
         wide: True if fractions are even in angle.
     """
@@ -567,7 +564,7 @@ class LensNumbers(NamedTuple):
         """
         K, lens = camera.K.detach().double().numpy(), camera.distortion
         if lens is None:
-            return cls(0, np.zeros(14), 0.0, np.ascontiguousarray(K), wide)
+            return cls(1, np.zeros(14), math.inf, np.ascontiguousarray(K), wide)
         c = lens.coefficients.detach().double()
         padded = np.zeros(14)
         padded[: len(c)] = c.numpy()
