@@ -20,6 +20,7 @@ from ..camera import Camera, LensView, View
 from ..checks import check_above, check_bounds, check_field
 from ..distortion import Distortion
 from ..epipolar import FRONT, Clipped, Track, beside, clipped
+from ..lenses.common import cosine_and_sinc
 from ..pair import Pair
 from ..pixels import HW, floating, map_homogeneous, product, within
 from ..runtime.chunks import spans
@@ -451,7 +452,11 @@ class RayCurve(NamedTuple):
         r0, r1 = (
             X.square().sum(-1, keepdim=True).clamp(min=FRONT**2).sqrt() for X in (self.first, self.last)
         )
-        return (1 - u) * torch.sinc((1 - u) * angle / math.pi) * r1, u * torch.sinc(u * angle / math.pi) * r0
+        # Not by torch.sinc, which has no second derivative at 0.
+        of_first, of_last = (
+            v * cosine_and_sinc((v * angle).square())[1] * r for v, r in ((1 - u, r1), (u, r0))
+        )
+        return of_first, of_last
 
 
 class _Followed(torch.autograd.Function):
