@@ -9,7 +9,7 @@ from arraygeom import Curved, Positions, Rig, pixel_grid
 from arraygeom.fields.curved import RayCurve
 from tests.arraygeom.random_rigs import KINDS, drawn
 from tests.arraygeom.rigs import uniform
-from tests.arraygeom.test_field_kernels import LENSES, pair_with, readable
+from tests.arraygeom.test_field_kernels import BROWN, LENSES, pair_with, readable
 
 NUMBERS = ("first", "last", "K", "coefficients")
 
@@ -19,21 +19,32 @@ def however_few_pixels(monkeypatch) -> None:
     monkeypatch.setattr("arraygeom.fields.curved.FEW", 0)
 
 
-def curve_of(name: str, count: int = 1000, *, stretched: float = 0.02) -> tuple[RayCurve, list[Tensor]]:
-    """A curve through a lens, and its numbers as parameters, in float64.
+CURVES = {
+    **{name: (lens, None, 0.3) for name, lens in LENSES.items()},
+    "wide": ("wide", None, 0.02),
+    "in angle and partly behind": (("brown-conrady", BROWN), True, 3.0),
+    "range ends on the image": (("brown-conrady", [-1.2, 0.0, 0.01, -0.02]), None, 0.5),
+    "range of angles ends on the image": (("kannala-brandt", [-0.6, 0.0, 0.0, 0.0]), None, 0.5),
+}
+"""Lens, whether fractions are even in angle if not as the camera says, and by which share of their distance
+the ends are moved apart: no end stays on the very edge of the image, where rounding chooses between two
+answers, and the image cuts many curves at both."""
 
-    Its ends are moved apart, so that no end is on the very edge of the image, where rounding chooses between
-    two answers, and many curves are cut by it.
-    """
-    pair = pair_with(name)
+
+def curve_of(name: str, count: int = 1000) -> tuple[RayCurve, list[Tensor]]:
+    """Curves of `CURVES`, and their numbers as parameters, in float64."""
+    lens, wide, apart = CURVES[name]
+    pair = pair_with(lens)
     x = pixel_grid(pair.alpha.hw, dtype=torch.float64)[::37, ::41].reshape(-1, 2)
     curve = RayCurve.from_pixels(pair, *pair.depth, x)
-    some = curve.valid.nonzero()[:, 0][:: max(1, int(curve.valid.sum()) // count)][:count]
+    some = curve.valid.nonzero()[:, 0]
+    some = some[:: -(-len(some) // count)]
     first, last, K, c = (t.detach().clone() for t in curve.numbers)
-    first, last = (v + stretched * (v - w) for v, w in ((first, last), (last, first)))
-    numbers = [first[some], last[some], K, c]
-    curve = curve._replace(valid=curve.valid[some], inverse=tuple(w[some] for w in curve.inverse))
-    return curve, [t.requires_grad_() for t in numbers]
+    first, last = (v + apart * (v - w) for v, w in ((first, last), (last, first)))
+    K = K + K.new_tensor([[0, 3, 0], [-2, 0, 0], [0, 0, 0]])
+    inverse = curve.inverse[0][some], curve.inverse[1][some]
+    curve = curve._replace(valid=curve.valid[some], inverse=inverse, wide=wide or curve.wide)
+    return curve, [t.requires_grad_() for t in (first[some], last[some], K, c)]
 
 
 def slopes(answer: Positions, by: list[Tensor]) -> list[Tensor]:
@@ -53,7 +64,7 @@ def difference(found: Tensor, expected: Tensor) -> float:
     return float(((found - expected).abs() / (size + 1e-3 * expected.abs().max()).clamp(min=1e-2)).max())
 
 
-@pytest.mark.parametrize("name", [*LENSES, "wide"])
+@pytest.mark.parametrize("name", CURVES)
 def test_gradients_by_each_number_of_a_curve_are_those_of_the_formulas(name):
     curve, numbers = curve_of(name)
     curve = curve.with_numbers(*numbers)

@@ -25,11 +25,11 @@ def readable(monkeypatch) -> None:
         monkeypatch.setattr(f"arraygeom.fields.{module}.compilable", lambda t: False)
 
 
-def pair_with(name: str) -> Pair:
+def pair_with(lens: str | tuple[str, list[float]] | None) -> Pair:
     """One whose beta sees part of what alpha sees through a lens, or two strong fisheyes."""
-    if name == "wide":
+    if lens == "wide":
         return fisheye_rig().pair("alpha", "beta")
-    given = LENSES[name]
+    given = LENSES[lens] if isinstance(lens, str) else lens
     return pairs(given and Distortion(given[0], torch.tensor(given[1], dtype=torch.float64)))[2]
 
 
