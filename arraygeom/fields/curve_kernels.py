@@ -82,7 +82,7 @@ def curved_gradients(begin, end, first, last, valid, lens, even, fractions, hw, 
     return by_K, by_c
 
 
-@compiled
+@compiled(error_model="numpy")
 def _room(nodes, samples):
     """Make arrays for a curve's numbers: shares, x, y and visibility at the nodes, the same at the samples,
     pieces, fractions of samples, their pieces, and fractions within these."""
@@ -92,7 +92,7 @@ def _room(nodes, samples):
     return at_nodes, at_samples, pieces, np.empty(samples), np.empty(samples, np.int64), within
 
 
-@compiled
+@compiled(error_model="numpy")
 def _follow(first, last, lens, even, fractions, hw, room):
     """Write the numbers of a curve, those of the samples if there are any, and return its visible length."""
     (s, x, y, visible), (s_at, x_at, y_at, visible_at), pieces, along, piece, within = room
@@ -155,7 +155,7 @@ def _sinc_slope(angle):
     return (math.cos(angle) - math.sin(angle) / angle) / angle
 
 
-@compiled
+@compiled(error_model="numpy")
 def _project(first, last, lens, u, s, x, y, visible):
     """Write the shares s of `last` in the points at fractions u, their pixels in beta, and which it can
     see."""
@@ -179,7 +179,7 @@ def _project(first, last, lens, u, s, x, y, visible):
         x[i], y[i] = K[0, 0] * u + K[0, 1] * v + K[0, 2], K[1, 0] * u + K[1, 1] * v + K[1, 2]
 
 
-@compiled
+@compiled(error_model="numpy")
 def _project_back(numbers, u, s, by):
     """Write the gradient by the fractions u as by[2], that by the pixels being by[:2], and add those by the
     ends, K and the coefficients: `_project` in reverse."""
@@ -199,7 +199,8 @@ def _project_back(numbers, u, s, by):
         if lens.model == BROWN:
             z = Z if Z > 0 else 1.0
             a, b, by_X, by_Y = _brown_back(lens.c, lens.limit, X / z, Y / z, by_a, by_b, by_c)
-            by_X, by_Y, by_Z = by_X / z, by_Y / z, -(X * by_X + Y * by_Y) / (z * z) if Z > 0 else 0.0
+            by_X, by_Y = by_X / z, by_Y / z
+            by_Z = -(X * by_X + Y * by_Y) / z if Z > 0 else 0.0
         else:
             a, b, by_X, by_Y, by_Z = _fisheye_back(lens.c, lens.limit, X, Y, Z, by_a, by_b, by_c)
         for j, v in enumerate((a, b, 1.0)):
@@ -215,9 +216,11 @@ def _project_back(numbers, u, s, by):
         by_share = by_s / (a * r1 + b * r0) ** 2
         by_a, by_b = -by_share * b * r0, by_share * a * r1
         by_r0, by_r1 = by_r0 + by_b * b, by_r1 + by_a * a
-        by[2, i] = by_b * r0 * math.cos(v * angle) - by_a * r1 * math.cos(w * angle)
-        by_angle += by_b * r0 * v * v * _sinc_slope(v * angle)
-        by_angle += by_a * r1 * w * w * _sinc_slope(w * angle)
+        by[2, i] = by_b * r0 - by_a * r1
+        if angle > 0:
+            by[2, i] = by_b * r0 * math.cos(v * angle) - by_a * r1 * math.cos(w * angle)
+            by_angle += by_b * r0 * v * v * _sinc_slope(v * angle)
+            by_angle += by_a * r1 * w * w * _sinc_slope(w * angle)
     if not lens.wide:
         by_first[2] += by_r0
         by_last[2] += by_r1
@@ -273,14 +276,14 @@ def _brown_back(c, limit, a, b, by_x, by_y, by_c):
     pull = 1.0 if squared < limit else math.sqrt(limit / squared)
     a, b, u = a * pull, b * pull, squared if squared < limit else limit
     x, y, xx, xy, yx, yy, g, inverse = _brown_terms(c, a, b)
-    radial = (by_x * a + by_y * b) * inverse
-    cross = 2 * a * b
-    powers = (radial * u, radial * u * u, radial * u * u * u)
-    tangential = (by_x * cross + by_y * (u + 2 * b * b), by_x * (u + 2 * a * a) + by_y * cross)
-    rational = (-g * powers[0], -g * powers[1], -g * powers[2])
-    prism = (by_x * u, by_x * u * u, by_y * u, by_y * u * u)
-    for j, v in enumerate((*powers[:2], *tangential, powers[2], *rational, *prism)):
-        by_c[j] += v
+    cross, radial = 2 * a * b, (by_x * a + by_y * b) * inverse * u
+    of_u, of_u2, of_u3 = radial, radial * u, radial * u * u
+    by_c[0], by_c[1], by_c[4] = by_c[0] + of_u, by_c[1] + of_u2, by_c[4] + of_u3
+    by_c[5], by_c[6], by_c[7] = by_c[5] - g * of_u, by_c[6] - g * of_u2, by_c[7] - g * of_u3
+    by_c[2] += by_x * cross + by_y * (u + 2 * b * b)
+    by_c[3] += by_x * (u + 2 * a * a) + by_y * cross
+    by_c[8], by_c[9] = by_c[8] + by_x * u, by_c[9] + by_x * u * u
+    by_c[10], by_c[11] = by_c[10] + by_y * u, by_c[11] + by_y * u * u
     by_a, by_b = by_x * xx + by_y * yx, by_x * xy + by_y * yy
     if not squared < limit:
         outward = (a * by_a + b * by_b) / u
@@ -323,7 +326,7 @@ def _fisheye_back(c, limit, x, y, z, by_x, by_y, by_c):
     by_factor = by_x * x + by_y * y
     for j, v in enumerate((w, w * w, w * w * w, w * w * w * w)):
         by_c[j] += by_factor * scale * v
-    by_u, by_z = -by_factor * scale * p / (2 * u) if u > 0 else 0.0, 0.0
+    by_u, by_z = -by_factor * scale * p / (2 * u), 0.0
     if inside:
         p_slope = c[0] + w * (2 * c[1] + w * (3 * c[2] + w * 4 * c[3]))
         by_ratio = by_factor * (p + 2 * w * p_slope)

@@ -22,7 +22,7 @@ def however_few_pixels(monkeypatch) -> None:
 CURVES = {
     **{name: (lens, None, 0.3) for name, lens in LENSES.items()},
     "wide": ("wide", None, 0.02),
-    "in angle and partly behind": (("brown-conrady", BROWN), True, 3.0),
+    "in angle and partly behind": (("brown-conrady", BROWN), True, 100.0),
     "range ends on the image": (("brown-conrady", [-1.2, 0.0, 0.01, -0.02]), None, 0.5),
     "range of angles ends on the image": (("kannala-brandt", [-0.6, 0.0, 0.0, 0.0]), None, 0.5),
 }
@@ -64,11 +64,12 @@ def difference(found: Tensor, expected: Tensor) -> float:
     return float(((found - expected).abs() / (size + 1e-3 * expected.abs().max()).clamp(min=1e-2)).max())
 
 
+@pytest.mark.parametrize("nodes", [2, 24])
 @pytest.mark.parametrize("name", CURVES)
-def test_gradients_by_each_number_of_a_curve_are_those_of_the_formulas(name):
+def test_gradients_by_each_number_of_a_curve_are_those_of_the_formulas(name, nodes):
     curve, numbers = curve_of(name)
     curve = curve.with_numbers(*numbers)
-    found, expected = curve.positions(24, 40), curve.formulas(24, 40)
+    found, expected = curve.positions(nodes, 40), curve.formulas(nodes, 40)
     assert torch.equal(found.mask, expected.mask)
     assert (found.xy - expected.xy).abs().max() < 1e-9
     assert expected.mask.any(-1).sum() > 100
