@@ -64,7 +64,7 @@ def difference(found: Tensor, expected: Tensor) -> float:
     return float(((found - expected).abs() / (size + 1e-3 * expected.abs().max()).clamp(min=1e-2)).max())
 
 
-@pytest.mark.parametrize("nodes", [2, 24])
+@pytest.mark.parametrize("nodes", [3, 24])
 @pytest.mark.parametrize("name", CURVES)
 def test_gradients_by_each_number_of_a_curve_are_those_of_the_formulas(name, nodes):
     curve, numbers = curve_of(name)

@@ -69,14 +69,6 @@ def test_without_numba_the_formulas_are_used(field, monkeypatch):
     assert (found.xy - expected.xy).abs().max() < 1e-9
 
 
-def test_where_a_gradient_is_asked_for_the_formulas_are_used():
-    pair = pair_with("radial")
-    x = torch.tensor([[300.0, 200.0]], dtype=torch.float64, requires_grad=True)
-    Curved(5)(pair, x).xy.sum().backward()
-    assert x.grad is not None
-    assert x.grad.abs().max() > 1
-
-
 @pytest.mark.parametrize(
     "field", [NearestVoxels(24, 12), NearestVoxels(96, 80), NearestVoxels(200, 5)], ids=repr
 )
