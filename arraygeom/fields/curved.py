@@ -7,18 +7,20 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Real
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from ..camera import Camera, LensView, View
 from ..checks import check_above, check_bounds, check_field
 from ..distortion import Distortion
 from ..epipolar import FRONT, Clipped, Track, beside, clipped
+from ..lenses.common import cosine_and_sinc
 from ..pair import Pair
 from ..pixels import HW, floating, map_homogeneous, product, within
 from ..runtime.chunks import spans
@@ -84,13 +86,7 @@ class Curved:
         curve = RayCurve.from_pixels(pair, near, far, x, self.bounds)
         if curve.compilable and curve.valid.numel() > FEW:
             return curve.positions(self.nodes, self.samples)
-        fractions = curve.nodes(self.nodes)
-        nodes, visible = curve.at(fractions)
-        pieces = visible_pieces(nodes, visible & curve.valid[..., None], pair.beta.hw, curve.turn)
-        xy, visible = curve.at(along_pieces(pieces, sample_fractions(self.samples, like=x), fractions))
-        xy, inside = _onto_edge(xy, pair.beta.hw, EDGE)
-        mask = inside & visible & (pieces.length.sum(-1, keepdim=True) > 0)
-        return Positions(torch.where(mask[..., None], xy, 0.0), mask)
+        return curve.formulas(self.nodes, self.samples)
 
 
 def _check_word(bounds: str) -> None:
@@ -302,51 +298,54 @@ class RayCurve(NamedTuple):
 
     @property
     def compilable(self) -> bool:
-        """True if a compiled loop can follow the curves: on the CPU, of one pair, without gradients, and with
-        no lens or one of `COMPILED_LENSES` without a tilted sensor."""
+        """True if compiled loops can follow the curves, and their gradients: on the CPU, of one pair, with no
+        lens or one of `COMPILED_LENSES` without a tilted sensor."""
         lens = self.beta.distortion
-        numbers = [self.first, self.last, self.beta.K, *([] if lens is None else [lens.coefficients])]
-        free = torch.is_grad_enabled() and any(t.requires_grad for t in numbers)
         lens_compiled = lens is None or (
             isinstance(lens, Distortion)
             and lens.model in COMPILED_LENSES
             and lens.coefficients.shape[-1] < 14
         )
-        return not free and lens_compiled and not self.beta.batch_shape and compilable(self.first)
+        plain = lens_compiled and not self.beta.batch_shape and compilable(self.first)
+        return plain and all(forward_ad.unpack_dual(t).tangent is None for t in self.numbers)
 
     def positions(self, nodes: int, samples: int) -> Positions:
-        """Compute the positions of `Curved` by a compiled loop in float64; the curve must be `compilable`.
+        """Compute the positions of `Curved` by compiled loops in float64; the curve must be `compilable`.
 
         Args:
             nodes: number of points at which each curve is followed, at least 2; not checked.
             samples: number of positions per pixel.
 
         Returns:
-            Positions (*n, samples, 2) in beta's pixels, in the precision of `first`, without gradient; masked
-            ones are 0.
+            Positions (*n, samples, 2) in beta's pixels, in the precision of `first`, differentiable twice;
+            masked ones are 0.
 
         Raises:
             ValueError: for fewer than 1 sample.
         """
-        from .curve_kernels import curved_positions
+        return Positions(*_Followed.apply(*self.numbers, self, nodes, samples))
 
-        like, n = self.first, self.valid.numel()
-        xy = np.empty((n, samples, 2), f"f{like.dtype.itemsize}")
-        mask = np.empty((n, samples), bool)
-        ends = (t.detach().double().reshape(n, 3).contiguous().numpy() for t in (self.first, self.last))
-        double = like.new_empty(0, dtype=torch.float64)
-        fractions = (torch.linspace(0, 1, nodes, dtype=torch.float64), sample_fractions(samples, like=double))
-        given = (
-            *ends,
-            self.valid.reshape(n).contiguous().numpy(),
-            LensNumbers.from_camera(self.beta, wide=bool(self.wide)),
-        )
-        rest = (*(t.numpy() for t in fractions), self.beta.hw, xy, mask)
-        in_parallel([partial(curved_positions, *span, *given, *rest) for span in spans(n, PIECE)])
-        axes = self.valid.shape
-        return Positions(
-            torch.from_numpy(xy).reshape(*axes, samples, 2), torch.from_numpy(mask).reshape(*axes, samples)
-        )
+    def formulas(self, nodes: int, samples: int) -> Positions:
+        """Compute the positions of `Curved` by torch, as `positions` does by compiled loops."""
+        fractions = self.nodes(nodes)
+        xy, visible = self.at(fractions)
+        pieces = visible_pieces(xy, visible & self.valid[..., None], self.beta.hw, self.turn)
+        xy, visible = self.at(along_pieces(pieces, sample_fractions(samples, like=xy), fractions))
+        xy, inside = _onto_edge(xy, self.beta.hw, EDGE)
+        mask = inside & visible & (pieces.length.sum(-1, keepdim=True) > 0)
+        return Positions(torch.where(mask[..., None], xy, 0.0), mask)
+
+    @property
+    def numbers(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Both ends, beta's intrinsics, and its lens's coefficients, none without a lens."""
+        lens = self.beta.distortion
+        return self.first, self.last, self.beta.K, self.beta.K[0, :0] if lens is None else lens.coefficients
+
+    def with_numbers(self, first: Tensor, last: Tensor, K: Tensor, coefficients: Tensor) -> RayCurve:
+        """Return the same curve with other `numbers`."""
+        lens = self.beta.distortion
+        lens = lens.with_coefficients(coefficients) if isinstance(lens, Distortion) else lens
+        return self._replace(first=first, last=last, beta=self.beta.replace(K=K, distortion=lens))
 
     def nodes(self, count: int) -> Float[Tensor, "*n k"]:
         """Compute the fractions of the way from `first` to `last`, 0..1, at which to follow the curve.
@@ -467,7 +466,61 @@ class RayCurve(NamedTuple):
         r0, r1 = (
             X.square().sum(-1, keepdim=True).clamp(min=FRONT**2).sqrt() for X in (self.first, self.last)
         )
-        return (1 - u) * torch.sinc((1 - u) * angle / math.pi) * r1, u * torch.sinc(u * angle / math.pi) * r0
+        # Not by torch.sinc, which has no second derivative at 0.
+        of_first, of_last = (
+            v * cosine_and_sinc((v * angle).square())[1] * r for v, r in ((1 - u, r1), (u, r0))
+        )
+        return of_first, of_last
+
+
+class _Followed(torch.autograd.Function):
+    """Positions and mask by compiled loops, with gradients by a loop too; theirs are by the formulas."""
+
+    @staticmethod
+    def forward(ctx, first, last, K, coefficients, curve, nodes, samples):
+        from .curve_kernels import curved_positions
+
+        xy = np.empty((*curve.valid.shape, samples, 2), f"f{first.dtype.itemsize}")
+        mask = np.empty(xy.shape[:-1], bool)
+        flat = xy.reshape(-1, samples, 2), mask.reshape(-1, samples)
+        _loop(curved_positions, curve, nodes, samples, *flat)
+        ctx.save_for_backward(first, last, K, coefficients)
+        ctx.rest = curve, nodes, samples
+        found = torch.from_numpy(xy), torch.from_numpy(mask)
+        ctx.mark_non_differentiable(found[1])
+        return found
+
+    @staticmethod
+    def backward(ctx, by_xy, _):
+        numbers, wanted, (curve, nodes, samples) = ctx.saved_tensors, ctx.needs_input_grad[:4], ctx.rest
+        if torch.is_grad_enabled() or not compilable(by_xy):
+            again = torch.is_grad_enabled()
+            with torch.enable_grad():
+                copies = [t.view_as(t) for t in numbers]  # the ends may depend on K: each has its own part
+                xy = curve.with_numbers(*copies).formulas(nodes, samples).xy
+            asked = [t for t, want in zip(copies, wanted) if want]
+            of_asked = iter(torch.autograd.grad(xy, asked, by_xy, create_graph=again, allow_unused=True))
+            return *(next(of_asked) if want else None for want in wanted), None, None, None
+        from .curve_kernels import curved_gradients
+
+        ends = np.zeros((2, curve.valid.numel(), 3))
+        flat = by_xy.reshape(-1, samples, 2).contiguous().numpy()
+        sums = zip(*_loop(curved_gradients, curve, nodes, samples, flat, *ends))
+        by_K, by_lens = (np.sum(parts, 0) for parts in sums)
+        found = zip((*ends, by_K, by_lens[: numbers[3].numel()]), numbers, wanted)
+        of_each = [torch.from_numpy(g).reshape(t.shape).to(t.dtype) if want else None for g, t, want in found]
+        return *of_each, None, None, None
+
+
+def _loop(loop: Callable[..., Any], curve: RayCurve, nodes: int, samples: int, *arrays: Any) -> list[Any]:
+    """Run a compiled loop over the pixels of a curve; return what it returns for each thread's piece."""
+    n, double = curve.valid.numel(), torch.empty(0, dtype=torch.float64)
+    ends = (t.detach().double().reshape(n, 3).contiguous().numpy() for t in (curve.first, curve.last))
+    lens = LensNumbers.from_camera(curve.beta, wide=bool(curve.wide))
+    fractions = torch.linspace(0, 1, nodes, dtype=torch.float64), sample_fractions(samples, like=double)
+    given = *ends, curve.valid.reshape(n).contiguous().numpy(), lens, *(t.numpy() for t in fractions)
+    parts = [partial(loop, *span, *given, curve.beta.hw, *arrays) for span in spans(n, PIECE)]
+    return in_parallel(parts)
 
 
 NODES, PASSES = 64, 2
@@ -505,9 +558,9 @@ class LensNumbers(NamedTuple):
     """A camera's numbers for the compiled loop, in float64.
 
     Attributes:
-        model: 0 for a pinhole, else a number of `COMPILED_LENSES`.
-        c: coefficients (14), padded with zeros; zeros for a pinhole.
-        limit: squared limit of the lens model's domain (`Distortion.squared_limit`); 0 for a pinhole.
+        model: number of `COMPILED_LENSES`; a pinhole is the first with coefficients of zero.
+        c: coefficients (14), padded with zeros.
+        limit: squared limit of the lens model's domain (`Distortion.squared_limit`); infinite for a pinhole.
         K: intrinsics (3, 3).
         wide: True if fractions of a curve (`RayCurve`) are even in angle.
     """
@@ -533,7 +586,7 @@ class LensNumbers(NamedTuple):
         """
         K, lens = camera.K.detach().double().numpy(), camera.distortion
         if lens is None:
-            return cls(0, np.zeros(14), 0.0, np.ascontiguousarray(K), wide)
+            return cls(1, np.zeros(14), math.inf, np.ascontiguousarray(K), wide)
         c = lens.coefficients.detach().double()
         padded = np.zeros(14)
         padded[: len(c)] = c.numpy()

@@ -141,7 +141,9 @@ def all_pixels(pair: Pair) -> Float[Tensor, "*b h w 2"]:
 def compilable(x: Tensor) -> bool:
     """Return True if compiled loops can take a tensor: plain numbers on the CPU that no trace follows."""
     plain = type(x) is Tensor and x.device.type == "cpu" and x.dtype in (torch.float32, torch.float64)
-    return plain and not followed() and can_compile()
+    if not plain or followed() or torch._C._functorch.is_legacy_batchedtensor(x):  # by `is_grads_batched`
+        return False
+    return can_compile()
 
 
 CHUNK = 1 << 15

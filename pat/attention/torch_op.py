@@ -108,6 +108,7 @@ class _AttendLocal(torch.autograd.Function):
         *inputs, bias, out, logsum = ctx.saved_tensors
         wanted = ctx.needs_input_grad[:3]
         if torch.is_grad_enabled():
+            inputs = [t.view_as(t) for t in inputs]  # one may depend on another
             asked = [t for t, want in zip(inputs, wanted) if want]
             of_asked = iter(torch.autograd.grad(ctx.again(*inputs), asked, upstream, create_graph=True))
             found = [next(of_asked) if want else None for want in wanted]
