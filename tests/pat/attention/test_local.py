@@ -89,6 +89,16 @@ def test_its_gradients_are_the_references(field, order, backend):
         torch.testing.assert_close(one.double(), other, rtol=1e-4, atol=most)
 
 
+def test_a_key_that_depends_on_the_query_counts_once():
+    """With a graph for second derivatives, or without one."""
+    query, _, value = (t.requires_grad_() for t in features((2 * ROWS + 3, 33)))
+    out = nearest(query, query.sin(), value, Local(7), backend="local").sum()
+    wanted, found = (
+        torch.autograd.grad(out, query, create_graph=again, retain_graph=True) for again in (False, True)
+    )
+    torch.testing.assert_close(found, wanted, rtol=1e-3, atol=1e-3)
+
+
 def test_it_finds_the_gradients_that_are_wanted_only():
     query, key, value = features()
     for wanted in (query, key, value):
