@@ -120,7 +120,7 @@ class HomographyDisplacement:
     H x; from F and H, or from calibration.
 
     The paper's homography-based field. H is as in `Pair.homography`: for a calibrated pair without a link
-    that of the plane in the middle of the depth range (`approximated` fits a better one), and a segment
+    that of the plane at the middle inverse depth (`approximated` fits a better one), and a segment
     starts towards near and ends towards far. Where there is no line (at the epipole, and without a baseline)
     the segment is the point H x.
 

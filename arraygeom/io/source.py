@@ -272,7 +272,7 @@ class RigSource:
             return self.at(_value_of_xml(self.at(self.xml()))).mapping()
         text = LARGE_DATA.sub("[]", re.sub(r"^%YAML.*|!!opencv[\w-]+", "", text, flags=re.M))
         documents = re.split(r"^(?:---|\.\.\.)", text, flags=re.M)
-        return self.yaml(next(filter(str.strip, documents), ""))
+        return self.yaml(next((one for one in documents if re.search(r"^\s*[^#\s]", one, re.M)), ""))
 
     def _parsed(self, kind: str, load: Callable[[str], Any], text: str) -> Entry:
         try:

@@ -93,13 +93,13 @@ class RigDifference:
 
     Attributes:
         cameras: difference of pixels by camera.
-        depths: difference of depths by alpha and another camera, by that camera's name; cameras that see none
-            of alpha's points are missing.
+        depths: relative difference of depths by alpha and another camera, by that camera's name; cameras that
+            see none of alpha's points are missing.
         alpha: camera of the depths, the first of the first rig.
         motion: rigid motion from the first rig's world to the second's that is taken out before comparing
             pixels.
         significance: result of the test; None without covariances.
-        unit: unit of depths: "m", or "baselines" for rigs of unknown scale.
+        unit: unit of `Difference.depth` and of lengths: "m", or "baselines" for rigs of unknown scale.
     """
 
     cameras: Mapping[str, Difference]

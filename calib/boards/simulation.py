@@ -51,7 +51,7 @@ def simulate_photos(
         The true `world_from_board`, a batch (count).
 
     Raises:
-        ValueError: for a rig without calibrated cameras, cameras that hardly see a board together, a board
+        ValueError: for a rig without calibrated cameras, too few poses whose middles all cameras see, a board
             that cannot be printed, a `count` below 1, and a negative `noise`.
         OSError: if files cannot be written.
     """

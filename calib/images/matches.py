@@ -308,7 +308,7 @@ class FittedLink(NamedTuple):
 def fit_link(matches: PointMatches, F: Float[Tensor, "3 3"], *, within: float = 6.0) -> FittedLink:
     """Improve F, and fit a rough map H, by the matches near their epipolar lines.
 
-    F is fitted by MAGSAC++ (Barath et al. 2020) to 1 px; the given one stays if fewer than `ENOUGH` are near.
+    F is fitted by MAGSAC++ (Barath et al. 2020) to 1 px.
 
     Args:
         matches: undistorted points.
@@ -319,7 +319,8 @@ def fit_link(matches: PointMatches, F: Float[Tensor, "3 3"], *, within: float = 
         The link with the matches within 3 px of its lines.
 
     Raises:
-        ValueError: for fewer than `ENOUGH` consistent matches, or no F or no similarity that fits them.
+        ValueError: for fewer than `ENOUGH` matches within `within`, or then within 3 px of the new lines, or
+            no F or no similarity that fits them.
     """
     near = near_lines(matches, F, within=within)
     fitted = fit_fundamental(near) if len(near.alpha) >= ENOUGH else F

@@ -126,7 +126,7 @@ def attend_with_statistics(
         `Attended`: the values as `attend` returns them; the expected position of the match (B, 2, Ha, Wa) and
         the spread of the weights (`deviation`, (B, Ha, Wa)), pixels of beta; and the largest weight (`peak`,
         (B, Ha, Wa)). Statistics are float32 (float64 for float64 inputs) and differentiable, the peak not by
-        the geometry if `nearest`. All are 0 where no sample counts.
+        the geometry if `nearest` without `border`. All are 0 where no sample counts.
 
     Raises:
         RuntimeError: as `attend`; also for the backend `local`, which has no statistics.

@@ -243,7 +243,9 @@ def join(which: JoinsBands, views: Views) -> StepResult:
 
 
 def co_located(rig: Rig, names: Sequence[str], fields: Fields, which: JoinsBands) -> list[list[str]]:
-    """Group the calibrated betas with the same K, R, t, lens, size and field; sensors may differ.
+    """Group the calibrated betas with the same K, R, t, lens and size, and the same field object or none.
+
+    Sensors may differ.
 
     Args:
         which: "neighbours" to group only those that follow each other, "all", or "no" for none.

@@ -103,11 +103,12 @@ def check_limit(pixels: int, limit: float | None = None, each: float = LEAST_BYT
 
     Args:
         pixels: number of alpha's pixels.
-        limit: bytes; None or 0 for that of `limited`, without which any frame fits.
+        limit: bytes of the process, some 0.5 GiB of Python and torch included; None or 0 for that of
+            `limited`, without which any frame fits.
         each: bytes of working memory for each pixel, at least; more may be needed than is checked.
 
     Raises:
-        ValueError: if so many pixels need more than the limit.
+        ValueError: if so many pixels, Python and torch need more than the limit.
     """
     limit = limit or _LIMIT.get() or math.inf
     if (needed := SLACK * (LIBRARIES + each * pixels)) > limit:

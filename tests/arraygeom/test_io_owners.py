@@ -514,3 +514,11 @@ def test_a_fisheye_is_not_fitted_anew():
     lens = Distortion("kannala-brandt", torch.zeros(4, dtype=torch.float64))
     with pytest.raises(ValueError, match="brown-conrady"):
         refit_lens(pole().replace(distortion=lens))
+
+
+def test_a_comment_before_the_first_yaml_document_is_none(tmp_path):
+    (tmp_path / "a.yaml").write_text(
+        f"# of the lab\n---\n{json.dumps({'K': MATRIX, 'dist': C})}\n---\nsecond: 1\n"
+    )
+    (camera,) = read_rig(tmp_path / "a.yaml", hw=(720, 1280)).cameras.values()
+    assert camera.K.flatten().tolist() == K

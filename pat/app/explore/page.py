@@ -91,8 +91,9 @@ class Explorer:
     def save(self, path: str | Path, columns: int = GRID) -> None:
         """Write a page of one file that needs neither a kernel nor a network connection.
 
-        For calibrated pinholes it computes any pixel and the rig's sliders itself, for the default field and
-        weights; for others it stores the answers for a grid of alpha's pixels, and has no sliders.
+        For calibrated pinholes with a depth range, and no links, it computes any pixel and the rig's sliders
+        itself, for the default field and weights; for others it stores the answers for a grid of alpha's
+        pixels, and has no sliders.
 
         Args:
             columns: columns of that grid.

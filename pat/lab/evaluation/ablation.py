@@ -440,11 +440,12 @@ def point_errors(case: AblationCase, depth: Float[Tensor, "h w"]) -> tuple[float
 
 
 def markdown(rows: Sequence[AblationRow]) -> str:
-    """Format rows as a Markdown table with an introduction, one line for each family.
+    """Format rows as an introduction and a Markdown table of one line for each family.
 
     Returns:
-        The text: mean PSNR with 95 % bootstrap interval, mean SSIM, mean gain in PSNR over "calibrated" (dB;
-        blank if that has no scores), PSNR by focal ratio, errors in beta, and the reason for missing scores.
+        The text: mean PSNR with 95 % bootstrap interval (of two scenes or more), mean SSIM, mean gain in PSNR
+        over "calibrated" (dB; blank if that has no scores), PSNR by focal ratio, errors in beta, and last the
+        reason if a family has no score, or how many scenes it lacks.
     """
     between = [f"ratio {low:g} to {high:g}" for low, high in pairwise(RATIOS)]
     bins = [f"ratio below {RATIOS[0]:g}", *between, f"ratio from {RATIOS[-1]:g}"]
