@@ -18,6 +18,8 @@ AnyLens = TypeVar("AnyLens", bound="LensModel")
 
 CAMERA_MODELS: dict[str, type[CameraModel]] = {}
 """Camera models that rig files know by name, registered when they are defined with one."""
+TAKEN: set[str] = set()
+"""Other names of lenses in rig files: the models of `Distortion`."""
 
 
 class LensModel(Batched):
@@ -124,7 +126,7 @@ class CameraModel(LensModel):
     False`, and `lengths`, the names of its numbers in metres or metres for each second.
 
     Raises:
-        ValueError: when a subclass is defined with the name of another one.
+        ValueError: when a subclass is defined with the name of another one or of a `Distortion`.
     """
 
     registered: ClassVar[str] = ""
@@ -135,6 +137,8 @@ class CameraModel(LensModel):
     def __init_subclass__(cls, *, name: str = "", **rest: Any) -> None:
         super().__init_subclass__(**rest)
         cls.registered = name
+        if name in TAKEN:
+            raise ValueError(f"a lens model named '{name}' exists: give {cls.__qualname__} another name")
         existing = CAMERA_MODELS.get(name)
         if name and existing is not None and existing.__qualname__ != cls.__qualname__:
             raise ValueError(
