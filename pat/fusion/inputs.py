@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import max_pool2d, pad
 
-from arraygeom import Curved, Moved, Pair, ReceptiveField, Sensor, Widened, depth_of
+from arraygeom import Moved, Pair, ReceptiveField, Sensor, Widened, depth_of
 from arraygeom.epipolar import Depth, Track
 from arraygeom.fields import AroundDepth, AroundMatches, default_field, pinhole_track
 from arraygeom.fields.grid import BLOCK, FieldOnGrid
@@ -24,7 +24,7 @@ from ..matching.normalisation import combined_bands
 from ..matching.tangents import along_tangents
 from ..networks.protocol import FusionNetwork
 from .steps import FusionStep, Undo, takes_pinhole_views
-from .views import Views, check_precision, innermost
+from .views import Views, check_precision, innermost, states_distance
 
 LOG = logging.getLogger(__name__)
 CLIPPED = 0.995
@@ -209,9 +209,8 @@ def points_of(field: ReceptiveField) -> Callable[[Tensor], Tensor]:
 
 
 def bounds_of(field: ReceptiveField) -> Literal["depth", "distance"]:
-    """Return the quantity that a field's depth range bounds."""
-    inner = innermost(field)
-    return inner.bounds if isinstance(inner, Curved) else "depth"
+    """Return the quantity that a field's depth range bounds: its attribute `bounds`; without one "depth"."""
+    return "distance" if states_distance(innermost(field)) else "depth"
 
 
 def measured_along(views: Views) -> Literal["depth", "distance"]:

@@ -11,6 +11,7 @@ from arraygeom.fields import FIELDS, named_field
 from arraygeom.io import READERS, WRITERS, RigFileError, recognise, write_rig
 from arraygeom.lenses import CAMERA_MODELS, CameraModel
 from arraygeom.runtime.extras import imported
+from pat.media.images import write_image
 from tests.pat.commands import pat
 
 MINE = '''
@@ -51,6 +52,14 @@ class Reader:
         )
 
 
+@dataclass(frozen=True)
+class Near:
+    near: float = 1.0
+
+    def __call__(self, pair, x):
+        return Epipolar(self.near, 9.0)(pair, x)
+
+
 READERS["mine"] = Reader
 FIELDS["mine"] = Epipolar
 '''
@@ -75,6 +84,17 @@ def test_a_plugin_is_imported_before_the_command(mine, option, capsys):
     rig = Rig.load(mine / "native.yaml")
     assert rig.names == ("left", "right")
     assert rig["left"].distortion.model == "tests-half"
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_the_processes_of_a_batch_know_plugins_and_fields_of_ones_own(mine, capsys, workers):
+    for name, bands in (("left", 1), ("right", 3)):
+        for frame in "12":
+            write_image(mine / name / f"{frame}.png", torch.rand(bands, 48, 64))
+    field = "--field tests_mine:Near --depth 1 9"
+    files = "--image left=left --image right=right"
+    pat(f"batch --plugin tests_mine array.mine --alpha left {field} {files} --out out --workers {workers}")
+    assert {path.name for path in (mine / "out").glob("*_fused.png")} == {"1_fused.png", "2_fused.png"}
 
 
 def test_without_it_the_format_is_unknown(mine, capsys):
