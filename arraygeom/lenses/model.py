@@ -268,7 +268,10 @@ def _kind(value: Any) -> str:
 
 
 def beside_points(number: Tensor, points: Tensor, axes: int = 0) -> Tensor:
-    """Reshape a model's number (*b, and `axes` of its own) for points (*b, ..., k), by axes of length 1."""
+    """Reshape a model's number (*b, and `axes` of its own) for points (*b, ..., k), by axes of length 1.
+
+    A number without axes of its own becomes (*b, 1, ...), with one axis fewer than the points, as X[..., 2].
+    """
     batch = number.ndim - axes
     trailing = number.shape[batch:]
     return number.to(points).reshape((*number.shape[:batch], *[1] * (points.ndim - 1 - batch), *trailing))

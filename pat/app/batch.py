@@ -18,8 +18,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+import torch
 import yaml
 from rich.console import Console
 from torch import Tensor
@@ -38,10 +39,11 @@ from ..fusion.checks import confidence_checked
 from ..fusion.frame import Frame
 from ..fusion.frames import ImageFiles
 from ..fusion.fuse import FuseSettings, fuse_frame
+from ..fusion.inputs import measured_along
 from ..fusion.results import ImageFormat, band_names, fused_group, refuse_to_replace, save_frame, view_of
 from ..fusion.sequence import KeyColour, SequenceFusion, readable
 from ..fusion.timeline import KeyFrame
-from ..fusion.views import ViewFiles
+from ..fusion.views import ViewFiles, Views
 from ..media.images import read_image
 from ..media.raw import developed_rig
 from ..media.suffixes import IMAGE_SUFFIXES, VIDEO_SUFFIXES
@@ -328,7 +330,14 @@ class Batch:
                 name=self.names[i],
                 bands=band_names(frame, self._betas) or self._propagated_bands(frame),
                 about={"inputs": inputs or self.inputs(i)},
+                along=self._along,
             )
+
+    @cached_property
+    def _along(self) -> Literal["depth", "distance"]:
+        field, images = self.settings.field, dict.fromkeys(self.files, torch.empty(0))
+        fields = field if isinstance(field, Mapping) else dict.fromkeys(images, field)
+        return measured_along(Views(self.rig, images, self.alpha, fields))
 
     @property
     def _betas(self) -> list[str]:

@@ -83,8 +83,9 @@ def test_points_of_a_whole_sphere_are_on_its_rays(tmp_path):
     rig.save(tmp_path / "rig.yaml")
     for name, image in recorded(rig)[0].items():
         write_image(tmp_path / f"{name}.png", image)
-    main(arguments(tmp_path, extra=["--extras", "points"]))
+    main(arguments(tmp_path, extra=["--extras", "points,page"]))
     depth = read_depth(tmp_path / "out" / "depth.tif")
+    assert "along the ray" in (tmp_path / "out" / "index.html").read_text()
     cloud = (tmp_path / "out" / "points.ply").read_bytes().partition(b"end_header\n")[2]
     X = torch.from_numpy(np.frombuffer(cloud, VERTEX)["X"].copy())
     torch.testing.assert_close(X.norm(dim=-1), depth[depth.isfinite()])
