@@ -194,7 +194,9 @@ class Batch:
             check_video(video)
         plan, many = self.out / KEYS / PLAN, range(len(self.names))
         how: dict[str, Any] = {"workers": workers, "resume": resume, "on_error": on_error, "console": console}
-        modules = self.modules
+        modules, folders = self.modules, {p.resolve().parent for paths in self.files.values() for p in paths}
+        if self.out.resolve() in folders:
+            raise ValueError(f"--out: images are read from {self.out}: give another folder for the results")
         with folder_lock(self.out):
             self._begin(resume)
             if self.sequence:
