@@ -384,8 +384,8 @@ def _made(entries: dict[str, Any]) -> Any:
     if entries.keys() == vars(NoiseLevel()).keys():
         return NoiseLevel(**entries)
     module, _, name = str(entries.get("kind")).partition(":")
-    kind: Any = getattr(sys.modules.get(module), name, None)  # a plan imports nothing
-    if not dataclasses.is_dataclass(kind):
+    kind = getattr(sys.modules.get(module), name, None)  # a plan imports nothing
+    if not (isinstance(kind, type) and dataclasses.is_dataclass(kind)):
         return entries
     return kind(**{name: value for name, value in entries.items() if name != "kind"})
 
