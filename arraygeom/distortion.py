@@ -38,7 +38,7 @@ from .lenses.brown import brown_derivatives, brown_distort, brown_limit, brown_u
 from .lenses.central import EXTENDED_UNIFIED, FOV, central_project, central_unproject
 from .lenses.common import WIDEST, finite_points, on_plane, once, unit
 from .lenses.fisheye import fisheye_limit, fisheye_project, fisheye_unproject
-from .lenses.model import LensModel
+from .lenses.model import TAKEN, LensModel
 from .pixels import to_homogeneous
 from .runtime.tracing import traced
 
@@ -63,6 +63,7 @@ LENS_TERMS = {
 COEFFICIENT_COUNTS: dict[str, tuple[int, ...]] = {
     name: (4, 5, 8, 12, 14) if name == BROWN_CONRADY else (len(terms),) for name, terms in LENS_TERMS.items()
 }
+TAKEN.update(COEFFICIENT_COUNTS)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

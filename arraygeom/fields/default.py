@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import difflib
-from typing import Any, Literal
+from typing import Literal
 
 from ..checks import check_field
 from ..epipolar import FRONT
 from ..pair import Pair
 from ..pixels import coarse_grid
-from ..runtime.extras import imported
+from ..runtime.extras import Registry, error_line, imported
 from ..runtime.tracing import traced
 from .curved import Curved, ThroughLenses
 from .explicit import Dense, Local, NearestVoxels
 from .protocol import ReceptiveField
 from .straight import AroundHomography, Epipolar, EpipolarLine, HomographyDisplacement, Rectified
 
-FIELDS: dict[str, type[Any]] = {
+_FAMILIES = {
     "epipolar": Epipolar,
     "line": EpipolarLine,
     "homography": HomographyDisplacement,
@@ -26,7 +26,8 @@ FIELDS: dict[str, type[Any]] = {
     "dense": Dense,
     "curved": Curved,
 }
-"""Families of fields by name; each can be constructed without arguments."""
+FIELDS = Registry("field", ("__call__",), _FAMILIES)
+"""Fields by name: classes that can be constructed without arguments; yours may be a field or function too."""
 
 
 def named_field(name: str) -> ReceptiveField:
@@ -40,20 +41,18 @@ def named_field(name: str) -> ReceptiveField:
 
     Raises:
         ValueError: for a name that is neither, a module or object that cannot be imported (`imported`), or an
-            object that is no field, such as a class that needs arguments. Other errors of the module pass.
+            object that is no field, such as a class that needs arguments.
     """
-    if ":" not in name:
-        if name in FIELDS:
-            return FIELDS[name]()
+    if ":" not in name and name not in FIELDS:
         near = difflib.get_close_matches(name, FIELDS, 1)
         hint = f"did you mean '{near[0]}'?" if near else f"use one of {', '.join(FIELDS)}, or MODULE:OBJECT"
         raise ValueError(f"no field is called '{name}': {hint}")
-    field = imported(name, "field")
+    field = FIELDS[name] if name in FIELDS else imported(name, "field")
     try:
         field = field() if isinstance(field, type) else field
         check_field(field)
-    except TypeError as error:
-        raise ValueError(f"the field '{name}': {error}") from None
+    except Exception as error:
+        raise ValueError(f"the field '{name}': {error_line(error)}") from error
     return field
 
 

@@ -11,7 +11,6 @@ import re
 from collections.abc import Mapping
 from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -22,6 +21,7 @@ from ..pixels import HW
 from ..rig import Rig
 from ..rig_check import file_oddities
 from ..runtime.atomic import write_text
+from ..runtime.extras import Registry, error_line
 from ..runtime.together import sweep, write_together
 from ..runtime.warned import warn
 from ..sensor import Sensor
@@ -35,12 +35,12 @@ FORMATS = (
     *("metashape", "xmp", "luxonis", "mrcal", "lensboy", "realsense", "zed", "azure", "usual"),
 )
 """Formats, each a module, in the order in which they are tried on a file."""
-READERS: dict[str, Any] = {
-    name: kitti.Raw if name == "kitti-raw" else import_module(f"{__name__}.{name}") for name in FORMATS
-}
+_READERS = {n: kitti.Raw if n == "kitti-raw" else import_module(f"{__name__}.{n}") for n in FORMATS}
+_READERS |= dict.fromkeys(("aniposelib", "caliscope", "multical", "pycalib"), _READERS["usual"])
+READERS = Registry("rig reader", ("read",), _READERS)
+"""Readers of rig files by name of the format; yours are asked before the package's."""
 ANY_SCALE = ("colmap", "nerfstudio", "usual", "strecha")
 """Formats that state no unit: their lengths are metres only if the file's author scaled them so."""
-READERS |= dict.fromkeys(("aniposelib", "caliscope", "multical", "pycalib"), READERS["usual"])
 LIKELY = {
     r"Camera\d?\.fx|Camera\.type": "ORB-SLAM's settings, whose numbers are not read as a rig",
     r"T_cn_cnm1|cam_overlaps|rostopic": "Kalibr: wanted cam0, cam1, ... with intrinsics",
@@ -52,7 +52,9 @@ LIKELY = {
     r"(?i)fisheye|distort|focal|intrinsic": "some tool for cameras",
 }
 """Tools that probably wrote a file that no reader recognises, by words in it."""
-WRITERS = {name: READERS[name] for name in ("native", "opencv", "colmap", "kalibr", "nerfstudio")}
+_WRITERS = {name: READERS[name] for name in ("native", "opencv", "colmap", "kalibr", "nerfstudio")}
+WRITERS = Registry("rig writer", ("write",), _WRITERS)
+"""Writers of rig files: `write(rig)` returns the text of a file, or texts by name of a folder's files."""
 
 __all__ = [
     "READERS",
@@ -108,19 +110,14 @@ def read_rig(
     source = RigSource(path, hw=hw, lens=lens)
     try:
         rig = READERS[format].read(source)
-    except (RigFileError, FileNotFoundError):
+        if not isinstance(rig, Rig):
+            raise TypeError(f"read(source) returns a {type(rig).__name__}: wanted a Rig")
+    except (RigFileError, FileNotFoundError, ImportError, MemoryError):
         raise
-    except (
-        ArithmeticError,
-        AttributeError,
-        LookupError,
-        OSError,
-        RecursionError,
-        TypeError,
-        ValueError,
-    ) as error:
-        cause = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise RigFileError(path, None, f"cannot be read as {format} ({cause}); is the file whole?") from error
+    except Exception as error:
+        remedy = "is the file whole?" if format in _READERS else "is its reader right?"
+        cause = f"cannot be read as {format} ({error_line(error)}); {remedy}"
+        raise RigFileError(path, None, cause) from error
     source.warn_of_unread()
     lenses = [view.distortion for view in rig.cameras.values() if isinstance(view, LensView)]
     if lens is not None and not any(one is not None and one.model == lens for one in lenses):
@@ -137,11 +134,11 @@ def write_rig(rig: Rig, path: str | Path, *, format: str = "native") -> None:
 
     Formats of several files make a folder, the last of them after the others.
 
-    What a format leaves out of the rig is named by one RigFileWarning: all but the native one the depth
-    range, links, what a sensor records; OpenCV's where the first camera is in the world.
+    What a format of the package leaves out of the rig is named by one RigFileWarning: all but the native one
+    the depth range, links, what a sensor records; OpenCV's where the first camera is in the world.
 
     Args:
-        format: "native", "opencv", "colmap", "kalibr" or "nerfstudio".
+        format: "native", "opencv", "colmap", "kalibr", "nerfstudio" or another name in `WRITERS`.
 
     Raises:
         ValueError: for an unknown format, a rig that the format cannot hold, and a batch.
@@ -151,7 +148,9 @@ def write_rig(rig: Rig, path: str | Path, *, format: str = "native") -> None:
     if format not in WRITERS:
         raise ValueError(f"cannot write rig format '{format}' (known: {', '.join(WRITERS)})")
     path, contents = Path(path), WRITERS[format].write(rig)
-    if format != "native" and (lost := _left_out(rig, format)):
+    if not isinstance(contents, str | Mapping):
+        raise ValueError(f"the writer of {format} gives a {type(contents).__name__}: wanted a text or texts")
+    if format in {*_WRITERS} - {"native"} and (lost := _left_out(rig, format)):
         warn(f"{path}: {format} files do not hold the rig's {lost}: use the native format", RigFileWarning)
     if isinstance(contents, Mapping):
         sweep(path, format)
@@ -166,14 +165,21 @@ def recognise(path: str | Path) -> str:
     """Return the name of a file's or folder's format.
 
     Raises:
-        RigFileError: for an empty file; its subclass UnknownRigFormat for one of no known format.
+        RigFileError: for an empty file, and a reader of yours that fails on it; its subclass UnknownRigFormat
+            for one of no known format.
     """
     path = Path(path)
     head = decoded(path.read_bytes()[:4096]) if path.is_file() else ""
     if path.is_file() and not head.strip():
         raise RigFileError(path, None, "is empty")
-    for name, reader in READERS.items():
-        if reader.recognises(path, head) if hasattr(reader, "recognises") else re.search(reader.HEAD, head):
+    for name, reader in sorted(READERS.items(), key=lambda entry: entry[0] in _READERS):
+        try:
+            by_head = not hasattr(reader, "recognises")
+            found = re.search(reader.HEAD, head) if by_head else reader.recognises(path, head)
+        except Exception as error:
+            cause = f"the reader of {name} cannot tell if it is one ({error_line(error)})"
+            raise RigFileError(path, None, cause) from error
+        if found:
             return name
     likely = next((f"It may be of {name}. " for word, name in LIKELY.items() if re.search(word, head)), "")
     raise UnknownRigFormat(

@@ -1,6 +1,6 @@
 """Camera models: maps between directions and points of the image plane, one file for each family.
 
-A model of your own is a subclass of `CameraModel`; see the page "A camera of one's own" of the documentation.
+A model of your own is a subclass of `CameraModel`; see "A camera of your own" in docs/rigs.md.
 """
 
 from .angular import Equirectangular, PolynomialFisheye

@@ -18,6 +18,8 @@ AnyLens = TypeVar("AnyLens", bound="LensModel")
 
 CAMERA_MODELS: dict[str, type[CameraModel]] = {}
 """Camera models that rig files know by name, registered when they are defined with one."""
+TAKEN: set[str] = set()
+"""Other names of lenses in rig files: the models of `Distortion`."""
 
 
 class LensModel(Batched):
@@ -124,7 +126,7 @@ class CameraModel(LensModel):
     False`, and `lengths`, the names of its numbers in metres or metres for each second.
 
     Raises:
-        ValueError: when a subclass is defined with the name of another one.
+        ValueError: when a subclass is defined with the name of another one or of a `Distortion`.
     """
 
     registered: ClassVar[str] = ""
@@ -135,6 +137,8 @@ class CameraModel(LensModel):
     def __init_subclass__(cls, *, name: str = "", **rest: Any) -> None:
         super().__init_subclass__(**rest)
         cls.registered = name
+        if name in TAKEN:
+            raise ValueError(f"a lens model named '{name}' exists: give {cls.__qualname__} another name")
         existing = CAMERA_MODELS.get(name)
         if name and existing is not None and existing.__qualname__ != cls.__qualname__:
             raise ValueError(
@@ -264,7 +268,10 @@ def _kind(value: Any) -> str:
 
 
 def beside_points(number: Tensor, points: Tensor, axes: int = 0) -> Tensor:
-    """Reshape a model's number (*b, and `axes` of its own) for points (*b, ..., k), by axes of length 1."""
+    """Reshape a model's number (*b, and `axes` of its own) for points (*b, ..., k), by axes of length 1.
+
+    A number without axes of its own becomes (*b, 1, ...), with one axis fewer than the points, as X[..., 2].
+    """
     batch = number.ndim - axes
     trailing = number.shape[batch:]
     return number.to(points).reshape((*number.shape[:batch], *[1] * (points.ndim - 1 - batch), *trailing))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -50,18 +50,56 @@ def imported(name: str, what: str) -> Any:
         The object, or the module where no object is named.
 
     Raises:
-        ValueError: for a module or object that does not exist, a relative name, or a module that fails with
-            ImportError, AttributeError, TypeError or ValueError; other errors of the module pass.
+        ValueError: for a module or object that does not exist, a name that is a path, or a module that fails.
     """
     module, _, attribute = name.partition(":")
     try:
         sys.path.insert(0, str(Path.cwd()))
         found = importlib.import_module(module)
         return getattr(found, attribute) if attribute or ":" in name else found
-    except (ImportError, AttributeError, TypeError, ValueError) as error:
-        raise ValueError(f"the {what} '{name}' cannot be imported: {error}") from None
+    except Exception as error:
+        is_path = "/" in module or module.endswith(".py")
+        hint = f": give the name of a module, as {Path(module).stem}" * is_path
+        raise ValueError(f"the {what} '{name}' cannot be imported: {error_line(error)}{hint}") from error
     finally:
         sys.path.pop(0)
+
+
+def error_line(error: BaseException) -> str:
+    """Return an error's first line, after its kind where the line may not say enough, as KeyError's."""
+    plain = isinstance(error, ImportError | AttributeError | OSError | TypeError | ValueError) and str(error)
+    kind = [] if plain else [type(error).__name__]
+    return ": ".join([*kind, *str(error).splitlines()[:1]])
+
+
+class Registry(dict[str, Any]):
+    """Dictionary by name in which users register their own, and replace none but their own.
+
+    Args:
+        what: kind of the entries, for messages, such as "field".
+        methods: methods that each entry has.
+        entries: entries of the package.
+
+    Raises:
+        ValueError: when an entry is set that lacks a method, or under the name of another class or module.
+    """
+
+    def __init__(self, what: str, methods: tuple[str, ...], entries: Mapping[str, Any]) -> None:
+        super().__init__(entries)
+        self.what, self.methods = what, methods
+
+    def __setitem__(self, name: str, entry: Any) -> None:
+        missing = [method for method in self.methods if not callable(getattr(entry, method, None))]
+        if missing:
+            raise ValueError(f"the {self.what} '{name}' ({entry!r}) has no method {missing[0]}")
+        if name in self and _origin(self[name]) != _origin(entry):
+            raise ValueError(f"a {self.what} named '{name}' exists: give yours another name")
+        super().__setitem__(name, entry)
+
+
+def _origin(entry: Any) -> tuple[str, str]:
+    kind = entry if hasattr(entry, "__qualname__") else type(entry)
+    return kind.__module__, kind.__qualname__
 
 
 PLUGINS = "arraygeom.plugins"

@@ -13,22 +13,25 @@ import hashlib
 import json
 import re
 import shutil
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+import torch
 import yaml
 from rich.console import Console
 from torch import Tensor
 
-from arraygeom import Rig, ThroughLenses, Widened
-from arraygeom.fields import FIELDS
+from arraygeom import Rig
 from arraygeom.io.native import read_text as rig_of_text
 from arraygeom.io.native import write as rig_text
+from arraygeom.lenses import CAMERA_MODELS
 from arraygeom.runtime import together
 from arraygeom.runtime.atomic import write_text
+from arraygeom.runtime.extras import imported
 from arraygeom.runtime.safe_yaml import dump_yaml, load_yaml
 from arraygeom.runtime.threads import in_parallel
 
@@ -36,10 +39,11 @@ from ..fusion.checks import confidence_checked
 from ..fusion.frame import Frame
 from ..fusion.frames import ImageFiles
 from ..fusion.fuse import FuseSettings, fuse_frame
+from ..fusion.inputs import measured_along
 from ..fusion.results import ImageFormat, band_names, fused_group, refuse_to_replace, save_frame, view_of
 from ..fusion.sequence import KeyColour, SequenceFusion, readable
 from ..fusion.timeline import KeyFrame
-from ..fusion.views import ViewFiles
+from ..fusion.views import ViewFiles, Views
 from ..media.images import read_image
 from ..media.raw import developed_rig
 from ..media.suffixes import IMAGE_SUFFIXES, VIDEO_SUFFIXES
@@ -56,7 +60,6 @@ KEYS, PLAN = f"{together.LISTS}/keys", "plan.json"
 
 PLAN_FORMAT = "pat-batch 1"
 _network = lru_cache(maxsize=2)(load_weights)
-FIELD_CLASSES = {kind.__name__: kind for kind in (*FIELDS.values(), ThroughLenses, Widened)}
 
 
 @dataclass(frozen=True)
@@ -191,6 +194,9 @@ class Batch:
             check_video(video)
         plan, many = self.out / KEYS / PLAN, range(len(self.names))
         how: dict[str, Any] = {"workers": workers, "resume": resume, "on_error": on_error, "console": console}
+        modules, folders = self.modules, {p.resolve().parent for paths in self.files.values() for p in paths}
+        if self.out.resolve() in folders:
+            raise ValueError(f"--out: images are read from {self.out}: give another folder for the results")
         with folder_lock(self.out):
             self._begin(resume)
             if self.sequence:
@@ -198,12 +204,10 @@ class Batch:
             if self.sequence and not self.alone:
                 missing = [i for i in many if not self.list_file(i).exists()]
                 keys = [(k, f"key frame {self.names[k.alpha]}") for k in self.fusion.keys_of(missing)]
-                first = [Task(self._key_file(k), fuse_key, (plan, k), about) for k, about in keys]
+                first = [Task(self._key_file(k), fuse_key, (plan, k, modules), about) for k, about in keys]
                 run_tasks(first, title="key frames", **how)
-            tasks = [
-                Task(self.list_file(i), fuse_one, (plan, i, self._of_sequence), self.fused_file(i).name)
-                for i in many
-            ]
+            given = [(plan, i, self._of_sequence, modules) for i in many]
+            tasks = [Task(self.list_file(i), fuse_one, given[i], self.fused_file(i).name) for i in many]
             report = run_tasks(tasks, title="frames", **{**how, "resume": True})
             if video is not None and (report.made or report.kept):
                 made = [self.fused_file(i) for i in many if self.list_file(i).exists()]
@@ -242,10 +246,16 @@ class Batch:
         """Format the batch as JSON text, for processes that fuse its frames.
 
         Raises:
-            ValueError: for a field of another family than arraygeom's.
+            ValueError: for a field that is no dataclass.
         """
         entries = {entry.name: getattr(self, entry.name) for entry in dataclasses.fields(self)}
         return json.dumps({"format": PLAN_FORMAT, **entries}, default=_plain)
+
+    @property
+    def modules(self) -> tuple[str, ...]:
+        """Modules of cameras and of the batch's fields, for processes that fuse its frames."""
+        fields = re.findall(r'"kind": "([\w.]+):', self.to_json())
+        return (*sorted({*fields, *(kind.__module__ for kind in CAMERA_MODELS.values())}),)
 
     @classmethod
     def from_json(cls, text: str, source: str = PLAN) -> Batch:
@@ -322,7 +332,14 @@ class Batch:
                 name=self.names[i],
                 bands=band_names(frame, self._betas) or self._propagated_bands(frame),
                 about={"inputs": inputs or self.inputs(i)},
+                along=self._along,
             )
+
+    @cached_property
+    def _along(self) -> Literal["depth", "distance"]:
+        field, images = self.settings.field, dict.fromkeys(self.files, torch.empty(0))
+        fields = field if isinstance(field, Mapping) else dict.fromkeys(images, field)
+        return measured_along(Views(self.rig, images, self.alpha, fields))
 
     @property
     def _betas(self) -> list[str]:
@@ -357,31 +374,30 @@ def _plain(value: object) -> object:
         return float(value)
     if isinstance(value, FuseSettings | NoiseLevel):
         return vars(value)
-    kind = type(value).__name__
-    if FIELD_CLASSES.get(kind) is not type(value):
-        supported = ", ".join(FIELD_CLASSES)
-        raise ValueError(f"a batch cannot write {value!r} to its file: give one of {supported}")
-    return {"kind": kind, **vars(value)}
+    if not dataclasses.is_dataclass(kind := type(value)):
+        raise ValueError(f"a batch cannot write {value!r} to its file: give a dataclass, as Rectified() is")
+    return {"kind": f"{kind.__module__}:{kind.__qualname__}", **vars(value)}
 
 
 def _made(entries: dict[str, Any]) -> Any:
     """Rebuild the field or noise level of a part of a plan; other entries stay."""
     if entries.keys() == vars(NoiseLevel()).keys():
         return NoiseLevel(**entries)
-    kind = entries.get("kind")
-    if isinstance(kind, str) and kind in FIELD_CLASSES:
-        return FIELD_CLASSES[kind](**{name: value for name, value in entries.items() if name != "kind"})
-    return entries
+    module, _, name = str(entries.get("kind")).partition(":")
+    kind = getattr(sys.modules.get(module), name, None)  # a plan imports nothing
+    if not (isinstance(kind, type) and dataclasses.is_dataclass(kind)):
+        return entries
+    return kind(**{name: value for name, value in entries.items() if name != "kind"})
 
 
-def fuse_key(plan: Path, key: KeyFrame) -> None:
-    """Task: fuse a key frame of the batch in the file `plan`."""
-    _planned(plan, plan.stat().st_mtime_ns).fuse_key(key)
+def fuse_key(plan: Path, key: KeyFrame, modules: tuple[str, ...] = ()) -> None:
+    """Task: fuse a key frame of the batch in the file `plan`, once `modules` are imported."""
+    _planned(plan, plan.stat().st_mtime_ns, modules).fuse_key(key)
 
 
-def fuse_one(plan: Path, i: int, inputs: str = "") -> None:
-    """Task: fuse a frame of the batch in the file `plan`."""
-    _planned(plan, plan.stat().st_mtime_ns).fuse_one(i, inputs)
+def fuse_one(plan: Path, i: int, inputs: str = "", modules: tuple[str, ...] = ()) -> None:
+    """Task: fuse a frame of the batch in the file `plan`, once `modules` are imported."""
+    _planned(plan, plan.stat().st_mtime_ns, modules).fuse_one(i, inputs)
 
 
 def _differing(now: str, before: str) -> list[str]:
@@ -403,7 +419,9 @@ def _digest(document: object) -> str:
 
 
 @lru_cache(maxsize=2)
-def _planned(plan: Path, time: int) -> Batch:
+def _planned(plan: Path, time: int, modules: tuple[str, ...]) -> Batch:
+    for name in modules:
+        imported(name, "module")
     return Batch.from_json(plan.read_text(encoding="utf-8", errors="replace"), str(plan))
 
 

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import max_pool2d, pad
 
-from arraygeom import Curved, Moved, Pair, ReceptiveField, Sensor, Widened, depth_of
+from arraygeom import Moved, Pair, ReceptiveField, Sensor, Widened, depth_of
 from arraygeom.epipolar import Depth, Track
 from arraygeom.fields import AroundDepth, AroundMatches, default_field, pinhole_track
 from arraygeom.fields.grid import BLOCK, FieldOnGrid
@@ -24,7 +24,7 @@ from ..matching.normalisation import combined_bands
 from ..matching.tangents import along_tangents
 from ..networks.protocol import FusionNetwork
 from .steps import FusionStep, Undo, takes_pinhole_views
-from .views import Views, check_precision, innermost
+from .views import Views, check_precision, innermost, states_distance
 
 LOG = logging.getLogger(__name__)
 CLIPPED = 0.995
@@ -161,8 +161,9 @@ def frame_inputs(network: FusionNetwork, views: Views) -> FrameInputs:
         if not on_grid.any_valid(pair.alpha.hw):
             unit = length_unit(views.rig)
             bounds = "" if pair.depth is None else f" between {pair.depth[0]:g} and {pair.depth[1]:g} {unit}"
+            own = ", and the field's positions" if views.fields.get(name) else ""
             raise ValueError(
-                f"alpha's and '{name}'s views do not overlap{bounds}: check the poses and the depth range"
+                f"alpha's and '{name}'s views do not overlap{bounds}: check the poses, the depth range{own}"
             )
         placements.append(place)
     inputs = Inputs(alpha, tuple(betas), m, network.beta_halo, bands=network.bands, learned=network.learned)
@@ -209,9 +210,8 @@ def points_of(field: ReceptiveField) -> Callable[[Tensor], Tensor]:
 
 
 def bounds_of(field: ReceptiveField) -> Literal["depth", "distance"]:
-    """Return the quantity that a field's depth range bounds."""
-    inner = innermost(field)
-    return inner.bounds if isinstance(inner, Curved) else "depth"
+    """Return the quantity that a field's depth range bounds: its attribute `bounds`; without one "depth"."""
+    return "distance" if states_distance(innermost(field)) else "depth"
 
 
 def measured_along(views: Views) -> Literal["depth", "distance"]:

@@ -109,7 +109,7 @@ def save_frame(
         view: rig of alpha alone, written to view.yaml, which frames with a `name` share; None for none.
         rig: rig of all cameras, written to found_rig.yaml; None for no such file.
         points: camera of alpha; the pixels of known depth are written to points.ply. None for no such file.
-        along: kind of depth (`measured_along`), for `points`.
+        along: kind of depth (`measured_along`), for `points` and depth_16.png.
         name: prefix of the files, as in name_fused.png; empty for none.
         bands: names of bands that cameras record one by one, each written to fused_NAME.png and
             confidence_NAME.png too (NAME by `file_names`); without names, bands that are not one or three are
@@ -141,7 +141,8 @@ def save_frame(
                 path = folder / f"{prefix}depth{suffix}.tif"
                 tasks.append(partial(write_image, path, depth[None], bits=32, unknown=True))
             near = float(view.depth[0]) if view is not None and view.depth else None
-            tasks.append(partial(write_depth, folder / f"{prefix}depth_16.png", frame.depth, near=near))
+            path = folder / f"{prefix}depth_16.png"
+            tasks.append(partial(write_depth, path, frame.depth, near=near, along=along))
             tasks.append(lambda: write_image(folder / f"{prefix}depth.png", colour_depth(frame.depth)))
         if view is not None and not name:
             view.save(folder / "view.yaml")
@@ -213,14 +214,17 @@ def depth_scale(near: float) -> float:
     return 10.0 ** math.floor(math.log10(MOST / 20 / near))
 
 
-def write_depth(path: Path, depth: Float[Tensor, "h w"], *, near: float | None = None) -> float:
+def write_depth(
+    path: Path, depth: Float[Tensor, "h w"], *, near: float | None = None, along: str = "depth"
+) -> float:
     """Write depth as a 16-bit PNG, in which 0 is unknown (not finite, or not above 0) and 65535 that or more.
 
-    The scale is in the file's text chunk "Description" too.
+    The file's text chunk "Description" has the scale, and says so if depth is measured along the ray.
 
     Args:
         depth: depth, metres or another unit of the rig's.
         near: depth by which the scale is chosen; None for the nearest in `depth`, or 1 if none is known.
+        along: kind of depth (`measured_along`).
 
     Returns:
         The scale in counts per metre (or that unit): a power of ten.
@@ -233,7 +237,8 @@ def write_depth(path: Path, depth: Float[Tensor, "h w"], *, near: float | None =
 
     counts = chunked(counted, depth, has_depth).numpy()
     said = PngInfo()
-    said.add_text("Description", f"depth: {scale:g} counts a metre; 0 is unknown, {MOST} that far or farther")
+    unit = "a metre, along the ray" if along == "distance" else "a metre"
+    said.add_text("Description", f"depth: {scale:g} counts {unit}; 0 is unknown, {MOST} that far or farther")
     Image.fromarray(counts).save(path, format="PNG", pnginfo=said, compress_level=4)
     return scale
 

@@ -43,7 +43,7 @@ from ..media.images import Images
 from ..media.raw import LIGHT, match_luminance
 from ..networks.protocol import FusionNetwork, JoinsBands
 from .frame import Frame
-from .views import Fields, Views, innermost
+from .views import Fields, Views, innermost, states_distance
 
 Undo = Callable[[Frame], Frame]
 
@@ -107,7 +107,8 @@ def undistort(views: Views) -> StepResult:
 def takes_pinhole_views(views: Views) -> bool:
     """Return True if `undistort` changes views."""
     cameras = [views.rig[name] for name in views.images]
-    through_lenses = any(isinstance(innermost(f), Curved | ThroughLenses) for f in views.fields.values())
+    fields = [innermost(field) for field in views.fields.values()]
+    through_lenses = any(isinstance(f, Curved | ThroughLenses) or states_distance(f) for f in fields)
     return any(map(has_lens, cameras)) and all(c.has_pinhole_view for c in cameras) and not through_lenses
 
 

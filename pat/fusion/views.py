@@ -134,6 +134,11 @@ def innermost(field: ReceptiveField | None) -> ReceptiveField | None:
     return field
 
 
+def states_distance(field: ReceptiveField | None) -> bool:
+    """Return True for a field, as `innermost`, whose attribute `bounds` is "distance"."""
+    return bool(getattr(field, "bounds", None) == "distance")
+
+
 def dense_bytes(alpha: HW, beta: HW, stride: int = 1) -> float:
     """Return the bytes of the positions that the dense field has for every 2 x 2 pixels of alpha."""
     return math.prod(alpha) / 4 * math.prod(beta) / stride**2 * 8

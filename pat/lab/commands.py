@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 from ..app.cli import options
 from ..app.cli.options import Address, FieldName, NetworkName, Out, say, writable
 from ..app.cli.parser import Option
+from ..support.folders import check_apart
 
 if TYPE_CHECKING:
     from .data.pairs import StereoPair
@@ -50,7 +51,7 @@ class StereoSets:
         folders = {name: getattr(self, name) for name in DATA_SETS if getattr(self, name) is not None}
         if not folders:
             raise ValueError(f"no images: give at least one of --{', --'.join(DATA_SETS)}")
-        writable(self.out, folder=True)
+        check_apart(writable(self.out, folder=True), folders.values())
         return {name: DATA_SETS[name](folder) for name, folder in folders.items()}
 
 
@@ -164,7 +165,7 @@ class Ablate:
         layered = [n for n in ("photos", "scenes", "hw") if getattr(self, n) != getattr(Ablate, n)]
         if self.rendered is not None and layered:
             raise ValueError(f"--{', --'.join(layered)}: of layered scenes: leave out with --rendered")
-        writable(self.out, folder=True)
+        check_apart(writable(self.out, folder=True), self.photos)
         network = load_weights(self.network)
         if self.rendered is not None:
             cases = rendered_cases(self.rendered, seed=self.seed)

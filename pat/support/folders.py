@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
 
 MOST_SHOWN = 2000
@@ -31,6 +32,13 @@ def files_below(folder: str | Path, within: frozenset[str] = frozenset()) -> lis
         return []
     below = [file for path in entries if path.is_dir() for file in files_below(path, within | {real})]
     return sorted([path for path in entries if path.is_file()] + below)
+
+
+def check_apart(out: Path, folders: Iterable[Path]) -> None:
+    """Raise ValueError for an output folder that is, or is below, a folder whose images are read."""
+    for folder in folders:
+        if out.resolve().is_relative_to(folder.resolve()):
+            raise ValueError(f"--out: {out} is in {folder}, whose images are read: give one outside of it")
 
 
 def error_text(error: Exception) -> str:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from ...media.suffixes import IMAGE_SUFFIXES
+from ...support.folders import check_apart
 from . import options
 from .fusing import files_by_camera, named_images
 from .known import Around
@@ -80,6 +81,7 @@ class Align(Around):
         flight = self._flight()
         image, with_rig = ((), False) if flight else named_images(self.given, self.image, "align")
         options.writable(self.out, folder=True)
+        check_apart(self.out, () if with_rig else filter(Path.is_dir, self.given))
         self.settings()
         self._extras = options.some_of(self.extras, EXTRAS)
         with self.judged():

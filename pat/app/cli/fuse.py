@@ -137,6 +137,8 @@ class Fuse(Around, Fusing):
             frame, gain = self._exposed(frame, found)
             if not frame.depth.isfinite().any():
                 self.note(no_depth(rig, alpha))
+            elif along == "distance":
+                self.note("depth is the distance along the ray, in depth.tif too")
             bands = band_names(frame, (name for name in rig.betas(alpha) if name in given.files))
             if said := describe_bands(frame, bands, self.kind):
                 self.note(said)

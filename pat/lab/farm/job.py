@@ -31,6 +31,7 @@ from arraygeom.runtime.together import sweep
 from pat.lab.synthesis.check import CheckLimits
 from pat.lab.synthesis.rendered import Rendered
 from pat.sensors import seed_for
+from pat.support.folders import check_apart
 from pat.support.jobs import JobError, JobReport, Task, Workers, run_tasks
 from pat.support.locks import folder_lock
 from pat.support.memory import resident
@@ -250,6 +251,7 @@ def render(
     """
     if scenes < 1 or workers < 1:
         raise ValueError(f"give at least one scene and one worker, got --scenes {scenes} --workers {workers}")
+    check_apart(out, (*config.layered.photos, *filter(None, [config.blender.photos])))
     scene_bytes = config.scene_bytes()
     root = Path(out).absolute()
     work = root / ".work" / f"{shard.number}of{shard.count}"

@@ -20,6 +20,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from arraygeom.runtime.together import sweep
 from pat.networks.paper import PAT
 from pat.networks.weights import new_network, save_weights, set_precision
+from pat.support.folders import check_apart
 from pat.support.locks import folder_lock
 from pat.support.tensor_files import write_tensors
 
@@ -53,6 +54,7 @@ def train(config: TrainConfig) -> Path:
         ValueError: for a folder with another run, a folder in use, no such device, or data that do not suit
             the recipe or cannot be read.
     """
+    check_apart(config.out, config.photos)
     former = former_run(config)
     if former and former.facts["done"]:
         return config.out / BEST

@@ -1,5 +1,7 @@
 """Depth stays within the bounds that were searched, wherever a network puts its positions."""
 
+from dataclasses import dataclass
+
 import pytest
 import torch
 
@@ -87,6 +89,14 @@ def test_a_field_with_bounds_needs_none_of_the_rig_in_cameras_of_any_model():
     assert quarter_turns(views.pair("b")) == 0
 
 
+@dataclass(frozen=True)
+class OwnField:
+    bounds: str
+
+    def __call__(self, pair, x):
+        return Curved(bounds=self.bounds)(pair, x)
+
+
 @pytest.mark.parametrize(
     ("lens", "field", "along"),
     [
@@ -95,6 +105,9 @@ def test_a_field_with_bounds_needs_none_of_the_rig_in_cameras_of_any_model():
         (LENSES["fisheye"], Curved(bounds="distance"), "distance"),
         (Equirectangular(), None, "distance"),
         (Equirectangular(), Curved(), "depth"),
+        (Equirectangular(), OwnField("depth"), "depth"),
+        (Equirectangular(), OwnField("distance"), "distance"),
+        (LENSES["fisheye"], OwnField("distance"), "distance"),
     ],
 )
 def test_what_depth_is_measured_along(lens, field, along):

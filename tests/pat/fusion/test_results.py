@@ -54,7 +54,9 @@ def test_a_full_disk_leaves_the_former_files_all_of_one_frame(tmp_path):
 def test_depth_in_16_bits_says_its_scale(tmp_path):
     depth = torch.tensor([[1.2343, 7.0, torch.nan, 1e9]])
     assert write_depth(tmp_path / "d.png", depth, near=1.0) == 1000
-    assert write_depth(tmp_path / "none.png", torch.full((2, 2), -1.0)) == 1000
+    assert write_depth(tmp_path / "none.png", torch.full((2, 2), -1.0), along="distance") == 1000
+    with Image.open(tmp_path / "none.png") as image:
+        assert "along the ray" in image.text["Description"]
     with Image.open(tmp_path / "d.png") as image:
         assert image.text["Description"].startswith("depth: 1000 counts a metre; 0 is unknown")
         assert np.asarray(image).astype(int).tolist() == [[1234, 7000, 0, 65535]]

@@ -83,8 +83,9 @@ def test_points_of_a_whole_sphere_are_on_its_rays(tmp_path):
     rig.save(tmp_path / "rig.yaml")
     for name, image in recorded(rig)[0].items():
         write_image(tmp_path / f"{name}.png", image)
-    main(arguments(tmp_path, extra=["--extras", "points"]))
+    main(arguments(tmp_path, extra=["--extras", "points,page"]))
     depth = read_depth(tmp_path / "out" / "depth.tif")
+    assert "along the ray" in (tmp_path / "out" / "index.html").read_text()
     cloud = (tmp_path / "out" / "points.ply").read_bytes().partition(b"end_header\n")[2]
     X = torch.from_numpy(np.frombuffer(cloud, VERTEX)["X"].copy())
     torch.testing.assert_close(X.norm(dim=-1), depth[depth.isfinite()])
@@ -595,3 +596,23 @@ def test_images_that_are_missing_are_asked_for(small, command, text, monkeypatch
     assert text in said
     assert "Error" not in said
     assert not (small / "new.yaml").exists()
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "batch rig.yaml --alpha mono --image mono=mono.png --image colour=colour.png --out .",
+        "align . . --out .",
+        "lab ablate --photos . --out figures/today",
+        "lab train pat-supervised --photos . --out run",
+        "lab evaluate --folder . --out out",
+        "lab render scenes.yaml --scenes 1 --out rendered",
+    ],
+)
+def test_results_among_the_images_that_are_read_are_refused(small, line, monkeypatch, refusal):
+    monkeypatch.chdir(small)
+    layered = "rig: rig.yaml\nseed: 1\nbackend: layered\nlayered: {photos: [.]}\n"
+    (small / "scenes.yaml").write_text(layered)
+    before = {*small.iterdir()}
+    assert "--out" in refusal(*line.split())
+    assert {*small.iterdir()} == before
