@@ -111,7 +111,7 @@ def read_rig(
     try:
         rig = READERS[format].read(source)
         if not isinstance(rig, Rig):
-            raise TypeError(f"read(source) returns a {type(rig).__name__}: wanted a Rig")
+            raise ValueError(f"read(source) returns a {type(rig).__name__}: wanted a Rig")
     except (RigFileError, FileNotFoundError, ImportError, MemoryError):
         raise
     except Exception as error:
