@@ -474,7 +474,7 @@ class RayCurve(NamedTuple):
 
 
 class _Followed(torch.autograd.Function):
-    """Positions and mask by compiled loops, with gradients by a loop too; theirs are by the formulas."""
+    """Positions and mask by compiled loops; gradients by a loop too, second derivatives by the formulas."""
 
     @staticmethod
     def forward(ctx, first, last, K, coefficients, curve, nodes, samples):

@@ -161,10 +161,11 @@ def frame_inputs(network: FusionNetwork, views: Views) -> FrameInputs:
         if not on_grid.any_valid(pair.alpha.hw):
             unit = length_unit(views.rig)
             bounds = "" if pair.depth is None else f" between {pair.depth[0]:g} and {pair.depth[1]:g} {unit}"
-            own = ", and the field's positions" if views.fields.get(name) else ""
-            raise ValueError(
-                f"alpha's and '{name}'s views do not overlap{bounds}: check the poses, the depth range{own}"
+            own = views.fields.get(name) is not None
+            suspects = (
+                "poses, the depth range and the field's positions" if own else "poses and the depth range"
             )
+            raise ValueError(f"alpha's and '{name}'s views do not overlap{bounds}: check the {suspects}")
         placements.append(place)
     inputs = Inputs(alpha, tuple(betas), m, network.beta_halo, bands=network.bands, learned=network.learned)
     return FrameInputs(inputs, placements, hw)

@@ -91,7 +91,7 @@ def test_gradients_are_differences(name):
 
 
 def gradients(rig: Rig, x: Tensor, dtype: torch.dtype = torch.float64) -> dict[str, Tensor]:
-    """Of all parameters of a rig and of alpha's pixels, through `Curved`."""
+    """Gradients by each parameter of a rig and by alpha's pixels, through `Curved`."""
     changes = rig.parameters(free=["*"])
     x = x.to(dtype, copy=True).requires_grad_()
     answer = Curved(24, nodes=16)(rig.perturbed(changes).pair("alpha", "beta"), x)

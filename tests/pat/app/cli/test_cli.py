@@ -159,7 +159,9 @@ def test_views_that_do_not_overlap(small, refusal):
     rig = yaml.safe_load((small / "rig.yaml").read_text())
     rig["cameras"]["colour"] |= {"rotation": [0, 180, 0]}
     (small / "rig.yaml").write_text(yaml.safe_dump(rig))
-    assert "'colour's views do not overlap" in refusal(*arguments(small))
+    said = refusal(*arguments(small))
+    assert "'colour's views do not overlap" in said
+    assert said.endswith("check the poses and the depth range")
 
 
 def test_images_with_an_alpha_channel_or_nan(small, refusal):

@@ -126,6 +126,12 @@ def test_what_cannot_be_imported_is_named(name):
         imported(name, "field")
 
 
+@pytest.mark.parametrize("name", ["./labrig", "labrig.py"])
+def test_a_path_in_place_of_a_module_is_told_its_name(name):
+    with pytest.raises(ValueError, match=r"as labrig$"):
+        imported(name, "plugin")
+
+
 @pytest.mark.parametrize("text", ["def f(:", "raise RuntimeError('no licence')", "{}['key']"])
 def test_a_module_that_fails_is_named(mine, text):
     (mine / "tests_mine.py").write_text(text)
