@@ -47,8 +47,8 @@ class MultiviewSettings:
     farthest: float = size(
         8.0, "Half-size pixels between disparities that are 1 in the facts, as in semi-global matching"
     )
-    sampled_rows: int = size(64, "In how many pairs of alpha's rows the depths of betas are compared")
-    sampled_columns: int = size(4, "Every how many columns the depths of betas are compared")
+    sampled_rows: int = size(32, "In how many pairs of alpha's rows the depths of betas are compared")
+    sampled_columns: int = size(8, "Every how many columns the depths of betas are compared")
     trials: int = size(
         400, "Fits to four pixels each; that with which most agree is taken (Fischler, Bolles 1981)"
     )

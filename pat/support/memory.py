@@ -17,8 +17,9 @@ M_TRIM_THRESHOLD, M_MMAP_MAX, M_ARENA_MAX = -1, -4, -8
 """Options of glibc's mallopt (malloc.h)."""
 LEAST = 2.0**20
 """Bytes below which a limit is a slip of the unit."""
-NEAR = 0.94
-"""Share of a limit above which freed memory is returned to the system."""
+NEAR = 0.97
+"""Share of a limit above which freed memory is returned to the system: plans leave 5 % (`SLACK`), so that
+what is in use stays below it, and memory is not given back only to be taken again."""
 EVERY = 0.005
 """Seconds between readings of resident memory under a limit."""
 
@@ -74,10 +75,10 @@ def planned(limit: float | None, memory: float, *, large: bool) -> float | None:
         large: True for a large task, of which a process after `keep_freed` also keeps what it frees.
 
     Returns:
-        Bytes: the smaller of both (`memory` without a limit) for a large task after `keep_freed`; otherwise
+        Bytes: `memory` and 5 %, at most `limit`, for a large task after `keep_freed`; otherwise
         `limit` unchanged, which may be None.
     """
-    return min(memory, limit or memory) if large and _keeps else limit
+    return min(SLACK * memory, limit or math.inf) if large and _keeps else limit
 
 
 def give_back() -> None:
