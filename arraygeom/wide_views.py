@@ -107,11 +107,11 @@ def cube_faces(camera: Camera, *, overlap: float = 5.0) -> dict[str, Camera]:
         overlap: degrees by which faces reach beyond their edges, well below 45.
 
     Returns:
-        Cameras in the place of `camera` by face, in the order of `FACES` ("front", "left", ...), those alone
-        of which the lens sees something, with its resolution in the middle.
+        Cameras in the place of `camera` by face, in the order of `FACES` ("front", "left", ...), if the lens
+        sees any of it, with its resolution in the middle.
 
     Raises:
-        ValueError: for a batch of cameras, lenses whose rays do not meet in a point, and an overlap near 45.
+        ValueError: for a batch, lenses whose rays do not meet in a point, and an overlap of about 45 or more.
     """
     if camera.batch_shape or not camera.central:
         raise ValueError("faces are of one camera at a time, whose rays meet in a point")

@@ -48,8 +48,8 @@ def brown_distort(c: Tensor, xy: Tensor) -> tuple[Tensor, Tensor]:
     """Distort normalised points (*n, 2), which lie in the plane z = 1 of the camera's frame.
 
     Args:
-        c: coefficients (*b, 1.., k), k from 4 to 14 in OpenCV's order, with an axis of length 1 for each
-            further one of the points.
+        c: coefficients (*b, 1.., k), k from 4 to 15 as `Brown.named` takes them, with an axis of length 1 for
+            each further one of the points.
         xy: points (*b, ..., 2).
 
     Returns:

@@ -129,6 +129,15 @@ def test_tensors_without_batch_axes_are_shared():
     assert Rig({**one.cameras, "b": camera})[1]["a"].K.equal(camera.K[0])
 
 
+def test_batches_that_share_a_tensor_stack():
+    pose = random_rig(3)["alpha"].cam_from_world
+    batch = stack([random_rig(1)["alpha"], random_rig(2)["alpha"]]).replace(cam_from_world=pose)
+    twice = stack([batch, batch])
+    assert twice.batch_shape == (2, 2)
+    assert twice[1, 0] == batch[0]
+    assert twice[0, 1] == batch[1]
+
+
 def test_names_are_cameras_and_numbers_items():
     rig = stack([random_rig(1), random_rig(2)])
     assert rig["beta"][1] == rig[1]["beta"] == random_rig(2)["beta"]
