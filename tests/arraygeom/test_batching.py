@@ -130,12 +130,13 @@ def test_tensors_without_batch_axes_are_shared():
 
 
 def test_batches_that_share_a_tensor_stack():
-    pose = random_rig(3)["alpha"].cam_from_world
-    batch = stack([random_rig(1)["alpha"], random_rig(2)["alpha"]]).replace(cam_from_world=pose)
-    twice = stack([batch, batch])
-    assert twice.batch_shape == (2, 2)
-    assert twice[1, 0] == batch[0]
-    assert twice[0, 1] == batch[1]
+    cameras = stack([random_rig(1)["alpha"], random_rig(2)["alpha"]])
+    poses = [random_rig(seed)["alpha"].cam_from_world for seed in (3, 4, 5)]
+    batches = [cameras.replace(cam_from_world=pose) for pose in poses]
+    for several in (batches, batches[:2]):
+        stacked = stack(several)
+        assert stacked.batch_shape == (len(several), 2)
+        assert [stacked[i, 1] == batch[1] for i, batch in enumerate(several)] == [True] * len(several)
 
 
 def test_names_are_cameras_and_numbers_items():

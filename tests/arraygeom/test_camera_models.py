@@ -408,9 +408,10 @@ def test_a_model_with_rays_that_it_does_not_see_covers_nothing():
 
 
 @pytest.mark.parametrize("k", [[], [0.01]])
-def test_a_fisheye_does_not_see_straight_behind(k):
-    lens = PolynomialFisheye(torch.tensor(k, dtype=torch.float64))
-    _, valid = lens.project(torch.tensor([[0.0, 0, 1], [0, 0, -1], [0, 0, 0], [1e-3, 0, -1]]).double())
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_fisheye_does_not_see_straight_behind(k, dtype):
+    lens = PolynomialFisheye(torch.tensor(k, dtype=dtype))
+    _, valid = lens.project(torch.tensor([[0.0, 0, 1], [0, 0, -1], [0, 0, 0], [1e-3, 0, -1]], dtype=dtype))
     assert valid.tolist() == [True, False, False, True]
 
 
