@@ -147,7 +147,8 @@ class LensView(View):
 
     Raises:
         ValueError: for an invalid size or K, NaN in a lens, or batch axes that do not broadcast.
-        TypeError: for other types, a `CameraModel` that `check_model` refuses; such a subclass, when defined.
+        TypeError: for fields of other types, a `CameraModel` that `check_model` refuses, and, when it is
+            defined, such a subclass.
         NotImplementedError: for a `CameraModel` without one of its methods.
     """
 

@@ -262,8 +262,8 @@ def checked(function: Callable[..., T]) -> Callable[..., T]:
 
     Tensors are checked for dtype, number of axes, last axes of fixed size, and a common device; an `HW` as
     `check_hw`; numbers, texts, lists, mappings, fields and this package's classes for their type. Defaults
-    and other annotations are not checked; no annotation is if one cannot be resolved, nothing if `checking`
-    is False.
+    and other annotations are not checked, none at all where one cannot be resolved (but devices); nothing is
+    unless `checking`.
 
     Returns:
         The function, which raises TypeError for a wrong type or dtype, else ValueError, in one sentence.

@@ -156,7 +156,7 @@ class Pair(Batched):
 
     @property
     def depth_range(self) -> Depths:
-        """Depth range (near, far) along alpha's axis, in `unit`.
+        """Depth range (near, far) along alpha's axis, or rays (`natural_bounds`), in `unit`.
 
         Raises:
             ValueError: if the rig states none.
@@ -266,8 +266,8 @@ def depth_range(near: Any, far: Any) -> Depths:
         (near, far).
 
     Raises:
-        ValueError: unless 0 < near <= far and near is finite; not checked while torch traces. Errors of
-            `float` for bounds that are no numbers pass.
+        ValueError: unless 0 < near <= far and near is finite; not checked while torch traces.
+        TypeError: for a bound that is no number; ValueError for a text, unless it reads as one.
     """
     bounds = [
         d if isinstance(d, Tensor) else torch.tensor(float(d), dtype=torch.float64) for d in (near, far)

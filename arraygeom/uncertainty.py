@@ -44,8 +44,8 @@ def position_covariance(
         depth: depth in alpha, in the rig's unit, one for all or one for each.
 
     Returns:
-        Covariances in pixels² of beta, float64; NaN where alpha's lens has no ray, the depth is not finite or
-        below 0, or beta's lens does not see the point (its image's border does not count).
+        Covariances in pixels² of beta, float64; NaN where `Camera.unproject` gives no point, the depth is
+        infinite, or beta's lens does not see the point (its image's border does not count).
 
     Raises:
         ValueError: for a camera that is unknown or not calibrated, and a covariance of parameters that the

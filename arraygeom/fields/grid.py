@@ -30,7 +30,7 @@ _CHUNK = 1 << 18
 class FieldOnGrid:
     """Receptive field of a pair, evaluated on every pixel of alpha.
 
-    Segments are computed in float64: rounding to float32 is enough to change which of two equally good
+    Fields are asked in float64: the rounding of float32 is enough to change which of two equally good
     matches is taken. A large grid's are stored as float32 nevertheless, without blocks, and converted to
     float64 when they are cut: the rounding is the same whatever the parts.
 

@@ -197,13 +197,13 @@ def covering_displacement(pair: Pair, x: Real[Tensor, "*n 2"] | None = None) -> 
     Depth-bounded segments count as beta's image clips them.
 
     Args:
-        x: pixels of alpha; None for all.
+        x: pixels of alpha, one or more; None for all.
 
     Returns:
-        Pixels of beta, one per rig, differentiable in the pair's numbers; 0 if no pixel has a segment.
+        Pixels of beta (*b), differentiable in the pair's numbers; 0 if no pixel has a segment.
 
     Raises:
-        ValueError: for a pair that is not calibrated, has lenses, or has no depth range.
+        ValueError: for a pair with lenses or without a depth range, and as `Pair.beta_from_alpha`.
     """
     squared = _squared_reach(pair, _widest(pair) if x is None else floating(x))
     largest = (

@@ -172,7 +172,7 @@ def _radial_factor(lens: Brown, u: Tensor) -> tuple[Tensor, Tensor]:
 def brown_limit(c: Tensor) -> Tensor:
     """Compute the squared radius up to which the model is used: where its radial part r g(r^2) stops rising.
 
-    It ends earlier at a pole and where other terms may fold the image, and at `WIDEST` squared.
+    It ends earlier short of a pole, where other terms may fold the image, and at `WIDEST` squared.
 
     With g = N / D the slope is P / D^2, P(u) = (N + 2 u N') D - 2 u N D', of degree 6 (or 7) with P(0) = 1.
 
