@@ -167,7 +167,7 @@ def consistent_depth(
 
     Args:
         depths: depth maps in metres, by camera; values that are not finite and positive are unknown.
-        views: least number of agreeing other views; 0 keeps all of alpha's depth.
+        views: least number of agreeing other views; 0 for none: all of alpha's known depths are valid.
         pixels: largest distance in alpha, pixels.
         relative: largest difference of depth, as a share of alpha's.
 

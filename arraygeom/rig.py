@@ -249,7 +249,7 @@ class Rig(Batched):
         return self.with_camera(name, self[name].transformed(A, hw)).replace(links=links)
 
     def scaled(self, factor: float) -> Rig:
-        """Return the rig with all lengths (cameras, depth range) multiplied by a factor, as for another unit.
+        """Return the rig with lengths (calibrated cameras', depth range) times a factor, as for another unit.
 
         Raises:
             ValueError: for a factor that is not positive and finite, and a camera model that is not central
