@@ -270,7 +270,7 @@ class Rig(Batched):
         Args:
             free: patterns over NAME.rotation (rotation vector, radians), NAME.translation (metres),
                 NAME.focal (fx, fy in pixels), NAME.centre (cx, cy in pixels), NAME.distortion, for each
-                camera's name, and depth.near and depth.far (metres): ["colour.*", "depth.near"]. An
+                camera's name, and depth.near and depth.far (metres), as ["colour.*", "depth.near"]. An
                 uncalibrated view has only its lens's, a rig without a depth range no bounds.
 
         Returns:

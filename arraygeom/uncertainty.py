@@ -94,7 +94,7 @@ class BandWidths(NamedTuple):
     """Half-widths of the bands that hold alpha's points in beta.
 
     Attributes:
-        across: at the near and the far bound, across the segment, pixels of beta.
+        across: at the near and the far bound, across the segment, pixels of beta; NaN where not seen.
         along: the same along the segment.
     """
 

@@ -31,8 +31,8 @@ def rectify_spherical(pair: Pair, *, focal: float | None = None) -> Pair:
         large enough for both images, without a link. Its depth range has the old numbers, along the new axis.
 
     Raises:
-        ValueError: for uncalibrated pairs, batches, no baseline, lenses whose rays do not meet in a point,
-            and new images larger than `check_hw` allows.
+        ValueError: for batches, no baseline, lenses whose rays do not meet in a point, new images larger than
+            `check_hw` allows, and as `Pair.beta_from_alpha`.
     """
     cameras = pair.cameras
     if any(c.batch_shape for c in cameras) or not all(c.central for c in cameras):

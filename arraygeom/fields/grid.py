@@ -31,8 +31,8 @@ class FieldOnGrid:
     """Receptive field of a pair, evaluated on every pixel of alpha.
 
     Fields are asked in float64: the rounding of float32 is enough to change which of two equally good
-    matches is taken. A large grid's are stored as float32 nevertheless, without blocks, and converted to
-    float64 when they are cut: the rounding is the same whatever the parts.
+    matches is taken. A large grid's segments are stored as float32 nevertheless, and converted to float64
+    when they are cut: the rounding is the same whatever the parts.
 
     Attributes:
         at: function from any pixels of alpha (n, 2) to segments or positions, (n) or for a batch of rigs
