@@ -30,7 +30,7 @@ class Batched:
         item_axes: by field, the number of a tensor's last axes that belong to one item; 0 for other fields.
 
     Raises:
-        TypeError: by `[i]` and `len` of a single item.
+        TypeError: by `[i]` and `len` of a single item; but `len` of a single rig is its number of cameras.
     """
 
     item_axes: ClassVar[Mapping[str, int]] = {}
@@ -61,11 +61,7 @@ class Batched:
         return True
 
     def __getitem__(self: T, index: Any) -> T:
-        """Select items of the batch; `index` applies to the batch axes as to the first axes of a tensor.
-
-        Raises:
-            TypeError: for a single item.
-        """
+        """Select items of the batch; `index` applies to its axes as to the first axes of a tensor."""
         shape = self._batched()
 
         def chosen(t: Tensor, axes: int) -> Tensor:
@@ -75,10 +71,9 @@ class Batched:
         return map_tensors(self, chosen)
 
     def to(self: T, *args: Any, **kwargs: Any) -> T:
-        """Apply `Tensor.to` to every tensor, whose errors pass; masks and whole numbers keep their dtype.
+        """Return a copy with `Tensor.to` applied to each tensor; masks and whole numbers keep their dtype.
 
-        Returns:
-            A copy; it shares the tensors that `Tensor.to` returns unchanged.
+        Tensors that stay as they are are shared, and errors of `Tensor.to` pass.
 
         Raises:
             TypeError: for another dtype than float32 and float64; half precision holds no pixel position.
@@ -153,6 +148,11 @@ class Batched:
     def _text(self) -> str:
         raise NotImplementedError
 
+    def _whole(self: T) -> T:
+        """Return a copy in which tensors that the items share have the batch's axes too."""
+        shape = self.batch_shape
+        return map_tensors(self, lambda t, axes: t.expand((*shape, *t.shape[t.ndim - axes :])))
+
     def _batched(self) -> torch.Size:
         shape = self.batch_shape
         if not shape:
@@ -163,10 +163,10 @@ class Batched:
 
 
 def stack(items: Sequence[T]) -> T:
-    """Stack items of one kind into a batch, along a new first axis.
+    """Stack items of one kind, single or batches of one shape, along a new first axis.
 
-    Everything but tensors must be equal in all (sizes, lens models, a rig's cameras by name), except for the
-    fields `name` and `sensor`, which are the first item's.
+    All but tensors must be equal (sizes, lens models, a rig's cameras by name), except for the fields `name`
+    and `sensor`, which are the first item's.
 
     Raises:
         ValueError: for no items, and items that differ in kind, shapes or such a field.
@@ -251,8 +251,6 @@ def _unflattened(held: Iterable[Any], layout: _Layout) -> Any:
 
 
 _NAMES = "_tensors"
-
-
 default_collate_fn_map[Batched] = lambda items, *, collate_fn_map=None: stack(items)
 
 
@@ -273,6 +271,7 @@ def _stacked(values: list[Any], where: str) -> Any:
             )
         return torch.stack(values)
     if isinstance(first, Batched):
+        values = [v._whole() for v in values]
         held = {f.name: [getattr(v, f.name) for v in values] for f in _fields(first)}
         made = {n: same[0] if n in LABELS else _stacked(same, f"{where}.{n}") for n, same in held.items()}
         return derived(dataclasses.replace, first, **made)

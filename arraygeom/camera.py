@@ -132,9 +132,9 @@ class View(Batched):
 class LensView(View):
     """View with a lens model, whose focal length and pose need not be known.
 
-    Without a calibration K is only the scale and the centre to which `distortion` refers: `rays` then follow
-    the lens but their angles mean nothing. Links of such views relate undistorted pixels. A subclass must not
-    override `rays` or `project_local`: models of one's own are a `CameraModel`.
+    Without a calibration K is only the scale and centre to which `distortion` refers: angles of `rays` mean
+    nothing then. Links of such views relate undistorted pixels. A subclass must not override `rays` or
+    `project_local`: models of one's own are a `CameraModel`.
 
     >>> lens = Distortion("brown-conrady", torch.tensor([-0.1, 0, 0, 0], dtype=torch.float64))
     >>> view = LensView(hw=(61, 101), K=intrinsics(50.0, (61, 101)), distortion=lens)
@@ -147,7 +147,8 @@ class LensView(View):
 
     Raises:
         ValueError: for an invalid size or K, NaN in a lens, or batch axes that do not broadcast.
-        TypeError: for fields of other types, a `CameraModel` that `check_model` refuses, and such a subclass.
+        TypeError: for fields of other types, a `CameraModel` that `check_model` refuses, and, when it is
+            defined, such a subclass.
         NotImplementedError: for a `CameraModel` without one of its methods.
     """
 
@@ -188,17 +189,13 @@ class LensView(View):
         return self.distortion.batch_shape if self.distortion is not None else torch.Size()
 
     def project_local(self, X: Real[Tensor, "*n 3"]) -> Projected:
-        """Project points in the camera's frame.
-
-        Returns:
-            Pixels, depth, and validity.
-        """
+        """Compute the projections of points (*n, 3) in the camera's frame."""
         X = floating(X)
         normalised, valid = on_plane(X) if self.distortion is None else self.distortion.project(X)
         return Projected(map_homogeneous(self.K[..., :2, :], normalised), X[..., 2], valid)
 
     def rays(self, x: Real[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*m 3"], Bool[Tensor, "*m"]]:
-        """Compute the rays of pixels in the camera's frame.
+        """Compute the directions of pixels' rays, which start at `ray_origins`, in the camera's frame.
 
         Returns:
             Directions (z = 1 for pinholes, unit length with a `Distortion`, any length by other models), and
@@ -206,6 +203,7 @@ class LensView(View):
 
         Raises:
             ValueError: for pixels without the axes of a batched K: wanted (*b, ..., 2).
+            RuntimeError: for pixels without those of a lens, where K has none.
         """
         normalised = map_homogeneous(torch.linalg.inv(self.K)[..., :2, :], x)
         if self.distortion is None:
@@ -262,8 +260,8 @@ class LensView(View):
 
         Raises:
             ValueError: for a last row of A other than (0, 0, 1) (no K describes a perspective), a singular A,
-                or an invalid size.
-            RuntimeError: for batch axes that do not broadcast.
+                an invalid size, or batch axes that do not broadcast with a lens's or a pose's.
+            RuntimeError: for batch axes that do not broadcast with K's.
         """
         if checking() and not bool(((A[..., 2, :] - A.new_tensor([0, 0, 1])).abs() < 1e-6).all()):
             raise ValueError("A is a perspective, which no K follows: crop, resize, mirror, rotate or shear")
@@ -450,7 +448,7 @@ def intrinsics(
     [500.0, 0.0, 319.5]
 
     Args:
-        focal: one number, or (fx, fy); tensors keep their gradient.
+        focal: one number, or (fx, fy), of any sign; tensors keep their gradient.
         hw: height and width of the image, for the middle alone.
         centre: principal point (cx, cy); None for the image's middle, ((W - 1) / 2, (H - 1) / 2).
 
@@ -458,7 +456,7 @@ def intrinsics(
         K in float64, of one camera: a batch is made with `stack`.
 
     Raises:
-        ValueError: for other than one or two numbers, or an invalid size.
+        ValueError: for other than one number or a pair, or an invalid size.
         TypeError: for values that are no numbers.
     """
     fx, fy = _two(focal, "focal")

@@ -52,8 +52,7 @@ def derived(make: Callable[..., T], *args: Any, **kwargs: Any) -> T:
 
     Args:
         make: function or class to call; its own errors pass.
-        args: its arguments.
-        kwargs: its named arguments.
+        args, kwargs: its arguments.
 
     Returns:
         The result of the call.
@@ -79,7 +78,7 @@ def check_numbers(value: Any, shape: tuple[int, ...], what: str) -> Tensor:
         The tensor, detached. A tensor of the meta device has no numbers to check.
 
     Raises:
-        TypeError: for another type, or integers.
+        TypeError: for another type, or a tensor of integers, bools or complex numbers.
         ValueError: for another shape, NaN or infinity.
     """
     if not isinstance(value, Tensor):
@@ -211,11 +210,11 @@ def check_above(least: float, *, whole: bool = False, itself: bool = True, **val
 
 
 def check_bounds(near: Any, far: Any) -> None:
-    """Check depth bounds: 0 < near <= far, metres, perhaps infinite. None and tensors are not checked.
+    """Check depth bounds: 0 < near <= far, metres, both perhaps infinite; None and tensors are passed over.
 
     Raises:
         ValueError: for other numbers, NaN included.
-        TypeError: for values that are no numbers.
+        TypeError: for values of other types than int and float, such as NumPy's float32.
     """
     for name, value in (("near", near), ("far", far)):
         if value is None or isinstance(value, Tensor):
@@ -263,7 +262,8 @@ def checked(function: Callable[..., T]) -> Callable[..., T]:
 
     Tensors are checked for dtype, number of axes, last axes of fixed size, and a common device; an `HW` as
     `check_hw`; numbers, texts, lists, mappings, fields and this package's classes for their type. Defaults
-    and other annotations are not checked, and nothing is unless `checking`.
+    and other annotations are not checked, none at all where one cannot be resolved (but devices); nothing is
+    unless `checking`.
 
     Returns:
         The function, which raises TypeError for a wrong type or dtype, else ValueError, in one sentence.

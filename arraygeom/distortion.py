@@ -127,7 +127,7 @@ class Distortion(LensModel):
         """Distort normalised pinhole points.
 
         Returns:
-            Distorted points, and True inside the model's range, False for NaN; others mean nothing.
+            Distorted points, and True inside the lens's range, not for NaN and infinity; others mean nothing.
         """
         xy, finite = finite_points(xy)
         if self.model == BROWN_CONRADY:
@@ -156,9 +156,9 @@ class Distortion(LensModel):
         """Project points in the camera's frame (any unit).
 
         Returns:
-            Distorted normalised points, and True where the model reaches the direction: ahead (z > 0) for
-            Brown-Conrady and the field-of-view model, for the others also at and beyond 90 degrees off axis.
-            (0, 0, 0) and NaN are not valid.
+            Distorted normalised points, and True where the lens reaches the direction: ahead (z > 0) for
+            Brown-Conrady and the field-of-view model, for others perhaps at and beyond 90 degrees off axis
+            too. (0, 0, 0), NaN and infinity are not valid; others mean nothing.
         """
         X, finite = finite_points(X)
         if self.model != BROWN_CONRADY:
@@ -220,11 +220,11 @@ def lens_derivatives(
 
     Args:
         lens: one lens, not a batch; None for a pinhole.
-        X: points in the camera's frame, in any unit.
+        X: points in the camera's frame, in any unit; metres for a lens that is not central.
 
     Returns:
-        Distorted normalised points (n, 2), derivatives by the points (n, 2, 3), and by the coefficients (n,
-        2, k), k = 0 for None. Validity is not checked: points that the lens does not see give finite numbers.
+        Points of the image plane (n, 2), derivatives by X (n, 2, 3), and by the coefficients (n, 2, k), k = 0
+        for None. Validity is not checked: points that a `Distortion` does not see give finite numbers.
     """
     X, c = X.detach(), X.new_zeros(0) if lens is None else lens.coefficients.detach()
     if lens is None or (lens.model == BROWN_CONRADY and len(c) < COEFFICIENT_COUNTS[BROWN_CONRADY][-1]):

@@ -33,7 +33,7 @@ def fundamental_matrix(
     Along (l1, -l0) of a line l = F x_alpha points are farther away: kornia's sign, unless K_beta mirrors.
 
     Returns:
-        F in the widest type of all, not scaled; zero without a baseline.
+        F in the widest type of all, not scaled; zero without a baseline, NaN for a singular K.
 
     Raises:
         ValueError: for batch axes that do not broadcast.
@@ -61,8 +61,8 @@ def epipolar_lines(F: Float[Tensor, "*b 3 3"], x: Real[Tensor, "*n 2"]) -> Float
     """Compute the lines l_beta = F x_alpha, scaled so that l . (x, y, 1) is a distance in pixels.
 
     Returns:
-        Lines (*m, 3); all zeros where there is none: at alpha's epipole, to the rounding of x's type, and
-        where F is zero. NaN for NaN pixels.
+        Lines (*m, 3); all zeros where there is none (or one at infinity): at alpha's epipole, to the rounding
+        of x's type, and where F is zero. NaN for NaN pixels.
 
     Raises:
         ValueError: for pixels without the axes of a batched F: wanted (*b, ..., 2).
@@ -140,8 +140,6 @@ def track(
     """Compute the track in beta of each alpha pixel of a pinhole pair.
 
     Args:
-        K_alpha: alpha's K.
-        K_beta: beta's K.
         beta_from_alpha: pose of alpha's frame in beta's.
         x: pixels of alpha; (*b, ..., 2) for a batch.
 
@@ -150,6 +148,7 @@ def track(
 
     Raises:
         ValueError: for pixels without the axes of a batch.
+        RuntimeError: for a singular K_alpha.
     """
     a = map_homogeneous(infinite_homography(K_alpha, K_beta, beta_from_alpha.R), x)
     b = matvec(K_beta, beta_from_alpha.t).to(a.dtype)
@@ -181,7 +180,7 @@ def segments_between(
 
 
 class Clipped(NamedTuple):
-    """Part of a track: the homogeneous pixels P + s D, with s from `low` to `high`.
+    """Part of a track: the homogeneous points P + s D, in the track's unit, with s from `low` to `high`.
 
     Attributes:
         P: points at s = 0 (far).
@@ -282,7 +281,7 @@ class Depth(NamedTuple):
     """Depth of alpha's pixels, metres (the unit of the cameras' poses).
 
     Attributes:
-        depth: z in alpha's frame; 0 where not valid.
+        depth: z in alpha's frame (from `ray_depth` perhaps the distance along the ray); 0 where not valid.
         deviation: its standard deviation; 0 where not valid, and if that of the pixels was not given.
         valid: True where there is a depth.
     """

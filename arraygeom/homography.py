@@ -65,8 +65,8 @@ def infinite_homography(
 def apply_homography(H: Float[Tensor, "*b 3 3"], x: Real[Tensor, "*n 2"]) -> TransformedPoints:
     """Map points (*n, 2); with batched H (*b), points are (*b, ..., 2).
 
-    The sign of H matters: `plane_homography` and `infinite_homography` give it such that the scale is
-    positive in front of both cameras; a fitted H is fixed only up to sign and has to be oriented first.
+    The sign of H matters: this module's functions give it such that the scale (third coordinate) is positive
+    in front of both cameras, or at the points of the fit; an H from elsewhere has to be oriented first.
 
     Returns:
         Points, valid where finite and of a scale above `SMALLEST_SCALE`; elsewhere zero, with zero gradient.

@@ -27,7 +27,7 @@ class LensCoverage(NamedTuple):
     """Coverage of an image by its lens model.
 
     Attributes:
-        share: share of the pixels of a coarse grid with a ray, 0..1; 1 for a pinhole.
+        share: share of the pixels of a coarse grid with a ray that projects back, 0..1; 1 for a pinhole.
         degrees: largest angle off axis of these rays; NaN for a pinhole, or without any ray.
     """
 
@@ -68,11 +68,7 @@ class LensKey:
 
 
 def once_a_lens(function: Callable[[V], T]) -> Callable[[V], T]:
-    """Decorate a function of a camera's image, K and lens alone: cameras with equal ones share its result.
-
-    Returns:
-        The function; it remembers the last 256 results.
-    """
+    """Keep the last 256 results of a function of a camera's size, K and lens alone."""
     known: Callable[[LensKey], T] = lru_cache(maxsize=256)(lambda lens: function(lens.camera))
     return wraps(function)(lambda camera: known(LensKey(camera)))
 
@@ -105,6 +101,8 @@ def refit_lens(camera: Camera) -> Refit:
         ValueError: for no lens, another model, a tilted sensor, a batch, or if no such lens covers the image.
     """
     lens = camera.distortion
+    if camera.batch_shape:
+        raise ValueError(f"a batch of cameras {tuple(camera.batch_shape)}: give one of them, as camera[0]")
     if not isinstance(lens, Distortion) or lens.model != BROWN_CONRADY or lens.coefficients[12:].any():
         raise ValueError("only lenses of brown-conrady, without a tilted sensor, are fitted anew")
     h, w = camera.hw
@@ -133,15 +131,16 @@ def refit_lens(camera: Camera) -> Refit:
 
 
 def refit_rig(rig: Rig) -> tuple[Rig, list[str]]:
-    """Refit the lenses of calibrated cameras that end within their images (`coverage`).
+    """Refit the lenses of a rig's calibrated cameras that end within their images (`coverage`).
 
     Returns:
         The rig, and a sentence on each refitted lens; none if all cover their images.
 
     Raises:
-        ValueError: as `refit_lens` for the first that cannot be refitted, and for a batch with lenses that
-            end within their images.
+        ValueError: for a batch of rigs, and as `refit_lens` for the first that cannot be refitted.
     """
+    if rig.batch_shape:
+        raise ValueError(f"a batch of rigs {tuple(rig.batch_shape)}: give one of them, as rig[0]")
     cameras, said = dict(rig.cameras), []
     for name, camera in rig.cameras.items():
         if isinstance(camera, Camera) and (before := coverage(camera)).share < 1:

@@ -78,12 +78,13 @@ def warp(
 
     Returns:
         Values (B, C, *d, Ha, Wa), 0 where not valid, and validity (B, *d, Ha, Wa): depth is finite and
-        positive, alpha's lens has a ray, and the point is in front of beta and on its image. Differentiable
-        in image, depth and cameras.
+        positive, alpha has a ray less than 90 degrees off axis, and beta's lens and image show the point.
+        Differentiable in image, depth and cameras.
 
     Raises:
-        ValueError: for an image or depth of another size than its camera's, uncalibrated cameras, and as
-            `sample`. Batches of unequal length, neither of 1, give ValueError or RuntimeError.
+        ValueError: for an image or depth of another size than its camera's, and as `Pair.beta_from_alpha` and
+            `sample` raise it. Batches of unequal length, neither of 1, give ValueError or RuntimeError.
+        NotImplementedError: as `sample`.
     """
     for what, plane, view in (("image", image, pair.beta), ("depth", depth, pair.alpha)):
         _check_size(f"the {what} given", plane, view.hw)
@@ -103,11 +104,10 @@ def plane_sweep(pair: Pair, image: Float[Tensor, "b c h w"], depths: Float[Tenso
         depths: metres, one or more; planes that are not at a finite, positive depth give nothing valid.
 
     Returns:
-        Values (B, C, D, Ha, Wa), and validity (B, D, Ha, Wa).
+        Values (B, C, D, Ha, Wa) and validity (B, D, Ha, Wa), as of `warp`.
 
     Raises:
-        ValueError: for an image of another size than beta's, and uncalibrated cameras.
-        RuntimeError: for no depths, and as `warp`.
+        RuntimeError: for no depths; the errors of `warp` pass.
     """
     planes = depths[:, None, None, None].expand(-1, len(image), *pair.alpha.hw)
     swept = [warp(pair, image, plane) for plane in planes]
@@ -143,7 +143,7 @@ class ConsistentDepth(NamedTuple):
     Attributes:
         depth: mean of alpha's depth and the agreeing views' in alpha's frame, metres; 0 where not valid.
         views: number of agreeing other views.
-        valid: True where enough views agree.
+        valid: True where alpha has a depth and enough views agree.
     """
 
     depth: Float[Tensor, "h w"]
@@ -160,24 +160,23 @@ def consistent_depth(
     pixels: float = 1.0,
     relative: float = 0.01,
 ) -> ConsistentDepth:
-    """Fuse alpha's depth map with other cameras' maps where they agree with it, through any lenses.
+    """Combine alpha's depth map with other cameras' where these agree with it, through any lenses.
 
-    A view agrees if alpha's point, replaced by the depth in the view's own map, returns to within `pixels` of
-    its place in alpha and within `relative` of its depth (Yao et al. 2018, MVSNet).
+    A view agrees if alpha's point, at the depth of the view's own map there, returns to within `pixels` of
+    its place in alpha and `relative` of its depth (Yao et al. 2018, MVSNet). Differentiable in all numbers.
 
     Args:
         depths: depth maps in metres, by camera; values that are not finite and positive are unknown.
-        views: least number of agreeing other views; 0 keeps all of alpha's depth.
+        views: least number of agreeing other views; 0 for none: all of alpha's known depths are valid.
         pixels: largest distance in alpha, pixels.
         relative: largest difference of depth, as a share of alpha's.
-
-    Returns:
-        The fused map, differentiable in depths and cameras.
 
     Raises:
         ValueError: if alpha has no map, the rig lacks a camera, a map has another size than its camera, one
             of two cameras is not calibrated, or for a batch of rigs.
     """
+    if rig.batch_shape:
+        raise ValueError(f"a batch of rigs {tuple(rig.batch_shape)}: give one of them, as rig[0]")
     if rig.require(alpha) not in depths:
         raise ValueError(f"there is no depth map of '{alpha}', only of {', '.join(depths)}")
     for name, depth in depths.items():

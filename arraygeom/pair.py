@@ -91,7 +91,7 @@ class Pair(Batched):
     Attributes:
         alpha: view whose pixels are matched.
         beta: view in which their matches are searched.
-        depth: (near, far) along alpha's axis, in `unit`; None if unknown.
+        depth: (near, far) along alpha's axis, or rays (`natural_bounds`), in `unit`; None if unknown.
         link: F and H measured between the two, which count before a calibration; None if there is none.
         unit: unit of lengths; "baselines" for rigs of unknown scale.
         memo: cache of what fields compute once for a pair; never copied.
@@ -156,7 +156,7 @@ class Pair(Batched):
 
     @property
     def depth_range(self) -> Depths:
-        """Depth range (near, far) along alpha's axis, in `unit`.
+        """Depth range (near, far) along alpha's axis, or rays (`natural_bounds`), in `unit`.
 
         Raises:
             ValueError: if the rig states none.
@@ -227,7 +227,7 @@ class Pair(Batched):
 
         Raises:
             ValueError: unless both cameras are calibrated and central, for depths that are not positive, and
-                as `beta_from_alpha`.
+                as `beta_from_alpha`. Depths that do not broadcast give RuntimeError.
         """
         alpha, beta = self._central("homography")
         depth = torch.as_tensor(depth).to(alpha.K)
@@ -260,14 +260,14 @@ ROUNDED = 8
 
 
 def depth_range(near: Any, far: Any) -> Depths:
-    """Convert depth bounds to tensors: numbers to float64, tensors as they are.
+    """Convert depth bounds to tensors: numbers by `float` to float64, tensors as they are.
 
     Returns:
         (near, far).
 
     Raises:
         ValueError: unless 0 < near <= far and near is finite; not checked while torch traces.
-        TypeError: for a bound that is no number.
+        TypeError: for a bound that is no number; ValueError for a text, unless it reads as one.
     """
     bounds = [
         d if isinstance(d, Tensor) else torch.tensor(float(d), dtype=torch.float64) for d in (near, far)

@@ -73,7 +73,7 @@ class Pose(Batched):
 
         Args:
             centre: world coordinates, metres.
-            target: world coordinates, metres.
+            target: world coordinates, metres, in centre's type, as `down`.
             down: direction in the world; None for (0, 1, 0). For a world with z upwards it is (0, 0, -1).
 
         Raises:

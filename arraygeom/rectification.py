@@ -43,7 +43,7 @@ def rectify(pair: Pair, *, K: Float[Tensor, "3 3"] | None = None, hw: HW | None 
     """Compute the rectifying homographies of a pinhole pair (Bouguet's: each camera is rotated half way).
 
     R_alpha and R_beta are as OpenCV's `stereoRectify` gives them for a horizontal pair; a vertical one is
-    rotated by 90 degrees, so that lines are rows here too.
+    rotated by 90 degrees, so that lines are rows here too. By calibration: a link does not count.
 
     Args:
         K: intrinsics of the new images; None for the smaller focal length, with the centres of the old images
@@ -54,8 +54,8 @@ def rectify(pair: Pair, *, K: Float[Tensor, "3 3"] | None = None, hw: HW | None 
         The rectification, differentiable in everything.
 
     Raises:
-        ValueError: for uncalibrated pairs, lenses, batches, no baseline, a baseline so near an optical axis
-            (motion forwards) that the new images would lie beside the old ones, and an invalid K or hw.
+        ValueError: for lenses, batches, no baseline, one so near an optical axis (motion forwards) that new
+            images would lie beside the old ones, an invalid K or hw, and as `Pair.beta_from_alpha`.
         NotImplementedError: within `torch.func.vmap`.
     """
     alpha, beta = pair.cameras
@@ -117,10 +117,10 @@ def middle_intrinsics(
     Args:
         cameras: alpha and beta before rectification.
         rotations: rotation of each to its rectified frame.
-        hw: height and width of the rectified images.
+        hw: size of the rectified images.
 
     Returns:
-        K with the smaller focal length, which takes the old images' middles, on average, to the new middle.
+        K with the smaller focal length sqrt(fx fy); it takes the old images' middles, on average, to the new.
     """
     focal = torch.stack([(c.K[:2, :2].det().abs()).sqrt() for c in cameras]).min()
     rays = [_middle_ray(camera, R) for camera, R in zip(cameras, rotations)]
@@ -148,8 +148,8 @@ def to_stereo_camera(pair: Pair) -> StereoCamera:
         The stereo camera, a batch (of one for a single pair); it has no sizes, world poses or depth range.
 
     Raises:
-        ValueError: for a pair that is not calibrated or not rectified, or whose beta is not to the right of
-            alpha.
+        ValueError: for a pair that is not calibrated, has lenses or is not rectified, or whose beta is not to
+            the right of alpha.
     """
     from kornia.geometry.camera import StereoCamera
 

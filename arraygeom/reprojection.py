@@ -28,8 +28,8 @@ def projection_slopes(
         distance: distance of the points from the camera, metres, above 0.
 
     Returns:
-        The projection, and slopes (*n, 2, 3), pixels for each metre, without meaning where it is not valid.
-        Differentiable as often as `Camera.project` is.
+        The projection, and slopes (*n, 2, 3), pixels for each metre, without meaning where it or a point
+        beside (`STEP`) is not valid. Differentiable as often as `Camera.project` is.
     """
     step = STEP * distance[..., None, None]
     offsets = torch.eye(3).to(X) * step
@@ -51,13 +51,14 @@ def reprojection_residuals(
     """Compute measured pixels x minus the projections of world points X.
 
     Args:
-        seen: True where a camera sees a point; None for all. NaN pixels are not seen.
+        seen: True where a camera sees a point; None for all. Pixels that are not finite are not seen.
 
     Returns:
         Residuals (v, *n, 2), pixels; zero where a point is not seen, or not valid in the camera.
 
     Raises:
         ValueError: for pixels of another number of views, and points without the axes of batched cameras.
+        RuntimeError: for no cameras, and axes *n that do not broadcast.
     """
     projected = [camera.project(X) for camera in cameras]
     if len(x) != len(cameras):
@@ -104,7 +105,7 @@ def bundle_adjusted(
     Args:
         X: world points to start from, metres.
         x: their pixels in the rig's cameras, in its order; NaN where not seen.
-        free: patterns of free parameters, as for `Rig.parameters`.
+        free: patterns of free parameters, as for `Rig.parameters`; none adjusts the points alone.
         seen: True where a camera sees a point; None for all.
         steps: number of steps, all of which are tried.
         damping: factor of the information's diagonal that is added to it at the first step.
@@ -114,8 +115,7 @@ def bundle_adjusted(
         least error's.
 
     Raises:
-        ValueError: for a batch, uncalibrated cameras, pixels of another shape, and a pattern in `free` that
-            matches nothing.
+        ValueError: for a batch, uncalibrated cameras, pixels of another shape, and as `Rig.parameters`.
     """
     cameras = list(rig.cameras.values())
     if rig.batch_shape or not all(isinstance(camera, Camera) for camera in cameras):

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .batching import Batched, map_tensors, tensors_of
+from .batching import Batched, tensors_of
 from .camera import Camera, LensView, View, view_facts
 from .checks import check_above, check_batches, check_tensors, checking, derived
 from .kornia_models import pinholes_by_name
@@ -33,13 +33,13 @@ SERVICES: dict[str, Callable[..., Any]] = {}
 class Rig(Batched):
     """Ordered, named cameras of different sizes, lenses and spectral responses.
 
-    Every number may have leading batch axes, the same for all: a batch of rigs. A rig never changes, except
-    by `requires_grad_`: methods return new ones.
+    Every number may have leading batch axes, the same for all that have any: a batch of rigs. A rig never
+    changes, except by `requires_grad_`: methods return new ones.
 
     Attributes:
         cameras: views by name; kornia's pinholes are converted, batches of one to single cameras.
-        depth: (near, far) in metres along the optical axis of whichever camera is alpha, far may be infinite;
-            None if unknown. Without batch axes it applies to each rig of a batch.
+        depth: (near, far) in metres along the optical axis of whichever camera is alpha (of one that sees 90
+            degrees off it, along its rays), far may be infinite, of each rig or all; None if unknown.
         links: relations of cameras, measured between their images, by (alpha, beta).
         name: name of the rig; `runtime.text.UNSCALED` and `ASSUMED` say that lengths are not in metres.
 
@@ -77,6 +77,8 @@ class Rig(Batched):
             self._check_links()
 
     def _check_links(self) -> None:
+        if not isinstance(self.links, Mapping):
+            raise TypeError(f"the links are a {type(self.links).__name__}: give a mapping of names to links")
         for names, link in self.links.items():
             if not isinstance(link, Link):
                 raise TypeError(f"the link {names} is a {type(link).__name__}: give a Link(F)")
@@ -93,19 +95,18 @@ class Rig(Batched):
         batched: bool = False,
         **fields: Any,
     ) -> Rig:
-        """Make a rig of kornia's cameras.
-
-        Kornia's cameras are always batched. `Rig(cameras)` takes pinholes by name as well.
+        """Make a rig of kornia's cameras, which are always batched.
 
         Args:
-            cameras: pinholes by name; a batch of pinholes, which are the rig's cameras "camera0", "camera1"
-                and so on; or a `StereoCamera`, whose cameras are "left" and "right".
-            hw: height and width of a `StereoCamera`'s images, which it does not state; else unused.
+            cameras: pinholes by name; a batch of pinholes, then named "camera0", "camera1" and so on; or a
+                `StereoCamera`, whose cameras are "left" and "right".
+            hw: height and width of a `StereoCamera`'s images; else unused.
             batched: True keeps batches of one as batches.
             fields: further fields of the rig, such as `depth`.
 
         Raises:
-            ValueError: for batches of unequal length, a `StereoCamera` without `hw`, and as `Rig`.
+            ValueError: for batches of unequal length, a `StereoCamera` without `hw`, and as
+                `Camera.from_kornia` and `Rig`.
             TypeError: for other cameras, or a field that `Rig` has not.
         """
         named = pinholes_by_name(cameras, hw)
@@ -128,22 +129,20 @@ class Rig(Batched):
             become one.
 
         Raises:
-            ValueError: for cameras with lenses, and cameras that are not calibrated.
+            ValueError: for cameras with lenses of effect or gradient, and cameras that are not calibrated.
         """
         views = [name for name, view in self.cameras.items() if not isinstance(view, Camera)]
         if views:
             raise ValueError(
                 f"kornia has no camera without a calibration: {', '.join(views)} of this rig are such"
             )
-        shape = self.batch_shape
         lenses = [(name, camera.distortion) for name, camera in self.cameras.items()]
         if bent := [name for name, lens in lenses if lens is not None and not lens.harmless]:
             raise ValueError(
                 f"kornia's cameras with a lens have no pose ({', '.join(bent)}): "
                 "give each as camera.to_kornia() and keep its cam_from_world"
             )
-        batched = map_tensors(self.cameras, lambda t, axes: t.expand(*shape, *t.shape[t.ndim - axes :]))
-        return {name: camera.to_kornia() for name, camera in batched.items()}
+        return {name: camera.to_kornia() for name, camera in self._whole().cameras.items()}
 
     def __getitem__(self, name: Any) -> Any:
         """Return the camera of a name; or for an index into a batch, the rigs there.
@@ -250,7 +249,7 @@ class Rig(Batched):
         return self.with_camera(name, self[name].transformed(A, hw)).replace(links=links)
 
     def scaled(self, factor: float) -> Rig:
-        """Return the rig with all lengths (cameras, depth range) multiplied by a factor, as for another unit.
+        """Return the rig with lengths (calibrated cameras', depth range) times a factor, as for another unit.
 
         Raises:
             ValueError: for a factor that is not positive and finite, and a camera model that is not central
@@ -269,13 +268,13 @@ class Rig(Batched):
         them.
 
         Args:
-            free: patterns over "camera.rotation" (rotation vector, radians), "camera.translation" (metres),
-                "camera.focal" (fx, fy in pixels), "camera.centre" (cx, cy in pixels), "camera.distortion",
-                "depth.near" and "depth.far" (metres), for instance ["colour.*", "depth.near"]. An
+            free: patterns over NAME.rotation (rotation vector, radians), NAME.translation (metres),
+                NAME.focal (fx, fy in pixels), NAME.centre (cx, cy in pixels), NAME.distortion, for each
+                camera's name, and depth.near and depth.far (metres), as ["colour.*", "depth.near"]. An
                 uncalibrated view has only its lens's, a rig without a depth range no bounds.
 
         Returns:
-            Tensors by name, (*b, n) each, (*b) for bounds; none for no patterns.
+            Tensors by name, (*b, n) each, (*b) for bounds, *b as the number itself has; none for no patterns.
 
         Raises:
             ValueError: for a pattern that matches nothing, such as each letter of a text given for a list.
@@ -292,7 +291,7 @@ class Rig(Batched):
     def perturbed(self, changes: Mapping[str, Tensor]) -> Rig:
         """Apply changes of parameters, named and in the units as in `parameters`.
 
-        Rotations step on the manifold, exp(change) R, so that they remain rotations. Other changes are added.
+        Rotations step on the manifold, to exp(change) R. Other changes are added.
 
         Returns:
             The rig; everything without a change is bit-identical. Cameras are not checked: NaN passes.
@@ -300,6 +299,7 @@ class Rig(Batched):
         Raises:
             ValueError: for an unknown name, a change of another size, and bounds that `Rig` refuses.
             TypeError: for a change that is no tensor.
+            RuntimeError: for batch axes that do not broadcast.
         """
         shapes = self._parameter_shapes()
         unknown = set(changes) - set(shapes)

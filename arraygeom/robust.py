@@ -77,7 +77,7 @@ def least_squares(
 
     Args:
         terms: k explaining terms of each of n values.
-        values: values to explain; axes *m are solved at once.
+        values: values to explain; axes *m, at most one with a prior, are solved at once.
         weight: weight of each value, at least 0.
         precision: inverse covariance (k, k) of a prior of zero mean; None for no prior: terms may then be
             dependent.
@@ -86,7 +86,7 @@ def least_squares(
         Coefficients c (k, *m); without a prior the shortest of all solutions.
 
     Raises:
-        RuntimeError: for a prior with which the equations are still singular.
+        RuntimeError: for equations that a prior leaves singular; without one for no values, NaN or infinity.
     """
     if precision is not None:
         information, slope = normal_equations(terms, values, weight)
@@ -109,7 +109,7 @@ def robust_least_squares(
 
     Args:
         terms: value of each of k terms at n points.
-        values: values at the points that the sum of terms times coefficients is to match.
+        values: values (n) or (n, m) that the sum of terms times coefficients is to match.
         start: coefficients whose residuals give the first weights.
         weigh: function from residuals (n, *m) to weights (n).
         precision: inverse covariance of a prior of zero mean, or a function of the coefficients that returns
@@ -168,7 +168,7 @@ def levenberg_marquardt(
         damping: damping of the first step.
 
     Returns:
-        The state, and True if it converged, or if every step up to `MOST_DAMPING` raises the cost.
+        The state, and True if it converged, or no step up to `MOST_DAMPING` keeps the cost from rising.
     """
     for _ in range(steps):
         before = model(state)

@@ -73,8 +73,8 @@ def sample(
         not valid unless `extended`, at NaN always. Differentiable in image and, unless "nearest", positions.
 
     Raises:
-        ValueError: for pixels of other shapes, images of other shapes, whole numbers or no pixel, or another
-            interpolation.
+        ValueError: for pixels or images of other shapes, images of whole numbers or without a pixel, or
+            another interpolation.
         TypeError: for values that are no tensors.
         NotImplementedError: in forward mode (jvp, jacfwd, hessian).
     """

@@ -22,7 +22,7 @@ from .runtime.tracing import followed
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Positions(Batched):
-    """Explicit sample positions, L for each alpha pixel.
+    """Explicit sample positions, L for each alpha pixel; nothing is checked.
 
     Attributes:
         xy: positions, pixels of beta; without meaning where `mask` is False.
@@ -39,7 +39,7 @@ class Positions(Batched):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Segments(Batched):
-    """One straight piece of beta's image for each alpha pixel.
+    """One straight piece of beta's image for each alpha pixel; nothing is checked.
 
     For a depth-bounded field `start` is the point at the near bound and `end` at the far bound.
 

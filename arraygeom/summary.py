@@ -28,8 +28,8 @@ class CameraSummary(NamedTuple):
         wh: image size (width, height).
         field_of_view: angles (across, down), degrees; NaN as `field_of_view` says.
         focal: focal lengths (x, y), pixels.
-        footprint: width that a pixel covers at the near and the far bound, thousandths of the rig's unit
-            (millimetres); infinite for an infinite bound.
+        footprint: width that a pixel in the middle covers at the near and the far bound, thousandths of the
+            rig's unit (millimetres); infinite at infinity, unless rays are parallel.
         lens: name of the lens model; None for a pinhole, and a view without one.
         coefficients: coefficients of a `Distortion`; empty for other models, and without a lens.
         covered: share of the image whose pixels have a ray, on a coarse grid; 1 without a lens.
@@ -55,8 +55,7 @@ class PairSummary(NamedTuple):
         rotation: angle between the orientations, degrees.
         seen: share of alpha's pixels, of some evenly spread, with a segment in beta; None without a depth
             range.
-        length: (median, largest) length of the segments, pixels of beta; None without any, and without a
-            depth range.
+        length: (median, largest) length of these segments, pixels of beta; None without any.
         depth_step: change of depth at (near, far) that moves a point by one pixel of beta, in the rig's unit:
             the median of alpha's pixels whose point beta sees, NaN if it sees none, infinite for an infinite
             bound; None without depth range or baseline.
@@ -121,7 +120,8 @@ def _camera(name: str, rig: Rig) -> CameraSummary:
     focal = (float(camera.K[0, :2].norm()), float(camera.K[1, :2].norm()))
     footprint = None
     if rig.depth is not None:
-        near, far = (float(1000 * d / math.sqrt(focal[0] * focal[1])) for d in rig.depth)
+        bounds = (1.0, 1.0) if camera.parallel else rig.depth
+        near, far = (float(1000 * d / math.sqrt(focal[0] * focal[1])) for d in bounds)
         footprint = near, far
     return CameraSummary(name, (w, h), field_of_view(camera), focal, footprint, *of_lens)
 

@@ -120,8 +120,8 @@ def depth_of(
         and less than 90 degrees off axis.
 
     Raises:
-        ValueError: for uncalibrated pairs, lenses whose rays do not meet in a point, and pixels without the
-            axes of a batch.
+        ValueError: for lenses whose rays do not meet in a point, pixels without the axes of a batch, and as
+            `Pair.beta_from_alpha`.
     """
     alpha, beta = pair.cameras
     x, x_beta = floating(x), floating(x_beta)

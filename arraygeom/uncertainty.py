@@ -44,8 +44,8 @@ def position_covariance(
         depth: depth in alpha, in the rig's unit, one for all or one for each.
 
     Returns:
-        Covariances in pixels² of beta, float64; NaN where alpha's lens has no ray, the depth is infinite, or
-        the point is not in front of beta or within its lens's range (its image's border does not count).
+        Covariances in pixels² of beta, float64; NaN where `Camera.unproject` gives no point, the depth is
+        infinite, or beta's lens does not see the point (its image's border does not count).
 
     Raises:
         ValueError: for a camera that is unknown or not calibrated, and a covariance of parameters that the
@@ -76,12 +76,12 @@ def triangulation_covariance(
         seen: as of `triangulate`.
 
     Returns:
-        Covariances, m², float64, zero where a point is not valid; `triangulate` gives the pixels' part, to be
-        added. All points move together: errors of two points are not independent.
+        Covariances, m², float64, zero where a point is not valid (with a deviation of 1); `triangulate` gives
+        the pixels' part, to be added. All points move together: their errors are not independent.
 
     Raises:
-        ValueError: as `triangulate`, for a camera that is not calibrated, and for a covariance of parameters
-            that the rig has not.
+        ValueError: as `triangulate`, for a camera that is not calibrated, and for a covariance as in
+            `position_covariance`.
     """
 
     def points(rig: Rig) -> Tensor:
@@ -94,7 +94,7 @@ class BandWidths(NamedTuple):
     """Half-widths of the bands that hold alpha's points in beta.
 
     Attributes:
-        across: at the near and the far bound, across the segment, pixels of beta.
+        across: at the near and the far bound, across the segment, pixels of beta; NaN where not seen.
         along: the same along the segment.
     """
 
@@ -103,7 +103,7 @@ class BandWidths(NamedTuple):
 
 
 FARTHEST = 1e4
-"""Far bound that stands for an infinite one, times the near bound."""
+"""Largest far bound, in near bounds; it stands for an infinite one."""
 
 
 def bands(
@@ -117,9 +117,9 @@ def bands(
         confidence: probability that the point is within them, in each direction by itself, for normal errors.
 
     Returns:
-        Half-widths at the rig's near and far bounds (`FARTHEST` for an infinite one); in between they are
-        interpolated. NaN at a bound where `position_covariance` is. A segment shorter than `SHORTEST` has
-        both directions' uncertainty in either.
+        Half-widths at the rig's near and far bounds (at most `FARTHEST` times near); in between they are to
+        be interpolated. NaN at a bound where `position_covariance` is. Without direction, as for a segment
+        with such a bound or shorter than `SHORTEST`, either has both directions' uncertainty.
 
     Raises:
         ValueError: for a rig without a depth range, a confidence that is not between 0 and 1, and as
@@ -134,8 +134,8 @@ def bands(
     near = float(rig.depth[0])
     depths, x = (near, min(float(rig.depth[1]), FARTHEST * near)), floating(x).double()
     a, b = _camera(rig, alpha), _camera(rig, beta)
-    first, last = (b.project(a.unproject(x, x.new_full((len(x),), d)).nan_to_num(1.0)).x for d in depths)
-    step = last - first
+    first, last = (b.project(a.unproject(x, x.new_full((len(x),), d)).nan_to_num(1.0)) for d in depths)
+    step = torch.where((first.valid & last.valid)[:, None], last.x - first.x, 0.0)
     length = step.norm(dim=-1, keepdim=True)
     u = torch.where(length > SHORTEST, step / length.clamp(min=SHORTEST), step.new_tensor([1.0, 0.0]))
     axes = torch.stack([u, torch.stack([-u[:, 1], u[:, 0]], -1)], -2)

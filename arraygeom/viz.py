@@ -175,7 +175,7 @@ def draw_fields(
 ) -> Figure:
     """Draw alpha's pixels x, and their sampling locations in every beta in the same colours.
 
-    Segments are lines with a dot at their near end, positions are dots.
+    Segments are lines with a dot at their start (near, of a field bounded by depth), positions are dots.
 
     Args:
         x: pixels of alpha, as the fields take them: by default as recorded.
@@ -205,7 +205,7 @@ def draw_fields(
 def draw_sampling_locations(axes: Axes, field: ReceptiveField, pair: Pair, x: Float[Tensor, "n 2"]) -> None:
     """Draw the sampling locations in beta of some alpha pixels into `axes`, each in its own colour.
 
-    Segments are lines with a dot at their near end; positions are dots; invalid ones are left out.
+    Segments are lines with a dot at their start; positions are dots; invalid ones are left out.
 
     Raises:
         ValueError: as the field raises it for this pair.
@@ -399,8 +399,8 @@ def show_image(axes: Axes, hw: HW, image: Any = None) -> None:
 
     Args:
         hw: height and width of the frame; an image of another size is not refused.
-        image: tensor or array (H, W), (H, W, 1 or 3) or (1 or 3, H, W); None for the frame alone. Floats are
-            0 to 1, integers up to their type's largest.
+        image: tensor or array (H, W), (H, W, 1 or 3; 4 with opacity) or (1 or 3, H, W); None for the frame
+            alone. Floats are 0 to 1, integers up to their type's largest.
 
     Raises:
         TypeError: for an image of another shape.

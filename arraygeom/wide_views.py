@@ -31,8 +31,8 @@ def rectify_spherical(pair: Pair, *, focal: float | None = None) -> Pair:
         large enough for both images, without a link. Its depth range has the old numbers, along the new axis.
 
     Raises:
-        ValueError: for uncalibrated pairs, batches, no baseline, lenses whose rays do not meet in a point,
-            and new images larger than `check_hw` allows.
+        ValueError: for batches, no baseline, lenses whose rays do not meet in a point, new images larger than
+            `check_hw` allows, and as `Pair.beta_from_alpha`.
     """
     cameras = pair.cameras
     if any(c.batch_shape for c in cameras) or not all(c.central for c in cameras):
@@ -107,11 +107,11 @@ def cube_faces(camera: Camera, *, overlap: float = 5.0) -> dict[str, Camera]:
         overlap: degrees by which faces reach beyond their edges, well below 45.
 
     Returns:
-        Cameras in the place of `camera` by face, in the order of `FACES` ("front", "left", ...), those alone
-        of which the lens sees something, with its resolution in the middle.
+        Cameras in the place of `camera` by face, in the order of `FACES` ("front", "left", ...), if the lens
+        sees any of it, with its resolution in the middle.
 
     Raises:
-        ValueError: for a batch of cameras, lenses whose rays do not meet in a point, and an overlap near 45.
+        ValueError: for a batch, lenses whose rays do not meet in a point, and an overlap of about 45 or more.
     """
     if camera.batch_shape or not camera.central:
         raise ValueError("faces are of one camera at a time, whose rays meet in a point")

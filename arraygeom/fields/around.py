@@ -26,8 +26,8 @@ from .straight import pinhole_track, require_pinholes
 class AroundDepth:
     """Field of the segments from depth / (1 + tolerance) to depth * (1 + tolerance) of a known depth map.
 
-    Needs a calibrated pair without lenses. Where the depth is known the pair's own depth bounds do not count;
-    where it is not positive and finite, the segment is that between them, and they are needed.
+    Needs a calibrated pair without lenses, of which a link does not count. Only where the depth is not
+    positive and finite, the segment is between the pair's own depth bounds, which are needed then.
 
     Attributes:
         depth: map (H, W) of depth z in the rig's unit (metres), at the pixels of `view`.

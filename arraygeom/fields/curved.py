@@ -36,13 +36,13 @@ from .straight import Epipolar
 class Curved:
     """Field of depth samples through lens models: positions near to far, evenly spaced in beta's pixels.
 
-    Needs a calibrated pair; without lenses it is `Epipolar` sampled. The part of each ray that can be on
-    beta's image is clipped in closed form, followed at nodes (even in undistorted pixels, or in angle where
-    beta sees more than 75 degrees off axis), and its part on the image is divided evenly. In a beta that is
-    not central the nodes are first moved to where its image is. Positions are exact for their depths; with a
-    lens the spacing, and where an edge of the image cuts the curve, are to the accuracy of straight pieces
-    between nodes. A point that alpha sees at 90 degrees or more off axis has no depth along the axis and no
-    samples, unless the bounds are of the `distance` along the ray.
+    Needs a calibrated pair, of which a link does not count; without lenses `Epipolar` sampled. The part of
+    each ray that can be on beta's image is clipped in closed form, followed at nodes (even in undistorted
+    pixels, or in angle where beta sees more than 75 degrees off axis), and its part on the image is divided
+    evenly. In a beta that is not central the nodes are first moved to where its image is. Positions are exact
+    for their depths; with a lens the spacing, and where an edge of the image cuts the curve, are to the
+    accuracy of straight pieces between nodes. A point that alpha sees at 90 degrees or more off axis has no
+    depth along the axis and no samples, unless the bounds are of the `distance` along the ray.
 
     Attributes:
         samples: number of positions per pixel of alpha.
@@ -77,8 +77,8 @@ class Curved:
             rig, lenses included; masked ones are 0.
 
         Raises:
-            ValueError: for an uncalibrated pair, one without the bounds that the field leaves open, and a
-                near bound beyond the far one.
+            ValueError: for a pair without the bounds that the field leaves open, a near bound infinite or
+                beyond the far one, and as `Pair.beta_from_alpha`.
         """
         pair.cameras  # noqa: B018  (raises for an uncalibrated pair, before the depth range is asked for)
         near, far = Epipolar(self.near, self.far).bounds(pair)
@@ -128,7 +128,7 @@ class ThroughLenses:
         """Compute the positions in beta of alpha's pixels.
 
         Returns:
-            Positions (*n, samples, 2) in beta's pixels; masked ones are 0.
+            Positions (*n, samples or the field's own number, 2) in beta's pixels; masked ones are 0.
 
         Raises:
             ValueError: for a batch of rigs with lenses, an image without a pixel within its lens's range, an
@@ -225,7 +225,7 @@ class RayCurve(NamedTuple):
             The curves, in the precision of x; valid ones may yet be off the image where beta has a lens.
 
         Raises:
-            ValueError: for a pair that is not calibrated, or other `bounds`.
+            ValueError: for other `bounds`, and as `Pair.beta_from_alpha`.
         """
         _check_word(bounds)
         pose = pair.beta_from_alpha.to(x.dtype)
@@ -298,8 +298,8 @@ class RayCurve(NamedTuple):
 
     @property
     def compilable(self) -> bool:
-        """True if compiled loops can follow the curves, and their gradients: on the CPU, of one pair, with no
-        lens or one of `COMPILED_LENSES` without a tilted sensor."""
+        """True if compiled loops can follow the curves, and their gradients: on the CPU, in one beta with no
+        lens or one of `COMPILED_LENSES` without a tilted sensor, outside torch's transformations."""
         lens = self.beta.distortion
         lens_compiled = lens is None or (
             isinstance(lens, Distortion)
@@ -582,7 +582,7 @@ class LensNumbers(NamedTuple):
             The numbers, without gradient.
 
         Raises:
-            KeyError: for a `Distortion` of another model.
+            KeyError: for a `Distortion` of another model; AssertionError or ValueError: for another lens.
         """
         K, lens = camera.K.detach().double().numpy(), camera.distortion
         if lens is None:
@@ -602,7 +602,7 @@ def undistorted_limits(camera: Camera) -> tuple[Tensor, tuple[Tensor, ...]]:
     """Compute the bounds of a camera's image in normalised undistorted points, 2 % wider, by its border.
 
     Returns:
-        One bool for all of a batch, True if they bound the image, False (and bounds without meaning) if it
+        One bool tensor for all of a batch, True if they bound the image, False (bounds mean nothing) if it
         reaches 75 degrees off axis or over the domain of its lens model; and x low, y low, x high, y high,
         (*b) each.
     """

@@ -69,13 +69,12 @@ def default_field(pair: Pair) -> ReceptiveField:
     """Return the field that fusion uses for a pair; through lenses where a view has one.
 
     Returns:
-        `AroundHomography` for cameras at one place, and for a pair whose link has H alone (F of zeros).
-        `HomographyDisplacement` for a pair with another link, calibrated or not (a link was measured between
-        these very images). `Epipolar` for another calibrated pair; called, it raises ValueError without a
-        depth range: a search of the whole line must be requested (`EpipolarLine`). `Rectified` with alpha on
-        either side where only sizes are known. With a lens in either view `Curved` in place of `Epipolar`,
-        with the bounds of `natural_bounds`, and `ThroughLenses` of any other; `Curved` always where a view
-        has no pinhole view.
+        With a link (measured between these very images), calibrated or not, `HomographyDisplacement`, or
+        `AroundHomography` if F is zero. For another calibrated pair `AroundHomography` without a baseline,
+        else `Epipolar`; called, it raises ValueError without a depth range: a search of the whole line must
+        be requested (`EpipolarLine`). `Rectified` with alpha on either side where only sizes are known. With
+        a lens in either view `Curved` in place of `Epipolar`, with the bounds of `natural_bounds`, and
+        `ThroughLenses` of any other; `Curved` always where a view has no pinhole view.
 
     Raises:
         ValueError: for an uncalibrated pair with a view without a pinhole view, and float32 poses too far
@@ -107,8 +106,8 @@ def natural_bounds(pair: Pair) -> Literal["depth", "distance"]:
     """Return the quantity that a pair's depth range bounds: "distance" if alpha sees 90 degrees off axis.
 
     Returns:
-        "distance" along the ray if one of alpha's pixels looks 90 degrees or more off its axis; else, and
-        while the pair is traced, "depth" along the axis.
+        "distance" along the ray if one of some pixels all over alpha looks 90 degrees or more off its axis;
+        else, and while the pair is traced, "depth" along the axis.
 
     Raises:
         ValueError: for an uncalibrated pair.

@@ -144,8 +144,8 @@ TIE = 1e-3
 class Local:
     """Field of a square window around H x; from H only (the CNN-like case).
 
-    H is as in `Pair.homography`: the link's; of calibrated cameras that of the plane at the middle inverse
-    depth, or at infinity without a depth range; else that of the same field of view.
+    H is as in `Pair.homography`: the link's if it has one; for calibrated cameras that of the plane at the
+    middle inverse depth, or at infinity without a depth range; else that of the same field of view.
 
     Attributes:
         size: samples per side, at least 1.

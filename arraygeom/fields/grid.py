@@ -30,9 +30,9 @@ _CHUNK = 1 << 18
 class FieldOnGrid:
     """Receptive field of a pair, evaluated on every pixel of alpha.
 
-    Segments are float64: the rounding of float32 is enough to change which of two equally good matches is
-    taken. A large grid's are stored as float32 nevertheless, without blocks, and converted to float64 when
-    they are cut: the rounding is the same whatever the parts.
+    Fields are asked in float64: the rounding of float32 is enough to change which of two equally good
+    matches is taken. A large grid's segments are stored as float32 nevertheless, and converted to float64
+    when they are cut: the rounding is the same whatever the parts.
 
     Attributes:
         at: function from any pixels of alpha (n, 2) to segments or positions, (n) or for a batch of rigs
@@ -40,7 +40,7 @@ class FieldOnGrid:
         samples: number of positions to sample from a segment, or number of explicit positions.
         pixels: segments (B or 1, H, W) in beta's pixels; None for explicit positions, which only `at` gives.
         blocks: segments (B or 1, H / 2, W / 2) of the centres of blocks of 2 x 2 pixels; None for explicit
-            positions, a large grid, and if not requested.
+            positions, and by `from_field` for a large grid and if not requested.
     """
 
     at: At
@@ -61,8 +61,8 @@ class FieldOnGrid:
 
         Returns:
             The field; segments that are NaN or infinite are not valid, and all are clipped to beta's image if
-            one is longer than its diagonal. Explicit positions are not evaluated: a whole frame's may not fit
-            into memory.
+            one (of every fourth row and column) is longer than its diagonal. Explicit positions are not
+            evaluated: a whole frame's may not fit into memory.
 
         Raises:
             ValueError: for an invalid result of the field, or whatever the field raises for this pair.

@@ -50,7 +50,7 @@ def ray_depth(
         depths.
 
     Raises:
-        ValueError: for pairs that are not calibrated or have no depth range, and other `bounds`.
+        ValueError: for pairs without a depth range, other `bounds`, and as `Pair.beta_from_alpha`.
     """
     pair.cameras  # noqa: B018  (raises for an uncalibrated pair)
     near, far = pair.depth_range
@@ -104,15 +104,15 @@ def _inverse_depth_per_pixel(curve: RayCurve, fraction: Float[Tensor, "n 1"]) ->
 
 
 def rough_transfer(pair: Pair, x: Real[Tensor, "n 2"]) -> TransformedPoints:
-    """Map pixels of alpha roughly to beta: by the pair's homography without the lenses, or to the middles of
-    their curves if a view has no pinhole view.
+    """Map pixels of alpha roughly to beta: by the pair's homography as if there were no lenses, or to the
+    middles of their curves if a view has no pinhole view.
 
     Returns:
         Positions in beta's pixels, without gradient to the pair, with their validity; 0 where not valid.
         Those by the homography may be off beta's image.
 
     Raises:
-        ValueError: for a pair that is not calibrated or has no depth range, where curves are needed.
+        ValueError: as `Curved` where curves are needed, else as `Pair.homography`.
     """
     if pair.alpha.has_pinhole_view and pair.beta.has_pinhole_view:
         return apply_homography(pair.homography.detach().to(x), x)

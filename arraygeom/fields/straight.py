@@ -25,7 +25,7 @@ from .protocol import CHUNK, all_pixels, segments_by_rows
 
 @dataclass(frozen=True)
 class Epipolar:
-    """Field of the segment of the epipolar line between depth bounds; needs calibration.
+    """Field of the segment of the epipolar line between depth bounds; by calibration, whatever the link.
 
     A segment of which nothing is in beta's image and in front of beta is invalid. Without a baseline, with
     near = far, and for identical cameras it is a point. An alpha pixel on the epipole sees one point of beta,
@@ -54,8 +54,7 @@ class Epipolar:
             Segments in beta's pixels, differentiable in the pair's numbers.
 
         Raises:
-            ValueError: for a pair that is not calibrated or has lenses, or without the bounds that the field
-                leaves open.
+            ValueError: for a pair with lenses, and as `bounds` and `Pair.beta_from_alpha`.
         """
         require_pinholes(pair)
         return _between(pair, *self.bounds(pair), x)
@@ -67,7 +66,7 @@ class Epipolar:
             Near and far, in the rig's unit: tensors, (*b) for the pair's, float64 for this field's.
 
         Raises:
-            ValueError: if neither states one, or near is beyond far.
+            ValueError: if neither states one, or near is infinite or beyond far.
         """
         if self.near is not None and self.far is not None:
             return depth_range(self.near, self.far)
@@ -119,10 +118,9 @@ class HomographyDisplacement:
     """Field of the part of the epipolar line up to `displacement` pixels either way from its point nearest to
     H x; from F and H, or from calibration.
 
-    The paper's homography-based field. H is as in `Pair.homography`: for a calibrated pair without a link
-    that of the plane at the middle inverse depth (`approximated` fits a better one), and a segment
-    starts towards near and ends towards far. Where there is no line (at the epipole, and without a baseline)
-    the segment is the point H x.
+    The paper's homography-based field, with H as in `Pair.homography` (`approximated` fits a better one). For
+    a calibrated pair without a link a segment starts towards near and ends towards far. Where there is no
+    line (at the epipole, and without a baseline) the segment is the point H x.
 
     Attributes:
         displacement: pixels of beta, at least 0; None for the smallest that covers near to far at every pixel
@@ -199,13 +197,13 @@ def covering_displacement(pair: Pair, x: Real[Tensor, "*n 2"] | None = None) -> 
     Depth-bounded segments count as beta's image clips them.
 
     Args:
-        x: pixels of alpha; None for all.
+        x: pixels of alpha, one or more; None for all.
 
     Returns:
-        Pixels of beta, one per rig, differentiable in the pair's numbers; 0 if no pixel has a segment.
+        Pixels of beta (*b), differentiable in the pair's numbers; 0 if no pixel has a segment.
 
     Raises:
-        ValueError: for a pair that is not calibrated, has lenses, or has no depth range.
+        ValueError: for a pair with lenses or without a depth range, and as `Pair.beta_from_alpha`.
     """
     squared = _squared_reach(pair, _widest(pair) if x is None else floating(x))
     largest = (
@@ -256,7 +254,8 @@ class Rectified:
     Attributes:
         max_disparity: largest disparity, pixels of beta, at least 0; None for the whole row.
         alpha_is: "left" or "right", the camera of the rectified pair that alpha is: the segment goes to the
-            left or right in beta from the pixel of the same place; for "either" both ways.
+            left or right in beta from the pixel of the same place, for "either" both ways; a whole row goes
+            from right to left for "right", else from left to right.
 
     Raises:
         ValueError: for a disparity that is negative, infinite or NaN, or another side.
@@ -274,8 +273,7 @@ class Rectified:
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Segments:
         """Compute segments from the largest disparity (near) to none (far), for "either" from left to right.
 
-        A whole row goes from its first pixel to its last, or back if alpha is the right camera. Images of
-        different sizes are taken to show the same view.
+        Images of different sizes are taken to show the same view.
 
         Returns:
             Segments in beta's pixels, on its image; not differentiable in a rig, of which nothing but sizes
@@ -330,8 +328,8 @@ def approximated(pair: Pair) -> Pair:
         The pair with a link of its F (exact, or that of a link it had) and this H, differentiable.
 
     Raises:
-        ValueError: for uncalibrated or batched pairs, lenses, no depth range, and fewer than 4 of these
-            pixels that beta sees between the bounds.
+        ValueError: for uncalibrated or batched pairs, lenses, no depth range, fewer than 4 of these pixels
+            that beta sees between the bounds, and as `fit_homography`.
         NotImplementedError: within `torch.func.vmap`.
     """
     alpha, _ = pair.cameras

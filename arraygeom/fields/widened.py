@@ -103,7 +103,7 @@ class Widened:
 
     Raises:
         ValueError: for numbers below these bounds, infinity or NaN.
-        TypeError: for an object that is no field, or values that are no numbers.
+        TypeError: for an object that is no field, or values that are no numbers, or no whole one.
     """
 
     field: ReceptiveField
@@ -144,7 +144,7 @@ class Widened:
 
         Raises:
             ValueError: as `arraygeom.uncertainty.bands`, such as for a rig without a depth range or a camera
-                that it has not, and if beta sees nothing within the depth range.
+                that it has not, for one camera given twice, and if beta sees nothing within the depth range.
         """
         camera, pair = rig[rig.require(alpha)], rig.pair(alpha, beta)
         (h, w), (rows, columns) = camera.hw, GRID

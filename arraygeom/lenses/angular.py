@@ -37,7 +37,7 @@ class PolynomialFisheye(CameraModel, name="polynomial-fisheye"):
 
         Returns:
             Points of the image plane (*n, 2), and True (*n) up to the angle at which the lens ends; NaN,
-            infinity and (0, 0, 0) are not valid. Points that are not valid mean nothing.
+            infinity, (0, 0, 0) and straight behind are not valid. Points that are not valid mean nothing.
         """
         X, finite = finite_points(X)
         squared = X[..., :2].square().sum(-1)
@@ -47,7 +47,7 @@ class PolynomialFisheye(CameraModel, name="polynomial-fisheye"):
             off, ratio * torch.where(off, squared, 1.0).sqrt(), torch.where(X[..., 2] < 0, math.pi, 0.0)
         )
         scale, _ = self._radius_over_angle(theta)
-        valid = finite & (theta <= beside_points(self._limit(), X)) & (X != 0).any(-1)
+        valid = finite & (theta <= beside_points(self._limit(), X)) & (off | (X[..., 2] > 0))
         return X[..., :2] * (ratio * scale)[..., None], valid
 
     def unproject(self, xy: Tensor) -> tuple[Tensor, Tensor]:

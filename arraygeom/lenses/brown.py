@@ -48,8 +48,8 @@ def brown_distort(c: Tensor, xy: Tensor) -> tuple[Tensor, Tensor]:
     """Distort normalised points (*n, 2), which lie in the plane z = 1 of the camera's frame.
 
     Args:
-        c: coefficients (*b, 1.., k), k from 4 to 14 in OpenCV's order, with an axis of length 1 for each
-            further one of the points.
+        c: coefficients (*b, 1.., k), k from 4 to 15 as `Brown.named` takes them, with an axis of length 1 for
+            each further one of the points.
         xy: points (*b, ..., 2).
 
     Returns:
@@ -172,7 +172,7 @@ def _radial_factor(lens: Brown, u: Tensor) -> tuple[Tensor, Tensor]:
 def brown_limit(c: Tensor) -> Tensor:
     """Compute the squared radius up to which the model is used: where its radial part r g(r^2) stops rising.
 
-    It ends earlier at a pole and where other terms may fold the image, and at `WIDEST` squared.
+    It ends earlier short of a pole, where other terms may fold the image, and at `WIDEST` squared.
 
     With g = N / D the slope is P / D^2, P(u) = (N + 2 u N') D - 2 u N D', of degree 6 (or 7) with P(0) = 1.
 

@@ -70,7 +70,7 @@ def polynomial_product(a: tuple[Tensor, ...], b: tuple[Tensor, ...]) -> list[Ten
 def once(bound: Callable[[Tensor], Tensor], c: Tensor) -> Tensor:
     """Compute a bound of lenses, such as `brown_limit`, once for the copies of one lens that `expand` makes.
 
-    The bound is cached for recent lenses, unless torch has to see its computation.
+    The bound is cached for recent lenses on the CPU, unless torch has to see its computation.
 
     Args:
         bound: function from coefficients (*b, n) to bounds (*b).

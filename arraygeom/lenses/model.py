@@ -28,9 +28,9 @@ class LensModel(Batched):
 
     Attributes:
         central: True if all rays start in the camera's origin.
-        even: "pixels" or "distance", along which another camera's ray is followed evenly, for models that are
-            not central.
-        period: length of the image plane after which it repeats itself; 0 for never.
+        even: measure in which another camera's ray is followed evenly if a model is not central: "pixels", or
+            "distance" for parallel rays, whose image plane is in metres.
+        period: length of the image plane along x after which it repeats itself; 0 for never.
         model: name of the model in rig files.
         coefficients: numbers of the model (*b, n), one after the other.
     """

@@ -129,6 +129,16 @@ def test_tensors_without_batch_axes_are_shared():
     assert Rig({**one.cameras, "b": camera})[1]["a"].K.equal(camera.K[0])
 
 
+def test_batches_that_share_a_tensor_stack():
+    cameras = stack([random_rig(1)["alpha"], random_rig(2)["alpha"]])
+    poses = [random_rig(seed)["alpha"].cam_from_world for seed in (3, 4, 5)]
+    batches = [cameras.replace(cam_from_world=pose) for pose in poses]
+    for several in (batches, batches[:2]):
+        stacked = stack(several)
+        assert stacked.batch_shape == (len(several), 2)
+        assert [stacked[i, 1] == batch[1] for i, batch in enumerate(several)] == [True] * len(several)
+
+
 def test_names_are_cameras_and_numbers_items():
     rig = stack([random_rig(1), random_rig(2)])
     assert rig["beta"][1] == rig[1]["beta"] == random_rig(2)["beta"]

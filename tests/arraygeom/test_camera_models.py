@@ -407,6 +407,14 @@ def test_a_model_with_rays_that_it_does_not_see_covers_nothing():
     assert "100 % of its image" in odd
 
 
+@pytest.mark.parametrize("k", [[], [0.01]])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_fisheye_does_not_see_straight_behind(k, dtype):
+    lens = PolynomialFisheye(torch.tensor(k, dtype=dtype))
+    _, valid = lens.project(torch.tensor([[0.0, 0, 1], [0, 0, -1], [0, 0, 0], [1e-3, 0, -1]], dtype=dtype))
+    assert valid.tolist() == [True, False, False, True]
+
+
 def test_an_uncalibrated_view_keeps_its_model_in_a_file(tmp_path):
     """A written file is read again."""
     view = LensView(hw=HW, K=intrinsics(100.0, HW), distortion=Division(number(-0.1)))

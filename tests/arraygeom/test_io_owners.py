@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from arraygeom import Camera, Pose, Rig, intrinsics
+from arraygeom import Camera, Pose, Rig, intrinsics, stack
 from arraygeom.distortion import Distortion
 from arraygeom.io import RigFileError, RigFileWarning, read_rig, write_rig
-from arraygeom.lens_fit import coverage, refit_lens
+from arraygeom.lens_fit import coverage, refit_lens, refit_rig
 from arraygeom.summary import summarise_cameras
 from tests.arraygeom.test_io import FIXTURES, assert_is_the_pair
 
@@ -514,6 +514,14 @@ def test_a_fisheye_is_not_fitted_anew():
     lens = Distortion("kannala-brandt", torch.zeros(4, dtype=torch.float64))
     with pytest.raises(ValueError, match="brown-conrady"):
         refit_lens(pole().replace(distortion=lens))
+
+
+def test_batches_are_not_fitted_anew():
+    for camera in (stack([pole()]), pole().replace(K=pole().K.expand(4, 3, 3))):
+        with pytest.raises(ValueError, match="a batch"):
+            refit_lens(camera)
+        with pytest.raises(ValueError, match="a batch"):
+            refit_rig(Rig({"a": camera}))
 
 
 def test_a_comment_before_the_first_yaml_document_is_none(tmp_path):

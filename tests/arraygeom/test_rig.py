@@ -25,7 +25,7 @@ from arraygeom import (
     rotation_from_vector,
 )
 from arraygeom.io import read_rig
-from arraygeom.lenses import FlatPort, RollingShutter
+from arraygeom.lenses import FlatPort, Orthographic, RollingShutter
 from arraygeom.pose import rotation_error
 from arraygeom.runtime.text import UNSCALED
 from arraygeom.summary import summarise_cameras, summarise_pairs
@@ -219,6 +219,14 @@ def test_a_rig_of_many_cameras_is_described_in_seconds(own_lenses, monkeypatch):
 
     few, more = numbers(40), numbers(160)
     assert more < 1.5 * few
+
+
+def test_a_pixel_of_parallel_rays_covers_the_same_at_any_depth():
+    camera = Camera(
+        K=intrinsics(500.0, (8, 10)), cam_from_world=Pose.identity(), hw=(8, 10), distortion=Orthographic()
+    )
+    (summary,) = summarise_cameras(Rig({"a": camera}, depth=(1.0, math.inf)))
+    assert summary.footprint == (2.0, 2.0)
 
 
 def test_some_of_many_different_lenses_are_looked_at(monkeypatch):

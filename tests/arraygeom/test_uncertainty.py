@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from arraygeom import Epipolar, Positions, Rig, Widened, triangulate
+from arraygeom import Epipolar, Pose, Positions, Rig, Widened, triangulate
 from arraygeom.uncertainty import bands, position_covariance, triangulation_covariance
 from tests.arraygeom.rigs import BARREL, random_rig, uniform, with_lenses
 
@@ -122,3 +122,18 @@ def test_covariances_of_another_rig_are_refused():
         bands(rig.replace(depth=None), stated(rig), "alpha", "beta", torch.zeros(1, 2))
     with pytest.raises(ValueError, match="confidence"):
         bands(rig, stated(rig), "alpha", "beta", torch.zeros(1, 2), 1.0)
+
+
+def test_a_band_without_one_of_its_ends_has_both_widths_at_the_other():
+    """Beta, 3 m ahead of alpha, does not see the near bound: there is no segment, nor a direction of it."""
+    rig = random_rig(1)
+    pose = Pose.from_centre(torch.eye(3).double(), torch.tensor([0.5, 0, 3], dtype=torch.float64))
+    rig = rig.replace(
+        depth=(0.5, 8.0), cameras={**rig.cameras, "beta": rig["beta"].replace(cam_from_world=pose)}
+    )
+    x, covariance = torch.tensor([[30.0, 20.0]], dtype=torch.float64), stated(rig)
+    band = bands(rig, covariance, "alpha", "beta", x)
+    assert band.across[0].isnan().tolist() == band.along[0].isnan().tolist() == [True, False]
+    of_both = position_covariance(rig, covariance, "alpha", "beta", x, 8.0)[0].trace().sqrt()
+    torch.testing.assert_close(band.across[0, 1], band.along[0, 1])
+    torch.testing.assert_close(band.along[0, 1], 1.959964 * of_both)

@@ -189,6 +189,7 @@ WRONG: dict[str, Callable[[], Any]] = {
     "a camera that is K": lambda: Rig({"a": K}),
     "both cameras the same": lambda: Rig({"a": camera(), "b": camera()}, depth=(1, 5)),
     "a link to a name unknown": lambda: rig(links={("alpha", "gamma"): Link(EYE)}),
+    "links as a list": lambda: rig(links=[Link(EYE)]),
     "F of rank three": lambda: rig(links={("alpha", "beta"): Link(EYE)}),
     "F of NaN": lambda: Link(with_nan(EYE)),
     "a field called as a function": lambda: Epipolar(pair(), X),
@@ -347,6 +348,9 @@ WRONG: dict[str, Callable[[], Any]] = {
         rig(), {"alpha": torch.ones(8, 8)}, "alpha"
     ),
     "consistent, no such camera": lambda: consistent_depth(rig(), {"alpha": torch.ones(HW)}, "gamma"),
+    "consistent, a batch of rigs": lambda: consistent_depth(
+        stack([rig()]), {"alpha": torch.ones(HW), "beta": torch.ones(HW)}, "alpha"
+    ),
     "resampled from a pair": lambda: resampled(IMAGE[0], pair(), pair()),
     "resampled with a batch": lambda: resampled(IMAGE, camera(), camera()),
     "resampled from a batch of poses": lambda: resampled(IMAGE[0], batch_of_poses(), camera()),
