@@ -22,7 +22,7 @@ def file_names(names: Iterable[str]) -> dict[str, str]:
 
     Letters and digits of any script, ``. _ + - , = @ ~ ( )`` and spaces within stay, others become "_", in
     Unicode's NFC. A name that this changes, that is empty or reserved, begins or ends with "." or a space,
-    is longer than `LONGEST` bytes (and then cut), differs from another one by case alone, or ends like a
+    is longer than `LONGEST` bytes (and then cut), equals another one so written but for case, or ends like a
     changed one, gets "-" and a digest of the name at its end.
 
     >>> file_names(["left", "a/b"])

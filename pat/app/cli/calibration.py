@@ -123,7 +123,7 @@ class PrintBoard:
         Raises:
             ValueError: for a text that is no board, a sheet that it does not fit on, and an `out` of another
                 suffix or where nothing can be written.
-            FileNotFoundError: for a missing target file.
+            OSError: for a missing target file, and if writing fails.
         """
         from calib.boards.target import page_note, parse_board, write_board
 

@@ -130,11 +130,11 @@ class Fusing(Known):
 
     @contextmanager
     def recordings(self, image: Sequence[str], *, with_rig: bool) -> Iterator[Recordings]:
-        """Context manager that yields the images with the given rig or one found; sets `network` and `bits`.
+        """Context manager that yields the images with the given rig or one found; sets `bits`, and `network`
+        if none was named and the default does not suit.
 
         Args:
-            image: images NAME=FILE, as `named` returns them.
-            with_rig: True if a rig is given, False to find one from the images.
+            image, with_rig: images NAME=FILE, and True for a given rig, as `named` returns them.
 
         Yields:
             The recordings; frames of videos exist within the block only.
@@ -230,7 +230,7 @@ class Fusing(Known):
         """Compare the rig with the images, and refine it, or warn, if they contradict it (`checked_rig`).
 
         Returns:
-            The rig of the views, or the corrected one, which is then written beside the results too.
+            The rig of the views, or the refined one, which is then written beside the results too.
 
         Raises:
             LowConfidenceWarning: for a rig that is wrong, with `--misfit refuse` (within `judged`).

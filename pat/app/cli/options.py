@@ -235,10 +235,10 @@ def some_of(text: str, names: Sequence[str], option: str = "--extras") -> set[st
     """Parse names between commas, such as "page,points", as the value of an option.
 
     Returns:
-        The names.
+        The names, a set.
 
     Raises:
-        UsageError: for a name that is none of `names`.
+        UsageError: for a name that is none of `names`, as of an empty text.
     """
     given = {*text.split(",")}
     if unknown := given - {*names}:

@@ -94,8 +94,7 @@ def parse(
 
     Args:
         kind: dataclass or function whose fields or parameters are the options; its docstring is the help.
-        arguments: words; None for those of this process.
-        prog: name of the program in the help; empty for that of this process.
+        arguments, prog: words, and the program's name in the help; None and empty for this process's.
         base: instance of `kind` that holds the defaults, and is copied with changes; None for the class's
             defaults.
         description: help text; empty for the docstring.
@@ -106,6 +105,7 @@ def parse(
     Raises:
         UsageError: for unknown and missing options, and invalid values; what `kind` itself raises passes.
         SystemExit: after `--help`, which prints.
+        OSError: for a dataclass without its source (`field_docs`).
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     parser = _Parser(
@@ -139,7 +139,7 @@ def script(kind: Callable[..., T], arguments: Sequence[str] | None = None, *, pr
     Arguments and result are as for `parse`.
 
     Raises:
-        SystemExit: with one line where `parse` raises UsageError, and after `--help`.
+        SystemExit: with one line, status 1, where `parse` raises UsageError, and after `--help`.
     """
     try:
         return parse(kind, arguments, prog=prog)
@@ -208,7 +208,7 @@ class _Entry:
         return text.replace("%", "%%")
 
     def add_to(self, group: Any) -> None:
-        """Add the option to a parser's group (argparse's); if not given it leaves no entry in the result."""
+        """Add the option (--no-NAME for True by default) to argparse's group; not given, it has no entry."""
         how: dict[str, Any] = {"default": argparse.SUPPRESS, "help": self.help}
         how |= {} if self.option.positional else {"dest": self.name}
         flag, members = f"--{self.dashed}", typing.get_args(self.kind)
@@ -283,7 +283,7 @@ def field_docs(kind: Any) -> dict[str, str]:
     """Return the docstrings that follow some of a dataclass's fields, parents' included, by field.
 
     Raises:
-        OSError: for a class whose source is not there.
+        OSError: for a class whose source is not there; TypeError for a built-in one, `object` excepted.
     """
     docs: dict[str, str] = {}
     for parent in reversed(kind.__mro__):

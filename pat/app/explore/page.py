@@ -58,8 +58,8 @@ class Explorer:
         """Compute what is drawn for a state of the controls.
 
         Returns:
-            The values of `answers.answer`, or for impossible controls and without a scene `error`, a
-            message; with a scene also the control `asked` as it was given, None if it was not.
+            The values of `answers.answer`, or for impossible controls, choices that it was started without,
+            and without a scene `error`, a message; with a scene also the control `asked`, None if not given.
         """
         if self.scene is None:
             return {"error": self.error}
@@ -92,8 +92,8 @@ class Explorer:
         """Write a page of one file that needs neither a kernel nor a network connection.
 
         For calibrated pinholes with a depth range, and no links, it computes any pixel and the rig's sliders
-        itself, for the default field and weights; for others it stores the answers for a grid of alpha's
-        pixels, and has no sliders.
+        itself, for the default field, weights and lenses, and no second field; for others it stores the
+        answers for a grid of alpha's pixels, and has no sliders.
 
         Args:
             columns: columns of that grid.

@@ -367,8 +367,8 @@ def match_offset(
         ends: start and end of the segment; None for other fields.
 
     Returns:
-        Its distance, pixels; 0 unless it matches better than all on the line. None without a segment of some
-        length or valid samples, if nothing matches clearly, or if it is at the edge of the search (`ACROSS`).
+        Its distance, pixels; 0 unless it matches better (`BETTER`) than the line near the largest weight.
+        None without a segment of some length or valid samples, a clear match, or one within `ACROSS`.
     """
     xy, weight = samples
     if ends is None or not bool((weight > 0).any()) or float((ends[1] - ends[0]).norm()) < 1e-6:
