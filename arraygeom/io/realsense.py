@@ -39,7 +39,7 @@ def recognises(path: Path, head: str) -> bool:
 
 
 def read(source: RigSource) -> Rig:
-    """Read the streams that are images, by name, each at its highest size, or the requested one.
+    """Read the streams that are images, by name, each at its largest (highest) size, or the requested.
 
     A stream without the requested size is read at the first size that is listed. "Depth", or else the first
     stream, is the world; lengths are metres.

@@ -136,8 +136,8 @@ class RigSource:
         return source
 
     def warn_of_unread(self) -> None:
-        """Give a RigFileWarning for each file with `suspicious` entries that no reader has looked up, in
-        mappings where it looked up others; files with the same such entries share one."""
+        """Give a RigFileWarning for each file with `suspicious` entries that no reader has looked up, of
+        mappings that one has looked into; files with the same such entries share one."""
         unread: dict[Path, list[str]] = {}
         for entry, used in self.lookups.values():
             left = [
@@ -492,7 +492,7 @@ class Entry:
             side: as of `find`, for the usual names; names without a side serve too.
 
         Returns:
-            Height and width in pixels.
+            Height and width in pixels; by `size_unstated` if they are not both stated.
 
         Raises:
             RigFileError: for a size that is not positive and whole, or too large; as `find` and
@@ -798,9 +798,8 @@ class Entry:
     def of_model(self, word: Entry) -> Distortion | None:
         """Return the lens of this entry's coefficients and of the model that another one names.
 
-        Where it names none, or "none", the model is the one that the user states. Without that it is
-        Brown-Conrady, but for four numbers, which a fisheye has too, the one that fits, with a warning unless
-        all are 0.
+        Where it names none, the model is the user's (which goes before "none", too), else Brown-Conrady, but
+        for four numbers, which a fisheye has too, the one that fits, with a warning unless all are 0.
 
         Args:
             word: entry with the model's name or a flag of fisheyes; its value is None if there is none.
@@ -861,7 +860,7 @@ class Entry:
             The lens; None for a Brown-Conrady lens whose coefficients are all 0.
 
         Raises:
-            RigFileError: for other coefficients, and as `numbers`.
+            RigFileError: for coefficients that the model cannot have, and as `numbers`.
             KeyError: for another model.
         """
         if model in (BROWN_CONRADY, KANNALA_BRANDT):

@@ -170,8 +170,8 @@ def states_cameras(paths: Sequence[Path]) -> bool:
 def rig_of_images(files: Mapping[str, Path]) -> Rig:
     """Read the rig of one capture's images from their tags.
 
-    A camera without distortion has no lens, one without rotation or translation is parallel to the rig's axes
-    or at its origin, with a warning for the second and further rotations, and if all lack a translation.
+    A camera without distortion has no lens, one without rotation has the rig's axes, one without translation
+    is at its origin. Warnings name all but the first without rotation, and say if all of several are there.
 
     Args:
         files: image of each camera by name.
@@ -371,7 +371,7 @@ class _Image(NamedTuple):
         Returns:
             Its response: "rgb", a Band (20 nm wide if unstated), or None if unstated. Of raw bands (no
             colour, no JPEG) also linear coding, 16 bits, black level (0 if unstated), exposure (or None), and
-            gain (ISO / 100, SensorGain, or 1). All assumed but None gives a warning.
+            gain (ISO / 100, SensorGain, or 1). What is assumed gives a warning.
 
         Raises:
             RigFileError: for tags that are no numbers.

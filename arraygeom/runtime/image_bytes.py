@@ -176,10 +176,10 @@ def stored_values(content: bytes, header: ImageHeader) -> Any:
 
 
 def decoded(content: bytes, flags: int = UNCHANGED) -> Any:
-    """Decode an image file's bytes by OpenCV without its messages (a grey or RGB JPEG by kornia, the same).
+    """Decode an image file's bytes by OpenCV without its messages.
 
     Args:
-        flags: OpenCV's IMREAD flags.
+        flags: OpenCV's IMREAD flags; with `UNCHANGED` kornia decodes grey and RGB JPEGs, to the same values.
 
     Returns:
         Values (h, w), or (h, w, channels) with blue first and alpha last, type as OpenCV gives it for the

@@ -70,8 +70,8 @@ class ImageArray:
     Attributes:
         rig: rig of the developed images.
         recorded: rig of the files, with their sensors' coding and black level.
-        images: images (c, h, w) of alpha, which is first, and of the betas to fuse; one band where all of a
-            file are equal.
+        images: images (c, h, w) of alpha, which is first, and of the betas to fuse; one band where three are
+            equal, unless tags state the cameras.
         alpha: name of alpha.
         weights: name of the weights to fuse with.
         match_levels: True to match each beta's mean and contrast to alpha's.

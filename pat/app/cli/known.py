@@ -110,8 +110,8 @@ class Known:
         """Context manager for the command's work, within --max-memory, and for its notes (`note`).
 
         Raises:
-            SystemExit: with status 3, if the work warned that the rig does not fit the images; with `--misfit
-                refuse` before that frame is written. Other errors of the work pass.
+            SystemExit: with status 3, if the work warned (shown as in `main`) that the rig does not fit the
+                images; with `--misfit refuse` before that frame is written. Other errors of the work pass.
             ValueError: for invalid options.
         """
         from ...fusion.checks import LowConfidenceWarning, confidence_checked

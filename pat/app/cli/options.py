@@ -419,7 +419,7 @@ LINE_EVERY = 10.0
 def working(title: str) -> Iterator[Callable[[str], None]]:
     """Context manager during which the terminal shows a title, the current step, and elapsed seconds.
 
-    Without a terminal, steps are lines, `LINE_EVERY` seconds apart.
+    Without a terminal, steps are lines, at least `LINE_EVERY` seconds apart.
 
     Yields:
         A function of a text, which becomes the title.

@@ -95,8 +95,8 @@ def parse(
     Args:
         kind: dataclass or function whose fields or parameters are the options; its docstring is the help.
         arguments, prog: words, and the program's name in the help; None and empty for this process's.
-        base: instance of `kind` that holds the defaults, and is copied with changes; None for the class's
-            defaults.
+        base: instance of `kind` that holds the defaults, and is copied with changes, needed for options of a
+            dataclass within it (--a.b); None for the class's defaults.
         description: help text; empty for the docstring.
 
     Returns:
@@ -208,7 +208,7 @@ class _Entry:
         return text.replace("%", "%%")
 
     def add_to(self, group: Any) -> None:
-        """Add the option (--no-NAME for True by default) to argparse's group; not given, it has no entry."""
+        """Add the option (--no-NAME if True is the default) to argparse's group; no entry unless given."""
         how: dict[str, Any] = {"default": argparse.SUPPRESS, "help": self.help}
         how |= {} if self.option.positional else {"dest": self.name}
         flag, members = f"--{self.dashed}", typing.get_args(self.kind)

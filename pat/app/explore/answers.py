@@ -383,8 +383,8 @@ def slider_ranges(rig: Rig) -> list[list[Any]]:
 
     Returns:
         A list [name, label, [low, high, step, value], change] for each, with `change` True for a change of
-        one camera (`ERRORS`, lens: of the longest one), False for "near", "far" and "baseline". Depths only
-        with a depth range, of which more than `FARTHEST` counts so; others only with calibrated cameras.
+        one camera (`ERRORS`; each number of the longest lens), False for "near", "far" and "baseline". Depths
+        only with a depth range, taken up to `FARTHEST`; others only with calibrated cameras.
     """
     ranges: list[list[Any]] = []
     unit = length_unit(rig)

@@ -86,7 +86,7 @@ class BetaReport(NamedTuple):
         xy: samples, pixels of beta.
         valid: True for samples in the image.
         ends: start and end of a segment, pixels of beta; None for other fields, or if it is not valid.
-        weight: weight of each sample, summing to 1 over valid ones; 0 for others.
+        weight: weight of each sample, summing to 1 over valid ones (if any); 0 for others.
         depth: depth of each sample along alpha's axis, in the rig's unit; NaN where it has none.
         offset: distance of the images' own match from the line, pixels; None without one (`match_offset`).
         band: corners of the band that holds the match by the calibration's uncertainty, pixels of beta; None
