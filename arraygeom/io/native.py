@@ -300,9 +300,8 @@ def _link(fields: Entry, cameras: Mapping[str, View]) -> tuple[tuple[str, str], 
         raise spread.fail(f"is {spread.number():g}; it is 0 or more, in pixels")
     if H.value is not None and "F" not in fields:
         return (alpha, beta), Link.from_homography(H.numbers((3, 3)), spread.number())
-    return (alpha, beta), Link(
-        fields.get("F").numbers((3, 3)), None if H.value is None else H.numbers((3, 3))
-    )
+    F, rough = fields.get("F").numbers((3, 3)), None if H.value is None else H.numbers((3, 3))
+    return (alpha, beta), Link(F, rough, spread.number())
 
 
 def _camera_named(entry: Entry, cameras: Mapping[str, View]) -> str:
