@@ -74,7 +74,7 @@ class Batch:
         weights: weights by name or file.
         sequence: True to fuse in order of time, as `fuse_sequence`; False to fuse the first files of all
             cameras, then the second ones (`frame_matching` matches them).
-        speed: fastest motion in a sequence, alpha's pixels for each second; None estimates it.
+        speed: fastest motion in a sequence, alpha's pixels a second; None estimates it (`SequenceFusion`).
         settings: settings of fusion.
         bits: bits of the fused image's values.
         kind: format of the fused image.
@@ -183,7 +183,7 @@ class Batch:
             Frames made, kept and failed, each by its `list_file`.
 
         Raises:
-            JobError: for a frame or key frame that fails with on_error="stop".
+            JobError: for a frame or key frame that fails with on_error="stop"; otherwise as `run_tasks`.
             ValueError: to resume with other settings, an `out` that images are in, in use or not writable, an
                 invalid video rate, a scheduler that does not answer, and as `to_json` and `SequenceFusion`.
             ImportError: for a video without the extra `video`, and a scheduler without Dask.

@@ -58,8 +58,8 @@ class Calibrate:
 
         Raises:
             ValueError: without a board, for invalid options, and for images that cannot be used.
-            FileNotFoundError: for a missing folder, start or board file.
-            OSError: if files cannot be written, or are in the way of the report and no run wrote them.
+            OSError: for a missing folder, start or board file, files that cannot be written, and files in
+                the way of the report that no run wrote; cv2.error as `calibrate_photos`.
         """
         from calib.boards.run import calibrate_photos
 

@@ -99,7 +99,7 @@ class Explorer:
             columns: columns of that grid.
 
         Raises:
-            OSError: if writing fails.
+            OSError: if writing fails; TypeError or AttributeError for `errors` of another type.
         """
         values = self.values()
         all_choices, values["choices"] = values["choices"], []
