@@ -313,7 +313,7 @@ def files_by_camera(
         image: images NAME=FILE; FILE may be a folder or a pattern.
 
     Returns:
-        Alpha's name, and files by camera, of those in `image` alone; alpha may be missing.
+        Alpha's name, and files by camera, for the cameras in `image` alone; alpha may be missing.
 
     Raises:
         ValueError: without alpha, for names that the rig lacks or that are given twice, one image given

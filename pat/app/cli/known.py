@@ -138,7 +138,7 @@ class Known:
         matches: Path | None = None,
         flight: bool = False,
     ) -> ImageArray:
-        """Find the array from each camera's first image, of a flight from those of its middle capture.
+        """Find the array from each camera's first image, or from the images of a flight's middle capture.
 
         Prints what it finds; `match_levels` is set to True if the array needs it.
 
@@ -205,7 +205,7 @@ class KnownFile(NamedTuple):
 
         Raises:
             UsageError: for another name than scale and tolerance, a scale of 0 or less, and a missing file.
-            ValueError: for what is no NAME=NUMBER, and a name given twice.
+            ValueError: for what is no NAME=NUMBER, and a name given twice. The tolerance is not checked.
         """
         path, *parts = text.split(",")
         numbers = options.numbers_by_name(parts, "--around")

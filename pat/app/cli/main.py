@@ -76,7 +76,7 @@ def main(arguments: list[str] | None = None, *, group: Any = Pat, prog: str = "p
     with --debug they are raised.
 
     Args:
-        arguments: words after the program's name; None for those of this process.
+        arguments: words after the program's name; None for this process's.
         group: class with `commands` by name, as `Pat`; `prog` is its name in messages.
 
     Raises:

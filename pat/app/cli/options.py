@@ -111,7 +111,7 @@ def rig_first(arguments: Sequence[str], command: Any) -> list[str]:
     """Move the rig of `--rig RIG` to the front of the arguments, for commands with a positional rig.
 
     Returns:
-        The arguments; those of other commands, and without --rig, as they are.
+        The arguments, for other commands and without --rig as they are.
 
     Raises:
         UsageError: for --rig without a value.

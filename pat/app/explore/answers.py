@@ -74,8 +74,8 @@ ERRORS: dict[str, tuple[str, float, float, float, float]] = {
 }
 """Label, least, most, step and usual value of each change of a camera.
 
-Rotations are about its own axes, steps along those of alpha (in longest baselines), pixels are
-added, the focal length is multiplied. "lens0", "lens1", ... are added to the numbers of the lens.
+Rotations are about its own axes, steps along alpha's (bounds in longest baselines, steps in the rig's unit),
+pixels are added, the focal length is multiplied. "lens0", "lens1", ... are added to the lens's numbers.
 """
 MAPS = ("none", "length, px", "betas that see it", "depth range seen", "entropy of weights")
 """Maps of the whole image: length of the segment or curve, pixels of beta; number of betas with a
@@ -92,7 +92,7 @@ SHIPPED = "pat-supervised"
 
 
 def answer(scene: ExplorerScene, alpha: str, controls: Controls) -> dict[str, Any]:
-    """Compute what is drawn for a state of the controls, which are all of `DEFAULTS`, and x.
+    """Compute all that the explorer draws for values of the controls, which are all of `DEFAULTS`, and x.
 
     Returns:
         Plain values for JSON: `x`, alpha's pixel; `depth` by all betas, in the rig's unit (None if unknown);
@@ -166,7 +166,7 @@ def moved_rig(rig: Rig, alpha: str, controls: Controls) -> Rig:
     """Apply the controls' changes to the calibrated cameras.
 
     Args:
-        alpha: name of alpha, in whose axes steps are; uncalibrated, nothing moves.
+        alpha: name of alpha, in whose axes steps are, in the rig's unit; uncalibrated, nothing moves.
         controls: values of the controls: `baseline`, and `errors` by camera or `ALL` (betas), as `ERRORS`.
 
     Returns:

@@ -55,7 +55,7 @@ class Explorer:
     files: Mapping[str, str] = field(default_factory=dict)
 
     def answer(self, controls: Controls) -> dict[str, Any]:
-        """Compute what is drawn for a state of the controls.
+        """Compute all that is drawn for values of the controls.
 
         Returns:
             The values of `answers.answer`, or for impossible controls, choices that it was started without,
@@ -250,7 +250,7 @@ def checked(
         alpha: name of alpha; None for the first camera with an image.
 
     Returns:
-        Images by camera, those of the room if none are given, and alpha's name.
+        Images by camera, of the room if none are given, and alpha's name.
 
     Raises:
         ValueError: for a rig of one camera, unknown names, no image of alpha or of any beta, and a rig for

@@ -120,7 +120,7 @@ class PixelReport(NamedTuple):
 
 @dataclass(frozen=True)
 class ExplorerScene:
-    """Rig and images of the explorer; the scene itself fills the last three, what is computed once.
+    """Rig and images of the explorer; the scene itself fills the last three, which are caches.
 
     Attributes:
         rig: the rig.
