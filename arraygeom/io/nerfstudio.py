@@ -39,9 +39,10 @@ HEAD = '"(transform_matrix|fl_x|camera_angle_x)"'
 def read(source: RigSource) -> Rig:
     """Read one camera for each frame, named by its `file_path`, in the file's scale, taken as metres.
 
+    A size not stated is the requested one, else guessed by a stated focal length and centre, with a warning.
+
     Raises:
-        RigFileError: for a damaged file, an unsupported lens, equal names, or a size that is neither stated
-            nor requested where focal length (not by a field of view) and centre are not both stated.
+        RigFileError: for a damaged file, an unsupported lens, equal names, or no size.
     """
     document = source.json()
     frames, shared = document["frames"].each(), document.value

@@ -51,10 +51,10 @@ def cameras_of(nodes: Entry, *, alone: str) -> Iterator[tuple[str, Camera]]:
     """Yield the cameras of a document with their names: stated, their tables', left and right, or cam0 ...
 
     The world is the first of a pair whose R and T are at the top, else the one of the stated poses; a single
-    camera without a pose is at its origin.
+    camera without a pose is at its origin. Lengths are in the file's unit. A size that is not stated is the
+    requested one, else guessed, with a warning.
 
     Args:
-        nodes: entry of the document, a mapping.
         alone: name of a single camera for which none is stated.
 
     Raises:

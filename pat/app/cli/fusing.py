@@ -130,14 +130,14 @@ class Fusing(Known):
 
     @contextmanager
     def recordings(self, image: Sequence[str], *, with_rig: bool) -> Iterator[Recordings]:
-        """Context manager that yields the images with the given rig or one found; sets `bits`, and `network`
-        if none was named and the default does not suit.
+        """Context manager that yields the images with the given rig or one found.
+
+        Sets `bits`, and `network` if none was named and the default does not suit. Frames of videos exist
+        within the block only.
 
         Args:
-            image, with_rig: images NAME=FILE, and True for a given rig, as `named` returns them.
-
-        Yields:
-            The recordings; frames of videos exist within the block only.
+            image: images NAME=FILE, as `named` returns them.
+            with_rig: True if a rig is given, False to find one from the images.
 
         Raises:
             ValueError: for options that contradict each other, before images are read, and a rig, images or

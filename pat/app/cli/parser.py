@@ -90,17 +90,15 @@ def parse(
     base: Any = None,
     description: str = "",
 ) -> T:
-    """Parse a command line for a class or a function.
+    """Parse a command line for a class or a function; returns the instance, or the function's result.
 
     Args:
         kind: dataclass or function whose fields or parameters are the options; its docstring is the help.
-        arguments, prog: words, and the program's name in the help; None and empty for this process's.
+        arguments: words; None for this process's.
+        prog: name of the program in the help; empty for this process's.
         base: instance of `kind` that holds the defaults, and is copied with changes, needed for options of a
             dataclass within it (--a.b); None for the class's defaults.
         description: help text; empty for the docstring.
-
-    Returns:
-        The instance, or the function's result.
 
     Raises:
         UsageError: for unknown and missing options, and invalid values; what `kind` itself raises passes.
@@ -208,7 +206,8 @@ class _Entry:
         return text.replace("%", "%%")
 
     def add_to(self, group: Any) -> None:
-        """Add the option (--no-NAME if True is the default) to argparse's group; no entry unless given."""
+        """Add the option (a flag that is True by default as --no-NAME) to a parser's group (argparse's); if
+        not given it leaves no entry in the result."""
         how: dict[str, Any] = {"default": argparse.SUPPRESS, "help": self.help}
         how |= {} if self.option.positional else {"dest": self.name}
         flag, members = f"--{self.dashed}", typing.get_args(self.kind)
