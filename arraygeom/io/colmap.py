@@ -73,14 +73,14 @@ def recognises(path: Path, head: str) -> bool:
 
 
 def read(source: RigSource) -> Rig:
-    """Read the cameras of a model's rig, or one for each image, named as the image is.
+    """Read the cameras of the model's rig of several, by folder or "camera1" ..., else each image's, by name.
 
     The path is that of the folder, a project's with `sparse` in it, or the model's file of cameras, images,
-    rigs or frames. The scale is the model's, taken as metres.
+    rigs or frames. The scale is the model's, taken as metres; the world is the rig's frame, else the model's.
 
     Raises:
-        RigFileError: for missing or damaged files, unknown models, equal names, or several rigs of several
-            cameras.
+        RigFileError: for missing or damaged files, unknown models, equal names, several rigs of several
+            cameras, or a camera without a place in its rig.
     """
     folder = _folder(source.path)
     if folder is None:
@@ -112,8 +112,8 @@ def write(rig: Rig) -> dict[str, str]:
         Texts of cameras.txt, points3D.txt and images.txt by file name.
 
     Raises:
-        ValueError: for names of several lines or with spaces at an end, a rig without cameras, cameras that
-            are uncalibrated or batches, and a K with skew or a lens that the format cannot hold.
+        ValueError: for no cameras, uncalibrated ones, batches, names that are empty or have spaces at an end,
+            and a K (skewed or mirrored, say) or lens that the format cannot hold.
     """
     cameras = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
     images = ["# IMAGE_ID, QW..QZ, TX..TZ, CAMERA_ID, NAME"]

@@ -52,7 +52,8 @@ def recognises(path: Path, head: str) -> bool:
 def read(source: RigSource) -> Rig:
     """Read cameras cam0, cam1, ...; EuRoC's sensor.yaml, or a folder of them, by the names of their folders.
 
-    Lengths are metres. The world is cam0, the IMU if each camera states its place there, or EuRoC's body.
+    Lengths are metres. The world is cam0, the IMU if each camera states its place there, or EuRoC's body. A
+    size that is not stated is the requested one, else guessed, with a warning.
 
     Raises:
         RigFileError: for a damaged file, a gap in the chain, or unsupported models.
@@ -92,8 +93,7 @@ def write(rig: Rig) -> str:
         The text of a YAML file.
 
     Raises:
-        ValueError: for a rig without cameras, cameras that are uncalibrated or batches, and a K with skew or
-            a lens that the format cannot hold.
+        ValueError: for no cameras, uncalibrated ones, batches, and a K or lens that the format cannot hold.
     """
     cameras = calibrated(rig, "Kalibr")
     has_imu = not at_origin(cameras[0][1].cam_from_world)

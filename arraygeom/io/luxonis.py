@@ -28,12 +28,12 @@ HEAD = r'(?s)"cameraData"|(?=.*"boardRev").*"boardName"'
 def read(source: RigSource) -> Rig:
     """Read the calibrated cameras by their sockets: "CAM_A" (colour on most), "CAM_B", "CAM_C", ...
 
-    The first of them is the world; lengths are metres. Cameras without a size are left out, and those whose
-    K is zeros, with a warning.
+    The first of them is the world; lengths are metres. Cameras without a size are left out; so are, with a
+    warning, those whose K is zeros.
 
     Raises:
-        RigFileError: for a damaged file, no calibrated camera, other units, or extrinsics that are circular
-            or relate not all cameras.
+        RigFileError: for a damaged file, no calibrated camera, other sockets, types or units, or extrinsics
+            that are circular or relate not all cameras.
     """
     listed = source.json()["cameraData"]
     entries: dict[int, Entry] = {}

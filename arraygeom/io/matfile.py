@@ -34,12 +34,11 @@ class _Element(NamedTuple):
 
 
 def load_variables(source: RigSource) -> dict[str, Any]:
-    """Load the variables of a .mat file that are made of structs, cells, text and numbers; others are left
-    out.
+    """Load the variables of a .mat file made of structs, cells, text and numbers; others are left out.
 
     Returns:
-        Values by name as scipy simplifies them: structs as mappings, text as str, numbers as arrays without
-        axes of length 1, or scalars.
+        Values by name as scipy simplifies them: structs as mappings, cells and arrays of structs as lists or
+        arrays, text as str, numbers as arrays without axes of length 1, or scalars.
 
     Raises:
         RigFileError: for a file that is missing, empty, too large, damaged, or not of version 5 to 7.

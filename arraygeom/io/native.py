@@ -81,11 +81,7 @@ def recognises(path: Path, head: str) -> bool:
 
 
 def read(source: RigSource) -> Rig:
-    """Read the rig of a native file.
-
-    Raises:
-        RigFileError: for a damaged file; its text names the file, the entry and what to do.
-    """
+    """Read the rig of a native file. Raises as `read_text`."""
     return _rig(source.yaml())
 
 
@@ -100,7 +96,8 @@ def read_text(text: str, path: str | Path) -> Rig:
         The rig, in metres and our pixels, float64.
 
     Raises:
-        RigFileError: for a damaged text; its message names the file, the entry and what to do.
+        RigFileError: for a damaged text; its message names file, entry and problem.
+        ValueError: also as `Rig` raises it, for a link of a camera with itself, say.
     """
     return _rig(RigSource(Path(path)).yaml(text))
 
@@ -234,7 +231,7 @@ def _lens(entry: Entry) -> LensModel | None:
     name = entry.value.get("model") if isinstance(entry.value, dict) else None
     if (kind := CAMERA_MODELS.get(str(name))) is not None:
         return _model(entry, kind)
-    if name is not None and name not in COEFFICIENT_COUNTS:
+    if name is not None and str(name) not in COEFFICIENT_COUNTS:
         raise entry["model"].fail(
             f"is '{name}', not one of {', '.join([*COEFFICIENT_COUNTS, *CAMERA_MODELS])}: "
             "import the module that defines a model of your own first (commands of pat: --plugin MODULE)"
@@ -291,8 +288,8 @@ def _response(fields: Entry) -> Band | Curve:
         _check_keys(fields, ("centre", "width"))
         return _made(fields, Band, *fields.listed("centre", "width").numbers((2,)).tolist())
     _check_keys(fields, ("wavelength", "response"))
-    curve = fields.listed("wavelength", "response").numbers().reshape(2, -1)
-    return _made(fields, Curve, *(tuple(row) for row in curve.tolist()))
+    curve = (tuple(fields[key].numbers().tolist()) for key in ("wavelength", "response"))
+    return _made(fields, Curve, *curve)
 
 
 def _link(fields: Entry, cameras: Mapping[str, View]) -> tuple[tuple[str, str], Link]:
@@ -303,9 +300,8 @@ def _link(fields: Entry, cameras: Mapping[str, View]) -> tuple[tuple[str, str], 
         raise spread.fail(f"is {spread.number():g}; it is 0 or more, in pixels")
     if H.value is not None and "F" not in fields:
         return (alpha, beta), Link.from_homography(H.numbers((3, 3)), spread.number())
-    return (alpha, beta), Link(
-        fields.get("F").numbers((3, 3)), None if H.value is None else H.numbers((3, 3))
-    )
+    F, rough = fields.get("F").numbers((3, 3)), None if H.value is None else H.numbers((3, 3))
+    return (alpha, beta), Link(F, rough, spread.number())
 
 
 def _camera_named(entry: Entry, cameras: Mapping[str, View]) -> str:

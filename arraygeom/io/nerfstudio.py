@@ -39,9 +39,10 @@ HEAD = '"(transform_matrix|fl_x|camera_angle_x)"'
 def read(source: RigSource) -> Rig:
     """Read one camera for each frame, named by its `file_path`, in the file's scale, taken as metres.
 
+    A size not stated is the requested one, else guessed by a stated focal length and centre, with a warning.
+
     Raises:
-        RigFileError: for a damaged file, an unsupported lens, equal names, or an image size that is neither
-            stated nor requested where a field of view stands for the focal length.
+        RigFileError: for a damaged file, an unsupported lens, equal names, or no size.
     """
     document = source.json()
     frames, shared = document["frames"].each(), document.value
@@ -61,8 +62,7 @@ def write(rig: Rig) -> str:
         The text of the file.
 
     Raises:
-        ValueError: for a rig without cameras, cameras that are uncalibrated or batches, and a K with skew or
-            a lens that the format cannot hold.
+        ValueError: for no cameras, uncalibrated ones, batches, and a K or lens that the format cannot hold.
     """
     frames = [_frame(name, camera) for name, camera in calibrated(rig, "nerfstudio")]
     return json.dumps({"frames": frames}, indent=1) + "\n"

@@ -41,8 +41,8 @@ def recognises(path: Path, head: str) -> bool:
 def read(source: RigSource) -> Rig:
     """Read one camera "camera", a stereo pair "left" (the world) and "right", or cameras named in the file.
 
-    One camera without a stated pose is at the origin. A size that is not stated is the requested one, else
-    guessed, with a warning. Lengths are taken as metres.
+    A pair's other file is read from beside its first. One camera without a stated pose is at the origin. A
+    size not stated is the requested one, else guessed, with a warning. Lengths are taken as metres.
 
     Raises:
         RigFileError: for a damaged file, half a pair, or cameras without a common frame.
@@ -68,8 +68,8 @@ def write(rig: Rig) -> str | dict[str, str]:
         A text, or texts by file name.
 
     Raises:
-        ValueError: for no cameras or more than two, cameras that are uncalibrated or batches, and a K with
-            skew or a lens that the format cannot hold.
+        ValueError: for no cameras or more than two, uncalibrated ones, batches, and a K (skewed or mirrored,
+            say) or lens that the format cannot hold.
     """
     cameras = calibrated(rig, "OpenCV")
     if len(cameras) == 1:

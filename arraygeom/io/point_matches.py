@@ -42,14 +42,14 @@ def read_matches(path: str | Path, files: Mapping[str, str | Path], sizes: Mappi
         sizes: height and width of each camera's image, pixels.
 
     Returns:
-        By pair of camera names, in the database's order, points (n, 2) of either, float64, with pixel centres
-        at whole numbers; pairs without matches are left out.
+        By pair of camera names, in the order of `files` or the database, points (n, 2) of either, float64,
+        pixel centres at whole numbers: of a pair in a database verified matches if it has any, else all;
+        pairs without any are left out.
 
     Raises:
         FileNotFoundError: for a missing file.
-        ValueError: for files of another kind, more or fewer than two images with a CSV file, a database
-            without one of these images or without matches between them, and points that are outside the
-            images or not finite.
+        ValueError: for files of another kind, other than two images with a CSV file, a database without one
+            of these images or matches between them, and points outside the images or not finite.
         KeyError: for a camera with matches that has no size.
     """
     path = Path(path)

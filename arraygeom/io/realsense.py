@@ -39,13 +39,13 @@ def recognises(path: Path, head: str) -> bool:
 
 
 def read(source: RigSource) -> Rig:
-    """Read the streams that are images, by name, each at its largest size, or the requested one.
+    """Read the streams that are images, by name, each at its largest (highest) size, or the requested.
 
     A stream without the requested size is read at the first size that is listed. "Depth", or else the first
     stream, is the world; lengths are metres.
 
     Raises:
-        RigFileError: for a damaged file, no stream, one without extrinsics, or an unsupported lens.
+        RigFileError: for a damaged file, no stream, one not related to the world's, or an unsupported lens.
     """
     text = source.text(LONGEST)
     streams: dict[str, tuple[HW, Entry]] = {}

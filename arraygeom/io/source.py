@@ -95,7 +95,7 @@ def decoded(content: bytes, errors: str = "replace") -> str:
 
 
 class RigFileError(ValueError):
-    """Error of a rig file that cannot be read; its text names file, entry and what to do, in one line.
+    """Error of a rig file that cannot be read; its text is "file: entry: problem", in one line.
 
     Attributes:
         path: the file, a Path.
@@ -122,7 +122,7 @@ class RigSource:
         path: the file or folder.
         hw: height and width of the images as stated by the user; None if unstated.
         lens: name of the lens model as stated by the user; None if unstated.
-        lookups: mappings of the file, by identity, with the names that readers have looked up in each.
+        lookups: mappings of the file and of those `beside`, by `id`: (Entry, names looked up in it).
     """
 
     def __init__(self, path: Path, *, hw: HW | None = None, lens: str | None = None) -> None:
@@ -136,8 +136,8 @@ class RigSource:
         return source
 
     def warn_of_unread(self) -> None:
-        """Give a RigFileWarning for each file with entries that no reader has looked up and that are
-        `suspicious`."""
+        """Give a RigFileWarning for each file with `suspicious` entries that no reader has looked up, of
+        mappings that one has looked into; files with the same such entries share one."""
         unread: dict[Path, list[str]] = {}
         for entry, used in self.lookups.values():
             left = [
@@ -237,13 +237,10 @@ class RigSource:
         return self._parsed("YAML", load_yaml, self.text() if text is None else text)
 
     def xml(self) -> ET.Element:
-        """Parse the file as XML.
-
-        Returns:
-            The root element.
+        """Parse the file as XML; returns the root element.
 
         Raises:
-            RigFileError: for a file that is too large, defines entities, or is no XML.
+            RigFileError: for a file that is too large, defines entities, or is no XML, and as `text`.
         """
         text = self.text(LARGEST_TEXT)
         if "<!DOCTYPE" in text or "<!ENTITY" in text:
@@ -254,12 +251,12 @@ class RigSource:
             raise self.fail(f"line {error.position[0]}", "is not XML; is the file whole?") from None
 
     def document(self) -> Entry:
-        """Parse a file in JSON, TOML (by its suffix), XML or YAML, OpenCV's dialects and printed ROS messages
+        """Parse a file in JSON, TOML (suffix .toml), XML or YAML, OpenCV's dialects and printed ROS messages
         included.
 
         Returns:
             The entry of the whole document, whose value is a mapping that is not empty; of several YAML
-            documents the first, with large pictures and maps emptied.
+            documents the first that holds anything, with large pictures and maps emptied.
 
         Raises:
             RigFileError: for any other file.
@@ -295,12 +292,12 @@ class RigSource:
 
         Args:
             separator: text between name and numbers, such as ":".
-            pattern: regular expression of the names whose values are numbers. Their values may be in
+            pattern: regular expression of whole names whose values are numbers. Their values may be in
                 brackets, with commas and semicolons.
 
         Returns:
-            The entry of a mapping: for names that the pattern matches vectors of numbers, float64, for others
-            the text of the last such line. Lines without the separator are left out.
+            The entry of a mapping, empty for no such lines: for names that the pattern matches vectors of
+            numbers, float64, for others the text of the last such line.
 
         Raises:
             RigFileError: for such a name that occurs twice, or whose values are no finite numbers, and as
@@ -370,7 +367,7 @@ class RigSource:
 
 
 class Entry:
-    """Value in a rig file with its name there; its methods raise RigFileError, which begins with that name.
+    """Value in a rig file with its name there; its methods raise RigFileErrors that name file and entry.
 
     Attributes:
         source: the file.
@@ -431,7 +428,7 @@ class Entry:
         return [(str(key), self.at(value, str(key))) for key, value in self._named().items()]
 
     def find(self, name: str, side: str = "") -> Entry:
-        """Find the entry of a mapping whose name matches a pattern.
+        """Find the entry of a mapping whose name matches a pattern, and note it as read (`use`).
 
         Names are compared in lower case without punctuation, as `plain` returns them. Entries that are None
         do not count, nor single numbers named as one coefficient of a lens, such as k1.
@@ -467,8 +464,10 @@ class Entry:
     def model(self, side: str = "") -> Entry:
         """Find the entry that names the lens model.
 
+        Of names that may be of another thing, as "model", only the name of a lens model counts.
+
         Args:
-            side: camera of a stereo pair, as for `find`; names without a side are taken where none has it.
+            side: camera of a stereo pair, as for `find`; names without a side serve too.
 
         Returns:
             The entry, a word or a flag of fisheyes; its value is None if there is none.
@@ -493,7 +492,7 @@ class Entry:
             side: as of `find`, for the usual names; names without a side serve too.
 
         Returns:
-            Height and width in pixels.
+            Height and width in pixels; by `size_unstated` if they are not both stated.
 
         Raises:
             RigFileError: for a size that is not positive and whole, or too large; as `find` and
@@ -561,11 +560,11 @@ class Entry:
         return listed.kannala_brandt() if fisheye else listed.brown_conrady()
 
     def camera(self, pose: Pose | None = None, *, side: str = "", **stated: Any) -> Camera:
-        """Return a camera. What is not stated is found under its usual names.
+        """Return a camera of the given parts; others (no sensor) are found under their usual names.
 
         Args:
             pose: pose in the world; None to find it.
-            side: end of the names, as of `find`.
+            side: as of `find`.
             stated: K, hw, distortion or sensor as of `Camera`.
 
         Raises:
@@ -636,8 +635,8 @@ class Entry:
             also: end of the message for other values.
 
         Returns:
-            Tensor of the list's shape; of no axes for one number, a vector for text with numbers and for the
-            `data` of OpenCV's and ROS' matrices.
+            Tensor of the list's shape (`data`'s, of OpenCV's and ROS' matrices); of no axes for one number, a
+            vector for text with numbers.
 
         Raises:
             RigFileError: for NaN, infinity unless accepted, and values that are no numbers.
@@ -755,7 +754,7 @@ class Entry:
         """Return the pose of a 4 x 4 or 3 x 4 matrix (R, t).
 
         Args:
-            metres: metres of the file's unit of length.
+            metres: length of the file's unit, metres; 1 leaves t in that unit.
 
         Returns:
             The pose X' = R X + t, with t in metres.
@@ -775,7 +774,7 @@ class Entry:
             The lens; None if all coefficients are 0, or none are stated.
 
         Raises:
-            RigFileError: for more than 14, and as `numbers`.
+            RigFileError: for more than 14 that are not all 0, and as `numbers`.
         """
         c = torch.zeros(0) if self.value is None else self.numbers()
         if not c.any():
@@ -786,10 +785,10 @@ class Entry:
         return Distortion(BROWN_CONRADY, torch.nn.functional.pad(c, (0, count - c.numel())))
 
     def kannala_brandt(self) -> Distortion:
-        """Return a Kannala-Brandt fisheye from one to four coefficients, zero-padded to four.
+        """Return a Kannala-Brandt fisheye (of zeros too) from one to four coefficients, zero-padded to four.
 
         Raises:
-            RigFileError: for another number of them, or none, and as `numbers`.
+            RigFileError: for another number of them, and as `numbers`.
         """
         c = self.numbers()
         if not 1 <= c.numel() <= 4:
@@ -799,19 +798,19 @@ class Entry:
     def of_model(self, word: Entry) -> Distortion | None:
         """Return the lens of this entry's coefficients and of the model that another one names.
 
-        Where it names none, the model is the one that the user states, else Brown-Conrady, but for four
-        numbers, which a fisheye has too, the one that fits, with a warning unless all are 0.
+        Where it names none, the model is the user's (which goes before "none", too), else Brown-Conrady, but
+        for four numbers, which a fisheye has too, the one that fits, with a warning unless all are 0.
 
         Args:
             word: entry with the model's name or a flag of fisheyes; its value is None if there is none.
 
         Returns:
-            The lens; None for a pinhole: the model "none", no coefficients (with a warning if they are not
-            stated), and Brown-Conrady's that are all 0.
+            The lens; None for a pinhole: the file's "none", an empty list, coefficients that are not stated
+            (with a warning), and Brown-Conrady's that are all 0.
 
         Raises:
-            RigFileError: for an unknown model, one that contradicts the user's, a fisheye without
-                coefficients, the model "none" with some, and as `lens`.
+            RigFileError: for an unknown model, one that contradicts the user's, a fisheye whose coefficients
+                are not stated, "none" with some that are not 0, and as `lens`.
         """
         said = _said(word)
         wanted, none = self.source.lens, said in ("", "none")
@@ -852,7 +851,7 @@ class Entry:
     def lens(self, model: str) -> Distortion | None:
         """Return a lens of a named model from the entry's coefficients.
 
-        Models other than Brown-Conrady and Kannala-Brandt need all of them.
+        Models other than Brown-Conrady and Kannala-Brandt need all of them, within their bounds.
 
         Args:
             model: name of a model of `Distortion`.
@@ -861,7 +860,7 @@ class Entry:
             The lens; None for a Brown-Conrady lens whose coefficients are all 0.
 
         Raises:
-            RigFileError: for another number of coefficients, or values that no lens has.
+            RigFileError: for coefficients that the model cannot have, and as `numbers`.
             KeyError: for another model.
         """
         if model in (BROWN_CONRADY, KANNALA_BRANDT):
@@ -884,10 +883,10 @@ def single(value: Any) -> bool:
 
 
 def suspicious(key: Any, value: Any) -> bool:
-    """Return True if an entry may be a lens, a model, a flag or a unit by its name, and is not 0, False or
-    empty.
+    """Return True if an entry that is not read may matter: a lens or a flag by its name that is not None, 0,
+    False or empty, a text that names a lens model, or a unit that is not pixels.
 
-    A text counts if it names a lens model, or under a name of a unit.
+    Names of errors, labels, files and the like never count.
     """
     name = plain(key)
     if value is None or HARMLESS.fullmatch(name):

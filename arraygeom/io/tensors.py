@@ -25,8 +25,8 @@ class GSplatCamera(NamedTuple):
     It needs an axis of cameras: `viewmats[None]` and `Ks[None]` of a single one.
 
     Attributes:
-        viewmats: camera from world, axes as ours.
-        Ks: intrinsics, with the first pixel's centre at (0.5, 0.5).
+        viewmats: camera from world, axes and lengths as ours, with the batch axes of the pose.
+        Ks: intrinsics, with the first pixel's centre at (0.5, 0.5), with K's axes.
     """
 
     viewmats: Float[Tensor, "*b 4 4"]
@@ -38,7 +38,7 @@ class OpenGLCamera(NamedTuple):
 
     Attributes:
         view: camera from world, lengths as the camera's, with the batch axes of the pose.
-        projection: clip coordinates from camera, y up (the image's first row is at the top), with K's axes.
+        projection: clip coordinates (z -1 at near, 1 at far) from camera, y up, with K's batch axes.
     """
 
     view: Float[Tensor, "*b 4 4"]
@@ -49,7 +49,7 @@ class PyTorch3DCamera(NamedTuple):
     """Arguments of `pytorch3d.renderer.PerspectiveCameras` with `in_ndc=False`: x left, y up, rows times R.
 
     Attributes:
-        R: rotation, X_camera = X_world R + T, with the batch axes of the pose, and the rest with K's.
+        R: rotation, X_camera = X_world R + T, with the batch axes of the pose, as T; the rest have K's.
         T: translation, lengths as the camera's.
         focal_length: (fx, fy), pixels.
         principal_point: (cx, cy), with the first pixel's centre at (0.5, 0.5).

@@ -39,26 +39,26 @@ def recognises(path: Path, head: str) -> bool:
 
 
 def read(source: RigSource) -> Rig:
-    """Read one camera; a pair; lists K, R, t, d over the cameras; or a table for each camera.
+    """Read one camera; a pair; lists K, R, t, d over the cameras; or a table for each (`cameras_of`).
 
     Raises:
-        RigFileError: for a damaged file, a camera without K, and several of which one has no pose.
+        RigFileError: for a damaged file, and as `cameras_of`.
     """
     return source.rig(cameras_of(source.document(), alone="cam0"))
 
 
 def cameras_of(nodes: Entry, *, alone: str) -> Iterator[tuple[str, Camera]]:
-    """Yield the cameras of a document with their names: those stated, else left and right, or cam0, cam1 ...
+    """Yield the cameras of a document with their names: stated, their tables', left and right, or cam0 ...
 
-    The world is the first of a pair whose R and T are at the top; a single camera without a pose is at its
-    origin.
+    The world is the first of a pair whose R and T are at the top, else the one of the stated poses; a single
+    camera without a pose is at its origin. Lengths are in the file's unit. A size that is not stated is the
+    requested one, else guessed, with a warning.
 
     Args:
-        nodes: entry of the document, a mapping.
         alone: name of a single camera for which none is stated.
 
     Raises:
-        RigFileError: as `read`: for a camera without K, one of several without a pose, and damaged numbers.
+        RigFileError: for a camera without K, one of several without a pose, unequal lists, damaged numbers.
     """
     K, R, t = (nodes.find(name) for name in (K_NAME, R_NAME, T_NAME))
     pair, origin = R.value is not None and t.value is not None, Pose.identity()

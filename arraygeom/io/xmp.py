@@ -87,7 +87,7 @@ def read(source: RigSource) -> Rig:
 def capture_of(path: Path) -> list[Path]:
     """List the images of the capture that an image belongs to.
 
-    Its images lie in one folder, and their names differ only after the last "_".
+    They are TIFF and JPEG files of one folder whose names, without suffix, differ only after the last "_".
 
     Returns:
         Files, sorted; those whose tags state no camera are left out, `path` too. For a name without "_"
@@ -107,10 +107,10 @@ def capture_of(path: Path) -> list[Path]:
 def by_capture(paths: Sequence[Path]) -> dict[str, list[Path]]:
     """Group the images of several captures by the names of their bands (`named_by_band`).
 
-    Captures with other bands than the largest are left out, with a RigFileWarning.
+    Captures with other ends of names than the largest are left out, with a RigFileWarning.
 
     Args:
-        paths: files of one band each, in any order; names in a capture differ after the last "_".
+        paths: image files, in any order; names in a capture differ after the last "_".
 
     Returns:
         Files of whole captures by band, in the captures' order; empty for a single whole capture, a single
@@ -170,8 +170,8 @@ def states_cameras(paths: Sequence[Path]) -> bool:
 def rig_of_images(files: Mapping[str, Path]) -> Rig:
     """Read the rig of one capture's images from their tags.
 
-    Missing tags of rotation, translation or sensor give warnings. Without distortion a camera has no lens;
-    without translations all cameras are at one point.
+    A camera without distortion has no lens, one without rotation has the rig's axes, one without translation
+    is at its origin. Warnings name all but the first without rotation, and say if all of several are there.
 
     Args:
         files: image of each camera by name.
@@ -180,8 +180,8 @@ def rig_of_images(files: Mapping[str, Path]) -> Rig:
         The rig, of the images as their orientation tags rotate them; lengths in metres.
 
     Raises:
-        RigFileError: for images without tags, tags that lack the intrinsics, several captures or bodies, and
-            mirrored or cropped images.
+        RigFileError: for images without tags, tags that lack intrinsics or are damaged, several captures or
+            bodies, and mirrored or cropped images.
         OSError: for a file that cannot be opened.
         ValueError: for no images, and numbers that no camera or sensor has.
         ImportError: without Pillow.
@@ -214,14 +214,12 @@ class _Image(NamedTuple):
 
     @classmethod
     def from_source(cls, source: RigSource) -> _Image:
-        """Read the tags of an image.
-
-        Returns:
-            The tags with their source.
+        """Read the tags of an image, with their source.
 
         Raises:
             RigFileError: unless they state its camera.
             OSError: for a file that cannot be opened.
+            ImportError: without Pillow.
         """
         tags = image_tags(source.path)
         if tags is None or not _states_camera(tags):
@@ -256,7 +254,8 @@ class _Image(NamedTuple):
 
     @property
     def per_mm(self) -> Tensor:
-        """Pixels per millimetre of the sensor, (x, y), float64, by EXIF's resolution of the focal plane.
+        """Pixels per millimetre of the sensor, (x, y), float64, by EXIF's focal-plane resolution (per inch
+        unless stated).
 
         Raises:
             RigFileError: if it is not stated.
@@ -370,9 +369,9 @@ class _Image(NamedTuple):
         """Return the sensor by the tags.
 
         Returns:
-            Its response: "rgb", a Band, or None if unstated. Of raw bands (no colour, no JPEG) also linear
-            coding, 16 bits, black level, exposure (None if unstated), and gain (ISO / 100, or SensorGain).
-            Other tags that are missing give warnings.
+            Its response: "rgb", a Band (20 nm wide if unstated), or None if unstated. Of raw bands (no
+            colour, no JPEG) also linear coding, 16 bits, black level (0 if unstated), exposure (or None), and
+            gain (ISO / 100, SensorGain, or 1). What is assumed gives a warning.
 
         Raises:
             RigFileError: for tags that are no numbers.
@@ -409,7 +408,7 @@ class _Image(NamedTuple):
 
     def _one(self, name: str, otherwise: float) -> float:
         numbers = self.numbers(name)
-        return otherwise if numbers is None else float(numbers[0])
+        return otherwise if numbers is None or not len(numbers) else float(numbers[0])
 
 
 def _states_camera(tags: ImageTags | None) -> bool:
@@ -477,7 +476,7 @@ def image_tags(path: Path) -> ImageTags | None:
     """Read the tags of a TIFF or JPEG file.
 
     Returns:
-        The tags; None for other files, damaged ones, and those without XMP.
+        The tags; None for other files, damaged ones, and those without XMP of `ImageTags`' namespaces.
 
     Raises:
         OSError: for a file that cannot be opened.

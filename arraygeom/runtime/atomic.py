@@ -24,7 +24,7 @@ def write_atomically(path: str | Path) -> Iterator[Path]:
     Raises:
         IsADirectoryError: if `path` is a folder.
         OSError: naming `path` or its folder, if writing fails or the block writes no file. Other errors of
-            the block pass.
+            the block, such as an OSError about another file, pass.
     """
     path = Path(path)
     if path.is_dir():
@@ -91,11 +91,11 @@ def write_text(path: str | Path, text: str) -> None:
 
 @contextmanager
 def alone(lock: Path, longest: float) -> Iterator[None]:
-    """Context manager that admits one process (and thread) at a time, by a lock file (filelock's).
+    """Context manager that admits one process (and thread) at a time, by a lock file, which may stay.
 
     After waiting for `longest` seconds, or where the file cannot be locked, the block runs all the same. The
-    system releases locks of ended processes. Where Python cannot ask the system for locks, a file with suffix
-    .soft exists while a process is in the block. The lock file may stay.
+    system releases locks of ended processes. Where it has none, a file (with suffix .soft, or on a drive
+    without locks the lock file itself) exists while a process is in the block.
     """
     from filelock import FileLock, SoftFileLock
 

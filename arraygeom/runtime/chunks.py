@@ -59,7 +59,7 @@ def tiles_of(lengths: Sequence[int], side: int | Sequence[int], halo: int) -> It
 
     Args:
         lengths: lengths (h, w) of the frame, or of any axes; a length of 0 has one empty part.
-        side: side of square tiles, or (height, width).
+        side: side of square tiles, or one for each axis; 1 or more.
         halo: pixels around each tile, as far as the frame goes.
     """
     sides = [side] * len(lengths) if isinstance(side, int) else side
@@ -78,15 +78,15 @@ def chunked(
     """Compute `function(*tensors)` for some rows at a time; with several axes, for one tile at a time.
 
     Results must be tensors as long as the input along the axis, or shorter by one whole factor that divides
-    the lengths, `rows` and `halo`. Each part gets up to `halo` more rows on either side, whose results are
-    dropped. On the CPU parts may be computed on several threads (`in_order`). Gradients pass through.
+    the lengths, `rows` and `halo` (not checked). Each part gets up to `halo` more rows on either side, whose
+    results are dropped. On the CPU parts may run on several threads (`in_order`). Gradients pass through.
 
     Args:
         function: function of tensors that returns a tensor or a tuple of tensors.
-        tensors: tensors of one length along the axis (or axes).
+        tensors: tensors, one or more, of one length along the axis (or axes).
         rows: length of a part along the axis, or lengths along each.
         halo: rows to add on either side.
-        axis: axis, or axes, to cut along.
+        axis: axis, or axes, of arguments and results to cut along.
 
     Returns:
         A tensor if the function returns one, else a tuple; what the function returned if all is one part.
@@ -133,7 +133,7 @@ def assembled(
 
 
 def sides_by_work(hw: Sequence[int], halo: int, multiple: int, most: float) -> list[tuple[int, int]]:
-    """List sizes of tiles of at most `most` pixels, the least total work (pixels of all tiles) first.
+    """List sizes of tiles that cut a frame evenly, the least total work (pixels of all tiles) first.
 
     Args:
         hw: height and width of the frame.

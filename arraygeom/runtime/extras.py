@@ -8,14 +8,12 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib.metadata import entry_points
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 
 def install_line(module: str, extra: str) -> str:
-    """Return the shell line that installs an optional module, with a checkout and without.
-
-    It names the module's own package: arraygeom-pat is on no index.
-    """
+    """Return the shell line that installs an optional module, or in a checkout this package's extra."""
     packages = {"cv2": "opencv-contrib-python-headless"}
     package = packages.get(module, module.replace("_", "-"))
     return f"pip install {package}, or in a checkout: pip install '.[{extra}]'"
@@ -73,7 +71,7 @@ def error_line(error: BaseException) -> str:
 
 
 class Registry(dict[str, Any]):
-    """Dictionary by name in which users register their own, and replace none but their own.
+    """Dictionary by name in which users register their own, and replace none but their own (by `[name] =`).
 
     Args:
         what: kind of the entries, for messages, such as "field".
@@ -98,6 +96,8 @@ class Registry(dict[str, Any]):
 
 
 def _origin(entry: Any) -> tuple[str, str]:
+    if isinstance(entry, ModuleType):
+        return "module", entry.__name__
     kind = entry if hasattr(entry, "__qualname__") else type(entry)
     return kind.__module__, kind.__qualname__
 

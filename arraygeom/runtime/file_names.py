@@ -22,8 +22,8 @@ def file_names(names: Iterable[str]) -> dict[str, str]:
 
     Letters and digits of any script, ``. _ + - , = @ ~ ( )`` and spaces within stay, others become "_", in
     Unicode's NFC. A name that this changes, that is empty or reserved, begins or ends with "." or a space,
-    is longer than `LONGEST` bytes (and then cut), differs from another one by case alone, or ends like a
-    changed one, gets "-" and a digest of the name at its end.
+    is longer than `LONGEST` bytes, equals another one so written but for case, or ends like a changed one,
+    gets "-" and a digest of the name at its end, and is cut to `LONGEST` bytes with it.
 
     >>> file_names(["left", "a/b"])
     {'left': 'left', 'a/b': 'a_b-c14cddc033f6'}

@@ -45,9 +45,9 @@ class ImageHeader(NamedTuple):
     Attributes:
         hw: stored (height, width), before the orientation is applied.
         orientation: EXIF orientation tag, 1 to 8; 1 where there is none, or one that is none of these.
-        bits: bits of a value in TIFF (the most of its bands), PNG and PNM (at least 8); 0 for others.
-        white: largest possible value of a grey or colour PNM file, or of a TIFF file with 9 to 15 bits a
-            value; 0 for others.
+        bits: bits of a value in TIFF (the most of its bands), PNG (of an index too) and PNM (8 at least, of
+            a bitmap too); 0 for others.
+        white: largest value of a grey or colour PNM, or a TIFF with 9 to 15 bits a value; 0 for others.
         page: tifffile's TiffPage of a TIFF file's first image; None for other files.
         several: True for a TIFF file whose second image has the first one's size and is no reduced copy or
             mask of it.
@@ -179,11 +179,11 @@ def decoded(content: bytes, flags: int = UNCHANGED) -> Any:
     """Decode an image file's bytes by OpenCV without its messages.
 
     Args:
-        flags: OpenCV's IMREAD flags.
+        flags: OpenCV's IMREAD flags; with `UNCHANGED` kornia decodes grey and RGB JPEGs, to the same values.
 
     Returns:
         Values (h, w), or (h, w, channels) with blue first and alpha last, type as OpenCV gives it for the
-        flags; None for a damaged file, and one that OpenCV cannot decode.
+        flags, strides as may be (negative); None for a damaged file, and one that OpenCV cannot decode.
     """
     import cv2
 
@@ -207,7 +207,7 @@ def decodable(content: bytes) -> bytes | None:
     Returns:
         A PNG without its animation, a text PNM with one more line break at its end, others (of unknown
         format too) unchanged; None for a PNG that is cut or fails its checksums, an incomplete TIFF, and a
-        TIFF or JPEG whose compressed pixels are damaged.
+        TIFF or JPEG whose compressed pixels are damaged (TIFF: by Deflate, PackBits, LZW or JPEG).
     """
     if content.startswith(PNG):
         chunks = png_chunks(content)

@@ -29,8 +29,8 @@ def load_yaml(text: str) -> Any:
     """Load the document of a YAML text.
 
     Returns:
-        Plain values: dicts, lists, texts, numbers, booleans, None, and YAML's dates, sets and bytes; None for
-        an empty text or document.
+        Plain values: dicts, lists, texts, numbers, booleans, None, and YAML's dates, sets, pairs and bytes;
+        None for an empty text or document.
 
     Raises:
         yaml.YAMLError: with the line where known, for text that is not YAML, several documents, tags of other

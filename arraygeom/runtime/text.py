@@ -28,7 +28,7 @@ def baseline_text(cameras: Mapping[str, Any], unit: str = "m") -> str:
     """Describe the least and largest distance between cameras of known pose, such as "baselines 10-20 mm".
 
     Args:
-        cameras: cameras by name, of any batch shapes that broadcast; those without a pose do not count.
+        cameras: cameras by name, of batch shapes that broadcast; those without a pose do not count.
         unit: unit of their lengths. For "m" the text names m, cm or mm; for others numbers alone.
 
     Returns:

@@ -91,9 +91,9 @@ def in_parallel(tasks: Sequence[Callable[[], Any]], *, most: int | None = None) 
 def in_order(function: Callable[[Any], Any], parts: Sequence[Any]) -> Iterator[Any]:
     """Compute `map(function, parts)` some parts ahead on several `threads`, with torch in one thread each.
 
-    A single part is computed in this thread, and so are all if torch itself uses several threads, or has to
-    see each operation (`followed`, a function mode, autocast). A part's error is raised at its place in the
-    iterator, once no part is being computed.
+    A single part is computed in this thread, when its turn comes, and so are all if one thread is allowed,
+    torch itself uses several, or it has to see each operation (`followed`, a function mode, autocast). A
+    part's error is raised at its place in the iterator, once no part is being computed.
 
     Args:
         function: function of one part.

@@ -55,8 +55,8 @@ def write_together(
         The temporary folder.
 
     Raises:
-        FileExistsError: for a file in the way, other than the new one, that no list has in its present state
-            and that is not `given`.
+        FileExistsError: for a file in the way, of other content than the new one, that no list has in its
+            present state and that is not `given`.
         OSError: naming the file, if writing fails. Other errors of the block pass.
     """
     folder = Path(folder)
@@ -189,17 +189,17 @@ def read_about(folder: Path, group: str) -> dict[str, str] | None:
 def refuse_others(
     folder: Path, names: Iterable[str] | Mapping[str, str], *, group: str = "", by_name: bool = False
 ) -> None:
-    """Check that no unlisted or changed files of these names are in a folder.
+    """Check that no unlisted or changed files of these names are in a folder (a missing one has none).
 
     Args:
-        folder: the folder; a missing one has no files.
         names: file names, or a mapping to digests: files of the same content are no obstacle.
         group: name of the group whose list is read first; the lists of other groups count too.
-        by_name: True to accept a file whose name is listed, without reading it. Files of a retired group
-            are accepted in any state.
+        by_name: True to accept any file whose name is listed, without reading it, as one of a retired group
+            always is.
 
     Raises:
-        FileExistsError: naming the first of the files, if there are any.
+        FileExistsError: naming some of the files, if there are any.
+        OSError: for a file that cannot be read.
     """
     new = names if isinstance(names, Mapping) else dict.fromkeys(names, "")
     there = {name: {""} for name in new if os.path.lexists(folder / name)}

@@ -55,13 +55,13 @@ def shown_layers(aligned: Aligned, rig: Rig | None = None) -> dict[str, Float[Te
     Bands are stretched to 0..1. Composites and NDVI need bands of suitable wavelengths.
 
     Args:
-        rig: rig of the recorded files, with all of these cameras, for NDVI; None to take values as light.
+        rig: rig of the recorded files, with all of these cameras, for NDVI, as for `ndvi`.
 
     Returns:
         Images (1 or 3, h, w), 0..1, by name: a camera's for its one or three bands, else for its first one,
         and a band's own for the others; then "colour", "infrared composite", "NDVI" and "depth", where there
-        are such bands and known depths. One that has a camera's name, such as "colour", is called "derived
-        colour".
+        are such bands and known depths. One that has a camera's or band's name, such as "colour", is called
+        "derived colour".
     """
     layers, derived = {}, {}
     for name, view in aligned.items():
@@ -81,10 +81,7 @@ def shown_layers(aligned: Aligned, rig: Rig | None = None) -> dict[str, Float[Te
 
 
 def ndvi(aligned: Aligned, rig: Rig | None = None) -> NDArray[np.float32] | None:
-    """Compute (near infrared - red) / (near infrared + red) of light.
-
-    Only reflectance, which a panel of known reflectance gives, yields the index of the literature (Tucker
-    1979).
+    """Compute (near infrared - red) / (near infrared + red) of light (of reflectance: Tucker's index, 1979).
 
     Args:
         aligned: values of the cameras at alpha's pixels, in one unit.
@@ -92,8 +89,9 @@ def ndvi(aligned: Aligned, rig: Rig | None = None) -> NDArray[np.float32] | None
             removed from values, which are counts; None to take values as light.
 
     Returns:
-        The index (h, w), -1..1 unless values are negative; NaN where a camera does not see the point, or none
-        records light. None without a band within `NEAREST` of 840 nm and another within it of 660 nm.
+        The index (h, w), float32, -1..1 unless values are negative; NaN where one of the cameras does not see
+        the point, or the sum is not above 0. None unless the bands nearest to 840 and 660 nm are within
+        `NEAREST` of these and of different names.
 
     Raises:
         ValueError: for a rig without the camera of either band.

@@ -74,7 +74,7 @@ class Batch:
         weights: weights by name or file.
         sequence: True to fuse in order of time, as `fuse_sequence`; False to fuse the first files of all
             cameras, then the second ones (`frame_matching` matches them).
-        speed: fastest motion in a sequence, alpha's pixels for each second; None estimates it.
+        speed: fastest motion in a sequence, alpha's pixels a second; None estimates it (`SequenceFusion`).
         settings: settings of fusion.
         bits: bits of the fused image's values.
         kind: format of the fused image.
@@ -118,8 +118,8 @@ class Batch:
 
     @cached_property
     def dependencies(self) -> str:
-        """Settings, rig and digest of the weights, as YAML text, computed once: all but the images and the
-        program's version that the results depend on.
+        """Settings, rig and digest of the weights (of a sequence also the numbers of images), as YAML text,
+        computed once: all but the images and the program's version that the results depend on.
 
         Raises:
             FileNotFoundError: for unknown weights.
@@ -183,9 +183,9 @@ class Batch:
             Frames made, kept and failed, each by its `list_file`.
 
         Raises:
-            JobError: for a frame that fails with on_error="stop".
-            ValueError: to resume with other settings, a folder in use or not writable, an invalid video rate,
-                a scheduler that does not answer, a field as in `to_json`, and what `SequenceFusion` refuses.
+            JobError: for a frame or key frame that fails with on_error="stop"; otherwise as `run_tasks`.
+            ValueError: to resume with other settings, an `out` that images are in, in use or not writable, an
+                invalid video rate, a scheduler that does not answer, and as `to_json` and `SequenceFusion`.
             ImportError: for a video without the extra `video`, and a scheduler without Dask.
             FileExistsError: for files in the way that no run wrote.
             OSError: if files cannot be written, on a full disk for instance, and for unknown weights.
@@ -246,7 +246,7 @@ class Batch:
         """Format the batch as JSON text, for processes that fuse its frames.
 
         Raises:
-            ValueError: for a field that is no dataclass.
+            ValueError: for a field that is no dataclass, and a rig that no file holds (`io.native.write`).
         """
         entries = {entry.name: getattr(self, entry.name) for entry in dataclasses.fields(self)}
         return json.dumps({"format": PLAN_FORMAT, **entries}, default=_plain)
@@ -259,7 +259,7 @@ class Batch:
 
     @classmethod
     def from_json(cls, text: str, source: str = PLAN) -> Batch:
-        """Parse the text of `to_json`, which messages call `source`.
+        """Parse the text of `to_json`, which messages call `source`, once `modules` are imported.
 
         Raises:
             ValueError: for other text.
@@ -311,7 +311,7 @@ class Batch:
         A frame of a sequence takes colours that `fuse_key` has written, unless `alone`; it needs one of them.
 
         Args:
-            i: number of the frame, from 0.
+            i: number of the frame, from 0; IndexError beyond the last.
             inputs: digest of what the frame depends on (`inputs`), if known; empty to compute it.
 
         Raises:
@@ -434,8 +434,8 @@ def find_images(text: str | Path, *, name: str = "") -> list[Path]:
 
     Returns:
         Files in natural order, numbers in names counting as such; of a folder those with the suffix of an
-        image, of a pattern all that match. Hidden ones are left out; a single file may have any other suffix
-        than a video's.
+        image, of a pattern all files that match, hidden ones left out; a single file may be hidden, and have
+        any other suffix than a video's.
 
     Raises:
         FileNotFoundError: if there is none.

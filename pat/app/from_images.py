@@ -70,8 +70,8 @@ class ImageArray:
     Attributes:
         rig: rig of the developed images.
         recorded: rig of the files, with their sensors' coding and black level.
-        images: images (c, h, w) of alpha, which is first, and of the betas to fuse; one band where all of a
-            file are equal.
+        images: images (c, h, w) of alpha, which is first, and of the betas to fuse; one band where three are
+            equal, unless tags state the cameras.
         alpha: name of alpha.
         weights: name of the weights to fuse with.
         match_levels: True to match each beta's mean and contrast to alpha's.
@@ -225,6 +225,9 @@ def camera_names(paths: Sequence[Path]) -> dict[str, Path]:
 
     Returns:
         Files by camera, in their order.
+
+    Raises:
+        OSError: for a file that cannot be opened.
     """
     if states_cameras(paths):
         return named_by_band(paths)
@@ -267,8 +270,7 @@ def video_frames(videos: Mapping[str, Path], folder: Path) -> tuple[dict[str, li
 
 
 def _tagged_rig(files: Mapping[str, Path], note: Say) -> Rig | None:
-    """Rig from the images' tags; None if not every image has such tags. Translations, which tags need not
-    state, are found later."""
+    """Rig from the images' tags, translations apart; None if not every image has such tags."""
     if not states_cameras(list(files.values())):
         return None
     with warnings.catch_warnings(record=True, action="always") as caught:
@@ -329,10 +331,8 @@ def _translated_rig(tagged: Rig, images: Images, alpha: str, note: Say) -> tuple
 def _mapped_rig(
     tagged: Rig, captures: Iterable[Images], alpha: str, note: Say, by_pair: Pairs | None = None
 ) -> tuple[Rig, list[str]]:
-    """Cameras of tags without poses: their lenses, and a homography, or F, by the points of all captures.
-
-    A scene without parallax, as from a drone, leaves translations open and needs none.
-    """
+    """Cameras of tags without poses (open without parallax, and not needed): their lenses, and a homography,
+    or F, by the points of all captures."""
     pools: dict[tuple[str, str], list[PointMatches]] = {}
     used = 0
     for images in captures:

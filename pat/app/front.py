@@ -76,8 +76,8 @@ def fuse(
         rig: the cameras, or their file. Those without an image are left out. Files are developed as it says.
         alpha: the camera whose view is wanted; without a rig by default the largest grey image, else the
             largest.
-        network: weights by name or file, or a network; by default "mono-colour" for betas in colour, else
-            "mono-spectral".
+        network: weights by name or file, or a network; by default "mono-colour" for betas in colour (without
+            a rig also for one of them, or three called red, green, blue), else "mono-spectral".
         settings: settings that frames of the same cameras have in common.
         corrections: response and alignment estimated from another frame of the same cameras
             (`corrections_of`); None to estimate them from this one.

@@ -91,7 +91,7 @@ def healed_rig(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> Healed | N
 
     Returns:
         The refined rig; None for too few points, and unless held-out points then lie about as near to their
-        lines as to those of an F fitted to them, far nearer than before, and not behind the cameras.
+        lines as to those of an F fitted to them, far nearer than before, and most within the depth range.
     """
     small = {name: scaled(image, min(MATCHED / max(image.shape[-2:]), 1.0)) for name, image in images.items()}
     reduced = resized_rig(rig.replace(cameras={name: rig[name] for name in (alpha, *small)}), small)

@@ -33,10 +33,10 @@ class SampleArray(NamedTuple):
 
 
 def load_sample(folder: Path = SAMPLE) -> SampleArray:
-    """Load the sample array, or another one from a folder with the same files.
+    """Load the sample array, or one from a folder with rig.yaml, truth.png and NAME.png of each camera.
 
     Raises:
-        FileNotFoundError: for a missing file.
+        FileNotFoundError: for a missing file; ValueError for a damaged one.
     """
     rig = Rig.load(folder / "rig.yaml")
     images = {name: read_image(folder / f"{name}.png") for name in rig.names}

@@ -449,6 +449,8 @@ def test_the_search_about_a_homography_is_as_wide_as_its_points_are_off(tmp_path
             assert float(segments.length) == pytest.approx(length)
     assert rig.links["a", "b"].reversed().spread == pytest.approx(1.5)
     assert rig.resize("b", (96, 128)).links["a", "b"].reversed().spread == pytest.approx(1.5)
+    rig.replace(links={("a", "b"): Link(torch.rand(3, 3), H, 1.5)}).save(tmp_path / "lines.yaml")
+    assert Rig.load(tmp_path / "lines.yaml").links["a", "b"].spread == 1.5
     (tmp_path / "bad.yaml").write_text((tmp_path / "rig.yaml").read_text().replace("1.5", "-1"))
     with pytest.raises(RigFileError, match="spread"):
         Rig.load(tmp_path / "bad.yaml")

@@ -270,6 +270,8 @@ NATIVE = [
     ("size: [true, 480]", "True"),
     ("size: [640, 480], focal: true", "True"),
     ("size: true", "True"),
+    ("size: [6, 4], response: {wavelength: 500 600, response: 1}", r"a\.response: a curve has a response"),
+    ("size: [6, 4], focal: 5, distortion: {model: [fov]}", r"distortion\.model: is '\['fov'\]', not one of"),
     (f"size: [6, 4], {BENT}}}", r"cameras\.a\.distortion: is of a camera without 'focal'.*`scale`"),
     (f"size: [6, 4], {BENT}, scale: -3}}", r"distortion\.scale: is -3; a scale is positive"),
     (f"size: [6, 4], focal: 500, {BENT}, scale: 3}}", r"distortion\.scale: unknown key"),

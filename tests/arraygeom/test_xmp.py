@@ -96,6 +96,11 @@ def test_a_fisheye_is_the_makers_formula(tmp_path):
     assert camera.sensor.exposure == pytest.approx(0.003)
 
 
+def test_an_empty_tag_is_not_stated(tmp_path):
+    path = image_of(tmp_path / "IMG_1.tif", {**FISHEYE, "CentralWavelength": ""})
+    assert Rig.load(path)["red"].sensor.response is None
+
+
 @pytest.mark.parametrize(
     "focal", [{"PerspectiveFocalLength": "5.5"}, {"PerspectiveFocalLength": str(5.5 * PER_MM)}]
 )

@@ -58,8 +58,8 @@ class Calibrate:
 
         Raises:
             ValueError: without a board, for invalid options, and for images that cannot be used.
-            FileNotFoundError: for a missing folder, start or board file.
-            OSError: if files cannot be written, or are in the way of the report and no run wrote them.
+            OSError: for a missing folder, start or board file, files that cannot be written, and files in
+                the way of the report that no run wrote; cv2.error as `calibrate_photos`.
         """
         from calib.boards.run import calibrate_photos
 
@@ -123,7 +123,7 @@ class PrintBoard:
         Raises:
             ValueError: for a text that is no board, a sheet that it does not fit on, and an `out` of another
                 suffix or where nothing can be written.
-            FileNotFoundError: for a missing target file.
+            OSError: for a missing target file, and if writing fails.
         """
         from calib.boards.target import page_note, parse_board, write_board
 

@@ -31,7 +31,7 @@ class Demo:
 
         Raises:
             FileExistsError: for files in the way that no run wrote.
-            FileNotFoundError: for unknown weights.
+            OSError: if writing fails, and FileNotFoundError for unknown weights.
             ValueError: for weights that cannot be used, and an `out` that cannot be written.
         """
         from arraygeom.runtime.together import refuse_others, write_listed, write_together
@@ -88,7 +88,7 @@ def table_of(columns: dict[str, dict[str, str]]) -> str:
     """Format a Markdown table of scores, with a column for each recording and a line for each method.
 
     Args:
-        columns: formatted score by method, for each recording by name; the first one lists all methods.
+        columns: formatted score by method, for each recording (one or more) by name; the first has all.
 
     Returns:
         The text; a dash where a method does not apply.

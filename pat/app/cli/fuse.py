@@ -37,9 +37,9 @@ class Fuse(Around, Fusing):
         pat fuse mono.png colour.png
         pat fuse rig.yaml --alpha mono --image mono=a.png --image colour=b.png --depth 2 20 --out out/
 
-    Without a rig it is found from the images, and written to found_rig.yaml beside the result; cameras are
-    then called as their files are. `pat batch` fuses many frames, `pat sequence` frames in order of time.
-    The same command again goes on where it was stopped.
+    Without a rig it is found from the images, and written to found_rig.yaml beside the result, unless they
+    determine no lines; cameras are then called as their files, or bands, are. `pat batch` fuses many frames,
+    `pat sequence` frames in order of time. The same command again goes on where it was stopped.
     """
 
     headings: ClassVar[Mapping[str, str]] = {
@@ -231,7 +231,7 @@ def fuse_with_progress(
         rig: the cameras.
         images: images (c, h, w) by camera.
         device: "cpu", "cuda" or "auto" (the GPU if there is one).
-        further: further arguments of `pat.fuse`, `alpha` among them.
+        further: further arguments of `pat.fuse` but `network`, `progress` and `announce`.
 
     Returns:
         The frame, on the CPU.

@@ -130,14 +130,14 @@ class Fusing(Known):
 
     @contextmanager
     def recordings(self, image: Sequence[str], *, with_rig: bool) -> Iterator[Recordings]:
-        """Context manager that yields the images with the given rig or one found; sets `network` and `bits`.
+        """Context manager that yields the images with the given rig or one found.
+
+        Sets `bits`, and `network` if none was named and the default does not suit. Frames of videos exist
+        within the block only.
 
         Args:
             image: images NAME=FILE, as `named` returns them.
             with_rig: True if a rig is given, False to find one from the images.
-
-        Yields:
-            The recordings; frames of videos exist within the block only.
 
         Raises:
             ValueError: for options that contradict each other, before images are read, and a rig, images or
@@ -230,7 +230,7 @@ class Fusing(Known):
         """Compare the rig with the images, and refine it, or warn, if they contradict it (`checked_rig`).
 
         Returns:
-            The rig of the views, or the corrected one, which is then written beside the results too.
+            The rig of the views, or the refined one, which is then written beside the results too.
 
         Raises:
             LowConfidenceWarning: for a rig that is wrong, with `--misfit refuse` (within `judged`).
@@ -313,7 +313,7 @@ def files_by_camera(
         image: images NAME=FILE; FILE may be a folder or a pattern.
 
     Returns:
-        Alpha's name, and files by camera, of those in `image` alone; alpha may be missing.
+        Alpha's name, and files by camera, for the cameras in `image` alone; alpha may be missing.
 
     Raises:
         ValueError: without alpha, for names that the rig lacks or that are given twice, one image given

@@ -110,8 +110,8 @@ class Known:
         """Context manager for the command's work, within --max-memory, and for its notes (`note`).
 
         Raises:
-            SystemExit: with status 3, if the work warned that the rig does not fit the images; with `--misfit
-                refuse` before anything is written. Other errors of the work pass.
+            SystemExit: with status 3, if the work warned (shown as in `main`) that the rig does not fit the
+                images; with `--misfit refuse` before that frame is written. Other errors of the work pass.
             ValueError: for invalid options.
         """
         from ...fusion.checks import LowConfidenceWarning, confidence_checked
@@ -138,7 +138,7 @@ class Known:
         matches: Path | None = None,
         flight: bool = False,
     ) -> ImageArray:
-        """Find the array from each camera's first image, of a flight from those of its middle capture.
+        """Find the array from each camera's first image, or from the images of a flight's middle capture.
 
         Prints what it finds; `match_levels` is set to True if the array needs it.
 
@@ -192,7 +192,7 @@ class KnownFile(NamedTuple):
     Attributes:
         path: depth map or matched points.
         scale: metres for each unit of a depth map; None: 1 for floats, 0.001 for whole numbers.
-        tolerance: relative error of the depth map; 0 = exact.
+        tolerance: relative error of the depth map; 0 = exact. Of no effect on points, as `scale`.
     """
 
     path: Path
@@ -201,11 +201,11 @@ class KnownFile(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> KnownFile:
-        """Parse the option's text, and check that the file exists.
+        """Parse the option's text, in which the path has no comma, and check that the file exists.
 
         Raises:
             UsageError: for another name than scale and tolerance, a scale of 0 or less, and a missing file.
-            ValueError: for what is no NAME=NUMBER, and a name given twice.
+            ValueError: for what is no NAME=NUMBER, and a name given twice. The tolerance is not checked.
         """
         path, *parts = text.split(",")
         numbers = options.numbers_by_name(parts, "--around")
@@ -272,8 +272,8 @@ class Around(Known):
             field: field of --field; None for the default.
 
         Returns:
-            The rig, and the field: one for all betas around a depth map; one for each by name around matches,
-            `field` for a beta without any; `field` itself without --around.
+            The rig (`with_pixels` around matches), and the field: one for all betas around a depth map; one
+            for each by name around matches, `field` for a beta without any; `field` itself without --around.
 
         Raises:
             ValueError: for options that contradict each other, files that cannot be read or do not suit these

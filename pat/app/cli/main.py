@@ -72,16 +72,16 @@ def command_paths(group: Any = Pat, before: tuple[str, ...] = ()) -> Iterator[tu
 def main(arguments: list[str] | None = None, *, group: Any = Pat, prog: str = "pat") -> None:
     """Run a command of `pat`, or of another group of commands.
 
-    Errors in the input are printed as one line on standard error; with --debug they are raised.
+    Errors, but a TypeError and the like of the program itself, are printed as one line on standard error;
+    with --debug they are raised.
 
     Args:
-        arguments: words after the program's name; None for those of this process.
-        group: class with `commands` by name, as `Pat`.
-        prog: name of the program in messages.
+        arguments: words after the program's name; None for this process's.
+        group: class with `commands` by name, as `Pat`; `prog` is its name in messages.
 
     Raises:
-        SystemExit: with status 0 after --help and --version, 2 for such errors, 130 for an interrupt, 141 for
-            a broken pipe; others by the commands.
+        SystemExit: with status 0 after --help and --version, 2 for printed errors, 130 for an interrupt, 141
+            for a broken pipe; others by the commands.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):

@@ -111,7 +111,7 @@ def rig_first(arguments: Sequence[str], command: Any) -> list[str]:
     """Move the rig of `--rig RIG` to the front of the arguments, for commands with a positional rig.
 
     Returns:
-        The arguments; those of other commands, and without --rig, as they are.
+        The arguments, for other commands and without --rig as they are.
 
     Raises:
         UsageError: for --rig without a value.
@@ -235,10 +235,10 @@ def some_of(text: str, names: Sequence[str], option: str = "--extras") -> set[st
     """Parse names between commas, such as "page,points", as the value of an option.
 
     Returns:
-        The names.
+        The names, a set.
 
     Raises:
-        UsageError: for a name that is none of `names`.
+        UsageError: for a name that is none of `names`, as of an empty text.
     """
     given = {*text.split(",")}
     if unknown := given - {*names}:
@@ -419,7 +419,7 @@ LINE_EVERY = 10.0
 def working(title: str) -> Iterator[Callable[[str], None]]:
     """Context manager during which the terminal shows a title, the current step, and elapsed seconds.
 
-    Without a terminal, steps are lines, `LINE_EVERY` seconds apart.
+    Without a terminal, steps are lines, at least `LINE_EVERY` seconds apart.
 
     Yields:
         A function of a text, which becomes the title.

@@ -90,22 +90,20 @@ def parse(
     base: Any = None,
     description: str = "",
 ) -> T:
-    """Parse a command line for a class or a function.
+    """Parse a command line for a class or a function; returns the instance, or the function's result.
 
     Args:
         kind: dataclass or function whose fields or parameters are the options; its docstring is the help.
-        arguments: words; None for those of this process.
-        prog: name of the program in the help; empty for that of this process.
-        base: instance of `kind` that holds the defaults, and is copied with changes; None for the class's
-            defaults.
+        arguments: words; None for this process's.
+        prog: name of the program in the help; empty for this process's.
+        base: instance of `kind` that holds the defaults, and is copied with changes, needed for options of a
+            dataclass within it (--a.b); None for the class's defaults.
         description: help text; empty for the docstring.
-
-    Returns:
-        The instance, or the function's result.
 
     Raises:
         UsageError: for unknown and missing options, and invalid values; what `kind` itself raises passes.
         SystemExit: after `--help`, which prints.
+        OSError: for a dataclass without its source (`field_docs`).
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     parser = _Parser(
@@ -139,7 +137,7 @@ def script(kind: Callable[..., T], arguments: Sequence[str] | None = None, *, pr
     Arguments and result are as for `parse`.
 
     Raises:
-        SystemExit: with one line where `parse` raises UsageError, and after `--help`.
+        SystemExit: with one line, status 1, where `parse` raises UsageError, and after `--help`.
     """
     try:
         return parse(kind, arguments, prog=prog)
@@ -208,7 +206,8 @@ class _Entry:
         return text.replace("%", "%%")
 
     def add_to(self, group: Any) -> None:
-        """Add the option to a parser's group (argparse's); if not given it leaves no entry in the result."""
+        """Add the option (a flag that is True by default as --no-NAME) to a parser's group (argparse's); if
+        not given it leaves no entry in the result."""
         how: dict[str, Any] = {"default": argparse.SUPPRESS, "help": self.help}
         how |= {} if self.option.positional else {"dest": self.name}
         flag, members = f"--{self.dashed}", typing.get_args(self.kind)
@@ -283,7 +282,7 @@ def field_docs(kind: Any) -> dict[str, str]:
     """Return the docstrings that follow some of a dataclass's fields, parents' included, by field.
 
     Raises:
-        OSError: for a class whose source is not there.
+        OSError: for a class whose source is not there; TypeError for a built-in one, `object` excepted.
     """
     docs: dict[str, str] = {}
     for parent in reversed(kind.__mro__):

@@ -216,7 +216,7 @@ class Info:
     """Print JSON instead of tables."""
 
     def run(self) -> None:
-        """Print what is odd about the rig, and a line for each camera and each pair.
+        """Print what is odd about the rig, and a line for each camera and pair (of large rigs some), or JSON.
 
         Raises:
             ValueError: for a file that is no rig, invalid bounds, and an unknown alpha.
@@ -308,7 +308,7 @@ class Convert:
     """Format of the target."""
 
     def run(self) -> None:
-        """Read and write the rig.
+        """Read the rig, fit its lenses anew if asked, and write it.
 
         Raises:
             FileNotFoundError: for a missing file.

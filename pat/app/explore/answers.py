@@ -74,8 +74,8 @@ ERRORS: dict[str, tuple[str, float, float, float, float]] = {
 }
 """Label, least, most, step and usual value of each change of a camera.
 
-Rotations are about its own axes, steps along those of alpha (in longest baselines), pixels are
-added, the focal length is multiplied. "lens0", "lens1", ... are added to the numbers of the lens.
+Rotations are about its own axes, steps along alpha's (bounds in longest baselines, steps in the rig's unit),
+pixels are added, the focal length is multiplied. "lens0", "lens1", ... are added to the lens's numbers.
 """
 MAPS = ("none", "length, px", "betas that see it", "depth range seen", "entropy of weights")
 """Maps of the whole image: length of the segment or curve, pixels of beta; number of betas with a
@@ -92,14 +92,14 @@ SHIPPED = "pat-supervised"
 
 
 def answer(scene: ExplorerScene, alpha: str, controls: Controls) -> dict[str, Any]:
-    """Compute what is drawn for a state of the controls, which are all of `DEFAULTS`, and x.
+    """Compute all that the explorer draws for values of the controls, which are all of `DEFAULTS`, and x.
 
     Returns:
         Plain values for JSON: `x`, alpha's pixel; `depth` by all betas, in the rig's unit (None if unknown);
         `betas` by name, as `drawn` gives them, or with a `problem`, each with `epipole` (None if not seen)
         and for a second field `second`, as `drawn` gives it; `backwards`, samples in alpha of a `clicked`
         pixel of beta; `pins`, each with `x` and `betas`; `top` (`top_view`); `map` (`whole_map`); and `rig`,
-        the changed rig's file, empty if it is unchanged.
+        the file of the rig as moved (`moved_rig`), empty if it is not.
 
     Raises:
         ValueError: for impossible controls; missing ones and other types give TypeError, AttributeError,
@@ -141,7 +141,7 @@ def clicked(scene: ExplorerScene, alpha: str, controls: Controls) -> tuple[Contr
         The controls with that pixel as `x`, and the samples in alpha, a list of (x, y).
 
     Raises:
-        ValueError: if no pixel can match, and for an unknown beta.
+        ValueError: if no pixel can match, and for an unknown beta; KeyError for alpha itself.
     """
     name, column, row = controls["clicked"]
     x = image_pixel(column, row, scene.rig[name].hw)
@@ -166,8 +166,8 @@ def moved_rig(rig: Rig, alpha: str, controls: Controls) -> Rig:
     """Apply the controls' changes to the calibrated cameras.
 
     Args:
-        alpha: name of alpha, in whose axes steps are; uncalibrated, nothing moves.
-        controls: values of the controls: `baseline`, and `errors` by camera or `ALL`, as `ERRORS` has them.
+        alpha: name of alpha, in whose axes steps are, in the rig's unit; uncalibrated, nothing moves.
+        controls: values of the controls: `baseline`, and `errors` by camera or `ALL` (betas), as `ERRORS`.
 
     Returns:
         The moved rig, its links unchanged; the same one for unchanged controls.
@@ -311,8 +311,8 @@ def whole_map(scene: ExplorerScene, alpha: str, controls: Controls) -> dict[str,
     """Compute the map that the controls choose (`MAPS`), on a grid of alpha's pixels; kept until they change.
 
     Returns:
-        Plain values: `columns`, `rows`, and `values` row by row (None where no beta has one); None for no
-        map.
+        Plain values: `columns`, `rows`, and `values` row by row, where no beta has one None (0 for the
+        number of betas); None for no map.
 
     Raises:
         ValueError: for an unknown map, and impossible depth bounds.
@@ -383,8 +383,8 @@ def slider_ranges(rig: Rig) -> list[list[Any]]:
 
     Returns:
         A list [name, label, [low, high, step, value], change] for each, with `change` True for a change of
-        one camera (`ERRORS`, lens), False for "near", "far" and "baseline". Depths only with a depth range,
-        at most `FARTHEST`; others only with calibrated cameras.
+        one camera (`ERRORS`; each number of the longest lens), False for "near", "far" and "baseline". Depths
+        only with a depth range, taken up to `FARTHEST`; others only with calibrated cameras.
     """
     ranges: list[list[Any]] = []
     unit = length_unit(rig)

@@ -55,11 +55,11 @@ class Explorer:
     files: Mapping[str, str] = field(default_factory=dict)
 
     def answer(self, controls: Controls) -> dict[str, Any]:
-        """Compute what is drawn for a state of the controls.
+        """Compute all that is drawn for values of the controls.
 
         Returns:
-            The values of `answers.answer`, or for impossible controls and without a scene `error`, a
-            message; with a scene also the control `asked` as it was given, None if it was not.
+            The values of `answers.answer`, or for impossible controls, choices that it was started without,
+            and without a scene `error`, a message; with a scene also the control `asked`, None if not given.
         """
         if self.scene is None:
             return {"error": self.error}
@@ -92,14 +92,14 @@ class Explorer:
         """Write a page of one file that needs neither a kernel nor a network connection.
 
         For calibrated pinholes with a depth range, and no links, it computes any pixel and the rig's sliders
-        itself, for the default field and weights; for others it stores the answers for a grid of alpha's
-        pixels, and has no sliders.
+        itself, for the default field, weights and lenses, and no second field; for others it stores the
+        answers for a grid of alpha's pixels, and has no sliders.
 
         Args:
             columns: columns of that grid.
 
         Raises:
-            OSError: if writing fails.
+            OSError: if writing fails; TypeError or AttributeError for `errors` of another type.
         """
         values = self.values()
         all_choices, values["choices"] = values["choices"], []
@@ -250,7 +250,7 @@ def checked(
         alpha: name of alpha; None for the first camera with an image.
 
     Returns:
-        Images by camera, those of the room if none are given, and alpha's name.
+        Images by camera, of the room if none are given, and alpha's name.
 
     Raises:
         ValueError: for a rig of one camera, unknown names, no image of alpha or of any beta, and a rig for

@@ -86,7 +86,7 @@ class BetaReport(NamedTuple):
         xy: samples, pixels of beta.
         valid: True for samples in the image.
         ends: start and end of a segment, pixels of beta; None for other fields, or if it is not valid.
-        weight: weight of each sample, summing to 1 over valid ones; 0 for others.
+        weight: weight of each sample, summing to 1 over valid ones (if any); 0 for others.
         depth: depth of each sample along alpha's axis, in the rig's unit; NaN where it has none.
         offset: distance of the images' own match from the line, pixels; None without one (`match_offset`).
         band: corners of the band that holds the match by the calibration's uncertainty, pixels of beta; None
@@ -120,7 +120,7 @@ class PixelReport(NamedTuple):
 
 @dataclass(frozen=True)
 class ExplorerScene:
-    """Rig and images of the explorer; the scene itself fills the last three, what is computed once.
+    """Rig and images of the explorer; the scene itself fills the last three, which are caches.
 
     Attributes:
         rig: the rig.
@@ -367,8 +367,8 @@ def match_offset(
         ends: start and end of the segment; None for other fields.
 
     Returns:
-        Its distance, pixels; 0 unless it matches better than all on the line. None without a segment of some
-        length or valid samples, if nothing matches clearly, or if it is at the edge of the search (`ACROSS`).
+        Its distance, pixels; 0 unless it matches better (`BETTER`) than the line near the largest weight.
+        None without a segment of some length or valid samples, a clear match, or one within `ACROSS`.
     """
     xy, weight = samples
     if ends is None or not bool((weight > 0).any()) or float((ends[1] - ends[0]).norm()) < 1e-6:

@@ -101,7 +101,7 @@ def serve(explorer: Explorer, *, port: int = 0, browser: bool = True) -> None:
         browser: True to open the page.
 
     Raises:
-        ValueError: for an invalid port, or one in use.
+        ValueError: for an invalid port, or one in use or not allowed.
     """
     if not 0 <= port <= 65535:
         raise ValueError(f"--port {port}: wanted 1 to 65535, or 0 for a free one")

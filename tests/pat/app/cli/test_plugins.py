@@ -143,6 +143,7 @@ def test_a_module_that_fails_is_named(mine, text):
     ("registry", "name", "entry"),
     [
         (READERS, "native", SimpleNamespace(read=print)),
+        (READERS, "native", READERS["usual"]),
         (READERS, "mine", SimpleNamespace(recognises=print)),
         (WRITERS, "mine", SimpleNamespace()),
         (FIELDS, "epipolar", EpipolarLine),
