@@ -59,11 +59,11 @@ Photos = Mapping[str, Mapping[FrameKey, Photo]]
 
 
 def to_grey(image: np.ndarray) -> Grey:
-    """Convert an image (h, w) or (h, w, c) to grey, 8 bits; dim images and other types are stretched to
-    0..255.
+    """Convert an image (h, w) or (h, w, c) to grey, 8 bits, stretched to 0..255.
 
-    Of one or two channels the first is grey; of more, the first three are blue, green and red. Stretching
-    clips half a percent at either end; NaN and infinity, and an image of one value, become black.
+    Images of 8 bits whose values span more than 100 are not stretched. Of one or two channels the first is
+    grey; of more, the first three are blue, green and red. Stretching clips half a percent at either end; NaN
+    and infinity, and an image of one value, become black.
 
     Returns:
         Grey image (h, w), uint8; it may share the memory of `image`.
@@ -119,7 +119,7 @@ def frame_keys(stems: list[str]) -> list[FrameKey]:
     [8, 9, 10]
 
     Args:
-        stems: names of the image files without suffix, at least one.
+        stems: file names without suffix, at least one, compared by runs of digits and of other characters.
 
     Returns:
         One key for each name, in order; equal keys are not refused. For a single name its last number, or the

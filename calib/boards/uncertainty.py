@@ -133,11 +133,11 @@ def beta_covariance(
         depth: depth in alpha, metres or the rig's own unit.
 
     Returns:
-        Covariances (n, 2, 2) in pixels² of beta; NaN where alpha's lens has no ray or beta's does not project
-        the point.
+        Covariances (n, 2, 2) in pixels² of beta, NaN as by `position_covariance`.
 
     Raises:
-        ValueError: for an unknown camera, and a covariance of parameters that the rig has not.
+        ValueError: for a camera that is unknown or not calibrated, and a covariance of parameters that the
+            rig has not.
     """
     found = position_covariance(rig, covariance, alpha, beta, torch.from_numpy(x), depth)
     return found.numpy()
@@ -272,8 +272,8 @@ class Jackknife(NamedTuple):
     Attributes:
         covariance: covariance of the cameras' free parameters, by the corrected estimate.
         left_out: covariance of these by a plain jackknife, which leaves out each frame in turn.
-        deformations: covariance of the boards' shapes, by the corrected estimate; (0, 0) for flat boards.
-        step: boards' shapes, board by board, after a Gauss-Newton step; empty for flat boards.
+        deformations: covariance of the boards' shapes, by the corrected estimate; (0, 0) without shapes.
+        step: boards' shapes, board by board, after a Gauss-Newton step; empty without shapes.
     """
 
     covariance: Float[np.ndarray, "c c"]
