@@ -119,6 +119,7 @@ def fit_statistics(
 
     Raises:
         ValueError: if `tried` has no "nothing" or "distortion", and as `observations`.
+        torch.linalg.LinAlgError: for a link of H alone.
     """
     observed = observations([hypothesis.rig for hypothesis in tried], pairs)
     inliers, floor = _inliers(tried, observed.off, pairs)
@@ -339,8 +340,7 @@ def _drift(r: Tensor, J: Tensor, B: Tensor, scale: float) -> tuple[float, float,
 
 
 def _rotation_to_plausible_depth(rig: Rig, pairs: Pairs) -> float:
-    """Return the rotation, in prior deviations, that brings half the points in front and into the depth
-    range; 0 without poses."""
+    """Return the rotation (prior deviations) that brings half the points into the range; 0 without poses."""
     near, far = (0.0, math.inf) if rig.depth is None else (float(bound) for bound in rig.depth)
     rotations = []
     for names, matches in pairs.items():

@@ -105,7 +105,7 @@ def self_calibrated(
         link: F between the undistorted views, not 0, and H if known: the ratio of focal lengths, and a
             rotation by quarter turns.
         matches: points of the images as recorded, distorted.
-        focal: focal lengths in pixels by camera; missing ones are assumed.
+        focal: focal lengths in pixels by camera; a missing one follows from the other and H, or is assumed.
 
     Returns:
         The pair, with the depth range of the points; None for points that no poses explain, and fewer than
