@@ -108,7 +108,7 @@ class MarkedBoard(Board):
 
     Attributes:
         dictionary: name of OpenCV's dictionary of markers, such as "4x4_50".
-        markers: number in the dictionary of each marker of the board; a tuple or range, which counts up.
+        markers: number in the dictionary of each marker of the board; a tuple or range, ascending.
     """
 
     dictionary: str
@@ -288,7 +288,7 @@ class Circles(Board):
     """Grid of black circles on white, `columns` x `rows`.
 
     The points are their centres. In an asymmetric grid circles of a row are 2 `spacing` apart, rows are
-    `spacing` apart, and every other row is shifted by one `spacing`.
+    `spacing` apart, and every second row is shifted by one `spacing`.
 
     Attributes:
         asymmetric: True for OpenCV's asymmetric grid.

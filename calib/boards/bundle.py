@@ -218,7 +218,7 @@ class InitialRig(NamedTuple):
         All parameters are free, except the first camera's pose if there are no priors.
 
         Returns:
-            The problem, without noise levels.
+            The problem, without noise levels, and with each `typical_prior` if there are no priors.
 
         Raises:
             KeyError: for a detection at a moment without a board pose, and a camera without views.

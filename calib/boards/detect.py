@@ -106,6 +106,7 @@ def detect(grey: Grey, board: Board) -> Detection | None:
 
     Raises:
         KeyError: for several boards (`Boards`), and a kind of one's own.
+        cv2.error: for an image of another type, or with colours.
     """
     for candidate in _versions(grey):
         detection = _FINDERS[type(board)](candidate, board)
@@ -472,10 +473,9 @@ def collect_folder(
         progress: function of an iterable and its length that yields its items and shows progress, or None.
 
     Raises:
-        FileNotFoundError: for a missing folder.
-        ValueError: as `find_photos`, for a camera whose images differ in size or of which none shows the
-            board, and images that show a larger chessboard.
-        ValueError, OSError: for an image that cannot be read.
+        ValueError: as `find_photos`, for an image that cannot be read, a camera whose images differ in size
+            or of which none shows the board, and images that show a larger chessboard.
+        OSError: for a folder that is missing (FileNotFoundError), or what cannot be read.
     """
     photos = find_photos(Path(folder), patterns=patterns)
     jobs = [job for moments in photos.values() for job in moments.items()]

@@ -136,8 +136,8 @@ def without_outliers(
         camera: the camera; its own pose does not count.
         poses: `cam_from_board` by moment.
         points: the board's points, metres.
-        sigma: standard deviation along x or y, pixels; None or 0 estimates it from the median of all
-            distances. `LEAST_SIGMA` counts for less.
+        sigma: standard deviation along x or y, pixels, smaller ones counting as `LEAST_SIGMA`; None or 0
+            estimates it from the median of all distances.
 
     Returns:
         The views; images without a pose, or that would keep fewer than `FEWEST_POINTS` points or collinear

@@ -94,7 +94,7 @@ def find_photos(folder: Path, *, patterns: Mapping[str, str] | None = None) -> P
         `MOST_FRAMES` are taken), not decoded yet.
 
     Raises:
-        FileNotFoundError: for a missing folder.
+        OSError: for a folder that is missing (FileNotFoundError) or cannot be read.
         ValueError: for no images, images beside subfolders of images, patterns that are whole paths, without
             a file or with a shared one, images of a camera that differ in orientation tags or repeat a
             number, a video among other files or that cannot be read, and images of too many pixels.

@@ -191,8 +191,8 @@ def verdict(calibration: Calibration) -> str:
 
     It is if points of held-out frames (not judged where they are too few) lie by `GOOD` pixels or less off
     their lines, in the mean of each pair, and, at some of five depths from the nearest to the farthest board
-    point, the positions predicted for pixels of the first camera have a standard deviation below `GOOD` in
-    each other one that has any, in the median over the image. Without a covariance it is not.
+    point, the positions predicted for pixels of the first camera have a standard deviation below `GOOD`, in
+    the median over the image, in the worst other camera that has any. Without a covariance it is not.
 
     Returns:
         The sentence, with depths in metres and deviations in pixels; empty for a single camera.

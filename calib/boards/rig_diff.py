@@ -66,7 +66,7 @@ class Significance(NamedTuple):
     Attributes:
         chi_square: chi-square of the difference.
         freedom: degrees of freedom of chi-square.
-        probability: probability of a larger chi-square by chance.
+        probability: probability of a larger chi-square by chance; NaN without degrees of freedom.
         camera: camera whose motion explains most of the difference.
         degrees: rotation of that camera, degrees.
         metres: shift of that camera's centre, metres or the rigs' own unit.

@@ -78,7 +78,7 @@ def calibrate_photos(
         ValueError: for unusable images, boards, start and options, and as `calibrate`; nothing is written.
         cv2.error: as `calibrate`.
         FileExistsError: for a report or covariance in the way that no run wrote, or that changed since.
-        OSError: if files cannot be written.
+        OSError: if files cannot be read or written.
     """
     if out.suffix.lower() not in (".yaml", ".yml"):
         raise ValueError(f"{out}: a rig file's name ends in .yaml")

@@ -117,7 +117,7 @@ def _check_tilts(name: str, poses: Mapping[FrameKey, Pose], board: Board) -> Non
 
 
 def solve(initial: InitialRig, board: Board, *, final: bool = True) -> Solved:
-    """Fit all observable parameters; unobservable ones are fixed at defaults.
+    """Fit all observable parameters; unobservable lens terms and principal points are fixed at defaults.
 
     Parameters fixed before the fit, when the noise was overestimated, may return after it; boards that are
     clearly not flat or not printed true are deformed.

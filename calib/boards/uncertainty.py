@@ -86,7 +86,7 @@ class RigCovariance:
                 states no rig passes. None does not check.
 
         Raises:
-            FileNotFoundError: for a missing file.
+            OSError: for a file that is missing (FileNotFoundError) or cannot be read.
             ValueError: for another file, a damaged one, or one of another rig.
         """
         path = Path(path)
@@ -133,11 +133,11 @@ def beta_covariance(
         depth: depth in alpha, metres or the rig's own unit.
 
     Returns:
-        Covariances (n, 2, 2) in pixels² of beta, NaN as by `position_covariance`.
+        Covariances (n, 2, 2) in pixels² of beta; NaN where alpha's lens has no ray or beta's does not project
+        the point, and at infinite depth.
 
     Raises:
-        ValueError: for a camera that is unknown or not calibrated, and a covariance of parameters that the
-            rig has not.
+        ValueError: for a camera that is unknown or not calibrated, and parameters that the rig has not.
     """
     found = position_covariance(rig, covariance, alpha, beta, torch.from_numpy(x), depth)
     return found.numpy()

@@ -142,7 +142,7 @@ class LensComparison:
 
     Attributes:
         errors: mean square error of a coordinate (pixels²) of each frame, with the board's pose fitted and
-            its freedom allowed for, by model; models that do not fit all are missing. Empty for few frames.
+            its freedom allowed for, by model that fits all frames; empty for too few frames.
     """
 
     errors: Mapping[Lens, Float[np.ndarray, " f"]]

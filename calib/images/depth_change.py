@@ -89,8 +89,8 @@ def share_outside(rig: Rig, pairs: Pairs) -> float:
     `BEYOND` at both ends.
 
     Returns:
-        A share in 0..1; 0 if there is no depth at all, as of pairs with a link, else NaN for fewer than `FEW`
-        such points.
+        A share in 0..1; 0 if no point has a depth (as all pairs have links), else NaN for fewer than `FEW`
+        points of observable depth.
 
     Raises:
         ValueError, TypeError: as `match_depths`.

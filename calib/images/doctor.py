@@ -218,7 +218,7 @@ def diagnose(rig: Rig, images: Images, matches: Pairs | None = None) -> Diagnosi
 
     Raises:
         ValueError: in one line, for a camera that the rig lacks, images that `match_cameras` refuses, given
-            points of which too few agree, or a rig that relates none of the matched cameras.
+            points of which too few agree, or a rig that relates none of the matched cameras by lines.
     """
     for name in images:
         rig.require(name)

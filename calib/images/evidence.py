@@ -237,7 +237,7 @@ def _mirrors(rig: Rig, names: tuple[str, str]) -> bool:
 
 @dataclass(frozen=True)
 class DriftEvidence:
-    """A rig with the drift that fits matched points best.
+    """The drift of a rig that fits matched points best, with its evidence.
 
     Attributes:
         cost: -2 log evidence of the rig and that drift by the points used; smaller is better, and only

@@ -49,8 +49,8 @@ def centres_found(
     """Estimate translations of pinhole cameras, and refine their orientations, from one image of each.
 
     Alpha is at the origin with the world's axes, and the baseline of the first beta has the length that the
-    rig states, 1 if that is 0. Cameras that no pairs connect with alpha are left out.
-    Views should be of about equal scale and orientation, and parallax a small share of the image (`WINDOW`).
+    rig states, 1 if that is 0. Cameras that no pairs connect with alpha are left out. Views should be of
+    about equal scale and orientation, and parallax a small share of the image (`WINDOW`).
 
     Args:
         rig: pinhole cameras of known intrinsics and roughly known orientation.

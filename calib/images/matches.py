@@ -153,7 +153,7 @@ def detect_features(image: Float[Tensor, "_ h w"]) -> SiftFeatures:
 
 
 def contrast_equalised(image: Float[Tensor, "_ h w"]) -> UInt8[NDArray, "h w"]:
-    """Compute an image's luminance (of another number of bands their mean) with equalised contrast (CLAHE).
+    """Compute an image's luminance (without three bands, their mean) with equalised contrast (CLAHE).
 
     Args:
         image: image (C, H, W); values are clipped to 0..1.
@@ -192,7 +192,7 @@ def _well_localised(deviation: NDArray[np.float64]) -> NDArray[np.bool_]:
 def match_cameras(images: Images, *, alpha: str | None = None) -> dict[tuple[str, str], PointMatches]:
     """Match the images of every two cameras, and keep matches consistent with some fundamental matrix.
 
-    Where fewer than `MANY` are, the second image is tried mirrored, to which features are not invariant.
+    Where there are fewer than `MANY`, the second image is tried mirrored: features are not invariant to it.
 
     Args:
         images: one image (C, H, W) in 0..1 per camera, by name.

@@ -164,7 +164,7 @@ def refine_matches(
     Raises:
         ValueError: for no frames, a camera that the rig lacks, a frame of whose pairs it relates none, a
             single frame's points all in one spot, nothing free, `free` or `sigma` that `free_parameters`
-            refuses, and a link without H in the end that `with_map` refuses.
+            refuses, and as `with_map` for a link that has no H.
     """
     if not keep_depth:
         problem = RefinementProblem.from_frames(rig, free, frames=frames, sigma=sigma)
