@@ -353,9 +353,9 @@ def _same_rig(rig: Rig, other: Rig, pairs: Pairs) -> bool:
 
 
 def _relates(rig: Rig, pairs: Pairs) -> bool:
-    """Return True if a rig relates all pairs; one with two linked cameras swapped may not."""
-    linked = (pair for names in pairs if not (pair := rig.pair(*names)).calibrated)
-    return all(pair.link is not None for pair in linked)
+    """Return True if a rig relates all pairs by lines; one with two linked cameras swapped may not."""
+    every = (rig.pair(*names) for names in pairs)
+    return all(pair.calibrated if pair.link is None else bool(pair.link.F.any()) for pair in every)
 
 
 def _thinned(matches: PointMatches) -> PointMatches:
