@@ -256,8 +256,8 @@ class Solved:
 
     Attributes:
         problem: the adjusted problem.
-        covariance: covariance of the cameras' free parameters (`names`) in their own units; None if they are
-            not observable.
+        covariance: posterior covariance of the cameras' free parameters (`names`) in their own units; None if
+            they are not observable.
         converged: True if the last iteration converged.
         notes: sentences on the solution.
         raised: largest factor by which `with_disagreement` raised a standard deviation; 1 for none.

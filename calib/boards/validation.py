@@ -79,8 +79,8 @@ def held_out_errors(
     """Compute epipolar errors of shared frames, each by a rig calibrated without it (in `FOLDS` parts).
 
     Returns:
-        Errors by pair, undistorted pixels; empty for fewer than `FEWEST_TO_HOLD_OUT` frames that two cameras
-        share, or if a camera would keep fewer than `FEWEST_LEFT`.
+        Errors by pair, undistorted pixels; empty if fewer than `FEWEST_TO_HOLD_OUT` frames are seen by two
+        cameras or more, or a camera would keep fewer than `FEWEST_LEFT`.
     """
     frames = fit.problem.frames
     shared = [key for key in frames if sum(key in v.seen for v in views.values()) > 1]

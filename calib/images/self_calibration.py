@@ -108,8 +108,8 @@ def self_calibrated(
         focal: focal lengths in pixels by camera; a missing one follows from the other and H, or is assumed.
 
     Returns:
-        The pair, with the depth range of the points; None for points that no poses explain, and fewer than
-        `ENOUGH` within `NEAR_LINE` pixels of their lines.
+        The pair, with the depth range of the points; None for points without parallax by any pose, and fewer
+        than `ENOUGH` within `NEAR_LINE` pixels of their lines.
 
     Raises:
         ValueError: for another number of views than two, and points that are all in one spot.
