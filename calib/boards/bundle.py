@@ -367,8 +367,8 @@ class NormalEquations:
         """Solve for a step, with diagonals multiplied by 1 + damping.
 
         Returns:
-            Steps of the cameras and deformations (c), where not determined the shortest in units of H's
-            diagonal, and of the board poses (b, 6), as `BundleProblem.stepped` takes them.
+            Steps of the cameras and deformations (c), where not determined the shortest once `reduced`'s
+            diagonal is scaled to 1, and of the board poses (b, 6), as `BundleProblem.stepped` takes them.
         """
         S, Y, inverse = self.reduced(damping)
         scale = 1 / np.sqrt(np.maximum(S.diagonal(), 1e-300))

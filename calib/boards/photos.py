@@ -1,7 +1,7 @@
 """Assignment of the images in a folder to cameras and moments: subfolders, file names, videos.
 
 A camera is a subfolder, or a prefix of file names in one folder, or a pattern. Images of one moment have the
-same number (or the same name, apart from the part that all names of a camera share).
+same number (or name, but for runs of digits or of other characters that all names of a camera share).
 """
 
 from __future__ import annotations
