@@ -112,7 +112,7 @@ def _missing(coverage: Coverage, board: Board) -> Iterator[str]:
 class NextView(NamedTuple):
     """Proposed view of a board, which lowers a camera's uncertainty of projection.
 
-    Uncertainty is the standard deviation of a projection, its length, in the median over the image.
+    Uncertainty is the root of the variances of a projection's x and y together, in the median over the image.
 
     Attributes:
         text: the view in words: position, distance and tilt of the board.
@@ -126,7 +126,7 @@ class NextView(NamedTuple):
 
 
 def next_views(intrinsics: Intrinsics, board: Board, depth: float, *, count: int = 2) -> list[NextView]:
-    """Propose the views that lower a camera's uncertainty of projection most, one after the other.
+    """Choose among `proposed_views` those that lower a camera's uncertainty most, one after the other.
 
     Args:
         intrinsics: camera with the covariance of its free intrinsics, at least one.
@@ -135,7 +135,7 @@ def next_views(intrinsics: Intrinsics, board: Board, depth: float, *, count: int
         count: number of views; a view may be proposed again.
 
     Returns:
-        `count` views; none for points in space, or if every candidate shows hardly any of the board (a
+        `count` views; none for points in space, or if no candidate shows 60 % of the board's points (a
         strip).
 
     Raises:
@@ -169,7 +169,7 @@ def proposed_views(camera: Camera, board: Board) -> Mapping[str, Float[np.ndarra
 
     Returns:
         The board's points (n, 3) in the camera's frame, metres, by description; some may lie outside the
-        image. NaN where the lens has no ray to the board's middle.
+        image. NaN where the board's middle has no ray through the lens, or one at 90 degrees or more.
     """
     proposals, (h, w) = {}, camera.hw
     middle = torch.from_numpy(board.middle)
@@ -213,7 +213,7 @@ def coverages(calibration: Calibration) -> dict[str, Coverage]:
 def coverage_advice(calibration: Calibration, *, always: bool = False) -> Iterator[str]:
     """Yield advice on each camera's coverage and, where something is missing, the views that would help most.
 
-    No views are proposed for a fit without a covariance, and where `next_views` has none.
+    No views are proposed without a covariance or free intrinsics, and where `next_views` has none.
 
     Args:
         always: True to propose views where nothing is missing too.

@@ -59,9 +59,9 @@ class Board:
     def symmetries(self) -> tuple[Int[np.ndarray, " n"], ...]:
         """Renumberings of the points under quarter turns that map the board onto itself, the identity first.
 
-        A detector may number the points in any of these ways: colours do not disambiguate them, as they are
-        inverted in some images (near infrared). Each is an array (n) of integers, the new number of every
-        point. Boards with markers have the identity only.
+        A detector may number the points in any of these ways, as colours, inverted in some images (near
+        infrared), do not count. Each is an array (n) of integers, the new number of every point. Boards with
+        markers have the identity only.
         """
         if self.identified:
             return (np.arange(len(self.points)),)
@@ -108,7 +108,7 @@ class MarkedBoard(Board):
 
     Attributes:
         dictionary: name of OpenCV's dictionary of markers, such as "4x4_50".
-        markers: number in the dictionary of each marker of the board, in the board's order; a tuple or range.
+        markers: number in the dictionary of each marker of the board; a tuple or range, ascending.
     """
 
     dictionary: str
@@ -201,9 +201,9 @@ class Charuco(MarkedBoard):
 class AprilGrid(MarkedBoard):
     """Kalibr's grid of AprilTags. Its points are the corners of all tags, four each.
 
-    The fields of `Board` and `MarkedBoard` come first. Tags are numbered row by row from below, points from
-    above. `columns` and `rows` count points, two for each tag; `spacing` is twice the gap between two tags,
-    metres.
+    The fields of `Board` and `MarkedBoard` come first. Tags are numbered row by row from below, without gaps,
+    points from above. `columns` and `rows` count points, two for each tag; `spacing` is twice the gap between
+    two tags, metres.
 
     Attributes:
         tag: side of a tag, metres.
@@ -258,7 +258,7 @@ class Boards(Board):
     `columns`, `rows` and `spacing` are the first board's.
 
     Attributes:
-        boards: the single boards, at least one.
+        boards: the single boards, at least one, whose markers all differ (which is not checked).
     """
 
     boards: tuple[Board, ...] = ()
@@ -288,7 +288,7 @@ class Circles(Board):
     """Grid of black circles on white, `columns` x `rows`.
 
     The points are their centres. In an asymmetric grid circles of a row are 2 `spacing` apart, rows are
-    `spacing` apart, and every other row is shifted by one `spacing`.
+    `spacing` apart, and every second row is shifted by one `spacing`.
 
     Attributes:
         asymmetric: True for OpenCV's asymmetric grid.
@@ -335,7 +335,7 @@ class KnownPoints(MarkedBoard):
         file: file that they were read from.
         ids: (marker, corner) of each point; corners clockwise from the marker's upper left, -1 for its
             centre.
-        positions: (x, y, z) of each point, metres, in any frame.
+        positions: (x, y, z) of each point, metres, in any frame; `points` are about their mean.
     """
 
     file: str

@@ -71,7 +71,7 @@ class BundleProblem:
         free: mask by camera of the parameters that may change, in the order of `parameter_names`.
         sigma: standard deviation of the noise along x or y by camera, pixels; empty before it is estimated.
         priors: priors of parameters by camera; cameras without one are missing.
-        deformation: shapes of the boards, adjusted with the cameras; None for flat boards.
+        deformation: shapes of the boards, adjusted with the cameras; None for boards as specified.
     """
 
     cameras: Mapping[str, Camera]
@@ -202,7 +202,7 @@ class InitialRig(NamedTuple):
         left_out: images (camera, moment) that contradict the others and are not in `views`.
         priors: priors by camera, with their roughly known poses; None for priors of ordinary cameras, of
             which the first keeps its pose.
-        deformation: shapes of the boards to begin with; None for flat boards.
+        deformation: shapes of the boards to begin with; None for boards as specified.
     """
 
     cameras: Mapping[str, Camera]
@@ -218,7 +218,7 @@ class InitialRig(NamedTuple):
         All parameters are free, except the first camera's pose if there are no priors.
 
         Returns:
-            The problem, without noise levels.
+            The problem, without noise levels, and with each `typical_prior` if there are no priors.
 
         Raises:
             KeyError: for a detection at a moment without a board pose, and a camera without views.
@@ -256,8 +256,8 @@ class Solved:
 
     Attributes:
         problem: the adjusted problem.
-        covariance: covariance of the cameras' free parameters (`names`) in their own units; None if they are
-            not observable.
+        covariance: posterior covariance of the cameras' free parameters (`names`) in their own units; None if
+            they are not observable.
         converged: True if the last iteration converged.
         notes: sentences on the solution.
         raised: largest factor by which `with_disagreement` raised a standard deviation; 1 for none.
@@ -367,8 +367,8 @@ class NormalEquations:
         """Solve for a step, with diagonals multiplied by 1 + damping.
 
         Returns:
-            Steps of the cameras and deformations (c), the shortest where they are not determined, and of the
-            board poses (b, 6), as `BundleProblem.stepped` takes them.
+            Steps of the cameras and deformations (c), where not determined the shortest once `reduced`'s
+            diagonal is scaled to 1, and of the board poses (b, 6), as `BundleProblem.stepped` takes them.
         """
         S, Y, inverse = self.reduced(damping)
         scale = 1 / np.sqrt(np.maximum(S.diagonal(), 1e-300))
@@ -387,7 +387,7 @@ class NormalEquations:
         """Eliminate the boards, after diagonals are multiplied by 1 + `damping`.
 
         Returns:
-            The Schur complement (c, c), W B^-1 (b, c, 6), and B^-1 (b, 6, 6).
+            The Schur complement (c, c), W B^-1 (b, c, 6), and B^-1 (b, 6, 6), all damped.
         """
         eye = np.eye(POSE)
         inverse = np.linalg.inv(self.B * (1 + damping * eye) + 1e-12 * eye)

@@ -55,7 +55,7 @@ class EdgeGeometry(NamedTuple):
 
     Attributes:
         along: tangent of each edge (x, y), pixels for each square.
-        normal: unit normal (x, y), towards the next square.
+        normal: unit normal (x, y) to the side of the board's larger x (first) and larger y (second).
         curvature: pixels along the normal by which the edge leaves its tangent, per squared pixel along it.
     """
 

@@ -81,7 +81,7 @@ class BoardViews:
 
     Attributes:
         hw: height and width of the images, pixels.
-        seen: detected points by moment; images without the board are missing.
+        seen: detected points by moment (of further boards see `detected`); images without one are missing.
     """
 
     hw: HW
@@ -101,11 +101,12 @@ def detect(grey: Grey, board: Board) -> Detection | None:
     """Detect a single board's points in a grey image (uint8).
 
     Returns:
-        The points, corners refined: all of the board's, or of a board with markers `FEWEST` or more (of known
-        points `FEWEST_KNOWN`); None if the board is not found.
+        The points, corners refined where that is plausible: all of the board's, or of one with markers
+        `FEWEST` or more (of known points `FEWEST_KNOWN`); None if the board is not found.
 
     Raises:
         KeyError: for several boards (`Boards`), and a kind of one's own.
+        cv2.error: for an image of another type, or with colours.
     """
     for candidate in _versions(grey):
         detection = _FINDERS[type(board)](candidate, board)
@@ -134,12 +135,11 @@ def other_size(images: Iterable[Grey], board: Board, *, larger: bool = False) ->
     """Find the size of a chessboard in the images that is not `board`'s.
 
     Args:
-        larger: True to count only larger ones, for images in which `board` was found: patches of a board pass
-            for smaller ones.
+        larger: True for images in which `board` was found, whose patches pass for smaller boards.
 
     Returns:
-        The size that images show most often, as "9x6", the longer side first; None if that is `board`'s, if
-        only one of several images shows it, and for other kinds of board.
+        The size that images show most often, as "9x6", the longer side first; None if they show none, if it
+        is `board`'s or (`larger`) has no more points, if only one of several shows it, and for other kinds.
     """
     if not isinstance(board, Chessboard):
         return None
@@ -470,13 +470,12 @@ def collect_folder(
 
     Args:
         patterns: file name patterns by camera; None derives cameras from folders or names.
-        progress: function of the iterable of results and their number that yields them, to show progress;
-            None for none.
+        progress: function of an iterable and its length that yields its items and shows progress, or None.
 
     Raises:
-        FileNotFoundError: for a missing folder.
         ValueError: as `find_photos`, for an image that cannot be read, a camera whose images differ in size
             or of which none shows the board, and images that show a larger chessboard.
+        OSError: for a folder that is missing (FileNotFoundError), or what cannot be read.
     """
     photos = find_photos(Path(folder), patterns=patterns)
     jobs = [job for moments in photos.values() for job in moments.items()]

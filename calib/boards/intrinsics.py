@@ -112,7 +112,7 @@ def without_bad_images(views: BoardViews, initial: CalibratedViews, board: Board
         initial: result of `initial_camera` for them; KeyError for an image that has no pose in it.
 
     Returns:
-        The detections in the images whose error (RMS) is below 2 pixels or ten times the median, the larger.
+        All detections in images whose error (RMS of inliers) is below 2 pixels, or ten times its median.
     """
     rms = {}
     for key, pose in initial.poses.items():
@@ -136,8 +136,8 @@ def without_outliers(
         camera: the camera; its own pose does not count.
         poses: `cam_from_board` by moment.
         points: the board's points, metres.
-        sigma: standard deviation along x or y, pixels, at least `LEAST_SIGMA`; None or 0 estimates it from
-            the median of all distances.
+        sigma: standard deviation along x or y, pixels, smaller ones counting as `LEAST_SIGMA`; None or 0
+            estimates it from the median of all distances.
 
     Returns:
         The views; images without a pose, or that would keep fewer than `FEWEST_POINTS` points or collinear
@@ -237,8 +237,8 @@ def board_pose(camera: Camera, detection: Detection, board: Board) -> Pose:
         The pose, metres.
 
     Raises:
-        ValueError: if fewer than four points have a ray, within a half space about their mean, as by a lens
-            far from the true one, or all lie on a line.
+        ValueError: if fewer than four points, or only points on a line, have rays less than 87 degrees from
+            the mean ray (as by a wrong lens).
         cv2.error: if OpenCV fails on the points.
     """
     rays, valid = _unit_rays(camera, detection)

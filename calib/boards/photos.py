@@ -1,7 +1,7 @@
 """Assignment of the images in a folder to cameras and moments: subfolders, file names, videos.
 
 A camera is a subfolder, or a prefix of file names in one folder, or a pattern. Images of one moment have the
-same number (or the same name, apart from the part that all names of a camera share).
+same number (or name, but for runs of digits or of other characters that all names of a camera share).
 """
 
 from __future__ import annotations
@@ -59,11 +59,11 @@ Photos = Mapping[str, Mapping[FrameKey, Photo]]
 
 
 def to_grey(image: np.ndarray) -> Grey:
-    """Convert an image (h, w) or (h, w, c) to grey, 8 bits; dim images and other types are stretched to
-    0..255.
+    """Convert an image (h, w) or (h, w, c) to grey, 8 bits, stretched to 0..255.
 
-    Of one or two channels the first is grey; of more, the first three are blue, green and red. Stretching
-    clips half a percent at either end; NaN and infinity, and an image of one value, become black.
+    Images of 8 bits whose values span more than 100 are not stretched. Of one or two channels the first is
+    grey; of more, the first three are blue, green and red. Stretching clips half a percent at either end; NaN
+    and infinity, and an image of one value, become black.
 
     Returns:
         Grey image (h, w), uint8; it may share the memory of `image`.
@@ -94,7 +94,7 @@ def find_photos(folder: Path, *, patterns: Mapping[str, str] | None = None) -> P
         `MOST_FRAMES` are taken), not decoded yet.
 
     Raises:
-        FileNotFoundError: for a missing folder.
+        OSError: for a folder that is missing (FileNotFoundError) or cannot be read.
         ValueError: for no images, images beside subfolders of images, patterns that are whole paths, without
             a file or with a shared one, images of a camera that differ in orientation tags or repeat a
             number, a video among other files or that cannot be read, and images of too many pixels.
@@ -119,7 +119,7 @@ def frame_keys(stems: list[str]) -> list[FrameKey]:
     [8, 9, 10]
 
     Args:
-        stems: names of the image files without suffix, at least one.
+        stems: file names without suffix, at least one, compared by runs of digits and of other characters.
 
     Returns:
         One key for each name, in order; equal keys are not refused. For a single name its last number, or the

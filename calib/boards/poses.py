@@ -112,7 +112,7 @@ def start_prior(camera: Camera, deviations: StartDeviations) -> CameraPrior:
 
 
 def initial_rig(singles: Mapping[str, Solved], board: Board) -> InitialRig:
-    """Estimate the poses of all cameras and boards from pairs, along the spanning tree of most corners.
+    """Estimate poses of all cameras and boards from pairs, along the spanning tree of most agreeing corners.
 
     Args:
         singles: each camera's own calibration by name, at least one.
@@ -156,7 +156,8 @@ def rig_near_start(
     Raises:
         KeyError: for a camera without a lens model, or an unknown one.
         ValueError: if the start lacks a camera or has it in another size, a camera shares no moment with
-            another, none of its images fits the start, or as `board_pose`.
+            another, or none of its images fits the start.
+        ValueError, cv2.error: as `board_pose`.
     """
     cameras = []
     for name, v in views.items():
@@ -199,10 +200,7 @@ def _start_camera(name: str, start: Rig, views: BoardViews, model_name: Lens) ->
 
 
 def _aligned(cameras: Sequence[CalibratedViews], board: Board) -> dict[str, Pose]:
-    """`cam_from_world` of all cameras, oriented by the frames that each shares with an earlier one.
-
-    First the camera with most images, then always the two that share most; without shared frames unchanged.
-    """
+    """`cam_from_world` of all cameras, oriented by frames shared with an earlier one, else unchanged."""
     first, symmetries = max(cameras, key=lambda v: len(v.poses)), symmetry_poses(board)
     poses = {first.name: first.camera.cam_from_world}
     for _ in cameras[1:]:

@@ -150,11 +150,11 @@ def html_page(parts: Iterable[str], title: str, further: str = "") -> str:
 
 
 def by_cameras(notes: Iterable[str]) -> list[str]:
-    """Merge notes that differ only in the camera: "left: no points" and "right: no points" become "left,
-    right: no points".
+    """Merge notes that differ only before the first colon, in the camera: "left: no points" and "right: no
+    points" become "left, right: no points".
 
     Returns:
-        The merged notes, in order of first appearance.
+        The merged notes, in order of first appearance, each once.
     """
     names: dict[str, list[str]] = {}
     for note in notes:
@@ -191,8 +191,8 @@ def verdict(calibration: Calibration) -> str:
 
     It is if points of held-out frames (not judged where they are too few) lie by `GOOD` pixels or less off
     their lines, in the mean of each pair, and, at some of five depths from the nearest to the farthest board
-    point, the positions predicted in every other camera for pixels of the first have a standard deviation
-    below `GOOD`, in the median over the image. Without a covariance it is not.
+    point, the positions predicted for pixels of the first camera have a standard deviation below `GOOD`, in
+    the median over the image, in the worst other camera that has any. Without a covariance it is not.
 
     Returns:
         The sentence, with depths in metres and deviations in pixels; empty for a single camera.
@@ -428,8 +428,8 @@ def _draw_field(axes: Any, x: np.ndarray, r: np.ndarray, hw: tuple[int, int]) ->
 
 
 def draw_uncertainty(calibration: Calibration, depths: tuple[float, float]) -> Figure:
-    """Draw the standard deviation of predicted pixels over the first camera's image, by beta (rows) and
-    depth (columns).
+    """Draw the standard deviation (worst direction, pixels) of predicted positions over the first camera's
+    image, by beta (rows) and depth (columns).
 
     Args:
         calibration: calibration of two cameras or more; AssertionError without a covariance.
@@ -456,10 +456,10 @@ def _extent(hw: tuple[int, int]) -> tuple[float, float, float, float]:
 
 def draw_adequacy(calibration: Calibration, depths: tuple[float, float]) -> Figure:
     """Draw each camera's (row's) uncertainty of projection at two depths, and the difference between halves
-    of the frames at their mean, in pixels.
+    of the frames (if there are enough) at their mean, in pixels.
 
     Args:
-        calibration: calibration with a covariance; without one the uncertainty is drawn as none.
+        calibration: calibration with a covariance; without one the uncertainty is drawn as 0.
         depths: both depths, metres.
     """
     names = list(calibration.views)
@@ -511,7 +511,7 @@ def draw_images(
     Args:
         chosen: camera and moment of each image, at least one, each in `detected`.
         detected: all detections by camera.
-        photos: images by camera and moment; without one, its points are drawn alone.
+        photos: images by camera (all of `chosen`) and moment; without one, its points are drawn alone.
 
     Raises:
         ValueError, OSError: if an image cannot be read.

@@ -90,14 +90,14 @@ def calibrate(
         deviations: standard deviations about the start; None for the defaults. Unused without a start.
 
     Returns:
-        The calibration of the cameras in `views`; its world is the first camera's frame, or the start's. The
-        rig has no depth range.
+        The calibration of the cameras in `views`, in the first one's frame or the start's world; the rig has
+        no depth range.
 
     Raises:
         ValueError: with advice, for no views, an unknown lens model, too few images, parallel boards, cameras
             without common frames, frames that contradict each other or determine too little
             (numpy.linalg.LinAlgError), or a start that does not fit.
-        cv2.error: if OpenCV fails on a board's pose.
+        IndexError: for points that the board has not; cv2.error: if OpenCV fails on a board's pose.
     """
     if not views:
         raise ValueError("there are no views: give those of one camera or more, by name")

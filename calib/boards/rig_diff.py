@@ -66,7 +66,7 @@ class Significance(NamedTuple):
     Attributes:
         chi_square: chi-square of the difference.
         freedom: degrees of freedom of chi-square.
-        probability: probability of a larger chi-square by chance.
+        probability: probability of a larger chi-square by chance; NaN without degrees of freedom.
         camera: camera whose motion explains most of the difference.
         degrees: rotation of that camera, degrees.
         metres: shift of that camera's centre, metres or the rigs' own unit.
@@ -110,7 +110,7 @@ class RigDifference:
     unit: str = "m"
 
     def as_text(self) -> str:
-        """Format a line for each camera (pixels) and pair (depths, percent), and the verdict.
+        """Format a heading, a line for each camera (pixels) and pair (depths, percent), and the verdict.
 
         Each line has RMS, maximum and, where known, standard deviation of the differences.
         """
@@ -166,8 +166,8 @@ def rig_difference(
         Differences of pixels and depths, and the test's result.
 
     Raises:
-        ValueError: for rigs of other cameras, sizes or units, cameras that are not calibrated, a
-            covariance of parameters that the first rig has not, and depths unless 0 < near <= far.
+        ValueError: for rigs of other cameras, sizes or units, cameras that are not calibrated, a covariance
+            of parameters that the first rig (of several cameras) has not, and depths unless 0 < near <= far.
     """
     depth_range(*depth)
     names = _same_cameras(a, b)
@@ -361,7 +361,7 @@ def _sizes(values: np.ndarray, sigma: np.ndarray, unit: str = "") -> str:
 
 
 def draw_difference(difference: RigDifference) -> Figure:
-    """Draw differences of pixels by camera and of depths by pair, at the nearest and the farthest depth.
+    """Draw differences of pixels by camera and of depths by pair, at each one's nearest and farthest depth.
 
     Returns:
         The figure, a row for each camera and pair: lengths of offsets in pixels, depths in percent.

@@ -34,7 +34,7 @@ class CalibrationOutput(NamedTuple):
     """Output of a calibration from a folder of images.
 
     Attributes:
-        messages: verdict (of two cameras and more), summary, and notes, which name their cameras.
+        messages: verdict (of two cameras and more), summary, and notes, which may name cameras.
         written: paths of the files written: report, covariance if there is one, rig.
     """
 
@@ -68,8 +68,7 @@ def calibrate_photos(
         start: file of a rig known to within `deviations`; one image of each camera is then enough, such as a
             file named like the camera. None for none.
         deviations: standard deviations about the start; None for the defaults.
-        progress: function of the iterable of images and their number that yields them, to show progress; None
-            for none.
+        progress: function that shows progress, as `collect_folder` takes it; None for none.
 
     Returns:
         Messages and files.
@@ -79,7 +78,7 @@ def calibrate_photos(
         ValueError: for unusable images, boards, start and options, and as `calibrate`; nothing is written.
         cv2.error: as `calibrate`.
         FileExistsError: for a report or covariance in the way that no run wrote, or that changed since.
-        OSError: if files cannot be written.
+        OSError: if files cannot be read or written.
     """
     if out.suffix.lower() not in (".yaml", ".yml"):
         raise ValueError(f"{out}: a rig file's name ends in .yaml")
@@ -135,9 +134,9 @@ def watch(
 ) -> dict[tuple[str, FrameKey], DetectedImage]:
     """Calibrate again and write a page whenever images arrive in a folder, until `finished` or Ctrl-C.
 
-    The page is the calibration's report, with what is missing and the views that would help most; before
-    there is one, it says where the board was found and what is wrong. Images that cannot be read are tried
-    again.
+    The page is the calibration's report, with what is missing and the views that would help most; while there
+    is none, or an image cannot be read, it says where the board was found and what is wrong. Such images are
+    tried again; others are read once, even if replaced.
 
     Args:
         page: HTML file to write.
@@ -151,7 +150,7 @@ def watch(
         which the page leaves out.
 
     Raises:
-        OSError: if the page cannot be written, or the folder is missing.
+        OSError: if the page cannot be written, or the folder is missing or cannot be read.
         cv2.error: as `calibrate`.
         KeyboardInterrupt: for Ctrl-C.
     """

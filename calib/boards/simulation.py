@@ -52,7 +52,7 @@ def simulate_photos(
 
     Raises:
         ValueError: for a rig without calibrated cameras, too few poses whose middles all cameras see, a board
-            that cannot be printed, a `count` below 1, and a negative `noise`.
+            that cannot be printed, a `count` below 1, and a `noise` that is negative or not finite.
         OSError: if files cannot be written.
     """
     if not 0 <= noise < math.inf:

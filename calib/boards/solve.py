@@ -117,7 +117,7 @@ def _check_tilts(name: str, poses: Mapping[FrameKey, Pose], board: Board) -> Non
 
 
 def solve(initial: InitialRig, board: Board, *, final: bool = True) -> Solved:
-    """Fit all observable parameters; unobservable ones are fixed at defaults.
+    """Fit all observable parameters; unobservable lens terms and principal points are fixed at defaults.
 
     Parameters fixed before the fit, when the noise was overestimated, may return after it; boards that are
     clearly not flat or not printed true are deformed.
@@ -258,14 +258,14 @@ def _with_deformation(solved: Solved, flat: BoardDeformation | None) -> Solved:
 
 
 def adjust(problem: BundleProblem, *, rounds: int = 4, equal_noise: bool = False) -> Solved:
-    """Minimise the reprojection error over the free camera parameters and all boards.
+    """Minimise the reprojection error over the free camera parameters, board poses and shapes.
 
-    First by least squares of equal noise, as the initial values may be poor; then up to `rounds` times with
-    the noise of each camera estimated from its residuals. (Individual noise from the beginning would discard
-    the camera that starts worst.)
+    First with one noise of all cameras, as the initial values may be poor; then up to `rounds` times with
+    noise estimated from residuals, once more of all cameras, later of each. (Individual noise from the
+    beginning would discard the camera that starts worst.)
 
     Args:
-        problem: the problem; its noise is not used.
+        problem: the problem, with points of every camera; its noise is not used.
         rounds: largest number of rounds with noise estimated from residuals.
         equal_noise: True for one noise of all cameras: where the board moves between exposures, a camera with
             a noise of its own would attract every board pose.
@@ -488,7 +488,7 @@ def many_wrong(wrong: Sequence[str], before: Sequence[str], counts: Mapping[str,
     Args:
         wrong: camera of each contradicting image.
         before: camera of each image left out before.
-        counts: remaining images by camera.
+        counts: images by camera, without the ones left out before.
 
     Returns:
         True if a camera has too many.

@@ -9,8 +9,7 @@ A board is specified by a short text:
 - ``acircles:4x11:20mm``: circles in every row x rows, distance between rows (OpenCV's asymmetric grid);
 - ``aprilgrid:6x6:88mm:0.3``: tags across x down, side of a tag, space between tags as a share of it (Kalibr's
   layout, tag family 36h11; ``border1`` for tags with one black bit around them instead of two); or Kalibr's
-  own target file.
-
+  own target file;
 - ``targets.csv:4x4``: markers at known positions, on a wall, in a frame, in a room (columns id, x, y, z or
   id, corner, x, y, z, in metres).
 
@@ -48,6 +47,7 @@ from .board import (
     marker_dictionary,
     on_a_line,
 )
+from .detect import FEWEST
 
 UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
 FORMS = (
@@ -93,15 +93,16 @@ def parse_board(text: str) -> Board:
     """Parse the text of a board, such as ``charuco:8x6:30mm``, or read a target file.
 
     Forms (options: see the module), with counts of 3 (tags: 2) to 100 and lengths in mm, cm, m or in:
-    chessboard:9x6:25mm counts inner corners, charuco:8x6:30mm squares, circles:7x5:20mm, acircles:4x11:20mm,
-    aprilgrid:6x6:88mm:0.3 tags; Kalibr's target file (.yaml); points in a file (.csv, then :DICTIONARY).
+    chessboard:9x6:25mm counts inner corners, charuco:8x6:30mm squares (8 inner corners at least),
+    circles:7x5:20mm, acircles:4x11:20mm, aprilgrid:6x6:88mm:0.3 tags; Kalibr's target file (.yaml); points in
+    a file (.csv, then :DICTIONARY).
 
     Returns:
         `Chessboard`, `Charuco`, `Circles`, `AprilGrid`, or `KnownPoints` of a .csv file.
 
     Raises:
         ValueError: for text or a file that is no board, or numbers out of range.
-        FileNotFoundError: for a missing file.
+        OSError: for a file that is missing (FileNotFoundError) or cannot be read.
     """
     if text.lower().endswith((".yaml", ".yml")):
         text = _kalibr_target(Path(text))
@@ -143,7 +144,7 @@ def parse_boards(texts: Sequence[str]) -> Board:
 
     Raises:
         ValueError: for no text or one that is no board, and several boards without markers or with the same.
-        FileNotFoundError: for a missing file.
+        OSError: as `parse_board`.
     """
     boards = [parse_board(text) for text in texts]
     if not boards:
@@ -154,7 +155,8 @@ def parse_boards(texts: Sequence[str]) -> Board:
     for board in boards:
         if not isinstance(board, MarkedBoard):
             raise ValueError(f"board '{board}': several boards need markers: use charuco or aprilgrid")
-        taken = used.setdefault(board.dictionary, set())
+        # larger dictionaries of a kind begin with the smaller one's markers
+        taken = used.setdefault(re.sub(r"_\d+$", "", board.dictionary), set())
         if taken & set(board.markers):
             raise ValueError(
                 f"board '{board}': its markers are on another board too: print it with "
@@ -167,6 +169,8 @@ def parse_boards(texts: Sequence[str]) -> Board:
 
 
 def _charuco(text: str, columns: int, rows: int, spacing: float, options: Mapping[str, str]) -> Charuco:
+    if (corners := (columns - 1) * (rows - 1)) < FEWEST:
+        raise ValueError(f"board '{text}': has {corners} inner corners and {FEWEST} is the least")
     marker = _length(text, options["length"]) if "length" in options else 0.75 * spacing
     first = int(options.get("first", "from0")[4:])
     markers = range(first, first + columns * rows // 2)
@@ -231,10 +235,7 @@ def _smallest_dictionary(text: str, name: str, markers: int) -> str:
 
 
 def _known_points(text: str) -> KnownPoints:
-    """Read points of a CSV file `targets.csv`, or `targets.csv:5x5_100` with their dictionary (or else 4x4).
-
-    Columns id, x, y, z (metres) for markers' centres, or id, corner (0 to 3), x, y, z. Raises ValueError.
-    """
+    """Read points of a CSV file `targets.csv`, or `targets.csv:5x5_100` with their dictionary (else 4x4)."""
     file, _, dictionary = text.partition(".csv")
     path = Path(f"{file}.csv")
     if not path.is_file():
@@ -369,8 +370,7 @@ def write_board(board: str, out: Path, *, paper: str | None = None) -> Path:
     Raises:
         ValueError: for another suffix, text that is no board, points of a .csv file, an unknown sheet, and a
             board that does not fit on it.
-        FileNotFoundError: for a missing target file.
-        OSError: if the file cannot be written.
+        OSError: as `parse_board`, and if the file cannot be written.
     """
     if out.suffix.lower() not in (".pdf", ".svg"):
         raise ValueError(f"{out}: a board is written as .pdf or .svg, which keep its true size")

@@ -86,7 +86,7 @@ class RigCovariance:
                 states no rig passes. None does not check.
 
         Raises:
-            FileNotFoundError: for a missing file.
+            OSError: for a file that is missing (FileNotFoundError) or cannot be read.
             ValueError: for another file, a damaged one, or one of another rig.
         """
         path = Path(path)
@@ -134,10 +134,10 @@ def beta_covariance(
 
     Returns:
         Covariances (n, 2, 2) in pixels² of beta; NaN where alpha's lens has no ray or beta's does not project
-        the point.
+        the point, and at infinite depth.
 
     Raises:
-        ValueError: for an unknown camera, and a covariance of parameters that the rig has not.
+        ValueError: for a camera that is unknown or not calibrated, and parameters that the rig has not.
     """
     found = position_covariance(rig, covariance, alpha, beta, torch.from_numpy(x), depth)
     return found.numpy()
@@ -272,8 +272,8 @@ class Jackknife(NamedTuple):
     Attributes:
         covariance: covariance of the cameras' free parameters, by the corrected estimate.
         left_out: covariance of these by a plain jackknife, which leaves out each frame in turn.
-        deformations: covariance of the boards' shapes, by the corrected estimate; (0, 0) for flat boards.
-        step: boards' shapes, board by board, after a Gauss-Newton step; empty for flat boards.
+        deformations: covariance of the boards' shapes, by the corrected estimate; (0, 0) without shapes.
+        step: boards' shapes, board by board, after a Gauss-Newton step; empty without shapes.
     """
 
     covariance: Float[np.ndarray, "c c"]

@@ -44,7 +44,7 @@ def epipolar_errors(
     """Compute epipolar errors by pair: distances of points from their lines, averaged over both directions.
 
     Args:
-        rig: rig that has the cameras in `views`; ValueError if it lacks one.
+        rig: rig of the cameras in `views`; ValueError if it lacks one that has points in common.
         views: detections by camera; points of one moment and one index are common.
 
     Returns:
@@ -79,8 +79,8 @@ def held_out_errors(
     """Compute epipolar errors of shared frames, each by a rig calibrated without it (in `FOLDS` parts).
 
     Returns:
-        Errors by pair, undistorted pixels; empty for fewer than `FEWEST_TO_HOLD_OUT` frames that two cameras
-        share, or if a camera would keep fewer than `FEWEST_LEFT`.
+        Errors by pair, undistorted pixels; empty if fewer than `FEWEST_TO_HOLD_OUT` frames are seen by two
+        cameras or more, or a camera would keep fewer than `FEWEST_LEFT`.
     """
     frames = fit.problem.frames
     shared = [key for key in frames if sum(key in v.seen for v in views.values()) > 1]
@@ -105,9 +105,9 @@ def half_difference(fit: Solved, depth: float) -> dict[str, tuple[np.ndarray, np
         depth: depth at which projections are compared, metres.
 
     Returns:
-        By camera, pixels (n, 2) near points of both halves and differences (n, 2) of projections there,
-        pixels, after the motion of the camera that keeps its boards where they were; empty for fewer than
-        `FEWEST_TO_HALVE` frames, a camera that sees no board in one half, or a half that cannot be fitted.
+        By camera, pixels (n, 2) near points of both halves, possibly none, and how far projections differ
+        there (n, 2), pixels, after the motion of the camera that keeps its boards where they were; empty for
+        fewer than `FEWEST_TO_HALVE` frames, a camera without a board in one half, or a failing fit.
     """
     count = len(fit.problem.frames)
     even = np.arange(count) % 2 == 0
@@ -142,7 +142,7 @@ class LensComparison:
 
     Attributes:
         errors: mean square error of a coordinate (pixels²) of each frame, with the board's pose fitted and
-            its freedom allowed for, by model; models that do not fit are missing. Empty for too few frames.
+            its freedom allowed for, by model that fits all frames; empty for too few frames.
     """
 
     errors: Mapping[Lens, Float[np.ndarray, " f"]]

@@ -42,11 +42,7 @@ class DepthChange(NamedTuple):
     suggested: float
 
     def objections(self) -> Iterator[str]:
-        """Yield a sentence for each reason not to accept the rig's change.
-
-        Yields:
-            Text without a full stop; nothing where depth raises no objection.
-        """
+        """Yield a sentence, without a full stop, for each reason not to accept the rig's change, if any."""
         if self.change > SMALL:
             yield f"depth would change by {self.change:.1%}, which matched points do not determine"
 
@@ -65,7 +61,7 @@ def relative_change(original: Rig, refined: Rig, pairs: Pairs) -> float:
         than `FEW`. Points without depth afterwards (behind a camera, too far) count as 1.
 
     Raises:
-        ValueError: as `observed_depths`.
+        ValueError, TypeError: as `match_depths`.
     """
     before, after = (observed_depths(rig, pairs) for rig in (original, refined))
     usable = (after / before - 1).abs()[~before.isnan()].nan_to_num(1.0)
@@ -73,14 +69,14 @@ def relative_change(original: Rig, refined: Rig, pairs: Pairs) -> float:
 
 
 def observed_depths(rig: Rig, pairs: Pairs) -> Float[Tensor, " n"]:
-    """Compute the depth in alpha of all points of all pairs, of which there must be one at least.
+    """Compute the depth in alpha of all points of all pairs.
 
     Returns:
         Depths in the rig's unit (metres), the pairs' points one after the other, detached; NaN for points
-        behind a camera, with too little parallax or without rays, and for pairs known by F.
+        behind a camera, with too little parallax or without rays, and for pairs with a link.
 
     Raises:
-        ValueError: for a camera that the rig lacks, and pairs with neither cameras nor F.
+        ValueError, TypeError: as `match_depths`.
     """
     depth, front, observable = match_depths(rig, pairs)
     return torch.where(front & observable, depth, torch.nan).detach()
@@ -93,10 +89,11 @@ def share_outside(rig: Rig, pairs: Pairs) -> float:
     `BEYOND` at both ends.
 
     Returns:
-        A share in 0..1; 0 if all pairs are known by F, NaN for fewer than `FEW` such points.
+        A share in 0..1; 0 if no point has a depth (as all pairs have links), else NaN for fewer than `FEW`
+        points of observable depth.
 
     Raises:
-        ValueError: as `observed_depths`.
+        ValueError, TypeError: as `match_depths`.
     """
     depth, front, observable = match_depths(rig, pairs)
     if bool(depth.isnan().all()):
@@ -123,7 +120,7 @@ def log_depths(
         points.
 
     Raises:
-        ValueError: as `observed_depths`.
+        ValueError, TypeError: as `match_depths`.
     """
     observable = ~torch.stack([observed_depths(rig, pairs) for rig in rigs]).isnan().any(0)
     if int(observable.sum()) < FEW:

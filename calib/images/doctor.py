@@ -218,7 +218,7 @@ def diagnose(rig: Rig, images: Images, matches: Pairs | None = None) -> Diagnosi
 
     Raises:
         ValueError: in one line, for a camera that the rig lacks, images that `match_cameras` refuses, given
-            points of which too few agree, or a rig that relates none of the matched cameras.
+            points of which too few agree, or a rig that relates none of the matched cameras by lines.
     """
     for name in images:
         rig.require(name)
@@ -233,22 +233,22 @@ def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnos
 
     Args:
         sizes: (height, width) of each camera's image, a tuple, which the rig may state otherwise.
-        pairs: matched points by pair of cameras; pairs that the rig does not relate are left out.
+        pairs: matched points by pair of cameras; pairs that the rig does not relate by lines are left out.
 
     Returns:
         The mistake with its repaired rig, and what else was compared.
 
     Raises:
-        ValueError: for no sizes, a camera that the rig lacks, if it relates none of the pairs, or for pairs
-            without `ENOUGH` points.
+        ValueError: for no sizes, a camera that the rig lacks, if it relates none of the pairs by lines, or
+            for fewer than `ENOUGH` points in all.
     """
-    pairs = {names: _thinned(matches) for names, matches in related(rig, pairs).items()}
+    pairs = {names: _thinned(matches) for names, matches in related(rig, pairs, by_lines=True).items()}
     fits = all(rig[name].hw == hw for name, hw in sizes.items())
     points = sum(len(matches.alpha) for matches in pairs.values())
     if points < ENOUGH:
         raise ValueError(f"{points} matched points: {ENOUGH} or more are needed")
     pairs = within_lenses(rig, pairs) if fits else pairs
-    tried = hypotheses(rig, sizes)
+    tried = [h for h in hypotheses(rig, sizes) if _relates(h.rig, pairs)]
     if fits:
         tried += [*_ignored_lens(rig, pairs), *_degrees(rig, pairs), *_depth_range(rig, pairs)]
         tried += [*_zoomed(rig, pairs), *_cropped(rig, pairs)]
@@ -301,12 +301,10 @@ def _by_evidence(
     *,
     mirrored: bool,
 ) -> tuple[Hypothesis, list[Hypothesis]]:
-    """Choose the mistake that explains the points clearly better than a drift of the rig, or the rig as
-    given; and all that are as good, best first.
+    """Choose the mistake that explains points clearly better than a drift, or the given rig; and its equals.
 
-    Points of one object, or wrong ones in one place, do not decide: the choice must hold without each part of
-    them in turn. No drift mirrors an image; a drift of the principal point does what a small shift of pixels
-    does.
+    The choice must hold without each part of the image in turn. No drift mirrors an image; one of a principal
+    point does what a small shift of pixels does.
     """
     unchanged = next(iter(misfit))
     limit = LARGEST_REMAINDER[0] * misfit[unchanged]
@@ -354,6 +352,12 @@ def _same_rig(rig: Rig, other: Rig, pairs: Pairs) -> bool:
     return bool((off[0] - off[1]).abs().median() < SAME_DISTANCE)
 
 
+def _relates(rig: Rig, pairs: Pairs) -> bool:
+    """Return True if a rig relates all pairs by lines; one with two linked cameras swapped may not."""
+    every = (rig.pair(*names) for names in pairs)
+    return all(pair.calibrated if pair.link is None else bool(pair.link.F.any()) for pair in every)
+
+
 def _thinned(matches: PointMatches) -> PointMatches:
     """Select at most `MOST` matches, evenly through the list."""
     step = max(1, -(-len(matches.alpha) // MOST))
@@ -375,10 +379,7 @@ def _ignored_lens(rig: Rig, pairs: Pairs) -> list[Hypothesis]:
 def _searched(
     make: Callable[[float], Hypothesis], bounds: tuple[float, float], prior: tuple[float, float], pairs: Pairs
 ) -> tuple[Hypothesis, float]:
-    """Search for the number of a mistake that leaves points nearest their lines, in the median.
-
-    `bounds` are the least and largest number, `prior` its mean and standard deviation without points.
-    """
+    """Search for the number (in `bounds`; `prior`: mean, deviation) with points nearest their lines."""
     (low, high), (mean, deviation) = bounds, prior
     for _ in range(ROUNDS):
         numbers = torch.linspace(low, high, 25, dtype=torch.float64)
@@ -445,8 +446,7 @@ def _degrees(rig: Rig, pairs: Pairs) -> list[Hypothesis]:
 
 
 def _off_planes(rig: Rig, names: tuple[str, str], matches: PointMatches) -> Float[Tensor, "k k"]:
-    """Compute sines of beta's rays with their epipolar planes, medians, for the turns of alpha (rows) and of
-    beta."""
+    """Compute median sines of beta's rays with their epipolar planes, for turns of alpha (rows) and beta."""
     alpha, beta = rig.pair(*names).cameras
     rays = [normalize(camera.rays(points)[0], dim=-1) for camera, points in zip((alpha, beta), matches)]
     of_alpha, of_beta = (from_degrees(camera.R, torch.tensor(TURNS)) for camera in (alpha, beta))

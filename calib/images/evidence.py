@@ -119,6 +119,7 @@ def fit_statistics(
 
     Raises:
         ValueError: if `tried` has no "nothing" or "distortion", and as `observations`.
+        torch.linalg.LinAlgError: for a link of H alone.
     """
     observed = observations([hypothesis.rig for hypothesis in tried], pairs)
     inliers, floor = _inliers(tried, observed.off, pairs)
@@ -236,7 +237,7 @@ def _mirrors(rig: Rig, names: tuple[str, str]) -> bool:
 
 @dataclass(frozen=True)
 class DriftEvidence:
-    """A rig with the drift that fits matched points best.
+    """The drift of a rig that fits matched points best, with its evidence.
 
     Attributes:
         cost: -2 log evidence of the rig and that drift by the points used; smaller is better, and only
@@ -339,8 +340,7 @@ def _drift(r: Tensor, J: Tensor, B: Tensor, scale: float) -> tuple[float, float,
 
 
 def _rotation_to_plausible_depth(rig: Rig, pairs: Pairs) -> float:
-    """Return the rotation, in prior deviations, that brings half the points in front and into the depth
-    range; 0 without poses."""
+    """Return the rotation (prior deviations) that brings half the points into the range; 0 without poses."""
     near, far = (0.0, math.inf) if rig.depth is None else (float(bound) for bound in rig.depth)
     rotations = []
     for names, matches in pairs.items():

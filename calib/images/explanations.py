@@ -40,9 +40,9 @@ class Explanation(NamedTuple):
     Attributes:
         H: homography nearest to most points, beta from alpha, undistorted pixels.
         points: number of the points.
-        beyond: number of points off H, even with smooth lenses, along the lines of F; of few points
-            (`registration`) of those off H.
-        wrong: number of points off these lines; of few points the same as `beyond`.
+        beyond: number of points off H, even with smooth lenses, along the lines of F; for few points
+            (`registration`) in any direction.
+        wrong: number of points off these lines; for few points the same as `beyond`.
         noise: standard deviation of the distances from the lines, or for few points from their places by H;
             pixels of beta.
     """
@@ -85,7 +85,7 @@ def explain(matches: PointMatches, pair: Pair) -> Explanation:
 
     Args:
         matches: undistorted points, of which F fits most.
-        pair: the pair, with F or cameras.
+        pair: the pair, with F or cameras; an F of 0 gives a `noise` of NaN.
 
     Returns:
         The explanation; H is the identity if no homography fits.

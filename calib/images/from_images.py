@@ -46,8 +46,8 @@ class UncalibratedRig(NamedTuple):
 
     Attributes:
         rig: views related by links; named `OPEN` if the points of some link leave its lines undetermined.
-        fits: links with the points that agree (undistorted), and their reach along the lines from the rough
-            map; for points too few for lines all of them, with a reach of 0.
+        fits: links with the points that agree (undistorted), and their reach along the lines from a
+            similarity, perhaps not the link's map; for points too few for lines all of them, with reach 0.
         distance: median distance of held-out points from their lines, pixels of beta; an empty dict for
             points too few for lines.
         by_focal: True where F was fitted with the given focal lengths.
@@ -113,8 +113,8 @@ def rig_from_images(
 
     Raises:
         ValueError: in one line, for images that `match_cameras` refuses, points of which too few agree, all
-            in one spot, or of a camera without an image, and a focal length that is not positive or of no
-            camera.
+            in one spot, or of a camera without an image, and a focal length that is not positive and finite
+            or of no camera.
     """
     focal = dict(focal or {})
     for name, length in focal.items():

@@ -44,7 +44,7 @@ def guided_matches(
     """Match corners of alpha with the most similar patch within `window` pixels of a homography's place in
     beta.
 
-    Images must have the same scale and orientation.
+    Images must have the same scale and orientation. Correlation is squared, so that contrast may be inverted.
 
     Args:
         alpha: image (C, H, W) in 0..1.

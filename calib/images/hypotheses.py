@@ -72,8 +72,8 @@ def hypotheses(rig: Rig, sizes: Mapping[str, HW]) -> list[Hypothesis]:
     """List the rig as given, and the single mistakes plausible in a rig whose images have these sizes.
 
     Mistakes whose repair must be estimated from points are left out (`ignored_lens`, `zoomed`, `cropped`,
-    `in_degrees`). Where images do not have the sizes that the rig states, only mistakes that explain the
-    sizes are listed.
+    `in_degrees`), and mistakes in cameras without a size. Where images do not have the sizes (height, width)
+    that the rig states, only mistakes that explain them are listed.
 
     Returns:
         Hypotheses, "nothing" first, then likely ones before others.

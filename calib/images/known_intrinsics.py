@@ -48,9 +48,9 @@ def centres_found(
 ) -> tuple[Rig, dict[str, tuple[int, float]]]:
     """Estimate translations of pinhole cameras, and refine their orientations, from one image of each.
 
-    Alpha is at the origin with the world's axes, and the baseline of the first beta is 1, unless the rig
-    states translations: then it is the stated length. Cameras that no pairs connect with alpha are left out.
-    Views should be of about equal scale and orientation, and parallax a small share of the image (`WINDOW`).
+    Alpha is at the origin with the world's axes, and the baseline of the first beta has the length that the
+    rig states, 1 if that is 0. Cameras that no pairs connect with alpha are left out. Views should be of
+    about equal scale and orientation, and parallax a small share of the image (`WINDOW`).
 
     Args:
         rig: pinhole cameras of known intrinsics and roughly known orientation.

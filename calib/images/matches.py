@@ -192,7 +192,7 @@ def _well_localised(deviation: NDArray[np.float64]) -> NDArray[np.bool_]:
 def match_cameras(images: Images, *, alpha: str | None = None) -> dict[tuple[str, str], PointMatches]:
     """Match the images of every two cameras, and keep matches consistent with some fundamental matrix.
 
-    Where there are few, the second image is tried mirrored, to which features are not invariant.
+    Where there are fewer than `MANY`, the second image is tried mirrored: features are not invariant to it.
 
     Args:
         images: one image (C, H, W) in 0..1 per camera, by name.
@@ -203,7 +203,7 @@ def match_cameras(images: Images, *, alpha: str | None = None) -> dict[tuple[str
 
     Raises:
         ValueError: in one line, for fewer than two images, one that is no float image (C, H, W), hardly any
-            texture, two equal images, no image of `alpha`, or if no pair is left.
+            texture, two nearly equal images, no image of `alpha`, or if no pair is left.
     """
     image_sizes(images)
     if alpha is not None and alpha not in images:
@@ -294,7 +294,7 @@ class FittedLink(NamedTuple):
 
     Attributes:
         link: F, and as H a similarity from which the matches lie as far to one side along their lines as to
-            the other.
+            the other (in an `UncalibratedRig` perhaps a homography).
         matches: the consistent matches, of the undistorted images if there are lenses.
         displacement: pixels of beta along the lines, to either side of H x, within which 98 % of the matches
             lie.
@@ -308,7 +308,7 @@ class FittedLink(NamedTuple):
 def fit_link(matches: PointMatches, F: Float[Tensor, "3 3"], *, within: float = 6.0) -> FittedLink:
     """Improve F, and fit a rough map H, by the matches near their epipolar lines.
 
-    F is fitted by MAGSAC++ (Barath et al. 2020) to 1 px.
+    F is fitted as by `fit_fundamental`.
 
     Args:
         matches: undistorted points.

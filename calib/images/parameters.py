@@ -36,8 +36,7 @@ FOCAL_CORRELATION = 0.995
 LENS_SIGMA = 0.2
 """The share of `typical_coefficients` for uncalibrated lenses, whose unit is half the image's longer side."""
 LINK_SIGMA = 0.1
-"""Standard deviation of the seven degrees of freedom of an F in coordinates of about -1 to 1:
-uninformative."""
+"""Standard deviation of the seven degrees of freedom of an F in coordinates of about -1 to 1: wide."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +77,7 @@ def free_parameters(
     """List the free parameters of these cameras.
 
     The first camera keeps its pose, as only relative poses are observable. A link between two of the cameras
-    has its F free, and lenses of uncalibrated views are free.
+    has its F free, unless it is of H alone, and lenses of uncalibrated views are free.
 
     Args:
         names: names of the cameras, one at least.
@@ -97,7 +96,8 @@ def free_parameters(
     if wrong := [k for k, v in stated.items() if k not in SIGMA or not v > 0]:
         raise ValueError(f"sigma: wanted a positive number for one of {', '.join(SIGMA)}; got '{wrong[0]}'")
     sigma = {**SIGMA, **stated}
-    parameters = rig.parameters(free=["*"]) if any(isinstance(rig[n], LensView) for n in names) else {}
+    views = [rig[name] for name in names]
+    parameters = rig.parameters(free=["*"]) if any(isinstance(v, LensView) for v in views) else {}
     parameters = {n: like for n, like in parameters.items() if n not in ("depth.near", "depth.far")}
     calibrated = [name for name in parameters if isinstance(rig[_camera_of(name)], Camera)]
     wanted = [*_matching(calibrated, free), *(name for name in parameters if name not in calibrated)]
@@ -107,7 +107,7 @@ def free_parameters(
         for name in wanted
         if _camera_of(name) in names and name not in fixed
     ]
-    links = [f"{a} > {b}" for a, b in rig.links if a in names and b in names]
+    links = [f"{a} > {b}" for (a, b), link in rig.links.items() if {a, b} <= {*names} and link.F.any()]
     return of_cameras + [
         FreeParameter(name, torch.full((7,), LINK_SIGMA).double(), "F", 1.0) for name in links
     ]

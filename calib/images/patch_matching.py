@@ -66,7 +66,7 @@ def refine_points(
     Args:
         alpha: bytes (H, W).
         beta: bytes (H, W).
-        x: points (x, y) of alpha, pixels, finite.
+        x: points (x, y) of alpha, pixels, finite; cv2.error for more than 32766.
         y: rough positions in beta, pixels, finite.
         beta_from_alpha: rough affine maps between neighbourhoods of the points, invertible.
 

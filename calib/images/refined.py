@@ -55,8 +55,8 @@ class Refinement:
     """Result of a refinement.
 
     Attributes:
-        rig: the refined rig if `accepted`, with rough maps for links that had none; else the given one, whose
-            views known by F alone may have got lenses without distortion.
+        rig: the refined rig if `accepted`, with rough maps for links that had none and have `ENOUGH` points;
+            else the given one (from `RefinementProblem.report` the problem's).
         accepted: True if the refined rig is used.
         changes: changes of the observable parameters; empty if not accepted.
         unobservable: names of parameters, or of components ("left.rotation x"), that the images do not

@@ -148,8 +148,8 @@ def refine_matches(
     """Refine a rig by matched points.
 
     Args:
-        frames: matched points of each frame, by pair of names; pairs that the rig does not relate are left
-            out.
+        frames: matched points of each frame, by pair of names; pairs that the rig does not relate by lines
+            are left out.
         free: free parameters: kinds such as "rotation" or "focal", or patterns over "camera.kind".
         sigma: prior standard deviations by kind, as `refine` takes them; None for the usual ones.
         force: True to follow the lines however depth changes, and accept the result in spite of objections.
@@ -163,8 +163,8 @@ def refine_matches(
 
     Raises:
         ValueError: for no frames, a camera that the rig lacks, a frame of whose pairs it relates none, a
-            single frame's points all in one spot, nothing free, and `free` or `sigma` that `free_parameters`
-            refuses.
+            single frame's points all in one spot, nothing free, `free` or `sigma` that `free_parameters`
+            refuses, and as `with_map` for a link that has no H.
     """
     if not keep_depth:
         problem = RefinementProblem.from_frames(rig, free, frames=frames, sigma=sigma)
@@ -248,7 +248,7 @@ class RefinementProblem:
         Raises:
             ValueError: as `refine_matches`.
         """
-        used, held_out = split([related(rig, pairs) for pairs in frames])
+        used, held_out = split([related(rig, pairs, by_lines=True) for pairs in frames])
         names = cameras_of(rig, (*used, *held_out))
         parameters = free_parameters(rig, names, free=free, sigma=sigma)
         if not parameters:

@@ -75,7 +75,8 @@ def epipolar_residuals(pair: Pair, matches: PointMatches) -> EpipolarResiduals:
     first order in the distance.
 
     Returns:
-        Signed distances in pixels, differentiable in the rig but not in the points, with their validity.
+        Signed distances in pixels (0 for a link of H alone), differentiable in the rig but not in the points,
+        with their validity.
 
     Raises:
         ValueError: if neither cameras nor F are known.
@@ -180,7 +181,7 @@ def share(chosen: Bool[Tensor, " n"]) -> float:
 def systematic_modes(pair: Pair, matches: PointMatches) -> tuple[Float[Tensor, "n m"], Float[Tensor, "n m"]]:
     """Compute derivatives of the Sampson distances by smooth displacements of alpha's points, and of beta's.
 
-    The displacements are what a lens model leaves, each 1 pixel at the image's corner: radial, of third and
+    The displacements are what a lens model leaves, about 1 pixel at the image's corner: radial, of third and
     fifth order, and decentred along x and along y.
 
     Returns:
@@ -229,6 +230,7 @@ def lines_basis(pair: Pair, matches: PointMatches) -> Float[Tensor, "n 8"]:
 
     Raises:
         ValueError: for a pair with neither cameras nor F.
+        torch.linalg.LinAlgError: for a link of H alone.
     """
     alpha, beta = (x.detach().requires_grad_() for x in matches)
     with torch.enable_grad():
@@ -241,8 +243,11 @@ def lines_basis(pair: Pair, matches: PointMatches) -> Float[Tensor, "n 8"]:
     return columns / size @ complement.T
 
 
-def related(rig: Rig, pairs: Pairs) -> dict[tuple[str, str], PointMatches]:
-    """Select those of the pairs that the rig relates: calibrated ones and those with a link.
+def related(rig: Rig, pairs: Pairs, *, by_lines: bool = False) -> dict[tuple[str, str], PointMatches]:
+    """Select the pairs that a rig relates: calibrated ones, and ones with a link.
+
+    Args:
+        by_lines: True to leave out links of H alone.
 
     Returns:
         Matches by pair of names, as given.
@@ -250,11 +255,11 @@ def related(rig: Rig, pairs: Pairs) -> dict[tuple[str, str], PointMatches]:
     Raises:
         ValueError: if there are none, and for a camera that the rig lacks.
     """
-    relations = {
-        names: m
-        for names, m in pairs.items()
-        if (pair := rig.pair(*names)).calibrated or pair.link is not None
-    }
+
+    def relates(pair: Pair) -> bool:
+        return pair.calibrated if pair.link is None else not by_lines or bool(pair.link.F.any())
+
+    relations = {names: matches for names, matches in pairs.items() if relates(rig.pair(*names))}
     if not relations:
         raise ValueError(
             "the rig does not relate these cameras: calibrate them, or make a rig with `pat rig start`"
@@ -263,8 +268,7 @@ def related(rig: Rig, pairs: Pairs) -> dict[tuple[str, str], PointMatches]:
 
 
 def stack_key(pair: Pair) -> tuple[object, ...]:
-    """Return what pairs must have in common to be stacked: calibrated or known by F, and their
-    lens models."""
+    """Return what pairs must share to be stacked: calibrated or known by F, and their lens models."""
     lenses = (view.distortion if isinstance(view, LensView) else None for view in (pair.alpha, pair.beta))
     kinds = (None if lens is None else (lens.model, lens.coefficients.shape[-1]) for lens in lenses)
     return (pair.calibrated and pair.link is None, *kinds)
@@ -327,15 +331,13 @@ def own_distance(rig: Rig, pairs: Pairs) -> float:
 
 
 def trimmed_square(distance: Float[Tensor, " n"]) -> float:
-    """Compute the mean square of the distances of those points that are nearest to their lines, `TRIMMED` of
-    all."""
+    """Compute the mean square of the distances of the points, `TRIMMED` of all, nearest to their lines."""
     squares = distance.square().sort().values
     return float(squares[: max(1, int(TRIMMED * len(squares)))].mean())
 
 
 def nearer(before: Float[Tensor, " n"], after: Float[Tensor, " n"]) -> bool:
-    """Return True if distances from the lines decreased significantly: a paired test, distances clipped at 5
-    px."""
+    """Return True if distances from the lines fell significantly: a paired test, clipped at 5 px."""
     gain = before.abs().clamp(max=5) - after.abs().clamp(max=5)
     return float(gain.mean()) > SIGNIFICANT * float(gain.std()) / len(gain) ** 0.5
 
@@ -398,8 +400,7 @@ def split(
 
 
 def held_out_parts(matches: PointMatches) -> Int[Tensor, " n"]:
-    """Return which of `HELD_OUT` parts, each of squares of alpha, a point is in; the first with any is held
-    out."""
+    """Return which of `HELD_OUT` parts, of alpha's squares, a point is in; the first with any is held out."""
     column, row = (matches.alpha / CELL).floor().long().unbind(-1)
     return (column + 2 * row) % HELD_OUT
 
@@ -419,8 +420,7 @@ def image_parts(rig: Rig, pairs: Pairs) -> Int[Tensor, " n"]:
 
 
 def parts_of(hw: HW, points: Float[Tensor, "n 2"]) -> Int[Tensor, " n"]:
-    """Return which of `PARTS` x `PARTS` parts of an image of this size each point (x, y) is in,
-    row by row."""
+    """Return which of `PARTS` x `PARTS` parts of such an image each point (x, y) is in, row by row."""
     h, w = hw
     cell = (points * PARTS / points.new_tensor([w, h])).floor().long().clamp(0, PARTS - 1)
     return cell[:, 0] + PARTS * cell[:, 1]

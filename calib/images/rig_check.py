@@ -61,7 +61,7 @@ def find_misfit(rig: Rig, images: Images) -> Misfit | None:
     Returns:
         The misfit if the rig fits badly; None if it fits, and where nothing can be said: fewer than two
         images, one of another size, images that `match_cameras` refuses, cameras that are not related, or at
-        one place.
+        one place by the points too.
 
     Raises:
         ValueError: for a camera that the rig lacks, of two images or more.

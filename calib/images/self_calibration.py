@@ -105,11 +105,11 @@ def self_calibrated(
         link: F between the undistorted views, not 0, and H if known: the ratio of focal lengths, and a
             rotation by quarter turns.
         matches: points of the images as recorded, distorted.
-        focal: focal lengths in pixels by camera; missing ones are assumed.
+        focal: focal lengths in pixels by camera; a missing one follows from the other and H, or is assumed.
 
     Returns:
-        The pair, with the depth range of the points; None for points that no poses explain, and fewer than
-        `ENOUGH` within `NEAR_LINE` pixels of their lines.
+        The pair, with the depth range of the points; None for points without parallax by any pose, and fewer
+        than `ENOUGH` within `NEAR_LINE` pixels of their lines.
 
     Raises:
         ValueError: for another number of views than two, and points that are all in one spot.
@@ -158,8 +158,8 @@ def refined_by_depth(
 
     Args:
         images: one image (C, H, W) in 0..1 per camera, of the pair's sizes, by name.
-        depth: depth of alpha's pixels, in the pair's unit; NaN where unknown.
-        confidence: confidence of alpha's pixels, 0..1.
+        depth: depth of all of alpha's pixels, in the pair's unit; NaN where unknown.
+        confidence: confidence of these, 0..1.
 
     Returns:
         The refined pair, always marked `exact`; the same pair if there are fewer than 5 `ENOUGH` matches, or
@@ -207,8 +207,8 @@ def dense_matches(
     Args:
         rig: two cameras, alpha first.
         images: one image (C, H, W) in 0..1 per camera, of the rig's sizes.
-        depth: depth of alpha's pixels, in the rig's unit; pixels without finite depth are left out.
-        confidence: confidence of alpha's pixels; those up to `LEAST_CONFIDENCE` are left out.
+        depth: depth of all of alpha's pixels, in the rig's unit; pixels without finite depth are left out.
+        confidence: confidence of these, 0..1; pixels up to `LEAST_CONFIDENCE` are left out.
 
     Returns:
         The matches whose position is known to `WELL_LOCALISED` pixels, float64; possibly none.

@@ -103,6 +103,8 @@ def test_two_boards_in_one_image(tmp_path):
 def test_boards_that_share_markers_are_refused():
     with pytest.raises(ValueError, match=":from15"):
         parse_boards(["charuco:6x5:40mm", "charuco:6x5:30mm"])
+    with pytest.raises(ValueError, match=":from15"):  # larger dictionaries begin with the smaller one's
+        parse_boards(["charuco:6x5:40mm", "charuco:6x5:30mm:20mm:4x4_100"])
     with pytest.raises(ValueError, match="chessboard:6x5:30mm"):
         parse_boards(["charuco:6x5:40mm", "chessboard:6x5:30mm"])
     with pytest.raises(ValueError, match="board"):

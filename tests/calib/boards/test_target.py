@@ -52,6 +52,7 @@ def test_points_are_numbered_as_opencv_numbers_them():
         ("charuco:8x6:30mm:30mm", "30mm"),
         ("charuco:8x6:30mm:9x9", "'9x9'"),
         ("charuco:40x40:30mm:4x4_50", "800 markers"),
+        ("charuco:3x4:30mm", "6 inner corners and 8 is the least"),
         ("charuco:8x6:30mm:30mm", "charuco:8x6:30mm:30mm"),
         ("charuco:8x6:30mm:22mm:blue", "'blue'"),
         ("charuco:8x6:30mm:22mm:blue", "charuco:8x6:30mm:22mm:4x4_50 (squares, markers, dictionary)"),

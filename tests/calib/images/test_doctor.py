@@ -231,6 +231,15 @@ def test_an_f_of_which_one_side_counts_from_one():
     assert math.isnan(found.before.front)
 
 
+def test_cameras_may_be_linked_in_a_chain():
+    g = np.random.default_rng(0)
+    rig = simulated_rig("wide", 3, g)
+    points = simulated_matches(rig, "wide", g, wrong=0.0)
+    views = {name: View(hw=camera.hw) for name, camera in rig.cameras.items()}
+    linked = Rig(views, links={names: Link(rig.pair(*names).fundamental) for names in points})
+    assert diagnose_matches(linked, sizes(rig), points).named.kind == "nothing"
+
+
 @pytest.mark.parametrize(("hw", "kind"), [((120, 160), "resized"), ((320, 240), "rotated or mirrored")])
 def test_images_of_another_size(hw, kind):
     rig = unlike_pair()

@@ -296,6 +296,23 @@ def test_a_fundamental_matrix_is_refined():
     assert median_off(found.rig, seen_points(rig, noise=0.0, seed=1)) < 0.1
 
 
+def test_unknown_cameras_have_no_parameters():
+    with pytest.raises(ValueError, match="third"):
+        free_parameters(unlike_pair(), ["first", "third"], free=FREE)
+
+
+def test_links_without_lines_are_left_out():
+    rig = unlike_pair()
+    bad, points = drawn(rig).pair("first", "second").fundamental, seen_points(rig)
+    views = {name: View(hw=camera.hw) for name, camera in rig.cameras.items()}
+    flat = {("first", "third"): Link.from_homography(torch.eye(3).double())}
+    linked = Rig({**views, "third": View(hw=HW)}, links={("first", "second"): Link(bad), **flat})
+    open_points = {("first", "third"): points["first", "second"]}
+    assert refine_matches(linked, [points | open_points]).accepted
+    with pytest.raises(ValueError, match="does not relate"):
+        refine_matches(linked, [open_points])
+
+
 def test_bad_input_is_one_clear_line():
     rig, images = rectified_pair(), rectified_images()
     with pytest.raises(ValueError):
