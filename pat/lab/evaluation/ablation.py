@@ -1,7 +1,6 @@
 """Ablation of calibration: one checkpoint with every family of receptive fields on the same scenes.
 
-Reproduces the paper's comparison of calibrated and rectified fields. Scenes are layered photographs seen by
-unrectified rigs, alpha with a focal length 1 to 3 times beta's, or rendered folders.
+Reproduces the paper's comparison of calibrated and rectified fields.
 """
 
 from __future__ import annotations
@@ -142,7 +141,7 @@ class FieldFamily:
 
         Raises:
             ValueError: as `fuse_frame`, such as for a field that the network does not support; if `warped`,
-                also as `rectified`.
+                also as `rectified`. Further errors as `fuse_frame`.
         """
         settings = FuseSettings(field=self.field(far))
         if not self.warped:
@@ -162,9 +161,10 @@ class AblationRow(NamedTuple):
         family: name of the family, or of a baseline.
         psnr: PSNR in dB; NaN if there is no result.
         ssim: SSIM; NaN if there is no result.
-        end_point_error: mean error in pixels of beta of the points at the estimated depth; NaN without depth.
+        end_point_error: mean error in pixels of beta of the points at the estimated depth; NaN for baselines,
+            without a result, and if no pixel can be compared.
         within_one: share of pixels of known true depth whose point is within a pixel of its true position in
-            beta; NaN without depth.
+            beta; NaN likewise.
         note: reason for a missing result; else empty.
     """
 
@@ -235,8 +235,9 @@ def disparity(network: FusionNetwork, pair: Pair) -> float:
 
     Returns:
         The largest displacement from H x, 1 or more, pixels of beta as the network receives it: of its
-        pinhole view if it has a lens, and resized if the network needs equal resolutions. Where a camera has
-        no pinhole view, the largest distance on beta's image from the middle of a pixel's curve.
+        pinhole view if it has a lens, and resized if the network needs equal resolutions and beta's is at
+        most 0.8 or at least 1.25 of alpha's. Where a camera has no pinhole view, the largest distance, on
+        beta's image, from the middle of a pixel's curve.
 
     Raises:
         ValueError: for a pair that is not calibrated or has no depth range.
@@ -260,7 +261,7 @@ def disparity(network: FusionNetwork, pair: Pair) -> float:
 def layered_cases(
     count: int, *, photos: Sequence[Path] = (), hw: HW = (240, 320), seed: int = 0
 ) -> Iterator[AblationCase]:
-    """Render cases from layered photographs, with some noise.
+    """Render cases from layered photographs by rigs of `RIGS`, recorded as `recorded` does.
 
     Args:
         count: number of cases.
@@ -269,10 +270,10 @@ def layered_cases(
         seed: seed of the scenes and the noise.
 
     Yields:
-        One case at a time, its depth range 10 % wider than the scene's.
+        One case at a time, its depth range at either end 10 % wider than alpha's finite depths.
 
     Raises:
-        ValueError: for missing folders and folders without images, when the first case is asked for.
+        ValueError: if no image is found, when the first case is asked for; OSError for an unreadable one.
     """
     bank = PhotoBank.load(*photos) if photos else sample_photographs()
     scenes, g = LayeredScenes(bank, RIGS, hw=hw, seed=seed), Generator().manual_seed(seed)
@@ -287,9 +288,9 @@ def rendered_cases(folder: Path, *, seed: int = 0) -> Iterator[AblationCase]:
     """Read cases from rendered scenes (`scene_folders`): their first camera is alpha, their second beta.
 
     Returns:
-        Iterator over the cases, read on demand, with noise drawn from `seed` for each, and a depth range 10 %
-        wider than alpha's finite depths. It raises ValueError for a damaged scene, one camera, or a scene
-        without finite depths.
+        Iterator over the cases, read on demand, with noise (`recorded`) drawn from `seed` anew for each, and
+        a depth range at either end 10 % wider than alpha's finite depths. It raises ValueError for a damaged
+        scene, one camera, or an alpha without finite depths.
 
     Raises:
         FileNotFoundError: for a missing folder.
@@ -365,12 +366,12 @@ def ablate(
         out: folder for the three files.
 
     Returns:
-        One row for each case and each family or baseline ("alpha alone", "classical"). Where fusion raises
+        One row for each case and each baseline ("alpha alone", "classical") or family. Where fusion raises
         ValueError, or dense positions would need more than `DENSE_LIMIT`, scores are NaN, with a note.
 
     Raises:
-        ValueError: for no cases (nothing is written then), and for one that is not calibrated, has no depth
-            range, or is too small for SSIM.
+        ValueError, before anything is written: for no cases, and for one that is not calibrated, has no depth
+            range, or is too small for SSIM. Errors of `cases` and `assumed`, and others of fusion, pass.
         OSError: if a file cannot be written.
     """
     rows: list[AblationRow] = []
@@ -424,8 +425,11 @@ def point_errors(case: AblationCase, depth: Float[Tensor, "h w"]) -> tuple[float
         depth: estimated depth of alpha's pixels, metres; NaN where unknown.
 
     Returns:
-        Mean error in pixels of beta where both are known and finite, and share of the pixels of known true
+        Mean error in pixels of beta where both are known and finite, and share of the pixels of finite true
         depth with an error of at most 1; (nan, nan) if none can be compared.
+
+    Raises:
+        ValueError: for a rig that is not calibrated.
     """
     alpha, beta = case.rig.pair(ALPHA, BETA).cameras
     x = pixel_grid(alpha.hw, dtype=torch.float64).reshape(-1, 2)
@@ -443,9 +447,10 @@ def markdown(rows: Sequence[AblationRow]) -> str:
     """Format rows as an introduction and a Markdown table of one line for each family.
 
     Returns:
-        The text: mean PSNR with 95 % bootstrap interval (of two scenes or more), mean SSIM, mean gain in PSNR
-        over "calibrated" (dB; blank if that has no scores), PSNR by focal ratio, errors in beta, and last the
-        reason if a family has no score, or how many scenes it lacks.
+        The text. Columns: mean PSNR with 95 % bootstrap interval (of two scenes or more), mean SSIM, mean
+        gain in PSNR over "calibrated" (dB), mean PSNR by focal ratio, both errors in beta, and last the first
+        row's note if a family has no score at all, or how many scenes it lacks. Means are of the scenes that
+        have the figure; blank where none has.
     """
     between = [f"ratio {low:g} to {high:g}" for low, high in pairwise(RATIOS)]
     bins = [f"ratio below {RATIOS[0]:g}", *between, f"ratio from {RATIOS[-1]:g}"]
@@ -494,15 +499,15 @@ def _mean(values: Sequence[float]) -> float:
 
 
 def crops(case: AblationCase, images: Mapping[str, Tensor], rows: Sequence[AblationRow]) -> dict[str, Tensor]:
-    """Cut squares of up to `CROP` pixels where "calibrated" is better than "rectified assumption" by most.
+    """Cut the square, of up to `CROP` pixels a side, where "calibrated" most betters "rectified assumption".
 
     Args:
         images: fused images (3, h, w) by family or baseline.
         rows: scores of the case, one for each family or baseline.
 
     Returns:
-        Crops (3, h, w) of the ground truth and of each row with an image, by title (case, family, PSNR of the
-        whole image). From the top left corner if one of the two families has no image.
+        The same crop (3, h, w) of the ground truth and of each row with an image, by title (case, family,
+        PSNR of the whole image); from the top left corner if one of the two families has no image.
     """
     window = (slice(None), *_most_different(images, case.ground_truth))
     panels = {f"{case.name}: ground truth\nfocal ratio {case.ratio:.1f}": case.ground_truth[window]}

@@ -22,7 +22,7 @@ def grouped(rows: Iterable[T], *names: str) -> dict[Any, list[T]]:
         names: names of attributes, at least one.
 
     Returns:
-        Lists of rows by the value of the one attribute, or by the tuple of several values.
+        Lists of rows by the value of the one attribute, or by the tuple of several.
     """
     groups: dict[Any, list[T]] = {}
     for row in rows:

@@ -127,7 +127,7 @@ def furnished(name: str, seed: int, rig: Rig, surface: Surface, moving: float) -
 
     Raises:
         ValueError: for a rig without a calibrated camera, a far bound below 5/3 of the near one, and a
-            negative seed.
+            negative seed or `moving`.
     """
     setting = Setting(rig, seeded(name, seed))
     room = _room(setting)

@@ -36,7 +36,7 @@ def abstract(seed: int, rig: Rig, *, moving: float = 0.0) -> Scene:
         The scene, the same for the same seed and rig; fewer shapes if they do not fit.
 
     Raises:
-        ValueError: for a rig without a calibrated camera, and a negative seed.
+        ValueError: as `furnished`.
     """
     return furnished("abstract", seed, rig, _pattern, moving)
 
@@ -56,7 +56,8 @@ def photographs(seed: int, rig: Rig, folder: str | Path, *, moving: float = 0.0)
         The scene, the same for the same seed, rig and images.
 
     Raises:
-        ValueError: for a missing folder, one without images, and as `abstract`.
+        ValueError: for a missing folder, one without images, and as `furnished`.
+        OSError: for an image that cannot be read.
     """
     files = _images(Path(folder))
 
@@ -75,7 +76,8 @@ def generator_named(name: str) -> Callable[..., Scene]:
     """Look up a scene generator: "abstract", "photographs", or your own "module:function".
 
     Returns:
-        The function, called with seed, rig and `moving` seconds; "photographs" needs `folder` too.
+        The function, called with seed, rig and `moving` seconds; "photographs" needs `folder` too. Your own
+        is not checked to be one.
 
     Raises:
         ValueError: for a name that is neither, or cannot be imported.
@@ -119,8 +121,7 @@ def paints(rng: Generator) -> tuple[Paint, ...]:
 
 
 def _near_infrared(rng: Generator, rgb: Vec3) -> float:
-    """Near-infrared reflectance: dyes hardly absorb there, pigments as in red, green is often a leaf, soot
-    stays black."""
+    """Near-infrared reflectance of a dye, a pigment, a leaf, or soot."""
     r, g, b = rgb
     if g > 1.2 * max(r, b):
         return float(rng.uniform(0.4, 0.6))

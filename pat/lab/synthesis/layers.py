@@ -37,7 +37,7 @@ class Layers:
         outline_from_plane: map from metres to the outline's square [-1, 1]^2.
         texture: number of the texture.
         texel_from_plane: map from metres to pixels of the full texture.
-        colour: matrix by which texture colours (r, g, b, 1), 0..1, are multiplied.
+        colour: matrix by which texture colours (r, g, b, 1), 0..1, are multiplied, before clipping.
     """
 
     plane_from_world: Pose
@@ -56,8 +56,8 @@ def draw_layers(
     """Draw random layers in front of the rigs' first camera, between near and far.
 
     Layer 0 is the background. In half of the scenes layer 1 is a ground or a ceiling, in a quarter layer 2 is
-    a wall; the others have outlines. In one scene in eight all are drawn within 5 % of one depth. Layers that
-    slant nearer than near are moved back, possibly beyond far.
+    a wall; the others have outlines. In one scene in eight all are within 5 % of one depth. Layers that slant
+    nearer than near are moved back, possibly beyond far.
 
     Args:
         rigs: rigs, one for each scene.

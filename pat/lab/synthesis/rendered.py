@@ -95,9 +95,10 @@ class Rendered:
             The frame, float32 (index int64).
 
         Raises:
-            ValueError: for an unknown camera, and a damaged rig.yaml or render.json.
+            ValueError: for an unknown camera, and a damaged rig.yaml.
             IndexError: for a `number` beyond its frames.
-            OSError: if a file cannot be read; damaged frames give BadZipFile, KeyError, TypeError and others.
+            OSError: if a file cannot be read; a damaged render.json or frame gives ValueError, BadZipFile,
+                KeyError, TypeError and others.
         """
         entry = self.about["frames"][self.rig.require(camera)][number]
         with np.load(self.folder / entry["file"]) as arrays:
@@ -146,8 +147,7 @@ def is_rendered(folder: str | Path) -> bool:
 
 
 UNEVEN = 0.001
-"""Relative deviation of inverse depth from its neighbours' mean that counts as a crease: interpolation errs
-by up to an eighth of it, a hundredth of a pixel at a disparity of 80."""
+"""Deviation that counts as a crease: interpolation errs by up to an eighth of it."""
 
 
 def depth_between(

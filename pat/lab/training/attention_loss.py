@@ -48,11 +48,11 @@ def attention_loss(
 ) -> Tensor:
     """Compute the mean cross-entropy of the attention weights against the true positions, over all betas.
 
-    For known points that a beta does not see it is against equal weights, times `UNSEEN`. Visible points off
-    the segment (`OFF`) do not count. No samples of beta are gathered.
+    For known points that a beta does not see it is against equal weights, times `UNSEEN`. Pixels without a
+    valid segment, and visible points off it (`OFF`) or off beta, do not count; 0 if none does.
 
     Args:
-        compared: features and segments of each of one or more betas.
+        compared: features and segments of each of one or more betas; a `border` is not applied.
         position: true positions (x, y) of all pixels of alpha, pixels of each beta; (0, 0) where unknown.
         visible: True where that beta sees the point.
         stride: only every `stride`-th row and column of alpha counts.

@@ -55,8 +55,8 @@ class TrainConfig:
     """A recipe. A step sees `groups` times `batch` scenes; there are `steps` steps, or what `minutes` allow.
 
     Raises:
-        ValueError: naming the entry, for values out of range, sides of `hw` that are not multiples of 16, and
-            a share of rendered or measured scenes without their folder or the other way round.
+        ValueError: naming the entry, for values out of range, sides of `hw` that are not multiples of 16, a
+            share of rendered or measured scenes without folders or the other way round, and both above 1.
     """
 
     photos: tuple[Path, ...] = ()
@@ -161,7 +161,8 @@ def recipes() -> tuple[str, ...]:
 
 
 def load_config(name: str | Path) -> TrainConfig:
-    """Load a recipe of the package by name, or else a YAML file.
+    """Load a recipe of the package by name, or else a YAML file; its paths stay as they are, relative to the
+    current folder.
 
     Raises:
         FileNotFoundError: if it is neither.
@@ -218,10 +219,10 @@ def command_line(arguments: list[str], prog: str = "pat lab train") -> TrainConf
         The recipe.
 
     Raises:
-        ValueError: for an invalid recipe, and for one that names code as its field where the arguments do
-            not.
+        ValueError: for an invalid recipe, also after the overrides, and for one that names code as its field
+            where the arguments do not.
         FileNotFoundError: for a missing recipe.
-        UsageError: for unknown options and invalid values.
+        UsageError: for unknown options and values that cannot be read.
         SystemExit: after `--help`, which prints.
     """
     base = TrainConfig()

@@ -54,7 +54,7 @@ class MeasuredPairs(Crops):
     `Crops`.
 
     Raises:
-        FileNotFoundError: for a missing folder.
+        FileNotFoundError: for a missing folder, or right image of Middlebury's.
         ValueError: for a folder without pairs, no chosen pair, and as `check`.
     """
 

@@ -115,7 +115,7 @@ def lens_for(camera: View, name: str) -> Lens:
 
     Raises:
         ValueError: naming the camera, if it is not calibrated, batched, skewed or mirrored, or its lens is
-            not central, invalid, or too wide for a plane image.
+            not central, invalid, or too wide or too strong for a plane image.
     """
     if not isinstance(camera, Camera):
         raise ValueError(f"camera '{name}' is not calibrated: rendering needs its K, R and t")

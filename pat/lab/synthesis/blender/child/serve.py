@@ -18,7 +18,8 @@ from .build import build
 def serve() -> None:
     """Answer requests on standard input until it ends, or one is refused.
 
-    An answer is a line of JSON: {"version": Blender's} to the first, {} to others, {"error": one line}.
+    An answer is a line of JSON: {"version": Blender's} to the first, {} to others; {"error": one line} for a
+    ValueError. Other errors pass, without an answer.
     """
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # Blender prints there, past Python
@@ -53,7 +54,7 @@ class Stage:
         request: `scene`, `meshes` and `settings`, as the studio sends them.
 
     Raises:
-        ValueError: if bpy cannot be imported, and as `build`.
+        ValueError: if bpy cannot be imported; it and other errors as `build`.
     """
 
     def __init__(self, request: Any):
