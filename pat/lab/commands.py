@@ -88,14 +88,13 @@ class Evaluate(StereoSets):
         self.write(rows, stereo.sets_markdown(rows))
 
     def sets(self) -> dict[str, Iterable[StereoPair]]:
-        """Open the folders of stereo pairs, and check the rates.
+        """Open the folders of stereo pairs as `StereoSets.sets`, and check the rates.
 
         Returns:
             The pairs, read on demand, by data set.
 
         Raises:
-            ValueError: for no rates or one below 1, and as `StereoSets.sets`.
-            FileNotFoundError: for a missing folder, or file of Middlebury's.
+            ValueError: for no rates or one below 1; it and further errors as `StereoSets.sets`.
         """
         if not self.rates or min(self.rates) < 1:
             raise ValueError(f"--rates: {' '.join(map(str, self.rates))}: give whole numbers from 1 up")

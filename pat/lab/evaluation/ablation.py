@@ -192,8 +192,7 @@ class HorizontalDisplacement:
         """Compute horizontal segments in beta around H x, for pixels x of alpha, clipped to beta's image.
 
         Returns:
-            Segments from right to left, one for each pixel; invalid where H x is infinite or the segment
-            misses beta's image.
+            Segments from right to left, (*n); invalid where H x is infinite or they miss beta's image.
 
         Raises:
             ValueError: as `Pair.homography`.
@@ -340,10 +339,8 @@ def recorded(ideal: Mapping[str, Tensor], g: Generator) -> dict[str, Tensor]:
 def sample_photographs(*, count: int = 12, seed: int = 0) -> PhotoBank:
     """Load four photographs of scikit-image, and `count` patterns drawn from `seed`.
 
-    They are free to use (astronaut: NASA; chelsea, coffee and rocket: CC0).
-
     Returns:
-        Bank of textures, the photographs first.
+        Bank of textures, the photographs first: astronaut (NASA), chelsea, coffee and rocket (CC0).
     """
     from skimage import io
     from skimage.data import data_dir
@@ -427,9 +424,6 @@ def point_errors(case: AblationCase, depth: Float[Tensor, "h w"]) -> tuple[float
     Returns:
         Mean error in pixels of beta where both are known and finite, and share of the pixels of finite true
         depth with an error of at most 1; (nan, nan) if none can be compared.
-
-    Raises:
-        ValueError: for a rig that is not calibrated.
     """
     alpha, beta = case.rig.pair(ALPHA, BETA).cameras
     x = pixel_grid(alpha.hw, dtype=torch.float64).reshape(-1, 2)
@@ -518,7 +512,7 @@ def crops(case: AblationCase, images: Mapping[str, Tensor], rows: Sequence[Ablat
 
 
 def _most_different(images: Mapping[str, Tensor], ground_truth: Tensor) -> tuple[slice, slice]:
-    """Square in which the rectified assumption is worst compared with calibrated."""
+    """Square of `crops`."""
     h, w = ground_truth.shape[1:]
     side = min(CROP, h, w)
     names = [n for n in ("rectified assumption", "calibrated") if n in images]

@@ -32,8 +32,7 @@ from pat.media.colour import linear_from_srgb
 from pat.support.schema import check_fields, from_document
 
 FARTHEST = 50.0
-"""Multiple of the near bound at which layered scenes end for rigs that see to infinity."""
-
+"""Largest far bound of layered scenes, in multiples of the near one."""
 
 Renderer = Callable[[int, Path], None]
 """Function of a seed and a folder that makes the folder, and renders and checks a scene into it."""
@@ -84,11 +83,10 @@ class LayeredSettings:
 
         Returns:
             A function that renders the scene of a seed into a new folder, `render(seed, out)`; it raises
-            FileExistsError if there is one, and OSError if a file cannot be written.
+            OSError if there is one (FileExistsError), or a file cannot be written.
 
         Raises:
-            ValueError: as `rig_from_alpha`, and if no image is found in `photos`; OSError for an unreadable
-                one.
+            ValueError: as `rig_from_alpha`, and if `photos` hold no image; OSError for an unreadable one.
         """
         rig_batch = rig_from_alpha(rig)
         if self.photos:
@@ -151,7 +149,7 @@ class BlenderSettings:
         self.render_settings()
 
     def render_settings(self) -> RenderSettings:
-        """Combine preset and own entries, with one thread by default, as a farm has one worker for each core.
+        """Combine preset and own entries, with one thread by default: a farm has one worker for each core.
 
         Raises:
             ValueError: naming the entry, for an invalid one.

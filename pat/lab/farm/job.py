@@ -52,11 +52,11 @@ class RetryLimits:
     """Limits on the attempts at a scene.
 
     Attributes:
-        timeout: seconds a scene may take, more than 0.
-        refusals: seeds tried while the self-check refuses them, more than 0.
+        timeout: seconds for a scene, all its seeds together, more than 0; not kept by Dask's workers.
+        refusals: seeds tried while the self-check refuses them or they cannot be rendered, more than 0.
 
     Raises:
-        ValueError: for values of 0 or less.
+        ValueError: for values of 0 or less, and NaN.
     """
 
     timeout: float = 900.0
@@ -278,9 +278,7 @@ def render(
 
 
 def write_manifest(config: RenderConfig, root: Path) -> None:
-    """Write the manifest of a job into its folder `root`, or check that the existing one is of the same job.
-
-    A folder of scenes without a manifest gets one.
+    """Write a job's manifest into its folder `root`, or check that the existing one is of the same job.
 
     Raises:
         ValueError: if the manifest is of another configuration, or does not say, or a file is damaged.

@@ -96,16 +96,12 @@ def view_figures(frame: RenderedFrame) -> dict[str, float]:
 
 
 def texture(rgb: Float[Tensor, "3 h w"], patch: int = 8) -> Float[Tensor, ""]:
-    """Compute the share of patches whose brightness (mean of the channels, clipped to 0..1) has a standard
-    deviation above 2 % of its mean, or of 0.01 if the mean is less.
+    """Compute the share, a scalar, of patches whose brightness (mean of the channels, clipped to 0..1) has a
+    standard deviation above 2 % of its mean, or of 0.01 if the mean is less.
 
     Args:
         rgb: image in linear light.
-        patch: side of a patch, pixels; the image's shorter side if that is less. What exceeds whole patches
-            at the bottom and the right does not count.
-
-    Returns:
-        A scalar tensor, 0..1.
+        patch: side of a patch, pixels; the image's shorter side if that is less. Only whole patches count.
     """
     grey = rgb.mean(0)[None, None].clamp(0, 1)
     mean = avg_pool2d(grey, min(patch, *rgb.shape[1:]))

@@ -44,12 +44,11 @@ def abstract(seed: int, rig: Rig, *, moving: float = 0.0) -> Scene:
 def photographs(seed: int, rig: Rig, folder: str | Path, *, moving: float = 0.0) -> Scene:
     """Generate a scene like `abstract`, with the images under a folder on all surfaces.
 
-    Images that are black in large parts are avoided.
-
     Args:
         seed: random seed, 0 or more.
         rig: rig that sees the scene.
-        folder: folder of images, searched with its subfolders, once for the process.
+        folder: folder of images, searched with its subfolders, once for the process; those that are black
+            in large parts are avoided.
         moving: seconds for which objects move; 0 for none.
 
     Returns:
@@ -76,8 +75,8 @@ def generator_named(name: str) -> Callable[..., Scene]:
     """Look up a scene generator: "abstract", "photographs", or your own "module:function".
 
     Returns:
-        The function, called with seed, rig and `moving` seconds; "photographs" needs `folder` too. Your own
-        is not checked to be one.
+        The function (your own is not checked to be one), called with seed, rig and `moving` seconds;
+        "photographs" needs `folder` too.
 
     Raises:
         ValueError: for a name that is neither, or cannot be imported.

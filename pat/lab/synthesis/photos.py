@@ -66,13 +66,12 @@ class PhotoBank:
         taken (`recoloured`).
 
         Args:
-            folders: folders, searched with their subfolders; not read if the cache exists.
-            max_edge: longest side in pixels that images are reduced to; without effect once the cache exists.
-            cache: .npz file, written on the first call and read on later ones; it is not checked against the
-                folders. None for no cache.
+            folders: folders, searched with their subfolders.
+            max_edge: longest side in pixels that images are reduced to.
+            cache: .npz file, written on the first call; once it exists it is read in place of the folders,
+                whatever `max_edge` is. None for no cache.
             seed: seed of the patterns and mixtures.
-            choose: called with an image's number, from 0 in the order of paths, returns True to take it; to
-                hold some out.
+            choose: called with an image's number, from 0 in the order of paths, returns True to take it.
 
         Raises:
             ValueError: if no image is found or chosen, and for a file that is no cache.

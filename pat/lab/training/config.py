@@ -56,7 +56,7 @@ class TrainConfig:
 
     Raises:
         ValueError: naming the entry, for values out of range, sides of `hw` that are not multiples of 16, a
-            share of rendered or measured scenes without folders or the other way round, and both above 1.
+            share of rendered or measured scenes without folders or the other way round, or over 1 in all.
     """
 
     photos: tuple[Path, ...] = ()
@@ -161,8 +161,7 @@ def recipes() -> tuple[str, ...]:
 
 
 def load_config(name: str | Path) -> TrainConfig:
-    """Load a recipe of the package by name, or else a YAML file; its paths stay as they are, relative to the
-    current folder.
+    """Load a recipe of the package by name, or else a YAML file; paths in it are not resolved by its folder.
 
     Raises:
         FileNotFoundError: if it is neither.

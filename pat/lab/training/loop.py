@@ -128,8 +128,7 @@ class Run:
 
     Raises:
         ValueError: for data or processes that do not suit the recipe, or a checkpoint of another network.
-        FileNotFoundError: for a missing folder of scenes or pairs, or file of weights.
-        OSError: if a file cannot be written.
+        OSError: as `train`.
     """
 
     def __init__(self, config: TrainConfig, here: Process, former: Checkpoint | None) -> None:

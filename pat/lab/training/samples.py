@@ -214,8 +214,7 @@ def scenes(config: TrainConfig, *, device: str = "cpu") -> tuple[SampleSource, S
     Raises:
         ValueError: for no photographs, as in a missing folder, or too few to hold some out, an unknown field,
             and other data that cannot be used.
-        FileNotFoundError: for a missing folder of rendered scenes or measured pairs.
-        OSError: as `photographs`.
+        OSError: as `photographs`; FileNotFoundError as `source_of`.
     """
     n, layered = config.held_out, config.rendered + config.measured < 1
     bank, unseen = photographs(config) if layered else (None, None)

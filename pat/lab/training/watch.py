@@ -37,8 +37,7 @@ class Watch:
         tensorboard: True to log for TensorBoard too.
 
     Raises:
-        ValueError: if TensorBoard is wanted and not installed, or a line of the two files is damaged
-            (KeyError for one of log.jsonl without a step).
+        ValueError: if TensorBoard is wanted and not installed, or a line of the two files is damaged.
         OSError: if a file cannot be written.
     """
 

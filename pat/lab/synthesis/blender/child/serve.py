@@ -16,10 +16,9 @@ from .build import build
 
 
 def serve() -> None:
-    """Answer requests on standard input until it ends, or one is refused.
+    """Answer requests on standard input until it ends, or one raises ValueError; other errors pass.
 
-    An answer is a line of JSON: {"version": Blender's} to the first, {} to others; {"error": one line} for a
-    ValueError. Other errors pass, without an answer.
+    An answer is a line of JSON: {"version": Blender's} to the first, {} to others, {"error": one line}.
     """
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # Blender prints there, past Python
