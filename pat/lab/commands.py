@@ -40,7 +40,7 @@ class StereoSets:
         """Open the folders of stereo pairs, and check that results can be written.
 
         Returns:
-            The pairs, read on demand, by data set.
+            Iterators over the pairs, read on demand, by data set.
 
         Raises:
             ValueError: if no folder is given, one has no pair, or `out` cannot be written or is in one.
@@ -91,7 +91,7 @@ class Evaluate(StereoSets):
         """Open the folders of stereo pairs as `StereoSets.sets`, and check the rates.
 
         Returns:
-            The pairs, read on demand, by data set.
+            Iterators over the pairs, read on demand, by data set.
 
         Raises:
             ValueError: for no rates or one below 1; it and further errors as `StereoSets.sets`.
@@ -231,7 +231,7 @@ class Render:
     """The file's `blender.generator`, if it is code of your own: the file alone does not run it."""
 
     def run(self) -> None:
-        """Render the missing scenes; exits with status 1 if some are still missing afterwards.
+        """Render the missing scenes of the shard; exits with status 1 if some are still missing afterwards.
 
         Raises:
             FileNotFoundError: for a missing configuration file.

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from tokenize import TokenError
 from typing import NamedTuple
 from zipfile import BadZipFile
+from zlib import error as BadDeflate
 
 import torch
 from jaxtyping import Float
@@ -17,6 +19,8 @@ from arraygeom import Camera, Rig, pinhole_view, pixel_grid, resampled, resize_m
 from arraygeom.pixels import HW, map_homogeneous
 from pat.lab.synthesis.rendered import RENDER_FILE, Rendered, is_rendered
 
+DAMAGED = EOFError, BadZipFile, BadDeflate, TokenError, NotImplementedError
+"""Errors of NumPy for a damaged archive, beside ValueError, KeyError and TypeError."""
 AGAIN = "remove it and run 'pat lab render' again"
 
 
@@ -50,15 +54,12 @@ def scene_folders(root: str | Path) -> list[Path]:
 
 @contextmanager
 def reading(folder: Path) -> Iterator[None]:
-    """Context manager that turns errors while reading a scene into ValueError, naming its folder.
-
-    Raises:
-        ValueError: for OSError, ValueError, KeyError, EOFError, BadZipFile and TypeError in the block; other
-            errors pass.
+    """Context manager that turns OSError, ValueError, KeyError, TypeError and `DAMAGED`, raised while a scene
+    is read, into a ValueError that names its folder; other errors pass.
     """
     try:
         yield
-    except (OSError, ValueError, KeyError, EOFError, BadZipFile, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, *DAMAGED) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise ValueError(f"{folder}: cannot be read ({reason}): {AGAIN}") from None
 

@@ -311,9 +311,7 @@ def versions() -> dict[str, str]:
 
 
 def check_space(root: Path, scenes: int, scene_bytes: float) -> None:
-    """Check that the disk of folder `root` holds `scenes` more scenes of `scene_bytes` bytes each.
-
-    `RESERVE` bytes stay free beside them.
+    """Check that the disk of folder `root` holds `scenes` more of `scene_bytes` bytes each, and `RESERVE`.
 
     Raises:
         FileNotFoundError: for a missing folder.
