@@ -180,7 +180,7 @@ class AblationRow(NamedTuple):
 
 @dataclass(frozen=True)
 class HorizontalDisplacement:
-    """Field along rows around the true H x: rectified geometry with correct position and scale.
+    """Field along rows around H x (`Pair.homography`): rectified geometry with correct position and scale.
 
     Attributes:
         disparity: half length of the segment, pixels of beta.
@@ -367,8 +367,8 @@ def ablate(
         ValueError, or dense positions would need more than `DENSE_LIMIT`, scores are NaN, with a note.
 
     Raises:
-        ValueError, before anything is written: for no cases, and for one that is not calibrated, has no depth
-            range, or is too small for SSIM. Errors of `cases` and `assumed`, and others of fusion, pass.
+        ValueError: for no cases, and for one that is not calibrated, has no depth range, or is too small for
+            SSIM; nothing is written then. Errors of `cases` and `assumed`, and others of fusion, pass.
         OSError: if a file cannot be written.
     """
     rows: list[AblationRow] = []
@@ -493,7 +493,8 @@ def _mean(values: Sequence[float]) -> float:
 
 
 def crops(case: AblationCase, images: Mapping[str, Tensor], rows: Sequence[AblationRow]) -> dict[str, Tensor]:
-    """Cut the square, of up to `CROP` pixels a side, where "calibrated" most betters "rectified assumption".
+    """Cut the square, of up to `CROP` pixels a side, where the mean squared error of "rectified assumption"
+    exceeds that of "calibrated" most.
 
     Args:
         images: fused images (3, h, w) by family or baseline.

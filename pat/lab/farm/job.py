@@ -148,8 +148,8 @@ class RenderConfig:
 
         Raises:
             FileNotFoundError: for a missing file of the rig.
-            ValueError: for a rig that cannot be read or rendered, a missing library, folders without images
-                (Blender's are looked at when a scene is made), and a generator that cannot be imported.
+            ValueError: for a rig that cannot be read; it and further errors as the backend's `images` and
+                `renderer`.
         """
         rig = Rig.load(self.rig)
         self.settings.images(rig)  # refuses rigs
@@ -163,7 +163,7 @@ class RenderConfig:
             Bytes of all its images and other files together.
 
         Raises:
-            ValueError: for a rig that cannot be read or rendered, and a generator that cannot be imported.
+            ValueError: for a rig that cannot be read, and as the backend's `images`.
             FileNotFoundError: for a missing file of the rig.
         """
         return sum(10.0 * h * w for h, w in self.settings.images(Rig.load(self.rig))) + 20_000
@@ -311,7 +311,7 @@ def versions() -> dict[str, str]:
 
 
 def check_space(root: Path, scenes: int, scene_bytes: float) -> None:
-    """Check that the disk of folder `root` holds `scenes` more of `scene_bytes` bytes each, and `RESERVE`.
+    """Check that the disk of folder `root` has room for `scenes` more of `scene_bytes` bytes, and `RESERVE`.
 
     Raises:
         FileNotFoundError: for a missing folder.

@@ -25,7 +25,8 @@ from .scene import Paint, Scene, Texture, TextureKind, Vec3
 
 
 def abstract(seed: int, rig: Rig, *, moving: float = 0.0) -> Scene:
-    """Generate one of the paper's scenes: 10 to 20 patterned shapes in a room, within the rig's depth range.
+    """Generate one of the paper's scenes: 10 to 20 patterned shapes in a room, within the rig's depth range
+    (see `furnished`).
 
     Args:
         seed: random seed, 0 or more.
@@ -33,7 +34,7 @@ def abstract(seed: int, rig: Rig, *, moving: float = 0.0) -> Scene:
         moving: seconds for which objects move, rotate and stretch along random paths; 0 for none.
 
     Returns:
-        The scene, the same for the same seed and rig; fewer shapes if they do not fit.
+        The scene, the same for the same arguments; fewer shapes if they do not fit.
 
     Raises:
         ValueError: as `furnished`.
@@ -47,12 +48,11 @@ def photographs(seed: int, rig: Rig, folder: str | Path, *, moving: float = 0.0)
     Args:
         seed: random seed, 0 or more.
         rig: rig that sees the scene.
-        folder: folder of images, searched with its subfolders, once for the process; those that are black
-            in large parts are avoided.
+        folder: folder of images, searched with its subfolders, once for the process; dark ones are avoided.
         moving: seconds for which objects move; 0 for none.
 
     Returns:
-        The scene, the same for the same seed, rig and images.
+        The scene, the same for the same arguments and images.
 
     Raises:
         ValueError: for a missing folder, one without images, and as `furnished`.

@@ -95,7 +95,7 @@ class LayeredScenes:
         """Render random scenes seen by given rigs, whose first camera is alpha and the world frame.
 
         A view with fewer pixels a radian than alpha is rendered at about alpha's resolution (up to 4 times)
-        and averaged by area, as a coarser sensor would. Lens models are ignored.
+        and its image averaged by area, as a coarser sensor would. Lens models are ignored.
 
         Args:
             rigs: rigs of float64 on the CPU, alpha at the world's origin.
@@ -103,7 +103,7 @@ class LayeredScenes:
             oversampling: factor of further samples in a pixel along each axis.
 
         Returns:
-            A batch, one scene for each rig, of the rigs' sizes, cameras float32, on this source's device.
+            A batch without gradient, a scene for each rig, of its sizes, on this device, cameras float32.
         """
         layers = draw_layers(rigs, self.layers, self.photos, len(self.outlines), generator)
         factors = [oversampling * _oversampling(rigs.cameras[0], v) for v in rigs.cameras]

@@ -56,8 +56,8 @@ def draw_layers(
     """Draw random layers in front of the rigs' first camera, between near and far.
 
     Layer 0 is the background. In half of the scenes layer 1 is a ground or a ceiling, in a quarter layer 2 is
-    a wall; the others have outlines. In one scene in eight all are within 5 % of one depth. Layers that slant
-    nearer than near are moved back, possibly beyond far.
+    a wall; the others have outlines. In one scene in eight all are drawn within 5 % of one depth. Layers that
+    slant nearer than near are moved back, possibly beyond far.
 
     Args:
         rigs: rigs, one for each scene.

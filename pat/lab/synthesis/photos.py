@@ -62,8 +62,8 @@ class PhotoBank:
         seed: int = 0,
         choose: Callable[[int], bool] = lambda i: True,
     ) -> PhotoBank:
-        """Load the images under folders (`read_photographs`), and add 48 patterns and 48 mixtures of those
-        taken (`recoloured`).
+        """Load the images under folders (`read_photographs`), followed by 48 patterns and 48 mixtures of the
+        images taken (`recoloured`).
 
         Args:
             folders: folders, searched with their subfolders.

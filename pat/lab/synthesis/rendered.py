@@ -147,7 +147,7 @@ def is_rendered(folder: str | Path) -> bool:
 
 
 UNEVEN = 0.001
-"""Deviation that counts as a crease: interpolation errs by up to an eighth of it."""
+"""Relative second difference that counts as a crease: interpolation errs by up to an eighth of it."""
 
 
 def depth_between(
@@ -163,7 +163,7 @@ def depth_between(
         depth: depth of the pixels, metres; infinite where nothing is hit, as which NaN counts.
         index: object index of each pixel.
         x: positions (x, y), pixels.
-        uneven: relative deviation of inverse depth from its neighbours' mean that counts as a step or crease.
+        uneven: second difference of inverse depth, relative to it, above which a pixel has a step or crease.
 
     Returns:
         Depth (n), infinite between infinite depths; and True on the image where the four pixels around are

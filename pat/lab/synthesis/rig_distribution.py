@@ -24,7 +24,7 @@ class RigDistribution:
         frame: width of the whole image as a multiple of alpha's, which is a patch of it.
         focal: focal length as a multiple of that width.
         resolutions: beta's pixels a radian over alpha's, and its size over alpha's; one is drawn for each
-            camera of a batch.
+            beta of a batch, before `focal_ratio`.
         alpha: side of alpha against a beta in rectified rigs; "either" draws one for each beta of each rig.
         focal_ratio: further factor of beta's focal length (general).
         rotation: size of a random rotation, degrees: two standard deviations about each axis (general).

@@ -245,7 +245,7 @@ def difference(config: TrainConfig, other: TrainConfig) -> str | None:
     """Compare two recipes, except for the entries in `UNSEEN`.
 
     Returns:
-        The first difference, as "name: value of config, value of other"; None if both are the same run.
+        The first difference, as "name: value of config, value of other"; None if there is none.
     """
     for entry in dataclasses.fields(TrainConfig):
         ours, theirs = getattr(config, entry.name), getattr(other, entry.name)

@@ -51,8 +51,8 @@ def train(config: TrainConfig) -> Path:
             saved.
         FileNotFoundError: for a missing folder of scenes or pairs, or file of weights.
         OSError: if a file cannot be read or written.
-        ValueError: for a folder with another run, in use or among the photographs, no such device, or data,
-            field or groups that do not suit the recipe, the processes or each other.
+        ValueError: for a folder with another run, in use or among the photographs, no such device, and data,
+            a field or a number of groups that cannot be used.
     """
     check_apart(config.out, config.photos)
     former = former_run(config)

@@ -347,7 +347,7 @@ def recorded(
 
 
 def steps(g: Generator, recording: RecordingConfig) -> list[Step]:
-    """Draw the degradations of one camera: gain, blur and noise, each with its own probability, then 8 bits.
+    """Draw one camera's degradations: gain, blur, noise, each by its own probability; then clipping, 8 bits.
 
     Returns:
         Steps for `pat.sensors.steps.record`, in order.

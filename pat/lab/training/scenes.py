@@ -229,7 +229,7 @@ def beside(alpha: RenderedView, beta: RenderedView, size: HW, hw: HW, g: Generat
         beta: beta's whole view.
         size: (height, width) of the result.
         hw: (height, width) of alpha's window.
-        g: random generator of the depth.
+        g: random generator of the depth and the shift.
 
     Returns:
         Beta's window, resized to `size`, with its camera; one larger than the image has NaN depth beyond.

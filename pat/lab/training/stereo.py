@@ -147,7 +147,7 @@ class MeasuredPairs(Crops):
 
 
 def disparity_files(pair: PairFiles) -> tuple[Path, Path]:
-    """Find the disparity files of the left and the right image.
+    """Find the disparity files (`DISPARITIES`) of the left and the right image beside the left image.
 
     Returns:
         Paths of left's and of right's disparity.

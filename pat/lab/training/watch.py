@@ -28,7 +28,7 @@ HEADER = "step,loss,gradient,rate\n"
 
 
 class Watch:
-    """Progress reports of the first process: `steps.csv`, `log.jsonl`, images, a bar on a terminal.
+    """Progress reports until `close`: `steps.csv`, `log.jsonl`, images, a bar on a terminal, TensorBoard.
 
     Args:
         out: folder of the run.

@@ -143,7 +143,7 @@ def read_layers(path: Path) -> dict[str, Tensor]:
         Channels (h, w), float32, by pass and channel without the layer, such as "Combined.R".
 
     Raises:
-        ImportError: without OpenEXR.
+        ImportError: without OpenEXR. RuntimeError: for a file that it cannot read.
     """
     import OpenEXR
 

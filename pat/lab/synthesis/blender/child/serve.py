@@ -67,7 +67,7 @@ class Stage:
         self._quality()
 
     def render(self, request: Any) -> None:
-        """Render one frame (colours, depth, object index) to a multi-layer EXR file.
+        """Render one frame (colours, depth, object index) to a multi-layer EXR file. Errors of Blender pass.
 
         Args:
             request: `places`, `spectrum`, `path`, `image`, `camera` and `pose`, as `Studio.channels` sends
