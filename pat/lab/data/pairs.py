@@ -161,8 +161,9 @@ def folder_pairs(root: str | Path) -> Iterator[StereoPair]:
     Rectification is assumed.
 
     Returns:
-        Pairs, read one at a time, named by left's path below `root` without suffix and mark (a name that is
-        nothing else stays), with `max_disparity` `PAPER_DISPARITY` and no true disparity.
+        Pairs, read one at a time, named by left's path below `root` without suffix and marks that begin a
+        name or follow _ (one that is the whole path stays), with `max_disparity` `PAPER_DISPARITY` and no
+        true disparity.
 
     Raises:
         FileNotFoundError: for a missing folder.

@@ -110,10 +110,10 @@ class Setting:
 
 
 def furnished(name: str, seed: int, rig: Rig, surface: Surface, moving: float) -> Scene:
-    """Make a scene of 10 to 20 shapes in a room, within the depth range of `Setting` of a camera each.
+    """Make a scene of 10 to 20 shapes in a room, each within the depth range (`Setting`) of one camera.
 
-    No camera has one nearer. The room's walls are in the range of all cameras, if some tries find such a
-    room: not for views over 150 degrees, or cameras opposed or ahead of each other with a narrow range.
+    None is nearer to another camera. The walls are within the range of all cameras where such a room is
+    found: not for views over 150 degrees, or cameras opposed or far ahead of each other for the range.
 
     Args:
         name: name of the generator, part of the seed.

@@ -163,11 +163,11 @@ def depth_between(
         depth: depth of the pixels, metres; infinite where nothing is hit, as which NaN counts.
         index: object index of each pixel.
         x: positions (x, y), pixels.
-        uneven: second difference of inverse depth, relative to it, above which a pixel has a step or crease.
+        uneven: relative second difference of inverse depth; two neighbours above it have an edge between.
 
     Returns:
-        Depth (n), infinite between infinite depths; and True on the image where the four pixels around are
-        one object, or all hit nothing, without step or crease: elsewhere the depth may lie between two
+        Depth (*n), infinite between infinite depths; and True on the image where the four pixels around are
+        one object, or all hit nothing, without such an edge: elsewhere the depth may lie between two
         surfaces, and off the image it is infinite.
     """
     inverse = torch.where(depth.isfinite(), 1 / depth, 0.0).to(x)

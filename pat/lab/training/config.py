@@ -165,16 +165,16 @@ def load_config(name: str | Path) -> TrainConfig:
 
     Raises:
         FileNotFoundError: if it is neither.
-        ValueError: naming the file and the entry, for an invalid recipe.
+        ValueError: naming the file and the entry, as `parse_config`.
     """
     path = next((p for p in (RECIPES / f"{name}.yaml", Path(name)) if p.is_file()), None)
     if path is None:
         raise FileNotFoundError(f"no recipe '{name}' (a file, or a shipped name){near(name, recipes())}")
-    return parse_config(path.read_text(encoding="utf-8"), str(path))
+    return parse_config(path.read_bytes(), str(path))
 
 
-def parse_config(text: str, name: str = "config") -> TrainConfig:
-    """Parse a recipe from YAML text; `name` begins messages.
+def parse_config(text: str | bytes, name: str = "config") -> TrainConfig:
+    """Parse a recipe from YAML text (UTF-8 if bytes); `name` begins messages.
 
     Returns:
         The recipe, with defaults for entries that the text leaves out.
