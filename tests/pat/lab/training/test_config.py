@@ -95,7 +95,7 @@ def test_what_is_wrong_is_named_in_one_line(text, message):
 def test_a_recipe_that_is_no_text_is_named(tmp_path):
     recipe = tmp_path / "recipe.yaml"
     recipe.write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(ValueError, match="recipe.yaml: not valid YAML"):
+    with pytest.raises(ValueError, match=r"recipe[.]yaml: not valid YAML"):
         load_config(recipe)
 
 
