@@ -136,8 +136,8 @@ class FieldFamily:
             far: largest displacement from H x, pixels of beta.
 
         Returns:
-            Alpha's fused view (3, h, w), possibly beyond 0..1, and its depth in metres (h, w), NaN where
-            unknown.
+            Alpha's fused view (3, h, w), possibly beyond 0..1, and its depth (h, w) as `Frame.depth`, NaN
+            where unknown.
 
         Raises:
             ValueError: as `fuse_frame`, such as for a field that the network does not support; if `warped`,
@@ -419,7 +419,7 @@ def point_errors(case: AblationCase, depth: Float[Tensor, "h w"]) -> tuple[float
 
     Args:
         case: scene with alpha's true depth.
-        depth: estimated depth of alpha's pixels, metres; NaN where unknown.
+        depth: estimated depth, metres, measured as `natural_bounds` says, like the true one; NaN where unknown.
 
     Returns:
         Mean error in pixels of beta where both are known and finite, and share of the pixels of finite true
