@@ -419,7 +419,7 @@ def point_errors(case: AblationCase, depth: Float[Tensor, "h w"]) -> tuple[float
 
     Args:
         case: scene with alpha's true depth.
-        depth: estimated depth, metres, measured as `natural_bounds` says, like the true one; NaN where unknown.
+        depth: estimated depth, metres, along what `natural_bounds` says, as the truth; NaN where unknown.
 
     Returns:
         Mean error in pixels of beta where both are known and finite, and share of the pixels of finite true
