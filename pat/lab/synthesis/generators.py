@@ -25,8 +25,8 @@ from .scene import Paint, Scene, Texture, TextureKind, Vec3
 
 
 def abstract(seed: int, rig: Rig, *, moving: float = 0.0) -> Scene:
-    """Generate one of the paper's scenes: 10 to 20 patterned shapes in a room, within the rig's depth range
-    (see `furnished`).
+    """Generate one of the paper's scenes: 10 to 20 patterned shapes in a room, in the rig's depth range as
+    `furnished` says.
 
     Args:
         seed: random seed, 0 or more.

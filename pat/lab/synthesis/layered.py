@@ -103,7 +103,7 @@ class LayeredScenes:
             oversampling: factor of further samples in a pixel along each axis.
 
         Returns:
-            A batch without gradient, a scene for each rig, of its sizes, on this device, cameras float32.
+            A batch without gradient, a scene for each rig, of its sizes, on this source's device, float32.
         """
         layers = draw_layers(rigs, self.layers, self.photos, len(self.outlines), generator)
         factors = [oversampling * _oversampling(rigs.cameras[0], v) for v in rigs.cameras]

@@ -16,7 +16,7 @@ def blender_python() -> str:
     """Return the path of a Python interpreter for Blender: this one if it has bpy, else that of `FOLDER`.
 
     Raises:
-        ValueError: in one line with the command to install it, if OpenEXR is missing here, or no interpreter.
+        ValueError: in one line with the command to install it, if OpenEXR or such an interpreter is missing.
     """
     if find_spec("OpenEXR") is None:
         line = install_line("OpenEXR", "synthesis")
