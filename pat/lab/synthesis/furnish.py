@@ -110,7 +110,7 @@ class Setting:
 
 
 def furnished(name: str, seed: int, rig: Rig, surface: Surface, moving: float) -> Scene:
-    """Make a scene of 10 to 20 shapes in a room, each with its middle in one camera's depth range (`Setting`).
+    """Make a scene of 10 to 20 shapes in a room, each centred in one camera's depth range (`Setting`).
 
     None is nearer to any camera. The walls are within the range of all cameras where such a room is found:
     not for views over 150 degrees, or cameras opposed or far ahead of each other for the range.
