@@ -40,11 +40,11 @@ class StereoSets:
         """Open the folders of stereo pairs, and check that results can be written.
 
         Returns:
-            The pairs, read on demand, by data set.
+            Iterators over the pairs, read on demand, by data set.
 
         Raises:
-            ValueError: if no folder is given, one has no pair, or `out` cannot be written.
-            FileNotFoundError: for a missing folder.
+            ValueError: if no folder is given, one has no pair, or `out` cannot be written or is in one.
+            FileNotFoundError: for a missing folder, or file of Middlebury's.
         """
         from .evaluation.stereo import DATA_SETS
 
@@ -68,16 +68,16 @@ class Evaluate(StereoSets):
     rates: tuple[int, ...] = (2, 4)
     """Factors by which beta is reduced."""
     out: Out = Path("out/evaluate")
-    """Folder for scores.md, scores.csv and, for each data set, a strip of images a pair."""
+    """Folder for scores.md, scores.csv and, in a folder for each data set, strips of images."""
 
     def run(self) -> None:
         """Score all methods on all pairs; write scores and strips of images to `out`, and print the scores.
 
         Raises:
             FileNotFoundError: for a missing folder, image, or file of weights.
-            ValueError: as `sets`, as `evaluate_pairs`, for images that cannot be read, and weights that
-                cannot be used.
-            RuntimeError: for images smaller than a rate.
+            ValueError: as `sets`, `evaluate_pairs` and `fuse_frame`, for images that cannot be read, and
+                weights that cannot be used.
+            OSError: if a result cannot be written.
         """
         from ..networks.weights import load_weights
         from .evaluation import protocols, stereo
@@ -88,14 +88,13 @@ class Evaluate(StereoSets):
         self.write(rows, stereo.sets_markdown(rows))
 
     def sets(self) -> dict[str, Iterable[StereoPair]]:
-        """Open the folders of stereo pairs, and check the rates.
+        """Open the folders of stereo pairs as `StereoSets.sets`, and check the rates.
 
         Returns:
-            The pairs, read on demand, by data set.
+            Iterators over the pairs, read on demand, by data set.
 
         Raises:
-            ValueError: for no rates or one below 1, no folder, one without a pair, and `out` not writable.
-            FileNotFoundError: for a missing folder.
+            ValueError: for no rates or one below 1; it and further errors as `StereoSets.sets`.
         """
         if not self.rates or min(self.rates) < 1:
             raise ValueError(f"--rates: {' '.join(map(str, self.rates))}: give whole numbers from 1 up")
@@ -127,15 +126,15 @@ class Evaluate(StereoSets):
 class Ablate:
     """Compare families of receptive fields by one network: the gain from calibration.
 
-    Scenes are layered, with exact positions, of unrectified rigs with focal lengths 1 to 3 times beta's; or
-    rendered scenes of your own rig.
+    Scenes are layered, of unrectified rigs whose alpha has 1 to 3 times beta's focal length; or rendered
+    scenes of your own rig.
 
     Example: pat lab ablate --rendered scenes --network runs/mine/best.safetensors
     """
 
     network: NetworkName = "pat-supervised"
     photos: tuple[Path, ...] = ()
-    """Folders of photographs; those that scikit-image ships if none is given."""
+    """Folders of photographs; scikit-image's, and patterns, if none is given."""
     rendered: Path | None = None
     """Folder of scenes written by `pat lab render`: their first camera is alpha, their second beta."""
     scenes: int = 6
@@ -155,7 +154,9 @@ class Ablate:
         Raises:
             FileNotFoundError: for a missing folder of rendered scenes, or file of weights.
             ValueError: for fewer than one scene, options of layered scenes next to --rendered, folders
-                without scenes or photographs, an unknown field, and as `ablate` and `rendered_cases`.
+                without photographs, `out` not writable or in one, an unusable field or weights, and as
+                `ablate` and `rendered_cases`.
+            OSError: if a result cannot be written.
         """
         from ..networks.weights import load_weights
         from .evaluation.ablation import FieldFamily, ablate, families, layered_cases, rendered_cases
@@ -190,7 +191,8 @@ class DataInfo:
 
         Raises:
             FileNotFoundError: for a missing folder.
-            ValueError: for a folder that `pat lab render` did not write, or that is damaged.
+            ValueError: for a folder without complete scenes, and as `summarise` for a damaged one.
+            KeyError: for a farm.json without an entry that `summarise` reads.
         """
         from .farm.job import summarise
 
@@ -229,14 +231,12 @@ class Render:
     """The file's `blender.generator`, if it is code of your own: the file alone does not run it."""
 
     def run(self) -> None:
-        """Render the missing scenes; exits with status 1 if some are still missing afterwards.
+        """Render the missing scenes of the shard; exits with status 1 if some are still missing afterwards.
 
         Raises:
-            FileNotFoundError: for a missing configuration file or rig.
-            ValueError: for an invalid configuration or shard, code named in the file and not in --generator,
-                and as `pat.lab.farm.job.render`.
-            pat.support.jobs.JobError: if the job cannot go on, such as on a full disk.
-            ImportError: for a scheduler without the package of Dask.
+            FileNotFoundError: for a missing configuration file.
+            ValueError: for an invalid configuration or shard, a missing rig or folder of photographs, code
+                named in the file and not in --generator; it and further errors as `pat.lab.farm.job.render`.
             SystemExit: with status 1, if a scene failed.
         """
         from .farm.job import RenderConfig, Shard, render
@@ -278,8 +278,8 @@ class Train:
             The command, ready to run.
 
         Raises:
-            ValueError: naming the entry, for a recipe that cannot be used, and as `command_line`.
-            FileNotFoundError: for a missing recipe.
+            ValueError: as `command_line`, which also raises FileNotFoundError and, after `--help`,
+                SystemExit.
         """
         from .training.config import command_line
 
@@ -313,7 +313,7 @@ class Settings:
     rooms: ClassVar[tuple[str, ...]] = ("pat.matching", "pat.fusion", "pat.networks")
 
     def run(self) -> None:
-        """Print a line for each setting, and their number."""
+        """Print a line for each setting of `kind`, and their number."""
         from ..support.settings import all_settings
 
         entries = [s for s in all_settings(*self.rooms) if self.kind in ("all", s.kind)]
@@ -341,7 +341,7 @@ class Import:
 
         Raises:
             FileNotFoundError: for a missing file.
-            ValueError: for a file that is no such checkpoint, and if `out` cannot be written.
+            ValueError: for a file that is no such checkpoint, and an `out` that cannot be written.
         """
         from ..networks.authors import read_authors
         from ..networks.paper import PAT

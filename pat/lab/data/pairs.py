@@ -1,7 +1,6 @@
 """Stereo pairs on disk, read one at a time.
 
-Readers are generators that hold one pair in memory. A folder without a pair is an error. Left is meant to be
-alpha, right beta: in a rectified pair the point at (x, y) in left is at (x - disparity, y) in right.
+In a rectified pair the point at (x, y) in left is at (x - disparity, y) in right.
 """
 
 from __future__ import annotations
@@ -36,11 +35,11 @@ class Disparity(NamedTuple):
     def regions(self) -> DisparityRegions:
         """Classify the left image's pixels by whether right sees their point.
 
-        A pixel is occluded if another one falls on the same pixel of right with a disparity greater by more
-        than 1. Right is taken to be as wide as left.
+        A pixel is occluded if another of its row falls on the same pixel of right (positions are rounded)
+        with a disparity greater by more than 1.
 
         Returns:
-            Three masks (h, w): seen, occluded, beyond right's edge; all False where the disparity is unknown.
+            Masks (h, w): seen, occluded, beyond right's left edge; all False where the disparity is unknown.
         """
         column = (torch.arange(self.value.shape[1]).to(self.value) - self.value).round()
         on_right = self.valid & (column >= 0)
@@ -90,9 +89,9 @@ class PairFiles(NamedTuple):
     Attributes:
         left: left image.
         right: right image.
-        max_disparity: largest disparity that the files can hold, pixels of left; `PAPER_DISPARITY` if the
-            names do not tell.
-        ground_truth: file of left's true disparity, 8 bits, 0 where unknown; None if the names do not tell.
+        max_disparity: for Middlebury's the largest disparity that the file can hold, pixels of left; for
+            others `PAPER_DISPARITY`.
+        ground_truth: file of left's true disparity, 8 bits, 0 where unknown; None unless Middlebury's.
         scale: counts of that file for a pixel of disparity.
     """
 
@@ -141,12 +140,12 @@ IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".ppm", ".pgm"}
 def middlebury_pairs(root: str | Path) -> Iterator[StereoPair]:
     """Read the 2001 to 2006 scenes under `root`/collection/scene, with left's true disparity.
 
-    Collections are recognised by folder name: 2001..., 2003_quarter, ..._half, ..._third. Tsukuba is its
-    cameras 3 and 4.
+    Collections are recognised by 2001, 2003_quarter, _half or _third in the name of the folder of the images
+    or the one above it. Tsukuba is its cameras 3 and 4.
 
     Returns:
-        Pairs, read one at a time, named by their folder; `max_disparity` is what the files can hold (255 /
-        scale), not the scene's own.
+        Pairs, read one at a time, named by their folder's path below `root`; `max_disparity` is what the
+        files can hold (255 / scale), not the scene's own.
 
     Raises:
         FileNotFoundError: for a missing folder, right image or disparity.
@@ -162,8 +161,9 @@ def folder_pairs(root: str | Path) -> Iterator[StereoPair]:
     Rectification is assumed.
 
     Returns:
-        Pairs, read one at a time, named by left's path without its mark, with `max_disparity`
-        `PAPER_DISPARITY` and no true disparity.
+        Pairs, read one at a time, named by left's path below `root` without suffix and marks that begin a
+        name or follow _ (one that is the whole path stays), with `max_disparity` `PAPER_DISPARITY` and no
+        true disparity.
 
     Raises:
         FileNotFoundError: for a missing folder.
@@ -203,7 +203,7 @@ def _some(items: list[T], root: Path) -> list[T]:
 
 
 def _middlebury(root: Path, *needed: str) -> list[PairFiles]:
-    """Pairs in folders of Middlebury's collections, in order; FileNotFoundError for a missing one."""
+    """Pairs of Middlebury's collections, in order; FileNotFoundError for a missing file."""
     found = sorted(
         PairFiles(file, file.with_name(right), 255 / scale, file.with_name(ground_truth), scale)
         for key, (left, right, ground_truth, scale) in MIDDLEBURY.items()
@@ -229,7 +229,7 @@ def _named(root: Path) -> list[PairFiles]:
 
 
 def _read(root: Path, files: PairFiles) -> StereoPair:
-    """Pair of images. A name such as `0001_L.png` loses its mark; of Middlebury's the folder is the name."""
+    """Read the images and name the pair."""
     left, right, most, ground_truth, scale = files
     name, disparity = left.relative_to(root).with_suffix("").as_posix(), None
     name = re.sub(r"(^|[/_])(L|left|image_2|colored_0|view1|im2|im0)($|/)", r"\3", name).strip("/") or name

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from tokenize import TokenError
 from typing import NamedTuple
 from zipfile import BadZipFile
+from zlib import error as BadDeflate
 
 import torch
 from jaxtyping import Float
@@ -17,6 +19,8 @@ from arraygeom import Camera, Rig, pinhole_view, pixel_grid, resampled, resize_m
 from arraygeom.pixels import HW, map_homogeneous
 from pat.lab.synthesis.rendered import RENDER_FILE, Rendered, is_rendered
 
+DAMAGED = EOFError, BadZipFile, BadDeflate, TokenError, NotImplementedError
+"""Errors of NumPy for a damaged archive, beside ValueError, KeyError and TypeError."""
 AGAIN = "remove it and run 'pat lab render' again"
 
 
@@ -27,7 +31,7 @@ def scene_folders(root: str | Path) -> list[Path]:
         root: folder of a job (with `scenes` in it), folder of scenes, or one scene.
 
     Returns:
-        Folders in order of their names.
+        Folders in order of their names; files, and folders whose names begin with a dot, are left out.
 
     Raises:
         FileNotFoundError: for a missing folder.
@@ -50,16 +54,12 @@ def scene_folders(root: str | Path) -> list[Path]:
 
 @contextmanager
 def reading(folder: Path) -> Iterator[None]:
-    """Context manager that turns errors while reading a scene into ValueError, naming the folder and a
-    remedy.
-
-    Raises:
-        ValueError: for OSError, ValueError, KeyError, EOFError, BadZipFile and TypeError in the block; other
-            errors pass.
+    """Context manager that turns OSError, ValueError, KeyError, TypeError and `DAMAGED`, raised while a scene
+    is read, into a ValueError that names its folder; other errors pass.
     """
     try:
         yield
-    except (OSError, ValueError, KeyError, EOFError, BadZipFile, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, *DAMAGED) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise ValueError(f"{folder}: cannot be read ({reason}): {AGAIN}") from None
 
@@ -119,8 +119,8 @@ def undistorted(view: RenderedView) -> RenderedView:
     """Resample a view to its pinhole camera.
 
     Returns:
-        The undistorted view (`pinhole_view`), usually of another size, bicubic in colour, nearest in depth;
-        the view itself without a lens model.
+        The view of `pinhole_view`, usually of another size: colours bicubic, clipped at 0, beyond the image
+        its edge's; depth of the nearest pixel, NaN beyond. Without a lens model the view itself.
 
     Raises:
         ValueError: if no pixel is within the lens's range.
@@ -134,7 +134,7 @@ def undistorted(view: RenderedView) -> RenderedView:
 
 
 def window(view: RenderedView, top: int, left: int, size: HW, hw: HW) -> RenderedView:
-    """Cut a window from a view and resize it to `hw`.
+    """Cut a window from a view and resize it to `hw` (`reduced`, `reduced_depth`).
 
     Args:
         view: whole view, through a lens or not.
@@ -170,8 +170,8 @@ def reduced_depth(depth: Float[Tensor, "n h w"], hw: HW) -> Float[Tensor, "n h2 
     """Resample depth to the centres of coarser pixels.
 
     Returns:
-        Depth (n, h2, w2): inverse depth interpolated where it differs by under 1 % from the nearest pixel's,
-        else the nearest pixel's, infinite and NaN too; the same tensor if the size is unchanged.
+        Depth (n, h2, w2): interpolated linearly in inverse depth where that is within 1 % of the nearest
+        pixel's depth, else the nearest pixel's, infinite and NaN too; the same tensor for an equal size.
     """
     old = (depth.shape[-2], depth.shape[-1])
     if old == hw:

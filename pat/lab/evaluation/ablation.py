@@ -1,7 +1,6 @@
 """Ablation of calibration: one checkpoint with every family of receptive fields on the same scenes.
 
-Reproduces the paper's comparison of calibrated and rectified fields. Scenes are layered photographs seen by
-unrectified rigs, alpha with a focal length 1 to 3 times beta's, or rendered folders.
+Reproduces the paper's comparison of calibrated and rectified fields.
 """
 
 from __future__ import annotations
@@ -137,12 +136,12 @@ class FieldFamily:
             far: largest displacement from H x, pixels of beta.
 
         Returns:
-            Alpha's fused view (3, h, w), possibly beyond 0..1, and its depth in metres (h, w), NaN where
-            unknown.
+            Alpha's fused view (3, h, w), possibly beyond 0..1, and its depth (h, w) as `Frame.depth`, NaN
+            where unknown.
 
         Raises:
             ValueError: as `fuse_frame`, such as for a field that the network does not support; if `warped`,
-                also as `rectified`.
+                also as `rectified`. Further errors as `fuse_frame`.
         """
         settings = FuseSettings(field=self.field(far))
         if not self.warped:
@@ -162,9 +161,10 @@ class AblationRow(NamedTuple):
         family: name of the family, or of a baseline.
         psnr: PSNR in dB; NaN if there is no result.
         ssim: SSIM; NaN if there is no result.
-        end_point_error: mean error in pixels of beta of the points at the estimated depth; NaN without depth.
+        end_point_error: mean error in pixels of beta of the points at the estimated depth; NaN for baselines,
+            without a result, and if no pixel can be compared.
         within_one: share of pixels of known true depth whose point is within a pixel of its true position in
-            beta; NaN without depth.
+            beta; NaN likewise.
         note: reason for a missing result; else empty.
     """
 
@@ -180,7 +180,7 @@ class AblationRow(NamedTuple):
 
 @dataclass(frozen=True)
 class HorizontalDisplacement:
-    """Field along rows around the true H x: rectified geometry with correct position and scale.
+    """Field along rows around H x (`Pair.homography`): rectified geometry with correct position and scale.
 
     Attributes:
         disparity: half length of the segment, pixels of beta.
@@ -192,8 +192,7 @@ class HorizontalDisplacement:
         """Compute horizontal segments in beta around H x, for pixels x of alpha, clipped to beta's image.
 
         Returns:
-            Segments from right to left, one for each pixel; invalid where H x is infinite or the segment
-            misses beta's image.
+            Segments from right to left, (*n); invalid where H x is infinite or they miss beta's image.
 
         Raises:
             ValueError: as `Pair.homography`.
@@ -235,8 +234,9 @@ def disparity(network: FusionNetwork, pair: Pair) -> float:
 
     Returns:
         The largest displacement from H x, 1 or more, pixels of beta as the network receives it: of its
-        pinhole view if it has a lens, and resized if the network needs equal resolutions. Where a camera has
-        no pinhole view, the largest distance on beta's image from the middle of a pixel's curve.
+        pinhole view if it has a lens, and resized if the network needs equal resolutions and beta's is at
+        most 0.8 or at least 1.25 of alpha's. Where a camera has no pinhole view, the largest distance, on
+        beta's image, from the middle of a pixel's curve.
 
     Raises:
         ValueError: for a pair that is not calibrated or has no depth range.
@@ -260,7 +260,7 @@ def disparity(network: FusionNetwork, pair: Pair) -> float:
 def layered_cases(
     count: int, *, photos: Sequence[Path] = (), hw: HW = (240, 320), seed: int = 0
 ) -> Iterator[AblationCase]:
-    """Render cases from layered photographs, with some noise.
+    """Render cases from layered photographs by rigs of `RIGS`, recorded as `recorded` does.
 
     Args:
         count: number of cases.
@@ -269,10 +269,10 @@ def layered_cases(
         seed: seed of the scenes and the noise.
 
     Yields:
-        One case at a time, its depth range 10 % wider than the scene's.
+        One case at a time, its depth range at either end 10 % wider than alpha's finite depths.
 
     Raises:
-        ValueError: for missing folders and folders without images, when the first case is asked for.
+        ValueError: if no image is found, when the first case is asked for; OSError for an unreadable one.
     """
     bank = PhotoBank.load(*photos) if photos else sample_photographs()
     scenes, g = LayeredScenes(bank, RIGS, hw=hw, seed=seed), Generator().manual_seed(seed)
@@ -287,9 +287,9 @@ def rendered_cases(folder: Path, *, seed: int = 0) -> Iterator[AblationCase]:
     """Read cases from rendered scenes (`scene_folders`): their first camera is alpha, their second beta.
 
     Returns:
-        Iterator over the cases, read on demand, with noise drawn from `seed` for each, and a depth range 10 %
-        wider than alpha's finite depths. It raises ValueError for a damaged scene, one camera, or a scene
-        without finite depths.
+        Iterator over the cases, read on demand, with noise (`recorded`) drawn from `seed` anew for each, and
+        a depth range at either end 10 % wider than alpha's finite depths. It raises ValueError for a damaged
+        scene, one camera, or an alpha without finite depths.
 
     Raises:
         FileNotFoundError: for a missing folder.
@@ -339,10 +339,8 @@ def recorded(ideal: Mapping[str, Tensor], g: Generator) -> dict[str, Tensor]:
 def sample_photographs(*, count: int = 12, seed: int = 0) -> PhotoBank:
     """Load four photographs of scikit-image, and `count` patterns drawn from `seed`.
 
-    They are free to use (astronaut: NASA; chelsea, coffee and rocket: CC0).
-
     Returns:
-        Bank of textures, the photographs first.
+        Bank of textures, the photographs first: astronaut (NASA), chelsea, coffee and rocket (CC0).
     """
     from skimage import io
     from skimage.data import data_dir
@@ -365,12 +363,12 @@ def ablate(
         out: folder for the three files.
 
     Returns:
-        One row for each case and each family or baseline ("alpha alone", "classical"). Where fusion raises
+        One row for each case and each baseline ("alpha alone", "classical") or family. Where fusion raises
         ValueError, or dense positions would need more than `DENSE_LIMIT`, scores are NaN, with a note.
 
     Raises:
-        ValueError: for no cases (nothing is written then), and for one that is not calibrated, has no depth
-            range, or is too small for SSIM.
+        ValueError: for no cases, and for one that is not calibrated, has no depth range, or is too small for
+            SSIM; nothing is written then. Errors of `cases` and `assumed`, and others of fusion, pass.
         OSError: if a file cannot be written.
     """
     rows: list[AblationRow] = []
@@ -421,10 +419,10 @@ def point_errors(case: AblationCase, depth: Float[Tensor, "h w"]) -> tuple[float
 
     Args:
         case: scene with alpha's true depth.
-        depth: estimated depth of alpha's pixels, metres; NaN where unknown.
+        depth: estimated depth, metres, along what `natural_bounds` says, as the truth; NaN where unknown.
 
     Returns:
-        Mean error in pixels of beta where both are known and finite, and share of the pixels of known true
+        Mean error in pixels of beta where both are known and finite, and share of the pixels of finite true
         depth with an error of at most 1; (nan, nan) if none can be compared.
     """
     alpha, beta = case.rig.pair(ALPHA, BETA).cameras
@@ -443,9 +441,10 @@ def markdown(rows: Sequence[AblationRow]) -> str:
     """Format rows as an introduction and a Markdown table of one line for each family.
 
     Returns:
-        The text: mean PSNR with 95 % bootstrap interval (of two scenes or more), mean SSIM, mean gain in PSNR
-        over "calibrated" (dB; blank if that has no scores), PSNR by focal ratio, errors in beta, and last the
-        reason if a family has no score, or how many scenes it lacks.
+        The text. Columns: mean PSNR with 95 % bootstrap interval (of two scenes or more), mean SSIM, mean
+        gain in PSNR over "calibrated" (dB), mean PSNR by focal ratio, both errors in beta, and last the first
+        row's note if a family has no score at all, or how many scenes it lacks. Means are of the scenes that
+        have the figure; blank where none has.
     """
     between = [f"ratio {low:g} to {high:g}" for low, high in pairwise(RATIOS)]
     bins = [f"ratio below {RATIOS[0]:g}", *between, f"ratio from {RATIOS[-1]:g}"]
@@ -494,15 +493,16 @@ def _mean(values: Sequence[float]) -> float:
 
 
 def crops(case: AblationCase, images: Mapping[str, Tensor], rows: Sequence[AblationRow]) -> dict[str, Tensor]:
-    """Cut squares of up to `CROP` pixels where "calibrated" is better than "rectified assumption" by most.
+    """Cut the square, of up to `CROP` pixels a side, where the mean squared error of "rectified assumption"
+    exceeds that of "calibrated" most.
 
     Args:
         images: fused images (3, h, w) by family or baseline.
         rows: scores of the case, one for each family or baseline.
 
     Returns:
-        Crops (3, h, w) of the ground truth and of each row with an image, by title (case, family, PSNR of the
-        whole image). From the top left corner if one of the two families has no image.
+        The same crop (3, h, w) of the ground truth and of each row with an image, by title (case, family,
+        PSNR of the whole image); from the top left corner if one of the two families has no image.
     """
     window = (slice(None), *_most_different(images, case.ground_truth))
     panels = {f"{case.name}: ground truth\nfocal ratio {case.ratio:.1f}": case.ground_truth[window]}
@@ -513,7 +513,7 @@ def crops(case: AblationCase, images: Mapping[str, Tensor], rows: Sequence[Ablat
 
 
 def _most_different(images: Mapping[str, Tensor], ground_truth: Tensor) -> tuple[slice, slice]:
-    """Square in which the rectified assumption is worst compared with calibrated."""
+    """Square of `crops`."""
     h, w = ground_truth.shape[1:]
     side = min(CROP, h, w)
     names = [n for n in ("rectified assumption", "calibrated") if n in images]

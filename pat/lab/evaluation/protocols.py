@@ -48,7 +48,7 @@ def mono_colour_task(pair: StereoPair, rate: int) -> MonoColourTask:
     beta.
 
     A pixel of beta is the mean of `rate` x `rate` pixels of right. Rows and columns beyond the last multiple
-    of `rate` are cut from both images and the disparity.
+    of `rate` are cut from both images and the disparity, whose unit stays.
 
     Args:
         pair: pair of colour images.
@@ -93,8 +93,8 @@ class StereoResult(NamedTuple):
 
     Attributes:
         image: fused image (3, h, w) at alpha's pixels, may exceed 0..1.
-        disparity: disparity (h, w) of alpha's pixels, in pixels of alpha, NaN where unknown; None if the
-            method returns none.
+        disparity: disparity (h, w) of alpha's pixels, in pixels of alpha, NaN or infinite where unknown; None
+            if the method returns none.
     """
 
     image: Tensor
@@ -130,17 +130,17 @@ def rectified_fusion(
     matcher: Matcher = match,
 ) -> StereoMethod:
     """Make a method from `fuse_frame` with a network, alpha on the left: segments are rows, `max_disparity`
-    pixels long.
+    pixels long, of beta as the network receives it.
 
     Args:
         network: network to fuse with.
-        bands: True to treat each channel of beta as a camera of its own.
+        bands: True to treat each of beta's (up to three) channels as a camera of its own.
         settings: settings of fusion; a field in them replaces the rows.
         matcher: matcher to use instead of `match`.
 
     Returns:
-        The method: called with alpha, beta and `max_disparity` (above 0), it returns image and disparity. It
-        raises what `rectified_rig` and `fuse_frame` raise.
+        The method, called with alpha, beta and `max_disparity` (above 0). It raises what `rectified_rig` and
+        `fuse_frame` raise.
     """
 
     def fused(alpha: Tensor, beta: Tensor, max_disparity: float) -> StereoResult:
@@ -168,7 +168,7 @@ def rectified_rig(hw: HW, betas: Mapping[str, HW], max_disparity: float) -> Rig:
         The rig; its first camera is called "alpha".
 
     Raises:
-        ValueError: for a `max_disparity` that is not above 0, or infinite.
+        ValueError: unless `max_disparity` is finite and above 0.
     """
     check_above(0, itself=False, max_disparity=max_disparity)
     alpha = Camera(K=intrinsics(float(hw[1]), hw), cam_from_world=Pose.identity(), hw=hw)

@@ -21,7 +21,7 @@ class Warped(NamedTuple):
     """Rectified pair of images.
 
     Attributes:
-        rig: the two rectified cameras, with the numbers of the original depth range.
+        rig: the two rectified cameras, with the depth range's old numbers, now along the rectified axis.
         images: rectified images (c, h, w) by name, all on one canvas.
         rectification: cameras on the canvas, and homographies to it from the original images.
         original: the pair before it.

@@ -39,8 +39,9 @@ class StereoRow(NamedTuple):
         psnr: PSNR in dB.
         ssim: SSIM.
         end_point_error: mean absolute error of disparity, pixels of alpha; None if no pixel has both a true
-            and an estimated one.
-        within_one: share of pixels of known true disparity with an error of at most one pixel; None likewise.
+            and a finite estimated one.
+        within_one: share of pixels of known true disparity with an error of at most one pixel, unknown
+            estimates counting as wrong; None likewise.
     """
 
     pair: str
@@ -59,7 +60,7 @@ def evaluate_sets(
     *,
     out: Path,
 ) -> dict[str, list[StereoRow]]:
-    """Evaluate methods on several data sets by `evaluate_pairs`, which says what is raised.
+    """Evaluate methods on data sets by `evaluate_pairs`, with its `max_disparity`; it says what is raised.
 
     Args:
         sets: pairs by data set.
@@ -83,13 +84,11 @@ def evaluate_pairs(
 ) -> list[StereoRow]:
     """Score each method on each pair at each rate: whole frames, values clipped to 0..1, not rounded.
 
-    Errors of the methods, and of reading and writing, are not caught.
-
     Args:
         pairs: stereo pairs, read one at a time.
         methods: fusion methods by name.
         rates: factors by which beta is reduced.
-        max_disparity: pixels of alpha, the same for all pairs (the paper's: 120 / rate pixels of beta).
+        max_disparity: largest disparity that methods are told, pixels of alpha, the same for all pairs.
         images: folder for one strip of each pair and rate (beta enlarged, each method, the ground truth), a
             PNG file; None writes none.
 
@@ -97,8 +96,8 @@ def evaluate_pairs(
         One row for each pair, rate and method.
 
     Raises:
-        ValueError: for grey images, those of unequal sizes, and sides too short for SSIM.
-        RuntimeError: for images smaller than a rate.
+        ValueError: as `mono_colour_task`, and for sides too short for SSIM (`score`). Errors of methods, of
+            reading and of writing pass.
     """
     rows = []
     for pair in track(pairs, "evaluating", disable=not sys.stderr.isatty()):

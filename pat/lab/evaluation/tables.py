@@ -19,10 +19,10 @@ def grouped(rows: Iterable[T], *names: str) -> dict[Any, list[T]]:
 
     Args:
         rows: named tuples or other objects.
-        names: names of attributes, at least one.
+        names: names of attributes, at least one; AttributeError for one that a row lacks.
 
     Returns:
-        Lists of rows by the value of the one attribute, or by the tuple of several values.
+        Lists of rows by the value of the one attribute, or by the tuple of several.
     """
     groups: dict[Any, list[T]] = {}
     for row in rows:

@@ -32,8 +32,7 @@ from pat.media.colour import linear_from_srgb
 from pat.support.schema import check_fields, from_document
 
 FARTHEST = 50.0
-"""Multiple of the near bound at which layered scenes end for rigs that see to infinity."""
-
+"""Largest far bound of layered scenes, in multiples of the near one."""
 
 Renderer = Callable[[int, Path], None]
 """Function of a seed and a folder that makes the folder, and renders and checks a scene into it."""
@@ -46,8 +45,8 @@ class LayeredSettings:
     Attributes:
         photos: folders of images for textures; empty for patterns alone.
         edge: longest side, in pixels, that images are reduced to; 32 or more.
-        layers: least and greatest number of planes.
-        oversampling: samples in a pixel along each axis.
+        layers: least and greatest number of planes, 1 or more.
+        oversampling: samples in a pixel along each axis, 1 or more.
 
     Raises:
         ValueError: for values below these bounds, and layers out of order.
@@ -71,7 +70,7 @@ class LayeredSettings:
             (height, width) of each camera's image, in the rig's order.
 
         Raises:
-            ValueError: for a rig that cannot be rendered, as `rig_from_alpha`.
+            ValueError: as `rig_from_alpha`.
         """
         return [camera.hw for camera in rig_from_alpha(rig).cameras]
 
@@ -84,10 +83,10 @@ class LayeredSettings:
 
         Returns:
             A function that renders the scene of a seed into a new folder, `render(seed, out)`; it raises
-            FileExistsError if there is one.
+            OSError if there is one (FileExistsError), or a file cannot be written.
 
         Raises:
-            ValueError: for a rig that cannot be rendered, missing folders, and folders without images.
+            ValueError: as `rig_from_alpha`, and if `photos` hold no image; OSError for an unreadable one.
         """
         rig_batch = rig_from_alpha(rig)
         if self.photos:
@@ -133,7 +132,8 @@ class BlenderSettings:
 
     Raises:
         ValueError: for a generator without its `photos` or with photos it does not take, an unknown
-            generator, and invalid settings.
+            generator (your own is not imported yet), and invalid settings.
+        KeyError: for another preset.
     """
 
     generator: str = "abstract"
@@ -149,7 +149,7 @@ class BlenderSettings:
         self.render_settings()
 
     def render_settings(self) -> RenderSettings:
-        """Combine preset and own entries, with one thread by default, as a farm has one worker for each core.
+        """Combine preset and own entries, with one thread by default: a farm has one worker for each core.
 
         Raises:
             ValueError: naming the entry, for an invalid one.
@@ -164,8 +164,7 @@ class BlenderSettings:
             (height, width) of each image, one for each camera and point in time.
 
         Raises:
-            ValueError: for a rig that cannot be rendered, as `lens_for`, and a generator that cannot be
-                imported.
+            ValueError: as `lens_for`, and for a generator that cannot be imported.
         """
         generator_named(self.generator)
         for name, camera in rig.cameras.items():
@@ -181,7 +180,8 @@ class BlenderSettings:
             limits: limits of the self-check, in place of those in `settings`.
 
         Returns:
-            A function that renders the scene of a seed into a new folder: `render(seed, out)`.
+            A function that renders the scene of a seed into a new folder, `render(seed, out)`; it raises what
+            the generator and `pat.lab.synthesis.blender.task.render` raise.
 
         Raises:
             ValueError: if Blender or OpenEXR is not installed, or the generator cannot be imported.

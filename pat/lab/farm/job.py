@@ -52,11 +52,11 @@ class RetryLimits:
     """Limits on the attempts at a scene.
 
     Attributes:
-        timeout: seconds a scene may take, more than 0.
-        refusals: seeds tried while the self-check refuses them, more than 0.
+        timeout: seconds for a scene, all its seeds together, more than 0; not kept by Dask's workers.
+        refusals: seeds tried while the self-check refuses them or they cannot be rendered, more than 0.
 
     Raises:
-        ValueError: for values of 0 or less.
+        ValueError: for values of 0 or less, and NaN.
     """
 
     timeout: float = 900.0
@@ -77,7 +77,7 @@ class RenderConfig:
         check: {overlap: 0.3}    # requirements of the self-check
         limits: {timeout: 300}   # seconds a scene, and how often to try
 
-    Settings of the backend that is not used are ignored. `load` reads such a file.
+    Settings of the backend that is not used are checked, and have no effect. `load` reads such a file.
     """
 
     rig: Path
@@ -103,7 +103,7 @@ class RenderConfig:
             The configuration, with absolute paths.
 
         Raises:
-            FileNotFoundError: for a missing file.
+            FileNotFoundError: for a missing configuration file.
             ValueError: naming the file, for an invalid entry, and as `beside`.
         """
         path = Path(path)
@@ -120,7 +120,7 @@ class RenderConfig:
             The configuration, its paths joined to the folder.
 
         Raises:
-            ValueError: for a missing rig file or folder of photographs of the chosen backend.
+            ValueError: for a missing rig file or, of the chosen backend, folder of photographs.
         """
         photos = tuple(folder / p for p in self.layered.photos)
         blender = self.blender
@@ -148,8 +148,8 @@ class RenderConfig:
 
         Raises:
             FileNotFoundError: for a missing file of the rig.
-            ValueError: for a rig that cannot be read or rendered, a missing library, folders without images,
-                and a generator that cannot be imported.
+            ValueError: for a rig that cannot be read; it and further errors as the backend's `images` and
+                `renderer`.
         """
         rig = Rig.load(self.rig)
         self.settings.images(rig)  # refuses rigs
@@ -160,10 +160,10 @@ class RenderConfig:
         compression, without near infrared.
 
         Returns:
-            Bytes of all its images and its other files together.
+            Bytes of all its images and other files together.
 
         Raises:
-            ValueError: for a rig that cannot be read or rendered, and a generator that cannot be imported.
+            ValueError: for a rig that cannot be read, and as the backend's `images`.
             FileNotFoundError: for a missing file of the rig.
         """
         return sum(10.0 * h * w for h, w in self.settings.images(Rig.load(self.rig))) + 20_000
@@ -243,11 +243,12 @@ def render(
         Report of the scenes made, kept and failed; a failed scene is skipped.
 
     Raises:
-        ValueError: for what cannot be rendered, scenes or workers below 1, more scenes than the disk holds,
-            or a folder in use or of another configuration.
+        ValueError: for a rig or generator that cannot be used, scenes or workers below 1, more scenes than
+            the disk holds, an `out` among the photographs, in use or of another configuration, and a
+            `scheduler` that does not answer.
+        JobError: if the job cannot go on, such as on a full disk or without Blender.
         FileNotFoundError: for a missing file of the rig.
-        JobError: if the job cannot go on, such as on a full disk.
-        ImportError: for a `scheduler` without the package of Dask.
+        ImportError, TimeoutError: for a `scheduler` without the package of Dask, or without workers.
     """
     if scenes < 1 or workers < 1:
         raise ValueError(f"give at least one scene and one worker, got --scenes {scenes} --workers {workers}")
@@ -277,13 +278,12 @@ def render(
 
 
 def write_manifest(config: RenderConfig, root: Path) -> None:
-    """Write the manifest of a job into its folder `root`, or check that the existing one is of the same job.
-
-    A folder of scenes without a manifest gets one.
+    """Write a job's manifest into its folder `root`, or check that the existing one is of the same job.
 
     Raises:
-        ValueError: if the manifest is of another configuration, or does not say, or a file cannot be read.
+        ValueError: if the manifest is of another configuration, or does not say, or a file is damaged.
         FileNotFoundError: for a missing file of the rig.
+        OSError: if the manifest cannot be written.
     """
     path, identity = root / MANIFEST, json.loads(json.dumps(config.identity()))
     if path.is_file():
@@ -311,9 +311,7 @@ def versions() -> dict[str, str]:
 
 
 def check_space(root: Path, scenes: int, scene_bytes: float) -> None:
-    """Check that the disk of folder `root` holds `scenes` more scenes of `scene_bytes` bytes each.
-
-    `RESERVE` bytes stay free beside them.
+    """Check that the disk of folder `root` has room for `scenes` more of `scene_bytes` bytes, and `RESERVE`.
 
     Raises:
         FileNotFoundError: for a missing folder.
@@ -342,7 +340,7 @@ def make_scene(config_text: str, work: Path, scene: Path, index: int) -> None:
         ValueError: if `refusals` seeds are refused, by the self-check or since they cannot be rendered.
         JobError: if no scene can be made: a full disk, or a configuration that cannot be used.
         BrokenProcessPool: if Blender's process dies.
-        OSError: if a file cannot be read or written for another reason.
+        OSError: if a file cannot be read or written for another reason. Other errors of a generator pass.
     """
     config, render_scene = _ready(config_text)
     reason = ""
@@ -412,15 +410,16 @@ def publish(partial: Path, final: Path) -> None:
 
 
 def summarise(root: Path) -> str:
-    """Summarise rendered scenes: number, image sizes, disk, time, memory and refused seeds.
+    """Summarise rendered scenes: number, the first one's image sizes, disk, time, memory and refused seeds.
 
     Returns:
-        One or two lines of text.
+        Two lines of text, the second of those scenes that have a farm.json; one line if none has.
 
     Raises:
         FileNotFoundError: for a missing folder.
         ValueError: for a folder without scenes, with an incomplete one, or whose first rig or a farm.json
             cannot be read.
+        KeyError: for a farm.json that lacks an entry.
     """
     from statistics import median
 

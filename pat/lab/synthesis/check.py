@@ -54,10 +54,10 @@ def check_views(
     Returns:
         A document for JSON: `views`, the `view_figures` by camera; `pairs`, the `pair_figures` by "alpha >
         beta" (frames of different times make no pair); `reasons`, texts for refusal; and `accepted`, True
-        without reasons.
+        without reasons. A camera in no pair is checked by its own image alone.
 
     Raises:
-        ValueError: for a frame of an unknown camera, and cameras that are not calibrated.
+        ValueError: for a pair with a camera that is unknown or not calibrated.
     """
     views = {name: view_figures(frame) for name, frame in frames.items()}
     together = [(a, b) for a, b in permutations(frames, 2) if frames[a].time == frames[b].time]
@@ -96,14 +96,12 @@ def view_figures(frame: RenderedFrame) -> dict[str, float]:
 
 
 def texture(rgb: Float[Tensor, "3 h w"], patch: int = 8) -> Float[Tensor, ""]:
-    """Compute the share of patches whose brightness has a standard deviation above 2 % of its mean.
+    """Compute the share, a scalar, of patches whose brightness (mean of the channels, clipped to 0..1) has a
+    standard deviation above 2 % of its mean, or of 0.01 if the mean is less.
 
     Args:
         rgb: image in linear light.
-        patch: side of a patch, pixels; the image's shorter side if that is less.
-
-    Returns:
-        A scalar tensor, 0..1.
+        patch: side of a patch, pixels; the image's shorter side if that is less. Only whole patches count.
     """
     grey = rgb.mean(0)[None, None].clamp(0, 1)
     mean = avg_pool2d(grey, min(patch, *rgb.shape[1:]))
@@ -122,10 +120,10 @@ def pair_figures(pair: Pair, here: RenderedFrame, there: RenderedFrame) -> dict[
     Returns:
         Figures by name. Shares of alpha's pixels of known depth: `inside` beta's image, `visible` there
         (projected back by beta's depth to within a pixel), `hidden` behind something nearer, `contradicted`
-        in front of beta's surface; points beside an edge in beta count for none of the last three. Of visible
-        points: `median`, `p95` and `p99` of the error in alpha's pixels, `colour`, the median difference
-        relative to brightness, and `shift`, the displacement in pixels that explains most of it. Without
-        visible points only the shares.
+        in front of beta's surface; points beside an edge in beta, and where beta's depth is not finite, count
+        for none of the last three. Of visible points: `median`, `p95` and `p99` of the error in alpha's
+        pixels, `colour`, the median difference relative to brightness, and `shift`, the displacement in
+        pixels that explains most of it. Without visible points only the shares; without known depth all 0.
 
     Raises:
         ValueError: unless both cameras are calibrated.
@@ -159,7 +157,7 @@ def pair_figures(pair: Pair, here: RenderedFrame, there: RenderedFrame) -> dict[
 
 
 def _chosen(frame: RenderedFrame, most: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Pixels of finite depth, evenly subsampled: x (n, 2), depth and index."""
+    """Positions, depth and index of pixels of finite depth, subsampled."""
     grid = pixel_grid((frame.depth.shape[0], frame.depth.shape[1]), dtype=torch.float64)
     finite = frame.depth.isfinite()
     step = max(1, -(-int(finite.sum()) // most))
@@ -167,7 +165,7 @@ def _chosen(frame: RenderedFrame, most: int) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _compared(here: RenderedFrame, x: Tensor, there: RenderedFrame, target: Tensor) -> tuple[Tensor, Tensor]:
-    """Median difference of colours, and the shift of one image against the other that explains most of it."""
+    """`colour` and `shift` of `pair_figures`."""
     slopes = torch.cat(torch.gradient(here.rgb, dim=(-1, -2)))[None]
     mine, dx, dy = sample(torch.cat([here.rgb[None], slopes], 1).double(), x[None]).values[0].split(3)
     difference = sample(there.rgb[None].double(), target[None]).values[0] - mine

@@ -110,9 +110,10 @@ class Setting:
 
 
 def furnished(name: str, seed: int, rig: Rig, surface: Surface, moving: float) -> Scene:
-    """Make a scene of 10 to 20 shapes in a room, within the depth range of `Setting`.
+    """Make a scene of 10 to 20 shapes in a room, each centred in one camera's depth range (`Setting`).
 
-    The walls are within it too, unless a view is wider than 150 degrees.
+    None is nearer to any camera. The walls are within the range of all cameras where such a room is found:
+    not for views over 150 degrees, or cameras opposed or far ahead of each other for the range.
 
     Args:
         name: name of the generator, part of the seed.
@@ -127,7 +128,7 @@ def furnished(name: str, seed: int, rig: Rig, surface: Surface, moving: float) -
 
     Raises:
         ValueError: for a rig without a calibrated camera, a far bound below 5/3 of the near one, and a
-            negative seed.
+            negative seed or `moving`.
     """
     setting = Setting(rig, seeded(name, seed))
     room = _room(setting)
@@ -201,8 +202,7 @@ def _wall_depths(room: _Room, cameras: Sequence[Camera], rays: Sequence[NDArray]
 
 
 def _lights(setting: Setting, room: _Room) -> tuple[Light, ...]:
-    """Two to four lamps beside and above the cameras, perhaps a sun; of similar brightness together in all
-    scenes."""
+    """Two to four lamps beside and above the cameras, of similar brightness together, and perhaps a sun."""
     rng = setting.rng
     shares = rng.dirichlet(np.full(int(rng.integers(2, 5)), 3.0)) * _IRRADIANCE * rng.uniform(0.8, 1.2)
     target = room.at(np.array([0.0, 0.0, 0.2]))
@@ -283,8 +283,7 @@ def _relief(rng: Generator, extent: NDArray) -> Relief:
 
 
 def _path(setting: Setting, start: Key, radius: float, duration: float) -> tuple[Key, ...]:
-    """Four evenly spaced keys: steps up to the object's size, rotations to 60 degrees, extents changed by up
-    to a fifth."""
+    """Four evenly spaced keys of random steps, rotations and changes of extent."""
     rng, keys = setting.rng, [start]
     for k in range(1, 4):
         position = np.asarray(keys[-1].position) + rng.normal(size=3) * 0.4 * radius

@@ -25,7 +25,8 @@ from .scene import Paint, Scene, Texture, TextureKind, Vec3
 
 
 def abstract(seed: int, rig: Rig, *, moving: float = 0.0) -> Scene:
-    """Generate one of the paper's scenes: 10 to 20 patterned shapes in a room, within the rig's depth range.
+    """Generate one of the paper's scenes: 10 to 20 patterned shapes in a room, in the rig's depth range as
+    `furnished` says.
 
     Args:
         seed: random seed, 0 or more.
@@ -33,10 +34,10 @@ def abstract(seed: int, rig: Rig, *, moving: float = 0.0) -> Scene:
         moving: seconds for which objects move, rotate and stretch along random paths; 0 for none.
 
     Returns:
-        The scene, the same for the same seed and rig; fewer shapes if they do not fit.
+        The scene, the same for the same arguments; fewer shapes if they do not fit.
 
     Raises:
-        ValueError: for a rig without a calibrated camera, and a negative seed.
+        ValueError: as `furnished`.
     """
     return furnished("abstract", seed, rig, _pattern, moving)
 
@@ -44,19 +45,18 @@ def abstract(seed: int, rig: Rig, *, moving: float = 0.0) -> Scene:
 def photographs(seed: int, rig: Rig, folder: str | Path, *, moving: float = 0.0) -> Scene:
     """Generate a scene like `abstract`, with the images under a folder on all surfaces.
 
-    Images that are black in large parts are avoided.
-
     Args:
         seed: random seed, 0 or more.
         rig: rig that sees the scene.
-        folder: folder of images, searched with its subfolders, once for the process.
+        folder: folder of images, searched with its subfolders, once for the process; dark ones are avoided.
         moving: seconds for which objects move; 0 for none.
 
     Returns:
-        The scene, the same for the same seed, rig and images.
+        The scene, the same for the same arguments and images.
 
     Raises:
-        ValueError: for a missing folder, one without images, and as `abstract`.
+        ValueError: for a missing folder, one without images, and as `furnished`.
+        OSError: for an image that cannot be read.
     """
     files = _images(Path(folder))
 
@@ -75,7 +75,8 @@ def generator_named(name: str) -> Callable[..., Scene]:
     """Look up a scene generator: "abstract", "photographs", or your own "module:function".
 
     Returns:
-        The function, called with seed, rig and `moving` seconds; "photographs" needs `folder` too.
+        The function (your own is not checked to be one), called with seed, rig and `moving` seconds;
+        "photographs" needs `folder` too.
 
     Raises:
         ValueError: for a name that is neither, or cannot be imported.
@@ -119,8 +120,7 @@ def paints(rng: Generator) -> tuple[Paint, ...]:
 
 
 def _near_infrared(rng: Generator, rgb: Vec3) -> float:
-    """Near-infrared reflectance: dyes hardly absorb there, pigments as in red, green is often a leaf, soot
-    stays black."""
+    """Near-infrared reflectance of a dye, a pigment, a leaf, or soot."""
     r, g, b = rgb
     if g > 1.2 * max(r, b):
         return float(rng.uniform(0.4, 0.6))

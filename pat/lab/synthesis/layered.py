@@ -37,10 +37,11 @@ class ArrayBatch:
 
     Attributes:
         images: images 0..1, sRGB.
-        depth: metres along each camera's own axis at the pixels' centres; NaN where unknown.
+        depth: metres along each camera's own axis at the pixels' centres; infinite where nothing is hit, NaN
+            where unknown.
         cameras: cameras, batched (b), with alpha's frame as the world.
         depth_range: (near, far) of alpha's depths, metres; far may be infinite.
-        index: number of the visible layer, from 1; an empty list for scenes that have no layers.
+        index: number of the visible layer, from 1, 0 where none is; an empty list for scenes of no layers.
     """
 
     images: list[Float[Tensor, "b 3 _ _"]]
@@ -53,13 +54,12 @@ class ArrayBatch:
 class LayeredScenes:
     """Source of random layered scenes for training.
 
-    All randomness comes from the generator given to `sample` or `render` (on the CPU for any device) and from
-    `seed`, which makes the outlines.
+    All randomness comes from the generator (on the CPU) given to `sample` or `render`, and from `seed`.
 
     Args:
         photos: textures.
         rigs: distribution of the random rigs.
-        hw: (height, width) of alpha's images.
+        hw: (height, width) of alpha's images in `sample`.
         layers: least and greatest number of planes, 1 or more.
         seed: seed of the outlines.
         device: device of the images.
@@ -95,7 +95,7 @@ class LayeredScenes:
         """Render random scenes seen by given rigs, whose first camera is alpha and the world frame.
 
         A view with fewer pixels a radian than alpha is rendered at about alpha's resolution (up to 4 times)
-        and averaged by area, as a coarser sensor would. Lens models are ignored.
+        and its image averaged by area, as a coarser sensor would. Lens models are ignored.
 
         Args:
             rigs: rigs of float64 on the CPU, alpha at the world's origin.
@@ -103,7 +103,7 @@ class LayeredScenes:
             oversampling: factor of further samples in a pixel along each axis.
 
         Returns:
-            A batch, one scene for each rig, cameras float32, on this source's device, without gradient.
+            A batch without gradient, a scene for each rig, of its sizes, on this source's device, float32.
         """
         layers = draw_layers(rigs, self.layers, self.photos, len(self.outlines), generator)
         factors = [oversampling * _oversampling(rigs.cameras[0], v) for v in rigs.cameras]
@@ -115,7 +115,8 @@ class LayeredScenes:
     def _seen(self, layers: Layers, camera: Camera, factor: int) -> tuple[Tensor, Tensor, Tensor]:
         """Image; depth at the pixels' centres; index of the surface that covers most of each pixel."""
         front = self._front(layers, camera)
-        depth, index = ((v.view(-1, *camera.hw)) for v in (1 / front.inverse_depth, front.main + 1))
+        number = torch.where(front.inverse_depth > 0, front.main + 1, 0)
+        depth, index = (v.view(-1, *camera.hw) for v in (1 / front.inverse_depth, number))
         if factor == 1:
             return self._shade(layers, camera, front), depth, index
         fine = camera.resize((camera.hw[0] * factor, camera.hw[1] * factor))
@@ -187,8 +188,7 @@ class LayeredScenes:
 
 @dataclass(frozen=True)
 class _Front:
-    """The two foremost layers at each pixel, the first one's opacity, and the main one with its inverse
-    depth."""
+    """The two foremost layers at each pixel, the first one's opacity, the main one and its inverse depth."""
 
     first: Tensor
     second: Tensor

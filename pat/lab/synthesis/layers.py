@@ -37,7 +37,7 @@ class Layers:
         outline_from_plane: map from metres to the outline's square [-1, 1]^2.
         texture: number of the texture.
         texel_from_plane: map from metres to pixels of the full texture.
-        colour: matrix by which texture colours (r, g, b, 1), 0..1, are multiplied.
+        colour: matrix by which texture colours (r, g, b, 1), 0..1, are multiplied, before clipping.
     """
 
     plane_from_world: Pose

@@ -22,10 +22,8 @@ def patterns(rng: np.random.Generator, count: int) -> list[np.ndarray]:
 
 
 def recoloured(images: list[np.ndarray], rng: np.random.Generator, count: int) -> list[np.ndarray]:
-    """Make textures with the luminance (contrast reduced) of one random image and the chroma of one, some
-    smoothed.
-
-    They break the correlation of colour and luminance in photographs.
+    """Make textures with the luminance (contrast reduced) of one random image and the chroma of another, or
+    the same; some are smoothed first.
 
     Args:
         images: arrays (h, w, 3), uint8, RGB, to take luminance and chroma from.

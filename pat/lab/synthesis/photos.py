@@ -1,7 +1,7 @@
 """Textures in memory, sampled at any position and level of detail.
 
-Textures repeat by mirroring, so that planes may be of any size. Each is stored with its pyramid of 2x area
-averages as packed bytes (R + 256 G + 65536 B in one int32): one gather fetches one texel.
+Each is stored with its pyramid of 2x area averages as packed bytes (R + 256 G + 65536 B in one int32): one
+gather fetches one texel.
 """
 
 from __future__ import annotations
@@ -62,21 +62,20 @@ class PhotoBank:
         seed: int = 0,
         choose: Callable[[int], bool] = lambda i: True,
     ) -> PhotoBank:
-        """Load all images under the folders (`read_photographs`), and add 48 patterns and 48 mixtures of the
-        images (`recoloured`).
+        """Load the images under folders (`read_photographs`), followed by 48 patterns and 48 mixtures of the
+        images taken (`recoloured`).
 
         Args:
-            folders: folders, searched with their subfolders; not read if the cache exists.
-            max_edge: longest side in pixels that images are reduced to; without effect once the cache exists.
-            cache: .npz file, written on the first call and read on later ones; it is not checked against the
-                folders. None for no cache.
+            folders: folders, searched with their subfolders.
+            max_edge: longest side in pixels that images are reduced to.
+            cache: .npz file, written on the first call; once it exists it is read in place of the folders,
+                whatever `max_edge` is. None for no cache.
             seed: seed of the patterns and mixtures.
-            choose: called with an image's number, from 0 in the order of paths, returns True to take it; to
-                hold some out.
+            choose: called with an image's number, from 0 in the order of paths, returns True to take it.
 
         Raises:
             ValueError: if no image is found or chosen, and for a file that is no cache.
-            OSError: if the cache cannot be written.
+            OSError: if an image cannot be read, or the cache not written.
         """
         if cache and Path(cache).exists():
             images = _cached(Path(cache))
@@ -184,11 +183,12 @@ def read_photographs(folders: tuple[str | Path, ...], max_edge: int) -> list[np.
     side (but no side under 32).
 
     Returns:
-        Arrays (h, w, 3), uint8, RGB (equal for grey), each folder's in the order of all paths; files that are
-        no images, have a side under 32 pixels, or are too large to decode, are skipped.
+        Arrays (h, w, 3), uint8, RGB (equal for grey), in the order of all folders' paths; files that are no
+        images, have a side under 32 pixels, or are too large to decode, are skipped.
 
     Raises:
-        ValueError: if none is found.
+        ValueError: if none is found, as under a missing folder.
+        OSError: if a file cannot be read.
     """
     paths = sorted(p for folder in folders for p in files_below(folder) if p.suffix.lower() in PHOTO_SUFFIXES)
     images = [_reduced(p, max_edge) for p in map(_decoded, paths) if p is not None]

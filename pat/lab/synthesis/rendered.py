@@ -95,9 +95,10 @@ class Rendered:
             The frame, float32 (index int64).
 
         Raises:
-            ValueError: for an unknown camera, and a damaged rig.yaml or render.json.
+            ValueError: for an unknown camera, and a damaged rig.yaml.
             IndexError: for a `number` beyond its frames.
-            OSError: if a file cannot be read; damaged frames give BadZipFile, KeyError, TypeError and others.
+            OSError: if a file cannot be read; a damaged render.json or frame gives ValueError, BadZipFile,
+                KeyError, TypeError and others.
         """
         entry = self.about["frames"][self.rig.require(camera)][number]
         with np.load(self.folder / entry["file"]) as arrays:
@@ -146,8 +147,7 @@ def is_rendered(folder: str | Path) -> bool:
 
 
 UNEVEN = 0.001
-"""Relative deviation of inverse depth from its neighbours' mean that counts as a crease: interpolation errs
-by up to an eighth of it, a hundredth of a pixel at a disparity of 80."""
+"""Relative second difference that counts as a crease: interpolation errs by up to an eighth of it."""
 
 
 def depth_between(
@@ -163,11 +163,11 @@ def depth_between(
         depth: depth of the pixels, metres; infinite where nothing is hit, as which NaN counts.
         index: object index of each pixel.
         x: positions (x, y), pixels.
-        uneven: relative deviation of inverse depth from its neighbours' mean that counts as a step or crease.
+        uneven: relative second difference of inverse depth; two neighbours above it have an edge between.
 
     Returns:
-        Depth (n), infinite between infinite depths; and True on the image where the four pixels around are
-        one object, or all hit nothing, without step or crease: elsewhere the depth may lie between two
+        Depth (*n), infinite between infinite depths; and True on the image where the four pixels around are
+        one object, or all hit nothing, without such an edge: elsewhere the depth may lie between two
         surfaces, and off the image it is infinite.
     """
     inverse = torch.where(depth.isfinite(), 1 / depth, 0.0).to(x)

@@ -24,16 +24,16 @@ class RigDistribution:
         frame: width of the whole image as a multiple of alpha's, which is a patch of it.
         focal: focal length as a multiple of that width.
         resolutions: beta's pixels a radian over alpha's, and its size over alpha's; one is drawn for each
-            camera of a batch.
-        alpha: side of alpha in rectified rigs; "either" draws one for each rig.
+            beta of a batch, before `focal_ratio`.
+        alpha: side of alpha against a beta in rectified rigs; "either" draws one for each beta of each rig.
         focal_ratio: further factor of beta's focal length (general).
         rotation: size of a random rotation, degrees: two standard deviations about each axis (general).
         toe_in: rotation of betas towards a point of the scene, 0 parallel, 1 fully (general).
         decentring: largest offset of beta's patch from alpha's view, as a fraction of its size (general).
 
     Raises:
-        ValueError: for bounds (but `toe_in`) that are not positive and in order, no betas, no resolutions,
-            and those that are not positive.
+        ValueError: for bounds (but `toe_in`) that are not positive, finite and in order, no betas, and
+            resolutions that are none or not positive.
     """
 
     mode: Literal["rectified", "general"] = "rectified"

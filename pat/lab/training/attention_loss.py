@@ -1,8 +1,7 @@
 """Attention loss supervised by geometry: weights along the segment classify the true position.
 
 For an alpha pixel whose point beta sees between the samples l and l + 1 of its segment, a share u of the way,
-the loss is the cross-entropy of the weights against (1 - u) at l and u at l + 1. For a pixel whose point beta
-does not see, it is the cross-entropy against equal weights, so that a failed search has a small peak.
+the true weights are 1 - u at l and u at l + 1; where beta does not see it, equal ones.
 """
 
 from __future__ import annotations
@@ -46,13 +45,14 @@ def attention_loss(
     *,
     stride: int = 2,
 ) -> Tensor:
-    """Compute the mean cross-entropy of the attention weights against the true positions, over all betas.
+    """Compute the cross-entropy of the attention weights against the true positions, as a mean over betas.
 
-    For known points that a beta does not see it is against equal weights, times `UNSEEN`. Visible points off
-    the segment (`OFF`) do not count. No samples of beta are gathered.
+    For each beta it is the mean over visible points plus `UNSEEN` times the mean over known points that beta
+    does not see, there against equal weights. Pixels without a valid segment, and visible points off it
+    (`OFF`) or off beta, do not count; a mean over none is 0.
 
     Args:
-        compared: features and segments of each of one or more betas.
+        compared: features and segments of each of one or more betas; a `border` is not applied.
         position: true positions (x, y) of all pixels of alpha, pixels of each beta; (0, 0) where unknown.
         visible: True where that beta sees the point.
         stride: only every `stride`-th row and column of alpha counts.

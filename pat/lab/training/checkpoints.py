@@ -120,7 +120,7 @@ def newest_checkpoint(folder: Path) -> Checkpoint | None:
     """Read the newest readable checkpoint of a folder.
 
     Returns:
-        The checkpoint, of the latest step; None if the folder has none or is missing.
+        The checkpoint, of the latest step that can be read; None if the folder has none or is missing.
 
     Raises:
         ValueError: if the folder has checkpoints and none can be read, so that no run starts again by
@@ -142,7 +142,7 @@ def read_checkpoint(path: Path) -> Checkpoint | None:
     """Read a checkpoint file.
 
     Returns:
-        The checkpoint, tensors on the CPU; None for a missing or damaged file, and one that is no checkpoint.
+        The checkpoint, tensors on the CPU; None for a file that cannot be read or is no checkpoint.
     """
     try:
         tensors, metadata = read_tensors(path)

@@ -55,8 +55,8 @@ class TrainConfig:
     """A recipe. A step sees `groups` times `batch` scenes; there are `steps` steps, or what `minutes` allow.
 
     Raises:
-        ValueError: naming the entry, for values out of range, sides of `hw` that are not multiples of 16, and
-            a share of rendered or measured scenes without their folder or the other way round.
+        ValueError: naming the entry, for values out of range, sides of `hw` that are not multiples of 16, a
+            share of rendered or measured scenes without folders or the other way round, or over 1 in all.
     """
 
     photos: tuple[Path, ...] = ()
@@ -161,20 +161,20 @@ def recipes() -> tuple[str, ...]:
 
 
 def load_config(name: str | Path) -> TrainConfig:
-    """Load a recipe of the package by name, or else a YAML file.
+    """Load a recipe of the package by name, or else a YAML file; paths in it are not resolved by its folder.
 
     Raises:
         FileNotFoundError: if it is neither.
-        ValueError: naming the file and the entry, for an invalid recipe.
+        ValueError: naming the file and the entry, as `parse_config`.
     """
     path = next((p for p in (RECIPES / f"{name}.yaml", Path(name)) if p.is_file()), None)
     if path is None:
         raise FileNotFoundError(f"no recipe '{name}' (a file, or a shipped name){near(name, recipes())}")
-    return parse_config(path.read_text(encoding="utf-8"), str(path))
+    return parse_config(path.read_bytes(), str(path))
 
 
-def parse_config(text: str, name: str = "config") -> TrainConfig:
-    """Parse a recipe from YAML text; `name` begins messages.
+def parse_config(text: str | bytes, name: str = "config") -> TrainConfig:
+    """Parse a recipe from YAML text (UTF-8 if bytes); `name` begins messages.
 
     Returns:
         The recipe, with defaults for entries that the text leaves out.
@@ -218,10 +218,10 @@ def command_line(arguments: list[str], prog: str = "pat lab train") -> TrainConf
         The recipe.
 
     Raises:
-        ValueError: for an invalid recipe, and for one that names code as its field where the arguments do
-            not.
+        ValueError: for an invalid recipe, also after the overrides, and for one that names code as its field
+            where the arguments do not.
         FileNotFoundError: for a missing recipe.
-        UsageError: for unknown options and invalid values.
+        UsageError: for unknown options and values that cannot be read.
         SystemExit: after `--help`, which prints.
     """
     base = TrainConfig()
@@ -245,7 +245,7 @@ def difference(config: TrainConfig, other: TrainConfig) -> str | None:
     """Compare two recipes, except for the entries in `UNSEEN`.
 
     Returns:
-        The first difference, as "name: value of config, value of other"; None if both are the same run.
+        The first difference, as "name: value of config, value of other"; None if there is none.
     """
     for entry in dataclasses.fields(TrainConfig):
         ours, theirs = getattr(config, entry.name), getattr(other, entry.name)

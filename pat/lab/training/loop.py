@@ -50,9 +50,9 @@ def train(config: TrainConfig) -> Path:
         FloatingPointError: for a loss or gradient that is not finite, naming the samples; their batch is
             saved.
         FileNotFoundError: for a missing folder of scenes or pairs, or file of weights.
-        OSError: if a file cannot be written.
-        ValueError: for a folder with another run, a folder in use, no such device, or data that do not suit
-            the recipe or cannot be read.
+        OSError: if a file cannot be read or written.
+        ValueError: for a folder with another run, in use or among the photographs, no such device, and data,
+            a field or a number of groups that cannot be used.
     """
     check_apart(config.out, config.photos)
     former = former_run(config)
@@ -70,7 +70,7 @@ def train(config: TrainConfig) -> Path:
 
 
 def former_run(config: TrainConfig) -> Checkpoint | None:
-    """Read the last checkpoint of the same run.
+    """Read the newest readable checkpoint of the same run.
 
     Returns:
         The checkpoint; None if there is none.
@@ -128,7 +128,7 @@ class Run:
 
     Raises:
         ValueError: for data or processes that do not suit the recipe, or a checkpoint of another network.
-        FileNotFoundError: for a missing folder of scenes or pairs, or file of weights.
+        OSError: as `train`.
     """
 
     def __init__(self, config: TrainConfig, here: Process, former: Checkpoint | None) -> None:
@@ -170,7 +170,7 @@ class Run:
         Raises:
             FloatingPointError: for a loss or gradient that is not finite.
             OSError: if a file cannot be written.
-            ValueError: for images that cannot be read.
+            ValueError: for images that cannot be read, and as field, network or loss refuse a sample.
         """
         groups_by_step = self.samples.steps(self.groups, start=self.step)
         recipe = self.config

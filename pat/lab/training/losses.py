@@ -69,10 +69,10 @@ def validation(network: FusionNetwork, samples: list[Sample]) -> dict[str, float
         samples: groups of samples.
 
     Returns:
-        By name: "psnr" of images clipped to 0..1, in dB, the mean over samples, each at most 80; "matched",
-        the share of visible pixels whose match is within 1.5 pixels of beta (NaN without truth); and "peaks",
-        the share whose largest weight is within one pixel, only for networks that are `Comparing` and fields
-        of segments.
+        Means over the groups by name: "psnr" of images clipped to 0..1, in dB, each sample's at most 80;
+        "matched", the share of visible pixels whose match is within 1.5 pixels of beta; and "peaks", the
+        share whose largest weight is within one pixel, only for networks that are `Comparing` and fields of
+        segments. The last two leave out groups without a visible pixel, and are NaN if all are.
 
     Raises:
         ValueError: for no samples.

@@ -214,7 +214,7 @@ def scenes(config: TrainConfig, *, device: str = "cpu") -> tuple[SampleSource, S
     Raises:
         ValueError: for no photographs, as in a missing folder, or too few to hold some out, an unknown field,
             and other data that cannot be used.
-        FileNotFoundError: for a missing folder of rendered scenes or measured pairs.
+        OSError: as `photographs`; FileNotFoundError as `source_of`.
     """
     n, layered = config.held_out, config.rendered + config.measured < 1
     bank, unseen = photographs(config) if layered else (None, None)
@@ -268,7 +268,7 @@ def photographs(config: TrainConfig) -> tuple[PhotoBank, PhotoBank]:
 
     Raises:
         ValueError: if there are none, or too few to hold some out, and for a cache that is none.
-        OSError: if the cache cannot be written.
+        OSError: if an image cannot be read, or the cache not written.
     """
     if not config.photos and not (config.cache and config.cache.exists()):
         raise ValueError("photos: none are given: name folders with images, --photos FOLDER")
@@ -292,8 +292,8 @@ def degraded(
     Args:
         scene: scenes with ground truth, of up to three betas, pinholes.
         g: random generator of the degradations.
-        field: receptive field of all betas; one with a method `of_depth` is asked for that of alpha's true
-            depth, (b, h, w) in metres: an upper bound.
+        field: receptive field of all betas; one with a method `of_depth` is replaced by what that returns
+            for alpha's true depth, (b, h, w) in metres, which no camera knows.
         recording: probabilities of degradations.
 
     Returns:
@@ -347,7 +347,7 @@ def recorded(
 
 
 def steps(g: Generator, recording: RecordingConfig) -> list[Step]:
-    """Draw the degradations of one camera: gain, blur and noise, each with its own probability, then 8 bits.
+    """Draw one camera's degradations: gain, blur, noise, each by its own probability; then clipping, 8 bits.
 
     Returns:
         Steps for `pat.sensors.steps.record`, in order.
@@ -383,7 +383,7 @@ def perturbed(pair: Pair, pixels: float, g: Generator) -> Pair:
     """Rotate betas at random, so that points move by about `pixels` (root mean square on each axis).
 
     Args:
-        pair: batched pair.
+        pair: batched, calibrated pair.
         pixels: displacement, pixels of beta.
 
     Returns:
@@ -407,8 +407,8 @@ def transfer(pair: Pair, depth: Tensor, beta_depth: Tensor) -> tuple[Tensor, Ten
         beta_depth: depth (b, hb, wb) of beta's view at any resolution, metres; NaN where unknown.
 
     Returns:
-        Positions (b, h, w, 2) in beta's pixels, also outside its image, (0, 0) where unknown; and masks
-        (b, h, w), True where visible: nowhere at infinite depth.
+        Positions (b, h, w, 2) in beta's pixels, also outside its image or behind it, (0, 0) where unknown;
+        and masks (b, h, w), True where visible: nowhere at infinite depth.
 
     Raises:
         ValueError: for cameras that are not calibrated or have lenses.

@@ -102,9 +102,8 @@ class RenderedCrops(Crops):
 
     Raises:
         FileNotFoundError: for a missing folder.
-        ValueError: for a folder without scenes or with an incomplete one, no chosen scene, a scene whose rig
-            cannot be read, with fewer than two cameras or one that is not calibrated, or without an image as
-            large as `hw`.
+        ValueError: for a folder without scenes or with an incomplete one, no chosen scene, and a scene whose
+            rig cannot be read, or as `large_enough`.
     """
 
     def _find(self, roots: Sequence[Path], choose: Callable[[int], bool]) -> None:
@@ -163,7 +162,7 @@ def active_items(number: int, count: int, seed: int) -> list[int]:
     True
 
     Returns:
-        Numbers of at most `ACTIVE` items.
+        Numbers of at most `ACTIVE` items; one may be there twice, where a new random order begins.
     """
     if count <= ACTIVE:
         return list(range(count))
@@ -207,7 +206,8 @@ def large_enough(folder: Path, rig: Rig, hw: HW) -> list[str]:
         Their names.
 
     Raises:
-        ValueError: if none is large enough, a camera is not calibrated, or there are fewer than two.
+        ValueError: if none is large enough, a camera is not calibrated, there are fewer than two, or a lens
+            is valid for no pixel.
     """
     sizes = {name: windows.pinhole_of(c).hw for name, c in rig.cameras.items() if isinstance(c, Camera)}
     count = len(rig.names)
@@ -222,17 +222,17 @@ def large_enough(folder: Path, rig: Rig, hw: HW) -> list[str]:
 
 def beside(alpha: RenderedView, beta: RenderedView, size: HW, hw: HW, g: Generator) -> RenderedView:
     """Cut beta's window with about alpha's angle of view, around the projection of alpha's centre at a random
-    depth (the image's middle where beta does not see it), moved into the image and shifted at random.
+    depth (beta's middle if it cannot be projected), shifted at random and then moved into the image.
 
     Args:
         alpha: alpha's window.
         beta: beta's whole view.
         size: (height, width) of the result.
         hw: (height, width) of alpha's window.
-        g: random generator of the depth.
+        g: random generator of the depth and the shift.
 
     Returns:
-        Beta's window, resized to `size`, with its camera; where it leaves the image depth is NaN.
+        Beta's window, resized to `size`, with its camera; one larger than the image has NaN depth beyond.
     """
     ratio = pixels_per_radian(beta.camera) / pixels_per_radian(alpha.camera)
     wanted = (max(round(hw[0] * ratio), 1), max(round(hw[1] * ratio), 1))

@@ -54,7 +54,7 @@ class MeasuredPairs(Crops):
     `Crops`.
 
     Raises:
-        FileNotFoundError: for a missing folder.
+        FileNotFoundError: for a missing folder, or right image of Middlebury's.
         ValueError: for a folder without pairs, no chosen pair, and as `check`.
     """
 
@@ -147,7 +147,7 @@ class MeasuredPairs(Crops):
 
 
 def disparity_files(pair: PairFiles) -> tuple[Path, Path]:
-    """Find the disparity files of the left and the right image.
+    """Find the disparity files (`DISPARITIES`) of the left and the right image beside the left image.
 
     Returns:
         Paths of left's and of right's disparity.

@@ -28,7 +28,7 @@ HEADER = "step,loss,gradient,rate\n"
 
 
 class Watch:
-    """Progress reports of the first process: `steps.csv`, `log.jsonl`, images, a bar on a terminal.
+    """Progress reports until `close`: `steps.csv`, `log.jsonl`, images, a bar on a terminal, TensorBoard.
 
     Args:
         out: folder of the run.
@@ -37,7 +37,7 @@ class Watch:
         tensorboard: True to log for TensorBoard too.
 
     Raises:
-        ValueError: if TensorBoard is wanted and not installed, or a line of the two files is damaged.
+        ValueError: for TensorBoard without its package, and a damaged line of the files (KeyError: no step).
         OSError: if a file cannot be written.
     """
 

@@ -13,10 +13,10 @@ FOLDER = Path(sys.prefix) / "blender"
 
 
 def blender_python() -> str:
-    """Return the path of a Python interpreter that has bpy: this one, or that of `FOLDER`.
+    """Return the path of a Python interpreter for Blender: this one if it has bpy, else that of `FOLDER`.
 
     Raises:
-        ValueError: in one line with the command to install it, if OpenEXR is missing here, or bpy in both.
+        ValueError: in one line with the command to install it, if OpenEXR or such an interpreter is missing.
     """
     if find_spec("OpenEXR") is None:
         line = install_line("OpenEXR", "synthesis")

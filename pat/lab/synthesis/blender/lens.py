@@ -41,7 +41,7 @@ class Lens(NamedTuple):
     def resampled(self, image: Float[Tensor, "c h1 w1"]) -> Float[Tensor, "c h2 w2"]:
         """Resample colours to the true camera by cubic splines; 0 where the lens sees nothing.
 
-        The bicubic kernel of `grid_sample` shifts linear ramps by up to 0.05 pixels, splines do not.
+        The bicubic kernel of `grid_sample` shifts linear ramps, splines do not.
 
         Args:
             image: image of the pinhole, on the CPU, without gradient.
@@ -115,7 +115,7 @@ def lens_for(camera: View, name: str) -> Lens:
 
     Raises:
         ValueError: naming the camera, if it is not calibrated, batched, skewed or mirrored, or its lens is
-            not central, invalid, or too wide for a plane image.
+            not central, invalid, or too wide or too strong for a plane image.
     """
     if not isinstance(camera, Camera):
         raise ValueError(f"camera '{name}' is not calibrated: rendering needs its K, R and t")

@@ -33,7 +33,7 @@ _SERVE = "import sys; sys.path.append(sys.argv[1]); from child.serve import serv
 
 
 class Studio:
-    """Blender with one scene loaded; renders frames of any pinhole camera at any time.
+    """Blender with one scene loaded, until `close`; renders frames of any pinhole camera at any time.
 
     Args:
         scratch: existing folder for temporary files.
@@ -42,8 +42,9 @@ class Studio:
         version: Blender's version.
 
     Raises:
-        ValueError: as `blender_python`, and as `build` refuses a scene.
-        BrokenProcessPool: if Blender's process dies.
+        ValueError: as `blender_python`, and for a texture whose image file is missing.
+        KeyError: for an unknown shape.
+        BrokenProcessPool: if Blender's process dies, as at another error in it.
     """
 
     def __init__(self, scene: Scene, settings: RenderSettings, scratch: Path):
@@ -76,7 +77,7 @@ class Studio:
 
         Raises:
             ValueError: for what Blender refuses, in one line; no further frame can be rendered then.
-            BrokenProcessPool: if its process dies.
+            BrokenProcessPool: if its process dies, as at other errors in it.
         """
         places = [_place(thing.motion, time) for thing in self.scene.objects]
         self._ask(places=places, spectrum=spectrum, path=str(self.path), **_aim(camera))
@@ -110,8 +111,7 @@ class Studio:
 
 
 def _aim(camera: Camera) -> dict[str, Any]:
-    """Settings of Blender's image, camera and pose, with a sensor 36 units wide for any camera: Blender
-    refuses less than 1 mm."""
+    """Settings of Blender's image, camera and pose, for a sensor of `_SENSOR` mm: it refuses under 1 mm."""
     (h, w), K = camera.hw, camera.K
     fx, fy = float(K[0, 0]), float(K[1, 1])
     across, down = max(1.0, fy / fx), max(1.0, fx / fy)
@@ -143,7 +143,7 @@ def read_layers(path: Path) -> dict[str, Tensor]:
         Channels (h, w), float32, by pass and channel without the layer, such as "Combined.R".
 
     Raises:
-        ImportError: without OpenEXR.
+        ImportError: without OpenEXR. RuntimeError: for a file that it cannot read.
     """
     import OpenEXR
 

@@ -56,7 +56,7 @@ def render(scene: Scene, rig: Rig, out: Path, *, settings: RenderSettings) -> Re
 
     Raises:
         ValueError: in one line, if `out` exists or the scene cannot be rendered (such as a camera that
-            `lens_for` refuses, or that is inside an object, or a missing library).
+            `lens_for` refuses, that is inside an object or sees nothing, or a missing library).
         BrokenProcessPool: if Blender's process dies.
         OSError: if a file cannot be written.
     """

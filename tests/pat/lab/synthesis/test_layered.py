@@ -161,6 +161,17 @@ def test_a_given_rig_keeps_its_cameras(rich):
     assert 1.9 < batch.depth[0].min() < batch.depth[0].max() < 14
 
 
+def test_a_pixel_without_a_layer_has_no_index(rich):
+    K = intrinsics(64.0, HW)[None]
+    poses = [rotation_from_vector(torch.tensor([[0.0, angle, 0.0]]).double()) for angle in (0.0, np.pi)]
+    cameras = [Camera(K=K, cam_from_world=Pose(R, torch.zeros(1, 3).double()), hw=HW) for R in poses]
+    rig = RigBatch(cameras, torch.tensor([1.0]).double(), torch.tensor([10.0]).double())
+    batch = LayeredScenes(rich, RigDistribution(), hw=HW).render(rig, torch.Generator().manual_seed(0))
+    assert batch.depth[1].isinf().any()
+    assert torch.equal(batch.index[1] == 0, batch.depth[1].isinf())
+    assert (batch.index[0] > 0).all()
+
+
 def test_chroma_is_not_a_function_of_luminance(rich):
     """At one luminance the spread of chroma is as large as that of chroma overall."""
     image = draw(rich, RigDistribution(), 16).images[0].movedim(1, 0).flatten(1)

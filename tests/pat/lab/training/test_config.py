@@ -92,6 +92,13 @@ def test_what_is_wrong_is_named_in_one_line(text, message):
     assert "\n" not in str(caught.value)
 
 
+def test_a_recipe_that_is_no_text_is_named(tmp_path):
+    recipe = tmp_path / "recipe.yaml"
+    recipe.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ValueError, match=r"recipe[.]yaml: not valid YAML"):
+        load_config(recipe)
+
+
 def test_numbers_as_people_write_them():
     config = parse_config("{rate: 8e-4, minutes: inf, steps: 1e5, photos: ~/images, start: null}")
     assert (config.rate, config.minutes, config.steps) == (8e-4, float("inf"), 100_000)

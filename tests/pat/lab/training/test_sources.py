@@ -291,6 +291,21 @@ def test_what_is_wrong_with_scenes(broken, tmp_path):
     assert "1 of 1 cameras" in said(broken / "scenes" / "000000")
 
 
+def test_a_flipped_byte_names_the_scene(broken):
+    """Of a damaged archive NumPy raises ValueError, but zlib.error, TokenError and others too."""
+    scene = broken / "scenes" / "000000"
+    file = scene / Rendered(scene).about["frames"]["mono"][0]["file"]
+    whole, refusals = file.read_bytes(), []
+    for i in range(0, len(whole), 101):
+        file.write_bytes(whole[:i] + bytes([whole[i] ^ 255]) + whole[i + 1 :])
+        try:
+            read_view(scene, "mono")
+        except ValueError as error:
+            refusals.append(str(error))
+    assert refusals
+    assert all(refusal.startswith(f"{scene}: cannot be read") for refusal in refusals)
+
+
 # Stereo pairs ----------------------------------------------------------------------------------------------
 
 

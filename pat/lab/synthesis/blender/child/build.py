@@ -49,7 +49,7 @@ def build(bpy: Any, scene: Part, meshes: Sequence[Part], world: Any) -> BuiltSce
 
     Raises:
         ValueError: for a texture whose image file is missing.
-        KeyError: for an unknown kind of texture or light.
+        KeyError: for an unknown kind of texture. Errors of Blender pass, such as for an unknown light.
     """
     stage = BuiltScene([], [])
     for i, (thing, surface) in enumerate(zip(scene.objects, meshes)):

@@ -16,7 +16,7 @@ from .build import build
 
 
 def serve() -> None:
-    """Answer requests on standard input until it ends, or one is refused.
+    """Answer requests on standard input until it ends, or one raises ValueError; other errors pass.
 
     An answer is a line of JSON: {"version": Blender's} to the first, {} to others, {"error": one line}.
     """
@@ -53,7 +53,7 @@ class Stage:
         request: `scene`, `meshes` and `settings`, as the studio sends them.
 
     Raises:
-        ValueError: if bpy cannot be imported, and as `build`.
+        ValueError: if bpy cannot be imported; it and other errors as `build`.
     """
 
     def __init__(self, request: Any):
@@ -67,7 +67,7 @@ class Stage:
         self._quality()
 
     def render(self, request: Any) -> None:
-        """Render one frame (colours, depth, object index) to a multi-layer EXR file.
+        """Render one frame (colours, depth, object index) to a multi-layer EXR file. Errors of Blender pass.
 
         Args:
             request: `places`, `spectrum`, `path`, `image`, `camera` and `pose`, as `Studio.channels` sends
