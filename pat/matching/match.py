@@ -37,8 +37,8 @@ your own."""
 def match(inputs: Inputs, choice: Choice | None = None) -> Matches:
     """Match alpha with every beta, estimate the confidence of each match, and transfer the betas' bands.
 
-    Gradients reach images and fields, through the positions too. Without `inputs.learned` matches are
-    semi-global ones with a left-right check, without `chosen`, `stated` and `certainty`.
+    Gradients reach images and fields, through `disparity` too. Without `inputs.learned` it has none, and
+    matches are semi-global ones with a left-right check, without `chosen`, `stated` and `certainty`.
 
     Args:
         inputs: alpha, of one channel and even sides, and the betas.
@@ -102,7 +102,7 @@ def located_in_one(inputs: Inputs) -> BetaMatches:
         inputs: inputs with one beta, and an alpha of even sides.
 
     Returns:
-        The matches, detached, without choice, confidence or colours.
+        The matches (with gradients in `comparison` alone), without choice, confidence or colours.
 
     Raises:
         ValueError: for several betas, or a field that is not of straight segments.

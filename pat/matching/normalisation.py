@@ -77,7 +77,7 @@ def normalised(
     *,
     largest_gain: float = math.inf,
 ) -> Float[Tensor, "*b c h w"]:
-    """Return an image with another's mean and standard deviation, of all bands together.
+    """Return an image with another's mean and, up to `largest_gain`, standard deviation, all bands together.
 
     Statistics of whole images mean little where these show different parts of a scene.
 
