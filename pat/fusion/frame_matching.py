@@ -39,7 +39,7 @@ def matched_frames(files: Files) -> dict[str, list[Path]]:
 
     Returns:
         Files of the frames that every camera has, in order, by camera; all files as given if a camera has
-        fewer than two.
+        fewer than two, or nothing but their order relates them.
 
     Raises:
         ValueError: if nothing relates the files and their numbers differ, and without cameras.
@@ -66,7 +66,7 @@ def matched_frames(files: Files) -> dict[str, list[Path]]:
 def warn_of_gaps(files: Files) -> None:
     """Warn of the first gap in the numbers of each camera's files: a sequence has frames equally far apart.
 
-    Nothing is known of names without numbers, or with several that vary: there is no warning.
+    There is no warning for any camera if names of one lack numbers, repeat them, or have several that vary.
 
     Args:
         files: files of each camera, in order.

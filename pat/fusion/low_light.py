@@ -127,7 +127,7 @@ class LowLight:
         """Add the brightness and colours that betas recorded to a frame fused from the denoised views.
 
         Betas add nothing unless all are RGB, and brightness only to a noisy alpha that is similar to a
-        combination of their bands.
+        combination of their bands, without `keep_alpha`.
 
         Args:
             frame: frame fused from the denoised views, its steps not undone yet.

@@ -112,9 +112,9 @@ def save_frame(
         along: kind of depth (`measured_along`), for `points` and depth_16.png.
         name: prefix of the files, as in name_fused.png; empty for none.
         bands: names of bands that cameras record one by one, each written to fused_NAME.png and
-            confidence_NAME.png too (NAME by `file_names`); without names, bands that are not one or three are
-            fused_1.png and so on.
-        pages: further text files by name; None for none.
+            (if the frame has `by_band`) confidence_NAME.png too, NAME by `file_names`; without names, bands
+            that are not one or three are fused_1.png and so on.
+        pages: further text files by name, without prefix; None for none.
         about: texts that `write_together` keeps about the group; None for none.
 
     Returns:
@@ -197,7 +197,7 @@ def describe_bands(frame: Frame, names: Sequence[str], kind: ImageFormat) -> str
         kind: format of the files.
 
     Returns:
-        The line; empty for an ordinary image of one band or three.
+        The line; empty for one band or three without names.
     """
     if not names and len(frame.image) in (1, 3):
         return ""
@@ -223,7 +223,7 @@ def write_depth(
 
     Args:
         depth: depth, metres or another unit of the rig's.
-        near: depth by which the scale is chosen; None for the nearest in `depth`, or 1 if none is known.
+        near: depth by which the scale is chosen, above 0; None for the nearest in `depth`, or 1 for none.
         along: kind of depth (`measured_along`).
 
     Returns:

@@ -83,9 +83,9 @@ DIRECTIONS = 8
 
 
 class MatchStatistics(NamedTuple):
-    """Statistics over a frame's consistent matches: on beta, not clipped, and past the left-right check.
+    """Statistics over a frame's consistent matches: on beta, past the left-right check.
 
-    They are taken over the whole frame: statistics of its tiles would differ, and their borders show.
+    Clipped ones count by a mix only. Statistics of tiles would differ, and the tiles' borders show.
 
     Attributes:
         matches: number of these matches, plus one, (B, 1, 1, 1); of a frame in pieces a mean of theirs.

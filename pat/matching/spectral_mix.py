@@ -54,7 +54,7 @@ class SpectralMix(NamedTuple):
     Attributes:
         weights: weight of each band (B, C).
         offset: offset (B).
-        slopes: change of each band (B, C) for a local one of 1 in the combination; less if it explains little.
+        slopes: change of each band (B, C) by a local one of 1 in the mix; less if that explains alpha badly.
         gain: share (B), 0 to 1, of alpha's difference from the combination that is an error of the bands, and
             not another spectrum; 0 for the mean of bands (`equal`), of which that is not known.
     """
