@@ -39,9 +39,9 @@ LARGEST_TIFF = 2**32 - 2**25
 class RecordedFiles(FilesOfCameras[NDArray[Any]]):
     """Values (C, H, W) of an image file of each camera as recorded, in its type, read when asked for.
 
-    Made of a rig and an image file of each camera. First bands behind a colour filter pattern are demosaiced:
-    red, green and blue counts, up to white. Three equal bands are one where the rig states one. Access raises
-    as `read_recorded`, also for another size or camera than the rig's; KeyError for a camera without a file.
+    Made of a rig and an image file of each camera. With a colour filter pattern the first band is demosaiced
+    to counts of red, green and blue, up to white. Three equal bands are one where the rig states one. Access
+    raises as `read_recorded`, also for other sizes or cameras than the rig's; KeyError without a file.
     """
 
     def __getitem__(self, name: str) -> NDArray[Any]:

@@ -108,7 +108,7 @@ def classical(rig: Rig, images: Mapping[str, Tensor], alpha: str, beta: str) -> 
 
     Args:
         images: images (C, h, w), 0..1, by camera, of the rig's sizes, which is not checked.
-        alpha: name of alpha.
+        alpha: name of alpha, in grey or colour.
         beta: name of the beta, of three bands or one.
 
     Returns:

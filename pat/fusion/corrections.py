@@ -72,7 +72,7 @@ class Corrections:
 
     Attributes:
         response: response of alpha in terms of beta's bands.
-        misalignments: misalignment by camera of the betas, zeros for none; empty for none of any camera.
+        misalignments: misalignment of each beta by camera, zeros for none; an empty mapping fits any cameras.
     """
 
     response: Response

@@ -67,8 +67,8 @@ class FuseSettings:
             None for no denoising; but `pat.fuse` without a rig takes None for "auto", and only {} for none.
         keep_alpha: True to leave alpha's values as recorded, noise included; as is done too if alpha has no
             noticeable noise.
-        luminance: luminance of the image: "alpha", which the network keeps exactly, that of "beta" in alpha's
-            detail, where alpha sees another part of the spectrum, or their "mix".
+        luminance: luminance of the image: "alpha", exact by networks with `keeps_luminance`, that of "beta" in
+            alpha's detail, where alpha sees another part of the spectrum, or their "mix".
 
     Raises:
         ValueError: for a noise or a response of another kind; the rest is checked when it is used.

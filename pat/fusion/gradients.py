@@ -42,7 +42,7 @@ def without_gradient(
 
     Raises:
         ValueError: as `fuse_frame` and `Rig.parameters`, and for a field that only fits full-size images.
-        TypeError: as `fuse_frame`; NotImplementedError too.
+        TypeError, NotImplementedError: as `fuse_frame`.
     """
     small = {name: image for name, image in images.items() if name in rig}
     for name, image in small.items():

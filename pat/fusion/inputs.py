@@ -200,7 +200,7 @@ def points_of(field: ReceptiveField) -> Callable[[Tensor], Tensor]:
     """Return the function from alpha's pixels to the positions in alpha for which a field searches.
 
     Returns:
-        The displacement of `Moved` fields, also within `Widened`; for other fields the identity.
+        That of `Moved` fields, also within `Widened`; for other fields the identity.
     """
     if isinstance(field, Widened):
         return points_of(field.field)

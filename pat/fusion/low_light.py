@@ -296,7 +296,7 @@ def exposed(view: NoisyView, response: Response) -> NoisyView:
 def denoised(
     image: Float[Tensor, "b c h w"], deviation: Float[Tensor, "b c h w"]
 ) -> Float[Tensor, "b c h w"]:
-    """Denoise images with noise of this standard deviation; bands other than three are denoised one by one.
+    """Denoise images on the CPU, with noise of this deviation; bands other than three are taken one by one.
 
     Returns:
         Images without noise, in their own type, not clipped, detached.

@@ -102,7 +102,6 @@ def save_frame(
     (`write_together`).
 
     Args:
-        frame: the frame.
         out: folder, made if missing.
         bits: 8 or 16 for sRGB values; 32 (tif, exr) for linear light as floats, not clipped.
         kind: format of the fused image.
@@ -181,10 +180,7 @@ def _write_shared(path: Path, text: str) -> None:
 
 
 def band_names(frame: Frame, betas: Iterable[str]) -> list[str]:
-    """Return the cameras that record a frame's bands one by one, in order.
-
-    Empty if its bands are those of colour cameras, or if cameras have several bands each.
-    """
+    """Return the cameras that record a frame's bands one by one, in order; empty unless they are several."""
     names = list(betas)
     return names if frame.by_band is not None and len(names) == len(frame.by_band) else []
 
@@ -228,6 +224,9 @@ def write_depth(
 
     Returns:
         The scale in counts per metre (or that unit): a power of ten.
+
+    Raises:
+        OSError: if the file cannot be written.
     """
     has_depth = depth.isfinite() & (depth > 0)
     scale = depth_scale(near or float(depth[has_depth].min() if has_depth.any() else 1.0))

@@ -35,7 +35,7 @@ FITTED = Path(__file__).with_name("certainty.safetensors")
 
 @dataclass(frozen=True)
 class CertaintySettings:
-    """Settings of the network's inputs and outputs.
+    """Settings of the confidence network's inputs and outputs.
 
     `pat lab settings` prints the value of each with its meaning and reason.
     """
@@ -121,7 +121,7 @@ def measured(matches: BetaMatches, typical: Float[Tensor, "b 2"]) -> Float[Tenso
 
     Returns:
         Numbers (B, `MEASURED`, H / 2, W / 2): `facts`, and their means in each radius of `SETTINGS.around`;
-        logarithms of 0.1 and the range of `surface` in each of `SETTINGS.apart`; blurs of alpha and of beta;
+        logarithms of .1 plus the range of `surface` in each of `SETTINGS.apart`; blurs of alpha and of beta;
         `typical`; `stated`.
     """
     assert matches.stated is not None

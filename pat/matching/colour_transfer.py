@@ -85,7 +85,7 @@ DIRECTIONS = 8
 class MatchStatistics(NamedTuple):
     """Statistics over a frame's consistent matches: on beta, past the left-right check.
 
-    Clipped ones count by a mix only. Statistics of tiles would differ, and the tiles' borders show.
+    Of clipped ones only those compared by a mix count. Statistics of tiles would differ, and borders show.
 
     Attributes:
         matches: number of these matches, plus one, (B, 1, 1, 1); of a frame in pieces a mean of theirs.

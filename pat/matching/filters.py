@@ -24,7 +24,7 @@ def blurred(images: Float[Tensor, "b 1 h w"], blurs: Sequence[float]) -> Float[T
         blurs: standard deviation for each image, pixels, as many as images; 0 leaves one as it is.
 
     Returns:
-        Images of the same shape and type; gradients, if the images have some, need sides above 4 deviations.
+        Images of the same shape and type; gradients, if they have some, need sides above about 4 deviations.
     """
 
     def one(image: Tensor, blur: float) -> Tensor:

@@ -210,7 +210,7 @@ class Matches:
         return 2 * (own + sum(fills.values())) + sum(planes)
 
     def cut(self, box: Box) -> Matches:
-        """Return the part at alpha's (top, bottom, left, right).
+        """Return the part at alpha's (top, bottom, left, right), all even.
 
         Fills that several betas share stay shared.
         """
