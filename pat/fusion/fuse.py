@@ -67,7 +67,7 @@ class FuseSettings:
             None for no denoising; but `pat.fuse` without a rig takes None for "auto", and only {} for none.
         keep_alpha: True to leave alpha's values as recorded, noise included; as is done too if alpha has no
             noticeable noise.
-        luminance: luminance of the image: "alpha", exact by networks with `keeps_luminance`, that of "beta" in
+        luminance: luminance of the image: "alpha", exact by networks with `keeps_luminance`, "beta", in
             alpha's detail, where alpha sees another part of the spectrum, or their "mix".
 
     Raises:
