@@ -119,6 +119,7 @@ def classical(rig: Rig, images: Mapping[str, Tensor], alpha: str, beta: str) -> 
         ValueError: for unknown or uncalibrated cameras, lenses, no depth range, another number of bands, and
             cameras that look along the line between them or have one centre.
         KeyError: for a camera without an image.
+        cv2.error: for disparities at the near bound for which there is not enough memory.
     """
     pair, mono, other = rig.pair(alpha, beta), luminance_of(images[alpha]), images[beta]
     if len(other) not in (1, 3):
@@ -372,10 +373,7 @@ def _mean_and_deviation(plane: Image, weight: Image) -> tuple[float, float]:
 
 
 def _regressed(chroma: Image, luma: Image, residual: Image) -> Image:
-    """Correct chroma along its local regression on luminance by the detail of alpha that beta's lacks.
-
-    This is the guided filter's linear model; it restores the detail that beta lost by its resolution.
-    """
+    """Correct chroma along its local regression on luminance (guided filter) by the detail that beta lost."""
     mean = _box(luma)
     variance: Image = _box(luma * luma) - mean * mean
     covariance = _box(chroma * luma[..., None]) - _box(chroma) * mean[..., None]

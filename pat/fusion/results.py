@@ -110,7 +110,7 @@ def save_frame(
         points: camera of alpha; the pixels of known depth are written to points.ply. None for no such file.
         along: kind of depth (`measured_along`), for `points` and depth_16.png.
         name: prefix of the files, as in name_fused.png; empty for none.
-        bands: names of bands that cameras record one by one, each written to fused_NAME.png and
+        bands: a name for each band, where cameras record them one by one, each written to fused_NAME.png and
             (if the frame has `by_band`) confidence_NAME.png too, NAME by `file_names`; without names, bands
             that are not one or three are fused_1.png and so on.
         pages: further text files by name, without prefix; None for none.

@@ -144,7 +144,7 @@ class SequenceFusion:
             The colour that fusion adds to alpha, with depth, and confidence, lowered where motion is unsure.
 
         Raises:
-            ValueError: if the frame cannot be fused, or an image cannot be read.
+            ValueError, TypeError: as `fuse_frame`, and if an image cannot be read.
             OSError: for an image file that is missing.
         """
         fields, weight = {}, torch.ones(self.rig[self.alpha].hw)
@@ -169,7 +169,7 @@ class SequenceFusion:
         Raises:
             ValueError: without keys, if none of those around it could be fused, or an image cannot be read.
             OSError: for an image file that is missing.
-            IndexError: for a number beyond alpha's frames.
+            IndexError: for a number beyond alpha's frames; one below 0 is not refused.
         """
         grey = self.grey(i)
         fetched = ((key, fetch(key)) for key in self._around(i, keys))

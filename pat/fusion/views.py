@@ -50,7 +50,7 @@ class Views:
         alpha: name of alpha.
         fields: receptive fields of betas; None, or no entry, for the pair's default field.
         alpha_in_colour: True if alpha's image was recorded in colour.
-        joined: for each beta that was joined from several, by its name, the names of those.
+        joined: names of the cameras in each beta, by its name, once betas were joined; empty before.
     """
 
     rig: Rig

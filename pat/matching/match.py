@@ -50,7 +50,7 @@ def match(inputs: Inputs, choice: Choice | None = None) -> Matches:
 
     Raises:
         ValueError: for no beta, a beta whose field is not of straight segments, and an alpha of odd sides or
-            several channels.
+            several channels. Images of less than 8 pixels a side may give a RuntimeError.
     """
     if inputs.alpha.shape[1] != 1:
         raise ValueError(f"alpha has {inputs.alpha.shape[1]} channels: what is matched has one")
