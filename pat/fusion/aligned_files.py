@@ -83,7 +83,7 @@ def save_aligned(
         out: folder, made if missing.
         separate: True for one file a camera, NAME.tif, in place of aligned.tif, as also for values of
             different types.
-        positions: format of the positions, "npy", "tif" or "none".
+        positions: format of the positions, "npy" or "tif"; "none", or any other word, for no such files.
         name: prefix of the files, as in name_aligned.tif; empty for none.
         keep: files that must not be overwritten, such as the images.
         pages: further text files by name, without prefix; None for none.

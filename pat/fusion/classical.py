@@ -83,7 +83,7 @@ def classical_view(
         longest: largest number of pixels of an image's longer side.
 
     Returns:
-        The fused bands (C, h, w) at the pixels of the reduced alpha, lens included; about 0..1 with a lens.
+        The fused bands (C, h, w) at the pixels of the reduced alpha, lens included; not clipped with a lens.
 
     Raises:
         ValueError: for cameras that are not calibrated, and as `Views.of` and `classical_baseline`.

@@ -33,7 +33,7 @@ class Frames(Protocol):
 
 
 class ImageFiles:
-    """Image files of one camera, read and developed when asked for, with the errors of `read_view` and of lists.
+    """Image files of one camera, read and developed on access, with the errors of `read_view` and of lists.
 
     Args:
         paths: files, in the order of time.
