@@ -152,7 +152,7 @@ def find_corrections(
         align: True to estimate misalignments.
 
     Returns:
-        The corrections; where none is fitted the stated response (`explained` as found), or Rec. 601's.
+        The corrections; where none is fitted the stated or Rec. 601's response, its `explained` as found.
 
     Raises:
         ValueError: for a response of another kind, and for stated weights where there is no RGB beta.

@@ -75,7 +75,7 @@ class Choice(nn.Module):
     pixel, and the logarithm of that one's error in pixels of beta.
 
     Args:
-        widths: channels at 1/2, 1/4 and 1/8 of alpha's size.
+        widths: three numbers, channels at 1/2, 1/4 and 1/8 of alpha's size.
     """
 
     def __init__(self, widths: tuple[int, ...] = SETTINGS.widths) -> None:

@@ -255,9 +255,9 @@ class Agreement(NamedTuple):
 def agreed(inputs: Inputs, matches: Matches) -> Matches:
     """Replace the matches in each beta by those at the inverse depths on which all betas agree.
 
-    Occluded pixels are found with a z-buffer: their left-right error (`facts`) is their distance from the
-    point in front. `disparity` and `facts` are replaced; `chosen` too if it is known for every beta, by
-    agreement of the chosen disparities, and is None otherwise.
+    Occluded pixels are found with a z-buffer: the left-right error (`facts`) is the distance from the point
+    in front, 1 where no match votes. `disparity` and `facts` are replaced; `chosen` too if it is known for
+    every beta, by agreement of the chosen disparities, and is None otherwise.
 
     Args:
         inputs: inputs for which `can_agree` is True, which is not checked.
@@ -284,8 +284,8 @@ def agreed(inputs: Inputs, matches: Matches) -> Matches:
 def with_likeliest_colours(inputs: Inputs, own: Matches, agreed: Matches) -> Matches:
     """Choose where each beta's colours are taken: at its own match, or at the one on which all betas agree.
 
-    The one at which beta is more similar to alpha is taken. This holds for betas that show all bands of the
-    result, whose colours can replace each other's; others keep the agreed match.
+    The one at which beta is more similar to alpha is taken. This holds for betas for which `shows_all_bands`
+    is True, whose colours can replace each other's; others keep the agreed match.
 
     Args:
         own: matches of each beta alone.
