@@ -51,8 +51,7 @@ LEAST_CONFIDENCE = 0.5
 pixels exceed it: docs/reports/alignment.md, under "occluded pixels filled"."""
 
 SMOOTH = 1.0
-"""Largest difference, in pixels, of a disparity between alpha's pixels from the nearest one's; beyond is a
-depth edge, where a mean is of neither surface."""
+"""Largest difference, pixels, of disparity between alpha's pixels from the nearest one's: more is an edge."""
 
 Recorded = Mapping[str, Any]
 """Values (C, H, W) by camera, as recorded: NumPy arrays of any type, or tensors."""
@@ -175,7 +174,7 @@ def align_frame(
         rig: the cameras. Those without an image are left out.
         alpha: name of the camera whose pixels are kept.
         network: network that uses matches.
-        settings: settings of fusion.
+        settings: settings of fusion; `keep_alpha` and `luminance` are not used.
         recorded: values to resample, of the images' sizes; None for the images themselves.
         interpolation: "nearest", "bilinear" or "cubic", of the values.
         min_confidence: confidence below which a pixel counts as occluded.
@@ -189,10 +188,10 @@ def align_frame(
         Values, masks and positions by camera, with alpha's depth: NumPy arrays, without gradients.
 
     Raises:
-        ValueError: for what `fuse_frame` refuses, a network that uses no matches, other words or numbers for
+        ValueError: as `ready_frame`; for a network or matches that do not serve, other words or numbers for
             `interpolation`, `fill` and `min_confidence`, and recorded values that are missing, no numbers, or
             of another size. Images that are read when asked for raise as their mapping does.
-        TypeError: for images that are no tensors, and what `matcher` returns if that is no `Matches`.
+        TypeError: as `ready_frame`, and for what `matcher` returns if that is no `Matches`.
     """
     rule = _ViewRule(interpolation, min_confidence, fill)
     rig = with_pixels(rig)
@@ -373,12 +372,13 @@ def _band_names(name: str, count: int) -> tuple[str, ...]:
 def resampled_values(
     values: NDArray[Any], positions: NDArray[np.float32], interpolation: Resampling
 ) -> NDArray[Any]:
-    """Resample recorded values (C, H, W) at positions (h, w, 2), pixels (x, y).
-
-    Computed in float64: float32 would round positions by 1e-4 pixels in an image of 4000.
+    """Resample recorded values (C, H, W) at positions (h, w, 2), pixels (x, y), in float64.
 
     Returns:
         Values (C, h, w) in the type given, integers rounded and clipped to it; 0 beyond the edge and at NaN.
+
+    Raises:
+        KeyError: for another word as `interpolation`.
     """
     kind, where = INTERPOLATIONS[interpolation], torch.from_numpy(positions)
 

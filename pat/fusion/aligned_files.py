@@ -39,9 +39,9 @@ LARGEST_TIFF = 2**32 - 2**25
 class RecordedFiles(FilesOfCameras[NDArray[Any]]):
     """Values (C, H, W) of an image file of each camera as recorded, in its type, read when asked for.
 
-    Made of a rig and an image file of each camera. Images behind a colour filter pattern are demosaiced: red,
-    green and blue counts. Three equal bands are one where the rig states one. Access raises as
-    `read_recorded`, also for another size than the rig's; KeyError for a camera without a file.
+    Made of a rig and an image file of each camera. With a colour filter pattern the first band is demosaiced
+    to counts of red, green and blue, up to white. Three equal bands are one where the rig states one. Access
+    raises as `read_recorded`, also for other sizes or cameras than the rig's; KeyError without a file.
     """
 
     def __getitem__(self, name: str) -> NDArray[Any]:
@@ -83,13 +83,13 @@ def save_aligned(
         out: folder, made if missing.
         separate: True for one file a camera, NAME.tif, in place of aligned.tif, as also for values of
             different types.
-        positions: format of the positions, "npy", "tif" or "none".
+        positions: format of the positions, "npy" or "tif"; "none", or any other word, for no such files.
         name: prefix of the files, as in name_aligned.tif; empty for none.
         keep: files that must not be overwritten, such as the images.
-        pages: further text files by name; None for none.
+        pages: further text files by name, without prefix; None for none.
         recorded: files from which the values were read: files of bands then have the tags of alpha's, by
-            which mapping software places them, and each band's exposure, gain and black level. None for
-            neither.
+            which mapping software places them, and the exposure, gain and black level that the rig states of
+            each band. None for neither.
 
     Returns:
         Paths of the files, sorted.
@@ -200,7 +200,7 @@ def write_bands(
             None for none.
 
     Raises:
-        ValueError: for other numbers of names and wavelengths.
+        ValueError: for more names than wavelengths, or fewer.
         OSError: if the file cannot be written; a part of it may be there.
     """
     items = [

@@ -46,9 +46,9 @@ class LowConfidenceWarning(UserWarning):
 def warn_of_confidence(network: FusionNetwork, frame: Frame, inputs: FrameInputs) -> None:
     """Warn if confidence is low, in the mean or in a large part, where the segments of all betas are valid.
 
-    A mean below `UNFIT_CONFIDENCE` gives a `LowConfidenceWarning`, others a UserWarning. If each band is of
-    another beta, the median band decides: some bands of nine differ from alpha whatever the rig. Nothing is
-    checked without such pixels, and for networks without matches, whose confidence is no probability.
+    A mean below `UNFIT_CONFIDENCE` gives a `LowConfidenceWarning`, others a UserWarning. Of bands of several
+    betas the median one decides: some bands of nine differ from alpha whatever the rig. Nothing is checked
+    without such pixels, and for networks without matches, whose confidence is no probability.
     """
     overlap = _overlap(inputs).to(frame.confidence.device)
     if not (network.uses_matches and overlap.any()):

@@ -79,14 +79,14 @@ def classical_view(
     """Fuse reduced images by `classical_baseline` at alpha's own view, through lenses.
 
     Args:
+        images: images (C, h, w), 0..1, by camera, of any size: the rig's cameras are resized to them.
         longest: largest number of pixels of an image's longer side.
 
     Returns:
-        The fused bands (C, h, w), 0..1, at the pixels of the reduced alpha, lens included.
+        The fused bands (C, h, w) at the pixels of the reduced alpha, lens included; not clipped with a lens.
 
     Raises:
-        ValueError: for cameras that are not calibrated, have no pinhole view or cannot be rectified, no depth
-            range, and images that do not fit the rig (`Views.of`).
+        ValueError: for cameras that are not calibrated, and as `Views.of` and `classical_baseline`.
     """
     if names := [name for name in images if not isinstance(rig[name], Camera)]:
         raise ValueError(
@@ -107,18 +107,19 @@ def classical(rig: Rig, images: Mapping[str, Tensor], alpha: str, beta: str) -> 
     far; the colour differences (for one band: the excess of beta over alpha) are warped back to alpha.
 
     Args:
-        images: images (C, h, w), 0..1, by camera.
-        alpha: name of alpha.
+        images: images (C, h, w), 0..1, by camera, of the rig's sizes, which is not checked.
+        alpha: name of alpha, in grey or colour.
         beta: name of the beta, of three bands or one.
 
     Returns:
-        Three bands with alpha's luminance, or one, 0..1, at alpha's pixels; where beta does not see a pixel,
-        by seen ones that are similar.
+        Three bands with alpha's luminance, or one, clipped to 0..1, at alpha's pixels; where beta does not
+        see a pixel, by seen ones that are similar.
 
     Raises:
         ValueError: for unknown or uncalibrated cameras, lenses, no depth range, another number of bands, and
             cameras that look along the line between them or have one centre.
         KeyError: for a camera without an image.
+        cv2.error: for disparities at the near bound for which there is not enough memory.
     """
     pair, mono, other = rig.pair(alpha, beta), luminance_of(images[alpha]), images[beta]
     if len(other) not in (1, 3):
@@ -153,8 +154,8 @@ def classical_fusion(
         max_disparity: largest disparity, in alpha's pixels.
 
     Returns:
-        Red, green and blue with alpha's luminance, 0..1; where beta does not see a pixel, by seen ones that
-        are similar.
+        Red, green and blue with alpha's luminance, clipped to 0..1; where beta does not see a pixel, by seen
+        ones that are similar.
 
     Raises:
         ValueError: for a `max_disparity` that is not positive.
@@ -344,8 +345,8 @@ def _softened(mono: Image, sharpness: float) -> Image:
 def raw_disparity(left: NDArray[np.uint8], right: NDArray[np.uint8], max_disparity: float) -> Image:
     """Compute the disparity of a left image (h, w) by OpenCV's semi-global matching, without a check.
 
-    The right image has the same size; disparities from 0 to `max_disparity` pixels, or the width, are
-    searched, and up to the next multiple of 16.
+    The right image has the same size; disparities from 0 to `max_disparity` pixels, or to the width if that
+    is less, are searched, and up to the next multiple of 16.
 
     Returns:
         Disparity (h, w) of the left image's pixels, in pixels; negative where unknown.
@@ -372,10 +373,7 @@ def _mean_and_deviation(plane: Image, weight: Image) -> tuple[float, float]:
 
 
 def _regressed(chroma: Image, luma: Image, residual: Image) -> Image:
-    """Correct chroma along its local regression on luminance by the detail of alpha that beta's lacks.
-
-    This is the guided filter's linear model; it restores the detail that beta lost by its resolution.
-    """
+    """Correct chroma along its local regression on luminance (guided filter) by the detail that beta lost."""
     mean = _box(luma)
     variance: Image = _box(luma * luma) - mean * mean
     covariance = _box(chroma * luma[..., None]) - _box(chroma) * mean[..., None]

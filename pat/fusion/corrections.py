@@ -72,7 +72,7 @@ class Corrections:
 
     Attributes:
         response: response of alpha in terms of beta's bands.
-        misalignments: misalignment by camera of the betas, zeros for none; empty if none has any.
+        misalignments: misalignment of each beta by camera, zeros for none; an empty mapping fits any cameras.
     """
 
     response: Response
@@ -88,8 +88,8 @@ class Corrections:
             hw: alpha's size without padding.
 
         Returns:
-            The corrected inputs: alpha and RGB betas by the response, segments by the misalignments; fields
-            of positions stay.
+            The corrected inputs: alpha and RGB betas by the response, which also gives `sees_luma`, segments
+            by the misalignments; fields of positions stay.
 
         Raises:
             ValueError: for misalignments of other cameras than these.
@@ -152,7 +152,7 @@ def find_corrections(
         align: True to estimate misalignments.
 
     Returns:
-        The corrections; the stated or the Rec. 601 response where none is fitted.
+        The corrections; where none is fitted the stated or Rec. 601's response, its `explained` as found.
 
     Raises:
         ValueError: for a response of another kind, and for stated weights where there is no RGB beta.

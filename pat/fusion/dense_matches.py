@@ -39,7 +39,7 @@ class MatchedDepth(NamedTuple):
     """Depth at alpha's pixels by matches.
 
     Attributes:
-        depth: (H, W), along alpha's axis, in the rig's unit; NaN where unknown.
+        depth: (H, W), along alpha's axis or its rays (`measured_along`), in the rig's unit; NaN if unknown.
         confidence: (H, W): probability that every beta sees the point and its position is right, 0 to 1.
     """
 
@@ -101,11 +101,11 @@ def matched_depth(images: Images, rig: Rig, *, alpha: str, bands: int | None) ->
             bands that is most similar.
 
     Returns:
-        Depth and confidence at alpha's pixels, detached.
+        Depth (as of `final_depth`) and confidence at alpha's pixels, detached.
 
     Raises:
         ValueError: for images that do not fit the rig, views that do not overlap, and a field that raises it.
-        TypeError: for images that are no tensors.
+        TypeError: for images that are no tensors, or no mapping.
     """
     network = MatchesAlone(bands)
     views = Views.of(rig, images, alpha=alpha)

@@ -63,11 +63,10 @@ def certain(output: FusionOutput, matches: Matches | None, inputs: Inputs) -> Fu
     Args:
         output: the network's output.
         matches: matches that it was given; None for none.
-        inputs: the network's inputs.
 
     Returns:
-        The output with these, and the largest confidence as `overall` if it had one; unchanged without
-        matches.
+        The output with these (confidence 0 off a segment, or where the network's is), and the largest as
+        `overall` if it had one; unchanged without matches.
     """
     if matches is None:
         return output
@@ -91,8 +90,8 @@ def measured_depth(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Compute depth from the calibrated betas: the mean of inverse depths, weighted by their confidences.
 
-    A position whose depth is beyond the bounds that were searched counts as the end of its segment: a pixel
-    beyond the far end may otherwise stand for any distance.
+    Depth beyond the bounds that were searched becomes that of the segment's end; for a pair with a link it is
+    clipped; with lenses it is as of `Placement.depth`; from explicit positions of other pinholes it stays.
 
     Args:
         hw: size of the inputs without padding.

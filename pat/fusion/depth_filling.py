@@ -67,10 +67,10 @@ def final_depth(frame: Frame, frame_inputs: FrameInputs) -> Float[Tensor, "h w"]
 
 
 def without_outliers(depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-    """Replace each depth by the median of 5 x 5 pixels, of inverse depth.
+    """Replace each known depth by the median of 5 x 5 pixels, of inverse depth.
 
-    Unknown depth (NaN) counts as far away; where most is unknown, a pixel keeps its own. Gradients are those
-    of the pixel's own inverse depth.
+    Unknown depth (NaN) counts as far away; where that is the median, a pixel keeps its own. Gradients are
+    those of the pixel's own inverse depth.
 
     Returns:
         Depth (H, W), in the same unit, NaN where it was unknown.

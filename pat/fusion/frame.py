@@ -25,11 +25,11 @@ class Frame(NamedTuple):
         image: (C, H, W), in alpha's coding, not clipped to 0..1.
         depth: (H, W), along alpha's axis, or its rays (`measured_along`), in the rig's unit; NaN where no
             calibrated beta sees the point.
-        confidence: (H, W), the probability that every band's beta sees the point and its position is right to
-            a pixel.
+        confidence: (H, W), the probability that every band's beta (one, of several that show all bands) sees
+            the point and its position is right to a pixel; a network without matches has its own measure.
         half_width: (H, W), one over that unit: in 9 of 10 pixels the true inverse depth is within it of 1 /
             depth; NaN where depth is.
-        by_band: (C, H, W), the confidence of each band, where they are several betas'; else None.
+        by_band: (C, H, W), the confidence of each band, where they are several cameras'; else None.
     """
 
     image: Float[Tensor, "c h w"]
@@ -40,7 +40,7 @@ class Frame(NamedTuple):
 
     @property
     def depth_interval(self) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
-        """Nearest and farthest depth (metres; possibly infinite) around the true one in 9 of 10 pixels; NaN
+        """Nearest and farthest depth (rig's unit; may be infinite) around the true one in 9 of 10 pixels; NaN
         where unknown."""
         inverse = 1 / self.depth
         farthest = inverse - self.half_width

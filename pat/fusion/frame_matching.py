@@ -31,15 +31,15 @@ class MissingFramesWarning(UserWarning):
 def matched_frames(files: Files) -> dict[str, list[Path]]:
     """Relate the files of several cameras by the names and numbers in them, frame by frame.
 
-    Names count if half of all frames or more are then whole, or else numbers, or else names without their
-    common beginning. Warns of frames that some camera lacks, and where nothing but their order relates files.
+    Names count if no camera repeats one and half of all frames or more are then whole, else numbers, or
+    else names without their common beginning. Warns of frames that some camera lacks, and of taking files in
+    order, as nothing relates them.
 
     Args:
         files: files of each camera, in order.
 
     Returns:
-        Files of the frames that every camera has, in order, by camera; all files as given if a camera has
-        fewer than two.
+        Files of the frames that every camera has, in order, by camera; all as given if one has under two.
 
     Raises:
         ValueError: if nothing relates the files and their numbers differ, and without cameras.
@@ -48,7 +48,7 @@ def matched_frames(files: Files) -> dict[str, list[Path]]:
     if min(map(len, files_of.values())) < 2:
         return files_of
     for what, keys in (("names", _names(files)), ("numbers", _numbers(files)), ("names", _endings(files))):
-        frames = _frames(files_of, keys) if keys else []
+        frames = _frames(files_of, keys) if keys and all(len({*k}) == len(k) for k in keys.values()) else []
         whole = [frame for frame in frames if len(frame) == len(files_of)]
         if len(whole) >= LEAST_WHOLE * len(frames) > 0:
             _warn_of_missing(files_of, frames, what)
@@ -66,7 +66,7 @@ def matched_frames(files: Files) -> dict[str, list[Path]]:
 def warn_of_gaps(files: Files) -> None:
     """Warn of the first gap in the numbers of each camera's files: a sequence has frames equally far apart.
 
-    Nothing is known of names without numbers, or with several that vary: there is no warning.
+    There is no warning for any camera if names of one lack numbers, repeat them, or have several that vary.
 
     Args:
         files: files of each camera, in order.

@@ -33,7 +33,7 @@ class Frames(Protocol):
 
 
 class ImageFiles:
-    """Image files of one camera, read and developed when asked for; that raises as `read_view` does.
+    """Image files of one camera, read and developed on access, with the errors of `read_view` and of lists.
 
     Args:
         paths: files, in the order of time.
@@ -65,7 +65,7 @@ class ImageFiles:
 class CachedFrames:
     """Frames with a cache of the last used ones, up to `CACHED` bytes or one image.
 
-    Neighbours in time need them again. An image is the cached tensor itself, not to be changed in place.
+    An image is the cached tensor itself, or that of `frames`, not to be changed in place.
 
     Args:
         frames: images of one camera.

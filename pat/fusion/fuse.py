@@ -56,10 +56,10 @@ class FuseSettings:
             included, if nothing else runs in it; None for no limit.
         match_levels: True to bring each beta to alpha's mean and standard deviation first, for cameras whose
             exposures or filters differ and which are not radiometrically calibrated.
-        response: weights in alpha of the RGB betas' red, green and blue. "fit" fits them to matches, with a
-            gain and a gamma, and leaves them at Rec. 601 luma ("rec601") where that explains the images as
-            well; three numbers, or a `Response`, state them. The result has alpha as this combination of its
-            colours.
+        response: weights in alpha of the RGB betas' red, green and blue. "fit" fits them to matches, with
+            gain, gamma and vignetting, and leaves them at Rec. 601 luma ("rec601") where that explains the
+            images as well; three numbers, or a `Response`, state them. The result has alpha as this
+            combination of its colours.
         align: True to estimate the betas' distance across their search segments, and correct it; None for
             True unless the fusion is differentiable, where a corrected rig has no gradient of its error.
         noise: noise level of each camera that has some, or "estimate": views are denoised before they are
@@ -67,8 +67,8 @@ class FuseSettings:
             None for no denoising; but `pat.fuse` without a rig takes None for "auto", and only {} for none.
         keep_alpha: True to leave alpha's values as recorded, noise included; as is done too if alpha has no
             noticeable noise.
-        luminance: luminance of the image: "alpha", which the network keeps exactly, that of "beta" in alpha's
-            detail, where alpha sees another part of the spectrum, or their "mix".
+        luminance: luminance of the image: "alpha", exact by networks with `keeps_luminance`, "beta", in
+            alpha's detail, where alpha sees another part of the spectrum, or their "mix".
 
     Raises:
         ValueError: for a noise or a response of another kind; the rest is checked when it is used.
@@ -123,7 +123,8 @@ def fuse_frame(
         explain: function that is called with lines about what was corrected; None for none.
         progress: function that wraps the tiles to show progress; None for none.
         announce: function that is called with the plan; None for none.
-        store: folder of finished tiles, from which a stopped fusion goes on; None for none.
+        store: folder of finished tiles, if there are several, from which a stopped fusion goes on; None for
+            none.
         differentiable: True to keep gradients; by default the frame has none.
         matcher: function that matches, instead of `match`.
 
@@ -131,9 +132,8 @@ def fuse_frame(
         The frame at alpha's pixels.
 
     Raises:
-        ValueError: for images that do not fit the rig or the network, views that do not overlap, settings
-            that contradict each other, corrections of other cameras, matches that `Matches.check` refuses,
-            and a memory limit that is too small. Images, fields and matcher raise their own errors too.
+        ValueError: as `ready_frame`; for settings that contradict each other or `differentiable`, and matches
+            that `Matches.check` refuses. Images, fields and matcher raise their own errors too.
         NotImplementedError: within a transformation of `torch.func`.
         TypeError: for images, settings, corrections, fields or matches of another type.
         OSError: if a finished tile cannot be written to `store`.
@@ -191,7 +191,7 @@ class ReadyFrame(NamedTuple):
         inputs: the network's inputs, corrected.
         undo: functions that take a frame of these back to alpha's pixels.
         plan: the plan of the fusion.
-        corrections: the corrections made.
+        corrections: the corrections made, found or given.
         low_light: views before and after denoising; without images if none had noticeable noise.
         in_colour: True if alpha's image was in colour.
     """
@@ -234,9 +234,9 @@ def ready_frame(
         The prepared frame.
 
     Raises:
-        ValueError: for images that do not fit the rig or the network, views that do not overlap, corrections
-            of other cameras, and a memory limit that is too small.
-        TypeError: for images that are no tensors, and an object that is no field.
+        ValueError: for images or settings that do not fit the rig or the network, views that do not overlap,
+            corrections of other cameras, and a memory limit that is too small.
+        TypeError: for images that are no tensors, an object that is no field, and a depth range of no two.
     """
     say = explain or (lambda line: None)
     least = LEAST_MATCHED if network.uses_matches else LEAST_BYTES

@@ -29,10 +29,11 @@ def without_gradient(
     """Name the rig's parameters by which the fused image, or its depth, has no gradient.
 
     The images are fused as `fuse_frame` would, at no more than 96 pixels a side. The derivative of every
-    pixel is 0 by parameters of a camera that is not used, those for which a field does not ask, and for
-    look-ups at whole pixels.
+    pixel is 0 by parameters of a camera that is not used, of which a field makes no use, or with look-ups at
+    whole pixels.
 
     Args:
+        images: tensors (C, H, W) by camera, of the rig's sizes: neither is checked. Others' do not count.
         settings: settings of fusion, without `max_memory` and `noise`.
         free: patterns of the parameters to look at, as for `Rig.parameters`.
 
@@ -40,9 +41,8 @@ def without_gradient(
         Names of the parameters, under "image" and under "depth".
 
     Raises:
-        ValueError: as `fuse_frame` and `Rig.parameters`, and for a field that only fits images of the full
-            size (`Moved`).
-        TypeError: as `fuse_frame`.
+        ValueError: as `fuse_frame` and `Rig.parameters`, and for a field that only fits full-size images.
+        TypeError, NotImplementedError: as `fuse_frame`.
     """
     small = {name: image for name, image in images.items() if name in rig}
     for name, image in small.items():

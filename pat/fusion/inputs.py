@@ -63,7 +63,7 @@ class Placement(NamedTuple):
     ) -> Depth:
         """Compute the depth of matches, or the distance along alpha's rays if `bounds` says so.
 
-        With lenses it lies within the pair's depth range, if there is one.
+        With lenses and no link it lies within the pair's depth range, if there is one.
 
         Args:
             x: pixels of alpha.
@@ -75,7 +75,7 @@ class Placement(NamedTuple):
 
         Raises:
             ValueError: for a pair that is not calibrated; without a depth range, for distances and cameras
-                that have no pinhole view.
+                that have no pinhole view; and as `depth_of`.
         """
         pair, x = self.pair, self.points(x)
         on_curve = partial(ray_depth, pair, bounds=self.bounds)
@@ -132,9 +132,9 @@ def frame_inputs(network: FusionNetwork, views: Views) -> FrameInputs:
         The inputs, with alpha's size without padding.
 
     Raises:
-        ValueError: if alpha's pixels have no valid search segment in a beta (views that do not overlap), for
-            an invalid result of a field, or whatever a field raises for its pair.
-        TypeError: for an object that is no field.
+        ValueError: if alpha's pixels have no valid search segment in a beta (views that do not overlap), as
+            `default_field`, for an invalid result of a field, or whatever a field raises for its pair.
+        TypeError: for an object that is no field, or gives segments for some pixels and positions for others.
     """
     m, hw = network.multiple, views.rig[views.alpha].hw
     alpha, *images = (padded(views.images[name][None], m) for name in (views.alpha, *views.betas))
@@ -200,7 +200,7 @@ def points_of(field: ReceptiveField) -> Callable[[Tensor], Tensor]:
     """Return the function from alpha's pixels to the positions in alpha for which a field searches.
 
     Returns:
-        The displacement of `Moved` fields, also within `Widened`; for other fields the identity.
+        That of `Moved` fields, also within `Widened`; for other fields the identity.
     """
     if isinstance(field, Widened):
         return points_of(field.field)

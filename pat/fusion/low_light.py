@@ -127,7 +127,7 @@ class LowLight:
         """Add the brightness and colours that betas recorded to a frame fused from the denoised views.
 
         Betas add nothing unless all are RGB, and brightness only to a noisy alpha that is similar to a
-        combination of their bands.
+        combination of their bands, without `keep_alpha`.
 
         Args:
             frame: frame fused from the denoised views, its steps not undone yet.
@@ -296,7 +296,7 @@ def exposed(view: NoisyView, response: Response) -> NoisyView:
 def denoised(
     image: Float[Tensor, "b c h w"], deviation: Float[Tensor, "b c h w"]
 ) -> Float[Tensor, "b c h w"]:
-    """Denoise images with noise of this standard deviation; bands other than three are denoised one by one.
+    """Denoise images on the CPU, with noise of this deviation; bands other than three are taken one by one.
 
     Returns:
         Images without noise, in their own type, not clipped, detached.

@@ -102,7 +102,6 @@ def save_frame(
     (`write_together`).
 
     Args:
-        frame: the frame.
         out: folder, made if missing.
         bits: 8 or 16 for sRGB values; 32 (tif, exr) for linear light as floats, not clipped.
         kind: format of the fused image.
@@ -111,10 +110,10 @@ def save_frame(
         points: camera of alpha; the pixels of known depth are written to points.ply. None for no such file.
         along: kind of depth (`measured_along`), for `points` and depth_16.png.
         name: prefix of the files, as in name_fused.png; empty for none.
-        bands: names of bands that cameras record one by one, each written to fused_NAME.png and
-            confidence_NAME.png too (NAME by `file_names`); without names, bands that are not one or three are
-            fused_1.png and so on.
-        pages: further text files by name; None for none.
+        bands: a name for each band, where cameras record them one by one, each written to fused_NAME.png and
+            (if the frame has `by_band`) confidence_NAME.png too, NAME by `file_names`; without names, bands
+            that are not one or three are fused_1.png and so on.
+        pages: further text files by name, without prefix; None for none.
         about: texts that `write_together` keeps about the group; None for none.
 
     Returns:
@@ -181,10 +180,7 @@ def _write_shared(path: Path, text: str) -> None:
 
 
 def band_names(frame: Frame, betas: Iterable[str]) -> list[str]:
-    """Return the cameras that record a frame's bands one by one, in order.
-
-    Empty if its bands are those of colour cameras, or if cameras have several bands each.
-    """
+    """Return the cameras that record a frame's bands one by one, in order; empty unless they are several."""
     names = list(betas)
     return names if frame.by_band is not None and len(names) == len(frame.by_band) else []
 
@@ -197,7 +193,7 @@ def describe_bands(frame: Frame, names: Sequence[str], kind: ImageFormat) -> str
         kind: format of the files.
 
     Returns:
-        The line; empty for an ordinary image of one band or three.
+        The line; empty for one band or three without names.
     """
     if not names and len(frame.image) in (1, 3):
         return ""
@@ -223,11 +219,14 @@ def write_depth(
 
     Args:
         depth: depth, metres or another unit of the rig's.
-        near: depth by which the scale is chosen; None for the nearest in `depth`, or 1 if none is known.
+        near: depth by which the scale is chosen, above 0; None for the nearest in `depth`, or 1 for none.
         along: kind of depth (`measured_along`).
 
     Returns:
         The scale in counts per metre (or that unit): a power of ten.
+
+    Raises:
+        OSError: if the file cannot be written.
     """
     has_depth = depth.isfinite() & (depth > 0)
     scale = depth_scale(near or float(depth[has_depth].min() if has_depth.any() else 1.0))

@@ -144,7 +144,7 @@ class SequenceFusion:
             The colour that fusion adds to alpha, with depth, and confidence, lowered where motion is unsure.
 
         Raises:
-            ValueError: if the frame cannot be fused, or an image cannot be read.
+            ValueError, TypeError: as `fuse_frame`, and if an image cannot be read.
             OSError: for an image file that is missing.
         """
         fields, weight = {}, torch.ones(self.rig[self.alpha].hw)
@@ -167,9 +167,9 @@ class SequenceFusion:
             The frame, without `by_band`.
 
         Raises:
-            ValueError: if none of the key frames around it could be fused, or an image cannot be read.
+            ValueError: without keys, if none of those around it could be fused, or an image cannot be read.
             OSError: for an image file that is missing.
-            IndexError: for a number that alpha's frames lack.
+            IndexError: for a number beyond alpha's frames; one below 0 is not refused.
         """
         grey = self.grey(i)
         fetched = ((key, fetch(key)) for key in self._around(i, keys))
@@ -233,8 +233,7 @@ class SequenceFusion:
     ) -> Frame:
         """Fuse alpha's frame with those of betas.
 
-        Levels are matched over several frames, or in this one if it is alone or its noise, which is of images
-        as recorded, is to be removed.
+        Levels are matched over several frames, or in this one if it is alone or to be denoised.
         """
         images = {name: self.frames[name][j] for name, j in betas.items()}
         alone = alone or self.settings.noise is not None
@@ -392,9 +391,10 @@ def fuse_sequence(
         Frames at alpha's pixels.
 
     Raises:
-        ValueError: for a negative speed, a camera that the rig lacks, unknown frame rates, recordings that do
-            not overlap in time, and a frame that cannot be fused: all when the frames are asked for.
-        OSError: for an image file that is missing, then too.
+        ValueError: for a negative or infinite speed, a camera that the rig lacks, unknown frame rates,
+            recordings that do not overlap in time, and a frame that cannot be fused.
+        OSError: for an image file that is missing. All come when the frames are asked for.
+        TypeError: for a speed that is no number, and as `fuse_frame`.
     """
     job = SequenceFusion(network, rig, frames, alpha, speed, settings)
     keys = job.timeline.key_frames()

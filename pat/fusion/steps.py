@@ -83,9 +83,9 @@ def steps_for(network: FusionNetwork, *, normalise: bool, joined: bool = True) -
 def undistort(views: Views) -> StepResult:
     """Replace views with lenses by pinhole views, up to 62 degrees off axis.
 
-    Unchanged if no camera has a lens, a field goes through lenses, or a camera has no pinhole view. Undone, a
-    frame of an alpha with a lens is at alpha's own pixels: the fusion's difference from alpha is resampled
-    and added to alpha's own image, and pixels outside the pinhole view have confidence 0 and unknown depth.
+    Unchanged if no camera has a lens or one has no pinhole view, or a field goes through lenses or bounds
+    distances. Undone, a frame of an alpha with a lens is at alpha's own pixels: the fusion's difference from
+    alpha is resampled and added to alpha's own image; outside the pinhole view confidence is 0, depth NaN.
 
     Returns:
         The views, and the function that undoes the step.
@@ -115,8 +115,8 @@ def takes_pinhole_views(views: Views) -> bool:
 def linear_luminance(views: Views) -> StepResult:
     """Schedule the correction of luminance for an alpha that measured light; the views stay as they are.
 
-    Undone, a frame in RGB betas' colours has the luminance of light that alpha measured (`match_luminance`).
-    For other alphas, and without a beta of three bands, nothing happens.
+    Undone, a frame of three bands has the luminance of light that alpha measured (`match_luminance`). For
+    other alphas, and without a beta of three bands, nothing happens.
 
     Returns:
         The views, and the function that undoes the step.
@@ -124,11 +124,12 @@ def linear_luminance(views: Views) -> StepResult:
     alpha, sensor = views.own, views.rig[views.alpha].sensor
     if sensor.response != LIGHT or 3 not in [len(views.images[name]) for name in views.betas]:
         return StepResult(views)
-    return StepResult(views, lambda frame: frame._replace(image=match_luminance(frame.image, alpha, sensor)))
+    matched = partial(match_luminance, alpha=alpha, sensor=sensor)
+    return StepResult(views, lambda f: f._replace(image=matched(f.image)) if len(f.image) == 3 else f)
 
 
 def upright(views: Views) -> StepResult:
-    """Rotate back betas, images and rig, that are rotated by about a quarter or half a turn against alpha.
+    """Rotate back betas, images and rig, that are rotated by about whole quarter turns against alpha.
 
     Returns:
         The views; there is nothing to undo.
@@ -143,8 +144,8 @@ def upright(views: Views) -> StepResult:
 def equal_resolution(network: FusionNetwork, views: Views) -> StepResult:
     """Resize betas to about alpha's angular resolution where views meet.
 
-    Betas within a quarter of it keep their size; resized images are clipped to 0..1. A beta that would be
-    enlarged is first cropped to the part that search segments touch, if that is much smaller.
+    Betas within a quarter of it keep their size; resized images are clipped to 0..1, of 16 pixels a side or
+    more. A beta to be enlarged is first cropped to what search segments touch, if that is much smaller.
 
     Returns:
         The views; there is nothing to undo.
@@ -163,10 +164,9 @@ def equal_resolution(network: FusionNetwork, views: Views) -> StepResult:
 
 
 def _cropped(network: FusionNetwork, views: Views, name: str) -> Views:
-    """Crop a beta to the part that search segments touch, if much smaller: it would be enlarged for nothing,
-    and be compared with alpha by the levels of what alpha does not see.
+    """Crop a beta to the part that search segments touch, if much smaller; unless a field depends on it.
 
-    Not where the field says something else for the cropped image: it depends on the image's size.
+    It would be enlarged for nothing, and be compared with alpha by the levels of what alpha does not see.
     """
     h, w = views.rig[name].hw
     if resolution_ratio(views.pair(name)) > 0.8:
@@ -215,7 +215,7 @@ def with_own_levels(
 
 
 def join(which: JoinsBands, views: Views) -> StepResult:
-    """Join co-located betas of the same size, lens and field to one of several bands.
+    """Join co-located betas (`co_located`) to one of several bands.
 
     Undone, the frame's bands are in the rig's order, each with its confidence (`by_band`). For "neighbours"
     nothing is joined if a beta has three bands.

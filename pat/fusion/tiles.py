@@ -124,7 +124,7 @@ def plan_frame(
 def tiles_within(
     network: FusionNetwork, frame: FrameInputs, limit: float | None, held: float = 0.0, matching: float = 0.0
 ) -> list[Tile]:
-    """Choose the tiles of a frame that fit into memory with the least work, as halos are computed twice.
+    """Choose the tiles of a frame that fit into memory with the least work, that of their halos included.
 
     Args:
         limit: memory limit of the process, bytes; None for no limit.
@@ -294,7 +294,7 @@ def fused_in_tiles(
         store: folder of finished tiles, read and written if they are several; None for none.
 
     Returns:
-        The whole frame, in the form of one tile. A stored tile that is damaged is fused again.
+        The whole frame, in the form of one tile; of `store` without gradients, its damaged tiles made anew.
 
     Raises:
         OSError: if a finished tile cannot be written to `store`.

@@ -106,7 +106,7 @@ class Timeline:
         return [KeyFrame(i, self.at(i)) for i in sorted(gains)]
 
     def warn_of_ends(self) -> None:
-        """Warn of each beta without a frame within one of its own intervals of each of alpha's frames.
+        """Warn of each beta that lacks a frame within one of its own intervals of some frame of alpha.
 
         Its first or last frame gives colour there.
         """

@@ -46,11 +46,11 @@ class Views:
 
     Attributes:
         rig: rig of the images as they are now.
-        images: images (C, H, W), values 0..1, by camera; alpha's is grey.
+        images: images (C, H, W), values 0..1, beyond for noise and exposure, by camera; alpha's is grey.
         alpha: name of alpha.
         fields: receptive fields of betas; None, or no entry, for the pair's default field.
         alpha_in_colour: True if alpha's image was recorded in colour.
-        joined: for each beta that was joined from several, by its name, the names of those.
+        joined: names of the cameras in each beta, by its name, once betas were joined; empty before.
     """
 
     rig: Rig
@@ -145,7 +145,7 @@ def dense_bytes(alpha: HW, beta: HW, stride: int = 1) -> float:
 
 
 def check_dense(views: Views, limit: float | None) -> None:
-    """Check that dense fields fit into memory: this machine's, and a limit.
+    """Check that dense fields fit into memory: this machine's (not on Windows), and a limit.
 
     Args:
         limit: memory limit, bytes; None for no limit.
@@ -366,7 +366,7 @@ class FilesOfCameras(Mapping[str, T]):
 class ViewFiles(FilesOfCameras[Tensor]):
     """Images by camera, read from files and developed when asked for; small ones (`KEPT`) stay in memory.
 
-    Looking up a camera raises FileNotFoundError or ValueError as `read_view` does, KeyError without a file.
+    These must not be changed in place. Looking up a camera raises as `read_view`, KeyError without a file.
 
     Args:
         rig: the cameras.

@@ -35,7 +35,7 @@ FITTED = Path(__file__).with_name("certainty.safetensors")
 
 @dataclass(frozen=True)
 class CertaintySettings:
-    """Settings of the network's inputs and outputs.
+    """Settings of the confidence network's inputs and outputs.
 
     `pat lab settings` prints the value of each with its meaning and reason.
     """
@@ -76,10 +76,10 @@ def fitted_network() -> CertaintyNetwork:
 def with_certainty(matches: Matches) -> Matches:
     """Add the confidence of each match, by the network that ships.
 
-    Where matches had a confidence before, of each beta alone, the smaller probability counts.
+    The probability is at least `SETTINGS.least`; where one was known before, the smaller of both counts.
 
     Returns:
-        The matches with `certainty`, detached, else as given.
+        The matches with a detached `certainty`, else as given.
 
     Raises:
         AssertionError: for matches before the choice network has run (`stated` is None).
@@ -121,7 +121,7 @@ def measured(matches: BetaMatches, typical: Float[Tensor, "b 2"]) -> Float[Tenso
 
     Returns:
         Numbers (B, `MEASURED`, H / 2, W / 2): `facts`, and their means in each radius of `SETTINGS.around`;
-        logarithms of the range of disparities in each of `SETTINGS.apart`; blurs of alpha and of beta;
+        logarithms of .1 plus the range of `surface` in each of `SETTINGS.apart`; blurs of alpha and of beta;
         `typical`; `stated`.
     """
     assert matches.stated is not None

@@ -64,8 +64,7 @@ CANDIDATES = 1 + 4 + len(AROUND)
 STRIP = 16
 """Size: number of rows, at half the size, that a thread compares at a time."""
 FACTS = 7
-"""Number of facts at half the size: those of matching, those that are typical of the pair, and the blurs of
-its views."""
+"""Number of facts at half the size: of matching (3), typical of the pair (2), and its views' blurs (2)."""
 
 
 class Choice(nn.Module):
@@ -76,7 +75,7 @@ class Choice(nn.Module):
     pixel, and the logarithm of that one's error in pixels of beta.
 
     Args:
-        widths: channels at 1/2, 1/4 and 1/8 of alpha's size.
+        widths: three numbers, channels at 1/2, 1/4 and 1/8 of alpha's size.
     """
 
     def __init__(self, widths: tuple[int, ...] = SETTINGS.widths) -> None:
@@ -95,17 +94,18 @@ def fitted_choice() -> Choice:
     return with_weights(Choice(), FITTED)
 
 
+@torch.no_grad()
 def chosen(inputs: Inputs, matches: Matches, network: Choice | None = None) -> Matches:
     """Choose each pixel's candidate disparity of the highest score, in each beta.
 
     Where each segment is around a known depth of its own pixel (`Beta.around`), candidates from other pixels
-    mean nothing: then nothing is chosen, and only `stated` is estimated.
+    mean nothing: there `chosen` is None, and only `stated` is estimated.
 
     Args:
         network: network that scores the candidates; None for the one that ships.
 
     Returns:
-        The matches with `chosen` (None for such a beta) and `stated`, detached.
+        The matches with detached `chosen` and `stated`, else as given.
 
     Raises:
         ValueError: for a beta whose field is not of straight segments.
@@ -146,7 +146,7 @@ def _answered(
 
     one = replace(matches, disparity=turned(matches.disparity), facts=turned(matches.facts))
     (h, w), ends = one.hw, (segments.start, segments.end, segments.valid)
-    with torch.no_grad(), convolutions_in_parallel():
+    with convolutions_in_parallel():
         planes = features(
             views._replace(alpha=turned(views.alpha)),
             Segments(*(turned(x, sides=(1, 2)) for x in ends)),
@@ -189,7 +189,7 @@ def features(
     options: Float[Tensor, "b n h w"],
     typical: Float[Tensor, "b 2"],
 ) -> Float[Tensor, "b i h2 w2"]:
-    """Compute the choice network's inputs, padded to multiples of `SETTINGS.multiple` pixels.
+    """Compute the choice network's inputs; sides are padded to multiples of `SETTINGS.multiple` alpha pixels.
 
     Args:
         views: alpha and beta, equally bright and sharp.
@@ -199,8 +199,8 @@ def features(
         typical: `typical_facts` of the whole frame.
 
     Returns:
-        Channels at half the size, detached: the `FACTS`, then the numbers of `choice_numba.compared`, four
-        for the 2 x 2 pixels of each plane.
+        Channels at half the size: the `FACTS`, then the numbers of `choice_numba.compared`, four for the 2 x
+        2 pixels of each plane.
     """
     extent, (h, w) = Extent.from_segments(segments), options.shape[-2:]
     half = _at_half(matches, typical)

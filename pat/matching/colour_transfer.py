@@ -83,12 +83,12 @@ DIRECTIONS = 8
 
 
 class MatchStatistics(NamedTuple):
-    """Statistics over a frame's consistent matches (those that pass the left-right check).
+    """Statistics over a frame's consistent matches: on beta, past the left-right check.
 
-    They are taken over the whole frame: statistics of its tiles would differ, and their borders show.
+    Of clipped ones only those compared by a mix count. Statistics of tiles would differ, and borders show.
 
     Attributes:
-        matches: number of consistent matches, plus one, (B, 1, 1, 1); of a frame in pieces a mean of theirs.
+        matches: number of these matches, plus one, (B, 1, 1, 1); of a frame in pieces a mean of theirs.
         colour: mean of beta's bands minus alpha, (B, C, 1, 1).
         level: means of beta's brightness and of its square, and of alpha and of its square, (4, B, 1, 1, 1).
         explained: share of the variance of beta's combined bands that alpha explains, 0 to 1, (B, 1, 1, 1).
@@ -120,7 +120,7 @@ class MatchStatistics(NamedTuple):
             values: beta's bands (B, C, H, W) at the matches.
             combined: combination of these bands that is compared with alpha.
             brightness: that combination, normalised to alpha's brightness.
-            valid: mask of the matches that are on beta.
+            valid: mask of the matches that are on beta, and not clipped.
             consistent: 1 where a match passes the left-right check, else 0.
         """
         both = valid * consistent
@@ -153,12 +153,12 @@ class MatchStatistics(NamedTuple):
 def transferred(inputs: Inputs, matches: Matches) -> Matches:
     """Transfer the betas' bands to alpha's view, also for matches from another source.
 
-    Fills are colours for pixels that beta does not see. Of several betas matched together, those with all of
-    the result's bands share one fill; any other has its own. Gradients reach images and fields, but not
-    through fills.
+    Alpha has one channel and even sides, unchecked. Fills are colours for pixels that beta does not see. Of
+    several betas for which `can_agree` is True, those with all of the result's bands share one fill; any
+    other has its own. Gradients reach images and fields, but not through fills.
 
     Returns:
-        The matches with `colours` (bands minus alpha); float16 for a large frame without gradients.
+        The matches with `colours`; of a large frame float16 planes where these have no gradient.
 
     Raises:
         ValueError: as `Matches.check`, and for a beta whose field is not of straight segments.
@@ -276,7 +276,7 @@ def matched_colours(
 
     Returns:
         Bands minus alpha (the statistics' mean where the match is not on beta); the weight of these colours,
-        0 to 1; the photometric similarity, 0 to 1, with 1 where it cannot tell; and the statistics.
+        0 to 1; the similarity, 0 to 1, as in `Colours` (all 1 without `sees_luma`); and the statistics.
 
     Raises:
         ValueError: for a field that is not of straight segments.
@@ -382,15 +382,15 @@ def match_weight(
 ) -> Float[Tensor, "b 1 h w"]:
     """Compute the weight of the colours at the matches.
 
-    It is the photometric similarity, halved where the left-right check fails. Where a confidence is known, it
-    is the geometric mean of that and of the probability that the match is right, given the similarity.
+    It is the photometric similarity, halved where the left-right check fails. Where `certainty` is known, it
+    is the root of that times the probability, given the similarity, that the match is right.
 
     Args:
         alike: photometric similarity, 0 to 1.
         valid: mask of the matches that are on beta.
 
     Returns:
-        Weights, 0 to 1; 0 where `valid` is False.
+        Weights, 0 to 1 (at least `LEAST` by `certainty`); 0 where `valid` is False.
     """
     checked = alike * (1 + is_consistent(matches.facts)) / 2
     if matches.certainty is None:
@@ -409,7 +409,7 @@ def filled_from(
 ) -> Float[Tensor, "b fills c h w"]:
     """Fill in the colours of pixels that beta does not see by those of the most similar pixels that it sees.
 
-    Seen pixels, those of a weight above 1/2, keep their colour; if these are hardly any, all pixels do.
+    In the fill seen pixels, those of a weight above 1/2, keep their colour; if these are hardly any, all do.
 
     Args:
         colour: bands minus alpha.
@@ -420,7 +420,7 @@ def filled_from(
             and take only the difference from it from examples.
 
     Returns:
-        One fill at all pixels, or with `regressed` the regression and the fill, minus alpha; detached.
+        The fill at all pixels, with `regressed` the regression and the fill, bands minus alpha; detached.
     """
     planes = zip(numpy_of(colour), numpy_of(alpha[:, 0]), numpy_of(weight[:, 0]), to_bytes(alpha[:, 0]))
     fills = []

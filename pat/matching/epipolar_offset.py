@@ -118,8 +118,8 @@ def fit_misalignment(
         weight: weight of each match, 0 to 1.
 
     Returns:
-        The misalignment, in widths of this alpha; all zeros for too little texture, for less than
-        `SETTINGS.least` pixels anywhere, or if it explains the images hardly better.
+        The misalignment, in widths of this alpha; all zeros for too little texture, for one below
+        `SETTINGS.least` pixels everywhere, or if it explains the images hardly better.
     """
     arrays = (t.detach().cpu().float().numpy() for t in (alpha, beta, position, normal, weight))
     views = _Windows.from_arrays(*arrays)

@@ -49,9 +49,9 @@ def by_examples(
     weight: Float[NDArray, "h w"],
     directions: Float[NDArray, "2 2"],
 ) -> Float[NDArray, "c h w"]:
-    """Replace the colour of pixels of low weight by the mean of their nearest seen pixels.
+    """Replace the colour of pixels of low weight by a weighted mean of the seen pixels most similar to them.
 
-    Every second pixel in each direction is searched for among such pixels, and pixels between them are
+    Every second pixel in each direction is compared with such pixels, and pixels between them are
     interpolated.
 
     Args:
@@ -62,8 +62,8 @@ def by_examples(
             examples count as nearer along these.
 
     Returns:
-        Colour at all pixels; seen ones keep theirs. The array `colour` itself if all are seen, or fewer than
-        a mean takes.
+        Colour at all pixels; seen ones keep theirs. The array `colour` itself if all are seen, or fewer of
+        every second pixel than a mean takes.
     """
     seen = weight > SETTINGS.seen
     near = cv2.dilate((~seen).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0

@@ -24,7 +24,7 @@ def blurred(images: Float[Tensor, "b 1 h w"], blurs: Sequence[float]) -> Float[T
         blurs: standard deviation for each image, pixels, as many as images; 0 leaves one as it is.
 
     Returns:
-        Images of the same shape and type, with gradients if the images have some.
+        Images of the same shape and type; gradients, if they have some, need sides above about 4 deviations.
     """
 
     def one(image: Tensor, blur: float) -> Tensor:
@@ -123,7 +123,7 @@ def smoothed(planes: Sequence[NDArray], guide: NDArray[np.uint8], how: tuple[flo
         how: strength of smoothing, and 8-bit difference of an edge.
 
     Returns:
-        The smoothed planes (h, w), float32, in order.
+        The smoothed planes, float32, in order.
     """
     smoother = cv2.ximgproc.createFastGlobalSmootherFilter(guide, *how)
     return [smoother.filter(np.ascontiguousarray(plane, np.float32)) for plane in planes]
@@ -132,7 +132,7 @@ def smoothed(planes: Sequence[NDArray], guide: NDArray[np.uint8], how: tuple[flo
 def nearest_known(
     x: Float[Tensor, "*b h w"], valid: Bool[Tensor, "*b h w"], axis: int, back: bool
 ) -> Float[Tensor, "*b h w"]:
-    """Replace each pixel by the nearest known one along an axis, itself included.
+    """Replace each unknown pixel by the nearest known one along an axis.
 
     Args:
         x: planes.
@@ -141,7 +141,7 @@ def nearest_known(
         back: False to search towards lower indices, True towards higher ones.
 
     Returns:
-        Planes of the same shape; a pixel's own value where none is known in that direction.
+        Planes of the same shape; a pixel keeps its value where none is known in that direction.
     """
     if back:
         return nearest_known(x.flip(axis), valid.flip(axis), axis, False).flip(axis)

@@ -39,11 +39,11 @@ class Beta:
     """One beta's image with the field of alpha's pixels in it.
 
     Attributes:
-        image: image (B, C, H, W), values 0..1.
+        image: image (B, C, H, W), values 0..1, beyond for noise and exposure.
         field: segments or positions of alpha's pixels, in pixels of `image`.
         offset: (x, y) of its first pixel in the whole image; other than (0, 0) for a part of an image.
-        track: function from alpha's pixels (*n, 2) to their tracks in the image; None for a beta that is
-            uncalibrated, known by a link, or of a pair with lenses.
+        track: function from alpha's pixels (*n, 2) to their tracks in the image; None if not known, as for a
+            beta that is uncalibrated, known by a link, or of a pair with lenses.
         around: True if each segment is around a known depth of its own pixel: positions along the segments of
             two pixels cannot be compared.
         cameras: names of the cameras whose bands are its channels, in order; empty if not known.
@@ -227,8 +227,8 @@ def box_around(points: Float[Tensor, "n 2"], hw: HW, halo: int, multiple: int) -
         multiple: number to whose multiples the part is widened, as far as the image goes.
 
     Returns:
-        Rows and columns: top, bottom, left, right; without points the first `multiple` of each, whatever
-        `hw`.
+        Rows and columns: top, bottom (after the last), left, right; without points the first `multiple` of
+        each, whatever `hw`.
     """
     if not len(points):
         return 0, multiple, 0, multiple

@@ -37,8 +37,8 @@ your own."""
 def match(inputs: Inputs, choice: Choice | None = None) -> Matches:
     """Match alpha with every beta, estimate the confidence of each match, and transfer the betas' bands.
 
-    Gradients reach images and fields, through the positions too. Without `inputs.learned` matches are
-    semi-global ones with a left-right check, without `chosen`, `stated` and `certainty`.
+    Gradients reach images and fields, through `disparity` too. Without `inputs.learned` it has none, and
+    matches are semi-global ones with a left-right check, without `chosen`, `stated` and `certainty`.
 
     Args:
         inputs: alpha, of one channel and even sides, and the betas.
@@ -50,7 +50,7 @@ def match(inputs: Inputs, choice: Choice | None = None) -> Matches:
 
     Raises:
         ValueError: for no beta, a beta whose field is not of straight segments, and an alpha of odd sides or
-            several channels.
+            several channels. Images of less than 8 pixels a side may give a RuntimeError.
     """
     if inputs.alpha.shape[1] != 1:
         raise ValueError(f"alpha has {inputs.alpha.shape[1]} channels: what is matched has one")
@@ -102,7 +102,7 @@ def located_in_one(inputs: Inputs) -> BetaMatches:
         inputs: inputs with one beta, and an alpha of even sides.
 
     Returns:
-        The matches, detached, without choice, confidence or colours.
+        The matches (with gradients in `comparison` alone), without choice, confidence or colours.
 
     Raises:
         ValueError: for several betas, or a field that is not of straight segments.

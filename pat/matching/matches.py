@@ -38,7 +38,7 @@ class Colours(NamedTuple):
             the frame's mean where the match is off beta.
         weight: (B, 1, H, W), weight of `bands` against the fills, 0 to 1; 0 off beta.
         likeness: (B, 1, H, W), photometric similarity of alpha and beta at the match, 0 to 1; 1 where luma is
-            compared and alpha does not see it.
+            compared and alpha does not see it, and nearer 1 for a single band the less alpha explains it.
         fills: (B, F, C, H, W), further bands minus alpha, at all pixels, without gradients: those of nearest
             examples where beta does not see the pixel; before these, where the bands' spectra are not known,
             their local regression on brightness. Several betas may share one tensor.
@@ -73,7 +73,7 @@ class BetaMatches:
             next best, and its cost; each 0 to 1.
         comparison: combination of beta's bands that was compared, and its normalisation to alpha.
         chosen: (B, 1, H, W), the disparity of the surface that alpha sees, which may be occluded in beta; of
-            several betas, the one on which they agree; None if none was chosen.
+            betas that were made to agree, theirs; None if none was chosen.
         stated: (B, 2, H / 2, W / 2), the choice network's logit that its disparity is right, and the
             logarithm of its error, pixels; None before that network has run.
         certainty: (B, 2, H / 2, W / 2), the probability that beta sees the point and the match is within a
@@ -142,8 +142,8 @@ class BetaMatches:
             inputs: inputs of this beta alone.
 
         Raises:
-            ValueError: for planes of other shapes than these inputs need, no floats, or NaN or infinite; for
-                a probability in `certainty` beyond 0 to 1; for `disparity` and `facts` of two types.
+            ValueError: for planes of other shapes than these inputs need, no floats, NaN or infinite; for a
+                probability in `certainty` beyond 0 to 1; for `disparity` and `facts` of two types.
         """
         (batch, _, *hw), bands = inputs.alpha.shape, inputs.betas[0].image.shape[1]
         planes = {name: getattr(self, name) for name in CHANNELS}
@@ -210,7 +210,7 @@ class Matches:
         return 2 * (own + sum(fills.values())) + sum(planes)
 
     def cut(self, box: Box) -> Matches:
-        """Return the part at alpha's (top, bottom, left, right).
+        """Return the part at alpha's (top, bottom, left, right), all even.
 
         Fills that several betas share stay shared.
         """

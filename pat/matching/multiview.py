@@ -98,7 +98,7 @@ class MatchedBeta:
 
     Attributes:
         segments: search segments, pixels of beta.
-        track: positions in beta by inverse depth in alpha.
+        track: positions in beta by inverse depth in alpha (by a reference beta's, after an `Ambiguity`).
         disparity: matches, pixels of beta from the segments' ends.
         facts: left-right error, margin and cost of the matches, (3, h, w), as in `BetaMatches`.
         weight: weight with which a match votes for its inverse depth; 0 for none.
@@ -122,7 +122,7 @@ class MatchedBeta:
             beta: a calibrated beta (its `track` is not None), in a field of straight segments.
             matches: its matches; the first of a batch. A chosen disparity is taken where there is one,
                 weighted by its confidence (`certainty` is not None); else the match, weighted by its margin
-                where it passes the left-right check.
+                plus .1 where it passes the left-right check.
             rows: first row, and row after the last, both even.
             ambiguity: relation of its inverse depths to those of a reference beta.
 
@@ -253,18 +253,18 @@ class Agreement(NamedTuple):
 
 @torch.no_grad()
 def agreed(inputs: Inputs, matches: Matches) -> Matches:
-    """Replace the matches in each beta by the inverse depths on which all betas agree.
+    """Replace the matches in each beta by those at the inverse depths on which all betas agree.
 
-    Occluded pixels are found with a z-buffer: their left-right error (`facts`) is their distance from the
-    point in front. `disparity` and `facts` are replaced; `chosen` too if it is known for every beta, by
-    agreement of the chosen disparities, and is None otherwise.
+    Occluded pixels are found with a z-buffer: the left-right error (`facts`) is the distance from the point
+    in front, 1 where no match votes. `disparity` and `facts` are replaced; `chosen` too if it is known for
+    every beta, by agreement of the chosen disparities, and is None otherwise.
 
     Args:
         inputs: inputs for which `can_agree` is True, which is not checked.
-        matches: matches of each beta alone; chosen ones with `certainty` (AssertionError without).
+        matches: matches of each beta alone; with `certainty` if all have `chosen` (AssertionError without).
 
     Returns:
-        The matches, consistent in all betas, detached.
+        The matches, consistent in all betas; what is replaced is detached.
     """
     of_betas = [replace(one, chosen=None) for one in matches.betas]
     between = ambiguities(inputs, of_betas)
@@ -284,16 +284,16 @@ def agreed(inputs: Inputs, matches: Matches) -> Matches:
 def with_likeliest_colours(inputs: Inputs, own: Matches, agreed: Matches) -> Matches:
     """Choose where each beta's colours are taken: at its own match, or at the one on which all betas agree.
 
-    The one at which beta is more similar to alpha is taken. This holds for betas that show all bands of the
-    result, whose colours can replace each other's; others keep the agreed match.
+    The one at which beta is more similar to alpha is taken. This holds for betas for which `shows_all_bands`
+    is True, whose colours can replace each other's; others keep the agreed match.
 
     Args:
         own: matches of each beta alone.
         agreed: matches on which all betas agree.
 
     Returns:
-        The agreed matches, detached; those in betas with all bands have their `disparity` where colours are
-        taken, and the `facts` of the own matches.
+        The agreed matches; those in betas with all bands have a detached `disparity` where colours are taken,
+        and the `facts` of the own matches.
     """
     betas = list(agreed.betas)
     for i, (one, found, same) in enumerate(zip(inputs.by_beta, own.betas, agreed.betas)):
@@ -328,7 +328,7 @@ def ambiguities(inputs: Inputs, of_betas: Sequence[BetaMatches]) -> list[Ambigui
     """Estimate the projective ambiguity of each beta against the one with the most informative matches.
 
     Returns:
-        One per beta, in order; `NO_AMBIGUITY` unless clearly more pixels agree with another.
+        One per beta, in order; `NO_AMBIGUITY` for that one, and unless clearly more pixels agree by another.
     """
     step = max(inputs.hw[0] // SETTINGS.sampled_rows // FINE, 1) * FINE
     rows = [(top, top + FINE) for top in range(0, inputs.hw[0], step)]
@@ -343,8 +343,7 @@ def ambiguities(inputs: Inputs, of_betas: Sequence[BetaMatches]) -> list[Ambigui
 class _Sampled(NamedTuple):
     """Inverse depths of a beta's matches at some of alpha's pixels.
 
-    With a mask of the known ones, and the pixels of beta by which a point moves if its inverse depth rises by
-    one.
+    With a mask of the known ones, and beta's pixels by which a point moves per unit of inverse depth.
     """
 
     w: Tensor
@@ -369,7 +368,8 @@ class _Sampled(NamedTuple):
             x: columns of alpha's sampled pixels, of the planes' shape; `y` are their rows.
 
         Returns:
-            The ambiguity; `NO_AMBIGUITY` if too few pixels are known, or not clearly more agree than without.
+            The ambiguity; `NO_AMBIGUITY` if few pixels are known in both, and unless its scale is above 0 and
+            clearly more agree than without it or with a plane alone.
         """
         both = self.known & other.known
         measured, w, rise, x, y = (plane[both] for plane in (self.w, other.w, self.pixels_per_w, x, y))

@@ -77,7 +77,7 @@ def normalised(
     *,
     largest_gain: float = math.inf,
 ) -> Float[Tensor, "*b c h w"]:
-    """Return an image with another's mean and standard deviation, of all bands together.
+    """Return an image with another's mean and, up to `largest_gain`, standard deviation, all bands together.
 
     Statistics of whole images mean little where these show different parts of a scene.
 
@@ -161,7 +161,7 @@ class Normalisation(NamedTuple):
         return cls(level, equalising_blurs(alpha, measured.matched(beta, wanted, SETTINGS.largest_gain)))
 
     def normalised(self, beta: Tensor) -> Tensor:
-        """Return beta's brightness (or that of a part of it) with alpha's mean and standard deviation."""
+        """Return brightness of beta, or a part, with alpha's mean and (up to `largest_gain`) deviation."""
         mean, factor, middle = self.level.to(beta)
         return (beta - mean) * factor + middle
 

@@ -222,12 +222,12 @@ def fit(
         alpha: alpha at the points.
         where: positions of the points in beta, in its width and height, from its middle, with which
             vignetting is estimated; None without.
-        enough: matched pixels as a share of those wanted, at most 1. Below 1 wrong ones among them could
-            explain anything: only an exposure is fitted, and no more of alpha than this need be explained.
+        enough: matched pixels as a share of those wanted, 1 or less, above 0. Below 1 wrong ones among them
+            could explain anything: only gain and gamma are fitted, and `explained` is divided by it.
 
     Returns:
-        The response; Rec. 601's where there are too few points (`SETTINGS.points`; `explained` is 1 then), or
-        where no combination of bands explains alpha (`Response.explains` is False).
+        The response, on the CPU; Rec. 601's if that is likeliest, for too few points (`SETTINGS.points`;
+        `explained` is 1 then), and where no bands' combination explains alpha (`explains` is False).
     """
     most, fewest = SETTINGS.points
     step = max(alpha.numel() // most, 1)
@@ -400,7 +400,7 @@ class _Groups(NamedTuple):
         """Return the most probable `_Explanation` of these kinds after this shading is removed from beta.
 
         `shading` has the coefficients (s) of `_shading_terms`. Tried without a gamma, and with one if the
-        kind's gain is free; if vignetted, with the shading that is left, which else is empty.
+        kind's gain is free; if vignetted, also fits what shading is left (`further`, else empty).
         """
         gammas = self.y.new_tensor(SETTINGS.gammas)
         _, gram = self._modelled(gammas, shading, vignetted)

@@ -307,15 +307,15 @@ def winners(total, first, count, segments, hw, corner, large, claims, labels):
         count: labels per run.
         segments: end, along, length and cut of alpha's segments, as for `costs`.
         hw: height and width of beta.
-        corner: first row and column of the block.
+        corner: first row and column of the block in `total`.
         large: the large penalty.
         claims: int32, for each pixel of beta, and one more, the least cost with which a pixel of alpha
             matches it and that pixel's label (16 bits each), at first the largest int32; updated.
         labels: three arrays to write, of the block: disparity (h, w), the best label to a fraction; numbers
             (h, w, 1 or 3): the best label, its margin, by which the best of labels not beside it costs more
             (the cost of that is `UNRELATED` if there is none), at least 0 and at most 1, and its cost, both
-            in 8 large penalties; and position (h, w) in beta, pixels counted row by row (height times width
-            for none).
+            in units of 8 large penalties; and position (h, w) in beta, pixels counted row by row (height
+            times width for none).
     """
     (end, along, length, cut), (rows, columns), (top, left) = segments, hw, corner
     disparity, facts, positions = labels

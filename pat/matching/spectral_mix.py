@@ -54,8 +54,7 @@ class SpectralMix(NamedTuple):
     Attributes:
         weights: weight of each band (B, C).
         offset: offset (B).
-        slopes: change of each band (B, C) where the combination changes by 1 from one pixel to the next; less
-            if that explains alpha badly.
+        slopes: change of each band (B, C) by a local one of 1 in the mix; less if that explains alpha badly.
         gain: share (B), 0 to 1, of alpha's difference from the combination that is an error of the bands, and
             not another spectrum; 0 for the mean of bands (`equal`), of which that is not known.
     """
@@ -80,7 +79,8 @@ class SpectralMix(NamedTuple):
     ) -> SpectralMix:
         """Fit the combination most similar to alpha by weighted least squares, relative to local means.
 
-        It is fitted twice, the second time without outliers.
+        It is fitted twice, the second time without outliers; where black and white then are about alpha's,
+        the weights are scaled to a sum of 1, and the offset is 0.
 
         Args:
             bands: beta's bands at alpha's pixels.

@@ -122,10 +122,10 @@ def _surfaces(disparity: Plane, weight: Plane, brightness: NDArray[np.uint8], ed
 
 
 def following(inputs: Inputs, matches: Matches) -> Matches:
-    """Give matches, chosen ones too, gradients by the images and segments that require some.
+    """Give `disparity` and `chosen` of matches gradients by the images and segments that require some.
 
     Returns:
-        The matches with the same values; those in betas of which none requires one are unchanged.
+        Matches of the same values; in a beta the given ones if alpha, its image and segments require none.
 
     Raises:
         ValueError: for a beta whose field is not of straight segments.

@@ -21,7 +21,7 @@ def weighted_terms(values, weight, centre, reach, out):
         centre: number that is subtracted from the values.
         reach: pixels that are the unit of x and y, which are counted from the middle.
         out: terms (3, h, w, 4) to write: weights; weights times x, y, x x, x y, y y, z, x z, y z and
-            themselves; and 0.
+            themselves; and two zeros.
     """
     (height, width), centre, reach = values.shape, np.float32(centre), np.float32(reach)
     one, two, three = out

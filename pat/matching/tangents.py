@@ -60,7 +60,7 @@ def along_tangents(
     Args:
         alpha: image of even sides.
         guide: beta's brightness, of even sides.
-        field: field of positions, of one rig.
+        field: field of positions, of one rig, not a batch.
         name: beta's name in the warning.
 
     Returns:
@@ -121,7 +121,7 @@ class _BlockCentres:
     def ordered(self) -> bool:
         """Return True if positions follow each other along a curve, for most of every eighth row and column.
 
-        False for fewer than three positions a pixel. A curve may turn back a few times (`SEAM`).
+        False without three positions in turn that count. A curve may turn back a few times (`SEAM`).
         """
         locations = self.at(slice(None, None, 8), slice(None, None, 8))
         if locations.xy.shape[-2] < 3:

@@ -59,6 +59,13 @@ def test_frames_that_nothing_relates_are_taken_in_order_and_that_is_said():
         matched_frames(files(a=["1", "2"], b=["x", "y", "z"]))
 
 
+def test_names_that_repeat_within_a_camera_relate_nothing():
+    """A folder of each scene: two files of one name are two frames, and none is lost."""
+    given = {name: [Path(name, scene, "image.png") for scene in ("kitchen", "garden")] for name in "ab"}
+    with pytest.warns(MissingFramesWarning, match="taken in order"):
+        assert matched_frames(given) == given
+
+
 def test_many_missing_frames_are_not_all_listed():
     with pytest.warns(MissingFramesWarning, match="1, 3, 5, 7, 9"):
         matched_frames(files(a=map(str, range(20)), b=map(str, range(0, 20, 2))))

@@ -33,8 +33,9 @@ from arraygeom.runtime.chunks import Tile, tiles_of
 from arraygeom.runtime.threads import limited_to
 from calib.images.matches import match_points, seen_depths
 from pat import FuseSettings, fuse
+from pat.fusion.frame import Frame
 from pat.fusion.inputs import FrameInputs, prepared
-from pat.fusion.steps import quarter_turns, resolution_ratio, steps_for, without_lenses
+from pat.fusion.steps import linear_luminance, quarter_turns, resolution_ratio, steps_for, without_lenses
 from pat.fusion.tiles import MAX_HALO, SLACK, tiles_within, working_memory
 from pat.fusion.views import Views
 from pat.lab.data.pairs import folder_pairs
@@ -485,6 +486,8 @@ def test_light_that_alpha_measured_stays():
     assert (luminance(plain) - images["mono"]).abs().max() < 1e-5
     assert (luminance(linear_from_srgb(light)) - linear_from_srgb(images["mono"])).abs().max() < 1e-4
     assert (luminance(light) - images["mono"]).abs().max() > 0.01
+    four, undo = torch.rand(4, 48, 64), linear_luminance(Views.of(rig, images, alpha="mono")).undo
+    assert torch.equal(undo(Frame(four, *four[:3])).image, four)
 
 
 def test_uncalibrated_rigs_fuse_without_depth():

@@ -204,6 +204,8 @@ def test_sides_need_not_be_multiples():
     inputs = Inputs.from_images(
         torch.rand(1, 1, h, w, generator=g), [torch.rand(1, 3, h, w, generator=g)], [field]
     )
-    made = chosen(inputs, Matches((found,)), Wanting()).betas[0].chosen[0, 0]
+    followed = replace(found, disparity=found.disparity.requires_grad_())
+    made = chosen(inputs, Matches((followed,)), Wanting()).betas[0].chosen[0, 0]
+    assert not made.requires_grad
     assert torch.equal(made[:, :-5], disparity[:, 5:])
     assert math.isfinite(float(made.sum()))
