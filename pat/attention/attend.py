@@ -287,11 +287,11 @@ def sample_positions(locations: Locations, query: Tensor, samples: int | None) -
 
 
 def samples_for(segments: Segments) -> int:
-    """Return the number of samples that puts one on each beta pixel of the longest valid segment; 1 if none
-    is valid."""
+    """Return the number of samples that puts one on each beta pixel of the longest valid, finite segment."""
     what = "the number of samples of the longest segment (give `samples`)"
     needs_numbers(what, segments.start, segments.end)
-    return int(torch.where(segments.valid, segments.length.detach(), 0).max().ceil()) + 1
+    length = segments.length.detach()
+    return int(torch.where(segments.valid & length.isfinite(), length, 0).max().ceil()) + 1
 
 
 def _bias(bias: Tensor | None, query: Tensor, samples: int) -> Tensor | None:

@@ -63,7 +63,7 @@ class FusionNetwork(Protocol):
     learned: bool
     """True if matching's trained networks take part in its matches."""
     keeps_luminance: bool
-    """True if the luminance of its image is alpha's."""
+    """True if the luminance of its image is alpha's, as far as `Inputs.luminance` says."""
     halo: int
     """Pixels around a pixel within which alpha's image, and the fields of its pixels, can matter."""
     beta_halo: int
