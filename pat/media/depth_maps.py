@@ -118,7 +118,7 @@ def write_points(
     Args:
         path: file to write; missing folders are made.
         camera: camera of the image.
-        depth: metres; pixels are left out where it is not positive and finite, or their ray does not reach it.
+        depth: metres; pixels are left out where it is not positive and finite, or the ray misses it.
         image: values 0..1; grey for one channel, or three and more, of which the first are RGB.
         along: "depth" for z along the optical axis, "distance" for the length of the ray.
 

@@ -47,8 +47,8 @@ class GuidedPATConfig:
 
     Attributes:
         bands: number of bands of the fused image; None for all bands of the betas.
-        keep_luminance: True if the network adds colour to alpha without its luminance (Rec. 601; without
-            the share `Inputs.luminance` of it), which needs three bands; without `bands` it has no effect.
+        keep_luminance: True if alpha gets the betas' colour without its luminance (Rec. 601; without the
+            share `Inputs.luminance` of it), which needs three bands; without `bands` it has no effect.
         learned: True for matching with trained networks; False for classical matching, semi-global with a
             left-right check, whose confidence is 0 or 1.
     """
