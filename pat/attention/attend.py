@@ -76,9 +76,9 @@ def attend(
             Positions with the leading axes (Ha, Wa) or (B, Ha, Wa), or a function from (n, 2) alpha pixels
             (x, y) to either, with the leading axes (n) or (B, n), which is called on one piece of alpha at a
             time, and for Positions again in backward, so that not all of these exist at once. Or the field
-            `Local`: windows, of views of the same field of view; or `Dense`: all of beta, by
-            `scaled_dot_product_attention`, which may store all weights, if `border`, `samples` and `backend`
-            have their defaults.
+            `Local`: windows, of views of the same field of view; or `Dense`: all of beta (every `stride`-th
+            pixel), by `scaled_dot_product_attention`, which may store all weights, if `border`, `samples` and
+            `backend` have their defaults.
         samples: how many samples a segment has. None: one for each beta pixel of the longest valid one.
             Positions have their own number, which alone may be given.
         interpolation: `bilinear` (differentiable in the geometry) or `nearest` (the paper's).

@@ -185,7 +185,7 @@ def run_tasks(
         ImportError: for a scheduler where Dask is not installed.
         ValueError: if no scheduler answers.
         TimeoutError: if it has no worker within a minute.
-        Warning: a task's own, where a filter of this process makes it an error.
+        Warning: a task's in another process, where a filter of this one makes it an error.
         Exception: another error of a task in this process, and of pickling for others, as it is.
     """
     if not resume:

@@ -59,7 +59,7 @@ def inner_products(x, rows, first, last, image, channels, out):
         x: vector of `channels` numbers.
         rows: numbers of pixels; read up to a multiple of TAP_BLOCK after `first`, so padded with any pixel's.
         image: pixels of `channels` numbers, one after the other.
-        out: numbers to write, those from `last` up to a multiple of LANES after `first` with no meaning.
+        out: numbers to write; from `last` up to a multiple of LANES after `first` they mean nothing.
     """
     c = 0
     for t in range(first, last, LANES):
