@@ -142,8 +142,8 @@ def required(matches: Matches | None, inputs: Inputs) -> Matches:
         The same matches.
 
     Raises:
-        ValueError: for None, and matches that `Matches.check` refuses, as for another size, number of betas or
-            shape of planes, or NaN. Matches of other images of the same size are not noticed.
+        ValueError: for None, and matches that `Matches.check` refuses, as for another size, number of betas
+            or shape of planes, or NaN. Matches of other images of the same size are not noticed.
     """
     if matches is None:
         raise ValueError("this network fuses by matches: call it as network(inputs, match(inputs))")
