@@ -76,9 +76,9 @@ def attend(
             Positions with the leading axes (Ha, Wa) or (B, Ha, Wa), or a function from (n, 2) alpha pixels
             (x, y) to either, with the leading axes (n) or (B, n), which is called on one piece of alpha at a
             time, and for Positions again in backward, so that not all of these exist at once. Or the field
-            `Local`: windows, of views of the same field of view; or `Dense`: all of beta, by
-            `scaled_dot_product_attention`, which may store all weights, if `border`, `samples` and `backend`
-            have their defaults.
+            `Local`: windows, of views of the same field of view; or `Dense`: all of beta (every `stride`-th
+            pixel), by `scaled_dot_product_attention`, which may store all weights, if `border`, `samples` and
+            `backend` have their defaults.
         samples: how many samples a segment has. None: one for each beta pixel of the longest valid one.
             Positions have their own number, which alone may be given.
         interpolation: `bilinear` (differentiable in the geometry) or `nearest` (the paper's).
@@ -287,11 +287,11 @@ def sample_positions(locations: Locations, query: Tensor, samples: int | None) -
 
 
 def samples_for(segments: Segments) -> int:
-    """Return the number of samples that puts one on each beta pixel of the longest valid segment; 1 if none
-    is valid."""
+    """Return the number of samples that puts one on each beta pixel of the longest valid, finite segment."""
     what = "the number of samples of the longest segment (give `samples`)"
     needs_numbers(what, segments.start, segments.end)
-    return int(torch.where(segments.valid, segments.length.detach(), 0).max().ceil()) + 1
+    length = segments.length.detach()
+    return int(torch.where(segments.valid & length.isfinite(), length, 0).max().ceil()) + 1
 
 
 def _bias(bias: Tensor | None, query: Tensor, samples: int) -> Tensor | None:

@@ -16,7 +16,7 @@ def segment_block_mask(segments: Segments, hw: HW, *, radius: float = 0.5, block
         segments: segments (Ha, Wa), or (B, Ha, Wa) for a batch.
         hw: (height, width) of beta; keys are its H W pixels, row by row.
         radius: largest distance of a key from the segment, pixels of beta.
-        block: queries, and keys, of a block of the mask.
+        block: number of queries, and of keys, in a block of the mask.
 
     Returns:
         The mask, for any number of heads, on the segments' device; without a batch for any batch. Queries

@@ -63,7 +63,7 @@ def backward(
         wanted: five flags, True for a gradient to compute.
 
     Returns:
-        Five gradients as `cpu.backward` returns them, those of key and value summed in no fixed order.
+        Five gradients as `cpu.backward` returns them; by key and value they are summed in no fixed order.
     """
     query, key, value, positions, *_ = inputs
     b, _, ha, wa = query.shape

@@ -87,8 +87,8 @@ def log_sum(compared: Compared) -> Float[Tensor, "b ha wa"]:
 
     Returns:
         Log sums (b, ha, wa); meaningless where no sample counts. Differentiable once by query and key. If the
-        segments require a gradient, the formula is used, which gathers all keys, and is differentiable by
-        these too and any number of times.
+        segments require a gradient, or the device has no compiled backend, the formula is used, which gathers
+        all keys, and is differentiable by segments too and any number of times.
 
     Raises:
         ValueError: for `locations` that are a function, and `locations` or a key that do not fit the query.
@@ -99,7 +99,8 @@ def log_sum(compared: Compared) -> Float[Tensor, "b ha wa"]:
         raise ValueError(f"query and key must agree in batch and channels, got {shapes}")
     positions = sample_positions(compared.segments, query, compared.samples)
     nearest = interpolation == "nearest"
-    if torch_op.wants_gradient(positions.points):
+    compiled = chosen_backend("auto", query.device.type) != "reference"
+    if torch_op.wants_gradient(positions.points) or not compiled:
         return reference.log_sum(AttentionInputs(query, key, value, positions, None, nearest))
     return _LogSum.apply(query, key, positions, nearest)
 
@@ -120,14 +121,11 @@ def peak_position(compared: Compared) -> Float[Tensor, "b 2 ha wa"]:
     """Compute the position of the largest weight, as the mean under a much sharper softmax.
 
     Scores are multiplied by `SHARPENED`; samples whose scores are nearly equal are averaged; `border` is not
-    applied.
+    applied. Errors as `attend`.
 
     Returns:
         Positions (x, y) in beta's pixels, (b, 2, ha, wa), float32, without gradient; 0 where no sample
         counts.
-
-    Raises:
-        ValueError: as `attend`, and also TypeError.
     """
     query, key, _, locations, samples, interpolation, _ = compared
     sharp = query.float() * SHARPENED

@@ -106,8 +106,8 @@ def exposure_gain(image: Float[Tensor, "c h w"]) -> float:
     The brightest part is the quantile `BRIGHT` of linear light, by RGB's luma or the mean of other channels.
 
     Returns:
-        Factor of linear light; 1 if that quantile is within `ORDINARY` already, or black; NaN if NaN is among
-        the pixels sampled.
+        Factor of linear light; 1 if that quantile is within `ORDINARY` already, or black; NaN for NaN or
+        infinity among the pixels, of which only some are looked at in large images.
     """
     light = linear_from_srgb(luminance_of(image).mean(0)).flatten()
     brightest = float(light[:: max(light.numel() // 100_000, 1)].quantile(BRIGHT))

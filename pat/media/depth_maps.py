@@ -50,9 +50,9 @@ def read_depth(path: str | Path, *, hw: HW | None = None, scale: float | None = 
         Depth z in metres (h, w), float32; NaN where the file's value is not positive and finite.
 
     Raises:
-        FileNotFoundError: for a missing file.
+        OSError: for a missing file (FileNotFoundError), or one that may not be read.
         ValueError: for a file that is no depth map (colour, 8 bits, no positive depth after scaling), has
-            another size, states no usable scale, or cannot be read (as `read_image` without `hw`).
+            another size, or states no usable scale; and as `read_recorded`.
     """
     path = Path(path)
     if not path.is_file():
@@ -118,7 +118,7 @@ def write_points(
     Args:
         path: file to write; missing folders are made.
         camera: camera of the image.
-        depth: metres; pixels where it is not positive and finite, or without a ray, are left out.
+        depth: metres; pixels are left out where it is not positive and finite, or the ray misses it.
         image: values 0..1; grey for one channel, or three and more, of which the first are RGB.
         along: "depth" for z along the optical axis, "distance" for the length of the ray.
 

@@ -30,7 +30,7 @@ def colour_depth(depth: Float[Tensor, "h w"]) -> Float[Tensor, "3 h w"]:
         depth: NaN, infinity, 0 and less are unknown.
 
     Returns:
-        RGB image (3, h, w) 0..1, float32 on the CPU; near is red, far dark blue, unknown black.
+        RGB (3, h, w) 0..1, float32 on the CPU; near is red, far (or a single depth) dark blue, unknown black.
     """
     depth = depth.detach().cpu()
     has_depth = depth.isfinite() & (depth > 0)
@@ -107,12 +107,12 @@ TITLE, GAP = 28, 10
 def draw_panels(
     panels: Mapping[str, Float[Tensor, "_ _ _"]], *, columns: int, width: float = 10.0
 ) -> Image.Image:
-    """Draw images side by side with titles, row by row, each scaled to its cell.
+    """Draw images side by side with titles, row by row, each scaled to its cell (aspect kept, centred).
 
     Args:
         panels: images (1 or 3, h, w), values 0..1, by title, at least one; a title may have several lines,
             and the font shrinks until the longest fits. The first image sets the cells' shape.
-        columns: panels in a row.
+        columns: panels in a row, 1 or more.
         width: width of the figure, in units of 110 pixels.
 
     Returns:

@@ -78,9 +78,9 @@ def read_image(
 
     Counts are divided by 2^bits - 1, or else by 255 or 65535; TIFF files that pack 10, 12 or 14 bits, and PNM
     files, state their own white. Float files must hold 0..1. An opaque alpha channel is dropped. HEIC is
-    reduced to 8 bits and rotated as its header says; raw files are developed to sRGB by LibRaw. An 8-bit
-    image with another colour profile is converted to sRGB with a warning; other profiles, and all with
-    `orientation="ignore"`, are ignored. Of several images in a file the first is read.
+    reduced to 8 bits, raw files are developed to 16-bit sRGB by LibRaw, both upright for any `orientation`.
+    An 8-bit image with another colour profile is converted to sRGB with a warning; other profiles, and all
+    with `orientation="ignore"`, are ignored. Of several images in a file the first is read.
 
     Args:
         name: prefix of messages, such as a camera's name.
@@ -95,9 +95,9 @@ def read_image(
         Grey (1, h, w) or RGB (3, h, w), float32, 0..1.
 
     Raises:
-        FileNotFoundError: for a missing file.
-        ValueError: for a file that is no usable image (damaged, transparent, other channels or types), values
-            out of range, more than `bits` or the file's own bits allow, a size other than `hw` or over
+        OSError: for a missing file (FileNotFoundError), or one that may not be read.
+        ValueError: for a file that is no usable image (damaged, transparent, other channels or types), NaN,
+            values out of range or beyond `bits`, `bits` beyond the file's, a size other than `hw` or over
             `MOST_PIXELS`, or an extra that is not installed.
     """
     label = f"{name}: {path}" if name else f"{path}"
@@ -121,7 +121,7 @@ def read_recorded(
         integers; RGB order; TIFF and PNM files with a lower white hold the camera's counts.
 
     Raises:
-        FileNotFoundError: for a missing file.
+        OSError: as `read_image`.
         ValueError: as `read_image`, but not for signed integers, NaN or values out of range.
     """
     label = f"{name}: {path}" if name else f"{path}"
@@ -175,13 +175,13 @@ def write_image(
     unknown: bool = False,
     profile: bool = False,
 ) -> None:
-    """Write a grey or RGB image atomically, in the format of its suffix (.png, .tif, .jpg; .exr with extra
-    `synthesis`).
+    """Write a grey or RGB image atomically, in the format of its suffix (.png, .tif, .jpg and others of
+    OpenCV's; .exr with extra `synthesis`).
 
     Args:
         image: floats (1 or 3, h, w), in 0..1.
-        bits: 8, or 16 (not .jpg): values are clipped to 0..1 and rounded; 32 (.tif, and .exr, which takes no
-            other): float32 as they are.
+        bits: 8, or 16 (.png, .tif, .ppm): values are clipped to 0..1 and rounded; 32 (.tif, and .exr, which
+            takes no other): float32 as they are.
         unknown: True allows NaN and infinity in 32-bit files.
         profile: True adds an sRGB profile to JPEG and PNG files in colour.
 
@@ -393,8 +393,8 @@ def _write_exr(path: Path, planes: NDArray, bits: int) -> None:
 def _encode(path: Path, colours: NDArray, bits: int) -> bytes:
     """Encode an image in the format of the path's suffix; ValueError for one that cannot hold it."""
     suffix = path.suffix.lower()
-    if suffix in (".jpg", ".jpeg") and bits != 8:
-        raise ValueError(f"{path}: JPEG holds 8 bits, not {bits}: write .png or .tif")
+    if suffix in (".jpg", ".jpeg", ".bmp", ".dib", ".gif", ".webp") and bits != 8:
+        raise ValueError(f"{path}: {suffix} holds 8 bits, not {bits}: write .png or .tif")
     tiff = suffix in (".tif", ".tiff")
     if bits == 32 and not tiff:
         raise ValueError(f"{path}: 32-bit floats need a name that ends in .tif")

@@ -25,15 +25,15 @@ from .colour import linear_from_srgb, luminance, srgb_from_linear
 def develop(
     image: Float[Tensor, "c h w"], sensor: Sensor, *, like: Sensor | None = None
 ) -> Float[Tensor, "c2 h w"]:
-    """Develop an image to sRGB: subtract the black level, demosaic, scale light to another camera's exposure.
+    """Develop an image to sRGB: subtract the black level, demosaic, scale light to another camera's level.
 
     Args:
         image: counts over 2^bits - 1; sRGB values unless `sensor.coding` is "linear". A mosaic is its first
             channel.
         sensor: the camera that recorded it; a black level without `bits` is in counts of 16 bits, and is
             under white, which is not checked.
-        like: sensor whose scale of light (exposure, gain in green) is wanted; None for its own. Exposures
-            count only if both are known.
+        like: sensor to whose scale of light (exposure, gain in green) each channel is brought; None for its
+            own. Exposures count only if both are known.
 
     Returns:
         sRGB values, 3 channels for a filter mosaic; at least 0 after a black level was subtracted, above 1
@@ -79,8 +79,8 @@ def match_luminance(
 ) -> Float[Tensor, "3 h w"]:
     """Shift a fused image so that the luminance of its light is alpha's, if alpha's camera measured light.
 
-    Fusion gives sRGB values whose luma is alpha's. Where the response is `LIGHT`, all three values of a pixel
-    are shifted equally until luminance agrees.
+    Where the response is `LIGHT`, all three sRGB values of a pixel are shifted equally, by four Newton steps,
+    which suffice if their luma is about alpha's, as fusion makes it.
 
     Args:
         alpha: alpha's developed image, sRGB values.
@@ -116,7 +116,7 @@ def demosaiced(raw: Float[Tensor, "1 h w"], pattern: str) -> Float[Tensor, "3 h 
         pattern: colours of the first two pixels of the first row, then of the second, such as "RGGB".
 
     Returns:
-        RGB image of the same size, clipped to 0..1, of the type and on the device of `raw`.
+        RGB image of the same size, type and device, clipped to 0..1; black if a side is under 3 pixels.
 
     Raises:
         ValueError: for another pattern, such as OpenCV's of two letters.

@@ -152,9 +152,8 @@ def focal_length(path: str | Path, hw: HW) -> float | None:
     """Read a photograph's focal length from its EXIF tags.
 
     Args:
-        hw: size of the image that the focal length is wanted for, the whole picture, at any scale if the tags
-            state the picture's size or the 35 mm equivalent, else at its own; the file's first image may be a
-            thumbnail.
+        hw: size of the image that the focal length is wanted for: the whole picture, at any scale; at the
+            file's own where the tags state the sensor's resolution without the picture's size.
 
     Returns:
         Focal length in pixels of that image, from the sensor's resolution or else the 35 mm equivalent; None

@@ -87,8 +87,8 @@ def config_of(state: Mapping[str, Tensor]) -> PATConfig:
         the authors' code.
 
     Raises:
-        ValueError: if one of the three weights that show them is missing, or a size is beyond 1 to 1024.
-            `renamed` checks the others.
+        ValueError: if one of the three weights that show them is missing or has not four axes, or a size is
+            beyond 1 to 1024. `renamed` checks the others.
     """
     betas = sum(re.fullmatch(r"pam\.b2s\.\d+\.weight", name) is not None for name in state)
     for name in ("init_feature.0.weight", "upscale.4.weight", "upscale.7.weight"):

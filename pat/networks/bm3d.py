@@ -82,16 +82,16 @@ def refined(
 ) -> Float[Tensor, "b c h w"]:
     """Refine a network's estimate of images of one band or of three (RGB) that were recorded with noise.
 
-    Brightness (or the single band) is a mean of the network's and the filtered one; colour is filtered twice.
+    A single band is filtered once, RGB twice; then the band, or RGB's brightness, is averaged with the
+    network's (share `kept`).
 
     Args:
-        estimate: the network's images without noise; one at least.
+        estimate: the network's images without noise; one at least, all values finite.
         recorded: the noisy images, values 0..1.
         deviation: standard deviation of each value's white noise.
 
     Returns:
-        Images of the same shape, not clipped. A gradient reaches the estimate only, through its share of
-        brightness.
+        Images of the same shape, not clipped. A gradient reaches the estimate only, through that share.
 
     Raises:
         RuntimeError: by torch, for two bands or more than three.

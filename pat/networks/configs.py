@@ -24,7 +24,7 @@ class PATConfig:
         values_after_block: True for values computed from the features of the keys, as in the authors' code.
         normalised: True for one more input channel of every image: the mean of its channels, without mean
             and contrast of its surroundings, which a grey and a colour camera see alike.
-        equal_resolution: True to resize betas to about alpha's angular resolution first.
+        equal_resolution: True if `fuse` resizes betas to about alpha's angular resolution first.
     """
 
     betas: int = 1
@@ -47,8 +47,8 @@ class GuidedPATConfig:
 
     Attributes:
         bands: number of bands of the fused image; None for all bands of the betas.
-        keep_luminance: True if the network adds colour to alpha but never luminance (Rec. 601), which needs
-            three bands; without `bands` it has no effect.
+        keep_luminance: True if alpha gets the betas' colour without its luminance (Rec. 601; without the
+            share `Inputs.luminance` of it), which needs three bands; without `bands` it has no effect.
         learned: True for matching with trained networks; False for classical matching, semi-global with a
             left-right check, whose confidence is 0 or 1.
     """

@@ -34,7 +34,7 @@ class DenoiserConfig:
 
     Attributes:
         widths: channels at 1/2, 1/4 and 1/8 size.
-        blocks: number of residual blocks at each size, as of `UNet`.
+        blocks: number of residual blocks, as for `UNet`.
     """
 
     widths: tuple[int, int, int] = (48, 96, 128)
@@ -62,7 +62,7 @@ class Denoising(nn.Module):
         """Denoise images of any size.
 
         Args:
-            image: noisy images, values 0..1, of `bands` channels and the weights' type.
+            image: noisy images, values 0..1, of `bands` channels and the weights' type; torch refuses others.
             deviation: standard deviation of each value's noise.
 
         Returns:

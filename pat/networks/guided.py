@@ -68,7 +68,7 @@ class GuidedPAT(nn.Module):
             The image (B, C, H, W) in the betas' bands, not clipped. For each beta the position of the surface
             that alpha sees, its confidence (0 off the beta), and a deviation of 1 everywhere. `overall` is
             the largest confidence of all betas, those for depth alone included, where there are several and
-            one or more have all bands; else None.
+            one or more have all `config.bands` bands; else None.
 
         Raises:
             ValueError: as `required`; for matches without colours, fields that are not straight, and betas

@@ -75,7 +75,7 @@ class PAT(nn.Module):
             sample counts; `overall` None.
 
         Raises:
-            ValueError: for another number of betas than configured, or channels that do not fit.
+            ValueError: for another number of betas than configured, unfit channels; and as `attend`.
             RuntimeError: by torch, with `config.residual`, for an alpha of neither one channel nor
                 `config.out_channels`.
         """

@@ -63,7 +63,7 @@ class FusionNetwork(Protocol):
     learned: bool
     """True if matching's trained networks take part in its matches."""
     keeps_luminance: bool
-    """True if the luminance of its image is alpha's."""
+    """True if the luminance of its image is alpha's, as far as `Inputs.luminance` says."""
     halo: int
     """Pixels around a pixel within which alpha's image, and the fields of its pixels, can matter."""
     beta_halo: int
@@ -142,8 +142,8 @@ def required(matches: Matches | None, inputs: Inputs) -> Matches:
         The same matches.
 
     Raises:
-        ValueError: for None, and matches that `Matches.check` refuses: of another size or number of betas, or
-            with planes of another shape, or NaN. Matches of other images of the same size are not noticed.
+        ValueError: for None, and matches that `Matches.check` refuses, as for another size, number of betas
+            or shape of planes, or NaN. Matches of other images of the same size are not noticed.
     """
     if matches is None:
         raise ValueError("this network fuses by matches: call it as network(inputs, match(inputs))")

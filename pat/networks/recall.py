@@ -64,10 +64,10 @@ def by_example(
     Args:
         alpha: alpha's image; both sides even.
         colour: colour of each pixel, such as bands minus alpha; finite everywhere.
-        confidence: confidence of each band's colour, 0 to 1; colours with 0 do not count.
+        confidence: confidence of each band, 0 to 1; examples count by their least band, at 0 not at all.
 
     Returns:
-        Colour at all pixels, of the same shape.
+        Colour at all pixels, of the same shape; about 0 without examples in the window.
 
     Raises:
         RuntimeError: by torch, for odd sides.

@@ -212,10 +212,10 @@ def find_weights(name: str | Path) -> Path:
     """Find a weights file, shipped with the package or the user's own.
 
     Args:
-        name: name of shipped weights, such as "mono-colour", or else a path.
+        name: name of shipped weights ("mono-colour"), or a path; if absolute, .safetensors may be left out.
 
     Returns:
-        The path; a given one as it is.
+        The path.
 
     Raises:
         FileNotFoundError: if neither exists.

@@ -82,8 +82,7 @@ class NoiseLevel:
     @classmethod
     @torch.no_grad()
     def estimated(cls, image: Float[Tensor, "1 c h w"]) -> NoiseLevel:
-        """Estimate the noise of an sRGB image, taken as white noise, from its smoothest parts at each
-        brightness.
+        """Estimate an sRGB image's noise, taken as white, from its smoothest parts at each brightness.
 
         The smallest second differences of a group of blocks are taken as noise alone; the better fit of noise
         in light and noise in values is chosen. Noise that demosaicing, resampling or a codec has smoothed is
@@ -118,10 +117,11 @@ class NoiseLevel:
         """
         linear = self.added_to == "light"
         light = linear_from_srgb(image) if linear else image
-        shot = torch.as_tensor(self.shot).to(light)
+        form = {"dtype": light.dtype, "device": light.device}
+        shot, read = (torch.as_tensor(x, **form) for x in (self.shot, self.read))
         expected = (light.clamp(min=0) / shot.clamp(min=1e-9)).clamp(max=1e7)
         counted = torch.poisson(expected, generator=generator) * shot
-        light = torch.where(shot > 1e-7, counted, light) + self.read * normal(light.shape, light, generator)
+        light = torch.where(shot > 1e-7, counted, light) + read * normal(light.shape, light, generator)
         return srgb_from_linear(light.clamp(0, 1)) if linear else light.clamp(0, 1)
 
     def deviation(self, image: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:

@@ -81,7 +81,7 @@ class GaussianBlur(Step):
     """Uniform Gaussian defocus with replicated border, differentiable in sigma.
 
     Attributes:
-        sigma: standard deviation in pixels, a number or a tensor of one; ValueError if it is negative,
+        sigma: standard deviation in pixels, a number or a tensor without axes; ValueError if it is negative,
             infinite or NaN. 0 changes nothing, and has no gradient in sigma.
     """
 

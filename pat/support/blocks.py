@@ -122,7 +122,7 @@ class UNet(nn.Module):
         """Return features (b, outputs, h, w) for an input (b, inputs, h, w).
 
         Raises:
-            RuntimeError: by torch, for other sides; some give a result instead, without meaning.
+            RuntimeError: by torch, for sides not multiples of 4; some give a result without meaning instead.
         """
         first = self._in_rows(self.first, x)
         second = self.second(first)

@@ -185,7 +185,8 @@ def run_tasks(
         ImportError: for a scheduler where Dask is not installed.
         ValueError: if no scheduler answers.
         TimeoutError: if it has no worker within a minute.
-        Exception: another error of a task in this process, as it is.
+        Warning: a task's in another process, where a filter of this one makes it an error.
+        Exception: another error of a task in this process, and of pickling for others, as it is.
     """
     if not resume:
         for task in tasks:
@@ -361,8 +362,7 @@ def _failed(task: Task, future: Future) -> TaskOutcome:
 
 
 def attempt(task: Task, threads: int) -> TaskOutcome:
-    """Run a task in this process, unless its file or folder exists, and catch ValueError, OSError and
-    Warning.
+    """Run a task in this process unless its file or folder exists; catch ValueError, OSError and Warning.
 
     Args:
         threads: torch's number of threads, which stays set for the whole process.

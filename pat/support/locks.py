@@ -24,7 +24,7 @@ def folder_lock(folder: Path) -> Iterator[None]:
     """Context manager that makes a folder and keeps other commands out of it.
 
     The lock is a file locked by the system; a file beside it names the process and the host. The lock of a
-    dead process on this host, or in a container on it, is ignored; that of another host's holds until its
+    dead process on this host, or in a container on it, is ignored; a lock of another host holds until its
     `OWNER` file is removed. Folders that the block leaves empty are removed again if this made them.
 
     Raises:

@@ -59,7 +59,7 @@ def bootstrap_interval(values: Sequence[float]) -> tuple[float, float]:
 
     Returns:
         Lower and upper bound from 10,000 resamples with a fixed seed; (nan, nan) for fewer than two values,
-        or if one is NaN.
+        or if one is NaN; either may be infinite or NaN if a value is infinite.
     """
     if len(values) < 2:
         return math.nan, math.nan

@@ -17,9 +17,9 @@ def nearest_points(
     """Find the nearest points of each query by a k-d tree (OpenCV's FLANN).
 
     Args:
-        points: points to search, `count` at least; rounded to float32, as are `queries`.
-        queries: points whose neighbours are wanted.
-        count: number of neighbours of each.
+        points: points to search, `count` at least; finite, and rounded to float32, as are `queries`.
+        queries: points whose neighbours are wanted, one at least.
+        count: number of neighbours of each, one at least.
         error: share by which a neighbour may be farther away than the one it stands for; 0 searches exactly.
 
     Returns:

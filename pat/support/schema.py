@@ -81,8 +81,8 @@ def parse_yaml(text: str | bytes, name: str) -> Any:
         Its content: mappings, lists and plain values; None for an empty text.
 
     Raises:
-        ValueError: with `name`, and the line where known, for text that is not YAML or not UTF-8, repeated
-            keys, and what `safe_yaml` limits (size, nesting, aliases).
+        ValueError: with `name`, and the line where known, for text that is not YAML or not UTF-8, several
+            documents, repeated keys, and what `safe_yaml` limits (size, nesting, aliases).
     """
     import yaml
 

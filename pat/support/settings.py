@@ -77,7 +77,7 @@ def all_settings(*rooms: str) -> list[SettingEntry]:
         The entries by package, by name of the module, as `listed`; equal ones appear once.
 
     Raises:
-        ImportError: for a package or module that cannot be imported.
+        ImportError: for a package or module that cannot be imported; AttributeError for a lone module.
         ValueError: as `listed`.
     """
     entries: dict[SettingEntry, None] = {}

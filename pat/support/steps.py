@@ -53,7 +53,7 @@ def about(seconds: float) -> str:
 
 @contextmanager
 def steps_shown(show: Callable[[str], None]) -> Iterator[None]:
-    """Context manager that calls `show` with a line of text for every step that these packages log (at INFO).
+    """Context manager that calls `show` with a line of text for every step that `PACKAGES` log (at INFO).
 
     The line ends with the stage and the remaining time where they are known. Steps of other threads are not
     shown, and of nested blocks only the innermost shows.

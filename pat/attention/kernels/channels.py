@@ -59,7 +59,7 @@ def inner_products(x, rows, first, last, image, channels, out):
         x: vector of `channels` numbers.
         rows: numbers of pixels; read up to a multiple of TAP_BLOCK after `first`, so padded with any pixel's.
         image: pixels of `channels` numbers, one after the other.
-        out: numbers to write, those from `last` up to a multiple of LANES after `first` with no meaning.
+        out: numbers to write; from `last` up to a multiple of LANES after `first` they mean nothing.
     """
     c = 0
     for t in range(first, last, LANES):
@@ -104,7 +104,7 @@ def weighted_sum(weights, rows, first, last, image, channels, begin, end, out):
     """Add a weighted sum of pixels: out[c] += weights[t] image[rows[t], c] for begin <= c < end.
 
     The sum is over first <= t < last. Taps are read up to a multiple of TAP_BLOCK after `first`: beyond
-    `last` weights have to be 0, and rows those of pixels, such as 0. `image` has `channels` numbers a pixel.
+    `last` weights have to be 0, and rows any pixel's, such as 0. `image` has `channels` numbers a pixel.
     """
     c = begin
     while c + ROW * LANES <= end:

@@ -46,7 +46,7 @@ class Code:
         context: numba's target context.
         builder: llvmlite's builder.
         kinds: numba's types of the intrinsic's arguments.
-        result: numba's type of its value.
+        result: numba's type of the intrinsic's value.
     """
 
     def __init__(self, context, builder, kinds, result):

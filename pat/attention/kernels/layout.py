@@ -165,7 +165,7 @@ class Saved(NamedTuple):
     """Results of forward, and gradients by its outputs: flat arrays in the order of `Outputs`.
 
     Attributes:
-        statistics: statistics of forward; those of pixel p start at `step` p.
+        statistics: statistics of forward; pixel p's start at `step` p.
         logsum: logarithms of the sums of exponentials.
         value_upstream: gradients by the values.
         statistics_upstream: gradients by the statistics, at the same places.

@@ -104,8 +104,8 @@ def differentiate_rows(query, key, value, upstream, sums, gradients, wanted, bia
     of keys and values are gathered, too.
 
     Args:
-        query: features (d, h, w) of alpha; `key`, `value`, `bias`, `which`, `size`, `spacing` and `top` are
-            those of `attend_rows`.
+        query: features (d, h, w) of alpha; `key`, `value`, `bias`, `which`, `size`, `spacing` and `top` as
+            for `attend_rows`.
         upstream: gradient (dv, h, w) by the means.
         sums: planes (2, h, w): `logsum`, and the inner product of `upstream` with the means.
         gradients: gradients by query, key and value to add to.

@@ -63,8 +63,8 @@ def test_refuses_a_function_that_returns_neither():
 
 
 def test_samples_left_out_are_one_a_pixel():
-    start, end = torch.zeros(2, 2), torch.tensor([[3.2, 0.0], [40.0, 0.0]])
-    assert operator.samples_for(Segments(start, end, torch.tensor([True, False]))) == 5
+    start, end = torch.zeros(3, 2), torch.tensor([[3.2, 0.0], [40.0, 0.0], [torch.inf, 0.0]])
+    assert operator.samples_for(Segments(start, end, torch.tensor([True, False, True]))) == 5
 
 
 @pytest.mark.parametrize("backend", ["cpu", "triton"])

@@ -53,6 +53,13 @@ def test_log_sum_and_mean_score_are_the_formula_in_value_and_gradient(interpolat
         torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-9)
 
 
+def test_the_log_sum_is_the_formula_where_no_backend_is_compiled():
+    one = compared()
+    segments = Segments(*(getattr(one.segments, name).to("meta") for name in ("start", "end", "valid")))
+    query, key = one.query.to("meta"), one.key.to("meta")
+    assert log_sum(one._replace(query=query, key=key, locations=segments)).shape == (2, 4, 6)
+
+
 def test_a_second_derivative_of_the_log_sum_is_refused():
     one = compared("bilinear")
     (first,) = torch.autograd.grad(log_sum(one).square().sum(), one.query, create_graph=True)

@@ -44,6 +44,12 @@ def test_each_image_of_a_batch_has_its_own_level():
         torch.testing.assert_close(both.unbiased(image)[i : i + 1], alone.unbiased(part))
 
 
+def test_a_level_in_another_precision_leaves_the_images_as_it_is():
+    level = torch.full((2, 1, 1, 1), 0.1, dtype=torch.float64)
+    image = torch.rand(2, 3, 20, 21, generator=generator_for(0, "batch"))
+    assert NoiseLevel(level, level).recorded(image, generator_for(0)).dtype == torch.float32
+
+
 def test_without_noise_nothing_is_biased():
     image = torch.rand(1, 3, 20, 21, generator=generator_for(0, "clean"))
     torch.testing.assert_close(NoiseLevel().unbiased(image), image, atol=1e-6, rtol=0)
