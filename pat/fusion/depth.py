@@ -65,8 +65,8 @@ def certain(output: FusionOutput, matches: Matches | None, inputs: Inputs) -> Fu
         matches: matches that it was given; None for none.
 
     Returns:
-        The output with these (confidence 0 off a segment, or where the network's is), and the largest as
-        `overall` if it had one; unchanged without matches.
+        The output with these (confidence 0 off a segment, or where the network's is), and `overall`, if it
+        had one, by `FusionOutput.of_best`; unchanged without matches.
     """
     if matches is None:
         return output
@@ -81,8 +81,8 @@ def certain(output: FusionOutput, matches: Matches | None, inputs: Inputs) -> Fu
             kept = (confidence[i] > stated) & beta.around
             confidence[i] = torch.where(kept, confidence[i], stated)
             deviation[i] = torch.where(kept, deviation[i], half_width / DEVIATIONS)
-    overall = output.overall if output.overall is None else torch.stack(confidence).amax(0)
-    return output._replace(confidence=confidence, deviation=deviation, overall=overall)
+    known = output._replace(confidence=confidence, deviation=deviation)
+    return known if output.overall is None else known.of_best(inputs.betas)
 
 
 def measured_depth(

@@ -67,8 +67,8 @@ class GuidedPAT(nn.Module):
         Returns:
             The image (B, C, H, W) in the betas' bands, not clipped. For each beta the position of the surface
             that alpha sees, its confidence (0 off the beta), and a deviation of 1 everywhere. `overall` is
-            the largest confidence of all betas, those for depth alone included, where there are several and
-            one or more have all `config.bands` bands; else None.
+            the largest confidence of the betas that have all `config.bands` bands, where there are several
+            betas and such ones; else None.
 
         Raises:
             ValueError: as `required`; for matches without colours, fields that are not straight, and betas
@@ -87,7 +87,7 @@ class GuidedPAT(nn.Module):
     def _known_bands(
         self, inputs: Inputs, carried: Sequence[Colours], matches: Matches
     ) -> tuple[Float[Tensor, "b c h w"], bool]:
-        """Compute the image, with True if each beta shows all of its bands."""
+        """Compute the image, with True if it is of betas, one of several or more, that have all bands."""
         alpha, wanted = inputs.alpha, self.bands
         bands = [one.bands.shape[1] for one in carried]
         parts = len(bands) == 1 or wanted not in bands
@@ -213,5 +213,5 @@ def _output_of(
         seen = segments.valid & on_image(within, (beta.image.shape[-2], beta.image.shape[-1]))
         confidence.append(matched.confidence[:, 0].to(image) * seen)
         deviation.append(torch.ones_like(confidence[-1]))
-    joint = torch.stack(confidence).amax(0) if overall else None
-    return FusionOutput(image, position, deviation, confidence, joint)
+    output = FusionOutput(image, position, deviation, confidence)
+    return output.of_best(inputs.betas) if overall else output

@@ -6,12 +6,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal, NamedTuple, Protocol, runtime_checkable
 
+import torch
 from torch import Tensor
 
 from arraygeom.runtime.chunks import Box, slices
 
 from ..attention.scores import Compared
-from ..matching.inputs import Inputs
+from ..matching.inputs import Beta, Inputs
 from ..matching.match import match
 from ..matching.matches import Matches
 
@@ -42,6 +43,14 @@ class FusionOutput(NamedTuple):
         position, deviation, confidence = ([t[index] for t in tensors] for tensors in self[1:4])
         overall = None if self.overall is None else self.overall[index]
         return FusionOutput(self.image[index], position, deviation, confidence, overall)
+
+    def of_best(self, betas: Sequence[Beta]) -> FusionOutput:
+        """Return the same with the largest confidence as `overall`: of the betas that have all bands of the
+        image, or of all betas if none has.
+        """
+        bands = self.image.shape[1]
+        sources = [c for c, beta in zip(self.confidence, betas) if beta.image.shape[1] == bands]
+        return self._replace(overall=torch.stack(sources or self.confidence).amax(0))
 
 
 JoinsBands = Literal["no", "neighbours", "all"]

@@ -51,6 +51,17 @@ def test_three_filtered_cameras_serve_as_one():
     assert len(three.confidence) == 3
 
 
+def test_the_image_is_as_certain_as_the_betas_it_is_of():
+    """A mono beta beside a colour one, of which depth alone is known, says nothing of colours."""
+    torch.manual_seed(0)
+    alpha = torch.rand(1, 1, *HW)
+    betas = [torch.rand(1, 3, *HW), alpha.clone()]
+    fused = fused_at_once(GuidedPAT(), Inputs.from_images(alpha, betas, [rectified()] * 2))
+    colour, mono = fused.confidence
+    assert (mono > colour).any()
+    assert fused.overall.equal(colour)
+
+
 def test_bands_must_add_up():
     network = GuidedPAT()
     with pytest.raises(ValueError, match=r"2 bands .* 3"):
