@@ -154,11 +154,12 @@ def seen_at(camera: Camera, x: Float[Tensor, "n 2"], depth: float) -> np.ndarray
     """
     camera = camera.to(torch.float64)
     middle = x.mean(0)
-    rays, valid = camera.rays(middle + torch.linspace(1, 0.2, 33).to(x)[:, None, None] * (x - middle))
-    outermost = valid.int().argmax(0)
-    rays = rays.gather(0, outermost[None, :, None].expand(1, -1, 3))[0]
-    rays = rays / rays.norm(dim=-1, keepdim=True)
-    points = camera.cam_from_world.inverse().apply(depth * rays / rays[:, 2:].clamp(min=0.6))
+    inwards = middle + torch.linspace(1, 0.2, 33).to(x)[:, None, None] * (x - middle)
+    rays, valid = camera.rays(inwards)
+    outermost = valid.int().argmax(0)[None, :, None].expand(1, -1, 3)
+    start, ray = (t.gather(0, outermost)[0] for t in (camera.ray_origins(inwards), rays))
+    ray = ray / ray.norm(dim=-1, keepdim=True)
+    points = camera.cam_from_world.inverse().apply(start + depth * ray / ray[:, 2:].clamp(min=0.6))
     return numpy(torch.where(valid.any(0)[:, None], points, torch.nan))
 
 

@@ -98,7 +98,7 @@ class BoardViews:
 
 
 def detect(grey: Grey, board: Board) -> Detection | None:
-    """Detect a single board's points in a grey image (uint8).
+    """Detect a single board's points in a grey image (uint8); one in colour is not refused.
 
     Returns:
         The points, corners refined where that is plausible: all of the board's, or of one with markers
@@ -106,7 +106,7 @@ def detect(grey: Grey, board: Board) -> Detection | None:
 
     Raises:
         KeyError: for several boards (`Boards`), and a kind of one's own.
-        cv2.error: for an image of another type, or with colours.
+        cv2.error: for an image of another type.
     """
     for candidate in _versions(grey):
         detection = _FINDERS[type(board)](candidate, board)
@@ -122,7 +122,7 @@ def explain(images: Iterable[Grey], board: Board, *, confirmed: bool = False) ->
     Args:
         images: grey images, uint8.
         board: a single board.
-        confirmed: True if other images show it, so that it is not another board.
+        confirmed: True if other images show it: its name and size are right, though these may show another.
 
     Returns:
         A sentence: the commonest reason, or that there are no images.

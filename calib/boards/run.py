@@ -63,7 +63,8 @@ def calibrate_photos(
         board: board as text (see `parse_board`), or several that may be in the images at once.
         out: rig file (.yaml); the others get its name with other suffixes. All appear together.
         patterns: file name patterns by camera; None derives cameras from folders or names.
-        lens: lens model; "auto" chooses for each camera the model that its images support.
+        lens: lens model; "auto" (not with a start) chooses for each camera the model that its images
+            support. With a start, for its pinholes alone: others keep their kind of lens.
         depth: depth range of the rig, metres; None keeps the start's, if there is one.
         start: file of a rig known to within `deviations`; one image of each camera is then enough, such as a
             file named like the camera. None for none.

@@ -100,7 +100,8 @@ class Diagnosis:
 
     Attributes:
         named: the mistake with its repaired rig; of kind "nothing", with the given rig, if none explains the
-            images clearly better than a drift of the cameras.
+            images clearly better than a drift of the cameras. Where images are not of the rig's sizes, the
+            best of the mistakes that explain the sizes, however well it fits (`after`).
         equal: mistakes that explain the images as well, or as well as a drift if none is named: the best of
             each kind, and of the named kind one whose rig is another.
         before: statistics of the given rig.

@@ -56,8 +56,8 @@ class LowLightSettings:
     middle: int = size(1024, "Side of the part of an image in which noise is looked for, pixels")
     far_more: float = physics(
         5.0,
-        "Warn if the stated noise is more than this many times the noise measured in the image: "
-        "noise that a demosaicing has smoothed shows as half or less",
+        "Warn if the stated noise is more than this many times the noise measured in the image (the least "
+        "deviation at least): noise that a demosaicing has smoothed shows as half or less",
     )
     found_bytes: float = size(12.0, "Of a position in a beta and its confidence")
     averaging: float = size(0.4, "The time of averaging over that of denoising the views, about")
@@ -215,7 +215,8 @@ def denoised_views(views: Views, noise: Noise | None) -> tuple[Views, LowLight]:
 def warn_of_noise(name: str, image: Float[Tensor, "c h w"], view: NoisyView) -> None:
     """Warn if the noise that is stated for an image is far more than it shows.
 
-    Far more is by `SETTINGS.far_more`. There is no warning where the image shows no noise at all.
+    Far more is by `SETTINGS.far_more`; noise under `least_deviation` counts as that. There is no warning
+    where the image shows none at all.
 
     Args:
         name: name of the camera.

@@ -72,7 +72,7 @@ class Choice(nn.Module):
 
     From `features` it computes planes (B, `CANDIDATES` + 2, 4, h2, w2), 2 x 2 pixels row by row: a score for
     each candidate, the logit of the probability that beta sees the point and the best one is right to a
-    pixel, and the logarithm of that one's error in pixels of beta.
+    pixel, and the natural logarithm of an error, pixels of beta, that 9 of 10 of those do not exceed.
 
     Args:
         widths: three numbers, channels at 1/2, 1/4 and 1/8 of alpha's size.

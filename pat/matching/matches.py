@@ -75,7 +75,7 @@ class BetaMatches:
         chosen: (B, 1, H, W), the disparity of the surface that alpha sees, which may be occluded in beta; of
             betas that were made to agree, theirs; None if none was chosen.
         stated: (B, 2, H / 2, W / 2), the choice network's logit that its disparity is right, and the
-            logarithm of its error, pixels; None before that network has run.
+            natural logarithm of an error, pixels, that 9 of 10 do not exceed; None before it has run.
         certainty: (B, 2, H / 2, W / 2), the probability that beta sees the point and the match is within a
             pixel of it, and the half-width, in pixels of beta, of the interval around the match that holds
             the true position in 9 of 10 cases; None where it is not known.

@@ -362,7 +362,8 @@ class _Sampled(NamedTuple):
         return cls(*(torch.cat(planes) for planes in zip(*parts)))
 
     def against(self, other: _Sampled, x: Tensor, y: Tensor) -> Ambiguity:
-        """Return the ambiguity of these inverse depths against another beta's with which most pixels agree.
+        """Return the ambiguity with which most of these inverse depths agree with another beta's: `scale`
+        times the other's, plus the plane.
 
         Args:
             x: columns of alpha's sampled pixels, of the planes' shape; `y` are their rows.

@@ -230,7 +230,9 @@ def _png_of_heif(path: Path, label: str, hw: HW | None) -> bytes:
         image = np.asarray(stored)
     except (OSError, ValueError) as error:
         raise ValueError(problem % error) from None
-    return cv2.imencode(".png", image if image.ndim == 2 else image[..., [2, 1, 0]])[1].tobytes()
+    content = cv2.imencode(".png", image if image.ndim == 2 else image[..., [2, 1, 0]])[1].tobytes()
+    profile = stored.info.get("icc_profile")
+    return content if profile is None else _with_profile(content, b"of the HEIC file", profile)
 
 
 def _png_of_raw(path: Path, label: str) -> bytes:
@@ -505,11 +507,16 @@ def with_srgb_profile(content: bytes, suffix: str) -> bytes:
         The bytes of a PNG or JPEG file with the profile; of other files unchanged.
     """
     if suffix == ".png":
-        body = b"iCCP" + b"sRGB\0\0" + zlib.compress(srgb_profile())
-        chunk = struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body))
-        return content[:33] + chunk + content[33:]
+        return _with_profile(content, b"sRGB", srgb_profile())
     if suffix in (".jpg", ".jpeg"):
         segment = b"ICC_PROFILE\0\1\1" + srgb_profile()
         assert len(segment) < _JPEG_PART
         return content[:2] + b"\xff\xe2" + struct.pack(">H", len(segment) + 2) + segment + content[2:]
     return content
+
+
+def _with_profile(png: bytes, name: bytes, profile: bytes) -> bytes:
+    """Return the bytes of a PNG file with a colour profile."""
+    body = b"iCCP" + name + b"\0\0" + zlib.compress(profile)
+    chunk = struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body))
+    return png[:33] + chunk + png[33:]

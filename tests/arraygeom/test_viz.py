@@ -4,7 +4,18 @@ import numpy as np
 import pytest
 import torch
 
-from arraygeom import Distortion, Epipolar, Local, Rig, Segments, View, Widened, sampling_locations, viz
+from arraygeom import (
+    Distortion,
+    Epipolar,
+    Local,
+    Rig,
+    Segments,
+    View,
+    Widened,
+    sampling_locations,
+    viz,
+)
+from arraygeom.lenses import Orthographic
 from arraygeom.runtime.text import UNSCALED
 from tests.arraygeom.rigs import known_by_f, random_rig, scene_points, two_cameras
 
@@ -49,8 +60,9 @@ def test_axes_are_in_the_rigs_unit(name, unit):
     ]
 
 
-def test_frusta_are_in_front_of_their_cameras_and_project_to_the_corners():
-    camera = random_rig(1)["alpha"]
+@pytest.mark.parametrize("lens", [None, Orthographic()], ids=["pinhole", "orthographic"])
+def test_frusta_are_in_front_of_their_cameras_and_project_to_the_corners(lens):
+    camera = random_rig(1)["alpha"].replace(distortion=lens)
     border = torch.from_numpy(viz.frustum(camera, 2.0)[-1])
     projected = camera.project(border)
     torch.testing.assert_close(projected.depth, torch.full_like(projected.depth, 2.0))

@@ -132,8 +132,9 @@ class Fusing(Known):
     def recordings(self, image: Sequence[str], *, with_rig: bool) -> Iterator[Recordings]:
         """Context manager that yields the images with the given rig or one found.
 
-        Sets `bits`, and `network` if none was named and the default does not suit. Frames of videos exist
-        within the block only.
+        Sets `bits`, and `network` if none was named (with a rig only where the default does not suit);
+        without a rig also the options that the array found asks for. Frames of videos exist within the block
+        only.
 
         Args:
             image: images NAME=FILE, as `named` returns them.
@@ -142,7 +143,7 @@ class Fusing(Known):
         Raises:
             ValueError: for options that contradict each other, before images are read, and a rig, images or
                 videos that cannot be used.
-            FileNotFoundError: for a missing file, and unknown weights.
+            FileNotFoundError: for a missing file; for unknown weights too where a rig is sought by matching.
         """
         self.fuse_settings()
         if with_rig:

@@ -179,12 +179,12 @@ def _cached(file: Path) -> list[np.ndarray]:
 
 
 def read_photographs(folders: tuple[str | Path, ...], max_edge: int) -> list[np.ndarray]:
-    """Read all images under the folders, subfolders included, reduced to `max_edge` pixels on the longest
-    side (but no side under 32).
+    """Read all photographs (`PHOTO_SUFFIXES`) in folders and their subfolders, reduced to `max_edge` pixels
+    on the longest side (but no side under 32).
 
     Returns:
-        Arrays (h, w, 3), uint8, RGB (equal for grey), in the order of all folders' paths; files that are no
-        images, have a side under 32 pixels, or are too large to decode, are skipped.
+        Arrays (h, w, 3), uint8, RGB (equal for grey), in the order of all folders' paths; files that
+        `decoded_photograph` does not decode, or have a side under 32 pixels, are skipped.
 
     Raises:
         ValueError: if none is found, as under a missing folder.

@@ -3,6 +3,7 @@
 import sys
 import time
 import warnings
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -36,12 +37,19 @@ def profile_of(primaries: tuple[float, ...], called: str = "wide built-in") -> b
 DISPLAY_P3 = (0.5151, 0.2920, 0.1571, 0.2412, 0.6922, 0.0666, -0.0011, 0.0419, 0.7841)
 
 
-@pytest.mark.parametrize("suffix", ["png", "jpg", "tif"])
-def test_another_profile_is_converted_and_said(suffix, tmp_path):
+@pytest.mark.parametrize("suffix", ["png", "jpg", "tif", "heic"])
+def test_another_profile_is_converted_and_said(suffix, tmp_path, monkeypatch):
+    """A HEIC file's, too, with a stand-in for pillow-heif."""
     path = tmp_path / f"p3.{suffix}"
     options = {"quality": 100, "subsampling": 0} if suffix == "jpg" else {}
     flat = np.full((8, 9, 3), (200, 60, 60), np.uint8)
-    Image.fromarray(flat).save(path, icc_profile=profile_of(DISPLAY_P3), **options)
+    if suffix == "heic":
+        path.write_bytes(b"\0\0\0\x18ftypheic\0\0\0\0mif1heic")
+        stored = Image.fromarray(flat)
+        stored.info["icc_profile"] = profile_of(DISPLAY_P3)
+        monkeypatch.setitem(sys.modules, "pillow_heif", SimpleNamespace(open_heif=lambda *_, **__: stored))
+    else:
+        Image.fromarray(flat).save(path, icc_profile=profile_of(DISPLAY_P3), **options)
     with pytest.warns(UserWarning, match="'wide"):
         red, green, _ = (255 * read_image(path)[:, 4, 4]).tolist()
     assert red > 205
