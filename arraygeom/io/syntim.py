@@ -26,7 +26,7 @@ HEAD = r"(?s)(?=.*Intrinsic parameters:).*Scale factor"
 def read(source: RigSource) -> Rig:
     """Read the pair "left" and "right" of a file cam_NAME_g or cam_NAME_d, or the one there is, in metres.
 
-    A file of another name gives one camera of that name.
+    Where the name ends otherwise, with a suffix too, the file gives one camera of its own whole name.
 
     Raises:
         RigFileError: for a damaged file, or none.

@@ -152,8 +152,9 @@ def stored_values(content: bytes, header: ImageHeader) -> Any:
         header: their `image_header`; a TIFF file has 1, 3 or 4 bands (not checked).
 
     Returns:
-        Values (h, w), or (h, w, channels) with blue first and alpha last, type as stored, 0 and 255 for
-        bitmaps; None for a damaged file, and one that OpenCV cannot decode.
+        Values (h, w), or (h, w, channels) with blue first and alpha last, type as stored, those of 1 to
+        4 bits scaled to 255; colours of 8-bit TIFF files with alpha are times that. None for a damaged file,
+        and one that OpenCV cannot decode.
     """
     page, original = header.page, content
     if page is not None and header.orientation != 1:

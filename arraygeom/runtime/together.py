@@ -57,6 +57,7 @@ def write_together(
     Raises:
         FileExistsError: for a file in the way, of other content than the new one, that no list has in its
             present state and that is not `given`.
+        IsADirectoryError: for a folder of a `given` name.
         OSError: naming the file, if writing fails. Other errors of the block pass.
     """
     folder = Path(folder)
@@ -87,8 +88,7 @@ def write_listed(path: Path, text: str, *, given: bool = False) -> None:
         given: True if the user chose the name: an unlisted or changed file of that name is then replaced.
 
     Raises:
-        FileExistsError: for an unlisted or changed file of other content in the way, unless `given`.
-        OSError: naming the file, if writing fails.
+        FileExistsError, IsADirectoryError, OSError: as `write_together`.
     """
     chosen = (path.name,) if given else ()
     with write_together(path.parent, group=path.name, last=path.name, given=chosen) as folder:
@@ -101,6 +101,8 @@ def _swap(
     """Move former files out and new ones in; the last move, that of the list, makes it count."""
     names = sorted((file.name for file in temporary.iterdir()), key=lambda name: name == last)
     files = {name: digest(temporary / name) for name in names}
+    if folders := [name for name in given if (folder / name).is_dir()]:
+        raise IsADirectoryError(f"{folder / folders[0]} is a folder: name a file in it")
     refuse_others(folder, {name: files[name] for name in names if name not in given}, group=group)
     former = _listed(_lists(folder, group))
     gone = [name for name, known in former.items() if name not in files and digest(folder / name) in known]

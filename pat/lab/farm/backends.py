@@ -79,14 +79,15 @@ class LayeredSettings:
 
         Args:
             rig: rig to render; its first camera is alpha.
-            limits: limits of the self-check.
+            limits: limits of the self-check, whose result is stored with a scene; one that fails is, too.
 
         Returns:
             A function that renders the scene of a seed into a new folder, `render(seed, out)`; it raises
             OSError if there is one (FileExistsError), or a file cannot be written.
 
         Raises:
-            ValueError: as `rig_from_alpha`, and if `photos` hold no image; OSError for an unreadable one.
+            ValueError: as `rig_from_alpha`, and if `photos` hold no image that is read (`read_photographs`).
+            OSError: as `read_photographs`.
         """
         rig_batch = rig_from_alpha(rig)
         if self.photos:

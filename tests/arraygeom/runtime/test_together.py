@@ -146,10 +146,14 @@ def test_files_of_other_groups_are_replaced_and_the_same_content_is_no_obstacle(
     assert seen(tmp_path) == NEW
 
 
-def test_a_folder_in_the_way(tmp_path):
+@pytest.mark.parametrize(("given", "error"), [((), FileExistsError), (("c",), IsADirectoryError)])
+def test_a_folder_in_the_way(tmp_path, given, error):
+    """It stays with what is in it, though its name was given."""
     (tmp_path / "c").mkdir()
-    with pytest.raises(FileExistsError, match="c"):
-        write(tmp_path, NEW)
+    (tmp_path / "c" / "kept").touch()
+    with pytest.raises(error, match="c"):
+        write(tmp_path, NEW, given=given)
+    assert (tmp_path / "c" / "kept").exists()
 
 
 def test_a_group_is_made_if_all_its_files_are_as_they_were(tmp_path):
