@@ -335,8 +335,8 @@ class KnownPoints(MarkedBoard):
         file: file that they were read from.
         ids: (marker, corner) of each point; corners clockwise from the marker's upper left, -1 for its
             centre.
-        positions: (x, y, z) of each point, metres, in any frame; `points` are about their mean, and, if coplanar,
-            in the axes of their plane.
+        positions: (x, y, z) of each point, metres, in any frame; `points` are about their mean, and,
+            if coplanar, in the axes of their plane.
     """
 
     file: str

@@ -26,7 +26,7 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[s
         metadata: texts by name to store beside the digest, which takes the name "digest".
 
     Raises:
-        RuntimeError: for sparse tensors, and contiguous ones on the CPU that share memory (others are copied).
+        RuntimeError: for sparse tensors, and contiguous ones on the CPU that share memory.
         OSError: naming the file, if writing fails (a full disk, a folder of that name).
     """
     whole = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
