@@ -19,7 +19,7 @@ from arraygeom.sampling import on_image
 from ..matching.colour_transfer import LEAST
 from ..matching.inputs import Inputs
 from ..matching.matches import BetaMatches, Colours, Matches
-from ..matching.positions import at_matches, match_positions
+from ..matching.positions import Extent, at_matches, match_positions
 from ..media.colour import luminance
 from ..support.blocks import enlarge
 from .configs import GuidedPATConfig
@@ -56,7 +56,7 @@ class GuidedPAT(nn.Module):
 
     def working_bytes(self, alpha: int, betas: Sequence[int]) -> float:
         """Return the bytes of memory to fuse so many pixels of alpha, beside the inputs."""
-        return alpha * (280.0 + 120.0 * max(len(betas) - 1, 0))
+        return alpha * (280.0 + 140.0 * max(len(betas) - 1, 0))
 
     def forward(self, inputs: Inputs, matches: Matches | None = None) -> FusionOutput:
         """Fuse alpha (B, 1, H, W), sides multiples of 16, with the betas, by their matches.
@@ -82,6 +82,7 @@ class GuidedPAT(nn.Module):
             image = torch.cat(parts, 1)
         else:
             image, overall = self._known_bands(inputs, carried, matches)
+        del carried  # as much memory as what follows takes
         return _output_of(image, inputs, matches, overall=overall)
 
     def _known_bands(
@@ -208,8 +209,10 @@ def _output_of(
     position, deviation, confidence = [], [], []
     for beta, matched in zip(inputs.betas, matches.betas):
         segments = beta.field.straight
-        position.append(match_positions(segments, matched.surface, beyond_edge=True).movedim(-1, 1))
-        within = match_positions(segments, matched.surface)
+        extent = Extent.from_segments(segments)
+        there = match_positions(segments, matched.surface, beyond_edge=True, extent=extent)
+        position.append(there.movedim(-1, 1))
+        within = match_positions(segments, matched.surface, extent=extent)
         seen = segments.valid & on_image(within, (beta.image.shape[-2], beta.image.shape[-1]))
         confidence.append(matched.confidence[:, 0].to(image) * seen)
         deviation.append(torch.ones_like(confidence[-1]))
