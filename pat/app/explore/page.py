@@ -32,6 +32,8 @@ from .answers import (
 )
 from .pixel import WINDOWS, ExplorerScene, shipped_attention, with_depths
 
+IMPOSSIBLE = (ValueError, TypeError, AttributeError, LookupError, ArithmeticError, RuntimeError)
+"""Errors of `answers.answer` for impossible controls."""
 MODULE, PINHOLE = (Path(__file__).with_name(name) for name in ("widget.js", "pinhole.js"))
 
 
@@ -68,7 +70,7 @@ class Explorer:
                 if controls[name] not in options:
                     raise ValueError(f"{name}: the explorer was started without {controls[name]!r:.80}")
             return {**answer(self.scene, self.alpha, controls), "asked": controls.get("asked")}
-        except (ValueError, TypeError, AttributeError, LookupError, ArithmeticError, RuntimeError) as error:
+        except IMPOSSIBLE as error:
             return {"error": str(error), "asked": controls.get("asked")}
 
     def values(self) -> dict[str, Any]:
@@ -99,11 +101,11 @@ class Explorer:
             columns: columns of that grid.
 
         Raises:
-            OSError: if writing fails; TypeError or AttributeError for `errors` of another type.
+            OSError: if writing fails.
         """
         values = self.values()
         all_choices, values["choices"] = values["choices"], []
-        if self.scene is not None and is_pinhole(self.scene.rig) and self.usual:
+        if self.scene is not None and self.usual:
             values["ranges"] = [entry for entry in values["ranges"] if not entry[0].startswith("lens")]
             values["choices"] = [choice for choice in all_choices if choice[0] in ("camera", "map")]
             asks = f"asksPinholes({json.dumps(geometry(self.scene.rig, self.alpha))})"
@@ -114,9 +116,14 @@ class Explorer:
 
     @property
     def usual(self) -> bool:
-        """True if field, weights and lenses are those that a page can compute."""
-        lenses = [key for errors in self.controls["errors"].values() for key in errors if key[:4] == "lens"]
-        return not lenses and all(self.controls[n] == DEFAULTS[n] for n in ("field", "second", "weights"))
+        """True if rig, field and weights are those that a page can compute."""
+        try:
+            pinholes = self.scene is not None and is_pinhole(
+                moved_rig(self.scene.rig, self.alpha, self.controls)
+            )
+        except IMPOSSIBLE:
+            return False
+        return pinholes and all(self.controls[n] == DEFAULTS[n] for n in ("field", "second", "weights"))
 
     @property
     def rig(self) -> Rig:
