@@ -189,6 +189,8 @@ WRONG: dict[str, Callable[[], Any]] = {
     "a camera that is K": lambda: Rig({"a": K}),
     "both cameras the same": lambda: Rig({"a": camera(), "b": camera()}, depth=(1, 5)),
     "a link to a name unknown": lambda: rig(links={("alpha", "gamma"): Link(EYE)}),
+    "a link by a text": lambda: Rig({"a": camera(), "b": moved()}, links={"ab": Link(pair().fundamental)}),
+    "a link of three cameras": lambda: rig(links={("alpha", "beta", "alpha"): Link(EYE)}),
     "links as a list": lambda: rig(links=[Link(EYE)]),
     "F of rank three": lambda: rig(links={("alpha", "beta"): Link(EYE)}),
     "F of NaN": lambda: Link(with_nan(EYE)),
