@@ -75,11 +75,17 @@ def once_a_lens(function: Callable[[V], T]) -> Callable[[V], T]:
 
 @once_a_lens
 def coverage(camera: LensView) -> LensCoverage:
-    """Measure the share of one camera's pixels with a ray, and their widest angle, on a coarse grid."""
+    """Measure the share of one camera's pixels with a ray, and their widest angle, on a coarse grid.
+
+    Raises:
+        ValueError: for a batch of lenses or, with a lens, of K.
+    """
     with torch.no_grad():
         grid = coarse_grid(camera.hw, max(8, max(camera.hw) // 128)).to(camera.K)
         if camera.distortion is None:
             return LensCoverage(1.0, float("nan"))
+        if camera.K.ndim > 2 or camera.distortion.batch_shape:
+            raise _of_batch(camera)
         points = _normalised(camera, grid)
         rays, valid = camera.distortion.unproject(points)
         valid = valid & camera.distortion.project(camera.distortion.origins(points) + rays)[1]
@@ -102,7 +108,7 @@ def refit_lens(camera: Camera) -> Refit:
     """
     lens = camera.distortion
     if camera.batch_shape:
-        raise ValueError(f"a batch of cameras {tuple(camera.batch_shape)}: give one of them, as camera[0]")
+        raise _of_batch(camera)
     if not isinstance(lens, Distortion) or lens.model != BROWN_CONRADY or lens.coefficients[12:].any():
         raise ValueError("only lenses of brown-conrady, without a tilted sensor, are fitted anew")
     h, w = camera.hw
@@ -150,6 +156,10 @@ def refit_rig(rig: Rig) -> tuple[Rig, list[str]]:
                 f"95 % of those pixels move by less than {usual:.2g} px, none by more than {largest:.2g}"
             )
     return rig.replace(cameras=cameras), said
+
+
+def _of_batch(camera: LensView) -> ValueError:
+    return ValueError(f"a batch of cameras {tuple(camera.batch_shape)}: give one of them, as camera[0]")
 
 
 def _normalised(camera: LensView, x: Tensor) -> Tensor:

@@ -261,8 +261,8 @@ def test_covariances_of_a_single_camera_are_of_it_and_of_something(rig):
     no_error = RigCovariance(("mono.focal.0",), np.zeros((1, 1)))
     found = rig_difference(alone, alone, covariances=(no_error, no_error), depth=DEPTH)
     assert "verdict: none" in found.verdict
+    other = RigCovariance(("nir.focal.0",), np.ones((1, 1)))
     with pytest.raises(ValueError, match=r"nir\.focal\.0"):
-        other = RigCovariance(("nir.focal.0",), np.ones((1, 1)))
         rig_difference(alone, alone, covariances=(other, None), depth=DEPTH)
 
 
