@@ -39,10 +39,8 @@ def fundamental_matrix(
         ValueError: for batch axes that do not broadcast.
         RuntimeError: for a singular K.
     """
-    F = in_float64(
-        lambda E, A, B: torch.linalg.inv(B).mT @ E @ torch.linalg.inv(A),
-        *(essential_matrix(beta_from_alpha), K_alpha, K_beta),
-    )
+    E = essential_matrix(beta_from_alpha)
+    F = in_float64(lambda E, A, B: torch.linalg.inv(B).mT @ E @ torch.linalg.inv(A), E, K_alpha, K_beta)
     return F * torch.linalg.det(K_beta).sign()[..., None, None]
 
 

@@ -96,9 +96,7 @@ def least_squares(
     else:
         rows = (weight.sqrt()[:, None] * torch.cat([terms.T, columns], 1)).cpu()
         if not bool(rows.isfinite().all()):
-            raise ValueError(
-                "terms, values or weights hold NaN or infinity, or weights below 0: leave them out"
-            )
+            raise ValueError("terms, values or weights hold NaN or infinity, or a weight is below 0")
         A, b = rows.tensor_split([len(terms)], 1)
         solution = torch.linalg.lstsq(A, b, driver="gelsd").solution.to(values)
     return solution.reshape(len(terms), *values.shape[1:])

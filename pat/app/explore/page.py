@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -32,8 +33,6 @@ from .answers import (
 )
 from .pixel import WINDOWS, ExplorerScene, shipped_attention, with_depths
 
-IMPOSSIBLE = (ValueError, TypeError, AttributeError, LookupError, ArithmeticError, RuntimeError)
-"""Errors of `answers.answer` for impossible controls."""
 MODULE, PINHOLE = (Path(__file__).with_name(name) for name in ("widget.js", "pinhole.js"))
 
 
@@ -70,7 +69,7 @@ class Explorer:
                 if controls[name] not in options:
                     raise ValueError(f"{name}: the explorer was started without {controls[name]!r:.80}")
             return {**answer(self.scene, self.alpha, controls), "asked": controls.get("asked")}
-        except IMPOSSIBLE as error:
+        except (ValueError, TypeError, AttributeError, LookupError, ArithmeticError, RuntimeError) as error:
             return {"error": str(error), "asked": controls.get("asked")}
 
     def values(self) -> dict[str, Any]:
@@ -117,13 +116,10 @@ class Explorer:
     @property
     def usual(self) -> bool:
         """True if rig, field and weights are those that a page can compute."""
-        try:
-            pinholes = self.scene is not None and is_pinhole(
-                moved_rig(self.scene.rig, self.alpha, self.controls)
-            )
-        except IMPOSSIBLE:
-            return False
-        return pinholes and all(self.controls[n] == DEFAULTS[n] for n in ("field", "second", "weights"))
+        with suppress(Exception):  # of impossible controls, which every answer then names
+            if self.scene is not None and is_pinhole(moved_rig(self.scene.rig, self.alpha, self.controls)):
+                return all(self.controls[name] == DEFAULTS[name] for name in ("field", "second", "weights"))
+        return False
 
     @property
     def rig(self) -> Rig:
