@@ -95,13 +95,11 @@ def refine_points(
 
 
 def _sampled(image: Array, x: Array) -> Array:
+    def of_rows(x: Array) -> Array:
+        return cv2.remap(image, x[..., 0], x[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+
     parts = np.array_split(x.astype(np.float32), len(x) // MOST_ROWS + 1)
-    return np.concatenate(
-        [
-            cv2.remap(image, *np.moveaxis(p, -1, 0), cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
-            for p in parts
-        ]
-    ).astype(np.float64)
+    return np.concatenate([of_rows(part) for part in parts]).astype(np.float64)
 
 
 def _step(
