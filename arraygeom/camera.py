@@ -267,6 +267,19 @@ class LensView(View):
             raise ValueError("A is a perspective, which no K follows: crop, resize, mirror, rotate or shear")
         return self.replace(K=product(A.to(self.K), self.K), hw=hw)
 
+    def scaled(self: AnyLensView, factor: float) -> AnyLensView:
+        """Return the view with all lengths multiplied by a factor, as for another unit.
+
+        Raises:
+            ValueError: for a factor that is not positive and finite, and a lens that is not central and does
+                not state which of its numbers are lengths.
+        """
+        check_above(0, itself=False, factor=factor)
+        K, lens = self.K, self.distortion
+        if self.parallel:  # the image plane is in metres
+            K = torch.cat([K[..., :2] / K.new_tensor([factor, factor, 1.0])[:, None], K[..., 2:]], -1)
+        return self.replace(K=K, distortion=lens and lens.scaled(factor))
+
     def _each_through(self, f: ThroughLens, x: Tensor) -> tuple[Tensor, Tensor]:
         """Map pixels to normalised points, through f, and back to pixels."""
         if self.distortion is None:
@@ -314,18 +327,8 @@ class Camera(LensView):
             check_batches("K, lens and cam_from_world", *shapes)
 
     def scaled(self, factor: float) -> Camera:
-        """Return the camera with all lengths multiplied by a factor, as for another unit.
-
-        Raises:
-            ValueError: for a factor that is not positive and finite, and a lens that is not central and does
-                not state which of its numbers are lengths.
-        """
-        check_above(0, itself=False, factor=factor)
-        K, lens = self.K, self.distortion
-        if self.parallel:  # the image plane is in metres
-            K = torch.cat([K[..., :2] / K.new_tensor([factor, factor, 1.0])[:, None], K[..., 2:]], -1)
-        pose = Pose(self.R, self.t * factor)
-        return self.replace(K=K, cam_from_world=pose, distortion=lens and lens.scaled(factor))
+        """Return the camera with all lengths multiplied by a factor; raises as `LensView.scaled`."""
+        return super().scaled(factor).replace(cam_from_world=Pose(self.R, self.t * factor))
 
     @property
     def R(self) -> Float[Tensor, "*b 3 3"]:

@@ -33,14 +33,14 @@ def fundamental_matrix(
     Along (l1, -l0) of a line l = F x_alpha points are farther away: kornia's sign, unless K_beta mirrors.
 
     Returns:
-        F in the widest type of all, not scaled; zero without a baseline, NaN for a singular K.
+        F in the widest type of all, not scaled; zero without a baseline.
 
     Raises:
         ValueError: for batch axes that do not broadcast.
+        RuntimeError: for a singular K.
     """
-    from kornia.geometry.epipolar import fundamental_from_essential
-
-    F = in_float64(fundamental_from_essential, essential_matrix(beta_from_alpha), K_alpha, K_beta)
+    E = essential_matrix(beta_from_alpha)
+    F = in_float64(lambda E, A, B: torch.linalg.inv(B).mT @ E @ torch.linalg.inv(A), E, K_alpha, K_beta)
     return F * torch.linalg.det(K_beta).sign()[..., None, None]
 
 

@@ -75,7 +75,11 @@ def once_a_lens(function: Callable[[V], T]) -> Callable[[V], T]:
 
 @once_a_lens
 def coverage(camera: LensView) -> LensCoverage:
-    """Measure the share of one camera's pixels with a ray, and their widest angle, on a coarse grid."""
+    """Measure the share of one camera's pixels with a ray, and their widest angle, on a coarse grid.
+
+    Raises:
+        ValueError: for a batch of lenses or, with a lens, of K.
+    """
     with torch.no_grad():
         grid = coarse_grid(camera.hw, max(8, max(camera.hw) // 128)).to(camera.K)
         if camera.distortion is None:
@@ -98,11 +102,10 @@ def refit_lens(camera: Camera) -> Refit:
         The camera with the new lens, and the differences.
 
     Raises:
-        ValueError: for no lens, another model, a tilted sensor, a batch, or if no such lens covers the image.
+        ValueError: for no lens, another model, a tilted sensor, a batch of K or lenses, or if no such lens
+            covers the image.
     """
     lens = camera.distortion
-    if camera.batch_shape:
-        raise ValueError(f"a batch of cameras {tuple(camera.batch_shape)}: give one of them, as camera[0]")
     if not isinstance(lens, Distortion) or lens.model != BROWN_CONRADY or lens.coefficients[12:].any():
         raise ValueError("only lenses of brown-conrady, without a tilted sensor, are fitted anew")
     h, w = camera.hw
@@ -137,10 +140,8 @@ def refit_rig(rig: Rig) -> tuple[Rig, list[str]]:
         The rig, and a sentence on each refitted lens; none if all cover their images.
 
     Raises:
-        ValueError: for a batch of rigs, and as `refit_lens` for the first that cannot be refitted.
+        ValueError: as `coverage`, and as `refit_lens` for the first that cannot be refitted.
     """
-    if rig.batch_shape:
-        raise ValueError(f"a batch of rigs {tuple(rig.batch_shape)}: give one of them, as rig[0]")
     cameras, said = dict(rig.cameras), []
     for name, camera in rig.cameras.items():
         if isinstance(camera, Camera) and (before := coverage(camera)).share < 1:
@@ -153,7 +154,9 @@ def refit_rig(rig: Rig) -> tuple[Rig, list[str]]:
 
 
 def _normalised(camera: LensView, x: Tensor) -> Tensor:
-    """Normalised points of pixels, before K."""
+    """Normalised points of pixels, before K. Raises ValueError for a batch of K or lenses."""
+    if camera.K.ndim > 2 or (camera.distortion is not None and camera.distortion.batch_shape):
+        raise ValueError(f"a batch of cameras {tuple(camera.batch_shape)}: give one of them, as camera[0]")
     return map_homogeneous(torch.linalg.inv(camera.K)[..., :2, :], x)
 
 

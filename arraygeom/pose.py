@@ -73,15 +73,15 @@ class Pose(Batched):
 
         Args:
             centre: world coordinates, metres.
-            target: world coordinates, metres, in centre's type, as `down`.
+            target: world coordinates, metres.
             down: direction in the world; None for (0, 1, 0). For a world with z upwards it is (0, 0, -1).
 
         Raises:
             ValueError: if down is along the axis, the target at the centre, or for NaN; not while torch
                 compiles.
         """
-        down = centre.new_tensor([0.0, 1.0, 0.0]) if down is None else down
         z = target - centre
+        down = z.new_tensor([0.0, 1.0, 0.0]) if down is None else down.to(z)
         x = torch.linalg.cross(down.expand_as(z), z)
         if not traced() and not bool((x.norm(dim=-1) > 1e-6 * down.norm(dim=-1) * z.norm(dim=-1)).all()):
             raise ValueError(

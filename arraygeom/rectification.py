@@ -154,8 +154,8 @@ def to_stereo_camera(pair: Pair) -> StereoCamera:
     from kornia.geometry.camera import StereoCamera
 
     alpha, beta = pair.cameras
-    pose, K = pair.beta_from_alpha, alpha.K.reshape(-1, 3, 3)
-    t = pose.t.reshape(-1, 3)
+    pose, batch = pair.beta_from_alpha, pair.batch_shape
+    K, t = alpha.K.expand(*batch, 3, 3).reshape(-1, 3, 3), pose.t.expand(*batch, 3).reshape(-1, 3)
     turned, other = (pose.R - torch.eye(3).to(pose.R)).abs().max(), (beta.K - alpha.K).abs().max()
     aside = (t[:, 1:].abs().amax(-1) > -ROUNDED * t[:, 0]).any()
     if pair.has_lens or bool(aside | (turned > ROUNDED) | (other > ROUNDED * K.max())):

@@ -57,12 +57,14 @@ def reprojection_residuals(
         Residuals (v, *n, 2), pixels; zero where a point is not seen, or not valid in the camera.
 
     Raises:
-        ValueError: for pixels of another number of views, and points without the axes of batched cameras.
-        RuntimeError: for no cameras, and axes *n that do not broadcast.
+        ValueError: for no cameras, pixels or `seen` of another shape, and points without the axes of batched
+            cameras.
     """
     projected = [camera.project(X) for camera in cameras]
-    if len(x) != len(cameras):
-        raise ValueError(f"wanted pixels (views, ..., 2) of {len(cameras)} cameras, got {tuple(x.shape)}")
+    views = len(cameras), *(projected[0].valid.shape if projected else ())
+    if not projected or x.shape != (*views, 2) or (seen is not None and seen.shape != views):
+        got = tuple(x.shape) if seen is None else f"{tuple(x.shape)}, seen {tuple(seen.shape)}"
+        raise ValueError(f"wanted pixels (views, *points, 2), here {(*views, 2)}, seen {views}, got {got}")
     used = _used(projected, x, seen)
     return torch.where(used[..., None], x - torch.stack([p.x for p in projected]), 0.0)
 
@@ -115,15 +117,14 @@ def bundle_adjusted(
         least error's.
 
     Raises:
-        ValueError: for a batch, uncalibrated cameras, pixels of another shape, and as `Rig.parameters`.
+        ValueError: for a batch, uncalibrated cameras, pixels or `seen` of another shape, and as
+            `Rig.parameters`.
     """
     cameras = list(rig.cameras.values())
     if rig.batch_shape or not all(isinstance(camera, Camera) for camera in cameras):
         raise ValueError(
             "bundle adjustment needs one rig of calibrated cameras: take one of the batch, or calibrate"
         )
-    if x.shape != (len(cameras), len(X), 2):
-        raise ValueError(f"wanted pixels ({len(cameras)} cameras, {len(X)} points, 2), got {tuple(x.shape)}")
     rig, X, x = rig.to(torch.float64), X.double(), x.double()
     names = list(rig.parameters(free=free))
     costs = [_cost(rig, X, x, seen)]

@@ -80,8 +80,9 @@ class Rig(Batched):
         if not isinstance(self.links, Mapping):
             raise TypeError(f"the links are a {type(self.links).__name__}: give a mapping of names to links")
         for names, link in self.links.items():
-            if not isinstance(link, Link):
-                raise TypeError(f"the link {names} is a {type(link).__name__}: give a Link(F)")
+            if not (isinstance(link, Link) and isinstance(names, tuple) and len(names) == 2):
+                kind = type(link).__name__
+                raise TypeError(f"the link {names!r:.80} is a {kind}: wanted {{(ALPHA, BETA): Link(F)}}")
             alpha, beta = names
             if self.require(alpha) == self.require(beta):
                 raise ValueError(f"a link relates two cameras; this one is from '{alpha}' to itself")
@@ -249,7 +250,7 @@ class Rig(Batched):
         return self.with_camera(name, self[name].transformed(A, hw)).replace(links=links)
 
     def scaled(self, factor: float) -> Rig:
-        """Return the rig with lengths (calibrated cameras', depth range) times a factor, as for another unit.
+        """Return the rig with all lengths (cameras', depth range) times a factor, as for another unit.
 
         Raises:
             ValueError: for a factor that is not positive and finite, and a camera model that is not central
@@ -257,7 +258,7 @@ class Rig(Batched):
         """
         check_above(0, itself=False, factor=factor)
         cameras = {
-            name: view.scaled(factor) if isinstance(view, Camera) else view
+            name: view.scaled(factor) if isinstance(view, LensView) else view
             for name, view in self.cameras.items()
         }
         depth = None if self.depth is None else (self.depth[0] * factor, self.depth[1] * factor)

@@ -77,7 +77,7 @@ def least_squares(
 
     Args:
         terms: k explaining terms of each of n values.
-        values: values to explain; axes *m, at most one with a prior, are solved at once.
+        values: values to explain; axes *m are solved at once.
         weight: weight of each value, at least 0.
         precision: inverse covariance (k, k) of a prior of zero mean; None for no prior: terms may then be
             dependent.
@@ -86,14 +86,20 @@ def least_squares(
         Coefficients c (k, *m); without a prior the shortest of all solutions.
 
     Raises:
-        RuntimeError: for equations that a prior leaves singular; without one for no values, NaN or infinity.
+        ValueError: without a prior, for NaN, infinity and a weight below 0.
+        RuntimeError: for equations that a prior leaves singular.
     """
+    columns = values[..., None].flatten(1)
     if precision is not None:
-        information, slope = normal_equations(terms, values, weight)
-        return torch.linalg.solve(information + precision, slope)
-    root, columns = weight.sqrt()[:, None], values.reshape(len(values), -1)
-    solution = torch.linalg.lstsq((root * terms.T).cpu(), (root * columns).cpu(), driver="gelsd").solution
-    return solution.to(values).reshape(len(terms), *values.shape[1:])
+        information, slope = normal_equations(terms, columns, weight)
+        solution = torch.linalg.solve(information + precision, slope)
+    else:
+        rows = (weight.sqrt()[:, None] * torch.cat([terms.T, columns], 1)).cpu()
+        if not bool(rows.isfinite().all()):
+            raise ValueError("terms, values or weights hold NaN or infinity, or a weight is below 0")
+        A, b = rows.tensor_split([len(terms)], 1)
+        solution = torch.linalg.lstsq(A, b, driver="gelsd").solution.to(values)
+    return solution.reshape(len(terms), *values.shape[1:])
 
 
 def robust_least_squares(
@@ -120,8 +126,7 @@ def robust_least_squares(
         The fit after the last step.
 
     Raises:
-        ValueError: for fewer steps.
-        RuntimeError: as `least_squares`.
+        ValueError: for fewer steps, and as `least_squares`, which raises RuntimeError too.
     """
     check_above(1, whole=True, steps=steps)
     coefficients = start

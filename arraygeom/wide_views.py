@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .camera import Camera, intrinsics
+from .checks import check_above
 from .lenses import Equirectangular
 from .pair import Pair
 from .pixels import pixel_grid, product
@@ -31,9 +32,11 @@ def rectify_spherical(pair: Pair, *, focal: float | None = None) -> Pair:
         large enough for both images, without a link. Its depth range has the old numbers, along the new axis.
 
     Raises:
-        ValueError: for batches, no baseline, lenses whose rays do not meet in a point, new images larger than
-            `check_hw` allows, and as `Pair.beta_from_alpha`.
+        ValueError: for batches, no baseline, lenses whose rays do not meet in a point, none with a ray, a
+            focal length that is not positive, new images larger than `check_hw` allows, and as
+            `Pair.beta_from_alpha`.
     """
+    check_above(0, itself=False, focal=focal)
     cameras = pair.cameras
     if any(c.batch_shape for c in cameras) or not all(c.central for c in cameras):
         raise ValueError("spherical rectification is of one pair at a time, whose rays meet in a point each")
@@ -43,6 +46,8 @@ def rectify_spherical(pair: Pair, *, focal: float | None = None) -> Pair:
     rotations = [product(to_columns, R) for R in rectifying_rotations(pair.beta_from_alpha)]
     scale = min(_focal(c) for c in cameras) if focal is None else focal
     angles = torch.cat([_angles(c, R) for c, R in zip(cameras, rotations)])
+    if not len(angles):
+        raise ValueError("no pixel of either camera has a ray: correct their K and lens models")
     low, high = (scale * angles.amin(0)).floor() - 1, (scale * angles.amax(0)).ceil() + 1
     w, h = (int(n) + 1 for n in (high - low).tolist())
     K = intrinsics(scale, (h, w)).to(low)

@@ -197,7 +197,7 @@ def covering_displacement(pair: Pair, x: Real[Tensor, "*n 2"] | None = None) -> 
     Depth-bounded segments count as beta's image clips them.
 
     Args:
-        x: pixels of alpha, one or more; None for all.
+        x: pixels of alpha; None for all.
 
     Returns:
         Pixels of beta (*b), differentiable in the pair's numbers; 0 if no pixel has a segment.
@@ -206,9 +206,8 @@ def covering_displacement(pair: Pair, x: Real[Tensor, "*n 2"] | None = None) -> 
         ValueError: for a pair with lenses or without a depth range, and as `Pair.beta_from_alpha`.
     """
     squared = _squared_reach(pair, _widest(pair) if x is None else floating(x))
-    largest = (
-        squared.flatten(len(pair.batch_shape)).amax(-1) if squared.ndim > len(pair.batch_shape) else squared
-    )
+    squared = squared[..., None].flatten(len(pair.batch_shape))
+    largest = torch.nn.functional.pad(squared, (0, 1)).amax(-1)  # of no pixels 0
     return torch.where(largest > 0, torch.where(largest > 0, largest, 1.0).sqrt(), 0.0)
 
 

@@ -97,7 +97,6 @@ def read_text(text: str, path: str | Path) -> Rig:
 
     Raises:
         RigFileError: for a damaged text; its message names file, entry and problem.
-        ValueError: also as `Rig` raises it, for a link of a camera with itself, say.
     """
     return _rig(RigSource(Path(path)).yaml(text))
 
@@ -151,8 +150,9 @@ def _rig(document: Entry) -> Rig:
         if not 0 < near <= far:
             stated = f"[{near * metres:g}, {far * metres:g}] m"
             raise document["depth"].fail(f"is {stated}; wanted [near, far] with 0 < near <= far")
-    rig = Rig(cameras, depth=depth, links=links, name=str(document.get("name", "").value))
-    return rig if metres == 1.0 else rig.scaled(metres)
+    name = str(document.get("name", "").value)
+    rig = document.source.rig(cameras.items(), depth=depth, links=links, name=name)
+    return rig if metres == 1.0 else _made(document, rig.scaled, metres)
 
 
 def _camera(fields: Entry, origin: float) -> View:

@@ -49,7 +49,8 @@ def read_matches(path: str | Path, files: Mapping[str, str | Path], sizes: Mappi
     Raises:
         FileNotFoundError: for a missing file.
         ValueError: for files of another kind, other than two images with a CSV file, a database without one
-            of these images or matches between them, and points outside the images or not finite.
+            of these images or matches between them, or where two cameras have one image, and points outside
+            the images or not finite.
         KeyError: for a camera with matches that has no size.
     """
     path = Path(path)
@@ -136,7 +137,12 @@ def _database(path: Path, files: Mapping[str, Path]) -> PointPairs:
 
 def _colmap(database: sqlite3.Connection, path: Path, files: Mapping[str, Path]) -> PointPairs:
     images = [(Path(name), number) for name, number in database.execute("SELECT name, image_id FROM images")]
-    names = {_image(path, file, images): name for name, file in files.items()}
+    names: dict[int, str] = {}
+    for name, file in files.items():
+        if (other := names.setdefault(_image(path, file, images), name)) != name:
+            raise ValueError(
+                f"{path}: '{other}' and '{name}' are one image, {file}: give each camera its own"
+            )
     matches: PointPairs = {}
     for table in ("two_view_geometries", "matches"):
         for (a, b), pairs in _matches(database, table, names):

@@ -15,7 +15,7 @@ import torch
 import yaml
 from torch import Tensor
 
-from ..camera import Camera
+from ..camera import Camera, View
 from ..checks import LARGEST_SIDE, MOST_PIXELS, ROUNDED
 from ..distortion import BROWN_CONRADY, COEFFICIENT_COUNTS, KANNALA_BRANDT, Distortion
 from ..pixels import HW, shift_matrix
@@ -345,7 +345,7 @@ class RigSource:
         )
         return h, w
 
-    def rig(self, cameras: Iterable[tuple[str, Camera]], **fields: Any) -> Rig:
+    def rig(self, cameras: Iterable[tuple[str, View]], **fields: Any) -> Rig:
         """Make the rig of named cameras.
 
         Args:
@@ -353,17 +353,19 @@ class RigSource:
             fields: further fields of the rig, such as `depth`.
 
         Raises:
-            RigFileError: for no camera, or a name that occurs twice.
-            ValueError: also as `Rig` raises it.
+            RigFileError: for no camera, a name that occurs twice, and what `Rig` refuses.
         """
-        named: dict[str, Camera] = {}
+        named: dict[str, View] = {}
         for name, camera in cameras:
             if name in named:
                 raise self.fail(name, "occurs twice; give every camera its own name")
             named[name] = camera
         if not named:
             raise self.fail(None, "holds no camera; is the file whole?")
-        return Rig(named, **fields)
+        try:
+            return Rig(named, **fields)
+        except ValueError as error:
+            raise self.fail(None, str(error)) from None
 
 
 class Entry:

@@ -1,7 +1,8 @@
 """Assignment of the images in a folder to cameras and moments: subfolders, file names, videos.
 
 A camera is a subfolder, or a prefix of file names in one folder, or a pattern. Images of one moment have the
-same number (or name, but for runs of digits or of other characters that all names of a camera share).
+same number (or name, but for runs of digits or of other characters that all names of a camera share; if the
+cameras share none, but for words that all share).
 """
 
 from __future__ import annotations
@@ -104,15 +105,18 @@ def find_photos(folder: Path, *, patterns: Mapping[str, str] | None = None) -> P
     cameras = _by_pattern(folder, patterns) if patterns else _by_folder_or_name(folder)
     if not cameras:
         raise ValueError(f"{folder}: no images or videos: give a folder with a subfolder for each camera")
-    photos = {name: _moments(name, files) for name, files in cameras.items()}
-    keys = {key for moments in photos.values() for key in moments}
+    for words in (False, True):
+        photos = {name: _moments(name, files, words) for name, files in cameras.items()}
+        keys = {key for moments in photos.values() for key in moments}
+        if len(photos) == 1 or len(keys) < sum(map(len, photos.values())):
+            break
     if len(keys) == 1 or any(len(moments) > 1 for moments in photos.values()):
         return photos
     # of one moment: numbers in the files' names are the cameras'
     return {name: dict(zip(["image 1"], moments.values())) for name, moments in photos.items()}
 
 
-def frame_keys(stems: list[str]) -> list[FrameKey]:
+def frame_keys(stems: list[str], *, words: bool = False) -> list[FrameKey]:
     """Derive the moments of one camera's images: the part in which names differ, as a number if it is one.
 
     >>> frame_keys(["cam01_08_int", "cam01_09_int", "cam01_10_int"])
@@ -120,15 +124,16 @@ def frame_keys(stems: list[str]) -> list[FrameKey]:
 
     Args:
         stems: file names without suffix, at least one, compared by runs of digits and of other characters.
+        words: True to part these at spaces, "_", "." and "-" too, as in left_near and left_far.
 
     Returns:
         One key for each name, in order; equal keys are not refused. For a single name its last number, or the
         name itself.
     """
-    pieces = [re.split(r"(\d+)", stem) for stem in stems]
     if len(stems) == 1:
-        numbers = pieces[0][1::2]
+        numbers = re.findall(r"\d+", stems[0])
         return [int(numbers[-1]) if numbers else stems[0]]
+    pieces = [re.split(r"(\d+|[ _.-]+)" if words else r"(\d+)", stem) for stem in stems]
     head = _common_prefix(pieces)
     tail = _common_prefix([p[head:][::-1] for p in pieces])
     middles = ["".join(p[head : len(p) - tail]) for p in pieces]
@@ -181,7 +186,7 @@ def _usable(paths: Iterable[Path]) -> list[Path]:
     return [p for p in files if p.suffix.lower() in IMAGE_SUFFIXES | VIDEOS]
 
 
-def _moments(name: str, files: list[Path]) -> dict[FrameKey, Photo]:
+def _moments(name: str, files: list[Path], words: bool) -> dict[FrameKey, Photo]:
     """Photos of a camera by moment. Raises ValueError for mixed videos, orientations, or equal numbers."""
     videos = [f for f in files if f.suffix.lower() in VIDEOS]
     if len(videos) > 1 or (videos and len(videos) < len(files)):
@@ -194,7 +199,7 @@ def _moments(name: str, files: list[Path]) -> dict[FrameKey, Photo]:
     if len(tags) > 1:  # they are applied: images stored alike would otherwise be rotated differently
         listed = ", ".join(f"{tag} in {file}" for tag, file in tags.items())
         raise ValueError(f"{name}: its images differ in orientation tags ({listed}): remove the tags")
-    keys = frame_keys([f.stem for f in files])
+    keys = frame_keys([f.stem for f in files], words=words)
     if len(set(keys)) < len(keys):
         raise ValueError(f"{name}: two images have one number, such as {files[0].name}: give each its own")
     return {key: Photo(file.name, partial(_decode_file, file)) for key, file in zip(keys, files)}

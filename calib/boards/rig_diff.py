@@ -24,7 +24,7 @@ from arraygeom.pair import depth_range
 from arraygeom.pose import cross_matrix
 from arraygeom.runtime.text import length_unit
 
-from .bundle import camera_jacobian
+from .bundle import camera_jacobian, parameter_names
 from .uncertainty import RigCovariance, beta_covariance, grid_points, worst_deviation
 
 DEPTHS = 3
@@ -128,9 +128,9 @@ class RigDifference:
 
     @property
     def verdict(self) -> str:
-        """Verdict in one line: moved, the same, or none without covariances."""
+        """Verdict in one line: moved, the same, or none without covariances, or for ones of 0."""
         motion = self.significance
-        if motion is None:
+        if motion is None or not motion.freedom:
             return "verdict: none: no deviations are known; one rig calibrated twice may differ so"
         test = (
             f"chi-square {motion.chi_square:.1f} of {motion.freedom} parameters, p = {motion.probability:.2g}"
@@ -167,7 +167,7 @@ def rig_difference(
 
     Raises:
         ValueError: for rigs of other cameras, sizes or units, cameras that are not calibrated, a covariance
-            of parameters that the first rig (of several cameras) has not, and depths unless 0 < near <= far.
+            of parameters that the first rig has not, and depths unless 0 < near <= far.
     """
     depth_range(*depth)
     names = _same_cameras(a, b)
@@ -178,6 +178,9 @@ def rig_difference(
     change = np.concatenate([projected.change.ravel() for projected in parts])
     by_motion, _ = np.linalg.qr(np.concatenate([projected.by_motion for projected in parts]))
     by_rig = [c if c is not None else other for c, other in zip(covariances, covariances[::-1])]
+    own = {f"{name}.{entry}" for name in names for entry in parameter_names(a[name])}
+    if unknown := {name for c in by_rig if c is not None for name in c.names} - own:
+        raise ValueError(f"the rig has no parameter {min(unknown)}: give the covariance of this rig")
     spread = None
     if by_rig[0] is not None and by_rig[1] is not None:
         roots, blocks = [_root(by_rig[0]), _root(by_rig[1])], []

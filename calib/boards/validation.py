@@ -48,7 +48,7 @@ def epipolar_errors(
         views: detections by camera; points of one moment and one index are common.
 
     Returns:
-        Errors in undistorted pixels, one for each common point within both lens models; pairs without common
+        Errors in undistorted pixels, one for each common point within both lens models; pairs without such
         points are absent.
     """
     errors = {}
@@ -66,7 +66,8 @@ def epipolar_errors(
         (pa, va), (pb, vb) = pair.alpha.undistort(xa), pair.beta.undistort(xb)
         forward = epipolar_distance(pair.fundamental, pa, pb).abs()
         backward = epipolar_distance(reverse.fundamental, pb, pa).abs()
-        errors[a, b] = ((forward + backward) / 2)[va & vb].numpy()
+        if (valid := va & vb).any():
+            errors[a, b] = ((forward + backward) / 2)[valid].numpy()
     return errors
 
 

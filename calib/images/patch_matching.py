@@ -21,6 +21,8 @@ LEAST_CORRELATION = 0.85
 """Least correlation of patches that are accepted."""
 LARGEST_SHIFT = 2.0
 """Largest shift of a patch, pixels; those that move farther are rejected as false matches."""
+MOST_ROWS = 2**15 - 2
+"""Largest number of rows that OpenCV resamples at once."""
 
 Array = np.ndarray
 
@@ -66,7 +68,7 @@ def refine_points(
     Args:
         alpha: bytes (H, W).
         beta: bytes (H, W).
-        x: points (x, y) of alpha, pixels, finite; cv2.error for more than 32766.
+        x: points (x, y) of alpha, pixels, finite.
         y: rough positions in beta, pixels, finite.
         beta_from_alpha: rough affine maps between neighbourhoods of the points, invertible.
 
@@ -93,10 +95,11 @@ def refine_points(
 
 
 def _sampled(image: Array, x: Array) -> Array:
-    x = x.astype(np.float32)
-    return cv2.remap(image, x[..., 0], x[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT).astype(
-        np.float64
-    )
+    def of_rows(x: Array) -> Array:
+        return cv2.remap(image, x[..., 0], x[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+
+    parts = np.array_split(x.astype(np.float32), len(x) // MOST_ROWS + 1)
+    return np.concatenate([of_rows(part) for part in parts]).astype(np.float64)
 
 
 def _step(

@@ -146,7 +146,7 @@ def _matched(rig: Rig, images: Mapping[str, Tensor], largest: int) -> tuple[Rig,
         rig = rig.resize(name, hw)
         reduced[name] = interpolate(image[None], hw, mode="area")[0] if scale < 1 else image
     try:
-        pairs = related(rig, match_cameras(reduced))
+        pairs = related(rig, match_cameras(reduced), by_lines=True)
     except ValueError:
         return None
     pairs = {names: points for names, points in pairs.items() if not _registered(rig.pair(*names), points)}

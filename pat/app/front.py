@@ -71,8 +71,8 @@ def fuse(
     colours, the result is as bright in that sense (`pat.media.raw.match_luminance`).
 
     Args:
-        images: an image of each camera by name: files, or tensors (C, H, W) in 0..1; or files alone, which
-            name the cameras. Of tensors a mapping that reads them when asked saves memory.
+        images: an image of each camera by name: a dict of files or tensors (C, H, W) in 0..1; or files alone,
+            which name the cameras. Another mapping, which reads its tensors when asked, saves memory.
         rig: the cameras, or their file. Those without an image are left out. Files are developed as it says.
         alpha: the camera whose view is wanted; without a rig by default the largest grey image, else the
             largest.

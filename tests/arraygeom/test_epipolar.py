@@ -1,3 +1,6 @@
+from functools import partial
+
+import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -8,6 +11,7 @@ from arraygeom import (
     epipolar_distance,
     epipolar_lines,
     epipoles,
+    fundamental_matrix,
     segments_between,
     shift_origin,
     track,
@@ -46,6 +50,13 @@ def test_epipoles_are_the_images_of_the_other_camera():
     for e, camera, other in zip(epipoles(pair.fundamental), pair.cameras, pair.cameras[::-1]):
         seen = camera.K @ camera.cam_from_world.apply(other.centre[None])[0]
         assert torch.linalg.cross(e, seen / seen.norm()).abs().max() < 1e-9
+
+
+def test_a_singular_K_has_neither_F_nor_tracks():
+    pose, K = random_rig(4).pair("alpha", "beta").beta_from_alpha, torch.eye(3).double()
+    for call in (partial(track, x=torch.zeros(1, 2)), fundamental_matrix):
+        with pytest.raises(RuntimeError, match="singular"):
+            call(0 * K, K, pose)
 
 
 def test_tiny_baselines_still_have_lines_in_float32():

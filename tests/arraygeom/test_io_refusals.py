@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from arraygeom.io import READERS, RigFileError, RigFileWarning, read_rig, recognise
+from arraygeom.io.native import read_text
 from tests.oracles import Oracle
 
 scipy_io = Oracle("scipy.io")
@@ -282,6 +283,21 @@ NATIVE = [
 def test_what_is_wrong_with_a_camera_of_our_own_format_is_named(camera, message, tmp_path):
     (tmp_path / "rig.yaml").write_text(f"format: arraygeom-rig 1\ncameras:\n  a: {{{camera}}}\n")
     assert re.search(message, refusal(tmp_path / "rig.yaml"))
+
+
+@pytest.mark.parametrize(
+    ("cameras", "message"),
+    [
+        (
+            "a: {size: [6, 4]}\nlinks: [{alpha: a, beta: a, H: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}]",
+            "'a' to it",
+        ),
+        ('"a\\eb": {size: [6, 4]}', r"'a\\x1bb'"),
+    ],
+)
+def test_what_no_rig_has_is_named_with_its_file(cameras, message):
+    with pytest.raises(RigFileError, match=rf"mine\.yaml: .*{message}"):
+        read_text(f"format: arraygeom-rig 1\ncameras:\n  {cameras}\n", "mine.yaml")
 
 
 def test_a_later_version_of_our_own_format_is_refused(tmp_path):

@@ -15,6 +15,7 @@ from arraygeom import (
     Distortion,
     Epipolar,
     Link,
+    Pair,
     Pose,
     Rig,
     rectify,
@@ -91,6 +92,9 @@ def test_a_rectified_pair_is_a_stereo_camera_and_others_are_refused():
     rectified = rectify(right).pair
     theirs = to_stereo_camera(rectified)
     torch.testing.assert_close(theirs.tx, (ALPHA.centre - BETA.centre).norm()[None])
+    twice = (one.replace(cam_from_world=stack([one.cam_from_world] * 2)) for one in rectified.cameras)
+    both = to_stereo_camera(Pair(*twice, rectified.depth))
+    torch.testing.assert_close(both.Q, theirs.Q.expand(2, 4, 4))
     for wrong in (right, dataclasses.replace(rectified, alpha=rectified.beta, beta=rectified.alpha)):
         with pytest.raises(ValueError, match="rectif"):
             to_stereo_camera(wrong)

@@ -113,6 +113,8 @@ def test_images_of_colmap_called_alike_are_told_by_their_folders(tmp_path):
         assert torch.allclose(one, torch.from_numpy(points))
     with pytest.raises(ValueError, match=r"photos/1.png.*mono/1.png"):
         read_matches(tmp_path / "database.db", {**files, "mono": Path("photos/1.png")}, SIZES)
+    with pytest.raises(ValueError, match="'colour' and 'mono'"):
+        read_matches(tmp_path / "database.db", {"colour": files["mono"], "mono": files["mono"]}, SIZES)
 
 
 @pytest.mark.parametrize(

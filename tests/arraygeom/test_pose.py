@@ -97,6 +97,9 @@ def test_a_camera_looks_at_its_target():
     assert y[:, 0].abs().max() < 1e-9
     assert (y[:, 1] > 0).all()
     assert float(rotation_error(pose.R).max()) < 1e-12
+    mixed = Pose.look_at(centre, target.float(), down=down.float())
+    torch.testing.assert_close(mixed.R, pose.R, atol=1e-5, rtol=0)
+    torch.testing.assert_close(Pose.look_at(centre.float(), target).centre, centre.float().double())
     level = Pose.look_at(torch.zeros(3), torch.tensor([0.0, 0.0, 5.0]))
     assert level.R.equal(torch.eye(3))
     with pytest.raises(ValueError, match="`down`"):

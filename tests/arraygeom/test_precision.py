@@ -187,6 +187,7 @@ def test_the_covering_displacement_of_a_batch_is_each_rigs_own():
     batch = stack(rigs).pair("alpha", "beta")
     alone = torch.stack([covering_displacement(r.pair("alpha", "beta")) for r in rigs])
     torch.testing.assert_close(covering_displacement(batch), alone)
+    assert not covering_displacement(batch, WHOLE[None, :0].double()).any()
     torch.testing.assert_close(
         covering_displacement(batch, WHOLE[None].double()),
         torch.stack([covering_displacement(r.pair("alpha", "beta"), WHOLE.double()) for r in rigs]),

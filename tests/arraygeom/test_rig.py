@@ -14,6 +14,7 @@ from arraygeom import (
     Distortion,
     Epipolar,
     EpipolarLine,
+    LensView,
     Pose,
     Rig,
     View,
@@ -162,6 +163,10 @@ def test_a_scaled_rig_shows_the_scaled_scene_alike():
     for name in rig.names:
         torch.testing.assert_close(scaled[name].project(1e3 * X).x, rig[name].project(X).x)
     assert [float(bound) for bound in scaled.depth] == [1e3, 4e3]
+    numbers = {"distance": 0.02, "thickness": 0.01, "glass": 1.5, "water": 1.33}
+    port = FlatPort(**{name: torch.tensor(value).double() for name, value in numbers.items()})
+    view = LensView(hw=(4, 6), K=intrinsics(5.0, (4, 6)), distortion=port)
+    assert float(Rig({"a": view}).scaled(1e3)["a"].distortion.distance) == pytest.approx(20)
     assert known_by_f(random_rig(0)).scaled(2.0).links == known_by_f(random_rig(0)).links
 
 

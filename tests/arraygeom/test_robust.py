@@ -40,6 +40,11 @@ def test_several_columns_are_solved_for_at_once():
     both = least_squares(terms, torch.stack([values, -2 * values], 1), weight)
     torch.testing.assert_close(both[:, 0], least_squares(terms, values, weight))
     torch.testing.assert_close(both[:, 1], -2 * both[:, 0])
+    columns = torch.stack([values, -2 * values, values, values], 1)
+    for prior in (None, torch.eye(3).double()):
+        found = least_squares(terms, columns.view(-1, 2, 2), weight, prior)
+        torch.testing.assert_close(found, least_squares(terms, columns, weight, prior).view(3, 2, 2))
+        assert not least_squares(terms[:, :0], columns[:0], weight[:0], prior).any()
 
 
 def test_a_prior_is_as_many_further_values():

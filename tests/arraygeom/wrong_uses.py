@@ -76,7 +76,8 @@ from arraygeom import (
 )
 from arraygeom.fields import AroundMatches
 from arraygeom.fields.ray_depth import ray_depth
-from arraygeom.robust import robust_least_squares
+from arraygeom.lens_fit import coverage
+from arraygeom.robust import least_squares, robust_least_squares
 from arraygeom.viz import draw_matches, draw_residuals
 from arraygeom.wide_views import cube_faces, rectify_spherical
 
@@ -86,6 +87,7 @@ EYE, ZERO = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float6
 OPENGL = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))
 ASIDE = torch.tensor([-0.1, 0, 0], dtype=torch.float64)
 X = torch.tensor([[20.0, 20.0]], dtype=torch.float64)
+ENDS = Distortion("brown-conrady", torch.tensor([-1e4, 0, 0, 0], dtype=torch.float64))
 IMAGE = torch.rand(1, 3, *HW, generator=torch.Generator().manual_seed(0))
 
 
@@ -189,6 +191,8 @@ WRONG: dict[str, Callable[[], Any]] = {
     "a camera that is K": lambda: Rig({"a": K}),
     "both cameras the same": lambda: Rig({"a": camera(), "b": camera()}, depth=(1, 5)),
     "a link to a name unknown": lambda: rig(links={("alpha", "gamma"): Link(EYE)}),
+    "a link by a text": lambda: Rig({"a": camera(), "b": moved()}, links={"ab": Link(pair().fundamental)}),
+    "a link of three cameras": lambda: rig(links={("alpha", "beta", "alpha"): Link(EYE)}),
     "links as a list": lambda: rig(links=[Link(EYE)]),
     "F of rank three": lambda: rig(links={("alpha", "beta"): Link(EYE)}),
     "F of NaN": lambda: Link(with_nan(EYE)),
@@ -252,6 +256,7 @@ WRONG: dict[str, Callable[[], Any]] = {
     "robust least squares of no steps": lambda: robust_least_squares(
         EYE, ZERO, ZERO, torch.ones_like, steps=0
     ),
+    "least squares of NaN": lambda: least_squares(EYE, with_nan(ZERO), ZERO + 1),
     "points of NaN": lambda: fit_homography(X.expand(5, 2) * math.nan, X.expand(5, 2)),
     "epipoles of a 3 x 4 matrix": lambda: epipoles(torch.zeros(3, 4)),
     "an image without its batch": lambda: sample(torch.rand(1, *HW), X[None]),
@@ -267,6 +272,16 @@ WRONG: dict[str, Callable[[], Any]] = {
     "matches a list": lambda: triangulate([camera(), moved()], X.expand(2, 1, 2).tolist()),
     "residuals of one view of two": lambda: reprojection_residuals(
         [camera(), moved()], ZERO[None] + 2, X[None]
+    ),
+    "residuals of no cameras": lambda: reprojection_residuals([], ZERO[None] + 2, X[None][:0]),
+    "residuals of one pixel for five points": lambda: reprojection_residuals(
+        [camera(), moved()], ZERO.expand(5, 3) + 2, X.expand(2, 1, 2)
+    ),
+    "residuals, seen by one view of two": lambda: reprojection_residuals(
+        [camera(), moved()], ZERO.expand(5, 3) + 2, X.expand(2, 5, 2), seen=torch.ones(1, 5).bool()
+    ),
+    "a bundle, seen by three views of two": lambda: bundle_adjusted(
+        rig(), ZERO.expand(5, 3) + 2, X.expand(2, 5, 2), free=["*.t*"], seen=torch.ones(3, 5).bool()
     ),
     "a camera for a pair": lambda: depth_of(camera(), X, X),
     "a camera for a pair, in a field": lambda: sampling_locations(Epipolar(), camera(), X),
@@ -364,6 +379,11 @@ WRONG: dict[str, Callable[[], Any]] = {
     "rectified on the sphere, a batch of poses": lambda: rectify_spherical(
         posed(EYE, ASIDE.expand(2, 3)).pair("alpha", "beta")
     ),
+    "rectified on the sphere, a focal length below 0": lambda: rectify_spherical(pair(), focal=-1.0),
+    "rectified on the sphere, without a ray": lambda: rectify_spherical(
+        Pair(*(one(K=intrinsics(60.0, HW, (999.0, 0.0)), distortion=ENDS) for one in (camera, moved)), None)
+    ),
+    "coverage by a batch of lenses": lambda: coverage(camera(distortion=stack([ENDS, ENDS]))),
     "rectified along the baseline": lambda: rectify(
         Pair(camera(), camera(cam_from_world=Pose(EYE, EYE[2] / 10)), None)
     ),

@@ -204,8 +204,9 @@ class KnownFile(NamedTuple):
         """Parse the option's text, in which the path has no comma, and check that the file exists.
 
         Raises:
-            UsageError: for another name than scale and tolerance, a scale of 0 or less, and a missing file.
-            ValueError: for what is no NAME=NUMBER, and a name given twice. The tolerance is not checked.
+            UsageError: for another name than scale and tolerance, a scale of 0 or less, a tolerance below 0,
+                and a missing file.
+            ValueError: for what is no NAME=NUMBER, and a name given twice.
         """
         path, *parts = text.split(",")
         numbers = options.numbers_by_name(parts, "--around")
@@ -214,6 +215,8 @@ class KnownFile(NamedTuple):
         known = cls(Path(path), **numbers)
         if known.scale is not None and known.scale <= 0:
             raise UsageError("--around", "a scale of more than 0", known.scale)
+        if known.tolerance < 0:
+            raise UsageError("--around", "a tolerance of 0 or more", known.tolerance)
         if not known.path.is_file():
             raise UsageError("--around", "an existing depth map, or file of matched points", path)
         return known

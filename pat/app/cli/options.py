@@ -85,7 +85,7 @@ def noise_of(texts: Iterable[str], *, by_default: bool = False) -> Any:
     for entry in entries:
         name, _, numbers = entry.partition("=")
         try:
-            electrons, *read = (float(number) for number in numbers.split(","))
+            electrons, *read = (float(number) for number in numbers.split(",") if name)
         except ValueError:
             raise ValueError(f"--noise: got '{entry}': give estimate, none, NAME=ELECTRONS[,READ]") from None
         if (count := 1 + len(read)) > 2:
@@ -364,7 +364,7 @@ def _named_file(option: str, text: str) -> tuple[str, Path]:
 def _named_number(option: str, text: str) -> tuple[str, float]:
     name, _, number = text.partition("=")
     with suppress(ValueError):
-        if math.isfinite(value := float(number)):
+        if name and math.isfinite(value := float(number)):
             return name, value
     example = 800 if option == "--focal" else 25
     raise ValueError(f"{option}: expected NAME=NUMBER, as mono={example}, got '{text}'")

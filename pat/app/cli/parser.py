@@ -96,8 +96,7 @@ def parse(
         kind: dataclass or function whose fields or parameters are the options; its docstring is the help.
         arguments: words; None for this process's.
         prog: name of the program in the help; empty for this process's.
-        base: instance of `kind` that holds the defaults, and is copied with changes, needed for options of a
-            dataclass within it (--a.b); None for the class's defaults.
+        base: instance of `kind` that holds the defaults, and is copied with changes; None for the class's.
         description: help text; empty for the docstring.
 
     Raises:
@@ -128,7 +127,9 @@ def parse(
         raise _unknown(rest[0], [f"--{entry.dashed}" for entry in entries if not entry.option.positional])
     values = {name: value for name, value in vars(known).items() if value is not argparse.SUPPRESS}
     given = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
-    return _changed(base, given) if base is not None else kind(**given)
+    if base is None:
+        base = kind(**{name: given.pop(name) for name in [*given] if "." not in name})
+    return _changed(base, given) if given else base
 
 
 def script(kind: Callable[..., T], arguments: Sequence[str] | None = None, *, prog: str = "") -> T:

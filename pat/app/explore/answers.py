@@ -6,6 +6,7 @@ import base64
 import io
 import json
 import math
+from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any
 
@@ -141,10 +142,10 @@ def clicked(scene: ExplorerScene, alpha: str, controls: Controls) -> tuple[Contr
         The controls with that pixel as `x`, and the samples in alpha, a list of (x, y).
 
     Raises:
-        ValueError: if no pixel can match, and for an unknown beta; KeyError for alpha itself.
+        ValueError: if no pixel can match, for an unknown beta, and for alpha itself.
     """
     name, column, row = controls["clicked"]
-    x = image_pixel(column, row, scene.rig[name].hw)
+    x = image_pixel(column, row, scene.rig.pair(alpha, name).beta.hw)
     inspected = inspect_pixel(scene, explorer_state(scene.rig, alpha, controls).replace(alpha=name, x=x))
     if alpha in inspected.problems:
         raise ValueError(inspected.problems[alpha])
@@ -173,10 +174,14 @@ def moved_rig(rig: Rig, alpha: str, controls: Controls) -> Rig:
         The moved rig, its links unchanged; the same one for unchanged controls.
 
     Raises:
-        ValueError: for a change that a camera's lens has not, unknown cameras and changes, and numbers that
-            no camera has.
+        ValueError: for a change that a camera's lens has not, unknown cameras and changes, `errors` of
+            another type, and numbers that no camera has.
     """
     alpha_view, cameras, errors = rig[alpha], dict(rig.cameras), controls["errors"]
+    if not all(
+        isinstance(e, Mapping) for e in (errors.values() if isinstance(errors, Mapping) else [errors])
+    ):
+        raise ValueError(f"errors: expected {{CAMERA: {{CHANGE: NUMBER}}}}, got {errors!r:.80}")
     known = {*rig.names, ALL}
     if unknown := {*errors} - known or {
         k for e in errors.values() for k in e if k not in ERRORS and k[:4] != "lens"

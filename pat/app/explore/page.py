@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -99,11 +100,11 @@ class Explorer:
             columns: columns of that grid.
 
         Raises:
-            OSError: if writing fails; TypeError or AttributeError for `errors` of another type.
+            OSError: if writing fails.
         """
         values = self.values()
         all_choices, values["choices"] = values["choices"], []
-        if self.scene is not None and is_pinhole(self.scene.rig) and self.usual:
+        if self.scene is not None and self.usual:
             values["ranges"] = [entry for entry in values["ranges"] if not entry[0].startswith("lens")]
             values["choices"] = [choice for choice in all_choices if choice[0] in ("camera", "map")]
             asks = f"asksPinholes({json.dumps(geometry(self.scene.rig, self.alpha))})"
@@ -114,9 +115,11 @@ class Explorer:
 
     @property
     def usual(self) -> bool:
-        """True if field, weights and lenses are those that a page can compute."""
-        lenses = [key for errors in self.controls["errors"].values() for key in errors if key[:4] == "lens"]
-        return not lenses and all(self.controls[n] == DEFAULTS[n] for n in ("field", "second", "weights"))
+        """True if rig, field and weights are those that a page can compute."""
+        with suppress(Exception):  # of impossible controls, which every answer then names
+            if self.scene is not None and is_pinhole(moved_rig(self.scene.rig, self.alpha, self.controls)):
+                return all(self.controls[name] == DEFAULTS[name] for name in ("field", "second", "weights"))
+        return False
 
     @property
     def rig(self) -> Rig:

@@ -70,6 +70,22 @@ def test_names_that_begin_with_the_camera(tmp_path):
     assert {n: list(m) for n, m in find_photos(tmp_path).items()} == {"left": [1, 2], "right": [1, 3]}
 
 
+@pytest.mark.parametrize(
+    ("names", "shared"),
+    [
+        (["left/left_near", "left/left_far", "right/right_near", "right/right_far"], {"near", "far"}),
+        (["left/1_a left", "left/2_b left", "right/1_a right", "right/2_b right"], {"1_a", "2_b"}),
+        (["left/pose_near", "left/pose_far", "right/pose_near", "right/pose_far", "right/sky"], 2),
+        (["left/near", "left/far", "right/left", "right/right"], 0),
+    ],
+)
+def test_moments_with_the_cameras_name_are_found_if_no_other_is_shared(names, shared, tmp_path):
+    for name in names:
+        write(tmp_path / f"{name}.png")
+    left, right = (moments.keys() for moments in find_photos(tmp_path).values())
+    assert (left & right == shared) if isinstance(shared, set) else len(left & right) == shared
+
+
 def test_one_image_of_each_camera_is_one_moment(tmp_path):
     for name in ("cam-0", "cam-1"):
         write(tmp_path / f"{name}.png")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from arraygeom import Pose, Rig, rotation_from_vector, triangulate
+from arraygeom import Distortion, Pose, Rig, rotation_from_vector, triangulate
 from calib.boards import intrinsics
 from calib.boards.adequacy import coverage
 from calib.boards.detect import BoardViews, Detection
@@ -24,7 +24,7 @@ from calib.boards.uncertainty import (
     rig_covariance,
     with_disagreement,
 )
-from calib.boards.validation import FOLDS
+from calib.boards.validation import FOLDS, epipolar_errors
 from tests.benchmarks.bench_robust import drawn
 from tests.calib.board_scenes import BOARD, board_poses, camera, errors_of, four_cameras, see, tensor
 from tests.calib.tracks import CALISCOPE_BOARD, caliscope_views
@@ -55,6 +55,13 @@ def kept(views, **keys):
 def with_seen(views, name, seen):
     """The views with other detections of one camera."""
     return {**views, name: BoardViews(views[name].hw, seen)}
+
+
+def test_a_pair_without_points_within_its_lenses_has_no_epipolar_errors(pair):
+    rig, _, views = pair
+    ends = Distortion("brown-conrady", tensor([-1e4, 0.0, 0.0, 0.0]))
+    rig = rig.with_camera("colour", rig["colour"].replace(distortion=ends))
+    assert epipolar_errors(rig, views) == {}
 
 
 def test_a_pair_is_found_within_its_uncertainty(pair, found):

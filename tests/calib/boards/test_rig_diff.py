@@ -15,7 +15,7 @@ from arraygeom.runtime.text import UNSCALED
 from calib.boards.bundle import changed, parameter_names
 from calib.boards.rig_diff import _projections, draw_difference, rig_difference
 from calib.boards.solve import adjust
-from calib.boards.uncertainty import rig_covariance
+from calib.boards.uncertainty import RigCovariance, rig_covariance
 from pat.app.cli.main import main
 from pat.app.sample_array import SAMPLE
 from tests.calib.board_scenes import board_poses, four_cameras, scene_of, see
@@ -254,6 +254,16 @@ def test_cameras_that_look_away_from_each_other_have_no_depths(rig):
     assert found.depths == {}
     assert "depth by" not in found.as_text()
     assert len(draw_difference(found).axes) == 8
+
+
+def test_covariances_of_a_single_camera_are_of_it_and_of_something(rig):
+    alone = Rig({"mono": rig["mono"]})
+    no_error = RigCovariance(("mono.focal.0",), np.zeros((1, 1)))
+    found = rig_difference(alone, alone, covariances=(no_error, no_error), depth=DEPTH)
+    assert "verdict: none" in found.verdict
+    other = RigCovariance(("nir.focal.0",), np.ones((1, 1)))
+    with pytest.raises(ValueError, match=r"nir\.focal\.0"):
+        rig_difference(alone, alone, covariances=(other, None), depth=DEPTH)
 
 
 @pytest.mark.parametrize("depth", [(0.0, 4.0), (4.0, 1.0)])

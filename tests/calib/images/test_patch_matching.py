@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from calib.images.matches import match_points
-from calib.images.patch_matching import refine_points
+from calib.images.patch_matching import _sampled, refine_points
 from tests.calib.scenes import texture
 
 A = np.array([[0.93, -0.08], [0.11, 1.04]])
@@ -42,6 +42,12 @@ def test_points_return_to_where_they_are_seen(rng):
     off = np.linalg.norm(found - ground_truth, axis=1)
     assert np.median(off) < 0.05
     assert (off < 0.15).mean() > 0.95
+
+
+def test_more_patches_than_opencv_takes_rows_are_sampled(rng):
+    image = rng.uniform(size=(20, 30)).astype(np.float32)
+    x = rng.integers(1, 19, (40_000, 3, 2)).astype(float)
+    assert (_sampled(image, x) == image[x[..., 1].astype(int), x[..., 0].astype(int)]).all()
 
 
 def test_uncorrelated_patches_are_rejected(rng):

@@ -8,13 +8,15 @@ import sys
 import pytest
 import torch
 
-from arraygeom import Pose, Rig
+from arraygeom import Link, Pose, Rig
+from arraygeom.pixels import shift_matrix
 from calib.images import rig_check
 from calib.images.depth_change import share_outside
 from calib.images.matches import PointMatches, match_cameras
 from calib.images.rig_check import find_misfit, misfit_warning, share_unlike
 from pat.app.cli.main import main
 from pat.media.images import write_image
+from tests.arraygeom.rigs import known_by_f
 from tests.calib.scenes import rectified_images, rectified_pair, texture, vector
 
 
@@ -28,6 +30,17 @@ def test_a_drifted_rig_is_named():
     assert found is not None
     assert 5.5 < float(re.search(r"lie ([\d.]+) px", found)[1]) < 6.6
     assert "`pat rig doctor` says: none of the usual mistakes, but the rig is 6." in found
+
+
+def test_a_link_of_H_alone_hides_no_misfit_of_another():
+    """Its points have no lines that they could be off."""
+    bad, images = (
+        known_by_f(rectified_pair().perturbed({"right.rotation": vector(0.02, 0, 0)})),
+        rectified_images(),
+    )
+    links = {**bad.links, ("left", "third"): Link.from_homography(shift_matrix(9, 9))}
+    rig = bad.with_camera("third", bad["left"]).replace(links=links)
+    assert find_misfit(rig, {**images, "third": images["left"].roll(7, -1)}).off > 5
 
 
 def test_points_behind_the_cameras_and_wrong_units_are_named():

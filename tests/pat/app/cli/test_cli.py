@@ -408,6 +408,24 @@ def test_images_stand_anywhere_among_the_options_of_fuse():
     assert rig_first(["a.png", "--rig", "r.yaml", "b.png"], Fuse) == ["r.yaml", "a.png", "b.png"]
 
 
+@dataclasses.dataclass
+class Inner:
+    steps: int = 1
+    rate: float = 0.5
+
+
+@dataclasses.dataclass
+class Outer:
+    name: str
+    inner: Inner = dataclasses.field(default_factory=Inner)
+
+
+@pytest.mark.parametrize("base", [None, Outer("n")])
+def test_options_of_a_dataclass_within_another_change_its_default(base):
+    made = parse(Outer, ["--name", "n", "--inner.steps", "2"], base=base)
+    assert made == Outer("n", Inner(2))
+
+
 def test_writers_take_o_and_out():
     """Every command but those that write nothing has an option --out, also called -o."""
     nothing = {("explore",), ("rig", "info"), ("warm-up",), ("rig", "convert")}

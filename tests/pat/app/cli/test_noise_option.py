@@ -2,7 +2,7 @@
 
 import pytest
 
-from pat.app.cli.options import noise_of
+from pat.app.cli.options import noise_of, numbers_by_name
 from pat.sensors import NoiseLevel
 
 
@@ -21,6 +21,7 @@ def test_levels_by_camera_or_estimated():
         (["mono"], "--noise: .*'mono'"),
         (["none", "mono=200"], "--noise: .*none, mono=200"),
         (["mono=dark"], "--noise: .*'mono=dark'"),
+        (["=200"], "--noise: .*'=200'"),
         (["mono=200,2,1"], "--noise: 'mono=200,2,1'"),
         (["mono=-200"], "electrons .*-200"),
         (["mono=0.02"], "electrons .*0.02"),
@@ -31,3 +32,8 @@ def test_levels_by_camera_or_estimated():
 def test_what_is_no_level_is_named(given, said):
     with pytest.raises(ValueError, match=said):
         noise_of(given)
+
+
+def test_a_number_without_a_name_is_refused():
+    with pytest.raises(ValueError, match="'=800'"):
+        numbers_by_name(["=800"], "--focal")

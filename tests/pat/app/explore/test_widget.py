@@ -142,7 +142,7 @@ def test_depths_of_unknown_scale_are_not_metres():
         assert {camera["unit"] for camera in view.cameras} == {unit}
 
 
-def test_what_is_wrong_is_said_in_the_picture():
+def test_what_is_wrong_is_said_in_the_picture(tmp_path):
     assert "one camera" in explore(small_rig(names=("a",))).answer["error"]
     other_size = {"a": torch.rand(1, 80, 120), "b": torch.rand(1, 40, 60)}
     assert "60x40" in explore(small_rig(), other_size).answer["error"]
@@ -151,7 +151,13 @@ def test_what_is_wrong_is_said_in_the_picture():
     assert "nobody" in explore(small_rig(), alpha="nobody").answer["error"]
     assert "nothing" in explore(small_rig(), network="nothing").answer["error"]
     assert "infinity" in explore(small_rig(), x=(float("inf"), 0)).answer["error"]
-    assert "error" in explore(small_rig(), errors=0.1).answer
+    for errors in (0.1, {"b": 3}):
+        wrong = explore(small_rig(), errors=errors)
+        assert "errors" in wrong.answer["error"]
+        wrong.save(tmp_path / "wrong.html")
+        with pytest.raises(ValueError, match="errors"):
+            _ = wrong.rig
+    assert "'a'" in change(explore(small_rig()), clicked=["a", 60, 40])["error"]
     problem = explore(small_rig(), weights="nothing").answer["betas"]["b"]["problem"]
     assert problem.startswith("no weights 'nothing'")
     for image in (torch.rand(80, 120), torch.ones(3, 80, 120, dtype=torch.uint8)):
