@@ -378,8 +378,10 @@ def resampled_values(
         Values (C, h, w) in the type given, integers rounded and clipped to it; 0 beyond the edge and at NaN.
 
     Raises:
-        KeyError: for another word as `interpolation`.
+        ValueError: for another word as `interpolation`.
     """
+    if interpolation not in INTERPOLATIONS:
+        raise ValueError(f"interpolation is {interpolation!r}: wanted {', '.join(INTERPOLATIONS)}")
     kind, where = INTERPOLATIONS[interpolation], torch.from_numpy(positions)
 
     def sampled(plane: NDArray[Any]) -> NDArray[np.float64]:

@@ -169,10 +169,10 @@ class SequenceFusion:
         Raises:
             ValueError: without keys, if none of those around it could be fused, or an image cannot be read.
             OSError: for an image file that is missing.
-            IndexError: for a number beyond alpha's frames; one below 0 is not refused.
+            IndexError: for a frame that alpha does not have, as one below 0.
         """
-        grey = self.grey(i)
-        fetched = ((key, fetch(key)) for key in self._around(i, keys))
+        around, grey = self._around(i, keys), self.grey(i)
+        fetched = ((key, fetch(key)) for key in around)
         sources = [self._warped(i, grey, key, colour) for key, colour in fetched if colour]
         if not sources:
             raise ValueError(f"frame {i}: none of the key frames around it could be fused")

@@ -177,7 +177,7 @@ def stated_response(weights: Sequence[float]) -> Response:
         ValueError: unless there are three numbers, none negative, infinite or NaN, not all 0.
     """
     try:
-        values = torch.tensor([float(w) for w in weights], dtype=torch.float64)
+        values = torch.tensor([float(w + 0.0) for w in weights], dtype=torch.float64)  # of texts: TypeError
     except (TypeError, ValueError):
         values = torch.zeros(0)
     if values.shape != (3,) or not bool((values >= 0).all() & (values.sum() > 0) & values.isfinite().all()):
@@ -228,7 +228,12 @@ def fit(
     Returns:
         The response, on the CPU; Rec. 601's if that is likeliest, for too few points (`SETTINGS.points`;
         `explained` is 1 then), and where no bands' combination explains alpha (`explains` is False).
+
+    Raises:
+        ValueError: for another `enough`.
     """
+    if not 0 < enough <= 1:
+        raise ValueError(f"enough is {enough}: give a share of the matches wanted, above 0, at most 1")
     most, fewest = SETTINGS.points
     step = max(alpha.numel() // most, 1)
     x, y = bands[:, ::step].double().cpu(), alpha[::step].double().cpu()

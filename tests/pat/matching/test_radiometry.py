@@ -239,3 +239,9 @@ def test_fusion_of_another_response():
 def test_wrong_responses_are_refused(wrong):
     with pytest.raises(ValueError, match="weights"):
         stated_response(wrong)
+
+
+@pytest.mark.parametrize("enough", [0, -1.0, 1.5, float("nan")])
+def test_a_share_of_matches_that_is_none_is_refused(enough):
+    with pytest.raises(ValueError, match="enough"):
+        fit(torch.rand(3, 400), torch.rand(400), enough=enough)
