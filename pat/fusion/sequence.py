@@ -34,7 +34,7 @@ from ..support.settings import physics, size
 from .corrections import Corrections
 from .frame import Frame
 from .frames import CachedFrames, Frames
-from .fuse import FuseSettings, corrections_of, fuse_frame
+from .fuse import FuseSettings, corrections_of, fuse_frame, of_kind
 from .low_light import noise_levels
 from .optical_flow import flow_between, warped
 from .steps import with_own_levels
@@ -97,7 +97,7 @@ class SequenceFusion:
 
     Raises:
         ValueError: for a negative or infinite speed; the rest is checked when it is used.
-        TypeError: for a speed that is no number.
+        TypeError: for a speed that is no number, and settings of another type.
     """
 
     network: FusionNetwork
@@ -109,6 +109,7 @@ class SequenceFusion:
 
     def __post_init__(self) -> None:
         check_above(0, speed=self.speed)
+        of_kind(FuseSettings, self.settings)
         cached = {n: f if isinstance(f, CachedFrames) else CachedFrames(f) for n, f in self.frames.items()}
         object.__setattr__(self, "frames", cached)
 

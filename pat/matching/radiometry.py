@@ -222,7 +222,7 @@ def fit(
         alpha: alpha at the points.
         where: positions of the points in beta, in its width and height, from its middle, with which
             vignetting is estimated; None without.
-        enough: matched pixels as a share of those wanted, 1 or less, above 0. Below 1 wrong ones among them
+        enough: matched pixels as a share of those wanted, 0 to 1. Below 1 wrong ones among them
             could explain anything: only gain and gamma are fitted, and `explained` is divided by it.
 
     Returns:
@@ -232,14 +232,14 @@ def fit(
     Raises:
         ValueError: for another `enough`.
     """
-    if not 0 < enough <= 1:
-        raise ValueError(f"enough is {enough}: give a share of the matches wanted, above 0, at most 1")
+    if not 0 <= enough <= 1:
+        raise ValueError(f"enough is {enough}: give a share of the matches wanted, 0 to 1")
     most, fewest = SETTINGS.points
     step = max(alpha.numel() // most, 1)
     x, y = bands[:, ::step].double().cpu(), alpha[::step].double().cpu()
     place = y.new_zeros(len(y), 2) if where is None else where[::step].double().cpu()
     unclipped = (y > 0.02) & (y < 0.98) & (x > 0.01).all(0) & (x < 0.98).all(0)
-    if int(unclipped.sum()) < fewest:
+    if not enough or int(unclipped.sum()) < fewest:
         return Response.rec601()
     groups = _Groups.from_points(x[:, unclipped], y[unclipped], place[unclipped])
     luma, unlike = groups.most_probable(LUMA), groups.most_probable(UNLIKE)

@@ -160,6 +160,7 @@ from pat.app.sample_array import load_sample
 from pat.fusion.align import align_frame, resampled_values
 from pat.fusion.aligned_files import save_aligned
 from pat.fusion.fuse import corrections_of, fuse_frame
+from pat.fusion.sequence import SequenceFusion
 from pat.media.images import write_image
 from pat.networks.weights import load_weights
 
@@ -185,6 +186,7 @@ for use in (
     lambda: fuse_frame(images, rig, alpha="mono", network=load_weights("mono-colour"), corrections={}),
     lambda: align_frame(images, rig, alpha="mono", network=load_weights("mono-colour"), settings={}),
     lambda: corrections_of(images, rig, alpha="mono", network=load_weights("mono-colour"), settings={}),
+    lambda: SequenceFusion(None, rig, {}, "mono", settings={}),
     lambda: fuse(images, rig, alpha="mono", matcher=lambda inputs: 3),
     lambda: fuse(images, rig, alpha=0),
     lambda: resampled_values(np.zeros((1, 4, 5)), np.zeros((1, 1, 2), np.float32), "lanczos"),
@@ -219,6 +221,7 @@ def test_what_is_not_what_it_should_be_is_refused_in_a_line():
         "wanted FuseSettings, got a dict",
         "wanted Corrections, got a dict",
         "wanted Corrections, got a dict",
+        "wanted FuseSettings, got a dict",
         "wanted FuseSettings, got a dict",
         "wanted FuseSettings, got a dict",
         "wanted Matches, got a int",
