@@ -13,7 +13,7 @@ FOLDER = Path(sys.prefix) / "blender"
 
 
 def blender_python() -> str:
-    """Return the path of a Python interpreter for Blender: this one if it has bpy, else that of `FOLDER`.
+    """Return the path of a Python interpreter that has bpy: this one, or else that of `FOLDER`.
 
     Raises:
         ValueError: in one line with the command to install it, if OpenEXR or such an interpreter is missing.
@@ -23,8 +23,10 @@ def blender_python() -> str:
         raise ValueError(f"rendering needs OpenEXR to read what Blender writes: {line}")
     if find_spec("bpy") is not None:
         return sys.executable
-    python = FOLDER / ("Scripts/python.exe" if sys.platform == "win32" else "bin/python")
-    if not python.is_file():
+    windows = sys.platform == "win32"
+    python = FOLDER / ("Scripts/python.exe" if windows else "bin/python")
+    packages = f"{'Lib' if windows else 'lib/python3*'}/site-packages"
+    if not (python.is_file() and [*FOLDER.glob(f"{packages}/bpy")]):
         raise ValueError(
             "rendering needs Blender as a Python module, in an environment of its own: `make synthesis` in a "
             f"checkout, or python3.11 -m venv {FOLDER} && {python} -m pip install 'bpy==5.0.1'"
