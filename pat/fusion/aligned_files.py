@@ -206,8 +206,8 @@ def write_bands(
         OSError: if the file cannot be written; a part of it may be there.
     """
     if not len(bands) == len(wavelengths) == len(values):
-        got = f"{len(bands)} names and {len(wavelengths)} wavelengths"
-        raise ValueError(f"{path}: {len(values)} bands, {got}: give one of each for every band")
+        got = f"{len(bands)} names, {len(wavelengths)} wavelengths"
+        raise ValueError(f"{path}: {len(values)} bands, {got}: give as many of each")
     items = [
         f'<Item name="{name}" sample="{i}">{value:.9g}</Item>'
         for i, of_band in enumerate(facts)

@@ -174,7 +174,9 @@ def classical_fusion(
     """
     if not max_disparity > 0:
         raise ValueError(f"max_disparity must be positive, got {max_disparity}")
-    mono, colours = _planes(alpha)[..., 0], _resized(_planes(beta), alpha.shape[1:])
+    mono, colours = _planes(alpha)[..., 0], _planes(beta)
+    how = cv2.INTER_AREA if len(colours) > len(mono) else cv2.INTER_CUBIC
+    colours = cv2.resize(colours, mono.shape[::-1], interpolation=how)  # c' = (c + 0.5) s - 0.5
     sharpness = beta.shape[2] / alpha.shape[2]
     chroma = _warped_chroma(mono, colours, np.ones_like(mono), max_disparity, sharpness)
     return _recoloured(alpha, chroma)
@@ -247,10 +249,7 @@ def _rectified_plane(pair: Pair) -> _Plane:
     shift = -(rotation @ R.T @ t)[0] * focal / np.array([near * z.min(), far * z.max()])
     max_disparity, across = float(np.ptp(shift)), float(np.ptp(corners[:, 0]))
     if max_disparity > NEAREST * across:
-        raise ValueError(
-            f"points at the near bound, {near:g}, are {max_disparity:.0f} pixels apart in images of "
-            f"{across:.0f}: give a depth range that begins farther away"
-        )
+        raise ValueError(f"the near bound, {near:g}, means {max_disparity:.0f} pixels of disparity: raise it")
     K[:2, 2] = -corners.min(0) + [max_disparity, 0]
     sides = np.ceil(np.ptp(corners, axis=0) + np.array([max_disparity + 1, 1]))
     width, height = (int(side) for side in sides)
@@ -452,12 +451,6 @@ def _luma(colours: Image) -> Image:
 def _grid(shape: tuple[int, ...]) -> tuple[Image, Image]:
     rows, columns = np.mgrid[: shape[0], : shape[1]].astype(np.float32)
     return columns, rows
-
-
-def _resized(colours: Image, hw: torch.Size) -> Image:
-    """Resize colours by OpenCV, which obeys c' = (c + 0.5) s - 0.5."""
-    smaller = colours.shape[0] > hw[0]
-    return cv2.resize(colours, (hw[1], hw[0]), interpolation=cv2.INTER_AREA if smaller else cv2.INTER_CUBIC)
 
 
 def _sampled(image: Image, columns: Image, rows: Image, how: int = cv2.INTER_CUBIC) -> Image:

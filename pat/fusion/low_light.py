@@ -21,7 +21,6 @@ from arraygeom.runtime.warned import warn
 
 from ..matching.radiometry import Response
 from ..networks.bm3d import Observation, other_camera_update, without_noise
-from ..networks.denoiser import LowLightNetwork
 from ..networks.weights import load_denoiser
 from ..sensors import NoiseLevel, generator_for
 from ..sensors.steps import normal
@@ -68,12 +67,8 @@ SETTINGS = LowLightSettings()
 
 in_tiles = partial(chunked, rows=1024, halo=128, axis=(-2, -1))
 """Function that denoises images in tiles of this side, with so many pixels around them."""
-
-
-@cache
-def shipped_denoiser(device: torch.device) -> LowLightNetwork:
-    """Return the network that ships with the package on a device, read once for each."""
-    return load_denoiser().to(device)
+shipped_denoiser = cache(lambda device: load_denoiser().to(device))
+"""Function that returns the network that ships with the package on a device, read once for each."""
 
 
 class NoisyView(NamedTuple):

@@ -27,8 +27,6 @@ from .spectral_mix import SpectralMix
 from .subpixel import following, matched_at_full_size
 
 LOG = logging.getLogger(__name__)
-LEAST = 4 * FINE
-"""Least side of an image that is matched at half size, itself reduced by `FINE` to estimate its mix."""
 
 
 Matcher = Callable[[Inputs], Matches]
@@ -60,11 +58,9 @@ def match(inputs: Inputs, choice: Choice | None = None) -> Matches:
     (h, w), betas = inputs.hw, [beta.image for beta in inputs.betas]
     multiple = FINE * (1 + (inputs.bands is None and any(image.shape[1] > 1 for image in betas)))
     if h % multiple or w % multiple:
-        raise ValueError(
-            f"alpha has {w}x{h} pixels to match: pad both sides to whole multiples of {multiple}"
-        )
-    if (least := min(h, w, *(side for image in betas for side in image.shape[-2:]))) < LEAST:
-        raise ValueError(f"an image to match has a side of {least} pixels: give {LEAST} or more")
+        raise ValueError(f"alpha has {w}x{h} pixels to match: pad both sides to multiples of {multiple}")
+    if (least := min(h, w, *(side for image in betas for side in image.shape[-2:]))) < 4 * FINE:
+        raise ValueError(f"an image to match has a side of {least} pixels: give {4 * FINE} or more")
     if not inputs.learned:
         return transferred(inputs, located(inputs))
     with torch.no_grad():

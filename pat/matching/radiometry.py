@@ -177,7 +177,7 @@ def stated_response(weights: Sequence[float]) -> Response:
         ValueError: unless there are three numbers, none negative, infinite or NaN, not all 0.
     """
     try:
-        values = torch.tensor([float(w + 0.0) for w in weights], dtype=torch.float64)  # of texts: TypeError
+        values = torch.tensor([float(w + 0.0) for w in weights], dtype=torch.float64)  # no texts
     except (TypeError, ValueError):
         values = torch.zeros(0)
     if values.shape != (3,) or not bool((values >= 0).all() & (values.sum() > 0) & values.isfinite().all()):

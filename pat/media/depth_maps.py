@@ -94,15 +94,13 @@ def _stated_scale(path: Path) -> float | None:
     """Metres for each count as `write_depth` states them in a PNG file; None in other files."""
     with path.open("rb") as file:  # Pillow would refuse large ones
         head, *_ = file.read(2**16).split(b"IDAT", 1)
-    said = re.match(rb"\x89PNG.*tEXtDescription\0depth: (\S+) counts a metre", head, re.DOTALL)
+    said = re.match(rb"\x89PNG.*tEXtDescription\0depth: ([!-~]+) counts a metre", head, re.DOTALL)
     if said is None:
         return None
     with suppress(ValueError, ZeroDivisionError):
         if 0 < (scale := 1 / float(said[1])) < math.inf:
             return scale
-    raise ValueError(
-        f"{path}: says {said[1].decode('latin-1')} counts a metre: give FILE,scale=METRES of a count"
-    )
+    raise ValueError(f"{path}: says {said[1].decode()} counts a metre: give FILE,scale=METRES of a count")
 
 
 def write_points(

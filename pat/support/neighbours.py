@@ -30,10 +30,10 @@ def nearest_points(
         ValueError: for another `count`, points of other lengths, NaN and infinity.
     """
     points, queries = (np.ascontiguousarray(x, np.float32) for x in (points, queries))
-    if not 1 <= count <= len(points):
-        raise ValueError(f"{count} neighbours of {len(points)} points: ask for 1 to {len(points)}")
-    if points.shape[1:] != queries.shape[1:] or not all(np.isfinite(x).all() for x in (points, queries)):
-        raise ValueError(f"points {points.shape} and {queries.shape}: give finite ones of equal length")
+    finite = all(np.isfinite(x).all() for x in (points, queries))
+    if not (1 <= count <= len(points) and points.shape[1:] == queries.shape[1:] and finite):
+        got = f"{count} neighbours of points {queries.shape} among {points.shape}"
+        raise ValueError(f"{got}: give finite points of one length, and ask for one to as many as there are")
     if not len(queries):
         return np.zeros((0, count), np.int32), np.zeros((0, count), np.float32)
     tree = cv2.flann.Index(points, {"algorithm": KD_TREE, "leaf_max_size": 10})

@@ -177,10 +177,7 @@ def _room(setting: Setting) -> _Room:
             return room
         front = front if farthest <= 0.98 * setting.far else 0.93 * front
         half = half if nearest >= setting.near else 1.15 * half
-    warn(
-        f"no room found with its walls {setting.near:g} to {setting.far:g} m from every camera: they are "
-        f"{nearest:.3g} to {farthest:.3g} m away; give a wider depth range, or cameras of narrower views"
-    )
+    warn(f"walls {nearest:.3g} to {farthest:.3g} m away: no room fits the cameras' depth range: widen that")
     return room
 
 

@@ -23,10 +23,8 @@ def blender_python() -> str:
         raise ValueError(f"rendering needs OpenEXR to read what Blender writes: {line}")
     if find_spec("bpy") is not None:
         return sys.executable
-    windows = sys.platform == "win32"
-    python = FOLDER / ("Scripts/python.exe" if windows else "bin/python")
-    packages = f"{'Lib' if windows else 'lib/python3*'}/site-packages"
-    if not (python.is_file() and [*FOLDER.glob(f"{packages}/bpy")]):
+    python = FOLDER / ("Scripts/python.exe" if sys.platform == "win32" else "bin/python")
+    if not (python.is_file() and any(FOLDER.rglob("site-packages/bpy"))):
         raise ValueError(
             "rendering needs Blender as a Python module, in an environment of its own: `make synthesis` in a "
             f"checkout, or python3.11 -m venv {FOLDER} && {python} -m pip install 'bpy==5.0.1'"
