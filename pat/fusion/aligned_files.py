@@ -164,9 +164,8 @@ def _shares(aligned: Aligned) -> str:
     lines = []
     for camera, view in aligned.items():
         if camera != aligned.alpha:
-            outside, occluded, visible = (
-                np.bincount(view.visibility.ravel(), minlength=3) / view.visibility.size
-            )
+            counts = np.bincount(view.visibility.ravel(), minlength=3)
+            outside, occluded, visible = counts / view.visibility.size
             not_seen = f"{occluded:.1%} occluded or unmatched, {outside:.1%} beyond its edge"
             lines.append(f"{camera}: sees {visible:.1%} of {aligned.alpha}, {not_seen}\n")
     return "".join(lines)

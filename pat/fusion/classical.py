@@ -199,13 +199,7 @@ def non_local_means(image: Float[Tensor, "c h w"], deviation: float) -> Float[Te
 
     pixels = image.movedim(0, -1).numpy()
     denoised = denoise_nl_means(
-        pixels,
-        patch_size=5,
-        patch_distance=6,
-        h=0.8 * deviation,
-        sigma=deviation,
-        fast_mode=True,
-        channel_axis=-1,
+        pixels, patch_size=5, patch_distance=6, h=0.8 * deviation, sigma=deviation, channel_axis=-1
     )
     return torch.from_numpy(np.ascontiguousarray(denoised.reshape(pixels.shape))).movedim(-1, 0).to(image)
 

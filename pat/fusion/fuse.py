@@ -289,12 +289,7 @@ def _check_gradients(differentiable: bool, *, in_parts: bool, noisy: bool) -> No
 @torch_in_one_thread()
 @without_autocast()
 def corrections_of(
-    images: Images,
-    rig: Rig,
-    *,
-    alpha: str,
-    network: FusionNetwork,
-    settings: FuseSettings = FuseSettings(),
+    images: Images, rig: Rig, *, alpha: str, network: FusionNetwork, settings: FuseSettings = FuseSettings()
 ) -> Corrections:
     """Estimate the corrections that `fuse` makes, to use them for other frames of the same cameras.
 

@@ -38,8 +38,7 @@ def blurred(images: Float[Tensor, "b 1 h w"], blurs: Sequence[float]) -> Float[T
             padded = image[rows[:, None], columns][None, None]  # kornia mirrors no more than the image itself
             there = slice(side // 2, -(side // 2))
             return gaussian_blur2d(padded, side, (blur, blur))[0, 0, there, there]
-        plane = np.ascontiguousarray(image.detach().cpu().numpy(), np.float32)
-        return torch.from_numpy(cv2.GaussianBlur(plane, (0, 0), blur)).to(image)
+        return torch.from_numpy(cv2.GaussianBlur(numpy_of(image), (0, 0), blur)).to(image)
 
     return torch.stack([one(p[0], blur) for p, blur in zip(images, blurs)])[:, None]
 

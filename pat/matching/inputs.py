@@ -235,9 +235,7 @@ def box_around(points: Float[Tensor, "n 2"], hw: HW, halo: int, multiple: int) -
     """
     if not len(points):
         return 0, multiple, 0, multiple
-    points = points.clamp(min=0).minimum(
-        points.new_tensor([hw[1] - 1, hw[0] - 1])
-    )  # own fields may be off it
+    points = points.clamp(min=0).minimum(points.new_tensor([hw[1] - 1, hw[0] - 1]))  # some may be off it
     corners = torch.stack([points.amin(0) - halo, points.amax(0) + halo + multiple])
     if bool(corners.isnan().any()):
         raise ValueError("points hold NaN: leave those out that are not known")

@@ -164,12 +164,10 @@ class Noise(Step):
     read: float = 0.0
 
     def __post_init__(self) -> None:
-        if not (0 < self.full_well < math.inf and 0 <= self.read < math.inf):
-            got = f"{self.full_well:g} and {self.read:g}"
-            raise ValueError(f"noise: wanted full_well > 0 and read >= 0 electrons, got {got}")
+        check_above(0, itself=False, full_well=self.full_well)
+        check_above(0, read=self.read)
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
-
         variance = (image.clamp(min=0) * self.full_well + self.read**2) / self.full_well**2
         return image + (variance + 1e-20).sqrt() * normal(image.shape, image, generator)
 
@@ -221,9 +219,7 @@ class Jitter(Step):
     normalisation: float = 0.03
 
     def __post_init__(self) -> None:
-        for name in ("gain", "gamma", "normalisation"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"jitter: {name} must be 0 or more, got {getattr(self, name):g}")
+        check_above(0, gain=self.gain, gamma=self.gamma, normalisation=self.normalisation)
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
         b, c = image.shape[:2]

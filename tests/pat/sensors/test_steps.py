@@ -230,7 +230,7 @@ def test_mistakes_are_named():
     with pytest.raises(ValueError, match="collects"):
         run(noise_image(1, 3, 4, 4), Spectral(Curve((1500.0, 1600.0), (1.0, 1.0))))
     for numbers in ((0.0, 0.0), (math.nan, 0.0), (100.0, math.nan), (math.inf, 0.0), (100.0, math.inf)):
-        with pytest.raises(ValueError, match="full_well > 0"):
+        with pytest.raises(ValueError, match=r"full_well|read"):
             Noise(*numbers)
 
     for to in (0.0, math.nan, math.inf, (4, 0)):
