@@ -58,7 +58,8 @@ def write_together(
         FileExistsError: for a file in the way, of other content than the new one, that no list has in its
             present state and that is not `given`.
         IsADirectoryError: for a folder of a `given` name.
-        OSError: naming the file, if writing fails. Other errors of the block pass.
+        OSError: naming the file, if writing fails.
+        ValueError: of the block, with `folder` in place of the temporary one. Its other errors pass.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -73,6 +74,10 @@ def write_together(
             raise
         written = folder / Path(error.filename).name if error.filename else folder
         raise naming(written, error, temporary) from error
+    except ValueError as error:
+        if str(temporary) not in str(error):
+            raise
+        raise ValueError(str(error).replace(str(temporary), str(folder))) from error
     finally:
         with suppress(OSError):  # what cannot be put back now is put back by the next call
             _undo(folder, temporary)

@@ -324,20 +324,16 @@ class _ViewRule:
         now = place.pair.beta
         assert isinstance(now, LensView)
         where, valid = chunked(lambda x: recorded_pixels(x, now, camera), located[0].double(), axis=0)
-        visible, where, confidence = (
-            confidence >= self.min_confidence,
-            where.float().cpu(),
-            confidence.float(),
-        )
+        visible, where = (confidence >= self.min_confidence).cpu(), where.float().cpu()
         inside = (located[1] & valid).cpu() & on_image(where, camera.hw)
-        seen = torch.where(inside, torch.where(visible.cpu(), SEEN, OCCLUDED), OUTSIDE)
+        seen = torch.where(inside, torch.where(visible, SEEN, OCCLUDED), OUTSIDE)
         visibility = seen.to(torch.uint8).numpy()
         taken = resampled_values(values, where.numpy(), self.interpolation)
         return AlignedView(
             filled(taken, visibility == SEEN, self.fill),
             torch.where(inside[..., None], where, torch.nan).numpy(),
             visibility,
-            torch.where(inside, confidence.cpu(), 0.0).numpy(),
+            torch.where(inside, confidence.float().cpu(), 0.0).numpy(),
             _band_names(name, len(values)),
             camera.sensor.response,
         )
@@ -378,8 +374,10 @@ def resampled_values(
         Values (C, h, w) in the type given, integers rounded and clipped to it; 0 beyond the edge and at NaN.
 
     Raises:
-        KeyError: for another word as `interpolation`.
+        ValueError: for another word as `interpolation`.
     """
+    if interpolation not in INTERPOLATIONS:
+        raise ValueError(f"interpolation is {interpolation!r}: wanted {', '.join(INTERPOLATIONS)}")
     kind, where = INTERPOLATIONS[interpolation], torch.from_numpy(positions)
 
     def sampled(plane: NDArray[Any]) -> NDArray[np.float64]:

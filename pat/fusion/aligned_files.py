@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 from xml.sax.saxutils import escape
 
 import numpy as np
@@ -83,7 +83,7 @@ def save_aligned(
         out: folder, made if missing.
         separate: True for one file a camera, NAME.tif, in place of aligned.tif, as also for values of
             different types.
-        positions: format of the positions, "npy" or "tif"; "none", or any other word, for no such files.
+        positions: format of the positions, "npy" or "tif"; "none" for no such files.
         name: prefix of the files, as in name_aligned.tif; empty for none.
         keep: files that must not be overwritten, such as the images.
         pages: further text files by name, without prefix; None for none.
@@ -95,10 +95,12 @@ def save_aligned(
         Paths of the files, sorted.
 
     Raises:
-        ValueError: for two files of one name, and rather than overwrite a file of `keep`.
+        ValueError: for another format, two files of one name, and rather than overwrite a file of `keep`.
         FileExistsError: for files in the way that no run wrote.
         OSError: if files cannot be written; those of a former alignment stay.
     """
+    if positions not in get_args(PositionFormat):
+        raise ValueError(f"positions is {positions!r}: wanted {', '.join(get_args(PositionFormat))}")
     prefix = f"{name}_" if name else ""
     files = _files(aligned, separate, positions, recorded)
     files = [(f"{prefix}{file}", *how) for file, *how in files]
@@ -162,9 +164,8 @@ def _shares(aligned: Aligned) -> str:
     lines = []
     for camera, view in aligned.items():
         if camera != aligned.alpha:
-            outside, occluded, visible = (
-                np.bincount(view.visibility.ravel(), minlength=3) / view.visibility.size
-            )
+            counts = np.bincount(view.visibility.ravel(), minlength=3)
+            outside, occluded, visible = counts / view.visibility.size
             not_seen = f"{occluded:.1%} occluded or unmatched, {outside:.1%} beyond its edge"
             lines.append(f"{camera}: sees {visible:.1%} of {aligned.alpha}, {not_seen}\n")
     return "".join(lines)
@@ -193,22 +194,25 @@ def write_bands(
     Args:
         path: file, replaced if there is one.
         values: values (C, H, W).
-        bands: name of each band.
+        bands: name of each of the C bands.
         wavelengths: central wavelength of each band, nanometres; None where unknown.
         facts: further numbers of each band by name, written as its metadata.
         tags: tags of the file whose pixels these are, written too; left out of files over `LARGEST_TIFF`.
             None for none.
 
     Raises:
-        ValueError: for more names than wavelengths, or fewer.
+        ValueError: for more names or wavelengths than bands, or fewer.
         OSError: if the file cannot be written; a part of it may be there.
     """
+    if not len(bands) == len(wavelengths) == len(values):
+        got = f"{len(bands)} names, {len(wavelengths)} wavelengths"
+        raise ValueError(f"{path}: {len(values)} bands, {got}: give as many of each")
     items = [
         f'<Item name="{name}" sample="{i}">{value:.9g}</Item>'
         for i, of_band in enumerate(facts)
         for name, value in of_band.items()
     ]
-    for i, (band, wave) in enumerate(zip(bands, wavelengths, strict=True)):
+    for i, (band, wave) in enumerate(zip(bands, wavelengths)):
         items.append(f'<Item name="DESCRIPTION" sample="{i}" role="description">{escape(band)}</Item>')
         if wave is not None:
             of = f'name="CENTRAL_WAVELENGTH_UM" domain="IMAGERY" sample="{i}"'

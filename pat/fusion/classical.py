@@ -20,15 +20,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from arraygeom import Camera, Pair, Rig
+from arraygeom.checks import checked
 
 from ..matching.filters import filled
-from ..media.colour import from_luma_chroma, luminance, luminance_of, to_bytes
+from ..media.colour import from_luma_chroma, luminance, to_bytes
 from ..media.figures import reduced
 from ..sensors import NoiseLevel
 from ..support.neighbours import nearest_points
 from .frame import Frame
 from .steps import undistort
-from .views import Views
+from .views import Views, grey_alpha, range_of
 
 Image = NDArray[Any]
 
@@ -51,6 +52,8 @@ SEEN = 0.5
 UNSEEN = 0.2
 DISPARITY_FILL, COLOUR_FILL, LAST_FILL = (50, 4), (300, 3), (30, 1.5)
 """Strength of the edge-aware smoothing, and the difference of 8-bit luminance that counts as an edge."""
+NEAREST = 3
+"""Largest disparity, in widths of alpha's image: memory grows with its square."""
 UNRECTIFIABLE = "the cameras look along the line between them: such a pair cannot be rectified"
 
 
@@ -79,7 +82,7 @@ def classical_view(
     """Fuse reduced images by `classical_baseline` at alpha's own view, through lenses.
 
     Args:
-        images: images (C, h, w), 0..1, by camera, of any size: the rig's cameras are resized to them.
+        images: images (C, h, w), 0..1, by camera, of the rig's sizes.
         longest: largest number of pixels of an image's longer side.
 
     Returns:
@@ -87,14 +90,17 @@ def classical_view(
 
     Raises:
         ValueError: for cameras that are not calibrated, and as `Views.of` and `classical_baseline`.
+        TypeError: for images that are no tensors.
     """
     if names := [name for name in images if not isinstance(rig[name], Camera)]:
         raise ValueError(
             f"{', '.join(names)}: not calibrated, and the classical baseline needs poses and depths"
         )
-    small = {name: reduced(image, longest).clamp(0, 1) for name, image in images.items()}
-    for name, image in small.items():
-        rig = rig.resize(name, (image.shape[-2], image.shape[-1]))
+    small = {}
+    for name, image in images.items():
+        range_of(name, image, rig[name].hw, exposed=True)
+        small[name] = reduced(image, longest).clamp(0, 1)
+        rig = rig.resize(name, (small[name].shape[-2], small[name].shape[-1]))
     views, back = undistort(Views.of(rig, small, alpha=alpha))
     image = classical_baseline(views.rig, views.images, alpha)
     return back(Frame(image, *torch.zeros(3, *image.shape[-2:]))).image
@@ -107,7 +113,7 @@ def classical(rig: Rig, images: Mapping[str, Tensor], alpha: str, beta: str) -> 
     far; the colour differences (for one band: the excess of beta over alpha) are warped back to alpha.
 
     Args:
-        images: images (C, h, w), 0..1, by camera, of the rig's sizes, which is not checked.
+        images: images (C, h, w), 0..1, by camera, of the rig's sizes.
         alpha: name of alpha, in grey or colour.
         beta: name of the beta, of three bands or one.
 
@@ -116,12 +122,16 @@ def classical(rig: Rig, images: Mapping[str, Tensor], alpha: str, beta: str) -> 
         see a pixel, by seen ones that are similar.
 
     Raises:
-        ValueError: for unknown or uncalibrated cameras, lenses, no depth range, another number of bands, and
-            cameras that look along the line between them or have one centre.
+        ValueError: for unknown or uncalibrated cameras, lenses, no depth range, or a near bound far too near,
+            images as `range_of` or of another number of bands, and cameras that look along the line between
+            them or have one centre.
         KeyError: for a camera without an image.
-        cv2.error: for disparities at the near bound for which there is not enough memory.
+        TypeError: for images that are no tensors.
     """
-    pair, mono, other = rig.pair(alpha, beta), luminance_of(images[alpha]), images[beta]
+    pair = rig.pair(alpha, beta)
+    for name in (alpha, beta):
+        range_of(name, images[name], rig[name].hw, exposed=True)
+    mono, other = grey_alpha(alpha, images[alpha]), images[beta]
     if len(other) not in (1, 3):
         raise ValueError(f"'{beta}' has {len(other)} bands: the classical baseline takes one or three")
     if pair.has_lens:
@@ -140,6 +150,7 @@ def classical(rig: Rig, images: Mapping[str, Tensor], alpha: str, beta: str) -> 
     return (mono + torch.from_numpy(difference)[None].to(mono)).clamp(0, 1)
 
 
+@checked
 def classical_fusion(
     alpha: Float[Tensor, "1 h w"], beta: Float[Tensor, "3 hb wb"], max_disparity: float
 ) -> Float[Tensor, "3 h w"]:
@@ -158,11 +169,14 @@ def classical_fusion(
         ones that are similar.
 
     Raises:
-        ValueError: for a `max_disparity` that is not positive.
+        ValueError: for a `max_disparity` that is not positive, and images of other shapes.
+        TypeError: for images that are no tensors of floats.
     """
     if not max_disparity > 0:
         raise ValueError(f"max_disparity must be positive, got {max_disparity}")
-    mono, colours = _planes(alpha)[..., 0], _resized(_planes(beta), alpha.shape[1:])
+    mono, colours = _planes(alpha)[..., 0], _planes(beta)
+    how = cv2.INTER_AREA if len(colours) > len(mono) else cv2.INTER_CUBIC
+    colours = cv2.resize(colours, mono.shape[::-1], interpolation=how)  # c' = (c + 0.5) s - 0.5
     sharpness = beta.shape[2] / alpha.shape[2]
     chroma = _warped_chroma(mono, colours, np.ones_like(mono), max_disparity, sharpness)
     return _recoloured(alpha, chroma)
@@ -185,13 +199,7 @@ def non_local_means(image: Float[Tensor, "c h w"], deviation: float) -> Float[Te
 
     pixels = image.movedim(0, -1).numpy()
     denoised = denoise_nl_means(
-        pixels,
-        patch_size=5,
-        patch_distance=6,
-        h=0.8 * deviation,
-        sigma=deviation,
-        fast_mode=True,
-        channel_axis=-1,
+        pixels, patch_size=5, patch_distance=6, h=0.8 * deviation, sigma=deviation, channel_axis=-1
     )
     return torch.from_numpy(np.ascontiguousarray(denoised.reshape(pixels.shape))).movedim(-1, 0).to(image)
 
@@ -233,7 +241,9 @@ def _rectified_plane(pair: Pair) -> _Plane:
     corners, z = _project(K @ rotation @ np.linalg.inv(K_alpha), ends)
     near, far = (float(d) for d in pair.depth_range)
     shift = -(rotation @ R.T @ t)[0] * focal / np.array([near * z.min(), far * z.max()])
-    max_disparity = float(np.ptp(shift))
+    max_disparity, across = float(np.ptp(shift)), float(np.ptp(corners[:, 0]))
+    if max_disparity > NEAREST * across:
+        raise ValueError(f"the near bound, {near:g}, means {max_disparity:.0f} pixels of disparity: raise it")
     K[:2, 2] = -corners.min(0) + [max_disparity, 0]
     sides = np.ceil(np.ptp(corners, axis=0) + np.array([max_disparity + 1, 1]))
     width, height = (int(side) for side in sides)
@@ -435,12 +445,6 @@ def _luma(colours: Image) -> Image:
 def _grid(shape: tuple[int, ...]) -> tuple[Image, Image]:
     rows, columns = np.mgrid[: shape[0], : shape[1]].astype(np.float32)
     return columns, rows
-
-
-def _resized(colours: Image, hw: torch.Size) -> Image:
-    """Resize colours by OpenCV, which obeys c' = (c + 0.5) s - 0.5."""
-    smaller = colours.shape[0] > hw[0]
-    return cv2.resize(colours, (hw[1], hw[0]), interpolation=cv2.INTER_AREA if smaller else cv2.INTER_CUBIC)
 
 
 def _sampled(image: Image, columns: Image, rows: Image, how: int = cv2.INTER_CUBIC) -> Image:

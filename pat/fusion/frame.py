@@ -29,7 +29,7 @@ class Frame(NamedTuple):
             the point and its position is right to a pixel; a network without matches has its own measure.
         half_width: (H, W), one over that unit: in 9 of 10 pixels the true inverse depth is within it of 1 /
             depth; NaN where depth is.
-        by_band: (C, H, W), the confidence of each band, where they are several cameras'; else None.
+        by_band: (C, H, W), float16, the confidence of each band, where they are several cameras'; else None.
     """
 
     image: Float[Tensor, "c h w"]

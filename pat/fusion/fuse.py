@@ -138,7 +138,7 @@ def fuse_frame(
         TypeError: for images, settings, corrections, fields or matches of another type.
         OSError: if a finished tile cannot be written to `store`.
     """
-    given = _given(FuseSettings, settings).align
+    given = of_kind(FuseSettings, settings).align
     settings = replace(settings, align=not differentiable if given is None else given)
     in_parts, luminance = settings.max_memory is not None or store is not None, settings.luminance
     _check_gradients(differentiable, in_parts=in_parts, noisy=bool(settings.noise))
@@ -149,7 +149,7 @@ def fuse_frame(
         alpha,
         network,
         settings,
-        corrections=corrections and _given(Corrections, corrections),
+        corrections=None if corrections is None else of_kind(Corrections, corrections),
         stored=store is not None,
         explain=explain,
         announce=announce,
@@ -236,13 +236,14 @@ def ready_frame(
     Raises:
         ValueError: for images or settings that do not fit the rig or the network, views that do not overlap,
             corrections of other cameras, and a memory limit that is too small.
-        TypeError: for images that are no tensors, an object that is no field, and a depth range of no two.
+        TypeError: for images that are no tensors, an object that is no field, a depth range of no two, and
+            settings of another type.
     """
-    say = explain or (lambda line: None)
+    limit, say = of_kind(FuseSettings, settings).limit, explain or (lambda line: None)
     least = LEAST_MATCHED if network.uses_matches else LEAST_BYTES
-    check_limit(math.prod(rig[rig.require(alpha)].hw), settings.limit, least)
+    check_limit(math.prod(rig[rig.require(alpha)].hw), limit, least)
     views = Views.of(rig, images, alpha=alpha, depth=settings.depth, field=settings.field)
-    check_dense(views, settings.limit)
+    check_dense(views, limit)
     views, low_light = denoised_views(views, settings.noise)
     check_bands(views, network.bands)
     if settings.noise == "auto" and low_light.noisy:
@@ -257,7 +258,7 @@ def ready_frame(
     plan = plan_frame(
         network,
         inputs,
-        limit=settings.limit,
+        limit=limit,
         estimate=announce is not None,
         stored=stored,
         before=0.0 if corrections else expected_work(inputs, settings.response, align=align),
@@ -288,12 +289,7 @@ def _check_gradients(differentiable: bool, *, in_parts: bool, noisy: bool) -> No
 @torch_in_one_thread()
 @without_autocast()
 def corrections_of(
-    images: Images,
-    rig: Rig,
-    *,
-    alpha: str,
-    network: FusionNetwork,
-    settings: FuseSettings = FuseSettings(),
+    images: Images, rig: Rig, *, alpha: str, network: FusionNetwork, settings: FuseSettings = FuseSettings()
 ) -> Corrections:
     """Estimate the corrections that `fuse` makes, to use them for other frames of the same cameras.
 
@@ -314,7 +310,7 @@ def corrections_of(
     return ready_frame(images, rig, alpha, network, settings, explain=None, announce=None).corrections
 
 
-def _given(kind: type[T], value: T) -> T:
+def of_kind(kind: type[T], value: T) -> T:
     """Return the value, if it is of this kind.
 
     Raises:
@@ -332,6 +328,6 @@ def matches_by(matcher: Matcher, inputs: Inputs) -> Matches:
         TypeError: for a result of another type.
         ValueError: for matches that `Matches.check` refuses. The matcher's own errors pass.
     """
-    matches = _given(Matches, matcher(inputs))
+    matches = of_kind(Matches, matcher(inputs))
     matches.check(inputs)
     return matches

@@ -12,6 +12,7 @@ from arraygeom import Rig
 
 from ..networks.protocol import FusionNetwork
 from .fuse import FuseSettings, fuse_frame
+from .views import range_of
 
 LONGEST = 96
 """Pixels of the longest side of an image on which gradients are tried."""
@@ -33,7 +34,7 @@ def without_gradient(
     whole pixels.
 
     Args:
-        images: tensors (C, H, W) by camera, of the rig's sizes: neither is checked. Others' do not count.
+        images: tensors (C, H, W) by camera, of the rig's sizes. Others' do not count.
         settings: settings of fusion, without `max_memory` and `noise`.
         free: patterns of the parameters to look at, as for `Rig.parameters`.
 
@@ -46,7 +47,8 @@ def without_gradient(
     """
     small = {name: image for name, image in images.items() if name in rig}
     for name, image in small.items():
-        h, w = image.shape[-2:]
+        h, w = rig[name].hw
+        range_of(name, image, (h, w), exposed=True)
         share = min(1.0, LONGEST / max(h, w))
         hw = max(1, round(h * share)), max(1, round(w * share))
         small[name], rig = interpolate(image[None].float(), hw, mode="area")[0], rig.resize(name, hw)

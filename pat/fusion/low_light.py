@@ -67,8 +67,8 @@ SETTINGS = LowLightSettings()
 
 in_tiles = partial(chunked, rows=1024, halo=128, axis=(-2, -1))
 """Function that denoises images in tiles of this side, with so many pixels around them."""
-shipped_denoiser = cache(load_denoiser)
-"""Function that returns the network that ships with the package, read once."""
+shipped_denoiser = cache(lambda device: load_denoiser().to(device))
+"""Function that returns the network that ships with the package on a device, read once for each."""
 
 
 class NoisyView(NamedTuple):
@@ -268,7 +268,7 @@ def noise_levels(images: Mapping[str, Tensor], noise: Noise | None) -> Mapping[s
         ValueError: for a `noise` of another kind.
     """
     check_noise(noise)
-    if noise == "auto" and max(map(shown_noise, images.values())) < SETTINGS.plain:
+    if noise == "auto" and max(map(shown_noise, images.values()), default=0.0) < SETTINGS.plain:
         return {}
     if isinstance(noise, str):
         return {name: NoiseLevel.estimated(image[None]) for name, image in images.items()}
@@ -297,12 +297,12 @@ def exposed(view: NoisyView, response: Response) -> NoisyView:
 def denoised(
     image: Float[Tensor, "b c h w"], deviation: Float[Tensor, "b c h w"]
 ) -> Float[Tensor, "b c h w"]:
-    """Denoise images on the CPU, with noise of this deviation; bands other than three are taken one by one.
+    """Denoise images with noise of this deviation; bands other than three are taken one by one.
 
     Returns:
-        Images without noise, in their own type, not clipped, detached.
+        Images without noise, in their own type and on their device, not clipped, detached.
     """
-    network, dtype = shipped_denoiser(), image.dtype
+    network, dtype = shipped_denoiser(image.device), image.dtype
     image, deviation = image.float(), deviation.float()
     if image.shape[1] == 3:
         return in_tiles(partial(without_noise, network.colour), image, deviation).to(dtype)

@@ -19,6 +19,7 @@ from PIL.PngImagePlugin import PngInfo
 from torch import Tensor
 
 from arraygeom import Camera, Rig
+from arraygeom.checks import check_above
 from arraygeom.io.native import write as rig_text
 from arraygeom.runtime.atomic import alone, write_text
 from arraygeom.runtime.chunks import chunked
@@ -121,7 +122,7 @@ def save_frame(
 
     Raises:
         ValueError: for bits that the format cannot hold, EXR without its extra, an image or confidence with
-            NaN or infinity.
+            NaN or infinity, and too few, too many or equal names of bands.
         FileExistsError: for files in the way that no fusion wrote.
         OSError: if files cannot be written. After any error those of a former frame stay.
     """
@@ -151,7 +152,9 @@ def save_frame(
             write_points(folder / "points.ply", points, frame.depth, picture_of(frame.image), along=along)
         image = linear_from_srgb(frame.image) if bits == 32 else frame.image
         bands = bands or ([] if len(image) in (1, 3) else [str(i + 1) for i in range(len(image))])
-        bands = list(file_names(bands).values()) if len({*bands}) == len(bands) else bands
+        if bands and not len({*bands}) == len(bands) == len(image):
+            raise ValueError(f"bands are {', '.join(bands)}: give a name of its own to each of {len(image)}")
+        bands = list(file_names(bands).values())
         for band, values in zip(bands, image):
             write_image(folder / f"{prefix}fused_{band}.{kind}", values[None], bits=bits)
         for band, confidence in zip(bands, () if frame.by_band is None else frame.by_band):
@@ -206,7 +209,12 @@ def describe_bands(frame: Frame, names: Sequence[str], kind: ImageFormat) -> str
 
 
 def depth_scale(near: float) -> float:
-    """Return counts per metre of a 16-bit depth image: a power of ten that makes `near` at most MOST / 20."""
+    """Return counts per metre of a 16-bit depth image: a power of ten that makes `near` at most MOST / 20.
+
+    Raises:
+        ValueError: for a `near` that is not above 0 and finite.
+    """
+    check_above(0, itself=False, near=near)
     return 10.0 ** math.floor(math.log10(MOST / 20 / near))
 
 
@@ -219,17 +227,19 @@ def write_depth(
 
     Args:
         depth: depth, metres or another unit of the rig's.
-        near: depth by which the scale is chosen, above 0; None for the nearest in `depth`, or 1 for none.
+        near: depth by which the scale is chosen; None for the nearest in `depth`, or 1 for none.
         along: kind of depth (`measured_along`).
 
     Returns:
         The scale in counts per metre (or that unit): a power of ten.
 
     Raises:
+        ValueError: as `depth_scale`.
         OSError: if the file cannot be written.
     """
     has_depth = depth.isfinite() & (depth > 0)
-    scale = depth_scale(near or float(depth[has_depth].min() if has_depth.any() else 1.0))
+    nearest = float(depth[has_depth].min() if has_depth.any() else 1.0)
+    scale = depth_scale(nearest if near is None else near)
 
     def counted(depth: Tensor, has_depth: Tensor) -> Tensor:
         return torch.where(has_depth, (depth.double() * scale).round().clamp(1, MOST), 0.0).to(torch.uint16)

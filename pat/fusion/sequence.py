@@ -34,7 +34,7 @@ from ..support.settings import physics, size
 from .corrections import Corrections
 from .frame import Frame
 from .frames import CachedFrames, Frames
-from .fuse import FuseSettings, corrections_of, fuse_frame
+from .fuse import FuseSettings, corrections_of, fuse_frame, of_kind
 from .low_light import noise_levels
 from .optical_flow import flow_between, warped
 from .steps import with_own_levels
@@ -97,7 +97,7 @@ class SequenceFusion:
 
     Raises:
         ValueError: for a negative or infinite speed; the rest is checked when it is used.
-        TypeError: for a speed that is no number.
+        TypeError: for a speed that is no number, and settings of another type.
     """
 
     network: FusionNetwork
@@ -109,6 +109,7 @@ class SequenceFusion:
 
     def __post_init__(self) -> None:
         check_above(0, speed=self.speed)
+        of_kind(FuseSettings, self.settings)
         cached = {n: f if isinstance(f, CachedFrames) else CachedFrames(f) for n, f in self.frames.items()}
         object.__setattr__(self, "frames", cached)
 
@@ -169,10 +170,10 @@ class SequenceFusion:
         Raises:
             ValueError: without keys, if none of those around it could be fused, or an image cannot be read.
             OSError: for an image file that is missing.
-            IndexError: for a number beyond alpha's frames; one below 0 is not refused.
+            IndexError: for a frame that alpha does not have, as one below 0.
         """
-        grey = self.grey(i)
-        fetched = ((key, fetch(key)) for key in self._around(i, keys))
+        around, grey = self._around(i, keys), self.grey(i)
+        fetched = ((key, fetch(key)) for key in around)
         sources = [self._warped(i, grey, key, colour) for key, colour in fetched if colour]
         if not sources:
             raise ValueError(f"frame {i}: none of the key frames around it could be fused")

@@ -236,7 +236,7 @@ def join(which: JoinsBands, views: Views) -> StepResult:
 
     def back(frame: Frame) -> Frame:
         by_band = frame.confidence.expand(len(order), -1, -1) if frame.by_band is None else frame.by_band
-        return frame._replace(image=frame.image[order], by_band=by_band[order])
+        return frame._replace(image=frame.image[order], by_band=by_band[order].half())
 
     cameras = {group[0]: tuple(group) for group in groups}
     joined_views = dataclasses.replace(views, images={views.alpha: views.own, **joined}, joined=cameras)

@@ -64,7 +64,13 @@ class Timeline:
         return self.rig[name].sensor.frame_rate or 1.0
 
     def time(self, name: str, i: int) -> float:
-        """Return the time at which frame i was recorded, seconds of the rig's clock."""
+        """Return the time at which frame i was recorded, seconds of the rig's clock.
+
+        Raises:
+            IndexError: for a frame that the camera does not have, as one below 0.
+        """
+        if not 0 <= i < self.counts[name]:
+            raise IndexError(f"'{name}' has no frame {i}: give 0 to {self.counts[name] - 1}")
         return self.rig[name].sensor.time_offset + i / self.rate(name)
 
     def nearest(self, name: str, time: float) -> int:

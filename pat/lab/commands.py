@@ -192,7 +192,6 @@ class DataInfo:
         Raises:
             FileNotFoundError: for a missing folder.
             ValueError: for a folder without complete scenes, and as `summarise` for a damaged one.
-            KeyError: for a farm.json without an entry that `summarise` reads.
         """
         from .farm.job import summarise
 

@@ -24,7 +24,7 @@ def blurred(images: Float[Tensor, "b 1 h w"], blurs: Sequence[float]) -> Float[T
         blurs: standard deviation for each image, pixels, as many as images; 0 leaves one as it is.
 
     Returns:
-        Images of the same shape and type; gradients, if they have some, need sides above about 4 deviations.
+        Images of the same shape and type, with gradients if they have some.
     """
 
     def one(image: Tensor, blur: float) -> Tensor:
@@ -34,9 +34,11 @@ def blurred(images: Float[Tensor, "b 1 h w"], blurs: Sequence[float]) -> Float[T
             from kornia.filters import gaussian_blur2d
 
             side = round(8 * blur + 1) | 1  # as OpenCV chooses it
-            return gaussian_blur2d(image[None, None], side, (blur, blur))[0, 0]
-        plane = np.ascontiguousarray(image.detach().cpu().numpy(), np.float32)
-        return torch.from_numpy(cv2.GaussianBlur(plane, (0, 0), blur)).to(image)
+            rows, columns = (np.pad(np.arange(n), side // 2, mode="reflect") for n in image.shape)
+            padded = image[rows[:, None], columns][None, None]  # kornia mirrors no more than the image itself
+            there = slice(side // 2, -(side // 2))
+            return gaussian_blur2d(padded, side, (blur, blur))[0, 0, there, there]
+        return torch.from_numpy(cv2.GaussianBlur(numpy_of(image), (0, 0), blur)).to(image)
 
     return torch.stack([one(p[0], blur) for p, blur in zip(images, blurs)])[:, None]
 

@@ -229,13 +229,16 @@ def box_around(points: Float[Tensor, "n 2"], hw: HW, halo: int, multiple: int) -
     Returns:
         Rows and columns: top, bottom (after the last), left, right; without points the first `multiple` of
         each, whatever `hw`.
+
+    Raises:
+        ValueError: for NaN.
     """
     if not len(points):
         return 0, multiple, 0, multiple
-    points = points.clamp(min=0).minimum(
-        points.new_tensor([hw[1] - 1, hw[0] - 1])
-    )  # own fields may be off it
+    points = points.clamp(min=0).minimum(points.new_tensor([hw[1] - 1, hw[0] - 1]))  # some may be off it
     corners = torch.stack([points.amin(0) - halo, points.amax(0) + halo + multiple])
+    if bool(corners.isnan().any()):
+        raise ValueError("points hold NaN: leave those out that are not known")
     (x0, y0), (x1, y1) = torch.div(corners, multiple, rounding_mode="floor").long() * multiple
     return max(int(y0), 0), min(int(y1), hw[0]), max(int(x0), 0), min(int(x1), hw[1])
 

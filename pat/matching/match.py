@@ -41,7 +41,8 @@ def match(inputs: Inputs, choice: Choice | None = None) -> Matches:
     matches are semi-global ones with a left-right check, without `chosen`, `stated` and `certainty`.
 
     Args:
-        inputs: alpha, of one channel and even sides, and the betas.
+        inputs: alpha, of one channel and even sides (whole multiples of 4 for betas of several bands without
+            `inputs.bands`), and the betas; none of less than 8 pixels a side.
         choice: network that chooses between candidate disparities; None for the one that ships. Not used
             without `inputs.learned`.
 
@@ -49,14 +50,17 @@ def match(inputs: Inputs, choice: Choice | None = None) -> Matches:
         The matches in each beta, with `colours` at alpha's view.
 
     Raises:
-        ValueError: for no beta, a beta whose field is not of straight segments, and an alpha of odd sides or
-            several channels. Images of less than 8 pixels a side may give a RuntimeError.
+        ValueError: for no beta, a beta whose field is not of straight segments, an alpha of other sides or
+            several channels, and images that are too small.
     """
     if inputs.alpha.shape[1] != 1:
         raise ValueError(f"alpha has {inputs.alpha.shape[1]} channels: what is matched has one")
-    if any(side % FINE for side in inputs.hw):
-        h, w = inputs.hw
-        raise ValueError(f"alpha has {w}x{h} pixels to match: pad both sides to whole multiples of {FINE}")
+    (h, w), betas = inputs.hw, [beta.image for beta in inputs.betas]
+    multiple = FINE * (1 + (inputs.bands is None and any(image.shape[1] > 1 for image in betas)))
+    if h % multiple or w % multiple:
+        raise ValueError(f"alpha has {w}x{h} pixels to match: pad both sides to multiples of {multiple}")
+    if (least := min(h, w, *(side for image in betas for side in image.shape[-2:]))) < 4 * FINE:
+        raise ValueError(f"an image to match has a side of {least} pixels: give {4 * FINE} or more")
     if not inputs.learned:
         return transferred(inputs, located(inputs))
     with torch.no_grad():

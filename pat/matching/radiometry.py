@@ -177,7 +177,7 @@ def stated_response(weights: Sequence[float]) -> Response:
         ValueError: unless there are three numbers, none negative, infinite or NaN, not all 0.
     """
     try:
-        values = torch.tensor([float(w) for w in weights], dtype=torch.float64)
+        values = torch.tensor([float(w + 0.0) for w in weights], dtype=torch.float64)  # no texts
     except (TypeError, ValueError):
         values = torch.zeros(0)
     if values.shape != (3,) or not bool((values >= 0).all() & (values.sum() > 0) & values.isfinite().all()):
@@ -222,19 +222,24 @@ def fit(
         alpha: alpha at the points.
         where: positions of the points in beta, in its width and height, from its middle, with which
             vignetting is estimated; None without.
-        enough: matched pixels as a share of those wanted, 1 or less, above 0. Below 1 wrong ones among them
+        enough: matched pixels as a share of those wanted, 0 to 1. Below 1 wrong ones among them
             could explain anything: only gain and gamma are fitted, and `explained` is divided by it.
 
     Returns:
         The response, on the CPU; Rec. 601's if that is likeliest, for too few points (`SETTINGS.points`;
         `explained` is 1 then), and where no bands' combination explains alpha (`explains` is False).
+
+    Raises:
+        ValueError: for another `enough`.
     """
+    if not 0 <= enough <= 1:
+        raise ValueError(f"enough is {enough}: give a share of the matches wanted, 0 to 1")
     most, fewest = SETTINGS.points
     step = max(alpha.numel() // most, 1)
     x, y = bands[:, ::step].double().cpu(), alpha[::step].double().cpu()
     place = y.new_zeros(len(y), 2) if where is None else where[::step].double().cpu()
     unclipped = (y > 0.02) & (y < 0.98) & (x > 0.01).all(0) & (x < 0.98).all(0)
-    if int(unclipped.sum()) < fewest:
+    if not enough or int(unclipped.sum()) < fewest:
         return Response.rec601()
     groups = _Groups.from_points(x[:, unclipped], y[unclipped], place[unclipped])
     luma, unlike = groups.most_probable(LUMA), groups.most_probable(UNLIKE)

@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
-from PIL import Image
 from torch import Tensor
 
 from arraygeom import Camera, pixel_grid, world_rays
@@ -93,14 +92,15 @@ def _pfm(path: Path) -> NDArray[np.float32]:
 
 def _stated_scale(path: Path) -> float | None:
     """Metres for each count as `write_depth` states them in a PNG file; None in other files."""
-    with Image.open(path) as image:
-        said = re.match(r"depth: (\S+) counts a metre", str(image.info.get("Description", "")))
+    with path.open("rb") as file:  # Pillow would refuse large ones
+        head, *_ = file.read(2**16).split(b"IDAT", 1)
+    said = re.match(rb"\x89PNG.*tEXtDescription\0depth: ([!-~]+) counts a metre", head, re.DOTALL)
     if said is None:
         return None
     with suppress(ValueError, ZeroDivisionError):
         if 0 < (scale := 1 / float(said[1])) < math.inf:
             return scale
-    raise ValueError(f"{path}: says {said[1]} counts a metre: give FILE,scale=METRES of a count")
+    raise ValueError(f"{path}: says {said[1].decode()} counts a metre: give FILE,scale=METRES of a count")
 
 
 def write_points(

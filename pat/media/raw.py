@@ -116,14 +116,16 @@ def demosaiced(raw: Float[Tensor, "1 h w"], pattern: str) -> Float[Tensor, "3 h 
         pattern: colours of the first two pixels of the first row, then of the second, such as "RGGB".
 
     Returns:
-        RGB image of the same size, type and device, clipped to 0..1; black if a side is under 3 pixels.
+        RGB image of the same size, type and device, clipped to 0..1.
 
     Raises:
-        ValueError: for another pattern, such as OpenCV's of two letters.
+        ValueError: for another pattern, such as OpenCV's of two letters, and a side under 3 pixels.
         RuntimeError: for values that require a gradient.
     """
     if pattern not in PATTERNS:
         raise ValueError(f"the filter pattern is {pattern!r}: wanted {' or '.join(PATTERNS)}")
+    if min(raw.shape[-2:]) < 3:
+        raise ValueError(f"a mosaic of {raw.shape[-1]}x{raw.shape[-2]} pixels: give 3 or more a side")
     code = getattr(cv2, f"COLOR_Bayer{pattern}2RGB_EA")
     counts = np.rint(raw[0].clamp(0, 1).cpu().numpy().astype(np.float64) * 65535).astype(np.uint16)
     colours = cv2.demosaicing(counts, code).astype(np.float32) / np.float32(65535)

@@ -29,9 +29,8 @@ def write_video(path: str | Path, frames: Iterable[Float[Tensor, "c h w"]], *, r
 
     Raises:
         ImportError: without the extra `video`.
-        ValueError: for no frames, frames of different sizes or under 2 x 2, another suffix, or a rate outside
-            .001 to 1000.
-        RuntimeError: for another number of channels.
+        ValueError: for no frames, frames of different sizes, under 2 x 2 or of other channels, another
+            suffix, or a rate outside .001 to 1000.
         OSError: if it cannot be written.
     """
     path = Path(path)
@@ -44,8 +43,8 @@ def write_video(path: str | Path, frames: Iterable[Float[Tensor, "c h w"]], *, r
         stream = None
         for frame in frames:
             h, w = (n // 2 * 2 for n in frame.shape[-2:])
-            if not (h and w):
-                raise ValueError(f"{path}: the frames of a video have at least 2 x 2 pixels")
+            if not (h and w and len(frame) in (1, 3)):
+                raise ValueError(f"{path}: the frames of a video are grey or RGB, of at least 2 x 2 pixels")
             pixels = np.ascontiguousarray(to_bytes(frame[..., :h, :w].expand(3, -1, -1)).transpose(1, 2, 0))
             if stream is None:
                 stream = file.add_stream("libx264", rate=Fraction(rate).limit_denominator(1000))

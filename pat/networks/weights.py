@@ -212,7 +212,7 @@ def find_weights(name: str | Path) -> Path:
     """Find a weights file, shipped with the package or the user's own.
 
     Args:
-        name: name of shipped weights ("mono-colour"), or a path; if absolute, .safetensors may be left out.
+        name: name of shipped weights ("mono-colour"), or else a path.
 
     Returns:
         The path.
@@ -220,9 +220,9 @@ def find_weights(name: str | Path) -> Path:
     Raises:
         FileNotFoundError: if neither exists.
     """
-    for path in (SHIPPED / f"{name}.safetensors", Path(name)):
-        if path.is_file():
-            return path
+    path = SHIPPED / f"{name}.safetensors" if str(name) in shipped() else Path(name)
+    if path.is_file():
+        return path
     raise FileNotFoundError(f"no weights '{name}': there is no such file{near(name, shipped())}")
 
 

@@ -117,8 +117,7 @@ class NoiseLevel:
         """
         linear = self.added_to == "light"
         light = linear_from_srgb(image) if linear else image
-        form = {"dtype": light.dtype, "device": light.device}
-        shot, read = (torch.as_tensor(x, **form) for x in (self.shot, self.read))
+        shot, read = (torch.as_tensor(x, dtype=light.dtype).to(light) for x in (self.shot, self.read))
         expected = (light.clamp(min=0) / shot.clamp(min=1e-9)).clamp(max=1e7)
         counted = torch.poisson(expected, generator=generator) * shot
         light = torch.where(shot > 1e-7, counted, light) + read * normal(light.shape, light, generator)

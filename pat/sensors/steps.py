@@ -14,6 +14,7 @@ from jaxtyping import Float, Int
 from torch import Generator, Tensor
 from torch.nn.functional import conv2d, interpolate, pad
 
+from arraygeom.checks import check_above, check_hw
 from arraygeom.pixels import HW, resize_matrix
 
 
@@ -109,15 +110,15 @@ class Resample(Step):
             usual antialiased resize with a = -0.5, which may leave 0..1.
 
     Raises:
-        ValueError: for a factor or size that is not positive, or another method.
+        ValueError: for a factor that is not above 0 and finite, a size that is not in whole pixels, or
+            another method.
     """
 
     to: float | HW
     method: Literal["area", "bicubic"] = "area"
 
     def __post_init__(self) -> None:
-        if not min(self.to if isinstance(self.to, tuple) else (self.to,)) > 0:
-            raise ValueError(f"resample: give a positive factor or a (height, width), got {self.to}")
+        check_hw(self.to) if isinstance(self.to, tuple) else check_above(0, itself=False, to=self.to)
         if self.method not in ("area", "bicubic"):
             raise ValueError(f"resample: method is 'area' or 'bicubic', got {self.method!r}")
 
@@ -163,12 +164,10 @@ class Noise(Step):
     read: float = 0.0
 
     def __post_init__(self) -> None:
-        if not (0 < self.full_well < math.inf and 0 <= self.read < math.inf):
-            got = f"{self.full_well:g} and {self.read:g}"
-            raise ValueError(f"noise: wanted full_well > 0 and read >= 0 electrons, got {got}")
+        check_above(0, itself=False, full_well=self.full_well)
+        check_above(0, read=self.read)
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
-
         variance = (image.clamp(min=0) * self.full_well + self.read**2) / self.full_well**2
         return image + (variance + 1e-20).sqrt() * normal(image.shape, image, generator)
 
@@ -186,14 +185,13 @@ class Quantise(Step):
     """Clipping to 0..1 and rounding to 2^bits levels; gradients pass as if only clipped.
 
     Attributes:
-        bits: bits of a value, 1 or more; fewer raise ValueError.
+        bits: bits of a value, 1 or more; fewer raise ValueError, other types than integers TypeError.
     """
 
     bits: int = 8
 
     def __post_init__(self) -> None:
-        if self.bits < 1:
-            raise ValueError(f"quantise: bits must be 1 or more, got {self.bits}")
+        check_above(1, whole=True, bits=self.bits)
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
         levels = 2**self.bits - 1
@@ -221,9 +219,7 @@ class Jitter(Step):
     normalisation: float = 0.03
 
     def __post_init__(self) -> None:
-        for name in ("gain", "gamma", "normalisation"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"jitter: {name} must be 0 or more, got {getattr(self, name):g}")
+        check_above(0, gain=self.gain, gamma=self.gamma, normalisation=self.normalisation)
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
         b, c = image.shape[:2]

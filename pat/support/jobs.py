@@ -136,7 +136,7 @@ class Workers:
             limit. A task in this process has none.
 
     Raises:
-        ValueError: for a `count` or `threads` below 1, and a `timeout` of 0 or less.
+        ValueError: for a `count` or `threads` below 1, and a `timeout` of 0 or less, or without end.
     """
 
     count: int = 1
@@ -148,7 +148,7 @@ class Workers:
     def __post_init__(self) -> None:
         if self.count < 1 or self.threads < 1:
             raise ValueError(f"{self.count} processes of {self.threads} threads: give 1 or more of each")
-        if self.timeout is not None and not self.timeout > 0:
+        if self.timeout is not None and not 0 < self.timeout <= threading.TIMEOUT_MAX:
             raise ValueError(f"timeout is {self.timeout} seconds: give more than 0, or None for no limit")
 
 

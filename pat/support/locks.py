@@ -50,7 +50,7 @@ def folder_lock(folder: Path) -> Iterator[None]:
 
 def _make(folder: Path) -> list[Path]:
     """Make a folder and its parents. Returns those that are new, innermost first."""
-    missing = [path for path in (folder, *folder.parents) if not path.exists()]
+    missing = [path for path in (folder, *folder.parents) if not os.path.exists(path)]
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -96,7 +96,8 @@ def _in_use(folder: Path, owner: dict[str, object], advice: str) -> ValueError:
 
 def _unusable(folder: Path, error: OSError) -> ValueError:
     place = Path(error.filename) if error.filename else folder
-    blocked = next((path for path in (folder, *folder.parents) if path.exists() and not path.is_dir()), None)
+    paths = (path for path in (folder, *folder.parents) if os.path.exists(path) and not os.path.isdir(path))
+    blocked = next(paths, None)  # `Path.exists` raises PermissionError
     place = place.parent if place.name in (LOCK, OWNER) else place
     reason = f"{blocked} is a file" if blocked else f"{place}: {error.strerror}"
     return ValueError(f"{folder}: cannot write there ({reason}): give another folder")

@@ -17,9 +17,9 @@ def nearest_points(
     """Find the nearest points of each query by a k-d tree (OpenCV's FLANN).
 
     Args:
-        points: points to search, `count` at least; finite, and rounded to float32, as are `queries`.
-        queries: points whose neighbours are wanted, one at least.
-        count: number of neighbours of each, one at least.
+        points: points to search, finite, and rounded to float32, as are `queries`.
+        queries: points whose neighbours are wanted.
+        count: number of neighbours of each, from one to as many as there are points.
         error: share by which a neighbour may be farther away than the one it stands for; 0 searches exactly.
 
     Returns:
@@ -27,9 +27,15 @@ def nearest_points(
         float32.
 
     Raises:
-        cv2.error: for fewer points than `count`; SystemError for none.
+        ValueError: for another `count`, points of other lengths, NaN and infinity.
     """
     points, queries = (np.ascontiguousarray(x, np.float32) for x in (points, queries))
+    finite = all(np.isfinite(x).all() for x in (points, queries))
+    if not (1 <= count <= len(points) and points.shape[1:] == queries.shape[1:] and finite):
+        got = f"{count} neighbours of points {queries.shape} among {points.shape}"
+        raise ValueError(f"{got}: give finite points of one length, and ask for one to as many as there are")
+    if not len(queries):
+        return np.zeros((0, count), np.int32), np.zeros((0, count), np.float32)
     tree = cv2.flann.Index(points, {"algorithm": KD_TREE, "leaf_max_size": 10})
     index, squared = tree.knnSearch(queries, count, params={"eps": error})
     return index, np.sqrt(squared)

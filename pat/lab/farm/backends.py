@@ -29,7 +29,7 @@ from pat.lab.synthesis.rendered import RENDER_FILE, RenderedFrame, frame_file, s
 from pat.lab.synthesis.rig_distribution import RigDistribution
 from pat.lab.synthesis.rigs import RigBatch, in_frame_of
 from pat.media.colour import linear_from_srgb
-from pat.support.schema import check_fields, from_document
+from pat.support.schema import check_fields, from_document, near
 
 FARTHEST = 50.0
 """Largest far bound of layered scenes, in multiples of the near one."""
@@ -133,8 +133,7 @@ class BlenderSettings:
 
     Raises:
         ValueError: for a generator without its `photos` or with photos it does not take, an unknown
-            generator (your own is not imported yet), and invalid settings.
-        KeyError: for another preset.
+            generator (your own is not imported yet), another preset, and invalid settings.
     """
 
     generator: str = "abstract"
@@ -153,8 +152,10 @@ class BlenderSettings:
         """Combine preset and own entries, with one thread by default: a farm has one worker for each core.
 
         Raises:
-            ValueError: naming the entry, for an invalid one.
+            ValueError: naming the entry, for an invalid one, and for another preset.
         """
+        if self.preset not in PRESETS:
+            raise ValueError(f"no preset '{self.preset}'{near(self.preset, PRESETS)}")
         settings = {**PRESETS[self.preset], "threads": 1, **self.settings}
         return from_document(RenderSettings, settings, "settings")
 

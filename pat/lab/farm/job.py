@@ -418,8 +418,7 @@ def summarise(root: Path) -> str:
     Raises:
         FileNotFoundError: for a missing folder.
         ValueError: for a folder without scenes, with an incomplete one, or whose first rig or a farm.json
-            cannot be read.
-        KeyError: for a farm.json that lacks an entry.
+            cannot be read, or lacks an entry.
     """
     from statistics import median
 
@@ -433,12 +432,19 @@ def summarise(root: Path) -> str:
         f"{len(folders)} scenes of {sizes}; "
         f"{size / 1e6 / len(folders):.2f} MB each, {size / 1e9:.2f} GB in all"
     )
-    facts = [json.loads((f / FACTS).read_text(encoding="utf-8")) for f in folders if (f / FACTS).is_file()]
-    if not facts:
+    figures = [_figures(f / FACTS) for f in folders if (f / FACTS).is_file()]
+    if not figures:
         return text
-    seconds, cpu = (median(f[key] for f in facts) for key in ("seconds", "cpu_seconds"))
-    memory, refused = max(f["memory_mb"] for f in facts), sum(f["attempt"] for f in facts)
+    seconds, cpu, memory, refused = zip(*figures)
     return (
-        f"{text}\na scene took {seconds:.1f} s, {cpu:.1f} s of a core (medians); workers had up to "
-        f"{memory:.0f} MB; {refused} seeds were refused by the check"
+        f"{text}\na scene took {median(seconds):.1f} s, {median(cpu):.1f} s of a core (medians); workers had "
+        f"up to {max(memory):.0f} MB; {sum(refused):.0f} seeds were refused by the check"
     )
+
+
+def _figures(path: Path) -> list[float]:
+    try:
+        facts = json.loads(path.read_text(encoding="utf-8"))
+        return [float(facts[key]) for key in ("seconds", "cpu_seconds", "memory_mb", "attempt")]
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path}: is damaged ({error!r}): remove the folder and render it again") from None

@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from arraygeom import Camera, Rig
+from arraygeom.checks import check_above
 from arraygeom.pixels import coarse_grid
+from arraygeom.runtime.warned import warn
 
 from .scene import (
     Key,
@@ -112,8 +114,8 @@ class Setting:
 def furnished(name: str, seed: int, rig: Rig, surface: Surface, moving: float) -> Scene:
     """Make a scene of 10 to 20 shapes in a room, each centred in one camera's depth range (`Setting`).
 
-    None is nearer to any camera. The walls are within the range of all cameras where such a room is found:
-    not for views over 150 degrees, or cameras opposed or far ahead of each other for the range.
+    None is nearer to any camera. The walls are within the range of all cameras where such a room is found; it
+    warns if not, as for views over 150 degrees, or cameras opposed or far ahead of each other for the range.
 
     Args:
         name: name of the generator, part of the seed.
@@ -130,6 +132,7 @@ def furnished(name: str, seed: int, rig: Rig, surface: Surface, moving: float) -
         ValueError: for a rig without a calibrated camera, a far bound below 5/3 of the near one, and a
             negative seed or `moving`.
     """
+    check_above(0, moving=moving)
     setting = Setting(rig, seeded(name, seed))
     room = _room(setting)
     count = int(setting.rng.integers(10, 21))
@@ -155,7 +158,7 @@ def furnished(name: str, seed: int, rig: Rig, surface: Surface, moving: float) -
 
 
 def _room(setting: Setting) -> _Room:
-    """Room around the cameras, its walls between near and far along every camera's axis."""
+    """Room around the cameras, its walls between near and far along every camera's axis; warns if not."""
     rng, camera = setting.rng, setting.cameras[0]
     rotation = Rotation.from_rotvec(np.radians(rng.uniform(-8, 8, 3)))
     R = (rotation * Rotation.from_matrix(camera.R.double().numpy())).as_matrix().T
@@ -174,6 +177,7 @@ def _room(setting: Setting) -> _Room:
             return room
         front = front if farthest <= 0.98 * setting.far else 0.93 * front
         half = half if nearest >= setting.near else 1.15 * half
+    warn(f"walls {nearest:.3g} to {farthest:.3g} m away: no room fits the cameras' depth range: widen that")
     return room
 
 

@@ -167,8 +167,8 @@ def load_config(name: str | Path) -> TrainConfig:
         FileNotFoundError: if it is neither.
         ValueError: naming the file and the entry, as `parse_config`.
     """
-    path = next((p for p in (RECIPES / f"{name}.yaml", Path(name)) if p.is_file()), None)
-    if path is None:
+    path = RECIPES / f"{name}.yaml" if str(name) in recipes() else Path(name)
+    if not path.is_file():
         raise FileNotFoundError(f"no recipe '{name}' (a file, or a shipped name){near(name, recipes())}")
     return parse_config(path.read_bytes(), str(path))
 

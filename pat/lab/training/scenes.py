@@ -162,12 +162,13 @@ def active_items(number: int, count: int, seed: int) -> list[int]:
     True
 
     Returns:
-        Numbers of at most `ACTIVE` items; one may be there twice, where a new random order begins.
+        Numbers of at most `ACTIVE` items, each once.
     """
     if count <= ACTIVE:
         return list(range(count))
     first = number // GROUPS_PER_EXCHANGE
-    return [_order(count, seed, i // count)[i % count] for i in range(first, first + ACTIVE)]
+    items = (_order(count, seed, i // count)[i % count] for i in range(first, first + 2 * ACTIVE))
+    return [*dict.fromkeys(items)][:ACTIVE]  # a new random order may begin with some of the last ones
 
 
 @lru_cache(8)

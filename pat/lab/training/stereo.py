@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 from torch import Generator, Tensor
 
 from arraygeom import Camera, Pose, intrinsics
@@ -219,8 +219,8 @@ def _header(file: Path) -> tuple[int, int, int]:
     try:
         with Image.open(file) as image:
             return image.height, image.width, 1 if image.mode[0] in "1LIF" else 3
-    except (OSError, UnidentifiedImageError):
-        raise ValueError(f"{file}: not an image that can be read: give a PNG, TIFF or JPEG") from None
+    except (OSError, Image.DecompressionBombError) as error:
+        raise ValueError(f"{file}: cannot be read ({error}): give a PNG, TIFF or JPEG") from None
 
 
 def _described(header: tuple[int, int, int]) -> str:

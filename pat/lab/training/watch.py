@@ -37,7 +37,7 @@ class Watch:
         tensorboard: True to log for TensorBoard too.
 
     Raises:
-        ValueError: for TensorBoard without its package, and a damaged line of the files (KeyError: no step).
+        ValueError: for TensorBoard without its package, and a damaged line of the files.
         OSError: if a file cannot be written.
     """
 
@@ -141,7 +141,10 @@ def _keep_lines(path: Path, step: int, step_of: Any, *, header: str = "") -> Non
     """Remove the lines of steps after `step`, and an incomplete last line."""
     text = path.read_text(encoding="utf-8") if path.is_file() else ""
     lines = text.splitlines(keepends=True)[bool(header) :]
-    earlier = [line for line in lines if line.endswith("\n") and step_of(line) <= step]
+    try:
+        earlier = [line for line in lines if line.endswith("\n") and step_of(line) <= step]
+    except (KeyError, TypeError, ValueError):
+        raise ValueError(f"{path}: has a line without its step: remove that, or give another `out`") from None
     write_text(path, header + "".join(earlier))
 
 

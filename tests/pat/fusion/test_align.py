@@ -369,6 +369,9 @@ def test_values_in_bfloat16_and_names_beyond_ascii(tmp_path):
 def test_one_band_and_packed_values(tmp_path):
     write_bands(tmp_path / "one.tif", np.ones((1, 8, 9), np.float32), ["x"], [None])
     assert read_image(tmp_path / "one.tif").shape == (1, 8, 9)
+    for names, waves in ((["x"], [None]), (["x", "y"], [None]), (["x"] * 3, [None] * 3)):
+        with pytest.raises(ValueError, match=r"two\.tif.*2 bands"):
+            write_bands(tmp_path / "two.tif", np.ones((2, 8, 9), np.float32), names, waves)
 
 
 def test_ndvi_is_of_light_where_the_sensors_are_stated():

@@ -15,9 +15,12 @@ from pat.fusion.checks import LowConfidenceWarning, noise_advice, warn_of_confid
 from pat.fusion.frame import Frame
 from pat.fusion.inputs import FrameInputs
 from pat.fusion.results import band_names, save_frame
+from pat.fusion.steps import join
+from pat.fusion.views import Views
 from pat.matching.inputs import Inputs
 from pat.networks.weights import load_weights
 from pat.sensors import NoiseLevel
+from tests.arraygeom.rigs import parallel_rig
 from tests.pat.commands import pat
 from tests.pat.fusion.test_results import frame_of
 
@@ -76,6 +79,23 @@ def test_bands_keep_their_own_values_where_levels_are_matched():
     assert frame.by_band.shape == frame.image.shape
     assert band_names(frame, ["a", "b"]) == ["a", "b"]
     assert torch.allclose(frame.by_band.amin(0).float(), frame.confidence, atol=2e-3)
+
+
+@pytest.mark.parametrize("by_band", [None, torch.rand(3, 6, 8).half()])
+def test_confidences_of_bands_have_one_type(by_band):
+    """However many betas were joined."""
+    rig = parallel_rig(8.0, (6, 8), {"mono": (), "a": (0.1,)}, (2.0, 50.0))
+    rig = Rig({**rig.cameras, "b": rig["a"], "c": rig["a"]}, depth=rig.depth)
+    views = Views.of(rig, {name: torch.rand(1, 6, 8) for name in rig.names}, alpha="mono")
+    _, back = join("all", views)
+    assert back(frame_of(3)._replace(by_band=by_band)).by_band.dtype == torch.float16
+
+
+@pytest.mark.parametrize("bands", [["red"], ["red", "nir", "red"], ["red", "nir", "edge", "far"]])
+def test_bands_are_never_left_out(bands, tmp_path):
+    with pytest.raises(ValueError, match="red"):
+        save_frame(frame_of(3), tmp_path, bands=bands)
+    assert not list(tmp_path.iterdir())
 
 
 def test_bands_are_files_by_name_with_their_confidences(tmp_path):

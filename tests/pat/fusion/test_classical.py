@@ -4,10 +4,19 @@ import pytest
 import torch
 
 from arraygeom import Camera, Pose, Rig
-from pat.fusion.classical import _rectified_plane, _regressed, classical, classical_baseline, classical_fusion
+from pat.fusion.classical import (
+    _rectified_plane,
+    _regressed,
+    classical,
+    classical_baseline,
+    classical_fusion,
+    classical_view,
+)
+from pat.fusion.gradients import without_gradient
 from pat.lab.data import StereoPair, middlebury_pairs
 from pat.lab.evaluation.protocols import mono_colour_task
 from pat.media.colour import luminance, to_luma_chroma
+from pat.networks.weights import load_weights
 from pat.support.metrics import score
 
 
@@ -70,15 +79,34 @@ def test_a_featureless_pair_takes_betas_colour():
     torch.testing.assert_close(result, beta.contiguous(), atol=1e-4, rtol=0)
 
 
-def test_a_beta_of_other_bands_than_one_and_three_is_refused():
+@pytest.mark.parametrize(
+    ("error", "said", "images"),
+    [
+        (ValueError, r"'beta'.*5", {"beta": torch.rand(5, 24, 32)}),
+        (ValueError, r"'alpha'.*4", {"alpha": torch.rand(4, 24, 32)}),
+        (ValueError, r"'alpha'.*32x20.*32x24", {"alpha": torch.rand(1, 20, 32)}),
+        (ValueError, r"'beta'.*30x24.*32x24", {"beta": torch.rand(3, 24, 30)}),
+        (TypeError, "'beta'.*ndarray", {"beta": np.ones((3, 24, 32), np.float32)}),
+    ],
+)
+@pytest.mark.parametrize("fuse", [classical, classical_view, without_gradient])
+def test_images_that_do_not_fit_are_refused(error, said, images, fuse):
     rig = rig_of(camera(200.0, (24, 32)), camera(200.0, (24, 32), t=[-0.1, 0.0, 0.0]), (2.0, 6.0))
-    with pytest.raises(ValueError, match=r"'beta'.*5"):
-        classical(rig, {"alpha": torch.rand(1, 24, 32), "beta": torch.rand(5, 24, 32)}, "alpha", "beta")
+    images = {"alpha": torch.rand(1, 24, 32), "beta": torch.rand(3, 24, 32), **images}
+    further = {classical_view: {"longest": 16}, without_gradient: {"network": load_weights("mono-colour")}}
+    named = {"beta": "beta"} if fuse is classical else further[fuse]
+    calls = {"rig": rig, "images": images, "alpha": "alpha", **named}
+    with pytest.raises(error, match=said):
+        fuse(**calls)
 
 
-def test_no_disparity_to_search_is_refused():
-    with pytest.raises(ValueError, match="max_disparity"):
-        classical_fusion(torch.rand(1, 20, 20), torch.rand(3, 20, 20), max_disparity=0.0)
+@pytest.mark.parametrize(
+    ("alpha", "beta", "most", "said"),
+    [(1, 3, 0.0, "max_disparity"), (1, 1, 9.0, "beta.*1, 20, 20"), (3, 3, 9.0, "alpha.*3, 20, 20")],
+)
+def test_no_disparity_to_search_and_other_bands_are_refused(alpha, beta, most, said):
+    with pytest.raises(ValueError, match=said):
+        classical_fusion(torch.rand(alpha, 20, 20), torch.rand(beta, 20, 20), max_disparity=most)
 
 
 def test_colour_follows_luminance_as_it_does_nearby():
@@ -161,15 +189,16 @@ def test_a_slanted_plane_seen_by_unrectified_cameras_is_coloured(pose):
 
 
 @pytest.mark.parametrize(
-    ("t", "complaint"),
+    ("t", "near", "complaint"),
     [
-        ([0.0, 0.0, 0.3], "line"),
-        ([0.05, 0.0, 0.3], "line"),
-        ([0.0, 0.0, 0.0], r"\bt\b"),
+        ([0.0, 0.0, 0.3], 2.0, "line"),
+        ([0.05, 0.0, 0.3], 2.0, "line"),
+        ([0.0, 0.0, 0.0], 2.0, r"\bt\b"),
+        ([-0.1, 0.0, 0.0], 1e-4, "near"),
     ],
 )
-def test_rigs_that_cannot_be_rectified_are_refused(t, complaint):
-    rig = rig_of(camera(200.0, (24, 32)), camera(200.0, (24, 32), t=t), (2.0, 6.0))
+def test_rigs_that_cannot_be_rectified_are_refused(t, near, complaint):
+    rig = rig_of(camera(200.0, (24, 32)), camera(200.0, (24, 32), t=t), (near, 6.0))
     images = {"alpha": torch.rand(1, 24, 32), "beta": torch.rand(3, 24, 32)}
     with pytest.raises(ValueError, match=complaint):
         classical(rig, images, "alpha", "beta")

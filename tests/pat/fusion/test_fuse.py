@@ -153,11 +153,16 @@ def test_halos_are_wide_enough_for_the_weights(folder, shared_data):
 
 
 WRONG = """
+import numpy as np
 import torch
 from pat import FuseSettings, fuse
 from pat.app.sample_array import load_sample
-from pat.fusion.fuse import fuse_frame
+from pat.fusion.align import align_frame, resampled_values
+from pat.fusion.aligned_files import save_aligned
+from pat.fusion.fuse import corrections_of, fuse_frame
+from pat.fusion.sequence import SequenceFusion
 from pat.media.images import write_image
+from pat.networks.weights import load_weights
 
 sample = load_sample()
 rig, images = sample.rig, sample.images
@@ -169,6 +174,7 @@ for use in (
     lambda: fuse(images, rig, alpha="mono", settings=FuseSettings(noise="much")),
     lambda: fuse(images, rig, alpha="mono", settings=FuseSettings(response="luma")),
     lambda: fuse(images, rig, alpha="mono", settings=FuseSettings(response=None)),
+    lambda: fuse(images, rig, alpha="mono", settings=FuseSettings(response=("1", "2", "3"))),
     lambda: fuse(images, rig, alpha="mono", settings=FuseSettings(noise=0.1)),
     lambda: fuse(images, rig, alpha="mono", settings=FuseSettings(noise={"mono": 200})),
     lambda: fuse([*images.values()], rig, alpha="mono"),
@@ -177,8 +183,14 @@ for use in (
     lambda: fuse(images, rig, alpha="mono", settings={"noise": None}),
     lambda: fuse_frame(images, rig, alpha="mono", network=None, settings={"noise": None}),
     lambda: fuse(images, rig, alpha="mono", corrections={"colour": 1}),
+    lambda: fuse_frame(images, rig, alpha="mono", network=load_weights("mono-colour"), corrections={}),
+    lambda: align_frame(images, rig, alpha="mono", network=load_weights("mono-colour"), settings={}),
+    lambda: corrections_of(images, rig, alpha="mono", network=load_weights("mono-colour"), settings={}),
+    lambda: SequenceFusion(None, rig, {}, "mono", settings={}),
     lambda: fuse(images, rig, alpha="mono", matcher=lambda inputs: 3),
     lambda: fuse(images, rig, alpha=0),
+    lambda: resampled_values(np.zeros((1, 4, 5)), np.zeros((1, 1, 2), np.float32), "lanczos"),
+    lambda: save_aligned(None, None, positions="csv"),
     lambda: write_image("x.png", torch.zeros(3, 8, 8, dtype=torch.uint8)),
 ):
     try:
@@ -199,6 +211,7 @@ def test_what_is_not_what_it_should_be_is_refused_in_a_line():
         "noise is 'estimate', 'auto' or a NoiseLevel of each camera; got 'much'",
         "response is 'fit', 'rec601' or three weights; got 'luma'",
         "a response is three weights, of red, green and blue, none negative; got None",
+        "a response is three weights, of red, green and blue, none negative; got ('1', ",
         "noise is 'estimate', 'auto' or a NoiseLevel of each camera; got 0.1: give {NAME",
         "noise is 'estimate', 'auto' or a NoiseLevel of each camera; got {'mono': 200}: give {NAME",
         "an image is a Tensor without a name",
@@ -207,8 +220,14 @@ def test_what_is_not_what_it_should_be_is_refused_in_a_line():
         "settings are a dict",
         "wanted FuseSettings, got a dict",
         "wanted Corrections, got a dict",
+        "wanted Corrections, got a dict",
+        "wanted FuseSettings, got a dict",
+        "wanted FuseSettings, got a dict",
+        "wanted FuseSettings, got a dict",
         "wanted Matches, got a int",
         "name is a int",
+        "interpolation is 'lanczos': wanted nearest",
+        "positions is 'csv': wanted npy",
         "x.png: the image to write is uint8: give floats in 0..1",
     )
     lines = done.stdout.splitlines()

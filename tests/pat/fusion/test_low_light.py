@@ -371,3 +371,16 @@ def test_noise_that_shows_plainly_is_removed_unasked(network, fused):
     clean = {name: image * 255 // 1 / 255 for name, image in sample.images.items()}
     assert max(map(shown_noise, clean.values())) < 4 / 255
     assert not noise_levels(clean, "auto")
+    assert noise_levels({}, "auto") == {}
+
+
+@pytest.mark.parametrize("bands", [2, 3])
+def test_the_denoiser_is_where_the_image_is(bands, monkeypatch):
+    def without_noise(denoise, image, deviation):
+        assert {weights.device for weights in denoise.parameters()} == {image.device}
+        return image
+
+    monkeypatch.setattr("pat.fusion.low_light.without_noise", without_noise)
+    for device in ("meta", "cpu"):
+        image = torch.zeros(1, bands, 16, 16, device=device)
+        assert denoised(image, image).device.type == device

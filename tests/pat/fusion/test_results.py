@@ -61,6 +61,17 @@ def test_depth_in_16_bits_says_its_scale(tmp_path):
         assert image.text["Description"].startswith("depth: 1000 counts a metre; 0 is unknown")
         assert np.asarray(image).astype(int).tolist() == [[1234, 7000, 0, 65535]]
     assert (depth_scale(0.3), depth_scale(5.0), depth_scale(50.0)) == (10000, 100, 10)
+    for near in (-1.0, 0.0, float("inf"), float("nan")):
+        with pytest.raises(ValueError, match="near"):
+            write_depth(tmp_path / "d.png", depth, near=near)
+
+
+def test_an_image_that_is_none_is_named_as_it_would_be_called(tmp_path):
+    """Not by the temporary file."""
+    frame = frame_of(1)
+    frame.confidence[0, 0] = torch.nan
+    with pytest.raises(ValueError, match=re.escape(str(tmp_path / "confidence.png"))):
+        save_frame(frame, tmp_path)
 
 
 def test_fused_images_say_that_they_are_srgb(tmp_path):

@@ -142,6 +142,17 @@ def test_colours_mix_by_confidence_which_disagreement_lowers():
     torch.testing.assert_close(frame.half_width, 0.1 * sure)
 
 
+@pytest.mark.parametrize("i", [-1, 2])
+def test_a_frame_that_alpha_lacks_is_refused(i):
+    """Frame -1 was the last one at a wrong time."""
+    frames, _ = moving.recording(2)
+    job = SequenceFusion(load_weights("mono-colour"), moving.rig(), frames, "fast")
+    keys = job.timeline.key_frames()
+    for act in (lambda: job.frame(i, keys, lambda key: None), lambda: job.alone(i), lambda: job.keys_of([i])):
+        with pytest.raises(IndexError, match="'fast'"):
+            act()
+
+
 def test_a_speed_that_is_none_is_refused_at_once():
     frames, _ = moving.recording(2)
     for speed in (-3.0, float("nan"), float("inf")):

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from arraygeom import Local, pixel_grid
+from arraygeom import Epipolar, Local, pixel_grid
 from arraygeom.fields.grid import FieldOnGrid
 from pat import FuseSettings, fuse
 from pat.fusion.inputs import frame_inputs
@@ -74,6 +74,8 @@ def test_explicit_positions_of_a_part_are_never_all_held(flat):
     positions = window(rig.pair("mono", "colour"), pixel_grid((H, W))[16:48:2, 32:64:2].reshape(-1, 2))
     assert box == box_around(positions.xy[positions.mask], (H, W), inputs.beta_halo, inputs.multiple)
     assert max(asked) <= W
+    with pytest.raises(ValueError, match="NaN"):
+        box_around(torch.tensor([[3.0, 4.0], [torch.nan, 5.0]]), (H, W), 2, 2)
 
 
 def test_positions_are_where_the_wall_is(inputs):
@@ -136,6 +138,25 @@ def test_matches_of_other_inputs_are_refused(network, inputs):
         network(inputs, Matches(found.betas * 2))
     with pytest.raises(ValueError, match="in 2 betas"):
         transferred(inputs, Matches(found.betas * 2))
+
+
+@pytest.mark.parametrize("learned", [True, False])
+@pytest.mark.parametrize(
+    ("hw", "beta_hw", "bands"),
+    [
+        ((2, 2), (2, 2), 1),
+        ((6, 40), (6, 40), 3),
+        ((16, 16), (4, 4), 3),
+        ((16, 16), (1, 1), 1),
+        ((10, 10), (10, 10), 3),
+    ],
+)
+def test_images_too_small_to_match_or_not_padded_are_refused(hw, beta_hw, bands, learned):
+    rig = parallel_rig(8.0, hw, {"mono": (), "beta": (BASELINE,)}, (2.0, 50.0)).resize("beta", beta_hw)
+    field = FieldOnGrid.from_field(Epipolar(), rig.pair("mono", "beta"))
+    inputs = Inputs.from_images(torch.rand(1, 1, *hw), [torch.rand(1, bands, *beta_hw)], [field])
+    with pytest.raises(ValueError, match=r"pixels"):
+        match(replace(inputs, learned=learned))
 
 
 def test_an_alpha_in_colour_is_refused(inputs):

@@ -1,9 +1,10 @@
 """Moments of images: whole, where a weight is, and local."""
 
 import numpy as np
+import pytest
 import torch
 
-from pat.matching.filters import LocalMoments, box_mean
+from pat.matching.filters import LocalMoments, blurred, box_mean
 from pat.matching.normalisation import Moments, equalising_blurs, mean_moments, moments, normalised
 
 
@@ -64,3 +65,13 @@ def test_images_of_few_rows_are_as_sharp_as_their_columns_are():
     (own,), (other,) = equalising_blurs(one, 0.3 * one)
     assert 0 < own < 3
     assert other == 0
+
+
+@pytest.mark.parametrize("hw", [(40, 50), (9, 50), (3, 4), (1, 1)])
+def test_images_that_want_gradients_are_blurred_alike(hw):
+    images = torch.rand(3, 1, *hw)
+    wanting = images.clone().requires_grad_()
+    found = blurred(wanting, [0.0, 0.8, 3.0])
+    torch.testing.assert_close(found.detach(), blurred(images, [0.0, 0.8, 3.0]), atol=1e-5, rtol=0)
+    found.sum().backward()
+    assert wanting.grad.isfinite().all()

@@ -239,3 +239,11 @@ def test_fusion_of_another_response():
 def test_wrong_responses_are_refused(wrong):
     with pytest.raises(ValueError, match="weights"):
         stated_response(wrong)
+
+
+def test_a_share_of_matches_that_is_none_is_refused():
+    bands = torch.rand(3, 400)
+    assert fit(bands, combined(bands[..., None])[0, :, 0], enough=0).is_rec601
+    for enough in (-1.0, 1.5, float("nan")):
+        with pytest.raises(ValueError, match="enough"):
+            fit(bands, bands[0], enough=enough)

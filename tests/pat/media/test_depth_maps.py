@@ -55,6 +55,12 @@ def test_the_scale_that_our_own_file_states_is_taken(tmp_path):
     assert float((read_depth(tmp_path / "depth_16.png") - 8 * DEPTH).abs().max()) < 6e-3
 
 
+def test_maps_that_pillow_takes_for_an_attack_are_read(tmp_path, monkeypatch):
+    write_depth(tmp_path / "depth_16.png", 8 * DEPTH)
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 100)
+    assert float((read_depth(tmp_path / "depth_16.png") - 8 * DEPTH).abs().max()) < 6e-3
+
+
 def test_what_is_no_depth_map_is_refused(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"none\.tif"):
         read_depth(tmp_path / "none.tif")

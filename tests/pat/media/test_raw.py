@@ -10,6 +10,7 @@ from experiments.sensors import Mosaic
 from pat.fusion.aligned_files import RecordedFiles
 from pat.fusion.views import ViewFiles
 from pat.media.colour import linear_from_srgb, luminance, srgb_from_linear
+from pat.media.depth_maps import read_depth
 from pat.media.images import write_image
 from pat.media.raw import demosaiced, develop, developed, match_luminance
 
@@ -72,19 +73,33 @@ def test_recorded_values_behind_a_mosaic_are_colours_in_their_own_counts(tmp_pat
     assert np.abs(found["a"] / (4095 if bits == 12 else 1) - demosaiced(raw, "RGGB").numpy()).mean() < 3e-4
 
 
-def test_packed_tiffs_need_no_bits_and_follow_them(tmp_path):
-    """A TIFF with 12 bits a value, two values in three bytes, written here by hand."""
-    values = counts(light(channels=1), bits=12, black=0)[0]
-    bits = "".join(f"{v:012b}" for v in values.ravel())
-    data = int(bits, 2).to_bytes(len(bits) // 8, "big")
+@pytest.mark.parametrize("bits", [12, 10])
+def test_packed_tiffs_need_no_bits_and_follow_them(tmp_path, bits):
+    """A TIFF with 12 bits a value, two values in three bytes, or 10, written here by hand."""
+    values = counts(light(channels=1), bits=bits, black=0)[0]
+    digits = "".join(f"{v:0{bits}b}" for v in values.ravel())
+    data = int(digits, 2).to_bytes(len(digits) // 8, "big")
     h, w = HW
-    tags = [(256, w), (257, h), (258, 12), (259, 1), (262, 1), (273, 8), (277, 1), (278, h), (279, len(data))]
+    tags = [
+        (256, w),
+        (257, h),
+        (258, bits),
+        (259, 1),
+        (262, 1),
+        (273, 8),
+        (277, 1),
+        (278, h),
+        (279, len(data)),
+    ]
     entry = b"".join(np.array([t, 4], "<u2").tobytes() + np.array([1, v], "<u4").tobytes() for t, v in tags)
     head = b"II*\0" + np.array([8 + len(data)], "<u4").tobytes()
     (tmp_path / "a.tif").write_bytes(head + data + np.array([len(tags)], "<u2").tobytes() + entry + bytes(4))
-    for given in (None, 12):
+    for given in (None, bits):
         read = ViewFiles(rig(a=Sensor(coding="linear", bits=given)), {"a": tmp_path / "a.tif"}, alpha="a")
-        assert (linear_from_srgb(read["a"]) - light(channels=1)).abs().max() < 0.6 / 4095
+        assert (linear_from_srgb(read["a"]) - light(channels=1)).abs().max() < 0.6 / (2**bits - 1)
+    assert torch.equal(
+        read_depth(tmp_path / "a.tif").nan_to_num(), torch.from_numpy(values * np.float32(0.001))
+    )
 
 
 @pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG"])
@@ -175,6 +190,10 @@ def test_a_mosaic_makes_little_false_colour():
     assert ours < 0.7 * of_plain
 
 
-def test_a_pattern_by_opencvs_two_letters_is_refused():
+def test_a_pattern_by_opencvs_two_letters_and_mosaics_without_neighbours_are_refused():
     with pytest.raises(ValueError, match="'BG'"):
         demosaiced(light(channels=1), "BG")
+    for hw in ((2, 6), (6, 2), (1, 1)):
+        with pytest.raises(ValueError, match=f"{hw[1]}x{hw[0]}"):
+            demosaiced(torch.rand(1, *hw), "RGGB")
+    assert demosaiced(torch.full((1, 3, 3), 0.5), "RGGB").min() > 0.4

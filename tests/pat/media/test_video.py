@@ -59,6 +59,8 @@ def test_what_goes_wrong_leaves_no_file(tmp_path):
         write_video(tmp_path / "a.mp4", [torch.zeros(3, 32, 32), torch.zeros(3, 32, 34)])
     with pytest.raises(ValueError, match="2 x 2"):
         write_video(tmp_path / "a.mp4", frames(1, (1, 9)))
+    with pytest.raises(ValueError, match="RGB"):
+        write_video(tmp_path / "a.mp4", [torch.zeros(2, 32, 32)])
     with pytest.raises(ValueError, match="at least one"):
         write_video(tmp_path / "a.mp4", [])
     with pytest.raises(ValueError, match=r"\.mp4"):

@@ -13,7 +13,15 @@ from pat.networks.configs import GuidedPATConfig, PATConfig
 from pat.networks.denoiser import DenoiserConfig
 from pat.networks.guided import GuidedPAT
 from pat.networks.paper import PAT
-from pat.networks.weights import FORMAT, SHIPPED, load_weights, new_network, save_weights, shipped
+from pat.networks.weights import (
+    FORMAT,
+    SHIPPED,
+    find_weights,
+    load_weights,
+    new_network,
+    save_weights,
+    shipped,
+)
 
 NETWORKS = [
     PAT(PATConfig(betas=2, dim=8)),
@@ -44,6 +52,12 @@ def test_shipped_weights_load_and_are_small():
 def test_what_is_not_weights_is_named(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"'mono-color'.*mono-colour"):
         load_weights("mono-color")
+    save_weights(NETWORKS[0], tmp_path / "mine.safetensors")
+    for name in (str(tmp_path / "mine"), f"../shipped/{shipped()[0]}", ""):
+        with pytest.raises(FileNotFoundError):  # a name is one of the package, or a whole path
+            find_weights(name)
+    (tmp_path / "mine").touch()
+    assert find_weights(str(tmp_path / "mine")) == tmp_path / "mine"
     cut = tmp_path / "cut.safetensors"
     save_weights(NETWORKS[0], cut)
     cut.write_bytes(cut.read_bytes()[:1000])

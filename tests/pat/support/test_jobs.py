@@ -1,5 +1,6 @@
 """Tasks: once each, resumed, the same in other processes; killed workers and commands lose nothing."""
 
+import math
 import os
 import re
 import signal
@@ -185,5 +186,6 @@ def test_the_time_left_is_right_within_half_once_two_tasks_are_done(seconds, mon
 
 
 def test_a_time_limit_leaves_some_time():
-    with pytest.raises(ValueError, match="timeout"):
-        Workers(timeout=0)
+    for timeout in (0, math.inf, 1e30, math.nan):
+        with pytest.raises(ValueError, match="timeout"):
+            Workers(timeout=timeout)

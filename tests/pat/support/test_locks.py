@@ -6,6 +6,7 @@ import signal
 import socket
 import subprocess
 import sys
+from errno import EACCES
 from pathlib import Path
 
 import pytest
@@ -76,6 +77,18 @@ def test_a_folder_left_empty_is_removed(tmp_path):
     with folder_lock(tmp_path / "a" / "b"):
         (tmp_path / "a" / "kept").touch()
     assert [p.name for p in (tmp_path / "a").iterdir()] == ["kept"]
+
+
+def test_a_folder_that_may_not_be_looked_into_is_named(tmp_path, monkeypatch):
+    """`Path.exists` and `Path.is_dir` raise there."""
+
+    def forbidden(path, *_, **__):
+        raise PermissionError(EACCES, "Permission denied", str(path))
+
+    for name in ("stat", "mkdir"):
+        monkeypatch.setattr(Path, name, forbidden)
+    with pytest.raises(ValueError, match="Permission denied"), folder_lock(tmp_path / "secret" / "out"):
+        pass
 
 
 def test_what_cannot_be_a_folder_is_named(tmp_path):

@@ -13,7 +13,7 @@ FOLDER = Path(sys.prefix) / "blender"
 
 
 def blender_python() -> str:
-    """Return the path of a Python interpreter for Blender: this one if it has bpy, else that of `FOLDER`.
+    """Return the path of a Python interpreter that has bpy: this one, or else that of `FOLDER`.
 
     Raises:
         ValueError: in one line with the command to install it, if OpenEXR or such an interpreter is missing.
@@ -24,7 +24,7 @@ def blender_python() -> str:
     if find_spec("bpy") is not None:
         return sys.executable
     python = FOLDER / ("Scripts/python.exe" if sys.platform == "win32" else "bin/python")
-    if not python.is_file():
+    if not (python.is_file() and any(FOLDER.rglob("site-packages/bpy"))):
         raise ValueError(
             "rendering needs Blender as a Python module, in an environment of its own: `make synthesis` in a "
             f"checkout, or python3.11 -m venv {FOLDER} && {python} -m pip install 'bpy==5.0.1'"

@@ -77,7 +77,7 @@ class Studio:
 
         Raises:
             ValueError: for what Blender refuses, in one line; no further frame can be rendered then.
-            BrokenProcessPool: if its process dies, as at other errors in it.
+            BrokenProcessPool: if its process dies.
         """
         places = [_place(thing.motion, time) for thing in self.scene.objects]
         self._ask(places=places, spectrum=spectrum, path=str(self.path), **_aim(camera))

@@ -18,7 +18,16 @@ from arraygeom import Camera, Pose, Rig, intrinsics
 from arraygeom.distortion import Distortion
 from pat.app.cli.main import main
 from pat.lab.farm.backends import LayeredSettings, rig_from_alpha
-from pat.lab.farm.job import RenderConfig, Shard, check_space, publish, render, scene_seed, write_manifest
+from pat.lab.farm.job import (
+    RenderConfig,
+    Shard,
+    check_space,
+    publish,
+    render,
+    scene_seed,
+    summarise,
+    write_manifest,
+)
 from pat.lab.synthesis.rendered import Rendered
 from pat.support.jobs import JobError
 from tests.pat.lab.synthesis.scenes import needs_blender
@@ -104,6 +113,10 @@ def test_a_job_is_rendered_killed_and_resumed(config, tmp_path, capfd):
     assert (frame.index > 0).all()
     main(["lab", "data", "info", str(out)])
     assert f"{len(facts)} scenes of mono 96x64, colour 80x60" in capfd.readouterr().out
+    for text in ('{"seconds": 3}', "damaged", "[]"):
+        (out / "scenes/000001/farm.json").write_text(text)
+        with pytest.raises(ValueError, match=r"000001/farm\.json"):
+            summarise(out)
 
 
 @pytest.mark.slow

@@ -45,6 +45,19 @@ def test_moving_scenes_move():
     assert {o.motion.keys[-1].time for o in moving} == {2.0}
 
 
+def test_time_does_not_run_back():
+    with pytest.raises(ValueError, match="moving"):
+        abstract(3, unlike_cameras(), moving=-1.0)
+
+
+def test_walls_out_of_range_are_said():
+    """Of cameras that look at each other each sees a wall behind the other."""
+    one = Camera(K=intrinsics(60.0, (48, 64)), cam_from_world=posed(), hw=(48, 64))
+    other = one.replace(cam_from_world=posed((0, np.pi, 0), (0.0, 0.0, 19.0)))
+    with pytest.warns(UserWarning, match="walls"):
+        abstract(0, Rig({"a": one, "b": other}, depth=(2.0, 20.0)))
+
+
 def test_a_rig_without_depths_gets_those_of_the_paper():
     camera = Camera(K=intrinsics(60.0, (48, 64)), cam_from_world=posed(), hw=(48, 64))
     assert abstract(0, Rig({"a": camera})).depth == (2.0, 20.0)

@@ -97,6 +97,8 @@ def test_a_recipe_that_is_no_text_is_named(tmp_path):
     recipe.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(ValueError, match=r"recipe[.]yaml: not valid YAML"):
         load_config(recipe)
+    with pytest.raises(FileNotFoundError, match="recipe"):  # a name is one of the package
+        load_config(recipe.with_suffix(""))
 
 
 def test_numbers_as_people_write_them():

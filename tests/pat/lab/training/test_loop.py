@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import socket
 import subprocess
@@ -21,6 +22,7 @@ from pat.lab.training.loop import rate_at, train
 from pat.lab.training.losses import validation
 from pat.lab.training.processes import Process
 from pat.lab.training.samples import SampleSource, made_ahead, scenes
+from pat.lab.training.watch import Watch
 from pat.networks.configs import PATConfig
 from pat.networks.weights import find_weights, load_weights, new_network, save_weights
 from pat.support.locks import folder_lock
@@ -269,6 +271,15 @@ def test_schedules():
     assert rate_at(warm, 50, 0.5) == pytest.approx(0.5)
     halving = TrainConfig(rate=1.0, schedule="halving", warmup=0)
     assert [rate_at(halving, 1, done) for done in (0.3, 0.4, 0.8)] == [1, 0.5, 0.25]
+
+
+@pytest.mark.parametrize(
+    ("name", "line"), [("log.jsonl", '{"psnr": 3}'), ("log.jsonl", "3"), ("steps.csv", "a,b,c,d")]
+)
+def test_a_damaged_line_is_named_by_its_file(tmp_path, name, line):
+    (tmp_path / name).write_text(f"step,loss\n{line}\n" if name == "steps.csv" else f"{line}\n")
+    with pytest.raises(ValueError, match=re.escape(str(tmp_path / name))):
+        Watch(tmp_path, 1, 1, tensorboard=False)
 
 
 def test_a_run_whose_checkpoints_are_all_damaged_does_not_begin_again(folder, whole):

@@ -83,3 +83,9 @@ def test_a_recipe_takes_its_batches_from_them(pair):
     config = TrainConfig(measured=1.0, measured_from=(pair.parent,), hw=HW, batch=1, held_out=2)
     with pytest.raises(ValueError, match="too few"):  # one pair cannot be learned from and held out
         scenes(config)
+
+
+def test_an_image_beyond_pillows_limit_is_named(pair, monkeypatch):
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 100)
+    with pytest.raises(ValueError, match=r"\.png"):
+        MeasuredPairs([pair], hw=HW)

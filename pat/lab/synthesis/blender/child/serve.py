@@ -16,7 +16,7 @@ from .build import build
 
 
 def serve() -> None:
-    """Answer requests on standard input until it ends, or one raises ValueError; other errors pass.
+    """Answer requests on standard input until it ends, or one raises an error, which is the last answer.
 
     An answer is a line of JSON: {"version": Blender's} to the first, {} to others, {"error": one line}.
     """
@@ -42,8 +42,9 @@ def _answers(requests: Iterator[Any]) -> Iterator[dict[str, str]]:
         for request in requests:
             stage.render(request)
             yield {}
-    except ValueError as error:
-        yield {"error": str(error)}
+    except (LookupError, RuntimeError, TypeError, ValueError) as error:
+        kind = "" if type(error) is ValueError else f"{type(error).__name__}: "
+        yield {"error": kind + " ".join(str(error).split())}
 
 
 class Stage:

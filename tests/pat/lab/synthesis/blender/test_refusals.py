@@ -11,7 +11,7 @@ import torch
 from arraygeom.camera import Camera, intrinsics
 from arraygeom.rig import Rig
 from pat.lab.synthesis.blender import RenderSettings, environment, render, studio, task
-from pat.lab.synthesis.blender.child import compat
+from pat.lab.synthesis.blender.child import compat, serve
 from pat.lab.synthesis.blender.settings import PRESETS
 from tests.pat.lab.synthesis.scenes import posed, room_scene, unlike_cameras
 
@@ -65,6 +65,9 @@ def test_what_is_missing_is_named_with_what_installs_it(missing, monkeypatch, tm
         environment.blender_python()
     (tmp_path / "bin").mkdir()
     (tmp_path / "bin" / "python").touch()
+    with pytest.raises(ValueError, match=rf"pip install .*{missing}"):  # an interpreter without bpy
+        environment.blender_python()
+    (tmp_path / "lib" / "python3.11" / "site-packages" / "bpy").mkdir(parents=True)
     if missing == "bpy":
         assert environment.blender_python() == str(tmp_path / "bin" / "python")
 
@@ -74,6 +77,17 @@ def test_the_childs_code_needs_nothing_of_the_rest():
     command = [sys.executable, "-I", "-c", code, str(Path(environment.__file__).parent)]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert not {"pat", "arraygeom", "torch", "scipy"} & set(done.stdout.split())
+
+
+@pytest.mark.parametrize("error", [ValueError, KeyError, TypeError, RuntimeError])
+def test_an_error_in_the_child_is_an_answer(error, monkeypatch):
+    def fail(request):
+        raise error("no\nmesh")
+
+    monkeypatch.setattr(serve, "Stage", fail)
+    (answer,) = serve._answers(iter([None]))
+    assert "mesh" in answer["error"]
+    assert "\n" not in answer["error"]
 
 
 def test_missing_libraries_are_named_with_the_packages_that_bring_them(monkeypatch):
