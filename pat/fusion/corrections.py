@@ -216,7 +216,9 @@ def _reduced_frame(frame: FrameInputs) -> FrameInputs:
         image = padded(avg_pool2d(beta.image, factor), inputs.multiple)
         track = beta.track and track_in(beta.track, whole, 1 / factor, offset)
         small = _reduced_field(beta.field, alpha, whole, factor)
-        clipped = None if beta.clipped is None else padded(max_pool2d(beta.clipped, factor), inputs.multiple)
+        clipped = beta.clipped
+        if clipped is not None:
+            clipped = padded(max_pool2d(clipped.to(image), factor), inputs.multiple).bool()
         betas.append(Beta(image, small, track=track, cameras=beta.cameras, clipped=clipped))
     return frame._replace(inputs=replace(inputs, alpha=alpha, betas=tuple(betas)), hw=hw)
 
@@ -260,7 +262,9 @@ def _of_beta(alpha: Tensor, before: Beta, beta: Beta, matches: BetaMatches, hw: 
     positions, valid = matches.positions(beta.field.straight, (beta.image.shape[-2], beta.image.shape[-1]))
     where = positions[0, :h, :w]
     luma = combined_bands(beta.image)
-    clipped = torch.zeros_like(luma) if before.clipped is None else before.clipped.amax(1, keepdim=True)
+    clipped = torch.zeros_like(luma)
+    if before.clipped is not None:
+        clipped = before.clipped.any(1, keepdim=True).to(luma)
     sampled = sample(torch.cat([before.image, luma, clipped], 1), where.reshape(1, -1, 2).to(luma)).values
     values = sampled.reshape(sampled.shape[1], h, w)
     unlike, margin, _ = matches.facts[0]

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Literal, NamedTuple
 
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import max_pool2d, pad
 
@@ -171,21 +171,21 @@ def frame_inputs(network: FusionNetwork, views: Views) -> FrameInputs:
     return FrameInputs(inputs, placements, hw)
 
 
-def clipped_in(image: Float[Tensor, "1 c h w"], sensor: Sensor) -> Float[Tensor, "1 c h w"] | None:
-    """Compute the mask of clipped bands: 1 at the largest value and beside such a pixel, else 0.
+def clipped_in(image: Float[Tensor, "1 c h w"], sensor: Sensor) -> Bool[Tensor, "1 c h w"] | None:
+    """Compute the mask of clipped bands: True at the largest value and beside such a pixel.
 
     The largest value is 1; the image's own if that is more, or if its exposure is stated, which scaled it.
     Values from `CLIPPED` times that count.
 
     Returns:
-        The mask, in the image's type; None if no value counts.
+        The mask; None if no value counts.
     """
     image = image.detach()
     largest = float(image.max())
     if sensor.exposure is None:
         largest = max(largest, 1.0)
     clipped = image >= CLIPPED * largest
-    return max_pool2d(clipped.to(image), 3, 1, 1) if clipped.any() else None
+    return max_pool2d(clipped.to(image), 3, 1, 1).bool() if clipped.any() else None
 
 
 def bytes_beside(inputs: Inputs, images: Iterable[Tensor]) -> float:

@@ -283,7 +283,7 @@ def matched_colours(
     """
     guide, normalisation = combined_bands(beta.image), matches.comparison.whole
     bands = beta.image.shape[1]
-    clipped = torch.zeros_like(beta.image) if beta.clipped is None else beta.clipped
+    clipped = torch.zeros_like(beta.image) if beta.clipped is None else beta.clipped.to(beta.image)
     planes = torch.cat([beta.image, guide, normalisation.normalised(guide), clipped], 1)
     sampled, valid = at_matches(planes, beta.field.straight, matches.disparity)
     values, luma, brightness, clipped = sampled.split([bands, 1, 1, bands], 1)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from arraygeom import Positions, Segments
@@ -47,8 +47,8 @@ class Beta:
         around: True if each segment is around a known depth of its own pixel: positions along the segments of
             two pixels cannot be compared.
         cameras: names of the cameras whose bands are its channels, in order; empty if not known.
-        clipped: mask (B, C, H, W), in the type of `image`, 1 where a band is at its largest value or beside
-            such a pixel, else 0; None for none.
+        clipped: mask (B, C, H, W), True where a band is at its largest value or beside such a pixel; None for
+            none.
     """
 
     image: Float[Tensor, "b c h w"]
@@ -57,7 +57,7 @@ class Beta:
     track: Callable[[Tensor], Track] | None = None
     around: bool = False
     cameras: tuple[str, ...] = ()
-    clipped: Float[Tensor, "b c h w"] | None = None
+    clipped: Bool[Tensor, "b c h w"] | None = None
 
 
 @dataclass(frozen=True)
@@ -103,8 +103,9 @@ class Inputs:
 
     @property
     def nbytes(self) -> int:
-        """Memory of images and fields, bytes."""
-        return self.alpha.nbytes + sum(beta.image.nbytes + beta.field.nbytes for beta in self.betas)
+        """Memory of images, masks and fields, bytes."""
+        masks = sum(beta.clipped.nbytes for beta in self.betas if beta.clipped is not None)
+        return masks + self.alpha.nbytes + sum(beta.image.nbytes + beta.field.nbytes for beta in self.betas)
 
     @property
     def pieces(self) -> list[Tile]:

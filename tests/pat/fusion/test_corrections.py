@@ -249,6 +249,16 @@ def test_a_band_is_clipped_at_the_largest_value_that_it_can_have(most, exposure,
     assert (clipped is not None and bool(clipped[0, 0, 4, 4])) is expected
 
 
+def test_the_memory_of_inputs_includes_masks_of_clipped_bands(sample):
+    network = load_weights("mono-colour")
+    views = Views.of(sample.rig, sample.images, alpha=ALPHA)
+    inputs = prepared(network, views, [])[0].inputs
+    (beta,) = inputs.betas
+    masked = replace(inputs, betas=(replace(beta, clipped=beta.image > 1),))
+    bare = replace(inputs, betas=(replace(beta, clipped=None),))
+    assert masked.nbytes - bare.nbytes == beta.image.numel()
+
+
 def test_clipped_bands_share_light_and_others_keep_theirs():
     values = torch.tensor([1.0, 1.0, 0.4])[None, :, None, None]
     clipped = (values == 1).to(values)
