@@ -59,7 +59,8 @@ def write_together(
             present state and that is not `given`.
         IsADirectoryError: for a folder of a `given` name.
         OSError: naming the file, if writing fails.
-        ValueError: of the block, with `folder` in place of the temporary one. Its other errors pass.
+        ValueError: of the block, of its own kind, with `folder` in place of the temporary one. Its other
+            errors pass.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -77,7 +78,9 @@ def write_together(
     except ValueError as error:
         if str(temporary) not in str(error):
             raise
-        raise ValueError(str(error).replace(str(temporary), str(folder))) from error
+        hidden, shown = str(temporary), str(folder)
+        error.args = tuple(x.replace(hidden, shown) if isinstance(x, str) else x for x in error.args)
+        raise
     finally:
         with suppress(OSError):  # what cannot be put back now is put back by the next call
             _undo(folder, temporary)

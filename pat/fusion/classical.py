@@ -52,7 +52,7 @@ SEEN = 0.5
 UNSEEN = 0.2
 DISPARITY_FILL, COLOUR_FILL, LAST_FILL = (50, 4), (300, 3), (30, 1.5)
 """Strength of the edge-aware smoothing, and the difference of 8-bit luminance that counts as an edge."""
-NEAREST = 3
+MOST_DISPARITY = 3
 """Largest disparity, in widths of alpha's image: memory grows with its square."""
 UNRECTIFIABLE = "the cameras look along the line between them: such a pair cannot be rectified"
 
@@ -242,7 +242,7 @@ def _rectified_plane(pair: Pair) -> _Plane:
     near, far = (float(d) for d in pair.depth_range)
     shift = -(rotation @ R.T @ t)[0] * focal / np.array([near * z.min(), far * z.max()])
     max_disparity, across = float(np.ptp(shift)), float(np.ptp(corners[:, 0]))
-    if max_disparity > NEAREST * across:
+    if max_disparity > MOST_DISPARITY * across:
         raise ValueError(f"the near bound, {near:g}, means {max_disparity:.0f} pixels of disparity: raise it")
     K[:2, 2] = -corners.min(0) + [max_disparity, 0]
     sides = np.ceil(np.ptp(corners, axis=0) + np.array([max_disparity + 1, 1]))

@@ -66,7 +66,7 @@ def certain(output: FusionOutput, matches: Matches | None, inputs: Inputs) -> Fu
 
     Returns:
         The output with these (confidence 0 off a segment, or where the network's is), and `overall`, if it
-        had one, by `FusionOutput.of_best`; unchanged without matches.
+        had one, by `FusionOutput.with_overall`; unchanged without matches.
     """
     if matches is None:
         return output
@@ -82,7 +82,7 @@ def certain(output: FusionOutput, matches: Matches | None, inputs: Inputs) -> Fu
             confidence[i] = torch.where(kept, confidence[i], stated)
             deviation[i] = torch.where(kept, deviation[i], half_width / DEVIATIONS)
     known = output._replace(confidence=confidence, deviation=deviation)
-    return known if output.overall is None else known.of_best(inputs.betas)
+    return known if output.overall is None else known.with_overall(inputs.betas)
 
 
 def measured_depth(

@@ -56,7 +56,7 @@ class GuidedPAT(nn.Module):
 
     def working_bytes(self, alpha: int, betas: Sequence[int]) -> float:
         """Return the bytes of memory to fuse so many pixels of alpha, beside the inputs."""
-        return alpha * (280.0 + 140.0 * max(len(betas) - 1, 0))
+        return alpha * (200.0 + 180.0 * max(len(betas) - 1, 0))
 
     def forward(self, inputs: Inputs, matches: Matches | None = None) -> FusionOutput:
         """Fuse alpha (B, 1, H, W), sides multiples of 16, with the betas, by their matches.
@@ -217,4 +217,4 @@ def _output_of(
         confidence.append(matched.confidence[:, 0].to(image) * seen)
         deviation.append(torch.ones_like(confidence[-1]))
     output = FusionOutput(image, position, deviation, confidence)
-    return output.of_best(inputs.betas) if overall else output
+    return output.with_overall(inputs.betas) if overall else output

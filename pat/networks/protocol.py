@@ -44,7 +44,7 @@ class FusionOutput(NamedTuple):
         overall = None if self.overall is None else self.overall[index]
         return FusionOutput(self.image[index], position, deviation, confidence, overall)
 
-    def of_best(self, betas: Sequence[Beta]) -> FusionOutput:
+    def with_overall(self, betas: Sequence[Beta]) -> FusionOutput:
         """Return the same with the largest confidence as `overall`: of the betas that have all bands of the
         image, or of all betas if none has.
         """

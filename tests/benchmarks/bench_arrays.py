@@ -28,7 +28,7 @@ from tests.arraygeom.rigs import parallel_rig
 from tests.benchmarks.printed import print_tables
 
 CENTRES = {"left": (-0.09, 0.0), "right": (0.09, 0.0), "up": (0.0, -0.07), "down": (0.0, 0.07)}
-"""Of the betas, metres right of and below alpha."""
+"""Centres of the betas, metres right of and below alpha."""
 SETS = (("left",), ("right",), ("left", "right"), ("up", "down"), tuple(CENTRES))
 
 

@@ -70,14 +70,14 @@ CASES = (
     Case(4, "3GiB", betas=4),
     Case(4, "2GiB", noise=True),
     Case(12, None),
-    Case(12, "2GiB", lens=True),
-    Case(12, "2GiB", rig=False),
+    Case(12, "3GiB", lens=True),
+    Case(12, "3GiB", rig=False),
     Case(12, "4GiB", betas=3),
     Case(12, "3GiB", noise=True),
-    Case(24, "4GiB", lens=True),
-    Case(24, "4GiB", rig=False),
-    Case(50, "8GiB"),
-    Case(50, "8GiB", rig=False),
+    Case(24, "6GiB", lens=True),
+    Case(24, "6GiB", rig=False),
+    Case(50, "12GiB"),
+    Case(50, "12GiB", rig=False),
 )
 
 

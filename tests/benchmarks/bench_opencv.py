@@ -38,7 +38,7 @@ from tests.calib.rendered import BOARD
 from tests.calib.tracks import CALISCOPE_BOARD, caliscope_views
 
 opencv: Any = cv2
-"""Of version 5, which has more than stubs know of."""
+"""OpenCV of version 5, which has more than stubs know of."""
 Views = Mapping[str, BoardViews]
 Calibrator = Callable[[Views, Board], Rig]
 FEWEST = 6

@@ -45,7 +45,7 @@ class Fuzz:
     only: str | None = None
     """One kind of file."""
     share: float = 1.0
-    """Of the number of cases."""
+    """Share of the cases that are done."""
     first: int = 0
     """The number of the first damage: other numbers are other damage."""
     out: Path | None = None

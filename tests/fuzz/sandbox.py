@@ -15,7 +15,7 @@ from tests.processes import forked
 
 MEMORY = 4 << 30
 SECONDS = 10
-"""Of a core's time. A case that sleeps is ended after `WAITING` times as long by the clock."""
+"""Limit of a core's time. A case that sleeps is ended after `WAITING` times as long by the clock."""
 WAITING = 12
 
 

@@ -49,9 +49,9 @@ class Kills:
     only: str | None = None
     """One job."""
     share: float = 1.0
-    """Of the number of kills."""
+    """Share of the kills that are done."""
     seed: int = 0
-    """Of the moments."""
+    """Seed of the moments of the kills."""
     out: Path | None = None
     """A document whose block `kills` the table replaces; with `only`, its row."""
 

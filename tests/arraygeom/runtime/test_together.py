@@ -195,3 +195,12 @@ def test_a_list_from_a_stranger_moves_nothing_of_other_folders(tmp_path):
     (out / "last").unlink()
     write(out, NEW)
     assert (tmp_path / "mine").read_text() == "mine"
+
+
+def test_a_value_error_keeps_its_kind_and_names_the_folder_that_the_user_gave(tmp_path):
+    class OwnError(ValueError):
+        pass
+
+    with pytest.raises(OwnError) as refused, write_together(tmp_path, group="some", last="a.txt") as folder:
+        raise OwnError(f"{folder / 'a.txt'} is empty", 3)
+    assert refused.value.args == (f"{tmp_path / 'a.txt'} is empty", 3)

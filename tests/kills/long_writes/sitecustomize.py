@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 PIECES, PAUSE = 20, 0.01
-"""Of a write; seconds after each piece."""
+"""Number of pieces of a write; seconds after each."""
 
 
 def lengthen(announced: Path) -> None:

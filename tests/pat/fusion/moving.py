@@ -11,7 +11,7 @@ from tests.arraygeom.rigs import parallel_rig
 HW, FOCAL, BASELINE = (96, 160), 160.0, 0.1
 FAR, NEAR = 4.0, 2.0
 SPEED = 300.0
-"""Of the square, pixels of alpha a second."""
+"""Speed of the square, pixels of alpha a second."""
 RATE, SLOW = 120.0, 20.0
 
 

@@ -51,7 +51,7 @@ def test_time_does_not_run_back():
 
 
 def test_walls_out_of_range_are_said():
-    """Of cameras that look at each other each sees a wall behind the other."""
+    """Each of two cameras that look at each other sees a wall behind the other."""
     one = Camera(K=intrinsics(60.0, (48, 64)), cam_from_world=posed(), hw=(48, 64))
     other = one.replace(cam_from_world=posed((0, np.pi, 0), (0.0, 0.0, 19.0)))
     with pytest.warns(UserWarning, match="walls"):

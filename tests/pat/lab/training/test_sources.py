@@ -292,7 +292,7 @@ def test_what_is_wrong_with_scenes(broken, tmp_path):
 
 
 def test_a_flipped_byte_names_the_scene(broken):
-    """Of a damaged archive NumPy raises ValueError, but zlib.error, TokenError and others too."""
+    """NumPy raises ValueError for a damaged archive, but zlib.error, TokenError and others too."""
     scene = broken / "scenes" / "000000"
     file = scene / Rendered(scene).about["frames"]["mono"][0]["file"]
     whole, refusals = file.read_bytes(), []
