@@ -51,7 +51,8 @@ def train_denoiser(config: DenoiserTraining) -> Path:
         network = network.to(config.device)
         bank = PhotoBank.load(*config.photos, cache=config.cache, seed=config.seed)
         config.train(network, partial(losses, config, bank, network))
-        save_weights(network.half(), config.out / "best.safetensors", facts={"recipe": recipe_text(config)})
+        facts = {"recipe": recipe_text(config)}
+        save_weights(network, config.out / "best.safetensors", facts=facts, in_bytes=True)
     return config.out / "best.safetensors"
 
 

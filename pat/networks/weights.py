@@ -34,11 +34,18 @@ LARGEST, MOST_ENTRIES = 1024, 16
 """Largest number in a configuration, and largest length of a list of them. The largest shipped
 are 48 and 4."""
 
+STEP = ".step"
+"""Suffix of the name of the steps, one for each output channel, in which a tensor is stored as whole numbers."""
+
 Precision = Literal["float32", "bfloat16"]
 
 
 def save_weights(
-    network: Network | LowLightNetwork, path: str | Path, *, facts: Mapping[str, str] | None = None
+    network: Network | LowLightNetwork,
+    path: str | Path,
+    *,
+    facts: Mapping[str, str] | None = None,
+    in_bytes: bool = False,
 ) -> None:
     """Write a network's weights and configuration to a safetensors file, atomically.
 
@@ -47,6 +54,7 @@ def save_weights(
     Args:
         facts: texts by name (recipe, seed, figures) to store in the file too, other than "format", "network",
             "config" and "digest"; None for none.
+        in_bytes: True to round weights other than biases to a byte each, of 255 steps for each output channel.
 
     Raises:
         OSError: naming the file, if it cannot be written.
@@ -57,7 +65,19 @@ def save_weights(
         "config": json.dumps(dataclasses.asdict(network.config)),
         **(facts or {}),
     }
-    write_tensors(Path(path), network.state_dict(), metadata)
+    state: Mapping[str, Tensor] = network.state_dict()
+    write_tensors(Path(path), _in_steps(state) if in_bytes else state, metadata)
+
+
+def _in_steps(state: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
+    """Return weights as whole numbers of a byte, with the step of each output channel; biases as they are."""
+    largest = {
+        name: tensor.abs().amax(tuple(range(1, tensor.dim())), keepdim=True).clamp(min=1e-12)
+        for name, tensor in state.items()
+        if tensor.dim() > 1
+    }
+    numbers = {name: (127 * state[name] / most).round().to(torch.int8) for name, most in largest.items()}
+    return {**state, **numbers, **{name + STEP: most / 127 for name, most in largest.items()}}
 
 
 def load_weights(name: str | Path, *, precision: Precision = "float32") -> Network:
@@ -159,8 +179,9 @@ def _load(path: Path, networks: Mapping[str, tuple[Any, Any]]) -> Any:
             metadata = file.metadata() or {}
             network, config = _described(path, metadata, networks)
             names = list(file.keys())
-            _check_shapes(path, network, config, {name: file.get_slice(name).get_shape() for name in names})
-            state = {name: file.get_tensor(name) for name in names}
+            shapes = {name: file.get_slice(name).get_shape() for name in names if not name.endswith(STEP)}
+            _check_shapes(path, network, config, shapes)
+            tensors = {name: file.get_tensor(name) for name in names}
     except (SafetensorError, OSError) as error:
         if _is_of_pytorch(path):
             raise ValueError(
@@ -168,8 +189,9 @@ def _load(path: Path, networks: Mapping[str, tuple[Any, Any]]) -> Any:
                 "`pat lab weights import` makes weights of one of the paper's authors"
             ) from None
         raise ValueError(f"{path}: {not_whole(error)}") from None
-    if not undamaged(state, metadata):
+    if not undamaged(tensors, metadata):
         raise ValueError(f"{path}: {DAMAGED}")
+    state = {name: _with_step(path, name, tensors) for name in shapes}
     for name, tensor in state.items():
         if not tensor.is_floating_point() or not tensor.float().isfinite().all():
             raise ValueError(
@@ -178,6 +200,16 @@ def _load(path: Path, networks: Mapping[str, tuple[Any, Any]]) -> Any:
     made = network(config)
     made.load_state_dict(state)
     return made.eval().requires_grad_(False)
+
+
+def _with_step(path: Path, name: str, tensors: Mapping[str, Tensor]) -> Tensor:
+    """Return a tensor of a file, times its step if it is stored as whole numbers of one."""
+    numbers, step = tensors[name], tensors.get(name + STEP)
+    if step is None:
+        return numbers
+    if step.shape != (*numbers.shape[:1], *(1 for _ in numbers.shape[1:])):
+        raise ValueError(f"{path}: the steps of {name} do not fit it: train it again, or copy it again")
+    return numbers * step
 
 
 def _is_of_pytorch(path: Path) -> bool:

@@ -6,8 +6,9 @@ import torch
 from pat.fusion.classical import non_local_means
 from pat.media.colour import luminance
 from pat.networks.denoiser import DenoiserConfig, LowLightNetwork
-from pat.networks.weights import DENOISER, SHIPPED, load_denoiser, load_weights, save_weights
+from pat.networks.weights import DENOISER, SHIPPED, STEP, load_denoiser, load_weights, save_weights
 from pat.sensors import NoiseLevel, generator_for
+from pat.support.tensor_files import read_tensors, write_tensors
 from tests.pat.layered_array import load_sample
 
 
@@ -50,8 +51,30 @@ def denoised(part, electrons):
 
 
 def test_the_shipped_network_is_small_and_described():
-    assert DENOISER.stat().st_size < 1e7
+    assert DENOISER.stat().st_size < 5e6
     assert DENOISER.with_suffix(".md").is_file()
+
+
+def test_weights_in_bytes_are_a_quarter_as_long_and_off_by_half_a_step_at_most(tmp_path):
+    network = LowLightNetwork(DenoiserConfig((16, 16, 16), blocks=1))
+    save_weights(network, tmp_path / "whole.safetensors")
+    save_weights(network, tmp_path / "bytes.safetensors", in_bytes=True)
+    again = load_denoiser(tmp_path / "bytes.safetensors").state_dict()
+    for name, tensor in network.state_dict().items():
+        most = tensor.abs().amax(tuple(range(1, tensor.dim())), keepdim=True) if tensor.dim() > 1 else 0
+        assert ((again[name] - tensor).abs() <= most / 254 * 1.001).all()
+    whole, of_bytes = ((tmp_path / f"{name}.safetensors").stat().st_size for name in ("whole", "bytes"))
+    assert of_bytes < 0.4 * whole
+
+
+def test_steps_that_do_not_fit_are_refused(tmp_path):
+    network = LowLightNetwork(DenoiserConfig((4, 4, 4), blocks=1))
+    save_weights(network, tmp_path / "w.safetensors", in_bytes=True)
+    tensors, metadata = read_tensors(tmp_path / "w.safetensors")
+    name = next(name for name in tensors if name.endswith(STEP))
+    write_tensors(tmp_path / "w.safetensors", tensors | {name: tensors[name].flatten()}, metadata)
+    with pytest.raises(ValueError, match=r"w\.safetensors: the steps of "):
+        load_denoiser(tmp_path / "w.safetensors")
 
 
 def test_written_and_read_back(tmp_path):
