@@ -37,10 +37,10 @@ from calib.images.refinement import FREE, refine
 from experiments.evaluation.halves import of_half
 from experiments.names import refuse_unknown
 from pat import FuseSettings, align
+from pat.app.aligned_files import RecordedFiles
 from pat.app.aligned_page import ndvi, shown_layers
 from pat.app.from_images import array_from_images, camera_names
 from pat.fusion.align import LEAST_CONFIDENCE, SEEN, Aligned, resampled_values
-from pat.fusion.aligned_files import RecordedFiles
 from pat.fusion.steps import without_lenses
 from pat.fusion.views import ViewFiles
 from pat.lab.data.pairs import PAPER_DISPARITY, Disparity, StereoPair, middlebury_pairs

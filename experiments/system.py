@@ -21,11 +21,11 @@ from arraygeom.runtime.atomic import write_text
 from experiments.hdr import merged, missed, tone_curve, usable_range
 from experiments.names import refuse_unknown
 from pat import fuse
+from pat.app.results import save_frame, view_of
 from pat.fusion.classical import classical_baseline
 from pat.fusion.frame import Frame
 from pat.fusion.frames import ImageFiles
 from pat.fusion.fuse import FuseSettings
-from pat.fusion.results import save_frame, view_of
 from pat.fusion.sequence import SequenceFusion
 from pat.fusion.views import ViewFiles
 from pat.lab.evaluation.tables import markdown_table

@@ -12,9 +12,9 @@ from arraygeom.runtime.atomic import write_text
 from experiments.showcase import FAST, SCENE, SLOW, bright_gain, fast_and_slow_array
 from experiments.system import SystemResult, files_of, flicker, fused_frames
 from pat.app.cli.fusing import with_sensor
+from pat.app.results import save_frame
 from pat.fusion.frame import Frame
 from pat.fusion.fuse import FuseSettings
-from pat.fusion.results import save_frame
 from pat.fusion.sequence import SequenceFusion
 from pat.lab.evaluation.tables import markdown_table
 from pat.media.colour import luminance_of, srgb_image

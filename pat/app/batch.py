@@ -40,7 +40,6 @@ from ..fusion.frame import Frame
 from ..fusion.frames import ImageFiles
 from ..fusion.fuse import FuseSettings, fuse_frame
 from ..fusion.inputs import measured_along
-from ..fusion.results import ImageFormat, band_names, fused_group, refuse_to_replace, save_frame, view_of
 from ..fusion.sequence import KeyColour, SequenceFusion, readable
 from ..fusion.timeline import KeyFrame
 from ..fusion.views import ViewFiles, Views
@@ -54,6 +53,7 @@ from ..support.jobs import HERE, JobReport, OnError, Task, Workers, run_tasks
 from ..support.locks import folder_lock
 from ..support.memory import limited
 from ..support.tensor_files import read_tensors, write_tensors
+from .results import ImageFormat, band_names, fused_group, refuse_to_replace, save_frame, view_of
 
 SETTINGS, VIDEO = "settings.yaml", "fused.mp4"
 KEYS, PLAN = f"{together.LISTS}/keys", "plan.json"

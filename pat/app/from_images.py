@@ -33,7 +33,6 @@ from calib.images.lenses import describe_lenses
 from calib.images.matches import Pairs, PointMatches, match_cameras, undistort_matches
 from calib.images.self_calibration import RefinedPair, joined, refined_by_depth, self_calibrated
 
-from ..fusion.dense_matches import MatchedDepth, matched_depth
 from ..fusion.steps import without_lenses
 from ..fusion.views import is_in_colour, range_of, read_view
 from ..media.images import ImageSources, read_image, write_image
@@ -41,6 +40,7 @@ from ..media.raw import developed_rig
 from ..media.tags import focal_length
 from ..media.video import read_video
 from ..networks.weights import load_weights
+from .dense_matches import MatchedDepth, matched_depth
 
 LOG = logging.getLogger(__name__)
 

@@ -342,9 +342,9 @@ class Import:
             FileNotFoundError: for a missing file.
             ValueError: for a file that is no such checkpoint, and an `out` that cannot be written.
         """
-        from ..networks.authors import read_authors
         from ..networks.paper import PAT
         from ..networks.weights import save_weights
+        from .training.authors import read_authors
 
         writable(self.out)
         read = read_authors(self.checkpoint)

@@ -35,7 +35,7 @@ LARGEST, MOST_ENTRIES = 1024, 16
 are 48 and 4."""
 
 STEP = ".step"
-"""Suffix of the name of the steps, one for each output channel, in which a tensor is stored as whole numbers."""
+"""Suffix of the name of steps, one for each output channel, in which a tensor is stored as whole numbers."""
 
 Precision = Literal["float32", "bfloat16"]
 
@@ -54,7 +54,7 @@ def save_weights(
     Args:
         facts: texts by name (recipe, seed, figures) to store in the file too, other than "format", "network",
             "config" and "digest"; None for none.
-        in_bytes: True to round weights other than biases to a byte each, of 255 steps for each output channel.
+        in_bytes: True to round weights other than biases to a byte each, in 255 steps by output channel.
 
     Raises:
         OSError: naming the file, if it cannot be written.

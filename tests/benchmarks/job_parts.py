@@ -27,7 +27,7 @@ STAGES = {
     "attention": ["pat.attention.attend._attend"],
     "network": ["pat.networks.guided.GuidedPAT.forward"],
     "depth": ["pat.fusion.tiles.measured_depth", "pat.fusion.fuse.final_depth"],
-    "write": ["pat.fusion.results.save_frame", "pat.app.report.report_page"],
+    "write": ["pat.app.results.save_frame", "pat.app.report.report_page"],
 }
 """What is counted as each part, without the parts within it."""
 

@@ -102,8 +102,8 @@ class Align(Around):
 
     def _frames_with_rig(self, image: tuple[str, ...]) -> Iterator[_Frame]:
         """Frames of the given rig, which is checked against the first one."""
-        from ...fusion.frame_matching import matched_frames
         from ...fusion.views import ViewFiles
+        from ..frame_matching import matched_frames
         from ..healing import checked_rig
 
         rig = options.load_rig(self.given[0], self.depth, or_image=True)
@@ -117,9 +117,9 @@ class Align(Around):
 
     def _frames_without(self, flight: Mapping[str, list[Path]]) -> Iterator[_Frame]:
         """Frames of the rig that is found from the first one, or from a flight's captures."""
-        from ...fusion.frame_matching import matched_frames
         from ...fusion.views import ViewFiles
         from ..batch import find_images
+        from ..frame_matching import matched_frames
         from ..from_images import camera_names
 
         if self.depth:
@@ -140,9 +140,9 @@ class Align(Around):
         from arraygeom.io.native import write
         from arraygeom.runtime.together import sweep, write_listed
 
-        from ...fusion.aligned_files import RecordedFiles, refuse_to_replace, save_aligned
-        from ...fusion.results import FOUND_RIG
         from ...support.locks import folder_lock
+        from ..aligned_files import RecordedFiles, refuse_to_replace, save_aligned
+        from ..results import FOUND_RIG
 
         begin = time.monotonic()
         options.say_when_compiling()
@@ -175,7 +175,7 @@ class Align(Around):
 
     def _aligned(self, frame: _Frame) -> Aligned:
         """Align a frame, with the plan and a bar on the terminal."""
-        from ...fusion.aligned_files import RecordedFiles
+        from ..aligned_files import RecordedFiles
         from ..front import align
 
         rig, field = self.with_known(frame.images, frame.rig, frame.alpha, frame.files, None)

@@ -74,7 +74,7 @@ class FuseBatch(Fusing):
         from arraygeom.io.native import write
         from arraygeom.runtime.together import refuse_others, write_listed
 
-        from ...fusion.results import FOUND_RIG
+        from ..results import FOUND_RIG
 
         if recordings.found is None:
             return self._many(self.judged_rig(recordings))

@@ -37,10 +37,10 @@ class Demo:
         from arraygeom.runtime.together import refuse_others, write_listed, write_together
 
         from ...fusion.fuse import FuseSettings
-        from ...fusion.results import refuse_to_replace, save_frame
         from ...networks.weights import load_weights
         from ...support.metrics import score
         from ..demo import as_real_cameras, classical_methods, save_demo_figure
+        from ..results import refuse_to_replace, save_frame
         from ..sample_array import ALPHA, load_motorcycle, load_sample
 
         options.writable(self.out, folder=True)

@@ -103,10 +103,10 @@ class Fuse(Around, Fusing):
         from arraygeom.runtime.together import LISTS, sweep
 
         from ...fusion.inputs import measured_along
-        from ...fusion.results import band_names, describe_bands, refuse_to_replace, save_frame, view_of
         from ...fusion.views import ViewFiles, Views
         from ...media.raw import developed_rig
         from ...support.locks import folder_lock
+        from ..results import band_names, describe_bands, refuse_to_replace, save_frame, view_of
 
         alpha, found, points, begin = given.alpha, given.found, "points" in self._extras, time.monotonic()
         if points and not isinstance(given.rig[alpha], Camera):

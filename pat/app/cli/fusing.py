@@ -101,7 +101,7 @@ class Fusing(Known):
         Raises:
             ValueError: for files that cannot be matched to frames.
         """
-        from ...fusion.frame_matching import matched_frames
+        from ..frame_matching import matched_frames
 
         return matched_frames(files)
 
@@ -201,8 +201,8 @@ class Fusing(Known):
 
     def _checked(self, files: Files) -> Files:
         """Files of the frames. Raises ValueError for files where results would go."""
-        from ...fusion.results import check_no_result
         from ...media.images import has_many_bits
+        from ..results import check_no_result
 
         images = (path for paths in files.values() for path in paths)
         check_no_result([*self.given, *self.known_files(), *images], self.out)
@@ -240,8 +240,8 @@ class Fusing(Known):
         from arraygeom.io.native import write
         from arraygeom.runtime.together import write_listed
 
-        from ...fusion.results import HEALED_RIG
         from ..healing import checked_rig
+        from ..results import HEALED_RIG
 
         with options.working("comparing the rig with the images"):
             healed = checked_rig(views, heal=self.correct)

@@ -51,7 +51,7 @@ class FuseSequence(FuseBatch):
 
     def frames(self, files: Files) -> Files:
         """Return all files, with a warning where numbers are missing."""
-        from ...fusion.frame_matching import warn_of_gaps
+        from ..frame_matching import warn_of_gaps
 
         warn_of_gaps(files)
         return files

@@ -22,8 +22,8 @@ from calib.images.from_images import rig_from_images
 from calib.images.matches import PointMatches, fit_fundamental
 from calib.images.refinement import refine_matches
 from pat.app.cli.main import main
+from pat.app.results import save_frame, view_of
 from pat.fusion.frame import Frame
-from pat.fusion.results import save_frame, view_of
 from pat.media.images import write_image
 from tests.calib.scenes import HW, rectified_pair, seen_points, vector
 

@@ -24,10 +24,10 @@ from arraygeom import (
 )
 from arraygeom.undistortion import recorded_pixels, straight_pixels
 from pat import FuseSettings, align
+from pat.app.aligned_files import RecordedFiles, save_aligned, write_bands
 from pat.app.aligned_page import aligned_page, ndvi, shown_layers
 from pat.app.report import Facts
 from pat.fusion.align import OUTSIDE, SEEN, filled, resampled_values
-from pat.fusion.aligned_files import RecordedFiles, save_aligned, write_bands
 from pat.fusion.steps import without_lenses
 from pat.matching.inputs import Inputs
 from pat.matching.match import match

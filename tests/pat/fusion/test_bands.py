@@ -10,19 +10,19 @@ import torch
 from arraygeom import Rig
 from pat import FuseSettings, fuse
 from pat.app.from_images import _ordered_betas, show_colour
+from pat.app.results import band_names, save_frame
 from pat.app.sample_array import load_sample
 from pat.fusion.checks import LowConfidenceWarning, noise_advice, warn_of_confidence
 from pat.fusion.frame import Frame
 from pat.fusion.inputs import FrameInputs
-from pat.fusion.results import band_names, save_frame
 from pat.fusion.steps import join
 from pat.fusion.views import Views
 from pat.matching.inputs import Inputs
 from pat.networks.weights import load_weights
 from pat.sensors import NoiseLevel
 from tests.arraygeom.rigs import parallel_rig
+from tests.pat.app.test_results import frame_of
 from tests.pat.commands import pat
-from tests.pat.fusion.test_results import frame_of
 
 
 def sample_of_bands(scales: dict[str, float]) -> tuple[Rig, dict[str, torch.Tensor]]:

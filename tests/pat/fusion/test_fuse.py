@@ -158,7 +158,7 @@ import torch
 from pat import FuseSettings, fuse
 from pat.app.sample_array import load_sample
 from pat.fusion.align import align_frame, resampled_values
-from pat.fusion.aligned_files import save_aligned
+from pat.app.aligned_files import save_aligned
 from pat.fusion.fuse import corrections_of, fuse_frame
 from pat.fusion.sequence import SequenceFusion
 from pat.media.images import write_image

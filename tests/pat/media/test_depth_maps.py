@@ -6,7 +6,7 @@ import tifffile
 import torch
 from PIL import Image
 
-from pat.fusion.results import write_depth
+from pat.app.results import write_depth
 from pat.media.depth_maps import read_depth
 
 DEPTH = torch.linspace(0.5, 6.0, 20 * 30).reshape(20, 30)

@@ -7,7 +7,7 @@ import torch
 
 from arraygeom import Band, Rig, Sensor, View
 from experiments.sensors import Mosaic
-from pat.fusion.aligned_files import RecordedFiles
+from pat.app.aligned_files import RecordedFiles
 from pat.fusion.views import ViewFiles
 from pat.media.colour import linear_from_srgb, luminance, srgb_from_linear
 from pat.media.depth_maps import read_depth

@@ -8,7 +8,7 @@ import tifffile
 from PIL import ExifTags, Image
 
 from arraygeom.io.xmp import image_tags
-from pat.fusion.aligned_files import write_bands
+from pat.app.aligned_files import write_bands
 from pat.media.tags import EXIF, GPS, recorded_tags
 
 XMP = """<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">

@@ -9,7 +9,7 @@ from pat.networks.configs import PATConfig
 from pat.networks.paper import PAT
 from pat.networks.weights import load_weights
 from tests.pat.commands import pat
-from tests.pat.networks.test_authors import authors_state, save
+from tests.pat.lab.training.test_authors import authors_state, save
 
 LAYOUT = {"block_bias": False, "fusion_bias": True, "values_after_block": True, "equal_resolution": True}
 

@@ -19,9 +19,9 @@ from experiments.evaluation.paper import with_found_rig
 from pat import FuseSettings, fuse, load_weights
 from pat.app.cli.sequence import FuseSequence
 from pat.app.from_images import ImageArray, array_from_images, camera_names, found_rig
+from pat.app.results import save_frame
 from pat.app.sample_array import load_sample
 from pat.fusion.frame import Frame
-from pat.fusion.results import save_frame
 from pat.media.images import read_image, write_image
 from pat.media.tags import focal_length
 from pat.media.video import read_video, write_video

@@ -12,8 +12,8 @@ import torch
 
 from arraygeom import Link, NearestVoxels, Pair, Positions, Rectified, View
 from arraygeom.fields.grid import FieldOnGrid
+from pat.lab.training.authors import _names, load_authors, read_authors
 from pat.matching.inputs import Inputs
-from pat.networks.authors import _names, load_authors, read_authors
 from pat.networks.configs import PATConfig
 from pat.networks.paper import PAT
 from pat.networks.weights import load_weights, save_weights

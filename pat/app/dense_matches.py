@@ -16,6 +16,12 @@ from arraygeom.runtime.chunks import whole
 from arraygeom.runtime.threads import torch_in_one_thread
 from arraygeom.sampling import on_image
 
+from ..fusion.corrections import Corrections
+from ..fusion.depth_filling import final_depth
+from ..fusion.inputs import prepared
+from ..fusion.steps import steps_for, undone
+from ..fusion.tiles import fused_in_tiles
+from ..fusion.views import Views
 from ..matching.inputs import Inputs
 from ..matching.match import match
 from ..matching.matches import Matches
@@ -24,12 +30,6 @@ from ..matching.radiometry import Response
 from ..media.images import Images
 from ..networks.protocol import FusionOutput, JoinsBands, required
 from ..support.blocks import without_autocast
-from .corrections import Corrections
-from .depth_filling import final_depth
-from .inputs import prepared
-from .steps import steps_for, undone
-from .tiles import fused_in_tiles
-from .views import Views
 
 AROUND = [step / 2 for step in range(-6, 7)]
 """Pixels along the segment from a match, one of which must be on beta's image for the match to count."""

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from pat.fusion.frame_matching import MissingFramesWarning, matched_frames, warn_of_gaps
+from pat.app.frame_matching import MissingFramesWarning, matched_frames, warn_of_gaps
 
 
 def files(**names):

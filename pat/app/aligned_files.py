@@ -19,12 +19,12 @@ from arraygeom.runtime.atomic import write_text
 from arraygeom.runtime.file_names import file_names
 from arraygeom.runtime.together import refuse_others, write_together
 
+from ..fusion.align import Aligned
+from ..fusion.views import FilesOfCameras
 from ..media.images import read_recorded, recorded_bands, write_image
 from ..media.raw import demosaiced
 from ..media.tags import RecordedTags, recorded_tags
-from .align import Aligned
 from .results import with_links
-from .views import FilesOfCameras
 
 PositionFormat = Literal["npy", "tif", "none"]
 GREY = np.array([0, 128, 255], np.float32) / 255

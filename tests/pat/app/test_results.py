@@ -10,8 +10,8 @@ import torch
 from PIL import Image, ImageCms
 
 from arraygeom import Camera, Pose
+from pat.app.results import depth_scale, refuse_to_replace, save_frame, write_depth
 from pat.fusion.frame import Frame
-from pat.fusion.results import depth_scale, refuse_to_replace, save_frame, write_depth
 from pat.media.images import read_image
 from tests.processes import room_for
 

@@ -19,8 +19,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .configs import PATConfig
-from .paper import PAT
+from ...networks.configs import PATConfig
+from ...networks.paper import PAT
 
 PREFIX = "module."
 

@@ -28,13 +28,13 @@ from arraygeom.runtime.text import ASSUMED
 from arraygeom.runtime.threads import in_parallel
 from arraygeom.runtime.together import LISTS, refuse_others, write_listed, write_together
 
+from ..fusion.frame import Frame, picture_of
 from ..media.colour import linear_from_srgb
 from ..media.depth_maps import write_points
 from ..media.figures import colour_depth
 from ..media.images import write_image
 from ..media.raw import developed
 from ..support.memory import how_many_fit
-from .frame import Frame, picture_of
 
 MOST = 65535
 """Largest count of 16 bits."""
