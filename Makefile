@@ -15,7 +15,7 @@ help:
 	@echo "make showcase   fuse real images from DATA=$(DATA) into out/showcase"
 	@echo "make readme     run both and put what they print into docs/reports/demo.md and real_images.md"
 	@echo "make pairs      measure stereo pairs, ideal, into docs/reports/pairs.md; two minutes"
-	@echo "make stages     measure each stage of the fusion left out, on the tune half, into out/stages; ten minutes"
+	@echo "make stages     measure each stage of the fusion left out, on the tune half, into docs/reports/stages.md; half an hour"
 	@echo "make conditions measure other responses, low light and misalignment into docs/reports/conditions.md; half an hour"
 	@echo "make certainty  measure how well stated confidence holds into docs/reports/confidence.md; ten minutes"
 	@echo "make alignment  measure how well bands are aligned into docs/reports/alignment.md; ten minutes"
@@ -69,6 +69,7 @@ pairs: $(READY)
 
 stages: $(READY)
 	@$(BIN)/python -m experiments stages --middlebury $(DATA)/middlebury --out out/stages
+	@$(BIN)/python -m docs.update_readme --document docs/reports/stages.md --block stages=out/stages/stages.md
 
 conditions: $(READY)
 	@$(BIN)/python -m experiments conditions --middlebury $(DATA)/middlebury --half report --out out/conditions

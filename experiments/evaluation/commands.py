@@ -130,19 +130,20 @@ class Conditions(Pairs):
 class Stages(Pairs):
     """Fuse stereo pairs with each stage left out in turn: PSNR, depth and core seconds as they change.
 
-    Example: python -m experiments stages --middlebury data/middlebury --half tune --rates 2 4
+    Example: python -m experiments stages --middlebury data/middlebury --half tune --only x2 "200 electrons"
     """
 
     half: Half = "tune"
     """Pairs on which a stage may be judged."""
-    rates: tuple[int, ...] = (2, 4)
-    """Reductions of beta."""
+    only: tuple[str, ...] = tuple(stages.STAGE_CONDITIONS)
+    """Conditions to measure, by name."""
     out: Out = Path("out/stages")
     """Folder for stages.md."""
 
     def run(self) -> None:
-        """Write and print the table. Raises ValueError for no images."""
-        scores = stages.score_stages(self.pairs(), self.rates)
+        """Write and print the table. Raises ValueError for no images, and for an unknown condition."""
+        refuse_unknown("--only: no condition", self.only, stages.STAGE_CONDITIONS)
+        scores = stages.score_stages(self.pairs(), self.only)
         finished(self.out / "stages.md", stages.stages_markdown(scores))
 
 
