@@ -165,12 +165,12 @@ def score_stages(pairs: Sequence[StereoPair], conditions: Sequence[str]) -> Scor
                 how = FuseSettings(**{"noise": STAGE_CONDITIONS[name].noise, **without.settings})
                 method = rectified_fusion(load_weights(without.network), settings=how)
                 with left_out(stage):
-                    _score(method, *recorded[0])  # what is compiled, and read from files, is there afterwards
-                    scores[stage][name] = [_score(method, *one) for one in recorded]
+                    scored(method, *recorded[0])  # what is compiled, and read from files, is there afterwards
+                    scores[stage][name] = [scored(method, *one) for one in recorded]
     return scores
 
 
-def _score(method: Callable[..., Any], pair: StereoPair, task: MonoColourTask) -> StageScore:
+def scored(method: Callable[..., Any], pair: StereoPair, task: MonoColourTask) -> StageScore:
     begin = time.process_time()
     result = method(task.alpha, task.beta, pair.max_disparity or 120.0)
     seconds = time.process_time() - begin

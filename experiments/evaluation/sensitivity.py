@@ -1,0 +1,135 @@
+"""How much each tuned number matters: pairs fused with it halved and doubled."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pat.lab.evaluation.tables import markdown_table
+from pat.support import settings
+from pat.support.settings import SettingEntry, all_settings
+
+ROOMS = ("pat.matching", "pat.networks", "pat.fusion")
+PAIRS = ("Bowling1", "Cloth4", "Flowerpots", "Midd1")
+"""Ends of the names of the pairs that are fused, of the tune half."""
+STATES = ("x2", "alpha = .2/.4/.4", "rows off 3 px", "200 electrons")
+"""Conditions of `stages.STAGE_CONDITIONS` in which they are."""
+FACTORS = (0.5, 2.0)
+
+
+class Change(NamedTuple):
+    """Scores with a number changed, less those with it as it is.
+
+    Attributes:
+        psnr: mean of PSNR (dB), by condition.
+        within: share of true disparities within a pixel, by condition.
+    """
+
+    psnr: Mapping[str, float]
+    within: Mapping[str, float]
+
+
+def changed(value: Any, factor: float) -> Any:
+    """Return a setting, all of its numbers, times a factor: whole numbers stay whole, 1 or more."""
+    if isinstance(value, tuple):
+        return tuple(changed(one, factor) for one in value)
+    return max(round(value * factor), 1) if isinstance(value, int) else value * factor
+
+
+def scores_with(middlebury: Path, entry: SettingEntry | None, factor: float) -> dict[str, list[float]]:
+    """Fuse the pairs in a process of its own, with a setting changed before any room is imported.
+
+    What numba compiled before has the former number in it: it is compiled anew.
+
+    Returns:
+        By condition, mean PSNR (dB) and mean share of disparities within a pixel.
+
+    Raises:
+        RuntimeError: with the last lines of the process, if it fails.
+    """
+    with tempfile.TemporaryDirectory() as compiled:
+        of_entry = ["", "1"] if entry is None else [entry.why, str(factor)]
+        done = subprocess.run(
+            [sys.executable, "-W", "ignore", "-m", __name__, str(middlebury), *of_entry],
+            env={**os.environ, "NUMBA_CACHE_DIR": compiled, "PYTHONDONTWRITEBYTECODE": "1"},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+    if done.returncode:
+        raise RuntimeError(f"{entry}: {done.stderr[-2000:]}")
+    return dict(json.loads(done.stdout.splitlines()[-1]))
+
+
+def measured(
+    middlebury: Path, entries: Sequence[SettingEntry]
+) -> Iterator[tuple[SettingEntry, list[Change]]]:
+    """Yield each tuned setting with the changes by `FACTORS`."""
+    reference = scores_with(middlebury, None, 1.0)
+    for entry in entries:
+        changes = []
+        for factor in FACTORS:
+            found = scores_with(middlebury, entry, factor)
+            psnr, within = ({name: found[name][i] - reference[name][i] for name in STATES} for i in range(2))
+            changes.append(Change(psnr, within))
+        yield entry, changes
+
+
+def tuned_entries() -> list[SettingEntry]:
+    """The settings of the fusion that were tuned."""
+    return [entry for entry in all_settings(*ROOMS) if entry.kind == "tuned"]
+
+
+def sensitivity_markdown(rows: Iterable[tuple[SettingEntry, Sequence[Change]]]) -> str:
+    """A table: a line a setting; for each factor the change of PSNR and of depth that is largest."""
+    lines = []
+    for entry, changes in rows:
+        cells = []
+        for change in changes:
+            name = max(change.psnr, key=lambda name: abs(change.psnr[name]))
+            depth = max(change.within.values(), key=abs)
+            cells.append(f"{change.psnr[name]:+.2f} ({name}) / {depth:+.1%}")
+        lines.append([f"{entry.algorithm}.{entry.name} = {entry.value}", *cells])
+    heads = [f"times {factor:g}: PSNR, dB, where it changes most / depth" for factor in FACTORS]
+    return markdown_table(["setting", *heads], lines)
+
+
+def main(middlebury: str, why: str, factor: str) -> None:
+    """Print the scores with the setting of this reason changed, as JSON."""
+    entry_of, met = settings.tuned, []
+
+    def tuned(value: Any, reason: str) -> Any:
+        met.append(reason)
+        return entry_of(changed(value, float(factor)) if reason == why else value, reason)
+
+    settings.tuned = tuned  # type: ignore[assignment]
+    from pat.fusion.fuse import FuseSettings
+    from pat.lab.data.pairs import middlebury_pairs
+    from pat.lab.evaluation.protocols import rectified_fusion
+    from pat.networks.weights import load_weights
+
+    from .halves import of_half
+    from .stages import STAGE_CONDITIONS, scored
+
+    pairs = [p for p in of_half(middlebury_pairs(Path(middlebury)), "tune") if p.name.endswith(PAIRS)]
+    found = {}
+    for name in STATES:
+        condition = STAGE_CONDITIONS[name]
+        method = rectified_fusion(load_weights("mono-colour"), settings=FuseSettings(noise=condition.noise))
+        scores = np.array([scored(method, pair, condition.recorded(pair)) for pair in pairs])
+        found[name] = [float(scores[:, 0].mean()), float(np.nanmean(scores[:, 2]))]
+    if met.count(why) != bool(why):
+        raise RuntimeError(f"{met.count(why)} settings have the reason '{why}'")
+    print(json.dumps(found))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
