@@ -171,6 +171,7 @@ def score_stages(pairs: Sequence[StereoPair], conditions: Sequence[str]) -> Scor
 
 
 def scored(method: Callable[..., Any], pair: StereoPair, task: MonoColourTask) -> StageScore:
+    """Scores of one pair, recorded, by a method."""
     begin = time.process_time()
     result = method(task.alpha, task.beta, pair.max_disparity or 120.0)
     seconds = time.process_time() - begin
