@@ -9,13 +9,19 @@ import sys
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from pat.fusion.fuse import FuseSettings
+from pat.lab.data.pairs import middlebury_pairs
+from pat.lab.evaluation.protocols import rectified_fusion
 from pat.lab.evaluation.tables import markdown_table
-from pat.support import settings
+from pat.networks.weights import load_weights
 from pat.support.settings import SettingEntry, all_settings
+
+from .halves import of_half
+from .stages import STAGE_CONDITIONS, scored
 
 ROOMS = ("pat.matching", "pat.networks", "pat.fusion")
 PAIRS = ("Bowling1", "Cloth4", "Flowerpots", "Midd1")
@@ -23,6 +29,25 @@ PAIRS = ("Bowling1", "Cloth4", "Flowerpots", "Midd1")
 STATES = ("x2", "alpha = .2/.4/.4", "rows off 3 px", "200 electrons")
 """Conditions of `stages.STAGE_CONDITIONS` in which they are."""
 FACTORS = (0.5, 2.0)
+WORKER = """
+import sys
+from pat.support import settings
+middlebury, why, factor = sys.argv[1:]
+tuned, met = settings.tuned, []
+def changed(value):
+    if isinstance(value, tuple):
+        return tuple(map(changed, value))
+    return max(round(value * float(factor)), 1) if isinstance(value, int) else value * float(factor)
+def changing(value, reason):
+    met.append(reason)
+    return tuned(changed(value) if reason == why else value, reason)
+settings.tuned = changing
+from experiments.evaluation.sensitivity import print_scores
+assert met.count(why) == bool(why), met
+print_scores(middlebury)
+"""
+"""Program that changes a setting, named by its reason, before any room is imported; whole numbers stay whole,
+1 or more."""
 
 
 class Change(NamedTuple):
@@ -35,13 +60,6 @@ class Change(NamedTuple):
 
     psnr: Mapping[str, float]
     within: Mapping[str, float]
-
-
-def changed(value: Any, factor: float) -> Any:
-    """Return a setting, all of its numbers, times a factor: whole numbers stay whole, 1 or more."""
-    if isinstance(value, tuple):
-        return tuple(changed(one, factor) for one in value)
-    return max(round(value * factor), 1) if isinstance(value, int) else value * factor
 
 
 def scores_with(middlebury: Path, entry: SettingEntry | None, factor: float) -> dict[str, list[float]]:
@@ -58,7 +76,7 @@ def scores_with(middlebury: Path, entry: SettingEntry | None, factor: float) -> 
     with tempfile.TemporaryDirectory() as compiled:
         of_entry = ["", "1"] if entry is None else [entry.why, str(factor)]
         done = subprocess.run(
-            [sys.executable, "-W", "ignore", "-m", __name__, str(middlebury), *of_entry],
+            [sys.executable, "-W", "ignore", "-c", WORKER, str(middlebury), *of_entry],
             env={**os.environ, "NUMBA_CACHE_DIR": compiled, "PYTHONDONTWRITEBYTECODE": "1"},
             capture_output=True,
             text=True,
@@ -102,23 +120,8 @@ def sensitivity_markdown(rows: Iterable[tuple[SettingEntry, Sequence[Change]]]) 
     return markdown_table(["setting", *heads], lines)
 
 
-def main(middlebury: str, why: str, factor: str) -> None:
-    """Print the scores with the setting of this reason changed, as JSON."""
-    entry_of, met = settings.tuned, []
-
-    def tuned(value: Any, reason: str) -> Any:
-        met.append(reason)
-        return entry_of(changed(value, float(factor)) if reason == why else value, reason)
-
-    settings.tuned = tuned  # type: ignore[assignment]
-    from pat.fusion.fuse import FuseSettings
-    from pat.lab.data.pairs import middlebury_pairs
-    from pat.lab.evaluation.protocols import rectified_fusion
-    from pat.networks.weights import load_weights
-
-    from .halves import of_half
-    from .stages import STAGE_CONDITIONS, scored
-
+def print_scores(middlebury: str) -> None:
+    """Print the scores of the pairs as JSON."""
     pairs = [p for p in of_half(middlebury_pairs(Path(middlebury)), "tune") if p.name.endswith(PAIRS)]
     found = {}
     for name in STATES:
@@ -126,10 +129,4 @@ def main(middlebury: str, why: str, factor: str) -> None:
         method = rectified_fusion(load_weights("mono-colour"), settings=FuseSettings(noise=condition.noise))
         scores = np.array([scored(method, pair, condition.recorded(pair)) for pair in pairs])
         found[name] = [float(scores[:, 0].mean()), float(np.nanmean(scores[:, 2]))]
-    if met.count(why) != bool(why):
-        raise RuntimeError(f"{met.count(why)} settings have the reason '{why}'")
     print(json.dumps(found))
-
-
-if __name__ == "__main__":
-    main(*sys.argv[1:])
