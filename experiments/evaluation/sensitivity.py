@@ -26,13 +26,23 @@ from .stages import STAGE_CONDITIONS, scored
 ROOMS = ("pat.matching", "pat.networks", "pat.fusion")
 PAIRS = ("Bowling1", "Cloth4", "Flowerpots", "Midd1")
 """Ends of the names of the pairs that are fused, of the tune half."""
-STATES = ("x2", "alpha = .2/.4/.4", "rows off 3 px", "200 electrons")
-"""Conditions of `stages.STAGE_CONDITIONS` in which they are."""
+LOW_LIGHT, CORRECTIONS = ("200 electrons",), ("rows off 3 px", "alpha = .2/.4/.4")
+STATES = {
+    "BM3DSettings": LOW_LIGHT,
+    "NonLocalMeansSettings": LOW_LIGHT,
+    "LowLightSettings": LOW_LIGHT,
+    "AlignmentSettings": CORRECTIONS,
+    "PrePassSettings": CORRECTIONS,
+}
+"""Conditions of `stages.STAGE_CONDITIONS` in which they are, by algorithm; others by `USUAL`."""
+USUAL = ("x2", "alpha = .2/.4/.4")
+COMPILED_IN = ("CostSettings", "BM3DSettings")
+"""Algorithms whose loops have settings compiled into them."""
 FACTORS = (0.5, 2.0)
 WORKER = """
 import sys
 from pat.support import settings
-middlebury, why, factor = sys.argv[1:]
+middlebury, why, factor, *states = sys.argv[1:]
 tuned, met = settings.tuned, []
 def changed(value):
     if isinstance(value, tuple):
@@ -44,7 +54,7 @@ def changing(value, reason):
 settings.tuned = changing
 from experiments.evaluation.sensitivity import print_scores
 assert met.count(why) == bool(why), met
-print_scores(middlebury)
+print_scores(middlebury, states)
 """
 """Program that changes a setting, named by its reason, before any room is imported; whole numbers stay whole,
 1 or more."""
@@ -62,10 +72,16 @@ class Change(NamedTuple):
     within: Mapping[str, float]
 
 
-def scores_with(middlebury: Path, entry: SettingEntry | None, factor: float) -> dict[str, list[float]]:
+def scores_with(
+    middlebury: Path, entry: SettingEntry | None, factor: float, states: Sequence[str]
+) -> dict[str, list[float]]:
     """Fuse the pairs in a process of its own, with a setting changed before any room is imported.
 
-    What numba compiled before has the former number in it: it is compiled anew.
+    Args:
+        middlebury: folder of Middlebury's pairs.
+        entry: setting to change; None for none.
+        factor: factor of its numbers.
+        states: conditions of `stages.STAGE_CONDITIONS`.
 
     Returns:
         By condition, mean PSNR (dB) and mean share of disparities within a pixel.
@@ -73,15 +89,12 @@ def scores_with(middlebury: Path, entry: SettingEntry | None, factor: float) -> 
     Raises:
         RuntimeError: with the last lines of the process, if it fails.
     """
-    with tempfile.TemporaryDirectory() as compiled:
-        of_entry = ["", "1"] if entry is None else [entry.why, str(factor)]
-        done = subprocess.run(
-            [sys.executable, "-W", "ignore", "-c", WORKER, str(middlebury), *of_entry],
-            env={**os.environ, "NUMBA_CACHE_DIR": compiled, "PYTHONDONTWRITEBYTECODE": "1"},
-            capture_output=True,
-            text=True,
-            check=False,
-        )
+    why, algorithm = ("", "") if entry is None else (entry.why, entry.algorithm)
+    with tempfile.TemporaryDirectory() as folder:
+        compiled = {"NUMBA_CACHE_DIR": folder} if algorithm in COMPILED_IN else {}
+        words = [sys.executable, "-W", "ignore", "-c", WORKER, str(middlebury), why, str(factor), *states]
+        environment = {**os.environ, **compiled}
+        done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
         raise RuntimeError(f"{entry}: {done.stderr[-2000:]}")
     return dict(json.loads(done.stdout.splitlines()[-1]))
@@ -91,12 +104,13 @@ def measured(
     middlebury: Path, entries: Sequence[SettingEntry]
 ) -> Iterator[tuple[SettingEntry, list[Change]]]:
     """Yield each tuned setting with the changes by `FACTORS`."""
-    reference = scores_with(middlebury, None, 1.0)
+    every = sorted({*USUAL, *(state for states in STATES.values() for state in states)})
+    reference = scores_with(middlebury, None, 1.0, every)
     for entry in entries:
-        changes = []
+        changes, states = [], STATES.get(entry.algorithm, USUAL)
         for factor in FACTORS:
-            found = scores_with(middlebury, entry, factor)
-            psnr, within = ({name: found[name][i] - reference[name][i] for name in STATES} for i in range(2))
+            found = scores_with(middlebury, entry, factor, states)
+            psnr, within = ({name: found[name][i] - reference[name][i] for name in states} for i in range(2))
             changes.append(Change(psnr, within))
         yield entry, changes
 
@@ -120,11 +134,11 @@ def sensitivity_markdown(rows: Iterable[tuple[SettingEntry, Sequence[Change]]]) 
     return markdown_table(["setting", *heads], lines)
 
 
-def print_scores(middlebury: str) -> None:
-    """Print the scores of the pairs as JSON."""
+def print_scores(middlebury: str, states: Sequence[str]) -> None:
+    """Print the scores of the pairs in these conditions as JSON."""
     pairs = [p for p in of_half(middlebury_pairs(Path(middlebury)), "tune") if p.name.endswith(PAIRS)]
     found = {}
-    for name in STATES:
+    for name in states:
         condition = STAGE_CONDITIONS[name]
         method = rectified_fusion(load_weights("mono-colour"), settings=FuseSettings(noise=condition.noise))
         scores = np.array([scored(method, pair, condition.recorded(pair)) for pair in pairs])
