@@ -36,7 +36,7 @@ STATES = {
 }
 """Conditions of `stages.STAGE_CONDITIONS` in which they are, by algorithm; others by `USUAL`."""
 USUAL = ("x2", "alpha = .2/.4/.4")
-COMPILED_IN = ("CostSettings", "BM3DSettings")
+COMPILED_IN = ("CensusSettings", "BM3DSettings")
 """Algorithms whose loops have settings compiled into them."""
 FACTORS = (0.5, 2.0)
 WORKER = """
