@@ -16,10 +16,8 @@ from arraygeom.runtime.chunks import whole
 from arraygeom.runtime.threads import torch_in_one_thread
 from arraygeom.sampling import on_image
 
-from ..matching.inputs import Inputs
+from ..matching.inputs import Extent, Inputs, Matches, match_positions
 from ..matching.match import match
-from ..matching.matches import Matches
-from ..matching.positions import Extent, match_positions
 from ..matching.radiometry import Response
 from ..media.images import Images
 from ..networks.protocol import FusionOutput, JoinsBands, required

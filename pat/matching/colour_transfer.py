@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -16,24 +17,22 @@ from arraygeom import Segments
 from arraygeom.runtime.chunks import chunked
 
 from ..media.colour import REC601, to_bytes
+from ..media.filters import LocalMoments, box_mean, numpy_of, smoothed
+from ..support.neighbours import nearest_points
 from ..support.settings import size, tuned
-from .examples import by_examples
-from .filters import LocalMoments, box_mean, numpy_of, smoothed
-from .inputs import Beta, Inputs
-from .likeness import likeness
-from .matches import BetaMatches, Colours, Matches, is_consistent
+from .inputs import Beta, BetaMatches, Colours, Inputs, Matches, at_matches, combined_bands, is_consistent
 from .normalisation import SETTINGS as NORMALISATION
-from .normalisation import Moments, combined_bands, explained_share, moments
-from .positions import at_matches
+from .normalisation import Moments, explained_share, likeness, moments
 from .semi_global import DISPARITY_FILL
 from .spectral_mix import SpectralMix
 
 
 @dataclass(frozen=True)
 class ColourTransferSettings:
-    """Settings of the transfer of beta's colours to alpha's view.
+    """Settings of the transfer of beta's colours to alpha's view, and of colour by example.
 
-    Brightness is 0 to 1. Middlebury and SYNTIM are the pairs of their tune halves.
+    Brightness is 0 to 1, lengths are pixels of alpha. Middlebury and SYNTIM are the pairs of their tune
+    halves.
 
     `pat lab settings` prints the value of each with its meaning and reason.
     """
@@ -69,6 +68,16 @@ class ColourTransferSettings:
         "views over that of light beyond the largest value",
     )
     most_detail: float = size(0.2, "Differences of brightness beyond this are no detail that beta lost")
+    neighbours: int = size(5, "Examples of an unseen pixel; half or twice as many do as well")
+    radii: tuple[int, int] = size((2, 6), "Radii of the windows of examples' means and deviations")
+    place: tuple[float, float] = tuned(
+        (1200.0, 1800.0),
+        "Middlebury, tune half: pixels whose distance counts as much as black beside white, across "
+        "the searched segments and along them: what is occluded is long across",
+    )
+    seen: float = size(0.5, "Weight above which a pixel counts as seen, and is an example")
+    sources: int = size(60_000, "Seen pixels searched for examples at most")
+    error: float = size(0.5, "Relative error of the approximate nearest-neighbour search")
 
     def detail(self, difference: Tensor) -> Tensor:
         """Return the part of a difference of brightness that is detail that beta lost."""
@@ -80,6 +89,11 @@ LEAST = 1e-3
 """Size: least weight of a pixel in a fill."""
 DIRECTIONS = 8
 """Size: spacing, in rows and columns, of the segments whose directions are averaged."""
+
+
+EVERY = (slice(None, None, 2),) * 2
+"""Size: every second pixel is searched for."""
+Plane = NDArray[np.float32]
 
 
 class MatchStatistics(NamedTuple):
@@ -525,3 +539,73 @@ def _diffused(
     beyond = np.clip(brightness - mean, -SETTINGS.most_detail, SETTINGS.most_detail)
     bands = [band / total for band in of_bands]
     return np.stack([b + (p / total - b * mean) / variance * beyond for b, p in zip(bands, products)])
+
+
+def by_examples(
+    colour: Float[NDArray, "c h w"],
+    alpha: Float[NDArray, "h w"],
+    weight: Float[NDArray, "h w"],
+    directions: Float[NDArray, "2 2"],
+) -> Float[NDArray, "c h w"]:
+    """Replace the colour of pixels of low weight by a weighted mean of the seen pixels most similar to them.
+
+    Every second pixel in each direction is compared with such pixels, and pixels between them are
+    interpolated.
+
+    Args:
+        colour: bands of each pixel.
+        alpha: brightness, in which pixels are compared together with their positions.
+        weight: weight of each pixel's colour, 0 to 1; a pixel counts as seen above a half.
+        directions: mean outer product of the unit vectors (x, y) along the segments that were searched;
+            examples count as nearer along these.
+
+    Returns:
+        Colour at all pixels; seen ones keep theirs. The array `colour` itself if all are seen, or fewer of
+        every second pixel than a mean takes.
+    """
+    seen = weight > SETTINGS.seen
+    near = cv2.dilate((~seen).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    asked, seen_there = near[EVERY], seen[EVERY]
+    step = max(1, int(np.ceil(np.sqrt(np.count_nonzero(seen_there) / SETTINGS.sources))))
+    sources = np.zeros_like(seen_there)
+    sources[::step, ::step] = seen_there[::step, ::step]
+    if np.count_nonzero(sources) < SETTINGS.neighbours or not asked.any():
+        return colour
+    features = [(plane[sources], plane[asked]) for plane in _features(alpha, directions)]
+    known, wanted = (np.stack(planes, 1) for planes in zip(*features))
+    index, _ = nearest_points(known, wanted, SETTINGS.neighbours, SETTINGS.error)
+    share = weight[EVERY][sources][index]
+    share = (share / share.sum(1, keepdims=True)).astype(np.float32)
+    out = np.empty_like(colour)
+    for own, filled in zip(colour, out):
+        plane = np.where(seen, own, 0)[EVERY]
+        plane[asked] = np.einsum("nk,nk->n", plane[sources][index], share)
+        filled[:] = np.where(seen, own, _between(plane, (alpha.shape[0], alpha.shape[1])))
+    return out
+
+
+def _between(plane: Plane, hw: tuple[int, int]) -> Plane:
+    """Enlarge a plane of every second pixel, from the first, to all pixels, by linear interpolation."""
+    back = np.array([[0.5, 0, 0], [0, 0.5, 0]], np.float32)
+    how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    between: Plane = cv2.warpAffine(plane, back, (hw[1], hw[0]), flags=how, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[assignment]
+    return between
+
+
+def _features(alpha: Plane, directions: Float[NDArray, "2 2"]) -> Iterator[Plane]:
+    """Yield brightness, its means and standard deviations in windows, and place, of every second pixel.
+
+    They are scaled so that distances compare.
+    """
+    alpha = np.ascontiguousarray(alpha, np.float32)
+    yield alpha[EVERY]
+    for radius in SETTINGS.radii:
+        side = (2 * radius + 1,) * 2
+        mean, square = cv2.boxFilter(alpha, -1, side), cv2.boxFilter(alpha * alpha, -1, side)
+        yield mean[EVERY]
+        yield np.sqrt(np.maximum(square - mean * mean, 0))[EVERY]
+    across, along = (1 / pixels**2 for pixels in SETTINGS.place)
+    metric = across * np.eye(2) + (along - across) * directions
+    rows, columns = 2 * np.indices(alpha[EVERY].shape, dtype=np.float32)
+    for x, y in np.linalg.cholesky(metric).T.astype(np.float32):
+        yield x * columns + y * rows

@@ -13,14 +13,10 @@ from torch.nn.functional import avg_pool2d
 
 from arraygeom import Segments
 
-from .certainty import with_certainty
-from .choice import Choice, chosen
+from .choice import Choice, chosen, with_certainty
 from .colour_transfer import transferred
-from .inputs import Inputs
-from .matches import BetaMatches, Matches, is_consistent
+from .inputs import FINE, BetaMatches, Comparison, Inputs, Matches, at_matches, is_consistent, reduced
 from .multiview import agreed, with_likeliest_colours
-from .normalisation import Comparison
-from .positions import FINE, at_matches, reduced
 from .semi_global import HalfSizeMatches, matched_at_half_size
 from .spectral_mix import SETTINGS as MIX
 from .spectral_mix import SpectralMix

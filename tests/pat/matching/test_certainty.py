@@ -11,10 +11,10 @@ from pat import fuse
 from pat.app.sample_array import load_motorcycle, load_sample
 from pat.fusion.frame import Frame
 from pat.matching import certainty, choice
-from pat.matching.certainty import MEASURED, measured, typical_facts, with_certainty
+from pat.matching.choice import MEASURED, measured, typical_facts, with_certainty
+from pat.matching.inputs import BetaMatches, Comparison, Matches
 from pat.matching.match import match
-from pat.matching.matches import BetaMatches, Matches
-from pat.matching.normalisation import Comparison, Normalisation
+from pat.matching.normalisation import Normalisation
 from pat.networks.weights import load_weights
 
 
@@ -49,7 +49,7 @@ def test_other_threads_find_the_networks_as_they_were():
     images = {name: image[:, :64, :96].double() for name, image in sample.images.items()}
     frame = fuse(images, rig, alpha="mono", network=load_weights("mono-colour").double())
     assert frame.image.dtype == torch.float64
-    for network in (certainty.fitted_network(), choice.fitted_choice()):
+    for network in (certainty.fitted_certainty(), choice.fitted_choice()):
         assert {weight.dtype for weight in network.parameters()} == {torch.float32}
 
 

@@ -16,12 +16,19 @@ from pat.app.sample_array import load_motorcycle
 from pat.lab.evaluation.protocols import rectified_rig
 from pat.matching import choice
 from pat.matching import inputs as parts
-from pat.matching.certainty import typical_facts
-from pat.matching.choice import AROUND, CANDIDATES, Choice, candidates, chosen, features, quarter_turns
-from pat.matching.inputs import Inputs
+from pat.matching.choice import (
+    AROUND,
+    CANDIDATES,
+    Choice,
+    candidates,
+    chosen,
+    features,
+    quarter_turns,
+    typical_facts,
+)
+from pat.matching.inputs import BetaMatches, Comparison, Inputs, Matches
 from pat.matching.match import located_in_one, match
-from pat.matching.matches import BetaMatches, Matches
-from pat.matching.normalisation import ComparedViews, Comparison, Normalisation
+from pat.matching.normalisation import ComparedViews, Normalisation
 from pat.networks.weights import load_weights
 
 

@@ -11,9 +11,8 @@ from arraygeom.fields.grid import FieldOnGrid
 from pat.matching import colour_transfer as warped
 from pat.matching import inputs as inputs_module
 from pat.matching.colour_transfer import SETTINGS, MatchStatistics, _diffused, colour_noise, transferred
-from pat.matching.inputs import Inputs, InputsSettings
-from pat.matching.matches import BetaMatches, Colours, Matches
-from pat.matching.normalisation import Comparison, explained_share
+from pat.matching.inputs import BetaMatches, Colours, Comparison, Inputs, InputsSettings, Matches
+from pat.matching.normalisation import explained_share
 from pat.media.colour import luminance
 from tests.pat.matching.matched_scenes import beside, blurred, faint, semi_global_matching
 

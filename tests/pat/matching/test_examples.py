@@ -9,8 +9,7 @@ import torch
 
 from arraygeom import Segments
 from pat.matching import examples
-from pat.matching.colour_transfer import directions_of, filled_from
-from pat.matching.examples import SETTINGS, by_examples
+from pat.matching.colour_transfer import SETTINGS, by_examples, directions_of, filled_from
 
 H, W = 64, 96
 RED, BLUE = np.float32([0.3, -0.1, -0.1]), np.float32([-0.1, -0.1, 0.3])

@@ -13,10 +13,8 @@ from pat import FuseSettings, fuse
 from pat.fusion.inputs import frame_inputs
 from pat.fusion.views import Views
 from pat.matching.colour_transfer import transferred
-from pat.matching.inputs import Inputs, box_around
+from pat.matching.inputs import Colours, Inputs, Matches, box_around, enlarged
 from pat.matching.match import located, match
-from pat.matching.matches import Colours, Matches
-from pat.matching.positions import enlarged
 from pat.media.colour import luminance
 from pat.networks.protocol import FusionOutput, fused_at_once
 from pat.networks.weights import load_weights

@@ -14,8 +14,8 @@ from pat.fusion.views import Views
 from pat.matching import inputs as inputs_module
 from pat.matching import multiview as several
 from pat.matching.colour_transfer import transferred
+from pat.matching.inputs import Colours, Matches
 from pat.matching.match import in_each_beta, located, match
-from pat.matching.matches import Colours, Matches
 from pat.matching.multiview import NEAR as AGREES
 from pat.matching.multiview import MatchedBeta, agreed, with_likeliest_colours
 from pat.media.colour import luminance

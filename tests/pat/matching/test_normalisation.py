@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from pat.matching.filters import LocalMoments, blurred, box_mean
 from pat.matching.normalisation import Moments, equalising_blurs, mean_moments, moments, normalised
+from pat.media.filters import LocalMoments, blurred, box_mean
 
 
 def image(seed: int, bands: int = 1) -> torch.Tensor:

@@ -22,9 +22,8 @@ from arraygeom import (
     pixel_grid,
     rotation_from_vector,
 )
-from pat.matching.matches import BetaMatches, Colours
-from pat.matching.normalisation import Comparison, Normalisation, equalising_blurs
-from pat.matching.positions import match_positions
+from pat.matching.inputs import BetaMatches, Colours, Comparison, match_positions
+from pat.matching.normalisation import Normalisation, equalising_blurs
 from pat.matching.semi_global import matched_at_half_size
 from pat.media.colour import luminance
 from pat.support.memory import limited

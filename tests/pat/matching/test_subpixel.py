@@ -6,7 +6,7 @@ import torch
 from torch.nn.functional import avg_pool2d, interpolate
 
 from arraygeom import Segments, pixel_grid
-from pat.matching.normalisation import Comparison
+from pat.matching.inputs import Comparison
 from pat.matching.semi_global import matched_at_half_size
 from pat.matching.subpixel import SETTINGS, _runs, _surfaces
 from tests.pat.matching.matched_scenes import beside, blurred, matched

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pat.matching.surfaces import SETTINGS, Planes
+from pat.matching.subpixel import SETTINGS, Planes
 
 H, W = 120, 160
 

@@ -10,9 +10,9 @@ from arraygeom import Dense, Epipolar, Local, NearestVoxels, Positions, Segments
 from arraygeom.fields.grid import FieldOnGrid
 from pat import FuseSettings, fuse, load_weights
 from pat.matching import cost
-from pat.matching import semi_global_numba as kernels
+from pat.matching import kernels as kernels
 from pat.matching.cost import planes_of
-from pat.matching.tangents import along_tangents
+from pat.matching.semi_global import along_tangents
 from pat.support.metrics import score
 from tests.pat.layered_array import ALPHA, middle_of_sample
 
