@@ -170,7 +170,7 @@ def find_corrections(
     align = align and all(beta.field.pixels is not None for beta in frame.inputs.betas)
     if not network.uses_matches or not (fits or align):
         return corrections
-    small = _reduced_frame(frame)
+    small = _reduced_frame(frame._replace(inputs=replace(frame.inputs, learned=False)))
     for i in range(SETTINGS.passes):
         LOG.info("pre-pass %d of at most %d", i + 1, SETTINGS.passes)
         inputs = corrections.applied(small.inputs, small.hw)

@@ -1,4 +1,4 @@
-"""Choice of a pixel's disparity: that matched there, or one of a pixel beside it.
+"""Choice of a pixel's disparity, that matched there or one of a pixel beside it; and its confidence.
 
 Semi-global matching is wrong beside edges of depth, in regions that beta does not see, and where there is no
 texture; and nearly always the right disparity is that of a pixel not far off. So each pixel has candidates:
@@ -7,6 +7,12 @@ column. A U-Net computes their scores from alpha, the results of matching, and t
 beta at each. It was trained on matches of pairs with true disparity (`experiments.choice`), all with alpha on
 the left: there surfaces hide points of beta to their left. Elsewhere planes are turned first, so that it is
 to their left, too.
+
+Confidence is the probability of a match, and the likely distance of the true position from it. A small
+network, fitted to pairs with true disparity (`python -m experiments certainty`), computes both from the
+results of matching at a pixel and around it, the statements of the choice, the differences of disparities,
+the blur by which one image had to be made comparable, and the pair's consistent matches. It uses nothing of
+the image but by the choice, so it holds for any network that uses the matches.
 """
 
 from __future__ import annotations

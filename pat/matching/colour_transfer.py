@@ -1,4 +1,8 @@
-"""Beta's bands at alpha's view by matches: as bright as alpha, with its detail, diffused where not seen."""
+"""Beta's bands at alpha's view by matches: as bright as alpha, with its detail, filled in where not seen.
+
+Unseen pixels take the colour of the nearest neighbours among alpha's own seen pixels in brightness, texture
+and place (Welsh et al. 2002 colour a grey image so, by another one).
+"""
 
 from __future__ import annotations
 

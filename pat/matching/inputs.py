@@ -1,4 +1,9 @@
-"""Inputs of matching and fusion: alpha's image, and each beta's image and field of alpha's pixels in it."""
+"""Inputs and results of matching: images and fields in, positions and colours at alpha's pixels out.
+
+In go alpha's image, and each beta's image and field of alpha's pixels in it (`Inputs`). A match is a distance
+along the pixel's search segment, from its far end. Out are those of each beta, how they were compared, and
+the beta's bands there (`Matches`).
+"""
 
 from __future__ import annotations
 

@@ -1,8 +1,11 @@
-"""Compiled loops of `pat.matching.semi_global`, each on one image, in one thread, without Python's lock.
+"""Compiled loops of semi-global matching, of the planes through it and of the choice after it.
 
-Each pixel has one or two *runs* of `count` consecutive labels, which begin at `first` (h, w, runs) and do not
-overlap. Costs and sums of a run are in lanes, of which those after the last label mean nothing: a single run
-has as many as it needs, a multiple of 16; of two, each has 8, of which at most 5 are labels.
+Each works on one image, in one thread, without Python's lock.
+
+In semi-global matching each pixel has one or two *runs* of `count` consecutive labels, which begin at `first`
+(h, w, runs) and do not overlap. Costs and sums of a run are in lanes, of which those after the last label
+mean nothing: a single run has as many as it needs, a multiple of 16; of two, each has 8, of which at most 5
+are labels.
 """
 
 from __future__ import annotations

@@ -57,25 +57,31 @@ def match(inputs: Inputs, choice: Choice | None = None) -> Matches:
         raise ValueError(f"alpha has {w}x{h} pixels to match: pad both sides to multiples of {multiple}")
     if (least := min(h, w, *(side for image in betas for side in image.shape[-2:]))) < 4 * FINE:
         raise ValueError(f"an image to match has a side of {least} pixels: give {4 * FINE} or more")
-    if not inputs.learned:
-        return transferred(inputs, located(inputs))
-    with torch.no_grad():
-        matches = with_certainty(chosen(inputs, in_each_beta(inputs), choice))
-        if inputs.can_agree:
-            matches = with_likeliest_colours(inputs, matches, with_certainty(agreed(inputs, matches)))
-    if torch.is_grad_enabled():
+    matches = located(inputs, choice)
+    if inputs.learned and torch.is_grad_enabled():
         matches = following(inputs, matches)
     return transferred(inputs, matches)
 
 
-def located(inputs: Inputs) -> Matches:
+def located(inputs: Inputs, choice: Choice | None = None) -> Matches:
     """Match alpha's pixels in each beta, without colours; for several calibrated betas, where all agree.
 
+    Args:
+        choice: network that chooses between candidate disparities, as for `match`.
+
     Returns:
-        The matches, detached, without choice or certainty.
+        The matches, detached; without `inputs.learned` semi-global ones, without choice or certainty.
+
+    Raises:
+        ValueError: for a beta whose field is not of straight segments.
     """
-    of_each = in_each_beta(inputs)
-    return agreed(inputs, of_each) if inputs.can_agree else of_each
+    matches = in_each_beta(inputs)
+    if not inputs.learned:
+        return agreed(inputs, matches) if inputs.can_agree else matches
+    matches = with_certainty(chosen(inputs, matches, choice))
+    if not inputs.can_agree:
+        return matches
+    return with_likeliest_colours(inputs, matches, with_certainty(agreed(inputs, matches)))
 
 
 @torch.no_grad()

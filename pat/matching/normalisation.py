@@ -1,4 +1,4 @@
-"""Images made comparable: their moments (whole, where a weight is, and local), and their sharpness."""
+"""Images made comparable: their moments, whole and where a weight is, sharpness and similarity."""
 
 from __future__ import annotations
 

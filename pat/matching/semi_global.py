@@ -5,6 +5,12 @@ semi-global matching (Hirschmüller 2008) prefers depths that change little from
 labels are positions along each pixel's own segment, so it works for any rig with straight fields, rectified
 or not: all labels of a segment at half the size, and at full size those of a window around these matches.
 Without gradients.
+
+Fields of explicit positions become fields of segments (`along_tangents`). Where a pixel's positions follow
+each other along a curve they are labels like those of a segment. Positions without an order (a window, the
+nearest pixels, all) have no neighbours to agree with: the best one of each pixel is taken alone. The line
+through the match along the curve then is the pixel's search segment, in pixels of arc from its last position,
+and all further steps are as for any segment.
 """
 
 from __future__ import annotations

@@ -2,7 +2,9 @@
 
 At half the size an object's edge is some two pixels off and a slope is in steps. Here each pixel chooses, at
 full size, between labels around the least and around the greatest disparity of its neighbourhood at half the
-size.
+size. A step of least squares and planes through the surfaces give a fraction of a pixel: for every second
+pixel a plane, whose moments are gathered by the domain transform (Gastal and Oliveira 2011), to which a point
+beyond an edge of the guide is far away.
 """
 
 from __future__ import annotations

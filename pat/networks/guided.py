@@ -3,7 +3,7 @@
 Matching (`pat.matching`) gives the bands of each beta at its matches, the weight of each match, and fills for
 the rest. This network joins several betas, adds a fill by attention of alpha to itself
 (`pat.networks.recall`), and smooths doubtful pixels. Nothing of it is trained; the confidence and the depth
-that come with an image are (`pat.matching.choice`, `pat.matching.choice`).
+that come with an image are (`pat.matching.choice`).
 """
 
 from __future__ import annotations
