@@ -24,7 +24,7 @@ from ..media.colour import REC601, to_bytes
 from ..media.filters import LocalMoments, box_mean, numpy_of, smoothed
 from ..support.neighbours import nearest_points
 from ..support.settings import size, tuned
-from .inputs import Beta, BetaMatches, Colours, Inputs, Matches, at_matches, combined_bands, is_consistent
+from .inputs import Beta, BetaMatches, Colours, Inputs, Matches, at_matches, is_consistent
 from .normalisation import SETTINGS as NORMALISATION
 from .normalisation import Moments, explained_share, likeness, moments
 from .semi_global import DISPARITY_FILL
@@ -100,6 +100,52 @@ EVERY = (slice(None, None, 2),) * 2
 Plane = NDArray[np.float32]
 
 
+class MatchedValues(NamedTuple):
+    """Beta's values at the matches of alpha's pixels, and alpha as it is compared with them.
+
+    Attributes:
+        bands: beta's bands (B, C, H, W).
+        combined: combination of these that is compared with alpha, (B, 1, H, W).
+        brightness: that combination, normalised to alpha's brightness, (B, 1, H, W).
+        soft: alpha, blurred to be no sharper than beta, (B, 1, H, W).
+        valid: mask of the matches that are on beta, (B, 1, H, W).
+        consistent: 1 where a match passes the left-right check, else 0, (B, 1, H, W).
+        clipped: (B, C, H, W), 1 where a band is clipped, 0 elsewhere, and between them beside such pixels;
+            None for none, and for bands that are compared by a mix.
+    """
+
+    bands: Tensor
+    combined: Tensor
+    brightness: Tensor
+    soft: Tensor
+    valid: Tensor
+    consistent: Tensor
+    clipped: Tensor | None
+
+    @classmethod
+    def from_matches(cls, alpha: Float[Tensor, "b 1 h w"], beta: Beta, matches: BetaMatches) -> MatchedValues:
+        """Sample a beta at its matches.
+
+        Without a mix alpha is compared with luma of three bands, or the mean of others.
+
+        Raises:
+            ValueError: for a field that is not of straight segments.
+        """
+        comparison, segments = matches.comparison, beta.field.straight
+        image, soft = beta.image, comparison.whole.softened(alpha)
+        consistent = is_consistent(matches.facts)
+        if comparison.mix is not None:
+            bands, valid = at_matches(image, segments, matches.disparity)
+            combined = comparison.combined(bands)
+            return cls(bands, combined, combined, soft, valid, consistent, None)
+        luma = comparison.combined(image)
+        planes = [image, luma, comparison.whole.normalised(luma)]
+        planes += [] if beta.clipped is None else [beta.clipped.to(image)]
+        sampled, valid = at_matches(torch.cat(planes, 1), segments, matches.disparity)
+        bands, luma, brightness, *clipped = sampled.split([plane.shape[1] for plane in planes], 1)
+        return cls(bands, luma, brightness, soft, valid, consistent, clipped[0] if clipped else None)
+
+
 class MatchStatistics(NamedTuple):
     """Statistics over a frame's consistent matches: on beta, past the left-right check.
 
@@ -120,28 +166,11 @@ class MatchStatistics(NamedTuple):
     noise: Tensor
 
     @classmethod
-    def from_values(
-        cls,
-        alpha: Tensor,
-        soft: Tensor,
-        values: Tensor,
-        combined: Tensor,
-        brightness: Tensor,
-        valid: Tensor,
-        consistent: Tensor,
-    ) -> MatchStatistics:
-        """Compute the statistics of matches.
-
-        Args:
-            alpha: alpha's image (B, 1, H, W).
-            soft: alpha, blurred to be no sharper than beta; of its shape, as are the last four.
-            values: beta's bands (B, C, H, W) at the matches.
-            combined: combination of these bands that is compared with alpha.
-            brightness: that combination, normalised to alpha's brightness.
-            valid: mask of the matches that are on beta, and not clipped.
-            consistent: 1 where a match passes the left-right check, else 0.
-        """
-        both = valid * consistent
+    def from_values(cls, alpha: Float[Tensor, "b 1 h w"], matched: MatchedValues) -> MatchStatistics:
+        """Compute the statistics of alpha's image and a beta's values at the matches."""
+        values, combined, brightness, soft, valid, consistent, clipped = matched
+        counts = valid if clipped is None else valid & (clipped.amax(1, keepdim=True) < 0.5)
+        both = counts * consistent
         count = both.sum((-2, -1), keepdim=True) + 1
         colour = (both * (values - alpha)).sum((-2, -1), keepdim=True) / count
         measured = [moments(image, both) for image in (brightness, alpha)]
@@ -191,7 +220,7 @@ def transferred(inputs: Inputs, matches: Matches) -> Matches:
     def of(piece: Inputs, there: Matches) -> list[Tensor]:
         given: Sequence[MatchStatistics | None] = statistics or [None] * len(piece.betas)
         parts = zip(piece.betas, there.betas, given)
-        carried = (transferred_bands(piece.alpha, *one, sees_luma=piece.sees_luma)[:3] for one in parts)
+        carried = (transferred_bands(piece.alpha, *one, sees_luma=piece.sees_luma) for one in parts)
         return [stored(plane) for planes in carried for plane in planes]
 
     planes = iter(inputs.in_pieces(of, matches))
@@ -239,78 +268,55 @@ def directions_of(segments: Segments) -> Float[NDArray, "2 2"]:
 
 def _statistics_of_frame(inputs: Inputs, matches: Matches) -> list[MatchStatistics]:
     """Compute the statistics of each beta, over all pieces, in turn."""
-    pieces = ((inputs.cut(piece.outer), matches.cut(piece.outer)) for piece in inputs.pieces)
-    of_pieces = [
-        [transferred_bands(piece.alpha, *one)[-1] for one in zip(piece.betas, there.betas)]
-        for piece, there in pieces
-    ]
+    of_pieces = []
+    for tile in inputs.pieces:
+        piece, there = inputs.cut(tile.outer), matches.cut(tile.outer)
+        values = (MatchedValues.from_matches(piece.alpha, *one) for one in zip(piece.betas, there.betas))
+        of_pieces.append([MatchStatistics.from_values(piece.alpha, one) for one in values])
     return [MatchStatistics.mean(of_beta) for of_beta in zip(*of_pieces)]
 
 
 def transferred_bands(
-    alpha: Tensor,
-    beta: Beta,
-    matches: BetaMatches,
-    statistics: MatchStatistics | None = None,
-    *,
-    sees_luma: bool = True,
-) -> tuple[Tensor, Tensor, Tensor, MatchStatistics]:
-    """Compute a beta's colours at the matches: all of `Colours` but its fills.
-
-    Args:
-        alpha: alpha's image (B, 1, H, W).
-        beta: beta's image and field.
-        matches: matches in that beta.
-        statistics: statistics to use; None for those of these pixels.
-        sees_luma: True if alpha sees about the luma of RGB betas; not used for matches with a mix of bands.
-
-    Returns:
-        `bands`, `weight` and `likeness` of `Colours`, at alpha's pixels; and the statistics.
-
-    Raises:
-        ValueError: for a field that is not of straight segments.
-    """
-    if matches.comparison.mix is not None:
-        return _colours_of_bands(alpha, beta, matches, matches.comparison.mix, statistics)
-    return matched_colours(alpha, beta, matches, statistics, sees_luma=sees_luma)
-
-
-def matched_colours(
     alpha: Float[Tensor, "b 1 h w"],
     beta: Beta,
     matches: BetaMatches,
     statistics: MatchStatistics | None = None,
     *,
     sees_luma: bool = True,
-) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 1 h w"], Float[Tensor, "b 1 h w"], MatchStatistics]:
-    """Compute beta's bands minus alpha at the matches, with the detail that alpha has and beta lacks.
-
-    Alpha is compared with luma of three bands, or the mean of others, whatever mix the matches have.
+) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 1 h w"], Float[Tensor, "b 1 h w"]]:
+    """Compute a beta's colours at the matches: all of `Colours` but its fills.
 
     Args:
+        alpha: alpha's image.
+        beta: beta's image and field.
+        matches: matches in that beta.
         statistics: statistics to use; None for those of these pixels.
         sees_luma: True if alpha sees about the luma of RGB betas: photometric similarity then counts in the
-            weight, and colours grow with alpha's brightness.
+            weight, and colours grow with alpha's brightness; not used for matches with a mix of bands.
 
     Returns:
-        Bands minus alpha (the statistics' mean where the match is not on beta); the weight of these colours,
-        0 to 1; the similarity, 0 to 1, as in `Colours` (all 1 without `sees_luma`); and the statistics.
+        `bands` (the statistics' mean where the match is not on beta), `weight` and `likeness` of `Colours`,
+        at alpha's pixels.
 
     Raises:
         ValueError: for a field that is not of straight segments.
     """
-    guide, normalisation = combined_bands(beta.image), matches.comparison.whole
-    bands = beta.image.shape[1]
-    clipped = torch.zeros_like(beta.image) if beta.clipped is None else beta.clipped.to(beta.image)
-    planes = torch.cat([beta.image, guide, normalisation.normalised(guide), clipped], 1)
-    sampled, valid = at_matches(planes, beta.field.straight, matches.disparity)
-    values, luma, brightness, clipped = sampled.split([bands, 1, 1, bands], 1)
-    consistent, soft = is_consistent(matches.facts), normalisation.softened(alpha)
-    statistics = statistics or MatchStatistics.from_values(
-        alpha, soft, values, luma, brightness, valid & (clipped.amax(1, keepdim=True) < 0.5), consistent
-    )
-    unlike = statistics.leveled(brightness) - soft
-    if beta.clipped is not None and bands == 3 and sees_luma:
+    there, mix = MatchedValues.from_matches(alpha, beta, matches), matches.comparison.mix
+    statistics = statistics or MatchStatistics.from_values(alpha, there)
+    if mix is not None:
+        colours, weight, alike = _colours_by_mix(alpha, matches, there, mix)
+    else:
+        colours, weight, alike = _colours_by_luma(alpha, matches, there, statistics, sees_luma=sees_luma)
+    return torch.where(there.valid, colours, statistics.colour), weight, alike
+
+
+def _colours_by_luma(
+    alpha: Tensor, matches: BetaMatches, there: MatchedValues, statistics: MatchStatistics, *, sees_luma: bool
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Compute bands minus alpha, with the detail that alpha has and beta lacks; their weight and likeness."""
+    values, luma, brightness, soft, valid, _, clipped = there
+    bands, unlike = values.shape[1], statistics.leveled(brightness) - soft
+    if clipped is not None and bands == 3 and sees_luma:
         values, whole = with_clipped_light(values, luma, soft, clipped)
         unlike = unlike + (whole - luma) * (1 - clipped.amin(1, keepdim=True))  # white may be of any colour
         luma = whole
@@ -318,17 +324,29 @@ def matched_colours(
     if bands == 1:  # which may be unlike alpha
         alike = torch.lerp(torch.ones_like(alike), alike, statistics.explained.to(alike))
     weight = match_weight(alike, matches, valid)
-    if bands > 1:
-        power = SETTINGS.saturation if sees_luma else 0.0
-        colour, bright = _scaled_to_alpha(values - luma, luma, alpha, weight, power)
-        if float(statistics.noise.amax()) > SETTINGS.least_noise:
-            colour = _without_noise(colour, bright, statistics.noise)
-        radii = [round(SETTINGS.detail_radius * max(1.0, blur)) for blur in normalisation.blurs[0]]
-        detailed = _each_detailed(colour, bright, alpha, radii)
-        matched = torch.lerp(colour, detailed, statistics.explained) + luma - alpha
-    else:
-        matched = _detailed(values, soft, alpha) - alpha
-    return torch.where(valid, matched, statistics.colour), weight, alike, statistics
+    if bands == 1:
+        return _detailed(values, soft, alpha) - alpha, weight, alike
+    power = SETTINGS.saturation if sees_luma else 0.0
+    colour, bright = _scaled_to_alpha(values - luma, luma, alpha, weight, power)
+    if float(statistics.noise.amax()) > SETTINGS.least_noise:
+        colour = _without_noise(colour, bright, statistics.noise)
+    radii = [round(SETTINGS.detail_radius * max(1.0, blur)) for blur in matches.comparison.whole.blurs[0]]
+    detailed = _each_detailed(colour, bright, alpha, radii)
+    return torch.lerp(colour, detailed, statistics.explained) + luma - alpha, weight, alike
+
+
+def _colours_by_mix(
+    alpha: Tensor, matches: BetaMatches, there: MatchedValues, mix: SpectralMix
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Compute bands minus alpha, with the detail that alpha has and they lack; their weight and likeness."""
+    values, brightness, soft = there.bands, there.brightness, there.soft
+    gain = mix.gain[:, None, None, None].to(alpha)
+    beyond = (alpha - soft) + gain * (soft - brightness)
+    rises = mix.rises(values)
+    slope = rises + local_slope(values - rises * brightness, brightness)
+    colours = values + slope * SETTINGS.detail(beyond) - alpha
+    alike = likeness(brightness - soft)
+    return colours, match_weight(alike, matches, there.valid), alike
 
 
 def with_clipped_light(
@@ -353,30 +371,6 @@ def with_clipped_light(
     share = (clipped * values.new_tensor(REC601)[:, None, None]).sum(1, keepdim=True)
     beyond = (alpha - luma).clamp(min=0) * share / (share.square() + SETTINGS.light_differs)
     return values + clipped * beyond, luma + share * beyond
-
-
-def _colours_of_bands(
-    alpha: Tensor, beta: Beta, matches: BetaMatches, mix: SpectralMix, statistics: MatchStatistics | None
-) -> tuple[Tensor, Tensor, Tensor, MatchStatistics]:
-    """Compute the bands minus alpha at matches by a mix, with the detail that alpha has and they lack.
-
-    Returns:
-        Bands, weight, likeness and statistics, as of `transferred_bands`.
-    """
-    values, valid = at_matches(beta.image, beta.field.straight, matches.disparity)
-    brightness, soft = mix.combined(values), matches.comparison.whole.softened(alpha)
-    gain = mix.gain[:, None, None, None].to(alpha)
-    beyond = (alpha - soft) + gain * (soft - brightness)
-    rises = mix.rises(values)
-    slope = rises + local_slope(values - rises * brightness, brightness)
-    colours = values + slope * SETTINGS.detail(beyond) - alpha
-    consistent = is_consistent(matches.facts)
-    statistics = statistics or MatchStatistics.from_values(
-        alpha, soft, values, brightness, brightness, valid, consistent
-    )
-    alike = likeness(brightness - soft)
-    weight = match_weight(alike, matches, valid)
-    return torch.where(valid, colours, statistics.colour), weight, alike, statistics
 
 
 def _scaled_to_alpha(

@@ -236,7 +236,7 @@ def _matched_blocks(
     images, tasks, nbytes = [], [], 1.0
     for i, (mine, its) in enumerate(zip(planes[: len(alpha)], planes[len(alpha) :])):
         views = alpha[i], windows.first[i], *(g[i] for g in geometry), *mine
-        images.append(_Image(views, flat(its), (rows, columns), (disparity[i], measured[i], place[i]), []))
+        images.append(_Image(views, _flat(its), (rows, columns), (disparity[i], measured[i], place[i]), []))
         boxes = _boxes(hw, geometry.along[i], windows.first.shape[-1] * windows.labels, settings)
         tasks += [partial(_block, images[-1], box, windows, settings) for box in boxes]
         for_each = settings.pixel_bytes + settings.label_bytes * math.prod(windows.lanes)
@@ -249,7 +249,7 @@ def _matched_blocks(
     return disparity, measured
 
 
-def flat(planes: Sequence[NDArray]) -> tuple[NDArray, ...]:
+def _flat(planes: Sequence[NDArray]) -> tuple[NDArray, ...]:
     """Return planes (h, w, ...) as lists of pixels."""
     return tuple(plane.reshape(-1, *plane.shape[2:]) for plane in planes)
 
@@ -276,7 +276,7 @@ def _block(image: _Image, box: Tile, windows: Windows, settings: SemiGlobalSetti
     )
     labels, segments = (first, windows.labels), (end, along, length, cut)
     cost = np.empty((*length.shape, *windows.lanes), np.uint8)
-    kernels.costs(flat(alpha_planes), image.other, *labels, *segments, *image.hw, cost)
+    kernels.costs(_flat(alpha_planes), image.other, *labels, *segments, *image.hw, cost)
     total = np.empty(cost.shape, np.int16)
     step, jump = np.float32(settings.step), np.float32(settings.jump)
     kernels.aggregate(cost, guide, *labels, step, jump, total)
@@ -417,7 +417,7 @@ def _labels(alpha: Tensor, guide: Tensor, grid: _BlockCentres, *, ordered: bool)
     half_alpha, half_guide = avg_pool2d(alpha, FINE), avg_pool2d(guide, FINE)
     views = Normalisation.from_images(half_alpha, half_guide).views(half_alpha, half_guide)
     a, b = (numpy_of(p[0, 0]) for p in views[:2])
-    planes, other_planes = planes_of(a), flat(planes_of(b))
+    planes, other_planes = planes_of(a), _flat(planes_of(b))
     label, margin = np.zeros((2, *a.shape), np.float32)
     side, halo = (HALF_SIZE.block, HALF_SIZE.margin) if ordered else ((grid.rows, a.shape[1]), 0)
     for tile in tiles_of(a.shape, side, halo):
@@ -426,7 +426,7 @@ def _labels(alpha: Tensor, guide: Tensor, grid: _BlockCentres, *, ordered: bool)
         lanes = -(-places.shape[-1] // kernels.LANES) * kernels.LANES
         cost = np.empty((*places.shape[:2], 1, lanes), np.uint8)
         parts = [np.ascontiguousarray(p[outer]) for p in planes]
-        kernels.costs_at(flat(parts), other_planes, places, cost)
+        kernels.costs_at(_flat(parts), other_planes, places, cost)
         total = cost.astype(np.int16)
         if ordered:
             first = np.zeros((*places.shape[:2], 1), np.int32)

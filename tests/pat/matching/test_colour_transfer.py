@@ -13,6 +13,7 @@ from pat.matching import colour_transfer as warped
 from pat.matching import inputs as inputs_module
 from pat.matching.colour_transfer import (
     SETTINGS,
+    MatchedValues,
     MatchStatistics,
     _diffused,
     by_examples,
@@ -207,7 +208,7 @@ def test_statistics_of_pieces_are_those_of_the_whole():
 
     def statistics(columns: slice) -> MatchStatistics:
         a, b, one = (image[..., columns] for image in (alpha, beta, ones))
-        return MatchStatistics.from_values(a, a, b, b, b, one, one)
+        return MatchStatistics.from_values(a, MatchedValues(b, b, b, a, one > 0, one, None))
 
     whole = statistics(slice(None))
     pieces = MatchStatistics.mean([statistics(slice(0, 20)), statistics(slice(20, 60))])
