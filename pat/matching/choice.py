@@ -206,7 +206,7 @@ def features(
         typical: `typical_facts` of the whole frame.
 
     Returns:
-        Channels at half the size: the `FACTS`, then the numbers of `choice_numba.compared`, four for the 2 x
+        Channels at half the size: the `FACTS`, then the numbers of `kernels.compared`, four for the 2 x
         2 pixels of each plane.
     """
     extent, (h, w) = Extent.from_segments(segments), options.shape[-2:]
