@@ -269,8 +269,7 @@ def directions_of(segments: Segments) -> Float[NDArray, "2 2"]:
 def _statistics_of_frame(inputs: Inputs, matches: Matches) -> list[MatchStatistics]:
     """Compute the statistics of each beta, over all pieces, in turn."""
     of_pieces = []
-    for tile in inputs.pieces:
-        piece, there = inputs.cut(tile.outer), matches.cut(tile.outer)
+    for piece, there in inputs.cut_in_pieces(matches):
         values = (MatchedValues.from_matches(piece.alpha, *one) for one in zip(piece.betas, there.betas))
         of_pieces.append([MatchStatistics.from_values(piece.alpha, one) for one in values])
     return [MatchStatistics.mean(of_beta) for of_beta in zip(*of_pieces)]

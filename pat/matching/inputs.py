@@ -8,7 +8,7 @@ the beta's bands there (`Matches`).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -143,11 +143,13 @@ class Inputs:
         Returns:
             Planes of the whole frame: a tensor or a tuple; with a single tile the function's own result.
         """
-        pieces = self.pieces
-        if len(pieces) == 1:
+        if len(self.pieces) == 1:
             return make(self, *more)
-        made = (make(*(one.cut(piece.outer) for one in (self, *more))) for piece in pieces)
-        return assembled(self.hw, zip(pieces, made))
+        return assembled(self.hw, zip(self.pieces, (make(*parts) for parts in self.cut_in_pieces(*more))))
+
+    def cut_in_pieces(self, *more: Any) -> Iterator[list[Any]]:
+        """Yield these inputs and other values with a method `cut(box)` in each of `pieces`, in turn."""
+        return ([one.cut(piece.outer) for one in (self, *more)] for piece in self.pieces)
 
     @property
     def can_agree(self) -> bool:

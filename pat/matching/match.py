@@ -76,12 +76,12 @@ def located(inputs: Inputs, choice: Choice | None = None) -> Matches:
         ValueError: for a beta whose field is not of straight segments.
     """
     matches = in_each_beta(inputs)
-    if not inputs.learned:
-        return agreed(inputs, matches) if inputs.can_agree else matches
-    matches = with_certainty(chosen(inputs, matches, choice))
+    if inputs.learned:
+        matches = with_certainty(chosen(inputs, matches, choice))
     if not inputs.can_agree:
         return matches
-    return with_likeliest_colours(inputs, matches, with_certainty(agreed(inputs, matches)))
+    together = agreed(inputs, matches)
+    return with_likeliest_colours(inputs, matches, with_certainty(together)) if inputs.learned else together
 
 
 @torch.no_grad()
@@ -113,9 +113,9 @@ def located_in_one(inputs: Inputs) -> BetaMatches:
     Raises:
         ValueError: for several betas, or a field that is not of straight segments.
     """
-    comparison = Comparison.from_images(inputs.alpha, inputs.betas[0].image, seen_mix(inputs))
-    halves = comparison.half_views(inputs.alpha, inputs.betas[0].image)
-    half = matched_at_half_size(halves, inputs.betas[0].field.of_blocks(FINE))
+    mix, alpha, (beta,) = seen_mix(inputs), inputs.alpha, inputs.betas
+    comparison = Comparison.from_images(alpha, beta.image, mix)
+    half = matched_at_half_size(comparison.half_views(alpha, beta.image), beta.field.of_blocks(FINE))
 
     def closer(piece: Inputs, rough: HalfSizeMatches) -> tuple[Tensor, Tensor]:
         (beta,) = piece.betas
