@@ -24,13 +24,10 @@ from experiments.fit import command, recipe_text
 from experiments.training_pairs.samples import KINDS, PairTraining, fused_at_random
 from pat.lab.data.pairs import Disparity, StereoPair
 from pat.lab.synthesis.rigs import below
-from pat.matching.certainty import SETTINGS, typical_facts
-from pat.matching.choice import CANDIDATES, Choice, candidates, features
-from pat.matching.inputs import Inputs
+from pat.matching.choice import CANDIDATES, SETTINGS, Choice, candidates, features, typical_facts
+from pat.matching.inputs import FINE, BetaMatches, Comparison, Inputs, Matches
 from pat.matching.match import located_in_one, match
-from pat.matching.matches import BetaMatches, Matches
-from pat.matching.normalisation import ComparedViews, Comparison, Normalisation
-from pat.matching.positions import FINE
+from pat.matching.normalisation import ComparedViews, Normalisation
 from pat.media.colour import to_bytes
 from pat.networks.guided import GuidedPAT
 from pat.support.tensor_files import write_tensors

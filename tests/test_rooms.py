@@ -35,7 +35,7 @@ MAY_IMPORT = {
 """The rooms that a room may import beside itself; a room's own folders may import one another."""
 NEVER = {
     "pat.fusion": {"pat.networks.paper", "pat.networks.guided", "pat.networks.bandwise"},
-    "pat.networks": {"pat.matching.choice_numba", "pat.matching.semi_global_numba"},
+    "pat.networks": {"pat.matching.kernels"},
 }
 """Files that a room may not import either: the fusion knows a network by its protocol alone."""
 NAMES_THE_LAB = "pat.app.cli."

@@ -22,12 +22,9 @@ from pat.fusion.fuse import FuseSettings
 from pat.lab.data.pairs import PAPER_DISPARITY, StereoPair
 from pat.lab.evaluation.protocols import hw_of, rectified_fusion
 from pat.lab.evaluation.tables import grouped, markdown_table
-from pat.matching.certainty import SETTINGS, CertaintyNetwork, measured, typical_facts
-from pat.matching.choice import Choice
-from pat.matching.inputs import Inputs
+from pat.matching.choice import SETTINGS, CertaintyNetwork, Choice, measured, typical_facts
+from pat.matching.inputs import FINE, BetaMatches, Inputs, Matches
 from pat.matching.match import match
-from pat.matching.matches import BetaMatches, Matches
-from pat.matching.positions import FINE
 from pat.networks.protocol import FusionNetwork
 from pat.support.tensor_files import read_tensors, with_weights
 

@@ -18,7 +18,7 @@ from pat.lab.data.pairs import StereoPair, middlebury_pairs
 from pat.lab.evaluation import protocols, stereo
 from pat.lab.evaluation.ablation import sample_photographs
 from pat.lab.evaluation.tables import write_csv
-from pat.matching.certainty import fitted_network
+from pat.matching.choice import fitted_certainty
 from pat.media.figures import save_panels
 from pat.networks.paper import PAT
 from pat.networks.protocol import Comparing, FusionNetwork
@@ -190,7 +190,7 @@ class Certainty(Pairs):
             write_tensors(self.fit, certainty.widened(judged).state_dict())
             held = certainty.held(judged, certainty.by_thirds(judged))
         else:
-            held = certainty.held(judged, lambda one: certainty.Stated.by(fitted_network(), one.numbers))
+            held = certainty.held(judged, lambda one: certainty.Stated.by(fitted_certainty(), one.numbers))
         certainty.save_reliability(held, self.out / "reliability.png")
         finished(self.out / "certainty.md", certainty.held_markdown(held), ", and reliability.png beside it")
 

@@ -22,10 +22,8 @@ from ..fusion.inputs import prepared
 from ..fusion.steps import steps_for, undone
 from ..fusion.tiles import fused_in_tiles
 from ..fusion.views import Views
-from ..matching.inputs import Inputs
+from ..matching.inputs import Extent, Inputs, Matches, match_positions
 from ..matching.match import match
-from ..matching.matches import Matches
-from ..matching.positions import Extent, match_positions
 from ..matching.radiometry import Response
 from ..media.images import Images
 from ..networks.protocol import FusionOutput, JoinsBands, required

@@ -25,8 +25,8 @@ from arraygeom.runtime.threads import torch_in_one_thread
 from arraygeom.sampling import Interpolation, on_image
 from arraygeom.undistortion import pixels_between, recorded_pixels, resampled
 
+from ..matching.inputs import BetaMatches
 from ..matching.match import Matcher, match
-from ..matching.matches import BetaMatches
 from ..media.images import Images
 from ..networks.protocol import FusionNetwork
 from ..support.blocks import without_autocast

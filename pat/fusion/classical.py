@@ -22,9 +22,9 @@ from torch import Tensor
 from arraygeom import Camera, Pair, Rig
 from arraygeom.checks import checked
 
-from ..matching.filters import filled
 from ..media.colour import from_luma_chroma, luminance, to_bytes
 from ..media.figures import reduced
+from ..media.filters import filled
 from ..sensors import NoiseLevel
 from ..support.neighbours import nearest_points
 from .frame import Frame
@@ -408,7 +408,7 @@ def _blended(values: Image, weight: Image, mono: Image, guide: NDArray[np.uint8]
 def _by_examples(values: Image, seen: NDArray[np.bool_], mono: Image) -> Image:
     """Replace unseen values (c, h, w) by the mean of the seen ones nearest in luminance, texture and place.
 
-    Not `pat.matching.examples`, on purpose: what the fusion is compared with shares none of its stages.
+    Not `pat.matching.colour_transfer`, on purpose: the fusion's baseline shares none of its stages.
     """
     columns, rows = _grid(mono.shape)
     texture = [np.sqrt(np.maximum(_mean(mono * mono, r) - _mean(mono, r) ** 2, 0)) for r in (2, 6)]

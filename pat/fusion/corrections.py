@@ -2,7 +2,7 @@
 
 A pre-pass matches the images at half the size or less, without a network. Where its matches are reliable,
 alpha's response is fitted (`pat.matching.radiometry`), and beta's distance across its search segments
-(`pat.matching.epipolar_offset`). Both are corrected before the frame is fused.
+(`pat.fusion.epipolar_offset`). Both are corrected before the frame is fused.
 """
 
 from __future__ import annotations
@@ -23,19 +23,25 @@ from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.pixels import HW
 from arraygeom.sampling import sample
 
-from ..matching.epipolar_offset import SETTINGS as ALIGNMENT
-from ..matching.epipolar_offset import Misalignment, fit_misalignment
-from ..matching.filters import blurred
-from ..matching.inputs import Beta, Inputs, track_in
+from ..matching.inputs import (
+    CONSISTENT,
+    Beta,
+    BetaMatches,
+    Inputs,
+    combined_bands,
+    enlarged,
+    reduced,
+    track_in,
+)
 from ..matching.match import located
-from ..matching.matches import BetaMatches
 from ..matching.normalisation import SETTINGS as NORMALISATION
-from ..matching.normalisation import Normalisation, combined_bands, moments
-from ..matching.positions import enlarged, normals, reduced
+from ..matching.normalisation import Normalisation, moments
 from ..matching.radiometry import Response, ResponseSpec, fit, given_response
-from ..matching.semi_global import CONSISTENT
+from ..media.filters import blurred
 from ..networks.protocol import FusionNetwork
 from ..support.settings import size, tuned
+from .epipolar_offset import SETTINGS as ALIGNMENT
+from .epipolar_offset import Misalignment, fit_misalignment, normals
 from .frame import Frame
 from .inputs import FrameInputs, padded
 
@@ -164,7 +170,7 @@ def find_corrections(
     align = align and all(beta.field.pixels is not None for beta in frame.inputs.betas)
     if not network.uses_matches or not (fits or align):
         return corrections
-    small = _reduced_frame(frame)
+    small = _reduced_frame(frame._replace(inputs=replace(frame.inputs, learned=False)))
     for i in range(SETTINGS.passes):
         LOG.info("pre-pass %d of at most %d", i + 1, SETTINGS.passes)
         inputs = corrections.applied(small.inputs, small.hw)

@@ -16,9 +16,7 @@ from arraygeom.pixels import HW
 from arraygeom.runtime.chunks import ROWS, Tile, assembled, tiles_of
 from arraygeom.runtime.threads import in_order
 
-from ..matching.inputs import Beta, Inputs
-from ..matching.matches import Matches
-from ..matching.positions import FINE
+from ..matching.inputs import FINE, Beta, Inputs, Matches
 from ..networks.protocol import FusionOutput
 from ..support.settings import size
 from .inputs import Placement

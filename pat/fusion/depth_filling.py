@@ -15,9 +15,9 @@ from torch import Tensor
 
 from arraygeom.runtime.chunks import chunked
 
-from ..matching.filters import nearest_known, numpy_of
-from ..matching.positions import FINE
-from ..matching.surfaces import Plane, Planes, repeated
+from ..matching.inputs import FINE
+from ..matching.subpixel import Plane, Planes, repeated
+from ..media.filters import nearest_known, numpy_of
 from ..support.settings import physics, tuned
 from .frame import Frame
 from .inputs import FrameInputs, Placement

@@ -19,9 +19,8 @@ from arraygeom.fields.ray_depth import ray_depth
 from arraygeom.pixels import HW
 from arraygeom.runtime.text import length_unit
 
-from ..matching.inputs import Beta, Inputs
-from ..matching.normalisation import combined_bands
-from ..matching.tangents import along_tangents
+from ..matching.inputs import Beta, Inputs, combined_bands
+from ..matching.semi_global import along_tangents
 from ..networks.protocol import FusionNetwork
 from .steps import FusionStep, Undo, takes_pinhole_views
 from .views import Views, check_precision, innermost, states_distance

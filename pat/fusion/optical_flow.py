@@ -13,7 +13,7 @@ from torch import Tensor
 
 from arraygeom import pixel_grid, sample
 
-from ..matching.likeness import likeness
+from ..matching.normalisation import likeness
 from ..media.colour import to_bytes
 from ..support.settings import tuned
 

@@ -25,8 +25,7 @@ from arraygeom import Moved, ReceptiveField, Rig, Widened
 from arraygeom.checks import check_above
 from arraygeom.fields.default import straight_field
 
-from ..matching.likeness import UNLIKE
-from ..matching.normalisation import Moments, mean_moments
+from ..matching.normalisation import UNLIKE, Moments, mean_moments
 from ..matching.radiometry import Response
 from ..networks.protocol import FusionNetwork
 from ..sensors import NoiseLevel

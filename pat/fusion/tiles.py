@@ -16,8 +16,7 @@ from torch import Tensor, nn
 from arraygeom import pixel_grid
 from arraygeom.runtime.chunks import Box, Tile, area, assembled, sides_by_work, tiles_of, whole
 
-from ..matching.inputs import Inputs
-from ..matching.matches import Matches
+from ..matching.inputs import Inputs, Matches
 from ..networks.protocol import FusionNetwork, matched_for
 from ..support.convolutions import convolutions_in_parallel
 from ..support.memory import LIBRARIES, SLACK

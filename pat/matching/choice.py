@@ -1,4 +1,4 @@
-"""Choice of a pixel's disparity: that matched there, or one of a pixel beside it.
+"""Choice of a pixel's disparity, that matched there or one of a pixel beside it; and its confidence.
 
 Semi-global matching is wrong beside edges of depth, in regions that beta does not see, and where there is no
 texture; and nearly always the right disparity is that of a pixel not far off. So each pixel has candidates:
@@ -7,6 +7,12 @@ column. A U-Net computes their scores from alpha, the results of matching, and t
 beta at each. It was trained on matches of pairs with true disparity (`experiments.choice`), all with alpha on
 the left: there surfaces hide points of beta to their left. Elsewhere planes are turned first, so that it is
 to their left, too.
+
+Confidence is the probability of a match, and the likely distance of the true position from it. A small
+network, fitted to pairs with true disparity (`python -m experiments certainty`), computes both from the
+results of matching at a pixel and around it, the statements of the choice, the differences of disparities,
+the blur by which one image had to be made comparable, and the pair's consistent matches. It uses nothing of
+the image but by the choice, so it holds for any network that uses the matches.
 """
 
 from __future__ import annotations
@@ -17,34 +23,30 @@ from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 
+import cv2
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
-from torch.nn.functional import pad, pixel_shuffle
+from torch.nn.functional import max_pool2d, pad, pixel_shuffle
 
 from arraygeom import Segments
-from arraygeom.runtime.chunks import spans
+from arraygeom.runtime.chunks import ROWS, Tile, assembled, spans, tiles_of
 from arraygeom.runtime.threads import in_parallel
 
+from ..media.filters import box_mean, nearest_known, numpy_of
 from ..support.blocks import UNet
 from ..support.convolutions import convolutions_in_parallel
 from ..support.settings import size
 from ..support.tensor_files import with_weights
-from . import choice_numba as kernels
-from .certainty import typical_facts
-from .filters import nearest_known, numpy_of
-from .inputs import Inputs
-from .matches import BetaMatches, Matches
+from . import kernels
+from .inputs import CONSISTENT, FINE, BetaMatches, Extent, Inputs, Matches, enlarged
 from .normalisation import ComparedViews
-from .positions import FINE, Extent, enlarged
-from .semi_global import CONSISTENT
-
-FITTED = Path(__file__).with_name("choice.safetensors")
 
 
 @dataclass(frozen=True)
 class ChoiceSettings:
-    """Settings of the candidate disparities of a pixel and of the network that scores them.
+    """Settings of the candidate disparities of a pixel, of the network that scores them, and of confidence.
 
     `pat lab settings` prints the value of each with its meaning and reason.
     """
@@ -56,6 +58,11 @@ class ChoiceSettings:
     widths: tuple[int, int, int] = size((32, 48, 64), "Channels at 1/2, 1/4 and 1/8 of the size")
     multiple: int = size(8, "Images are padded to multiples of this")
     blur: float = size(6.375, "A blur, in pixels, of this counts as 1")
+    averaged: tuple[int, int] = size((2, 6), "Radii, at half the size, in which facts are averaged")
+    apart: tuple[int, int] = size((1, 4), "Radii, at full size, in which disparities are compared")
+    width: int = size(16, "Numbers in each of the confidence network's two hidden layers")
+    least: float = size(1e-3, "The least probability where a segment is: what is chosen there gives depth")
+    covered: float = size(0.9, "The share of true positions that an interval is to cover")
 
 
 SETTINGS = ChoiceSettings()
@@ -91,7 +98,7 @@ class Choice(nn.Module):
 @cache
 def fitted_choice() -> Choice:
     """Return the network that ships, loaded once."""
-    return with_weights(Choice(), FITTED)
+    return with_weights(Choice(), Path(__file__).with_name("choice.safetensors"))
 
 
 @torch.no_grad()
@@ -199,7 +206,7 @@ def features(
         typical: `typical_facts` of the whole frame.
 
     Returns:
-        Channels at half the size: the `FACTS`, then the numbers of `choice_numba.compared`, four for the 2 x
+        Channels at half the size: the `FACTS`, then the numbers of `kernels.compared`, four for the 2 x
         2 pixels of each plane.
     """
     extent, (h, w) = Extent.from_segments(segments), options.shape[-2:]
@@ -226,3 +233,96 @@ def _at_half(matches: BetaMatches, typical: Tensor) -> Float[Tensor, "b 7 h2 w2"
     blurs = torch.tensor(matches.comparison.whole.blurs).T.to(typical) / SETTINGS.blur
     same = torch.cat([typical, blurs], 1)[..., None, None].expand(-1, -1, *matches.facts.shape[-2:])
     return torch.cat([matches.facts, same], 1) - 0.4
+
+
+MEASURED = 3 * (1 + len(SETTINGS.averaged)) + len(SETTINGS.apart) + 4 + 2
+"""Number of inputs of a pixel."""
+
+
+class CertaintyNetwork(nn.Sequential):
+    """Network of a match's confidence, from the `measured` numbers of its pixel; a new one is not trained.
+
+    It takes them in the last axis, (..., `MEASURED`), and returns two (..., 2): the logit of the probability
+    that the match is right, and the logarithm of the half-width, pixels of beta, of the interval that holds
+    the true position in 9 of 10 cases.
+    """
+
+    def __init__(self) -> None:
+        width = SETTINGS.width
+        first, middle, last = nn.Linear(MEASURED, width), nn.Linear(width, width), nn.Linear(width, 2)
+        super().__init__(first, nn.SiLU(), middle, nn.SiLU(), last)
+
+
+@cache
+def fitted_certainty() -> CertaintyNetwork:
+    """Return the network that ships, loaded once."""
+    return with_weights(CertaintyNetwork(), Path(__file__).with_name("certainty.safetensors"))
+
+
+@torch.no_grad()
+def with_certainty(matches: Matches) -> Matches:
+    """Add the confidence of each match, by the network that ships.
+
+    The probability is at least `SETTINGS.least`; where one was known before, the smaller of both counts.
+
+    Returns:
+        The matches with a detached `certainty`, else as given.
+
+    Raises:
+        AssertionError: for matches before the choice network has run (`stated` is None).
+    """
+    return Matches(tuple(replace(beta, certainty=_certainty(beta)) for beta in matches.betas))
+
+
+def _certainty(matches: BetaMatches) -> Float[Tensor, "b 2 h2 w2"]:
+    """Compute confidence, and half of the interval of disparity, by the fitted network, in pieces."""
+    typical, (h, w) = typical_facts(matches), matches.disparity.shape[-2:]
+    bare = replace(matches, colours=None, certainty=None)
+    network = deepcopy(fitted_certainty()).to(matches.facts)  # another thread may need another type
+
+    def of(tile: Tile) -> Tensor:
+        numbers = measured(bare.cut(tile.outer), typical).movedim(1, -1)
+        logit, half_width = network(numbers).unbind(-1)
+        return torch.stack([logit.sigmoid().clamp(min=SETTINGS.least), half_width.exp()], 1)
+
+    halo = FINE * max(SETTINGS.averaged + SETTINGS.apart)
+    certainty = assembled((h, w), ((tile, of(tile)) for tile in tiles_of((h, w), (FINE * ROWS, w), halo)))
+    if matches.certainty is not None:
+        certainty[:, :1] = certainty[:, :1].minimum(matches.certainty[:, :1])
+    return certainty
+
+
+def typical_facts(matches: BetaMatches) -> Float[Tensor, "b 2"]:
+    """Compute the mean margin and cost of the pair's consistent matches."""
+    consistent = (matches.facts[:, :1] < CONSISTENT).to(matches.facts)
+    some = consistent.mean((-2, -1)).clamp(min=1e-3)
+    return (matches.facts[:, 1:] * consistent).mean((-2, -1)) / some
+
+
+def measured(matches: BetaMatches, typical: Float[Tensor, "b 2"]) -> Float[Tensor, "b n h2 w2"]:
+    """Compute the confidence network's inputs: `MEASURED` numbers of each pixel at half the size.
+
+    Args:
+        matches: matches in one beta, after the choice network (AssertionError before).
+        typical: `typical_facts` of the whole frame.
+
+    Returns:
+        Numbers (B, `MEASURED`, H / 2, W / 2): `facts`, and their means in each radius of `SETTINGS.averaged`;
+        logarithms of .1 plus the range of `surface` in each of `SETTINGS.apart`; blurs of alpha and of beta;
+        `typical`; `stated`.
+    """
+    assert matches.stated is not None
+    facts = [matches.facts, *(box_mean(matches.facts, radius) for radius in SETTINGS.averaged)]
+    ranges = (max_pool2d(_range(matches.surface, radius), FINE) for radius in SETTINGS.apart)
+    apart = [(spread.clamp(min=0) + 0.1).log() for spread in ranges]
+    blurs = torch.tensor(matches.comparison.whole.blurs).T  # of alpha and of beta, of each of the batch
+    same = torch.cat([blurs.to(typical), typical], 1)[..., None, None]
+    same = same.expand(*same.shape[:2], *matches.facts.shape[-2:])
+    return torch.cat([*facts, *apart, same, matches.stated], 1)
+
+
+def _range(x: Float[Tensor, "b 1 h w"], radius: int) -> Float[Tensor, "b 1 h w"]:
+    """Return the greatest less the least value within squares around each pixel."""
+    window = np.ones((2 * radius + 1,) * 2, np.uint8)
+    ranges = [cv2.dilate(plane, window) - cv2.erode(plane, window) for plane in numpy_of(x[:, 0])]
+    return torch.from_numpy(np.stack(ranges))[:, None].to(x)

@@ -1,11 +1,16 @@
-"""Beta's bands at alpha's view by matches: as bright as alpha, with its detail, diffused where not seen."""
+"""Beta's bands at alpha's view by matches: as bright as alpha, with its detail, filled in where not seen.
+
+Unseen pixels take the colour of the nearest neighbours among alpha's own seen pixels in brightness, texture
+and place (Welsh et al. 2002 colour a grey image so, by another one).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -16,24 +21,22 @@ from arraygeom import Segments
 from arraygeom.runtime.chunks import chunked
 
 from ..media.colour import REC601, to_bytes
+from ..media.filters import LocalMoments, box_mean, numpy_of, smoothed
+from ..support.neighbours import nearest_points
 from ..support.settings import size, tuned
-from .examples import by_examples
-from .filters import LocalMoments, box_mean, numpy_of, smoothed
-from .inputs import Beta, Inputs
-from .likeness import likeness
-from .matches import BetaMatches, Colours, Matches, is_consistent
+from .inputs import Beta, BetaMatches, Colours, Inputs, Matches, at_matches, is_consistent
 from .normalisation import SETTINGS as NORMALISATION
-from .normalisation import Moments, combined_bands, explained_share, moments
-from .positions import at_matches
+from .normalisation import Moments, explained_share, likeness, moments
 from .semi_global import DISPARITY_FILL
 from .spectral_mix import SpectralMix
 
 
 @dataclass(frozen=True)
 class ColourTransferSettings:
-    """Settings of the transfer of beta's colours to alpha's view.
+    """Settings of the transfer of beta's colours to alpha's view, and of colour by example.
 
-    Brightness is 0 to 1. Middlebury and SYNTIM are the pairs of their tune halves.
+    Brightness is 0 to 1, lengths are pixels of alpha. Middlebury and SYNTIM are the pairs of their tune
+    halves.
 
     `pat lab settings` prints the value of each with its meaning and reason.
     """
@@ -69,6 +72,16 @@ class ColourTransferSettings:
         "views over that of light beyond the largest value",
     )
     most_detail: float = size(0.2, "Differences of brightness beyond this are no detail that beta lost")
+    neighbours: int = size(5, "Examples of an unseen pixel; half or twice as many do as well")
+    radii: tuple[int, int] = size((2, 6), "Radii of the windows of examples' means and deviations")
+    place: tuple[float, float] = tuned(
+        (1200.0, 1800.0),
+        "Middlebury, tune half: pixels whose distance counts as much as black beside white, across "
+        "the searched segments and along them: what is occluded is long across",
+    )
+    seen: float = size(0.5, "Weight above which a pixel counts as seen, and is an example")
+    sources: int = size(60_000, "Seen pixels searched for examples at most")
+    error: float = size(0.5, "Relative error of the approximate nearest-neighbour search")
 
     def detail(self, difference: Tensor) -> Tensor:
         """Return the part of a difference of brightness that is detail that beta lost."""
@@ -80,6 +93,57 @@ LEAST = 1e-3
 """Size: least weight of a pixel in a fill."""
 DIRECTIONS = 8
 """Size: spacing, in rows and columns, of the segments whose directions are averaged."""
+
+
+EVERY = (slice(None, None, 2),) * 2
+"""Size: every second pixel is searched for."""
+Plane = NDArray[np.float32]
+
+
+class MatchedValues(NamedTuple):
+    """Beta's values at the matches of alpha's pixels, and alpha as it is compared with them.
+
+    Attributes:
+        bands: beta's bands (B, C, H, W).
+        combined: combination of these that is compared with alpha, (B, 1, H, W).
+        brightness: that combination, normalised to alpha's brightness, (B, 1, H, W).
+        soft: alpha, blurred to be no sharper than beta, (B, 1, H, W).
+        valid: mask of the matches that are on beta, (B, 1, H, W).
+        consistent: 1 where a match passes the left-right check, else 0, (B, 1, H, W).
+        clipped: (B, C, H, W), 1 where a band is clipped, 0 elsewhere, and between them beside such pixels;
+            None for none, and for bands that are compared by a mix.
+    """
+
+    bands: Tensor
+    combined: Tensor
+    brightness: Tensor
+    soft: Tensor
+    valid: Tensor
+    consistent: Tensor
+    clipped: Tensor | None
+
+    @classmethod
+    def from_matches(cls, alpha: Float[Tensor, "b 1 h w"], beta: Beta, matches: BetaMatches) -> MatchedValues:
+        """Sample a beta at its matches.
+
+        Without a mix alpha is compared with luma of three bands, or the mean of others.
+
+        Raises:
+            ValueError: for a field that is not of straight segments.
+        """
+        comparison, segments = matches.comparison, beta.field.straight
+        image, soft = beta.image, comparison.whole.softened(alpha)
+        consistent = is_consistent(matches.facts)
+        if comparison.mix is not None:
+            bands, valid = at_matches(image, segments, matches.disparity)
+            combined = comparison.combined(bands)
+            return cls(bands, combined, combined, soft, valid, consistent, None)
+        luma = comparison.combined(image)
+        planes = [image, luma, comparison.whole.normalised(luma)]
+        planes += [] if beta.clipped is None else [beta.clipped.to(image)]
+        sampled, valid = at_matches(torch.cat(planes, 1), segments, matches.disparity)
+        bands, luma, brightness, *clipped = sampled.split([plane.shape[1] for plane in planes], 1)
+        return cls(bands, luma, brightness, soft, valid, consistent, clipped[0] if clipped else None)
 
 
 class MatchStatistics(NamedTuple):
@@ -102,28 +166,11 @@ class MatchStatistics(NamedTuple):
     noise: Tensor
 
     @classmethod
-    def from_values(
-        cls,
-        alpha: Tensor,
-        soft: Tensor,
-        values: Tensor,
-        combined: Tensor,
-        brightness: Tensor,
-        valid: Tensor,
-        consistent: Tensor,
-    ) -> MatchStatistics:
-        """Compute the statistics of matches.
-
-        Args:
-            alpha: alpha's image (B, 1, H, W).
-            soft: alpha, blurred to be no sharper than beta; of its shape, as are the last four.
-            values: beta's bands (B, C, H, W) at the matches.
-            combined: combination of these bands that is compared with alpha.
-            brightness: that combination, normalised to alpha's brightness.
-            valid: mask of the matches that are on beta, and not clipped.
-            consistent: 1 where a match passes the left-right check, else 0.
-        """
-        both = valid * consistent
+    def from_values(cls, alpha: Float[Tensor, "b 1 h w"], matched: MatchedValues) -> MatchStatistics:
+        """Compute the statistics of alpha's image and a beta's values at the matches."""
+        values, combined, brightness, soft, valid, consistent, clipped = matched
+        counts = valid if clipped is None else valid & (clipped.amax(1, keepdim=True) < 0.5)
+        both = counts * consistent
         count = both.sum((-2, -1), keepdim=True) + 1
         colour = (both * (values - alpha)).sum((-2, -1), keepdim=True) / count
         measured = [moments(image, both) for image in (brightness, alpha)]
@@ -173,7 +220,7 @@ def transferred(inputs: Inputs, matches: Matches) -> Matches:
     def of(piece: Inputs, there: Matches) -> list[Tensor]:
         given: Sequence[MatchStatistics | None] = statistics or [None] * len(piece.betas)
         parts = zip(piece.betas, there.betas, given)
-        carried = (transferred_bands(piece.alpha, *one, sees_luma=piece.sees_luma)[:3] for one in parts)
+        carried = (transferred_bands(piece.alpha, *one, sees_luma=piece.sees_luma) for one in parts)
         return [stored(plane) for planes in carried for plane in planes]
 
     planes = iter(inputs.in_pieces(of, matches))
@@ -221,78 +268,54 @@ def directions_of(segments: Segments) -> Float[NDArray, "2 2"]:
 
 def _statistics_of_frame(inputs: Inputs, matches: Matches) -> list[MatchStatistics]:
     """Compute the statistics of each beta, over all pieces, in turn."""
-    pieces = ((inputs.cut(piece.outer), matches.cut(piece.outer)) for piece in inputs.pieces)
-    of_pieces = [
-        [transferred_bands(piece.alpha, *one)[-1] for one in zip(piece.betas, there.betas)]
-        for piece, there in pieces
-    ]
+    of_pieces = []
+    for piece, there in inputs.cut_in_pieces(matches):
+        values = (MatchedValues.from_matches(piece.alpha, *one) for one in zip(piece.betas, there.betas))
+        of_pieces.append([MatchStatistics.from_values(piece.alpha, one) for one in values])
     return [MatchStatistics.mean(of_beta) for of_beta in zip(*of_pieces)]
 
 
 def transferred_bands(
-    alpha: Tensor,
-    beta: Beta,
-    matches: BetaMatches,
-    statistics: MatchStatistics | None = None,
-    *,
-    sees_luma: bool = True,
-) -> tuple[Tensor, Tensor, Tensor, MatchStatistics]:
-    """Compute a beta's colours at the matches: all of `Colours` but its fills.
-
-    Args:
-        alpha: alpha's image (B, 1, H, W).
-        beta: beta's image and field.
-        matches: matches in that beta.
-        statistics: statistics to use; None for those of these pixels.
-        sees_luma: True if alpha sees about the luma of RGB betas; not used for matches with a mix of bands.
-
-    Returns:
-        `bands`, `weight` and `likeness` of `Colours`, at alpha's pixels; and the statistics.
-
-    Raises:
-        ValueError: for a field that is not of straight segments.
-    """
-    if matches.comparison.mix is not None:
-        return _colours_of_bands(alpha, beta, matches, matches.comparison.mix, statistics)
-    return matched_colours(alpha, beta, matches, statistics, sees_luma=sees_luma)
-
-
-def matched_colours(
     alpha: Float[Tensor, "b 1 h w"],
     beta: Beta,
     matches: BetaMatches,
     statistics: MatchStatistics | None = None,
     *,
     sees_luma: bool = True,
-) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 1 h w"], Float[Tensor, "b 1 h w"], MatchStatistics]:
-    """Compute beta's bands minus alpha at the matches, with the detail that alpha has and beta lacks.
-
-    Alpha is compared with luma of three bands, or the mean of others, whatever mix the matches have.
+) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 1 h w"], Float[Tensor, "b 1 h w"]]:
+    """Compute a beta's colours at the matches: all of `Colours` but its fills.
 
     Args:
+        alpha: alpha's image.
+        beta: beta's image and field.
+        matches: matches in that beta.
         statistics: statistics to use; None for those of these pixels.
         sees_luma: True if alpha sees about the luma of RGB betas: photometric similarity then counts in the
-            weight, and colours grow with alpha's brightness.
+            weight, and colours grow with alpha's brightness; not used for matches with a mix of bands.
 
     Returns:
-        Bands minus alpha (the statistics' mean where the match is not on beta); the weight of these colours,
-        0 to 1; the similarity, 0 to 1, as in `Colours` (all 1 without `sees_luma`); and the statistics.
+        `bands` (the statistics' mean where the match is not on beta), `weight` and `likeness` of `Colours`,
+        at alpha's pixels.
 
     Raises:
         ValueError: for a field that is not of straight segments.
     """
-    guide, normalisation = combined_bands(beta.image), matches.comparison.whole
-    bands = beta.image.shape[1]
-    clipped = torch.zeros_like(beta.image) if beta.clipped is None else beta.clipped.to(beta.image)
-    planes = torch.cat([beta.image, guide, normalisation.normalised(guide), clipped], 1)
-    sampled, valid = at_matches(planes, beta.field.straight, matches.disparity)
-    values, luma, brightness, clipped = sampled.split([bands, 1, 1, bands], 1)
-    consistent, soft = is_consistent(matches.facts), normalisation.softened(alpha)
-    statistics = statistics or MatchStatistics.from_values(
-        alpha, soft, values, luma, brightness, valid & (clipped.amax(1, keepdim=True) < 0.5), consistent
-    )
-    unlike = statistics.leveled(brightness) - soft
-    if beta.clipped is not None and bands == 3 and sees_luma:
+    there, mix = MatchedValues.from_matches(alpha, beta, matches), matches.comparison.mix
+    statistics = statistics or MatchStatistics.from_values(alpha, there)
+    if mix is not None:
+        colours, weight, alike = _colours_by_mix(alpha, matches, there, mix)
+    else:
+        colours, weight, alike = _colours_by_luma(alpha, matches, there, statistics, sees_luma=sees_luma)
+    return torch.where(there.valid, colours, statistics.colour), weight, alike
+
+
+def _colours_by_luma(
+    alpha: Tensor, matches: BetaMatches, there: MatchedValues, statistics: MatchStatistics, *, sees_luma: bool
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Compute bands minus alpha, with the detail that alpha has and beta lacks; their weight and likeness."""
+    values, luma, brightness, soft, valid, _, clipped = there
+    bands, unlike = values.shape[1], statistics.leveled(brightness) - soft
+    if clipped is not None and bands == 3 and sees_luma:
         values, whole = with_clipped_light(values, luma, soft, clipped)
         unlike = unlike + (whole - luma) * (1 - clipped.amin(1, keepdim=True))  # white may be of any colour
         luma = whole
@@ -300,17 +323,29 @@ def matched_colours(
     if bands == 1:  # which may be unlike alpha
         alike = torch.lerp(torch.ones_like(alike), alike, statistics.explained.to(alike))
     weight = match_weight(alike, matches, valid)
-    if bands > 1:
-        power = SETTINGS.saturation if sees_luma else 0.0
-        colour, bright = _scaled_to_alpha(values - luma, luma, alpha, weight, power)
-        if float(statistics.noise.amax()) > SETTINGS.least_noise:
-            colour = _without_noise(colour, bright, statistics.noise)
-        radii = [round(SETTINGS.detail_radius * max(1.0, blur)) for blur in normalisation.blurs[0]]
-        detailed = _each_detailed(colour, bright, alpha, radii)
-        matched = torch.lerp(colour, detailed, statistics.explained) + luma - alpha
-    else:
-        matched = _detailed(values, soft, alpha) - alpha
-    return torch.where(valid, matched, statistics.colour), weight, alike, statistics
+    if bands == 1:
+        return _detailed(values, soft, alpha) - alpha, weight, alike
+    power = SETTINGS.saturation if sees_luma else 0.0
+    colour, bright = _scaled_to_alpha(values - luma, luma, alpha, weight, power)
+    if float(statistics.noise.amax()) > SETTINGS.least_noise:
+        colour = _without_noise(colour, bright, statistics.noise)
+    radii = [round(SETTINGS.detail_radius * max(1.0, blur)) for blur in matches.comparison.whole.blurs[0]]
+    detailed = _each_detailed(colour, bright, alpha, radii)
+    return torch.lerp(colour, detailed, statistics.explained) + luma - alpha, weight, alike
+
+
+def _colours_by_mix(
+    alpha: Tensor, matches: BetaMatches, there: MatchedValues, mix: SpectralMix
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Compute bands minus alpha, with the detail that alpha has and they lack; their weight and likeness."""
+    values, brightness, soft = there.bands, there.brightness, there.soft
+    gain = mix.gain[:, None, None, None].to(alpha)
+    beyond = (alpha - soft) + gain * (soft - brightness)
+    rises = mix.rises(values)
+    slope = rises + local_slope(values - rises * brightness, brightness)
+    colours = values + slope * SETTINGS.detail(beyond) - alpha
+    alike = likeness(brightness - soft)
+    return colours, match_weight(alike, matches, there.valid), alike
 
 
 def with_clipped_light(
@@ -335,30 +370,6 @@ def with_clipped_light(
     share = (clipped * values.new_tensor(REC601)[:, None, None]).sum(1, keepdim=True)
     beyond = (alpha - luma).clamp(min=0) * share / (share.square() + SETTINGS.light_differs)
     return values + clipped * beyond, luma + share * beyond
-
-
-def _colours_of_bands(
-    alpha: Tensor, beta: Beta, matches: BetaMatches, mix: SpectralMix, statistics: MatchStatistics | None
-) -> tuple[Tensor, Tensor, Tensor, MatchStatistics]:
-    """Compute the bands minus alpha at matches by a mix, with the detail that alpha has and they lack.
-
-    Returns:
-        Bands, weight, likeness and statistics, as of `transferred_bands`.
-    """
-    values, valid = at_matches(beta.image, beta.field.straight, matches.disparity)
-    brightness, soft = mix.combined(values), matches.comparison.whole.softened(alpha)
-    gain = mix.gain[:, None, None, None].to(alpha)
-    beyond = (alpha - soft) + gain * (soft - brightness)
-    rises = mix.rises(values)
-    slope = rises + local_slope(values - rises * brightness, brightness)
-    colours = values + slope * SETTINGS.detail(beyond) - alpha
-    consistent = is_consistent(matches.facts)
-    statistics = statistics or MatchStatistics.from_values(
-        alpha, soft, values, brightness, brightness, valid, consistent
-    )
-    alike = likeness(brightness - soft)
-    weight = match_weight(alike, matches, valid)
-    return torch.where(valid, colours, statistics.colour), weight, alike, statistics
 
 
 def _scaled_to_alpha(
@@ -525,3 +536,73 @@ def _diffused(
     beyond = np.clip(brightness - mean, -SETTINGS.most_detail, SETTINGS.most_detail)
     bands = [band / total for band in of_bands]
     return np.stack([b + (p / total - b * mean) / variance * beyond for b, p in zip(bands, products)])
+
+
+def by_examples(
+    colour: Float[NDArray, "c h w"],
+    alpha: Float[NDArray, "h w"],
+    weight: Float[NDArray, "h w"],
+    directions: Float[NDArray, "2 2"],
+) -> Float[NDArray, "c h w"]:
+    """Replace the colour of pixels of low weight by a weighted mean of the seen pixels most similar to them.
+
+    Every second pixel in each direction is compared with such pixels, and pixels between them are
+    interpolated.
+
+    Args:
+        colour: bands of each pixel.
+        alpha: brightness, in which pixels are compared together with their positions.
+        weight: weight of each pixel's colour, 0 to 1; a pixel counts as seen above a half.
+        directions: mean outer product of the unit vectors (x, y) along the segments that were searched;
+            examples count as nearer along these.
+
+    Returns:
+        Colour at all pixels; seen ones keep theirs. The array `colour` itself if all are seen, or fewer of
+        every second pixel than a mean takes.
+    """
+    seen = weight > SETTINGS.seen
+    near = cv2.dilate((~seen).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    asked, seen_there = near[EVERY], seen[EVERY]
+    step = max(1, int(np.ceil(np.sqrt(np.count_nonzero(seen_there) / SETTINGS.sources))))
+    sources = np.zeros_like(seen_there)
+    sources[::step, ::step] = seen_there[::step, ::step]
+    if np.count_nonzero(sources) < SETTINGS.neighbours or not asked.any():
+        return colour
+    features = [(plane[sources], plane[asked]) for plane in _features(alpha, directions)]
+    known, wanted = (np.stack(planes, 1) for planes in zip(*features))
+    index, _ = nearest_points(known, wanted, SETTINGS.neighbours, SETTINGS.error)
+    share = weight[EVERY][sources][index]
+    share = (share / share.sum(1, keepdims=True)).astype(np.float32)
+    out = np.empty_like(colour)
+    for own, filled in zip(colour, out):
+        plane = np.where(seen, own, 0)[EVERY]
+        plane[asked] = np.einsum("nk,nk->n", plane[sources][index], share)
+        filled[:] = np.where(seen, own, _between(plane, (alpha.shape[0], alpha.shape[1])))
+    return out
+
+
+def _between(plane: Plane, hw: tuple[int, int]) -> Plane:
+    """Enlarge a plane of every second pixel, from the first, to all pixels, by linear interpolation."""
+    back = np.array([[0.5, 0, 0], [0, 0.5, 0]], np.float32)
+    how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    between: Plane = cv2.warpAffine(plane, back, (hw[1], hw[0]), flags=how, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[assignment]
+    return between
+
+
+def _features(alpha: Plane, directions: Float[NDArray, "2 2"]) -> Iterator[Plane]:
+    """Yield brightness, its means and standard deviations in windows, and place, of every second pixel.
+
+    They are scaled so that distances compare.
+    """
+    alpha = np.ascontiguousarray(alpha, np.float32)
+    yield alpha[EVERY]
+    for radius in SETTINGS.radii:
+        side = (2 * radius + 1,) * 2
+        mean, square = cv2.boxFilter(alpha, -1, side), cv2.boxFilter(alpha * alpha, -1, side)
+        yield mean[EVERY]
+        yield np.sqrt(np.maximum(square - mean * mean, 0))[EVERY]
+    across, along = (1 / pixels**2 for pixels in SETTINGS.place)
+    metric = across * np.eye(2) + (along - across) * directions
+    rows, columns = 2 * np.indices(alpha[EVERY].shape, dtype=np.float32)
+    for x, y in np.linalg.cholesky(metric).T.astype(np.float32):
+        yield x * columns + y * rows

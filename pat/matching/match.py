@@ -13,14 +13,10 @@ from torch.nn.functional import avg_pool2d
 
 from arraygeom import Segments
 
-from .certainty import with_certainty
-from .choice import Choice, chosen
+from .choice import Choice, chosen, with_certainty
 from .colour_transfer import transferred
-from .inputs import Inputs
-from .matches import BetaMatches, Matches, is_consistent
+from .inputs import FINE, BetaMatches, Comparison, Inputs, Matches, at_matches, is_consistent, reduced
 from .multiview import agreed, with_likeliest_colours
-from .normalisation import Comparison
-from .positions import FINE, at_matches, reduced
 from .semi_global import HalfSizeMatches, matched_at_half_size
 from .spectral_mix import SETTINGS as MIX
 from .spectral_mix import SpectralMix
@@ -61,25 +57,31 @@ def match(inputs: Inputs, choice: Choice | None = None) -> Matches:
         raise ValueError(f"alpha has {w}x{h} pixels to match: pad both sides to multiples of {multiple}")
     if (least := min(h, w, *(side for image in betas for side in image.shape[-2:]))) < 4 * FINE:
         raise ValueError(f"an image to match has a side of {least} pixels: give {4 * FINE} or more")
-    if not inputs.learned:
-        return transferred(inputs, located(inputs))
-    with torch.no_grad():
-        matches = with_certainty(chosen(inputs, in_each_beta(inputs), choice))
-        if inputs.can_agree:
-            matches = with_likeliest_colours(inputs, matches, with_certainty(agreed(inputs, matches)))
-    if torch.is_grad_enabled():
+    matches = located(inputs, choice)
+    if inputs.learned and torch.is_grad_enabled():
         matches = following(inputs, matches)
     return transferred(inputs, matches)
 
 
-def located(inputs: Inputs) -> Matches:
+def located(inputs: Inputs, choice: Choice | None = None) -> Matches:
     """Match alpha's pixels in each beta, without colours; for several calibrated betas, where all agree.
 
+    Args:
+        choice: network that chooses between candidate disparities, as for `match`.
+
     Returns:
-        The matches, detached, without choice or certainty.
+        The matches, detached; without `inputs.learned` semi-global ones, without choice or certainty.
+
+    Raises:
+        ValueError: for a beta whose field is not of straight segments.
     """
-    of_each = in_each_beta(inputs)
-    return agreed(inputs, of_each) if inputs.can_agree else of_each
+    matches = in_each_beta(inputs)
+    if inputs.learned:
+        matches = with_certainty(chosen(inputs, matches, choice))
+    if not inputs.can_agree:
+        return matches
+    together = agreed(inputs, matches)
+    return with_likeliest_colours(inputs, matches, with_certainty(together)) if inputs.learned else together
 
 
 @torch.no_grad()
@@ -111,9 +113,9 @@ def located_in_one(inputs: Inputs) -> BetaMatches:
     Raises:
         ValueError: for several betas, or a field that is not of straight segments.
     """
-    comparison = Comparison.from_images(inputs.alpha, inputs.betas[0].image, seen_mix(inputs))
-    halves = comparison.half_views(inputs.alpha, inputs.betas[0].image)
-    half = matched_at_half_size(halves, inputs.betas[0].field.of_blocks(FINE))
+    mix, alpha, (beta,) = seen_mix(inputs), inputs.alpha, inputs.betas
+    comparison = Comparison.from_images(alpha, beta.image, mix)
+    half = matched_at_half_size(comparison.half_views(alpha, beta.image), beta.field.of_blocks(FINE))
 
     def closer(piece: Inputs, rough: HalfSizeMatches) -> tuple[Tensor, Tensor]:
         (beta,) = piece.betas

@@ -28,13 +28,11 @@ from arraygeom.epipolar import FRONT, Track
 from arraygeom.runtime.chunks import Tile, assembled, slices, spans
 
 from ..media.colour import to_bytes
+from ..media.filters import filled, numpy_of
 from ..support.settings import size, tuned
-from .filters import filled, numpy_of
-from .inputs import Beta, Inputs
-from .likeness import likeness
-from .matches import BetaMatches, Matches
-from .positions import FINE, Extent, at_matches, enlarged
-from .semi_global import CONSISTENT, DISPARITY_FILL
+from .inputs import CONSISTENT, FINE, Beta, BetaMatches, Extent, Inputs, Matches, at_matches, enlarged
+from .normalisation import likeness
+from .semi_global import DISPARITY_FILL
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Images made comparable: their moments (whole, where a weight is, and local), and their sharpness."""
+"""Images made comparable: their moments, whole and where a weight is, sharpness and similarity."""
 
 from __future__ import annotations
 
@@ -14,11 +14,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from ..media.colour import luminance, to_bytes
-from ..support.settings import size
-from .filters import blurred
-from .positions import FINE
-from .spectral_mix import SpectralMix
+from ..media.colour import to_bytes
+from ..media.filters import blurred, box_mean
+from ..support.settings import size, tuned
 
 LEAST_WEIGHT = 1e-6
 """Size: added to weights, so that there are moments where all are 0."""
@@ -26,7 +24,9 @@ LEAST_WEIGHT = 1e-6
 
 @dataclass(frozen=True)
 class NormalisationSettings:
-    """Settings of the normalisation of one image's brightness and sharpness to another's.
+    """Settings of the normalisation of an image's brightness and sharpness, and of photometric similarity.
+
+    Brightness is 0 to 1.
 
     `pat lab settings` prints the value of each with its meaning and reason.
     """
@@ -36,9 +36,11 @@ class NormalisationSettings:
         (0.4, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0),
         "Standard deviations, pixels, tried on the sharper image until it is no sharper than the other",
     )
+    unlike: float = tuned(0.07, "Middlebury: difference of brightness at which likeness is 1 / e")
 
 
 SETTINGS = NormalisationSettings()
+UNLIKE = SETTINGS.unlike
 
 
 class Moments(NamedTuple):
@@ -210,50 +212,15 @@ def _sharpness(image: Float[Tensor, "1 h w"]) -> float:
     It is of fine detail, which blur takes first, and where noise counts less than from pixel to pixel. First
     differences are of coarser detail, too.
     """
-    half = avg_pool2d(image, FINE)
+    half = avg_pool2d(image, 2)
     differences = (half.diff(n=2, dim=axis).abs() for axis in (-1, -2))
     return sum(float(difference.mean()) for difference in differences if difference.numel()) + 1e-9
 
 
-class Comparison(NamedTuple):
-    """Combination of a beta's bands that is compared with alpha, and its normalisation to alpha.
+def likeness(difference: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b 1 h w"]:
+    """Compute photometric similarity: 1 where images are equally bright around a pixel, down to 0 elsewhere.
 
-    Attributes:
-        mix: combination of bands that alpha sees; None for Rec. 601 luma of three bands, the mean of others.
-        whole: normalisation of the combination.
-        half: normalisation of the combination at half the size.
+    Args:
+        difference: difference of brightness.
     """
-
-    mix: SpectralMix | None
-    whole: Normalisation
-    half: Normalisation
-
-    @classmethod
-    def from_images(
-        cls, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b c hb wb"], mix: SpectralMix | None = None
-    ) -> Comparison:
-        """Estimate the comparison of whole images of even sides, by this mix."""
-        other = combined_bands(beta, mix)
-        half = Normalisation.from_images(avg_pool2d(alpha, 2), avg_pool2d(other, 2))
-        return cls(mix, Normalisation.from_images(alpha, other), half)
-
-    def combined(self, beta: Float[Tensor, "b c hb wb"]) -> Float[Tensor, "b 1 hb wb"]:
-        """Return the combination of beta's bands, or of a part of it."""
-        return combined_bands(beta, self.mix)
-
-    def views(self, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b c hb wb"]) -> ComparedViews:
-        """Return alpha and the combination of beta's bands, or parts of them, as they are compared."""
-        return self.whole.views(alpha, self.combined(beta))
-
-    def half_views(self, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b c hb wb"]) -> ComparedViews:
-        """Return the same at half the size."""
-        return self.half.views(avg_pool2d(alpha, 2), avg_pool2d(self.combined(beta), 2))
-
-
-def combined_bands(
-    beta: Float[Tensor, "b c h w"], mix: SpectralMix | None = None
-) -> Float[Tensor, "b 1 h w"]:
-    """Combine the bands by a mix; without one return Rec. 601 luma of three bands, the mean of others."""
-    if mix is not None:
-        return mix.combined(beta)
-    return luminance(beta) if beta.shape[1] == 3 else beta.mean(1, keepdim=True)
+    return torch.exp(-(box_mean(difference.abs(), 1) / UNLIKE).square())

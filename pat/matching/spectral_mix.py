@@ -15,9 +15,9 @@ from torch import Tensor
 
 from arraygeom.robust import RobustFit, gaussian, least_squares, robust_least_squares
 
+from ..media.filters import box_mean
 from ..support.settings import size, tuned
-from .filters import box_mean
-from .likeness import UNLIKE
+from .normalisation import UNLIKE
 
 
 @dataclass(frozen=True)

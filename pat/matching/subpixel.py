@@ -2,12 +2,15 @@
 
 At half the size an object's edge is some two pixels off and a slope is in steps. Here each pixel chooses, at
 full size, between labels around the least and around the greatest disparity of its neighbourhood at half the
-size.
+size. A step of least squares and planes through the surfaces give a fraction of a pixel: for every second
+pixel a plane, whose moments are gathered by the domain transform (Gastal and Oliveira 2011), to which a point
+beyond an edge of the guide is far away.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -18,15 +21,14 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
 from arraygeom import Segments
+from arraygeom.pixels import HW
 
+from ..media.filters import box_mean, numpy_of
 from ..support.settings import size, tuned
-from .filters import box_mean, numpy_of
-from .inputs import Inputs
-from .matches import Matches
+from . import kernels
+from .inputs import CONSISTENT, FINE, Extent, Inputs, Matches, at_matches, match_positions
 from .normalisation import ComparedViews
-from .positions import FINE, Extent, at_matches, match_positions
-from .semi_global import CONSISTENT, SemiGlobalSettings, Windows, geometry_of, matched_by_labels
-from .surfaces import Plane, Planes
+from .semi_global import SemiGlobalSettings, Windows, geometry_of, matched_by_labels
 
 FULL_SIZE = SemiGlobalSettings(step=20.0, jump=80.0, margin=48)
 """Penalties chosen on Middlebury's tune half; half the size, where a label is two pixels, has others."""
@@ -57,6 +59,9 @@ class SubpixelSettings:
         0.5, "Middlebury, tune half, of .5 to 1: change of disparity as far as `reach`, where views are sharp"
     )
     surfaces: int = size(2, "How often surfaces are fitted, the second time within the first ones")
+    level: float = tuned(
+        0.005, "Middlebury, tune half: variance of position, over reach^2, below which planes are level"
+    )
 
 
 SETTINGS = SubpixelSettings()
@@ -199,3 +204,62 @@ def _runs(half: NDArray[np.float32]) -> NDArray[np.int32]:
     low, high = (np.rint(plane).astype(np.int32) - run // 2 for plane in extremes)
     low = np.maximum(np.where(high < low + run, (low + high) // 2 - run // 2, low), 0)
     return np.stack([low, np.maximum(high, low + run)], -1)
+
+
+Plane = NDArray[np.float32]
+"""Numbers of the pixels (h, w)."""
+
+
+class Planes(NamedTuple):
+    """Planes fitted around every second pixel in each direction, each attribute (h, w), float32.
+
+    Attributes:
+        value: value at the pixel.
+        right: slope per full-size pixel to the right.
+        down: slope per full-size pixel downwards.
+        around: mean weight of the values around.
+    """
+
+    value: Plane
+    right: Plane
+    down: Plane
+    around: Plane
+
+    @classmethod
+    def through(cls, values: Plane, weight: Plane, guide: NDArray[np.float32], reach: float) -> Planes:
+        """Fit a plane around every pixel by weighted least squares, within edges of a guide.
+
+        Args:
+            values: values (h, w) of every second pixel.
+            weight: their weights, at least 0.
+            guide: image (h, w, c), float32; a change of 1 in it counts as far as `reach`.
+            reach: full-size pixels to which values count.
+
+        Returns:
+            The planes; where no value reaches, `around` is about 0 and the rest means nothing.
+        """
+        reach /= FINE
+        values, weight = (np.ascontiguousarray(plane, np.float32) for plane in (values, weight))
+        centre = float(np.average(values, weights=weight + np.finfo(np.float32).tiny))  # for small numbers
+        terms = np.empty((3, *values.shape, 4), np.float32)
+        kernels.weighted_terms(values, weight, centre, reach, terms)
+        over = cv2.ximgproc.createDTFilter(guide, reach, 1.0, cv2.ximgproc.DTF_RF)
+        sums = (over.filter(term) for term in terms)
+        planes = np.empty((4, *values.shape), np.float32)
+        kernels.planes_through(*sums, centre, reach, SETTINGS.level, planes)
+        return cls(*planes)
+
+    def at_pixels(self, hw: HW) -> Plane:
+        """Return the values at all pixels."""
+        out = np.empty(hw, np.float32)
+        kernels.at_pixels(*self[:3], out)
+        return out
+
+
+def repeated(plane: Plane, hw: HW) -> Plane:
+    """Repeat a plane of every second pixel for those to its right and below it, too.
+
+    Returns:
+        The plane at all pixels.
+    """
+    return plane.repeat(FINE, 0).repeat(FINE, 1)[: hw[0], : hw[1]]

@@ -3,7 +3,7 @@
 Matching (`pat.matching`) gives the bands of each beta at its matches, the weight of each match, and fills for
 the rest. This network joins several betas, adds a fill by attention of alpha to itself
 (`pat.networks.recall`), and smooths doubtful pixels. Nothing of it is trained; the confidence and the depth
-that come with an image are (`pat.matching.choice`, `pat.matching.certainty`).
+that come with an image are (`pat.matching.choice`).
 """
 
 from __future__ import annotations
@@ -17,9 +17,7 @@ from torch import Tensor, nn
 from arraygeom.sampling import on_image
 
 from ..matching.colour_transfer import LEAST
-from ..matching.inputs import Inputs
-from ..matching.matches import BetaMatches, Colours, Matches
-from ..matching.positions import Extent, at_matches, match_positions
+from ..matching.inputs import BetaMatches, Colours, Extent, Inputs, Matches, at_matches, match_positions
 from ..media.colour import luminance
 from ..support.blocks import enlarge
 from .configs import GuidedPATConfig

@@ -18,9 +18,8 @@ from torch.nn.functional import interpolate
 from arraygeom.fields.grid import FieldOnGrid
 
 from ..attention.scores import Compared
-from ..matching.filters import box_mean
-from ..matching.inputs import Inputs
-from ..matching.matches import Matches
+from ..matching.inputs import Inputs, Matches
+from ..media.filters import box_mean
 from ..support.blocks import ResidualASPP, ResidualBlock
 from .configs import PATConfig
 from .protocol import FusionOutput, JoinsBands

@@ -12,9 +12,8 @@ from torch import Tensor
 from arraygeom.runtime.chunks import Box, slices
 
 from ..attention.scores import Compared
-from ..matching.inputs import Beta, Inputs
+from ..matching.inputs import Beta, Inputs, Matches
 from ..matching.match import match
-from ..matching.matches import Matches
 
 
 class FusionOutput(NamedTuple):

@@ -21,7 +21,7 @@ from arraygeom import Local
 from arraygeom.pixels import pixel_grid
 
 from ..attention import attend
-from ..matching.filters import box_mean
+from ..media.filters import box_mean
 from ..support.blocks import enlarge
 from ..support.settings import size, tuned
 

@@ -13,7 +13,7 @@ from experiments.evaluation.certainty import (
     held_markdown,
     widened,
 )
-from pat.matching.certainty import MEASURED
+from pat.matching.choice import MEASURED
 
 
 def judged(pair, power=2.0, condition="ideal", count=4000):

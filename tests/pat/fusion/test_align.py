@@ -29,9 +29,8 @@ from pat.app.aligned_page import aligned_page, ndvi, shown_layers
 from pat.app.report import Facts
 from pat.fusion.align import OUTSIDE, SEEN, filled, resampled_values
 from pat.fusion.steps import without_lenses
-from pat.matching.inputs import Inputs
+from pat.matching.inputs import Inputs, Matches
 from pat.matching.match import match
-from pat.matching.matches import Matches
 from pat.media.images import read_image, read_recorded
 from pat.networks.configs import PATConfig
 from pat.networks.paper import PAT

@@ -10,12 +10,12 @@ from arraygeom import Sensor
 from pat import FuseSettings, fuse
 from pat.fusion import corrections
 from pat.fusion.corrections import Corrections, find_corrections
+from pat.fusion.epipolar_offset import Misalignment, fit_misalignment
 from pat.fusion.fuse import corrections_of
 from pat.fusion.inputs import clipped_in, prepared
 from pat.fusion.sequence import SequenceFusion
 from pat.fusion.views import Views
 from pat.matching.colour_transfer import with_clipped_light
-from pat.matching.epipolar_offset import Misalignment, fit_misalignment
 from pat.matching.radiometry import Response
 from pat.media.colour import luminance
 from pat.networks.weights import load_weights

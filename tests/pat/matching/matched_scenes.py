@@ -6,9 +6,8 @@ import torch
 from arraygeom import Pair, Rectified, Segments, View, lazily, pixel_grid
 from arraygeom.fields.grid import FieldOnGrid
 from pat.matching.colour_transfer import transferred
-from pat.matching.inputs import Beta, Inputs
+from pat.matching.inputs import Beta, BetaMatches, Inputs, Matches
 from pat.matching.match import located_in_one
-from pat.matching.matches import BetaMatches, Matches
 from pat.matching.semi_global import matched_at_half_size
 from pat.matching.subpixel import matched_at_full_size
 

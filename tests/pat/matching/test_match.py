@@ -13,10 +13,8 @@ from pat import FuseSettings, fuse
 from pat.fusion.inputs import frame_inputs
 from pat.fusion.views import Views
 from pat.matching.colour_transfer import transferred
-from pat.matching.inputs import Inputs, box_around
-from pat.matching.match import located, match
-from pat.matching.matches import Colours, Matches
-from pat.matching.positions import enlarged
+from pat.matching.inputs import Colours, Inputs, Matches, box_around, enlarged
+from pat.matching.match import in_each_beta, located, match
 from pat.media.colour import luminance
 from pat.networks.protocol import FusionOutput, fused_at_once
 from pat.networks.weights import load_weights
@@ -92,8 +90,7 @@ def test_matches_are_located_first_and_coloured_then(inputs):
     assert bare.colours is None
     with pytest.raises(ValueError, match="colours"):
         bare.carried  # noqa: B018
-    sure = replace(bare, chosen=whole.betas[0].chosen, certainty=whole.betas[0].certainty)
-    (again,) = transferred(inputs, Matches((sure,))).betas
+    (again,) = transferred(inputs, Matches((bare,))).betas
     assert all(torch.equal(*planes) for planes in zip(again.carried, whole.betas[0].carried))
 
 
@@ -114,7 +111,7 @@ def test_matches_from_a_file_take_the_place_of_those_found(network, flat, tmp_pa
     torch.save(torch.full((1, 1, H, W), wanted - BASELINE * W / 50.0), path)
 
     def from_file(inputs):
-        (one,) = located(inputs).betas
+        (one,) = in_each_beta(inputs).betas
         disparity = torch.load(path, weights_only=True).to(one.disparity)
         sure = torch.tensor([0.0, 1.0, 0.0])[:, None, None].expand_as(one.facts[0])[None]
         return transferred(inputs, Matches((replace(one, disparity=disparity, facts=sure.to(one.facts)),)))

@@ -14,8 +14,8 @@ from pat.fusion.views import Views
 from pat.matching import inputs as inputs_module
 from pat.matching import multiview as several
 from pat.matching.colour_transfer import transferred
+from pat.matching.inputs import Colours, Matches
 from pat.matching.match import in_each_beta, located, match
-from pat.matching.matches import Colours, Matches
 from pat.matching.multiview import NEAR as AGREES
 from pat.matching.multiview import MatchedBeta, agreed, with_likeliest_colours
 from pat.media.colour import luminance
@@ -111,7 +111,7 @@ def test_colours_are_where_a_beta_is_most_like_alpha(network, scene):
     """At its own match or the agreed one; for betas with some of the bands where all agree."""
     rig, images, _ = scene
     inputs = replace(frame_inputs(network, Views.of(rig, images, alpha="mono")).inputs, bands=3)
-    found = located(replace(inputs, betas=inputs.betas[:1]))
+    found = in_each_beta(replace(inputs, betas=inputs.betas[:1]))
     own = found.betas[0]
     far = own.disparity + torch.where(own.disparity < 10, 7, -7)  # within the segments
     wrong = torch.zeros(own.hw, dtype=torch.bool)
@@ -132,7 +132,7 @@ def test_colours_are_where_a_beta_is_most_like_alpha(network, scene):
 def test_colour_that_betas_share_is_of_consistent_matches(network, scene):
     rig, images, _ = scene
     inputs = replace(frame_inputs(network, Views.of(rig, images, alpha="mono")).inputs, bands=3)
-    one, other = located(inputs).betas
+    one, other = located(replace(inputs, learned=False)).betas
     given = Matches((one, replace(other, facts=torch.ones_like(other.facts))))
     shared, alone = (transferred(replace(inputs, bands=n), given).betas[0].carried.fills for n in (3, 6))
     assert (shared - alone).abs().mean() < 0.05 * alone.abs().mean()
@@ -274,17 +274,12 @@ def test_betas_whose_lengths_do_not_fit_agree_all_the_same(network, scene):
     )
     assert score(found, ground_truth).psnr > score(true, ground_truth).psnr - 0.5
     inputs = frame_inputs(network, Views.of(Rig(wrong, depth=(NEAR, 2 * FAR)), images, alpha="mono")).inputs
-    alone = located_alone(inputs)
+    alone = in_each_beta(inputs).betas
     scales = sorted(a.scale for a in several.ambiguities(inputs, alone))
     assert 1.0 in scales
     assert scales[1] / scales[0] == pytest.approx(1.6, rel=0.05)
     inputs = frame_inputs(network, Views.of(Rig(cameras, depth=(NEAR, FAR)), images, alpha="mono")).inputs
-    assert several.ambiguities(inputs, located_alone(inputs)) == [several.NO_AMBIGUITY] * 2
-
-
-def located_alone(inputs):
-    """Each beta's own matches."""
-    return [located(one).betas[0] for one in inputs.by_beta]
+    assert several.ambiguities(inputs, in_each_beta(inputs).betas) == [several.NO_AMBIGUITY] * 2
 
 
 def test_a_plane_is_no_ambiguity():

@@ -11,9 +11,7 @@ from pat import FuseSettings, fuse
 from pat.app.sample_array import load_sample
 from pat.fusion.steps import co_located
 from pat.matching.colour_transfer import transferred
-from pat.matching.inputs import Inputs
-from pat.matching.matches import Matches
-from pat.matching.positions import at_matches
+from pat.matching.inputs import Inputs, Matches, at_matches
 from pat.media.colour import luminance
 from pat.networks import guided
 from pat.networks.configs import GuidedPATConfig

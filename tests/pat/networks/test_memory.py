@@ -12,9 +12,8 @@ from arraygeom.runtime.chunks import Tile
 from pat.fusion.inputs import frame_inputs
 from pat.fusion.tiles import fuse_tile, working_memory
 from pat.fusion.views import Views
-from pat.matching.matches import BetaMatches, Colours, Matches
+from pat.matching.inputs import BetaMatches, Colours, Comparison, Matches
 from pat.matching.multiview import agreed
-from pat.matching.normalisation import Comparison
 from pat.networks.weights import load_weights
 from pat.support.memory import give_back, limited, peak_memory, resident
 from tests.arraygeom.rigs import parallel_rig

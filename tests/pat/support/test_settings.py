@@ -47,7 +47,7 @@ def test_of_settings_that_a_room_has_twice_what_differs_is_counted():
     found = [s.value for s in all_settings("pat.matching") if s.algorithm == "SemiGlobalSettings"]
     steps = [s.value for s in all_settings("pat.matching") if s.name == "step" and s.kind == "tuned"]
     assert sorted(steps) == [HALF_SIZE.step, FULL_SIZE.step]
-    assert found.count(HALF_SIZE.consistent) == 1
+    assert found.count(HALF_SIZE.block) == 1
 
 
 def test_json_too_deep_to_read_has_no_entries(tmp_path):

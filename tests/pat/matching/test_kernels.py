@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pat.matching import cost
-from pat.matching import semi_global_numba as kernels
+from pat.matching import kernels as kernels
 
 SMALL, LARGE = np.float32(20), np.float32(100)
 HW, BETA = (5, 7), (6, 9)

@@ -17,13 +17,14 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from arraygeom import Segments
 from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.pixels import HW
 from arraygeom.robust import cauchy, normal_deviation, robust_least_squares
 
+from ..matching.inputs import Extent
+from ..matching.subpixel import SETTINGS as SUBPIXEL
 from ..support.settings import size, tuned
-from .positions import normals
-from .subpixel import SETTINGS as SUBPIXEL
 
 Image = NDArray[Any]
 
@@ -98,6 +99,12 @@ class Misalignment:
         if self == Misalignment() or field.pixels is None:
             return field
         return field.displaced(lambda locations, x: self.at(x, hw)[..., None] * normals(locations))
+
+
+def normals(segments: Segments) -> Float[Tensor, "*n 2"]:
+    """Compute unit vectors across the segments; zero where a segment is a point."""
+    direction = Extent.from_segments(segments).towards
+    return torch.stack([-direction[..., 1], direction[..., 0]], -1)
 
 
 @torch.no_grad()

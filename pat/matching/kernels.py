@@ -1,8 +1,11 @@
-"""Compiled loops of `pat.matching.semi_global`, each on one image, in one thread, without Python's lock.
+"""Compiled loops of semi-global matching, of the planes through it and of the choice after it.
 
-Each pixel has one or two *runs* of `count` consecutive labels, which begin at `first` (h, w, runs) and do not
-overlap. Costs and sums of a run are in lanes, of which those after the last label mean nothing: a single run
-has as many as it needs, a multiple of 16; of two, each has 8, of which at most 5 are labels.
+Each works on one image, in one thread, without Python's lock.
+
+In semi-global matching each pixel has one or two *runs* of `count` consecutive labels, which begin at `first`
+(h, w, runs) and do not overlap. Costs and sums of a run are in lanes, of which those after the last label
+mean nothing: a single run has as many as it needs, a multiple of 16; of two, each has 8, of which at most 5
+are labels.
 """
 
 from __future__ import annotations
@@ -21,6 +24,7 @@ from pat.attention.kernels.layout import pointers
 from pat.attention.kernels.vectors import add_int, from_index, load, splat, store
 
 from .cost import NOWHERE, UNSEEN, dissimilarity, pixel_of
+from .inputs import FINE
 
 NO_LABEL = np.uint8(255)
 """Cost of a lane without a label: so much more than `NOWHERE` and a jump that no path ever comes from one."""
@@ -413,3 +417,132 @@ def costs_at(alpha, beta, places, out):
 
 for _entry in (costs, aggregate, winners, costs_at):
     renew_with(_entry, [Path(__file__), Path(__file__).with_name("cost.py"), *SOURCES])
+
+
+COLUMNS = 32
+"""Number of columns whose numbers are written at a time: they stay in a core's first cache."""
+
+
+@compiled(inline="always")
+def soft(x):
+    """Return x for small x, with absolute values of at most 1."""
+    return x / (np.float32(1) + abs(x))
+
+
+@compiled(nogil=True, cache=True)
+def compared(alpha, beta, end, towards, candidates, scales, out):
+    """Compare alpha with beta at each candidate disparity, with 2 x 2 pixels as channels.
+
+    Beyond h or w alpha's last row or column is repeated, beyond beta's edge its nearest pixel.
+
+    Args:
+        alpha: brightness (h, w) of alpha.
+        beta: brightness of beta.
+        end: ends (h, w, 2) of the segments, pixels of beta.
+        towards: unit vectors (h, w, 2) from end to start.
+        candidates: disparities (n, h, w), pixels from the end; the first is the pixel's own match.
+        scales: differences of disparity and of brightness that are mapped to 1/2.
+        out: numbers (h / 2, w / 2, 4 + 8 n), or more rows and columns, to write; of each plane four for the 2
+            x 2 pixels: alpha minus 1/2; for each candidate but the first the difference of its disparity from
+            the first one's, by `soft`; for each the excess of alpha's brightness over beta's, by `soft`; and
+            1 where the first is on beta, else 0.
+    """
+    n, height, width = candidates.shape
+    rows, columns = beta.shape
+    pixels, level = np.float32(1) / np.float32(scales[0]), np.float32(1) / np.float32(scales[1])
+    right, bottom, zero, half = np.float32(columns - 1), np.float32(rows - 1), np.float32(0), np.float32(0.5)
+    for row in range(2 * out.shape[0]):
+        r = min(row, height - 1)
+        for first in range(0, 2 * out.shape[1], COLUMNS):
+            for k in range(n):
+                for column in range(first, min(first + COLUMNS, 2 * out.shape[1])):
+                    c = min(column, width - 1)
+                    target = out[row // 2, column // 2]
+                    channel = 2 * (row % 2) + column % 2
+                    far = candidates[k, r, c]
+                    x = end[r, c, 0] + far * towards[r, c, 0]
+                    y = end[r, c, 1] + far * towards[r, c, 1]
+                    if k:
+                        target[4 * k + channel] = soft((far - candidates[0, r, c]) * pixels)
+                    else:
+                        on = -half <= x and x <= right + half and -half <= y and y <= bottom + half
+                        target[channel] = alpha[r, c] - half
+                        target[8 * n + channel] = np.float32(on)
+                    x, y = min(max(x, zero), right), min(max(y, zero), bottom)
+                    left, top = min(int(x), max(columns - 2, 0)), min(int(y), max(rows - 2, 0))
+                    u, v = x - np.float32(left), y - np.float32(top)
+                    beside, below = min(left + 1, columns - 1), min(top + 1, rows - 1)
+                    above = beta[top, left] + u * (beta[top, beside] - beta[top, left])
+                    under = beta[below, left] + u * (beta[below, beside] - beta[below, left])
+                    target[4 * (n + k) + channel] = soft((alpha[r, c] - above - v * (under - above)) * level)
+
+
+TINY = np.finfo(np.float32).tiny
+
+
+@compiled(nogil=True, cache=True)
+def weighted_terms(values, weight, centre, reach, out):
+    """Compute the terms of the weighted least squares of planes z = value + right x + down y.
+
+    Args:
+        values: values z + centre (h, w).
+        weight: their weights.
+        centre: number that is subtracted from the values.
+        reach: pixels that are the unit of x and y, which are counted from the middle.
+        out: terms (3, h, w, 4) to write: weights; weights times x, y, x x, x y, y y, z, x z, y z and
+            themselves; and two zeros.
+    """
+    (height, width), centre, reach = values.shape, np.float32(centre), np.float32(reach)
+    one, two, three = out
+    for r in range(height):
+        y = (np.float32(r) - np.float32(0.5) * np.float32(height - 1)) / reach
+        for c in range(width):
+            x = (np.float32(c) - np.float32(0.5) * np.float32(width - 1)) / reach
+            w, z = weight[r, c], values[r, c] - centre
+            wx, wy = w * x, w * y
+            one[r, c, 0], one[r, c, 1], one[r, c, 2], one[r, c, 3] = w, wx, wy, wx * x
+            two[r, c, 0], two[r, c, 1], two[r, c, 2], two[r, c, 3] = wx * y, wy * y, w * z, wx * z
+            three[r, c, 0], three[r, c, 1], three[r, c, 2], three[r, c, 3] = wy * z, w * w, 0, 0
+
+
+@compiled(nogil=True, cache=True)
+def planes_through(one, two, three, centre, reach, level, out):
+    """Solve for the planes, from `weighted_terms` that are summed around each pixel.
+
+    Args:
+        one: first four terms (h, w, 4).
+        two: next four.
+        three: last four.
+        centre: number that was subtracted from the values.
+        reach: pixels that are the unit of x and y.
+        level: number, in that unit squared, added to the variances of position, which makes slopes smaller:
+            half as large where it is the variance.
+        out: planes (4, h, w) to write: value, slope per full-size pixel to the right and downwards, and the
+            mean of the weights, weighted by themselves.
+    """
+    (height, width), centre, reach = one.shape[:2], np.float32(centre), np.float32(reach)
+    level = np.float32(level)
+    for r in range(height):
+        y = (np.float32(r) - np.float32(0.5) * np.float32(height - 1)) / reach
+        for c in range(width):
+            x = (np.float32(c) - np.float32(0.5) * np.float32(width - 1)) / reach
+            share = np.float32(1) / max(one[r, c, 0], TINY)
+            mx, my, mz = one[r, c, 1] * share, one[r, c, 2] * share, two[r, c, 2] * share
+            xx, yy = one[r, c, 3] * share - mx * mx + level, two[r, c, 1] * share - my * my + level
+            xy, xz = two[r, c, 0] * share - mx * my, two[r, c, 3] * share - mx * mz
+            yz = three[r, c, 0] * share - my * mz
+            within = np.float32(1) / (xx * yy - xy * xy)
+            right, down = (xz * yy - yz * xy) * within, (yz * xx - xz * xy) * within
+            out[0, r, c] = mz + right * (x - mx) + down * (y - my) + centre
+            out[1, r, c], out[2, r, c] = right / (FINE * reach), down / (FINE * reach)
+            out[3, r, c] = three[r, c, 1] * share
+
+
+@compiled(nogil=True, cache=True)
+def at_pixels(value, right, down, out):
+    """Write planes of every second pixel at all pixels, `out` (h, w)."""
+    height, width = out.shape
+    for r in range(height):
+        for c in range(width):
+            y, x = r // FINE, c // FINE
+            out[r, c] = value[y, x] + np.float32(c % FINE) * right[y, x] + np.float32(r % FINE) * down[y, x]
