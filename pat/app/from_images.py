@@ -20,7 +20,6 @@ from torch.linalg import LinAlgError
 from torch.nn.functional import interpolate
 
 from arraygeom import LensView, Link, Rig, Sensor, View, apply_homography, resize_matrix
-from arraygeom.io.point_matches import read_matches
 from arraygeom.io.xmp import named_by_band, rig_of_images, states_cameras
 from arraygeom.pixels import HW
 from arraygeom.runtime.progress import log_step, part, stage
@@ -41,6 +40,7 @@ from ..media.raw import developed_rig
 from ..media.tags import focal_length
 from ..media.video import read_video
 from ..networks.weights import load_weights
+from .point_matches import read_matches
 
 LOG = logging.getLogger(__name__)
 

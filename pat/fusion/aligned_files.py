@@ -16,12 +16,12 @@ import torch
 from numpy.typing import NDArray
 
 from arraygeom.runtime.atomic import write_text
-from arraygeom.runtime.file_names import file_names
 from arraygeom.runtime.together import refuse_others, write_together
 
 from ..media.images import read_recorded, recorded_bands, write_image
 from ..media.raw import demosaiced
 from ..media.tags import RecordedTags, recorded_tags
+from ..support.file_names import file_names
 from .align import Aligned
 from .results import with_links
 from .views import FilesOfCameras

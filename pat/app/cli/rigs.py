@@ -118,8 +118,9 @@ def given_matches(path: Path | None, texts: Sequence[str], images: Mapping[str, 
     """
     if path is None:
         return None
-    from arraygeom.io.point_matches import read_matches
     from calib.images.matches import PointMatches
+
+    from ..point_matches import read_matches
 
     files = options.files_by_name(texts)
     sizes = {name: (image.shape[1], image.shape[2]) for name, image in images.items()}

@@ -19,8 +19,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..pixels import HW
-from .source import decoded
+from arraygeom.io.source import decoded
+from arraygeom.pixels import HW
 
 MAX_IMAGES = 2**31 - 1
 """Factor in COLMAP's number of a pair of images a < b: a * MAX_IMAGES + b (its documentation of the
