@@ -94,9 +94,8 @@ class Align(Around):
         listed = all(path.is_file() and path.suffix.lower() in IMAGE_SUFFIXES for path in self.given)
         if self.image or not (len(folders) == len(self.given) == 1 or (listed and len(self.given) > 2)):
             return {}
-        from arraygeom.io.xmp import by_capture
-
         from ..batch import find_images
+        from ..from_images import by_capture
 
         return by_capture(find_images(folders[0]) if folders else self.given)
 

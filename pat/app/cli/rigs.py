@@ -319,7 +319,8 @@ class Convert:
             OSError: if it cannot be written.
         """
         from arraygeom.io import read_rig, write_rig
-        from arraygeom.lens_fit import refit_rig
+
+        from ..lens_refit import refit_rig
 
         hw = None if self.size is None else (self.size[1], self.size[0])
         if hw is not None and min(hw) < 1:
