@@ -131,10 +131,7 @@ def named_by_band(paths: Sequence[Path]) -> dict[str, Path]:
 
 def states_cameras(paths: Sequence[Path]) -> bool:
     """Return True if the tags of every image state its camera; False for no images."""
-    return bool(paths) and all(
-        path.suffix.lower() in SUFFIXES and path.is_file() and _states_camera(image_tags(path))
-        for path in paths
-    )
+    return bool(paths) and all(recognises(path, "") for path in paths)
 
 
 def rig_of_images(files: Mapping[str, Path]) -> Rig:
