@@ -344,7 +344,7 @@ def _translated_rig(tagged: Rig, images: Images, alpha: str, note: Say) -> tuple
     straight, pinhole = without_lenses(Rig({name: tagged[name] for name in images}), images)
     shown = {name: pixels_between(tagged[name], straight[name])[1][None].float() for name in images}
     lengths = {name: float(straight[name].K[0, 0]) for name in images}
-    finest = lengths[alpha] * min(MATCHED / max(images[alpha].shape[-2:]), 1.0)
+    finest = lengths[alpha] * matching_factor(images[alpha])
     factors = {name: min(finest / length, 1.0) for name, length in lengths.items()}
     reduced = {name: scaled(image, factors[name]) for name, image in pinhole.items()}
     masks = {name: scaled(mask, factors[name])[0] > 0.99 for name, mask in shown.items()}
@@ -369,8 +369,7 @@ def _mapped_rig(
     for images in captures:
         rig = Rig({name: tagged[name] for name in images})
         straight, pinhole = without_lenses(rig, images)
-        factors = {name: min(MATCHED / max(image.shape[-2:]), 1.0) for name, image in pinhole.items()}
-        reduced = {name: scaled(image, factors[name]) for name, image in pinhole.items()}
+        reduced = {name: scaled(image, matching_factor(image)) for name, image in pinhole.items()}
         sized = resized_rig(straight, reduced)
         try:
             if by_pair is None:
@@ -435,7 +434,7 @@ def found_rig(
     Raises:
         ValueError: if no image shows enough of what alpha shows, and as `rig_from_images`.
     """
-    factors = {name: min(MATCHED / max(image.shape[-2:]), 1.0) for name, image in images.items()}
+    factors = {name: matching_factor(image) for name, image in images.items()}
     reduced = {name: scaled(image, factors[name]) for name, image in images.items()}
     lengths = {name: length * factors[name] for name, length in focal.items()}
     if by_pair is not None:
@@ -595,6 +594,12 @@ def resized_rig(rig: Rig, images: Images) -> Rig:
 
 def _hw(image: Tensor) -> HW:
     return int(image.shape[-2]), int(image.shape[-1])
+
+
+def matching_factor(image: Float[Tensor, "c h w"]) -> float:
+    """Return the factor that reduces an image to the size at which features are matched (`MATCHED`): at most
+    1."""
+    return min(MATCHED / max(image.shape[-2:]), 1.0)
 
 
 def scaled(image: Float[Tensor, "c h w"], factor: float) -> Float[Tensor, "c h2 w2"]:
