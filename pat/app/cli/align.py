@@ -83,7 +83,7 @@ class Align(Around):
         options.writable(self.out, folder=True)
         check_apart(self.out, () if with_rig else filter(Path.is_dir, self.given))
         self.settings()
-        self._extras = options.some_of(self.extras, EXTRAS)
+        self._extras = options.extras_of(self.extras, EXTRAS)
         with self.judged():
             for frame in self._frames_with_rig(image) if with_rig else self._frames_without(flight):
                 self._align(frame)
